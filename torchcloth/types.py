@@ -1,0 +1,43 @@
+"""The containers that cross floors. SI units, right-handed, z up; leading batch dimensions are written ``...``.
+
+NamedTuples: the one container that survives Lightning's device transfer, vmap, collate, checkpoint and compile.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class ClothState(NamedTuple):
+    """What the integrator carries from one substep to the next.
+
+    No affine velocity is stored: it is derived from the mesh at every step, so that a turning sheet is not braked.
+    """
+
+    x: Tensor  # [..., V, 3] m, vertex positions
+    v: Tensor  # [..., V, 3] m/s, vertex velocities
+    d3: Tensor  # [..., P, 3] -, elastic director of each contact point (P = 0 without contact)
+
+
+class Trajectory(NamedTuple):
+    """The motion of one end effector or collider, given at knots; the layer interpolates it (C1, cubic).
+
+    ``pose`` maps body coordinates to the world: p_world = pose[..., :3, :3] @ p_body + pose[..., :3, 3].
+    """
+
+    t: Tensor  # [K] s, strictly increasing
+    pose: Tensor  # [..., K, 4, 4] m
+    closed: Tensor  # [K] bool, the gripper holds the cloth from this knot until the next
+
+
+class Rollout(NamedTuple):
+    """A simulated motion at the requested frame times."""
+
+    t: Tensor  # [T] s
+    x: Tensor  # [..., T, V, 3] m
+    v: Tensor  # [..., T, V, 3] m/s
+    wrench: dict[str, Tensor]  # name -> [..., T, 6] N and N m: force and torque that the cloth exerts on the gripper, about
+    #                            its own origin, world axes, mean over the interval that ends at the frame (frame 0: zero)
+    state: ClothState  # the state at the last frame: pass it on to continue
