@@ -21,6 +21,19 @@ class ClothState(NamedTuple):
     d3: Tensor  # [..., P, 3] -, elastic director of each contact point (P = 0 without contact)
 
 
+class Surface(NamedTuple):
+    """Kinematics of the E triangles, computed once per substep and shared by material, effects and contact."""
+
+    f1: Tensor  # [..., E, 3] -, deformation gradient's warp column
+    f2: Tensor  # [..., E, 3] -, deformation gradient's weft column
+    cofactor1: Tensor  # [..., E, 3] -, dJ/df1 = f2 x n
+    cofactor2: Tensor  # [..., E, 3] -, dJ/df2 = n x f1
+    n: Tensor  # [..., E, 3] -, unit normal
+    J: Tensor  # [..., E, 1] -, area ratio
+    area: Tensor  # [E, 1] m^2, rest area
+    v: Tensor  # [..., E, 3] m/s, centroid velocity
+
+
 class Trajectory(NamedTuple):
     """The motion of one end effector or collider, given at knots; the layer interpolates it (C1, cubic).
 

@@ -1,1 +1,7 @@
-"""placeholder."""
+"""Physical effects on the bare membrane, one per file, keyed by name. They add, so their order cannot matter."""
+
+from .air import AirDrag
+from .base import AbstractEffect
+from .gravity import Gravity
+
+__all__ = ["AbstractEffect", "AirDrag", "Gravity"]

@@ -1,0 +1,26 @@
+"""Shared settings: one thread (the meshes are small), float64 physics."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    """Physics is verified in float64; tests of float32 set it themselves."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+@pytest.fixture
+def realdata() -> Path:
+    """Folder of measured data; skips where it is absent."""
+    folder = os.environ.get("TORCHCLOTH_REALDATA")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("TORCHCLOTH_REALDATA does not name a folder of measured data")
+    return Path(folder)

@@ -1,0 +1,145 @@
+"""Motion against closed forms and conservation."""
+
+import math
+
+import pytest
+import torch
+
+import torchcloth as tc
+
+
+def sheet(size=0.3, n=8, *, effects=None, boundaries=None, contact=tc.Contact(), Y=300.0, density=0.15):  # noqa: B008
+    mesh = tc.meshes.rectangle(size, size, resolution=(n, n))
+    material = tc.materials.AEP(Y * 1e3, 0.3, 1e6, 2e5)
+    return tc.Cloth(mesh, material, density, effects=effects, boundaries=boundaries, contact=contact)
+
+
+def momenta(cloth, state):
+    mass = cloth.model().mass
+    linear = (mass * state.v).sum(-2)
+    angular = torch.linalg.cross(state.x, mass * state.v).sum(-2)
+    return linear, angular
+
+
+def test_free_fall_is_exact():
+    cloth = sheet(effects={"gravity": tc.effects.Gravity()})
+    out = cloth(cloth.rest_state(), times=[0.0, 0.2])
+    n = math.ceil(0.2 / cloth.stable_step() - 1e-9)
+    dt = 0.2 / n
+    expected = -9.81 * dt * dt * n * (n + 1) / 2  # symplectic Euler's own sum; 9.81 t^2 / 2 + O(dt)
+    torch.testing.assert_close(out.x[-1, :, 2], torch.full((64,), expected), rtol=1e-9, atol=0)
+    assert abs(expected + 9.81 * 0.02) < 9.81 * 0.2 * dt
+
+
+def test_momentum_is_conserved_in_vacuum():
+    cloth = sheet()
+    torch.manual_seed(0)
+    state = cloth.state(cloth.rest_state().x, 0.5 * torch.randn(64, 3))
+    before = momenta(cloth, state)
+    after = momenta(cloth, cloth(state, times=[0.0, 0.05]).state)
+    torch.testing.assert_close(after[0], before[0], rtol=0, atol=1e-12)
+
+
+def test_angular_momentum_is_conserved_by_the_membrane():
+    cloth = sheet(contact=None)
+    torch.manual_seed(0)
+    state = cloth.state(cloth.rest_state().x, 0.5 * torch.randn(64, 3))
+    before = momenta(cloth, state)[1]
+    after = momenta(cloth, cloth(state, times=[0.0, 0.05]).state)[1]
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.6, 0.0, 0.8)])
+def test_a_spinning_sheet_is_not_braked_by_its_director(axis):
+    cloth = sheet(n=6)
+    omega = 6.0 * torch.tensor(axis)
+    x = cloth.rest_state().x
+    centre = (cloth.model().mass * x).sum(0) / cloth.model().mass.sum()
+    state = cloth.state(x, torch.linalg.cross(omega.expand_as(x), x - centre))
+    before = cloth.energy(state)["kinetic"], momenta(cloth, state)[1]
+    out = cloth(state, times=[0.0, 0.25]).state
+    after = cloth.energy(out)["kinetic"], momenta(cloth, out)[1]
+    torch.testing.assert_close(after[1], before[1], rtol=1e-9, atol=1e-12)
+    assert abs(after[0] / before[0] - 1) < 1e-3  # the sheet stretches a little under the centrifugal load
+    normals = cloth.state(out.x).d3
+    torch.testing.assert_close(out.d3, normals, rtol=0, atol=1e-9)
+
+
+def test_drag_reaches_terminal_velocity():
+    air = tc.effects.AirDrag(normal=1.2, density=1.2)
+    cloth = sheet(effects={"gravity": tc.effects.Gravity(), "air": air}, contact=None, density=0.15)
+    terminal = math.sqrt(2 * 0.15 * 9.81 / (1.2 * 1.2))
+    t = 0.6
+    out = cloth(cloth.rest_state(), times=[0.0, t])
+    expected = terminal * math.tanh(9.81 * t / terminal)
+    torch.testing.assert_close(-out.v[-1, :, 2].mean(), torch.tensor(expected), rtol=2e-3, atol=0)
+
+
+def test_amplitude_zero_is_bitwise_the_base_model():
+    base = sheet(effects={"gravity": tc.effects.Gravity()}, contact=None)
+    with_air = sheet(effects={"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(normal=0.0)}, contact=None)
+    torch.manual_seed(0)
+    v = torch.randn(64, 3)
+    a, b = (c(c.state(c.rest_state().x, v), times=[0.0, 0.03]).x for c in (base, with_air))
+    assert torch.equal(a, b)
+
+
+def test_hanging_strip_stretches_by_its_own_weight():
+    Y, density, length = 20.0, 0.3, 0.4
+    mesh = tc.meshes.rectangle(0.1, length, resolution=(5, 17))
+    top = torch.nonzero(torch.as_tensor(mesh.uv[:, 1]) > length - 1e-9).flatten().tolist()
+    material = tc.materials.AEP(Y * 1e3, 0.02)
+    cloth = tc.Cloth(
+        mesh, material, density, {"gravity": tc.effects.Gravity((0.0, -9.81, 0.0))},
+        {"clamp": tc.boundaries.Grasp(top)}, contact=None,
+    )  # fmt: skip
+    still = tc.Trajectory(torch.tensor([0.0, 9.0]), torch.eye(4).repeat(2, 1, 1), torch.ones(2, dtype=bool))
+    state, sags = cloth.rest_state(), []
+    for _ in range(2):  # no damping in the model: let it oscillate and average over whole periods
+        period = 4 * length * math.sqrt(density / Y)
+        out = cloth(state, {"clamp": still}, times=torch.linspace(0.0, period, 33))
+        sags.append(-(out.x[:-1, :, 1] - cloth.rest_state().x[:, 1])[:, mesh.uv[:, 1] == 0].mean())
+        state = out.state
+        weight = out.wrench["clamp"][1:, 1].mean()
+    expected = density * 9.81 * length**2 / (2 * Y)
+    torch.testing.assert_close(torch.stack(sags).mean(), torch.tensor(expected), rtol=0.02, atol=0)
+    torch.testing.assert_close(weight, torch.tensor(-density * 9.81 * 0.1 * length), rtol=0.02, atol=0)
+
+
+def test_sticks_and_slides_on_an_incline():
+    for slope, slides in ((0.9, False), (1.1, True)):
+        mu = 0.4
+        angle = math.atan(mu * slope)
+        g = (9.81 * math.sin(angle), 0.0, -9.81 * math.cos(angle))
+        cloth = sheet(
+            n=4, effects={"gravity": tc.effects.Gravity(g)}, contact=None,
+            boundaries={"table": tc.boundaries.Plane(friction=mu)},
+        )  # fmt: skip
+        out = cloth(cloth.rest_state(), times=[0.0, 0.3])
+        moved = float((out.x[-1] - out.x[0])[:, 0].mean())
+        expected = 0.5 * 9.81 * (math.sin(angle) - mu * math.cos(angle)) * 0.09 if slides else 0.0
+        assert moved == pytest.approx(expected, rel=0.03, abs=1e-9)
+        assert float(out.x[..., 2].min()) > -1e-9
+
+
+def test_one_sheet_comes_to_rest_on_another():
+    """Dropped on a pinned sheet at 1 m/s: no pass-through, the gap is a small multiple of the grid spacing."""
+    lower = tc.meshes.rectangle(0.2, 0.2, resolution=(7, 7))
+    vertices = torch.as_tensor(lower.vertices)
+    import numpy as np
+
+    both = np.concatenate([lower.vertices, lower.vertices + [0.005, 0.003, 0.08]])
+    faces = np.concatenate([lower.faces, lower.faces + len(vertices)])
+    mesh = tc.meshes.Mesh.build(both, faces)
+    cloth = tc.Cloth(
+        mesh, tc.materials.AEP(3e5, 0.3, 1e6, 2e5), 0.15, {"gravity": tc.effects.Gravity()},
+        {"pin": tc.boundaries.Grasp(range(len(vertices)))}, tc.Contact(spacing=0.02, subdivisions=2),
+    )  # fmt: skip
+    v = torch.zeros(len(both), 3)
+    v[len(vertices) :, 2] = -1.0
+    still = tc.Trajectory(torch.tensor([0.0, 9.0]), torch.eye(4).repeat(2, 1, 1), torch.ones(2, dtype=bool))
+    out = cloth(cloth.state(torch.as_tensor(both), v), {"pin": still}, times=torch.linspace(0, 0.2, 21))
+    height = out.x[:, len(vertices) :, 2]
+    assert float(height.min()) > 0.005
+    assert float(out.v[-1, len(vertices) :, 2].mean()) > -0.4  # it was stopped: without contact 3 m/s
+    assert float(height[8:].mean()) < 2.5 * 0.02

@@ -1,0 +1,41 @@
+"""What a boundary must answer."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, NamedTuple
+
+from torch import Tensor, nn
+
+from ..meshes import Mesh
+
+
+class Drive(NamedTuple):
+    """A trajectory resolved on the substeps of one frame interval."""
+
+    increment: Tensor  # [..., N, 4, 4] rigid motion of the world points carried along during each substep
+    origin: Tensor  # [..., N, 3] m, position of the body at the end of each substep
+    closed: tuple[bool, ...]  # N flags
+
+
+class AbstractBoundary(nn.Module, ABC):
+    """Changes velocities so that the constraint holds at the end of the substep.
+
+    ``driven`` boundaries need a trajectory in ``motion``; they report the impulse that they gave the cloth.
+    """
+
+    driven: ClassVar[bool] = False
+
+    @abstractmethod
+    def bind(self, mesh: Mesh) -> AbstractBoundary:
+        """Resolve what depends on the mesh (vertex indices); returns self.
+
+        Raises:
+            InvalidInput: the boundary does not fit the mesh.
+        """
+
+    @abstractmethod
+    def apply(
+        self, x: Tensor, v: Tensor, mass: Tensor, dt: float, drive: Drive | None, substep: int
+    ) -> tuple[Tensor, Tensor | None]:
+        """(new velocities [..., V, 3], impulse and its moment about the body [..., 6] N s, N m s, or None)."""

@@ -1,0 +1,91 @@
+"""A gripper that holds a patch of cloth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from .._math import cross
+from ..errors import InvalidInput
+from ..meshes import Mesh
+from .base import AbstractBoundary, Drive
+
+Corner = Literal["lower-left", "lower-right", "upper-left", "upper-right"]
+
+
+class Grasp(AbstractBoundary):
+    """Vertices that follow an end effector rigidly while it is closed.
+
+    Every substep applies the body's own increment of motion to the held vertices, so nothing has to be remembered from
+    the moment of closing, and nothing drifts.
+
+    Args:
+        vertices: indices of the held vertices; or
+        uv: [G, 2] m pattern coordinates of patch centres, with
+        radius: of the patch [m].
+
+    Raises:
+        InvalidInput: both or neither of vertices and uv; a patch that holds no vertex.
+    """
+
+    driven = True
+
+    def __init__(
+        self, vertices: Sequence[int] | None = None, *, uv: ArrayLike | None = None, radius: float = 0.015
+    ) -> None:
+        super().__init__()
+        if (vertices is None) == (uv is None):
+            raise InvalidInput("Grasp", got="both or neither of vertices and uv", expected="exactly one of them")
+        self._uv, self._corner, self.radius = uv, None, float(radius)
+        self.register_buffer("index", torch.as_tensor([] if vertices is None else list(vertices), dtype=torch.long))
+        self.index: Tensor
+
+    @classmethod
+    def corner(cls, corner: Corner, radius: float = 0.015) -> Grasp:
+        """The patch at a corner of the pattern's bounding box: "lower-left", "upper-right", ..."""
+        if corner not in ("lower-left", "lower-right", "upper-left", "upper-right"):
+            raise InvalidInput("corner", got=repr(corner), expected='"lower-left", "lower-right", "upper-left" or "upper-right"')  # fmt: skip
+        grasp = cls(uv=[[0.0, 0.0]], radius=radius)
+        grasp._corner = corner
+        return grasp
+
+    def bind(self, mesh: Mesh) -> Grasp:
+        """Find the held vertices in the mesh's pattern coordinates."""
+        if self._corner is not None:
+            if mesh.uv is None:
+                raise InvalidInput("Grasp.corner", got="a mesh without pattern coordinates", expected="a mesh with uv")
+            low, high = mesh.uv.min(0), mesh.uv.max(0)
+            vertical, horizontal = self._corner.split("-")
+            self._uv = [[(low if horizontal == "left" else high)[0], (low if vertical == "lower" else high)[1]]]
+        if self._uv is not None:
+            self.index = torch.as_tensor(mesh.nearest_vertices(self._uv, self.radius), device=self.index.device)
+        if len(self.index) == 0 or int(self.index.min()) < 0 or int(self.index.max()) >= len(mesh.vertices):
+            raise InvalidInput(
+                "Grasp vertices", got=np.asarray(self.index.cpu()).tolist(), expected=f"indices in 0..{len(mesh.vertices) - 1}"
+            )  # fmt: skip
+        return self
+
+    def apply(
+        self, x: Tensor, v: Tensor, mass: Tensor, dt: float, drive: Drive | None, substep: int
+    ) -> tuple[Tensor, Tensor | None]:
+        """Held vertices arrive exactly where the body carries them."""
+        if drive is None or not drive.closed[substep]:
+            return v, None
+        motion = drive.increment[..., substep, :, :]
+        held = x.index_select(-2, self.index)
+        target = held @ motion[..., :3, :3].mT + motion[..., None, :3, 3]
+        wanted = (target - held) / dt
+        free = v.index_select(-2, self.index)
+        change = mass.index_select(-2, self.index) * (wanted - free)
+        moment = cross(target - drive.origin[..., substep, None, :], change)
+        impulse = torch.cat([change.sum(-2), moment.sum(-2)], dim=-1)
+        return v.index_copy(-2, self.index, wanted.expand_as(free)), impulse
+
+    def extra_repr(self) -> str:
+        """One line of the data sheet."""
+        return f"{len(self.index)} vertices"

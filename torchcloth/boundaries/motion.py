@@ -1,0 +1,94 @@
+"""Trajectories at knots, resolved on the integrator's substeps."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .._math import cross, dot
+from ..errors import InvalidInput
+from ..types import Trajectory
+from .base import Drive
+
+
+def check(trajectory: Trajectory, name: str, start: float, end: float) -> None:
+    """Refuse a trajectory that cannot be followed over [start, end] s.
+
+    Raises:
+        InvalidInput: shapes, time order, coverage, non-finite poses, or turns over 90 degrees between knots.
+    """
+    t, pose, closed = trajectory
+    where = f"motion[{name!r}]"
+    if t.ndim != 1 or len(t) < 2 or pose.shape[-3:] != (len(t), 4, 4) or closed.shape != t.shape:
+        raise InvalidInput(
+            where,
+            got=f"t {tuple(t.shape)}, pose {tuple(pose.shape)}, closed {tuple(closed.shape)}",
+            expected="t [K], pose [..., K, 4, 4], closed [K] with K >= 2",
+        )
+    if not bool((t[1:] > t[:-1]).all()):
+        raise InvalidInput(f"{where}.t", got="times that do not increase", expected="strictly increasing seconds")
+    slack = 1e-6 * max(1.0, abs(end))
+    if float(t[0]) > start + slack or float(t[-1]) < end - slack:
+        raise InvalidInput(
+            f"{where}.t",
+            got=f"[{float(t[0]):g}, {float(t[-1]):g}] s",
+            expected=f"to cover the frame times [{start:g}, {end:g}] s",
+        )
+    if not bool(torch.isfinite(pose).all()):
+        raise InvalidInput(f"{where}.pose", got="NaN or infinite entries", expected="finite poses")
+    rotation = pose.detach()[..., :3, :3]
+    turn = (rotation[..., 1:, :, :] * rotation[..., :-1, :, :]).sum((-2, -1))  # trace of the relative rotation
+    if bool((turn < 1.0).any()):
+        raise InvalidInput(
+            f"{where}.pose", got="a turn of over 90 degrees between knots", expected="smaller steps",
+            remedy="give the trajectory at more knots",
+        )  # fmt: skip
+
+
+def interpolate(trajectory: Trajectory, times: Tensor) -> Tensor:
+    """Poses [..., N, 4, 4] at ``times`` [N] s: cubic Hermite on positions and rotation columns, orthonormalised.
+
+    C1, so that the held cloth sees no velocity jumps at the knots; differentiable in the knots' poses.
+    """
+    t, pose = trajectory.t.to(times), trajectory.pose
+    last = len(t) - 1
+    k = (torch.searchsorted(t, times, right=True) - 1).clamp(0, last - 1)
+    step = t[k + 1] - t[k]
+    s = ((times - t[k]) / step).clamp(0.0, 1.0)[:, None, None]
+    slope = _slopes(t, pose)
+    step = step[:, None, None]
+    mixed = (
+        (2 * s**3 - 3 * s**2 + 1) * pose[..., k, :, :]
+        + (s**3 - 2 * s**2 + s) * step * slope[..., k, :, :]
+        + (3 * s**2 - 2 * s**3) * pose[..., k + 1, :, :]
+        + (s**3 - s**2) * step * slope[..., k + 1, :, :]
+    )
+    first = mixed[..., :3, 0]
+    first = first / dot(first, first).sqrt()
+    second = mixed[..., :3, 1]
+    second = second - dot(first, second) * first
+    second = second / dot(second, second).sqrt()
+    rotation = torch.stack([first, second, cross(first, second)], dim=-1)
+    top = torch.cat([rotation, mixed[..., :3, 3:]], dim=-1)
+    return torch.cat([top, pose.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)], dim=-2)
+
+
+def drive(trajectory: Trajectory, times: Tensor) -> Drive:
+    """Increments of motion over the substeps between consecutive ``times`` [N + 1] s."""
+    pose = interpolate(trajectory, times)
+    before, after = pose[..., :-1, :, :], pose[..., 1:, :, :]
+    turn = after[..., :3, :3] @ before[..., :3, :3].mT
+    shift = after[..., :3, 3:] - turn @ before[..., :3, 3:]
+    increment = torch.cat([torch.cat([turn, shift], dim=-1), after[..., 3:, :]], dim=-2)
+    knot = (torch.searchsorted(trajectory.t.to(times), times[:-1] + 1e-9, right=True) - 1).clamp(min=0)
+    return Drive(increment, after[..., :3, 3], tuple(trajectory.closed[knot].tolist()))
+
+
+def _slopes(t: Tensor, pose: Tensor) -> Tensor:
+    """Derivative of each knot's pose [..., K, 4, 4] 1/s: central differences weighted for uneven knots."""
+    h = (t[1:] - t[:-1])[:, None, None]
+    secant = (pose[..., 1:, :, :] - pose[..., :-1, :, :]) / h
+    if len(t) == 2:
+        return secant.expand_as(pose)
+    inner = (h[1:] * secant[..., :-1, :, :] + h[:-1] * secant[..., 1:, :, :]) / (h[1:] + h[:-1])
+    return torch.cat([secant[..., :1, :, :], inner, secant[..., -1:, :, :]], dim=-3)

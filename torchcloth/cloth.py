@@ -1,0 +1,276 @@
+"""The layer: a cloth as an nn.Module."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint as recompute
+
+from . import functional
+from .boundaries import AbstractBoundary
+from .boundaries.motion import check as check_motion
+from .boundaries.motion import drive
+from .effects import AbstractEffect
+from .errors import InvalidInput, SimulationDiverged, UnstableStep
+from .materials import AbstractMaterial
+from .meshes import Mesh
+from .parameters import PhysicalParameter
+from .stability import stable_step
+from .transfer import Contact
+from .types import ClothState, Rollout, Trajectory
+
+CHUNK = 48  # substeps between checkpoints of a long frame interval: memory ~ frames + CHUNK, one extra forward pass
+
+
+class Cloth(nn.Module):
+    """A sheet of cloth that is simulated, and differentiated, by calling it.
+
+    Args:
+        mesh: the triangles and their rest shape.
+        material: the constitutive law.
+        areal_density: rho_A [kg/m^2]; scalar or one value per triangle; learnable.
+        effects: forces by name, e.g. ``{"gravity": Gravity(), "air": AirDrag()}``. None: none, not even weight.
+        boundaries: grasps and colliders by name, applied in order.
+        contact: discretisation of contact between layers; None leaves contact out, and with it the parameters k, gamma
+            and c_F of the material.
+
+    Raises:
+        InvalidInput: a part that does not fit.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        material: AbstractMaterial,
+        areal_density: float | Tensor,
+        effects: Mapping[str, AbstractEffect] | None = None,
+        boundaries: Mapping[str, AbstractBoundary] | None = None,
+        contact: Contact | None = Contact(),  # noqa: B008 - frozen, carries no state
+    ) -> None:
+        super().__init__()
+        self.mesh, self.material = mesh, material
+        self.areal_density = PhysicalParameter(areal_density, "kg/m^2", name="areal_density")
+        self.effects = nn.ModuleDict(dict(effects or {}))
+        self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in (boundaries or {}).items()})
+        self.contact = contact
+        self.spacing, points = (1.0, np.zeros((0, 3))) if contact is None else contact.resolve(mesh)
+        self.nodes = _grid_size(mesh, self.spacing) if contact is not None else 0
+        self._store_geometry(points)
+
+    def _store_geometry(self, points: np.ndarray) -> None:
+        gradient, area = self.mesh.shape_gradient, self.mesh.area
+        dtype = torch.get_default_dtype()
+        share = np.zeros(len(self.mesh.vertices))
+        np.add.at(share, self.mesh.faces.ravel(), np.repeat(area / 3, 3))
+        arrays = {
+            "_corners": torch.as_tensor(self.mesh.faces.T.ravel().copy()),
+            "_gradient": torch.as_tensor(gradient, dtype=dtype),
+            "_area": torch.as_tensor(area, dtype=dtype).unsqueeze(-1),
+            "_share": torch.as_tensor(share, dtype=dtype).unsqueeze(-1),
+            "_points": torch.as_tensor(points, dtype=dtype),
+            "_vertices": torch.as_tensor(self.mesh.vertices, dtype=dtype),
+        }
+        for name, tensor in arrays.items():
+            self.register_buffer(name, tensor, persistent=False)
+
+    # -- states ---------------------------------------------------------------------------------------------------
+
+    def rest_state(self) -> ClothState:
+        """The mesh as it was given, at rest."""
+        return self.state(self._vertices)
+
+    def state(self, x: Tensor, v: Tensor | None = None) -> ClothState:
+        """A state from vertex positions [..., V, 3] m and velocities (None: at rest), directors along the normals."""
+        x = torch.as_tensor(x, dtype=self._area.dtype, device=self._area.device)
+        if x.shape[-2:] != self._vertices.shape:
+            raise InvalidInput("x", got=f"shape {tuple(x.shape)}", expected=f"[..., {len(self._vertices)}, 3] in metres")
+        v = torch.zeros_like(x) if v is None else torch.as_tensor(v, dtype=x.dtype, device=x.device).expand_as(x)
+        n = functional.surface(self._geometry(), x, v).n
+        return ClothState(x, v, n.repeat_interleave(len(self._points), dim=-2))
+
+    # -- simulation -----------------------------------------------------------------------------------------------
+
+    def forward(
+        self,
+        state: ClothState,
+        motion: Mapping[str, Trajectory] | None = None,
+        times: Tensor | Sequence[float] = (0.0, 1.0),
+        *,
+        dt: float | None = None,
+        checkpoint: bool = True,
+    ) -> Rollout:
+        """Simulate from ``state`` at ``times[0]`` to the last time.
+
+        Args:
+            state: initial state, with or without leading batch dimensions.
+            motion: a trajectory for every driven boundary, by the boundary's name; poses may be batched.
+            times: [T] s, frame times, increasing; substeps are laid between them so that frames are met exactly.
+            dt: largest substep [s]; None chooses the stable one.
+            checkpoint: store only frames and recompute substeps in the backward pass.
+
+        Raises:
+            InvalidInput: motion that does not fit the boundaries or the times.
+            UnstableStep: ``dt`` beyond the stability limit.
+            SimulationDiverged: the state lost finiteness.
+        """
+        frames = _check_times(times)
+        motion = self._check_motion(dict(motion or {}), frames)
+        model = self.model()
+        limit = self._choose_step(dt)
+        self._check_extent(state.x)
+        states, wrenches = [state], []
+        for start, end in zip(frames[:-1], frames[1:], strict=True):
+            count = max(1, int(np.ceil((end - start) / limit - 1e-9)))
+            state, impulses = self._advance(model, state, motion, start, end, count, checkpoint)
+            self._check_finite(state, start, end)
+            states.append(state)
+            wrenches.append({name: -impulse / (end - start) for name, impulse in impulses.items()})
+        return _collect(frames, states, wrenches, [name for name, b in self.boundaries.items() if b.driven])
+
+    def stable_step(self) -> float:
+        """The substep [s] that is used by default, from the stiffest element and the present parameters."""
+        with torch.no_grad():
+            c = self.material.coefficients()
+            density = _per_triangle(self.areal_density.value)
+            spacing = self.spacing if self.contact is not None else None
+            return stable_step(self._gradient, density, self.material.stiffness(c), spacing)
+
+    def model(self) -> functional.Model:
+        """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
+        density = self.areal_density.value
+        mass = self._vertex_mass(density)
+        effects = [(effect, effect.coefficients()) for effect in self.effects.values()]
+        return functional.Model(
+            geometry=self._geometry(),
+            mass=mass,
+            areal_density=_per_triangle(density),
+            material=self.material,
+            coefficients=self.material.coefficients(),
+            effects=effects,  # type: ignore[arg-type]
+            boundaries=dict(self.boundaries.items()),  # type: ignore[arg-type]
+        )
+
+    def energy(self, state: ClothState) -> dict[str, Tensor]:
+        """Energies by name, each [...] J."""
+        return functional.energy(self.model(), state)
+
+    # -- parts of the above ---------------------------------------------------------------------------------------
+
+    def _geometry(self) -> functional.Geometry:
+        g = self._gradient
+        return functional.Geometry(
+            corners=self._corners,
+            warp=(g[:, 1, 0:1], g[:, 2, 0:1]),
+            weft=(g[:, 1, 1:2], g[:, 2, 1:2]),
+            area=self._area,
+            points=self._points,
+            spacing=self.spacing,
+            nodes=self.nodes,
+        )
+
+    def _vertex_mass(self, density: Tensor) -> Tensor:
+        if density.ndim == 0:
+            return density * self._share
+        triangle = density.unsqueeze(-1) * self._area / 3
+        corners = torch.cat([triangle] * 3, dim=-2)
+        return triangle.new_zeros(*triangle.shape[:-2], *self._share.shape).index_add(-2, self._corners, corners)
+
+    def _choose_step(self, dt: float | None) -> float:
+        limit = self.stable_step()
+        if dt is None:
+            return limit
+        if not 0 < dt:
+            raise InvalidInput("dt", got=f"{dt:g} s", expected="a step > 0")
+        if dt > limit * (1 + 1e-9):
+            raise UnstableStep(
+                "dt", got=f"{dt:.4g} s", expected=f"at most {limit:.4g} s for these parameters and this mesh",
+                remedy="lower dt, or leave it out",
+            )  # fmt: skip
+        return float(dt)
+
+    def _check_motion(self, motion: dict[str, Trajectory], frames: list[float]) -> dict[str, Trajectory]:
+        driven = {name for name, boundary in self.boundaries.items() if boundary.driven}
+        if set(motion) != driven:
+            raise InvalidInput("motion", got=f"trajectories for {sorted(motion)}", expected=f"one for each of {sorted(driven)}")  # fmt: skip
+        out = {}
+        for name, trajectory in motion.items():
+            check_motion(trajectory, name, frames[0], frames[-1])
+            out[name] = Trajectory(trajectory.t, trajectory.pose.to(self._area), trajectory.closed)
+        return out
+
+    def _advance(self, model, state, motion, start, end, count, checkpoint):
+        """One frame interval in ``count`` substeps; impulses summed over it."""
+        times = torch.linspace(start, end, count + 1, dtype=torch.float64)
+        drives = {name: drive(trajectory, times.to(trajectory.pose)) for name, trajectory in motion.items()}
+        store = checkpoint and torch.is_grad_enabled()
+        total: dict[str, Tensor] = {}
+        for first in range(0, count, CHUNK):
+            run = partial(
+                functional.rollout, model, dt=(end - start) / count, drives=drives,
+                substeps=min(CHUNK, count - first), first=first,
+            )  # fmt: skip
+            state, impulses = (
+                recompute(run, state, use_reentrant=False, preserve_rng_state=False) if store else run(state)
+            )
+            total = {name: total[name] + value if name in total else value for name, value in impulses.items()}
+        return state, total
+
+    def _check_extent(self, x: Tensor) -> None:
+        if self.contact is None:
+            return
+        extent = float((x.amax(-2) - x.amin(-2)).max())
+        if extent > (self.nodes - 4) * self.spacing:
+            raise SimulationDiverged(
+                "the cloth's extent", got=f"{extent:.3g} m", expected=f"below {(self.nodes - 4) * self.spacing:.3g} m",
+                remedy="the sheet is stretched far beyond its rest shape: check initial positions and motion",
+            )  # fmt: skip
+
+    def _check_finite(self, state: ClothState, start: float, end: float) -> None:
+        x = state.x.detach()
+        finite = torch.isfinite(x).all(-1)
+        if not bool(finite.all()):
+            vertex = int((~finite).reshape(-1, finite.shape[-1]).any(0).nonzero()[0])
+            raise SimulationDiverged(
+                f"simulation diverged between t = {start:.6g} and {end:.6g} s", got=f"vertex {vertex} not finite",
+                remedy="check the initial positions and the motion for jumps, or lower dt",
+            )  # fmt: skip
+        self._check_extent(x)
+
+    def extra_repr(self) -> str:
+        """Data sheet: size, contact, step."""
+        size = f"{len(self.mesh.vertices)} vertices, {len(self.mesh.faces)} triangles, {self.mesh.area.sum():.4g} m^2"
+        grid = "none" if self.contact is None else f"spacing {self.spacing:.3g} m, {len(self._points)} point(s) per triangle"
+        return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s"
+
+
+def _per_triangle(value: Tensor) -> Tensor:
+    return value.unsqueeze(-1) if value.ndim else value.reshape(1, 1)
+
+
+def _grid_size(mesh: Mesh, spacing: float) -> int:
+    """Nodes before the grid wraps: 1.6 times the longest diagonal of the rest shape, so layers never alias."""
+    longest = np.ptp(mesh.vertices, axis=0)
+    if mesh.uv is not None:
+        longest = np.concatenate([longest, np.ptp(mesh.uv, axis=0)])
+    return int(np.ceil(1.6 * np.linalg.norm(longest) / 2**0.5 / spacing)) + 6
+
+
+def _check_times(times: Tensor | Sequence[float]) -> list[float]:
+    frames = [float(t) for t in (times.tolist() if isinstance(times, Tensor) else times)]
+    if len(frames) < 2 or not np.all(np.isfinite(frames)) or not np.all(np.diff(frames) > 0):
+        raise InvalidInput("times", got=f"{len(frames)} values, first {frames[:3]}", expected="at least two, increasing, finite seconds")  # fmt: skip
+    return frames
+
+
+def _collect(frames: list[float], states: list[ClothState], wrenches: list[dict[str, Tensor]], names: list[str]):
+    x = torch.stack([s.x for s in states], dim=-3)
+    zero = x.new_zeros(*x.shape[:-3], 6)
+    wrench = {
+        name: torch.stack([zero, *(w.get(name, zero).expand_as(zero) for w in wrenches)], dim=-2) for name in names
+    }
+    v = torch.stack([s.v for s in states], dim=-3)
+    return Rollout(torch.tensor(frames, dtype=torch.float64), x, v, wrench, states[-1])

@@ -1,0 +1,57 @@
+"""What a cloth material must answer."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
+
+from torch import Tensor, nn
+
+from ..types import Surface
+
+
+class Stiffness(NamedTuple):
+    """Largest tangents of a material as stress resultants [N/m], each [..., E or 1, 1]; they bound the stable step."""
+
+    lame_lambda: Tensor  # in-plane
+    lame_mu: Tensor  # in-plane
+    normal: Tensor  # of the director's compression
+    shear: Tensor  # of the director's shear
+
+
+class AbstractMaterial(nn.Module, ABC):
+    """A thin sheet: a membrane law in the surface, and a director law for contact and friction across it.
+
+    Everything is per unit of rest area (thickness already multiplied in): energies in J/m^2, stresses in N/m.
+    ``coefficients`` is called once per rollout; the other methods are pure functions of what it returns, whose tensors
+    broadcast against [..., E, 3]. For the director law they are given with one more axis, [..., E, 1, 1], and meet
+    n [..., E, 1, 3] and d3 [..., E, S, 3] (S contact points per triangle).
+    """
+
+    @abstractmethod
+    def coefficients(self) -> Any:
+        """NamedTuple of tensors [..., E or 1, 1] derived from the learnable parameters."""
+
+    @abstractmethod
+    def membrane_energy(self, c: Any, surface: Surface) -> Tensor:
+        """[..., E, 1] J/m^2."""
+
+    @abstractmethod
+    def membrane_stress(self, c: Any, surface: Surface) -> tuple[Tensor, Tensor]:
+        """Columns (P1, P2) of the first Piola-Kirchhoff resultant d(energy)/dF, each [..., E, 3] N/m."""
+
+    @abstractmethod
+    def director_energy(self, c: Any, n: Tensor, d3: Tensor) -> Tensor:
+        """[..., E, S, 1] J/m^2, of the director d3 against the surface's unit normal n."""
+
+    @abstractmethod
+    def director_stress(self, c: Any, n: Tensor, d3: Tensor) -> tuple[Tensor, Tensor]:
+        """(d(energy)/dn, d(energy)/dd3), each [..., E, S, 3] N/m; n is varied freely, the caller projects."""
+
+    @abstractmethod
+    def return_map(self, c: Any, n: Tensor, d3: Tensor) -> Tensor:
+        """The elastic director after plastic flow, [..., E, S, 3]; idempotent."""
+
+    @abstractmethod
+    def stiffness(self, c: Any) -> Stiffness:
+        """Largest tangents, for the stable step."""

@@ -1,0 +1,68 @@
+"""Ready meshes and meshes from files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InvalidInput, MissingDependency
+from .mesh import Mesh
+
+
+def rectangle(
+    width: float, height: float, *, triangles: int | None = None, resolution: tuple[int, int] | None = None
+) -> Mesh:
+    """A flat rectangular sheet in the world's xy plane, lower left corner at the origin.
+
+    The diagonals alternate, so that the mesh has no preferred shear direction. Material axes: warp = x, weft = y.
+
+    Args:
+        width: extent along x (warp) [m].
+        height: extent along y (weft) [m].
+        triangles: about how many triangles (cells near square); default 800.
+        resolution: exact number of vertices (along x, along y) instead.
+
+    Raises:
+        InvalidInput: non-positive sizes or fewer than 2 vertices on a side.
+    """
+    if not (width > 0 and height > 0):
+        raise InvalidInput("rectangle size", got=f"{width:g} x {height:g} m", expected="positive lengths")
+    if resolution is None:
+        cells = max(1.0, (triangles or 800) / 2.0)
+        columns = max(1, round((cells * width / height) ** 0.5))
+        resolution = (columns + 1, max(1, round(cells / columns)) + 1)
+    nx, ny = resolution
+    if nx < 2 or ny < 2:
+        raise InvalidInput("resolution", got=resolution, expected="at least 2 vertices along each side")
+    u, v = np.meshgrid(np.linspace(0.0, width, nx), np.linspace(0.0, height, ny), indexing="ij")
+    uv = np.stack([u.ravel(), v.ravel()], axis=-1)
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(nx - 1), np.arange(ny - 1), indexing="ij"))
+    a, b, c, d = i * ny + j, (i + 1) * ny + j, (i + 1) * ny + j + 1, i * ny + j + 1
+    even = ((i + j) % 2 == 0)[:, None]
+    first = np.where(even, np.stack([a, b, c], -1), np.stack([a, b, d], -1))
+    second = np.where(even, np.stack([a, c, d], -1), np.stack([b, c, d], -1))
+    faces = np.stack([first, second], axis=1).reshape(-1, 3)
+    return Mesh.build(np.column_stack([uv, np.zeros(len(uv))]), faces, uv)
+
+
+def load(path: str | Path) -> Mesh:
+    """A cloth mesh from OBJ or PLY (metres); pattern coordinates are taken from the file's texture coordinates if any.
+
+    Raises:
+        InvalidInput: missing or unreadable file, or not a usable triangle mesh.
+        MissingDependency: trimesh is not installed.
+    """
+    try:
+        import trimesh
+    except ImportError as error:
+        raise MissingDependency("reading meshes needs trimesh", remedy='pip install "torchcloth[robots]"') from error
+    path = Path(path)
+    if not path.is_file():
+        raise InvalidInput("mesh file", got=str(path), expected="an existing OBJ or PLY file")
+    try:
+        mesh = trimesh.load_mesh(path, process=False, maintain_order=True)
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, OSError) as error:
+        raise InvalidInput("mesh file", got=f"{path} ({error})", expected="a readable OBJ or PLY file") from error
+    uv = getattr(mesh.visual, "uv", None)
+    return Mesh.build(mesh.vertices, mesh.faces, None if uv is None or len(uv) != len(mesh.vertices) else uv)

@@ -1,0 +1,99 @@
+"""Physical parameters: learnable, stored unconstrained, never out of their domain."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from .errors import InvalidInput
+
+Domain = Literal["positive", "unit_half", "nonnegative", "real"]
+
+
+class _Interval(NamedTuple):
+    lower: float
+    upper: float
+    includes_lower: bool
+    text: str
+
+    def contains(self, value: Tensor) -> bool:
+        above = value >= self.lower if self.includes_lower else value > self.lower
+        return bool((torch.isfinite(value) & above & (value < self.upper)).all())
+
+
+_DOMAINS: dict[str, _Interval] = {
+    "positive": _Interval(0.0, math.inf, False, "a value > 0"),
+    "unit_half": _Interval(0.0, 0.5, False, "a value in (0, 0.5)"),
+    "nonnegative": _Interval(0.0, math.inf, True, "a value >= 0"),
+    "real": _Interval(-math.inf, math.inf, False, "a finite value"),
+}
+
+
+class PhysicalParameter(nn.Module):
+    """One physical quantity with its unit and domain; scalar, or a field with one value per element.
+
+    The stored tensor ``raw`` is unconstrained (log for positive, logit for (0, 0.5)), so any optimiser step stays
+    legal. Amplitudes of effects are ``nonnegative``: stored as they are, because amplitude 0 must be exactly zero and
+    keep a gradient there; an optimiser has to project them (``tc.identify`` does).
+
+    Args:
+        value: physical value in ``unit``; a number or a tensor (one value per triangle, or [B, 1] for a batch).
+        unit: SI unit, "-" when dimensionless.
+        domain: "positive", "unit_half" (Poisson's ratio), "nonnegative" or "real".
+        name: how messages call it.
+
+    Raises:
+        InvalidInput: value outside the domain or not finite.
+    """
+
+    def __init__(self, value: float | Tensor, unit: str, domain: Domain = "positive", *, name: str = "parameter"):
+        super().__init__()
+        if domain not in _DOMAINS:
+            raise InvalidInput("domain", got=repr(domain), expected=f"one of {sorted(_DOMAINS)}")
+        self.unit, self.domain, self.label = unit, domain, name
+        self.raw = nn.Parameter(self._to_raw(value))
+
+    @property
+    def value(self) -> Tensor:
+        """Physical value in ``unit``, differentiable with respect to ``raw``."""
+        return to_value(self.raw, self.domain)
+
+    def set(self, value: float | Tensor) -> None:
+        """Assign a physical value in place; refuses an illegal one and leaves the old value."""
+        with torch.no_grad():
+            new = self._to_raw(value).to(self.raw)
+            if new.shape != self.raw.shape:
+                raise InvalidInput(
+                    self.label, got=f"shape {tuple(new.shape)}", expected=f"shape {tuple(self.raw.shape)}"
+                )
+            self.raw.copy_(new)
+
+    def _to_raw(self, value: float | Tensor) -> Tensor:
+        tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).detach().clone()
+        interval = _DOMAINS[self.domain]
+        if not interval.contains(tensor):
+            shown = f"{tensor.item():g}" if tensor.numel() == 1 else f"a field in [{tensor.min():g}, {tensor.max():g}]"
+            raise InvalidInput(self.label, got=f"{shown} {self.unit}", expected=interval.text)
+        if self.domain == "positive":
+            tensor = tensor.log()
+        elif self.domain == "unit_half":
+            tensor = torch.logit(2.0 * tensor)
+        return tensor if isinstance(value, Tensor) else tensor.to(torch.get_default_dtype())
+
+    def extra_repr(self) -> str:
+        """One line of a data sheet."""
+        value = self.value.detach()
+        shown = f"{value.item():.6g}" if value.numel() == 1 else f"field {tuple(value.shape)}, mean {value.mean():.6g}"
+        return f"{shown} {self.unit}"
+
+
+def to_value(raw: Tensor, domain: Domain) -> Tensor:
+    """Map the stored number(s) to the physical value(s)."""
+    if domain == "positive":
+        return raw.exp()
+    if domain == "unit_half":
+        return 0.5 * torch.sigmoid(raw)
+    return raw
