@@ -2,3 +2,9 @@
 
 if __name__ != "torchcloth.robots":
     raise ImportError(f"got {__name__!r}; import this package as torchcloth.robots")
+
+from .arm import Arm, Limits, Primitive, load
+from .description import models
+from .scene import Scene, bimanual_rig
+
+__all__ = ["Arm", "Limits", "Primitive", "Scene", "bimanual_rig", "load", "models"]

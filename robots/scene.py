@@ -1,0 +1,85 @@
+"""Several arms in one world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from torchcloth.errors import InvalidInput
+from torchcloth.types import Trajectory
+from .arm import Arm, Primitive, load
+
+# UniFolding (xiaoxiaoxh/UniFolding @ cbd0b37), from its calibration files v23: left base y +0.318, right base y -0.315,
+# both level and unrotated within 0.6 degrees; the rounded symmetric value is used.
+HALF_SPAN = 0.316  # m
+
+
+class Scene(nn.Module):
+    """Arms by name; each stands where its own ``base`` says.
+
+    Args:
+        arms: name to arm, e.g. ``{"left": load("rizon4", base=...), "right": ...}``. The names are those of the grasps.
+    """
+
+    def __init__(self, arms: Mapping[str, Arm]) -> None:
+        super().__init__()
+        if not arms:
+            raise InvalidInput("arms is empty", expected="one arm or more")
+        self.arms = nn.ModuleDict(dict(arms))
+
+    def __getitem__(self, name: str) -> Arm:
+        return cast(Arm, self.arms[name])
+
+    def forward(self, q: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Poses in the world, ``[..., 4, 4]`` m by name, from joint positions ``[..., J]`` by name."""
+        self._check_names("q", q)
+        return {name: self[name](q[name]) for name in self.arms}
+
+    def motion(
+        self, q: Mapping[str, Tensor], t: Tensor, closed: Mapping[str, Tensor] | None = None, **options: Any
+    ) -> dict[str, Trajectory]:
+        """Motions of all arms through waypoints at common times.
+
+        Args:
+            q: joint waypoints ``[..., K, J]`` (rad or m) by name.
+            t: ``[K]`` s, the times of the waypoints.
+            closed: ``[K]`` bool by name; an arm that is not named always holds.
+            options: passed to ``Arm.motion``: ``period``, ``stop``, ``check_limits``.
+        """
+        self._check_names("q", q)
+        closed = dict(closed or {})
+        if unknown := closed.keys() - self.arms.keys():
+            raise InvalidInput("closed names unknown arms", got=sorted(unknown), expected=f"among {list(self.arms)}")
+        return {name: self[name].motion(q[name], t, closed.get(name), **options) for name in self.arms}
+
+    def geometry(self, q: Mapping[str, Tensor]) -> list[Primitive]:
+        """The solids of all arms in the world, at joint positions ``[..., J]`` by name."""
+        self._check_names("q", q)
+        return [primitive for name in self.arms for primitive in self[name].geometry(q[name])]
+
+    def _check_names(self, argument: str, given: Mapping[str, Tensor]) -> None:
+        if given.keys() != set(self.arms):
+            raise InvalidInput(f"{argument} names other arms", got=sorted(given), expected=str(list(self.arms)))
+
+
+def bimanual_rig(model: str = "rizon4", frame: str = "tcp_closed", dtype: torch.dtype = torch.float64) -> Scene:
+    """Two arms side by side as in UniFolding's rig: ``left`` at (0, 0.316, 0) m, ``right`` at (0, -0.316, 0) m.
+
+    World: origin midway between the bases, x away from the robots over the table, y to the left arm, z up. The table
+    lies level with the bases, at z = 0. The positions are the rounded calibration of xiaoxiaoxh/UniFolding @ cbd0b37;
+    its arms of 2023 very likely had the wrist of ``rizon4_gen2022``.
+
+    Args:
+        model: one of ``models()`` or the path of a URDF file.
+        frame: the link whose pose is computed.
+        dtype: of every tensor of the arms.
+    """
+    arms = {}
+    for name, y in (("left", HALF_SPAN), ("right", -HALF_SPAN)):
+        base = torch.eye(4, dtype=dtype)
+        base[1, 3] = y
+        arms[name] = load(model, frame=frame, base=base, dtype=dtype)
+    return Scene(arms)

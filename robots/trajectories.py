@@ -1,0 +1,116 @@
+"""Joint waypoints to a densely sampled joint motion, and the check that the arm can follow it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchcloth.errors import InvalidInput
+
+
+class Sampled(NamedTuple):
+    """A joint motion at sample times; every waypoint is one of them."""
+
+    t: Tensor  # [S] s
+    q: Tensor  # [..., S, J] rad or m
+    waypoint: Tensor  # [S] long, the last waypoint at or before each sample
+
+
+def check_waypoints(q: Tensor, t: Tensor, **masks: Tensor | None) -> None:
+    """Refuses waypoints ``q [..., K, J]`` that no motion at times ``t [K]`` can be made from."""
+    if q.ndim < 2:
+        raise InvalidInput("q has the wrong shape", got=tuple(q.shape), expected="(..., K, J)")
+    knots = q.shape[-2]
+    if knots < 2:
+        raise InvalidInput(
+            "q has too few waypoints", got=knots, expected="2 or more", remedy="repeat it to stand still"
+        )
+    if t.shape != (knots,):
+        expected = f"({knots},), one time for each waypoint of q"
+        raise InvalidInput("t has the wrong shape", got=tuple(t.shape), expected=expected)
+    if not bool((t.diff() > 0).all() & t.isfinite().all()):
+        raise InvalidInput("t must increase", got=t.tolist(), expected="finite and strictly increasing seconds")
+    if not bool(q.isfinite().all()):
+        raise InvalidInput("q is not finite", remedy="look for NaN in the waypoints")
+    for name, mask in masks.items():
+        if mask is not None and (mask.shape != (knots,) or mask.dtype != torch.bool):
+            got = f"{mask.dtype} {tuple(mask.shape)}"
+            raise InvalidInput(f"{name} has the wrong shape or type", got=got, expected=f"torch.bool ({knots},)")
+
+
+def interpolate(q: Tensor, t: Tensor, stop: Tensor | None, period: float) -> Sampled:
+    """Cubic Hermite interpolation with Catmull-Rom velocities: C1, and linear in ``q``.
+
+    Args:
+        q: ``[..., K, J]`` waypoints.
+        t: ``[K]`` s, their times; they may require grad.
+        stop: ``[K]`` bool, where every joint comes to rest; by default at both ends.
+        period: s, the longest time between two samples.
+    """
+    if not (math.isfinite(period) and period > 0):
+        raise InvalidInput("period", got=period, expected="seconds above 0")
+    knot = torch.arange(len(t), device=t.device)
+    rests = (knot == 0) | (knot == len(t) - 1) if stop is None else stop.to(t.device)
+    duration = t.diff()
+    # The tolerance keeps a duration that is a whole number of periods, up to rounding, from gaining a sample.
+    counts = (duration.detach() / period - 1e-6).ceil().clamp(min=1).long()
+    interval = torch.repeat_interleave(knot[:-1], counts)
+    first = torch.repeat_interleave(counts.cumsum(0) - counts, counts)
+    u = (torch.arange(len(interval), device=t.device) - first) / counts[interval]
+    u = torch.cat([u, u.new_ones(1)]).to(t.dtype)
+    interval = torch.cat([interval, interval[-1:]])
+
+    h = duration[interval]
+    v = _velocities(q, duration).masked_fill(rests[:, None], 0.0)
+    s, w = u[:, None], h[:, None]
+    samples = (
+        (1 + 2 * s) * (1 - s) ** 2 * q[..., interval, :]
+        + s * (1 - s) ** 2 * w * v[..., interval, :]
+        + s**2 * (3 - 2 * s) * q[..., interval + 1, :]
+        + s**2 * (s - 1) * w * v[..., interval + 1, :]
+    )
+    waypoint = interval.clone()
+    waypoint[-1] += 1
+    return Sampled(t[interval] + u * h, samples, waypoint)
+
+
+def _velocities(q: Tensor, duration: Tensor) -> Tensor:
+    """Velocity at each waypoint: of the parabola through it and its neighbours; at the ends, of the line."""
+    slope = q.diff(dim=-2) / duration[:, None]
+    before, after = duration[:-1, None], duration[1:, None]
+    inner = (after * slope[..., :-1, :] + before * slope[..., 1:, :]) / (before + after)
+    return torch.cat([slope[..., :1, :], inner, slope[..., -1:, :]], dim=-2)
+
+
+def check_limits(motion: Sampled, names: tuple[str, ...], units: tuple[str, ...], limits: Tensor) -> None:
+    """Refuses a motion beyond a joint's hard position limits or its velocity limit.
+
+    Velocities are differences of samples. ``limits`` is ``[6, J]``: lower, upper, soft ones, velocity, effort.
+    """
+    q, t = motion.q.detach(), motion.t.detach()
+    lower, upper, _, _, fastest, _ = limits
+    slack = 1e-9
+    _refuse("position", q, t, lower - slack, upper + slack, names, units)
+    speed = q.diff(dim=-2) / t.diff()[:, None]
+    bound = fastest * (1 + slack)
+    _refuse("velocity", speed, t, -bound, bound, names, tuple(f"{unit}/s" for unit in units))
+
+
+def _refuse(
+    what: str, value: Tensor, t: Tensor, lower: Tensor, upper: Tensor, names: tuple[str, ...], units: tuple[str, ...]
+) -> None:
+    excess = torch.maximum(lower - value, value - upper)
+    if not bool((excess > 0).any()):
+        return
+    at = int(excess.argmax())
+    joint, sample = at % value.shape[-1], at // value.shape[-1] % value.shape[-2]
+    unit = units[joint]
+    raise InvalidInput(
+        f"the motion breaks the {what} limit of joint {names[joint]!r} at t = {float(t[sample]):.4g} s",
+        got=f"{float(value.flatten()[at]):.5g} {unit}",
+        expected=f"{float(lower[joint]):.5g} to {float(upper[joint]):.5g} {unit}",
+        remedy="change q or give it more time (check_limits=False skips this check)",
+    )

@@ -1,0 +1,56 @@
+"""Several arms in one world."""
+
+import pytest
+import torch
+import torchcloth.robots as robots
+
+from torchcloth.errors import InvalidInput
+
+T = torch.tensor([0.0, 1.0], dtype=torch.float64)
+
+
+@pytest.fixture
+def rig():
+    return robots.bimanual_rig()
+
+
+def homes(rig, count=None):
+    q = {name: arm.home for name, arm in rig.arms.items()}
+    return q if count is None else {name: home.repeat(count, 1) for name, home in q.items()}
+
+
+def test_bimanual_rig_stands_as_measured(rig):
+    poses = rig(homes(rig))
+    apart = poses["left"] - poses["right"]
+    assert apart[1, 3] == pytest.approx(0.632)
+    assert apart[:, :3].abs().max() == 0
+    torch.testing.assert_close(rig["left"].base[:3, 3], torch.tensor([0, 0.316, 0], dtype=torch.float64))
+    assert robots.bimanual_rig("rizon4s", frame="flange", dtype=torch.float32)["right"].base.dtype == torch.float32
+
+
+def test_is_a_module(rig):
+    assert list(dict(rig.named_modules())) == ["", "arms", "arms.left", "arms.right"]
+    assert rig.to(torch.float32)["left"].home.dtype == torch.float32
+
+
+def test_motion(rig):
+    closed = {"right": torch.tensor([False, True])}
+    motions = rig.motion(homes(rig, 2), T, closed, period=0.5)
+    assert list(motions) == ["left", "right"]
+    assert motions["left"].closed.tolist() == [True, True, True]
+    assert motions["right"].closed.tolist() == [False, False, True]
+    torch.testing.assert_close(motions["left"].pose[-1], rig["left"](rig["left"].home))
+
+
+def test_geometry_holds_both_arms(rig):
+    q = homes(rig)
+    assert len(rig.geometry(q)) == 2 * len(rig["left"].geometry(q["left"]))
+
+
+def test_refuses_other_names(rig):
+    with pytest.raises(InvalidInput, match="arms is empty"):
+        robots.Scene({})
+    with pytest.raises(InvalidInput, match=r"q names other arms; got \['left'\]; expected \['left', 'right'\]"):
+        rig({"left": rig["left"].home})
+    with pytest.raises(InvalidInput, match="closed names unknown arms"):
+        rig.motion(homes(rig, 2), T, {"middle": torch.ones(2, dtype=torch.bool)})
