@@ -5,6 +5,7 @@ if __name__ != "torchcloth.robots":
 
 from .arm import Arm, Limits, Primitive, load
 from .description import models
+from .replay import replay
 from .scene import Scene, bimanual_rig
 
-__all__ = ["Arm", "Limits", "Primitive", "Scene", "bimanual_rig", "load", "models"]
+__all__ = ["Arm", "Limits", "Primitive", "Scene", "bimanual_rig", "load", "models", "replay"]

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torchcloth.errors import InvalidInput
 from torchcloth.types import Trajectory
+
 from . import inverse, trajectories
 from .description import Description, describe, locate, models
 from .rigid import check_rigid, joint_modes

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchcloth.errors import InvalidInput, MissingDependency
+
 from .rigid import origin_matrix
 
 URDF_FOLDER = Path(str(resources.files("torchcloth.robots"))) / "urdf"

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcloth.errors import InvalidInput
+
 from .rigid import twist
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torchcloth.errors import InvalidInput
 from torchcloth.types import Trajectory
+
 from .arm import Arm, Primitive, load
 
 # UniFolding (xiaoxiaoxh/UniFolding @ cbd0b37), from its calibration files v23: left base y +0.318, right base y -0.315,

@@ -1,0 +1,73 @@
+"""Recorded motion to end-effector trajectories."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcloth.errors import RecordingError
+from torchcloth.recordings import JointMotion, Recording
+from torchcloth.types import Trajectory
+
+from .arm import load
+
+HOLDING_WIDTH = 0.02  # m, fingers opened less than this hold the cloth, when only the width was recorded
+
+
+def replay(recording: Recording, dtype: torch.dtype = torch.float64) -> dict[str, Trajectory]:
+    """The world poses of every gripper of an episode, by name.
+
+    Joint trajectories go through the arm's own kinematics; where an episode has joints and poses, the joints win:
+    they are what was measured, and what can be optimised.
+
+    Args:
+        recording: an episode.
+        dtype: of the poses.
+
+    Raises:
+        RecordingError: joints without an arm to replay them on, or no motion at all.
+        InvalidInput: the arm's model or frame is unknown.
+    """
+    out = {}
+    for name, motion in recording.grippers.items():
+        pose = _poses(motion.position, motion.quat_wxyz)
+        out[name] = Trajectory(_tensor(motion.t), pose.to(dtype), torch.as_tensor(motion.closed, dtype=torch.bool))
+    for name, joints in recording.joints.items():
+        if name not in recording.robots:
+            raise RecordingError(
+                f"{recording.path}: joints of {name!r}", got="no robot of that name", expected=f"robots.{name} in episode.json",
+                remedy="name the model and its base pose",
+            )  # fmt: skip
+        robot = recording.robots[name]
+        arm = load(robot.model, frame=robot.tool_frame or "flange", base=_tensor(robot.T_world_base))
+        out[name] = Trajectory(_tensor(joints.t), arm(_tensor(joints.q)).to(dtype), _closed(joints))
+    if not out:
+        raise RecordingError(f"{recording.path}: no motion", expected="grippers or joints in motion.npz")
+    return out
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    return torch.as_tensor(np.asarray(array, dtype=np.float64))
+
+
+def _closed(joints: JointMotion) -> Tensor:
+    if joints.closed is not None:
+        return torch.as_tensor(joints.closed, dtype=torch.bool)
+    if joints.width is not None:
+        return torch.as_tensor(joints.width < HOLDING_WIDTH)
+    return torch.ones(len(joints.t), dtype=torch.bool)
+
+
+def _poses(position: np.ndarray, quat_wxyz: np.ndarray) -> Tensor:
+    """[K, 4, 4] from positions [K, 3] m and unit quaternions [K, 4]."""
+    w, x, y, z = _tensor(quat_wxyz).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose = torch.eye(4, dtype=torch.float64).repeat(len(position), 1, 1)
+    pose[:, :3, :3] = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    pose[:, :3, 3] = _tensor(position)
+    return pose

@@ -1,0 +1,241 @@
+"""What is written is what is read, and writes are all or nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from torchcloth import recordings as rec
+from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.recordings import writing
+
+FLOAT32 = 1e-7  # relative precision of float32 times the 1 m size of the scene
+HALF_STEP = 0.5e-4 + 1e-12  # points are stored in tenths of a millimetre
+
+
+@pytest.mark.parametrize(("compact", "dtype", "atol"), [(True, np.int16, HALF_STEP), (False, np.float32, FLOAT32)])
+def test_round_trip(recording, tmp_path, assert_same, compact, dtype, atol):
+    path = rec.write(recording, tmp_path / "new" / "ep", compact=compact)
+    back = rec.read(path, with_truth=True)
+    assert_same(recording, back, atol=atol)
+    assert back.path == path
+    with np.load(path / "points.npz") as stored:
+        assert stored["xyz"].dtype == dtype
+
+
+def test_second_write_is_byte_identical(episode, tmp_path):
+    again = rec.write(rec.read(episode, with_truth=True), tmp_path / "again")
+    files = sorted(p.relative_to(episode) for p in episode.rglob("*") if p.is_file())
+    assert files == sorted(p.relative_to(again) for p in again.rglob("*") if p.is_file())
+    for file in files:
+        assert (episode / file).read_bytes() == (again / file).read_bytes(), file
+
+
+def test_points_too_far_for_int16_become_float32(recording, tmp_path):
+    points = replace(recording.points, xyz=recording.points.xyz + 4.0)
+    path = rec.write(replace(recording, points=points), tmp_path / "ep")
+    with np.load(path / "points.npz") as stored:
+        assert stored["xyz"].dtype == np.float32
+        assert "scale" not in stored
+    np.testing.assert_allclose(rec.read(path).points.xyz, points.xyz, rtol=1e-7)  # float32 has 24 bits
+
+
+def test_a_bare_sheet_is_an_episode(assert_same, tmp_path):
+    bare = rec.Recording(cloth=rec.ClothInfo(areal_density=0.2, sheet=(0.3, 0.4)), provenance="measured")
+    back = rec.read(rec.write(bare, tmp_path / "ep"))
+    assert_same(bare, back)
+    assert back.cloth.pattern_box()[1].tolist() == [0.3, 0.4]
+
+
+def test_the_format_texts_example_is_read(tmp_path):
+    """The example of the format, word for word where it is valid JSON, written without this package."""
+    eye = np.eye(4).tolist()
+    episode = {
+        "format": "torchcloth-recording",
+        "version": 1,
+        "cloth": {
+            "mesh": None,
+            "sheet": {"width": 0.30, "height": 0.30},
+            "areal_density": 0.15,
+            "thickness": 0.0005,
+            "areal_density_std": 0.005,
+            "initial_vertices": None,
+            "nominal": {"membrane_stiffness": 600, "units": {}},
+        },
+        "grasps": {"left": {"uv": [[0.0, 0.30]], "radius": 0.012}},
+        "colliders": {"table": {"plane": {"point": [0, 0, 0], "normal": [0, 0, 1]}, "friction": 0.4}},
+        "robots": {"left": {"model": "rizon4", "T_world_base": eye, "tool_frame": "tcp_closed"}},
+        "cameras": {},
+        "observation_noise": {"std": 0.002},
+        "clock_offset": 0.0,
+        "gravity": [0, 0, -9.81],
+        "air": {"density": 1.204},
+        "split": {"motion": "slow_swing", "replicate_of": None},
+        "provenance": "measured",
+        "licence": "CC-BY-4.0",
+    }
+    (tmp_path / "episode.json").write_text(json.dumps(episode))
+    t = np.linspace(0, 1, 5)
+    np.savez(tmp_path / "motion.npz", **{"left/t": t, "left/q": np.zeros((5, 7)), "left/width": np.zeros(5)})
+    got = rec.read(tmp_path)
+    assert got.joints["left"].q.shape == (5, 7)
+    assert got.cloth.sheet == (0.3, 0.3)
+    assert got.split == {"motion": "slow_swing"}
+
+
+def test_truth_is_read_only_on_request(episode):
+    (episode / "truth.npz").write_bytes(b"even a damaged one is not looked at")
+    blind = rec.read(episode)
+    assert blind.truth is None
+    with pytest.raises(RecordingError, match="with_truth=True"):
+        blind.require("truth")
+    with pytest.raises(RecordingError, match=r"truth\.npz"):
+        rec.read(episode, with_truth=True)
+
+
+def test_frames_and_images(episode, recording):
+    back = rec.read(episode)
+    assert len(back.points) == 3
+    assert [len(back.points.frame(i)) for i in range(3)] == [30, 1, 17]
+    np.testing.assert_array_equal(back.points.frame(-1), back.points.xyz[31:])
+    camera = back.cameras["cam0"]
+    for kind, dtype, shape in (
+        ("depth", np.uint16, (6, 8)),
+        ("color", np.uint8, (6, 8, 3)),
+        ("mask", np.bool_, (6, 8)),
+    ):
+        stream = getattr(camera, kind)
+        image = stream.load(1)
+        assert (image.dtype, image.shape) == (dtype, shape)
+        np.testing.assert_array_equal(image, getattr(recording.cameras["cam0"], kind).load(1))
+        assert stream.frames.tolist() == [0, 3]
+    camera.depth.paths[0].write_bytes(b"no image")
+    with pytest.raises(RecordingError, match="cannot be decoded"):
+        camera.depth.load(0)
+    with pytest.raises(RecordingError, match="wrong size"):
+        replace(camera.depth, size=(6, 8)).load(1)
+
+
+def test_require(recording):
+    assert recording.require("points") is recording.points
+    assert set(recording.require("force")) == {"left", "right"}
+    assert set(recording.require("torque")) == {"right"}
+    assert set(recording.require("depth")) == {"cam0"}
+    for stream in ("points", "markers", "observation_noise_std"):
+        with pytest.raises(RecordingError, match=f"has no {stream}, which tc.identify needs; "):
+            replace(recording, **{stream: None}).require(stream, by="tc.identify")
+    with pytest.raises(RecordingError, match=r"has no force, which this call needs; write NAME/force"):
+        replace(recording, grippers={}, joints={}).require("force")
+    with pytest.raises(InvalidInput, match="expected one of points"):
+        recording.require("smell")
+
+
+def test_an_existing_target_is_refused(episode, recording, tmp_path):
+    with pytest.raises(RecordingError, match="exists; expected a new name; pass overwrite=True"):
+        rec.write(recording, episode)
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "thesis.tex").write_text("years of work")
+    with pytest.raises(RecordingError, match="is not an episode"):
+        rec.write(recording, home, overwrite=True)
+    assert (home / "thesis.tex").exists()
+
+
+def test_a_target_that_appears_meanwhile_is_kept(recording, tmp_path, monkeypatch):
+    def appear(_):
+        rec.write(replace(recording, licence="first"), tmp_path / "ep")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(writing, "_sync", lambda part: (patch.undo(), appear(part)))
+        with pytest.raises(RecordingError, match="cannot be written"):
+            rec.write(recording, tmp_path / "ep")
+    assert rec.read(tmp_path / "ep").licence == "first"
+
+
+def test_overwrite_replaces(episode, recording, tmp_path):
+    rec.write(replace(rec.read(episode), licence="MIT", truth=None), episode, overwrite=True)  # images come from itself
+    back = rec.read(episode, with_truth=True)
+    assert (back.licence, back.truth, len(back.cameras["cam0"].depth)) == ("MIT", None, 2)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ep", "images"]
+
+
+def bad_recordings(recording):
+    points = replace(recording.points, xyz=recording.points.xyz * np.nan)
+    moved = replace(recording.grippers["right"], t=recording.grippers["right"].t + 1)
+    camera = recording.cameras["cam0"]
+    lost = replace(camera.depth, paths=(camera.depth.paths[0], camera.depth.paths[0].with_name("lost.png")))
+    yield replace(recording, points=points), r"ep/points.npz: xyz is not finite; got nan at \[0, 0\]"
+    yield replace(recording, extra={"what": object()}), "object cannot be stored as JSON"
+    yield replace(recording, extra={"what": float("nan")}), "cannot be written"
+    yield replace(recording, grippers={**recording.grippers, "right": moved}), r"grippers\['right'\].t differs"
+    yield replace(recording, cameras={"cam0": replace(camera, depth=lost)}), "lost.png"
+    yield (
+        replace(recording, cameras={"../up": replace(camera, depth=None)}),
+        "cameras.*is not a plain name",
+    )
+    yield replace(recording, provenance="a friend"), "provenance is unclear"
+    yield replace(recording, cloth=replace(recording.cloth, faces=None)), "cloth.faces is missing"
+    objects = replace(recording.points, extra={"o": np.array([{}], dtype=object)})
+    yield replace(recording, points=objects), "Object arrays"
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_refused_write_leaves_nothing(assert_same, recording, tmp_path, overwrite):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    if overwrite:
+        rec.write(recording, folder / "ep")
+    for bad, message in bad_recordings(recording):
+        with pytest.raises(RecordingError, match=message):
+            rec.write(bad, folder / "ep", overwrite=overwrite)
+        assert [p.name for p in folder.iterdir()] == ["ep"] * overwrite
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["images", "out"]
+    if overwrite:
+        assert_same(recording, rec.read(folder / "ep", with_truth=True), atol=HALF_STEP)
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize("step", ["_fill", "_sync", "_put", "rename"])
+def test_a_crash_at_any_step_keeps_the_old_episode(recording, episode, tmp_path, monkeypatch, step, error):
+    def crash(*_):
+        raise error
+
+    def crash_into_place(source, target):
+        if source.suffix == ".partial":
+            raise error
+        os.rename(source, target)
+
+    if step == "rename":
+        monkeypatch.setattr("pathlib.Path.rename", crash_into_place)
+    else:
+        monkeypatch.setattr(writing, step, crash)
+    expected = RecordingError if isinstance(error, OSError) else KeyboardInterrupt
+    with pytest.raises(expected):
+        rec.write(replace(recording, licence="new"), episode, overwrite=True)
+    assert rec.read(episode).licence == "CC0"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ep", "images"]
+
+
+def test_errors_pickle(tmp_path):
+    with pytest.raises(RecordingError) as caught:
+        rec.read(tmp_path / "nowhere")
+    copy = pickle.loads(pickle.dumps(caught.value))
+    assert (type(copy), str(copy)) == (RecordingError, str(caught.value))
+    assert "\n" not in str(copy)
+
+
+def test_recordings_pickle(assert_same, recording):
+    assert_same(recording, pickle.loads(pickle.dumps(recording)))
+
+
+def test_the_room_needs_only_numpy():
+    code = "import sys, torchcloth.recordings.reading as r; print(*[m for m in sys.modules if m in {'PIL', 'trimesh'}])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""

@@ -1,0 +1,137 @@
+"""Image folders of a camera: listed when the episode is read, decoded only when asked for."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..errors import MissingDependency, RecordingError
+from . import checks
+from .files import Folder
+
+Kind = Literal["depth", "color", "mask"]
+KINDS: tuple[Kind, ...] = ("depth", "color", "mask")
+TIMESTAMPS = "timestamps.csv"
+_COLUMNS = ["frame", "t_color", "t_depth"]
+_SUFFIXES: dict[Kind, set[str]] = {"depth": {".png"}, "color": {".jpg", ".jpeg", ".png"}, "mask": {".png"}}
+
+
+@dataclass(frozen=True, eq=False)
+class ImageStream:
+    """N images of one kind with their times."""
+
+    kind: Kind
+    frames: np.ndarray  # [N] frame numbers, as in the file names
+    t: np.ndarray  # [N] s
+    paths: tuple[Path, ...]
+    size: tuple[int, int]  # (width, height) in pixels
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def load(self, i: int) -> np.ndarray:
+        """Decode image ``i``: depth uint16 [H, W] (0 = invalid), colour uint8 [H, W, 3], mask bool [H, W].
+
+        Raises:
+            RecordingError: the file is damaged or does not have the camera's size.
+            MissingDependency: Pillow is not installed.
+        """
+        try:
+            from PIL import Image  # pyright: ignore[reportMissingImports]  (optional)
+        except ImportError as error:
+            raise MissingDependency("reading images needs Pillow", remedy="pip install pillow") from error
+        path = self.paths[i]
+        try:
+            with Image.open(path) as image:
+                pixels = np.asarray(image.convert("RGB") if self.kind == "color" else image)
+        except Exception as error:  # a damaged image raises whatever its decoder pleases
+            raise RecordingError(f"{path} cannot be decoded", got=type(error).__name__, remedy="restore it") from error
+        if self.kind == "depth" and pixels.dtype != np.uint16:
+            raise RecordingError(
+                f"{path} is no depth image", got=pixels.dtype, expected="uint16", remedy="export raw depth"
+            )
+        if pixels.shape[:2] != self.size[::-1]:
+            raise RecordingError(
+                f"{path} has the wrong size", got=pixels.shape[1::-1], expected=f"{self.size}, as calibrated"
+            )
+        return np.any(pixels.reshape(*self.size[::-1], -1), axis=-1, keepdims=False) if self.kind == "mask" else pixels
+
+
+def find_streams(folder: Folder, size: tuple[int, int]) -> dict[Kind, ImageStream]:
+    """List the image folders of one camera.
+
+    Masks take the depth image's time, or the colour image's where there is no depth.
+    """
+    present: list[Kind] = [kind for kind in KINDS if folder.has(kind)]
+    if not present:
+        return {}
+    color, depth = _read_times(folder)
+    times: dict[Kind, dict[int, float]] = {"color": color, "depth": depth, "mask": color | depth}
+    streams: dict[Kind, ImageStream] = {}
+    for kind in present:
+        paths = _list(folder, kind)
+        if kind == "mask":
+            times[kind] = {n: t for n, t in times[kind].items() if n in paths}
+        wrong = sorted(paths.keys() ^ times[kind].keys())
+        if wrong:
+            got = f"frame {wrong[0]} in only one of them"
+            raise RecordingError(
+                f"{folder.place(kind)} and {TIMESTAMPS} do not match", got=got, remedy="give each image one time"
+            )
+        frames = np.array(sorted(paths), dtype=np.int64)
+        t = np.array([times[kind][n] for n in frames.tolist()], dtype=float)
+        checks.increasing(t, f"{folder.place(TIMESTAMPS)}: t of {kind}")
+        streams[kind] = ImageStream(kind, frames, t, tuple(paths[n] for n in frames.tolist()), size)
+    return streams
+
+
+def dump_times(streams: dict[Kind, ImageStream]) -> str:
+    """The text of timestamps.csv; a mask on its own is timed in the depth column."""
+    times = {kind: dict(zip(s.frames.tolist(), s.t.tolist(), strict=True)) for kind, s in streams.items()}
+    color, depth = times.get("color", {}), times.get("depth", {})
+    depth = depth | {n: t for n, t in times.get("mask", {}).items() if n not in depth and n not in color}
+    rows = [f"{n},{color.get(n, '')},{depth.get(n, '')}" for n in sorted(color.keys() | depth.keys())]
+    return "\n".join([",".join(_COLUMNS), *rows]) + "\n"
+
+
+def _list(folder: Folder, kind: Kind) -> dict[int, Path]:
+    place = folder.place(kind)
+    try:
+        paths = [p for p in (folder.path / kind).iterdir() if p.suffix.lower() in _SUFFIXES[kind]]
+    except OSError as error:
+        raise RecordingError(f"{place} cannot be listed", got=error.strerror, expected="a folder of images") from error
+    named = [p for p in paths if p.stem.isdecimal()]
+    if not paths or len(named) < len(paths) or len({int(p.stem) for p in named}) < len(paths):
+        got = "no image" if not paths else "names that are not distinct frame numbers"
+        raise RecordingError(
+            f"{place} is no image stream", got=got, expected="%06d" + min(_SUFFIXES[kind]), remedy="rename them"
+        )
+    return {int(p.stem): p for p in named}
+
+
+def _read_times(folder: Folder) -> tuple[dict[int, float], dict[int, float]]:
+    """Times of the colour and depth images by frame number; an empty cell means no image."""
+    place = folder.place(TIMESTAMPS)
+    color: dict[int, float] = {}
+    depth: dict[int, float] = {}
+    try:
+        header, *rows = csv.reader(folder.text(TIMESTAMPS).splitlines())
+        if [cell.strip() for cell in header] != _COLUMNS:
+            raise ValueError(f"header {header}")
+        if len({int(row[0]) for row in rows}) < len(rows):
+            raise ValueError("a frame listed twice")
+        for frame, t_color, t_depth in rows:
+            color |= {int(frame): float(t_color)} if t_color.strip() else {}
+            depth |= {int(frame): float(t_depth)} if t_depth.strip() else {}
+        if not all(map(math.isfinite, [*color.values(), *depth.values()])):
+            raise ValueError("a time that is not finite")
+    except RecordingError:
+        raise
+    except (ValueError, IndexError, csv.Error) as error:
+        raise RecordingError(f"{place} is damaged", got=error, expected=f"rows of {','.join(_COLUMNS)}") from error
+    return color, depth

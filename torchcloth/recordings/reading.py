@@ -1,0 +1,213 @@
+"""Reads one episode folder and checks that its parts fit together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import RecordingError
+from . import scene, streams
+from .checks import Fields
+from .files import Folder
+from .types import Recording
+
+EPISODE = "episode.json"
+FORMAT, VERSION = "torchcloth-recording", 1
+RIZON_JOINTS = 7
+MARKER_SLACK = 0.01  # of the pattern's longer side: a marker's pattern coordinates are measured by hand
+
+
+def read(path: str | Path, *, with_truth: bool = False) -> Recording:
+    """Read an episode and refuse it when it cannot be trusted.
+
+    Args:
+        path: the episode folder.
+        with_truth: also read truth.npz. Only for scoring: identify and diagnose must never see it.
+
+    Raises:
+        RecordingError: names the file and key, what was found, what was expected and the remedy.
+    """
+    return read_folder(Folder(Path(path)), with_truth=with_truth)
+
+
+def read_folder(folder: Folder, *, with_truth: bool) -> Recording:
+    """Read an opened folder, see `read`."""
+    _refuse_no_episode(folder)
+    root = folder.json(EPISODE)
+    _check_version(root)
+    grippers, joints = streams.motions(folder) if folder.has(streams.MOTION) else ({}, {})
+    gravity = root.maybe(root.array, "gravity", 3)
+    noise, air = root.inside("observation_noise"), root.inside("air")
+    recording = Recording(
+        cloth=scene.cloth(_needed(root, "cloth"), folder),
+        provenance=_provenance(root),
+        grasps={name: scene.grasp(f) for name, f in root.each("grasps").items()},
+        grippers=grippers,
+        joints=joints,
+        robots={name: scene.robot(f) for name, f in root.each("robots").items()},
+        cameras={name: scene.camera(f, folder.sub(name)) for name, f in root.each("cameras").items()},
+        colliders={name: scene.collider(f) for name, f in root.each("colliders").items()},
+        points=streams.points(folder) if folder.has(streams.POINTS) else None,
+        markers=streams.markers(folder) if folder.has(streams.MARKERS) else None,
+        truth=streams.truth(folder) if with_truth and folder.has(streams.TRUTH) else None,
+        observation_noise_std=noise.maybe(noise.number, "std", least=0, most=1, suspect="millimetres"),
+        clock_offset=root.maybe(root.number, "clock_offset") or 0.0,
+        gravity=np.array([0.0, 0.0, -9.81]) if gravity is None else gravity,
+        air_density=air.maybe(air.number, "density", least=0),
+        split=_split(root),
+        licence=root.maybe(root.text, "licence"),
+        path=folder.shown,
+        extra=root.left(observation_noise=noise, air=air),
+    )
+    _check_cloth(recording, folder)
+    for name in recording.grasps:
+        _check_grasp(recording, name, folder)
+    _check_robots(recording, folder)
+    _check_markers(recording, folder)
+    _check_overlap(recording, folder)
+    return recording
+
+
+def _refuse_no_episode(folder: Folder) -> None:
+    if not folder.has("."):
+        raise RecordingError(f"{folder.shown} does not exist", expected="an episode folder", remedy="check the path")
+    if not folder.path.is_dir():
+        raise RecordingError(
+            f"{folder.shown} is a file", expected="an episode folder", remedy="pass the folder around it"
+        )
+    if not folder.has(EPISODE):
+        raise RecordingError(
+            f"{folder.place(EPISODE)} is missing", expected="an episode folder", remedy="check the path"
+        )
+
+
+def _check_version(root: Fields) -> None:
+    got = root.text("format")
+    if got != FORMAT:
+        raise RecordingError(
+            f"{root.at('format')} is unknown", got=repr(got), expected=repr(FORMAT), remedy="convert it first"
+        )
+    version = root.number("version")
+    if version != VERSION:
+        raise RecordingError(
+            f"{root.at('version')} is unknown", got=f"{version:g}", expected=f"{VERSION}", remedy="update torchcloth"
+        )
+
+
+def _needed(root: Fields, key: str) -> Fields:
+    return Fields(root.take(key), root.at(key))
+
+
+def _provenance(root: Fields) -> str:
+    got = root.text("provenance")
+    if got != "measured" and not got.startswith("synthetic: "):
+        expected = "'measured' or 'synthetic: <generator>'"
+        raise RecordingError(
+            f"{root.at('provenance')} is unclear", got=repr(got), expected=expected, remedy="say where it is from"
+        )
+    return got
+
+
+def _split(root: Fields) -> dict:
+    split = root.inside("split")
+    known = {key: split.maybe(split.text, key) for key in ("motion", "replicate_of")}
+    return {**{key: value for key, value in known.items() if value is not None}, **split.rest}
+
+
+def _check_cloth(recording: Recording, folder: Folder) -> None:
+    cloth = recording.cloth
+    if cloth.sheet is None or cloth.uv is None:
+        return
+    got = np.ptp(cloth.uv, axis=0)
+    if not np.allclose(got, cloth.sheet, rtol=0.01):
+        expected = f"{list(cloth.sheet)}"
+        raise RecordingError(
+            f"{folder.place(EPISODE)}: cloth.sheet is not the mesh",
+            got=f"a mesh of {got.tolist()}",
+            expected=expected,
+            remedy="drop one",
+        )
+
+
+def _check_grasp(recording: Recording, name: str, folder: Folder) -> None:
+    """A grasp needs a gripper that moves and material to hold."""
+    place = f"{folder.place(EPISODE)}: grasps.{name}"
+    if name not in recording.grippers and name not in recording.joints:
+        got = sorted({*recording.grippers, *recording.joints})
+        raise RecordingError(
+            f"{place} has no motion", got=got, expected=f"{name}/t in {streams.MOTION}", remedy="rename or record it"
+        )
+    arm = recording.joints.get(name)
+    if arm is not None and arm.closed is None and arm.width is None:
+        raise RecordingError(
+            f"{folder.place(streams.MOTION)}: {name}/closed is missing", expected="closed or width [K]"
+        )
+    grasp, box = recording.grasps[name], recording.cloth.pattern_box()
+    if box is None:
+        raise RecordingError(
+            f"{place} cannot be found on the mesh", expected="vt in the mesh file", remedy="export with uv"
+        )
+    outside = np.linalg.norm(np.maximum(np.maximum(box[0] - grasp.uv, grasp.uv - box[1]), 0), axis=1)
+    if outside.max() > grasp.radius:
+        got = f"uv {grasp.uv[int(outside.argmax())].tolist()}, {outside.max():.3g} m outside"
+        expected = f"within {box[0].tolist()} to {box[1].tolist()}"
+        raise RecordingError(
+            f"{place} holds nothing", got=got, expected=expected, remedy="use pattern coordinates in metres"
+        )
+    if recording.cloth.uv is not None:
+        nearest = min(float(np.linalg.norm(recording.cloth.uv - point, axis=1).min()) for point in grasp.uv)
+        if nearest > grasp.radius:
+            got = f"radius {grasp.radius:g}, nearest vertex at {nearest:.3g} m"
+            raise RecordingError(
+                f"{place} holds no vertex", got=got, expected="one vertex within", remedy="refine the mesh"
+            )
+
+
+def _check_robots(recording: Recording, folder: Folder) -> None:
+    for name, robot in recording.robots.items():
+        if name not in recording.joints and name not in recording.grippers:
+            got = sorted({*recording.grippers, *recording.joints})
+            raise RecordingError(
+                f"{folder.place(EPISODE)}: robots.{name} is an unknown arm", got=got, expected="a name in motion.npz"
+            )
+        arm = recording.joints.get(name)
+        if arm is not None and robot.model.startswith("rizon") and arm.q.shape[1] != RIZON_JOINTS:
+            place = f"{folder.place(streams.MOTION)}: {name}/q"
+            raise RecordingError(
+                f"{place} is not a {robot.model}'s", got=list(arm.q.shape), expected=f"[K, {RIZON_JOINTS}]"
+            )
+
+
+def _check_markers(recording: Recording, folder: Folder) -> None:
+    box = recording.cloth.pattern_box()
+    if recording.markers is None or recording.markers.uv is None or box is None:
+        return
+    uv, slack = recording.markers.uv, MARKER_SLACK * float((box[1] - box[0]).max())
+    outside = ((uv < box[0] - slack) | (uv > box[1] + slack)).any(axis=1)
+    if outside.any():
+        got = uv[outside][0].tolist()
+        expected = f"within {box[0].tolist()} to {box[1].tolist()}"
+        raise RecordingError(f"{folder.place(streams.MARKERS)}: uv is not on the cloth", got=got, expected=expected)
+
+
+def _check_overlap(recording: Recording, folder: Folder) -> None:
+    """What was seen and what moved must share some time, on the motion clock."""
+    offset = recording.clock_offset
+    seen = {streams.POINTS: recording.points, streams.MARKERS: recording.markers}
+    spans = [(folder.place(file), s.t[0] + offset, s.t[-1] + offset) for file, s in seen.items() if s is not None]
+    if recording.truth is not None:
+        spans.append((folder.place(streams.TRUTH), recording.truth.t[0], recording.truth.t[-1]))
+        if recording.provenance == "measured":
+            raise RecordingError(f"{folder.place(streams.TRUTH)} is in a measured episode", expected="a synthetic one")
+    times = [m.t for m in (*recording.grippers.values(), *recording.joints.values())]
+    if not times:
+        return
+    first, last = min(t[0] for t in times), max(t[-1] for t in times)
+    for place, start, end in spans:
+        if start > last or end < first:
+            got = f"{start:.6g} to {end:.6g} s"
+            expected = f"some of {first:.6g} to {last:.6g} s"
+            raise RecordingError(
+                f"{place}: t does not overlap the motion", got=got, expected=expected, remedy="set clock_offset"
+            )
