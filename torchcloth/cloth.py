@@ -13,8 +13,8 @@ from torch.utils.checkpoint import checkpoint as recompute
 from . import functional
 from .boundaries import AbstractBoundary
 from .boundaries.motion import check as check_motion
-from .boundaries.motion import drive
-from .effects import AbstractEffect
+from .boundaries.motion import drive, interpolate
+from .effects import AbstractEffect, MassDamping
 from .errors import InvalidInput, SimulationDiverged, UnstableStep
 from .materials import AbstractMaterial
 from .meshes import Mesh
@@ -54,7 +54,7 @@ class Cloth(nn.Module):
         super().__init__()
         self.mesh, self.material = mesh, material
         self.areal_density = PhysicalParameter(areal_density, "kg/m^2", name="areal_density")
-        self.effects = nn.ModuleDict(dict(effects or {}))
+        self.effects = nn.ModuleDict({name: part.bind(mesh) for name, part in (effects or {}).items()})
         self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in (boundaries or {}).items()})
         self.contact = contact
         self.spacing, points = (1.0, np.zeros((0, 3))) if contact is None else contact.resolve(mesh)
@@ -87,7 +87,9 @@ class Cloth(nn.Module):
         """A state from vertex positions [..., V, 3] m and velocities (None: at rest), directors along the normals."""
         x = torch.as_tensor(x, dtype=self._area.dtype, device=self._area.device)
         if x.shape[-2:] != self._vertices.shape:
-            raise InvalidInput("x", got=f"shape {tuple(x.shape)}", expected=f"[..., {len(self._vertices)}, 3] in metres")
+            raise InvalidInput(
+                "x", got=f"shape {tuple(x.shape)}", expected=f"[..., {len(self._vertices)}, 3] in metres"
+            )
         v = torch.zeros_like(x) if v is None else torch.as_tensor(v, dtype=x.dtype, device=x.device).expand_as(x)
         n = functional.surface(self._geometry(), x, v).n
         return ClothState(x, v, n.repeat_interleave(len(self._points), dim=-2))
@@ -131,13 +133,52 @@ class Cloth(nn.Module):
             wrenches.append({name: -impulse / (end - start) for name, impulse in impulses.items()})
         return _collect(frames, states, wrenches, [name for name, b in self.boundaries.items() if b.driven])
 
+    def settle(
+        self,
+        state: ClothState,
+        motion: Mapping[str, Trajectory] | None = None,
+        *,
+        start: float = 0.0,
+        duration: float = 0.3,
+        rate: float = 30.0,
+    ) -> ClothState:
+        """Let the cloth come to rest with every driven body held where it is at ``start`` [s].
+
+        Measured initial positions carry noise, which would ring through an undamped simulation: this damps it.
+
+        Args:
+            state: measured or guessed state.
+            motion: as for ``forward``.
+            start: time at which the bodies stand.
+            duration: simulated time [s].
+            rate: of the mass damping that is added meanwhile [1/s].
+        """
+        frames = [start, start + duration]
+        held = {}
+        for name, trajectory in (motion or {}).items():
+            pose = interpolate(trajectory, torch.tensor([start], dtype=torch.float64).to(trajectory.pose))
+            closed = drive(trajectory, torch.tensor([start, start], dtype=trajectory.pose.dtype)).closed[0]
+            pose = pose.expand(*pose.shape[:-3], 2, 4, 4)
+            held[name] = Trajectory(torch.tensor(frames, dtype=torch.float64), pose, torch.tensor([closed, closed]))
+        held = self._check_motion(held, frames)
+        damping = MassDamping(rate).to(self._area)
+        model = self.model()
+        model = model._replace(effects=[*model.effects, (damping, damping.coefficients().detach())])
+        count = int(np.ceil(duration * (1 / self.stable_step() + rate)))
+        settled, _ = self._advance(model, state, held, *frames, count, checkpoint=True)
+        self._check_finite(settled, *frames)
+        return settled._replace(v=torch.zeros_like(settled.v))
+
     def stable_step(self) -> float:
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
         with torch.no_grad():
             c = self.material.coefficients()
             density = _per_triangle(self.areal_density.value)
             spacing = self.spacing if self.contact is not None else None
-            return stable_step(self._gradient, density, self.material.stiffness(c), spacing)
+            model = self.model()
+            extra = [effect.rates(k, model.mass) for effect, k in model.effects]
+            elastic, damping = (float(sum(rate[i] for rate in extra)) for i in (0, 1))
+            return stable_step(self._gradient, density, self.material.stiffness(c), spacing, elastic, damping)
 
     def model(self) -> functional.Model:
         """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
@@ -183,7 +224,7 @@ class Cloth(nn.Module):
         limit = self.stable_step()
         if dt is None:
             return limit
-        if not 0 < dt:
+        if not dt > 0:
             raise InvalidInput("dt", got=f"{dt:g} s", expected="a step > 0")
         if dt > limit * (1 + 1e-9):
             raise UnstableStep(
@@ -243,7 +284,11 @@ class Cloth(nn.Module):
     def extra_repr(self) -> str:
         """Data sheet: size, contact, step."""
         size = f"{len(self.mesh.vertices)} vertices, {len(self.mesh.faces)} triangles, {self.mesh.area.sum():.4g} m^2"
-        grid = "none" if self.contact is None else f"spacing {self.spacing:.3g} m, {len(self._points)} point(s) per triangle"
+        grid = (
+            "none"
+            if self.contact is None
+            else f"spacing {self.spacing:.3g} m, {len(self._points)} point(s) per triangle"
+        )
         return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s"
 
 

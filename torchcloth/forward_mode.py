@@ -24,7 +24,7 @@ _SCALAR = {
 _MIXED = {*_SCALAR, Tensor.matmul, Tensor.__matmul__, torch.matmul}
 
 
-class real_tangents(TorchFunctionMode):  # noqa: N801 - used like torch.no_grad
+class real_tangents(TorchFunctionMode):
     """Context in which no operand is left with a symbolic zero tangent."""
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
@@ -48,4 +48,6 @@ def _has_tangent(tensor: Tensor) -> bool:
 
 def _promote(tensor: Tensor) -> Tensor:
     # an expanded tensor cannot hold a tangent: its elements share memory
-    return forward_ad.make_dual(tensor.contiguous(), torch.zeros(tensor.shape, dtype=tensor.dtype, device=tensor.device))
+    return forward_ad.make_dual(
+        tensor.contiguous(), torch.zeros(tensor.shape, dtype=tensor.dtype, device=tensor.device)
+    )

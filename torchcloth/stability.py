@@ -10,8 +10,15 @@ from .materials import Stiffness
 SAFETY = 0.7  # of the linear limit at rest: leaves room for tangents that double under large strain
 
 
-def stable_step(gradient: Tensor, density: Tensor, stiffness: Stiffness, spacing: float | None) -> float:
-    """Stable substep [s] of the symplectic Euler scheme, SAFETY x 2 / omega_max.
+def stable_step(
+    gradient: Tensor,
+    density: Tensor,
+    stiffness: Stiffness,
+    spacing: float | None,
+    elastic: float = 0.0,
+    damping: float = 0.0,
+) -> float:
+    """Stable substep [s] of the symplectic Euler scheme, SAFETY x 2 / omega_max, less where there is linear damping.
 
     The highest frequency of the mesh is bounded by that of its stiffest free element with lumped mass
     (Irons and Treharne 1971). The director adds its own: a contact point alone in its grid cell sees
@@ -22,6 +29,8 @@ def stable_step(gradient: Tensor, density: Tensor, stiffness: Stiffness, spacing
         density: [..., E or 1, 1] kg/m^2.
         stiffness: tangents [N/m].
         spacing: contact grid [m]; None without contact.
+        elastic: squared frequency that the effects add [1/s^2].
+        damping: linear damping rate c that the effects add [1/s]; the step must obey 4 - 2 c dt - omega^2 dt^2 > 0.
     """
     gx, gy = gradient[..., 0], gradient[..., 1]
     zero = torch.zeros_like(gx)
@@ -34,7 +43,8 @@ def stable_step(gradient: Tensor, density: Tensor, stiffness: Stiffness, spacing
     if spacing is not None:
         grid = 4 * torch.maximum(stiffness.normal, stiffness.shear) / spacing**2
         squared = torch.maximum(squared, (grid + 3 * stiffness.shear * steepest) / density)
-    return float(SAFETY * 2.0 / squared.max().sqrt())
+    omega2 = float(squared.max()) + elastic
+    return SAFETY * ((damping**2 + 4 * omega2) ** 0.5 - damping) / omega2
 
 
 def _root(stiffness: Stiffness) -> Tensor:

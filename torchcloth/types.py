@@ -51,6 +51,6 @@ class Rollout(NamedTuple):
     t: Tensor  # [T] s
     x: Tensor  # [..., T, V, 3] m
     v: Tensor  # [..., T, V, 3] m/s
-    wrench: dict[str, Tensor]  # name -> [..., T, 6] N and N m: force and torque that the cloth exerts on the gripper, about
-    #                            its own origin, world axes, mean over the interval that ends at the frame (frame 0: zero)
+    # wrench: name -> [..., T, 6] N and N m, what the cloth exerts on the gripper, about its own origin, world axes,
+    wrench: dict[str, Tensor]  # mean over the interval that ends at the frame (frame 0: zero)
     state: ClothState  # the state at the last frame: pass it on to continue

@@ -2,6 +2,8 @@
 
 from .air import AirDrag
 from .base import AbstractEffect
+from .bending import Bending
+from .damping import MassDamping
 from .gravity import Gravity
 
-__all__ = ["AbstractEffect", "AirDrag", "Gravity"]
+__all__ = ["AbstractEffect", "AirDrag", "Bending", "Gravity", "MassDamping"]

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from torch import Tensor, nn
 
+from ..meshes import Mesh
 from ..types import ClothState, Surface
 
 
@@ -27,6 +28,10 @@ class AbstractEffect(nn.Module, ABC):
     equivalences: ClassVar[tuple[str, ...]] = ()
     acts_on: ClassVar[Literal["vertices", "triangles"]] = "vertices"
 
+    def bind(self, mesh: Mesh) -> AbstractEffect:
+        """Resolve what depends on the mesh; returns self."""
+        return self
+
     @abstractmethod
     def coefficients(self) -> Any:
         """What ``force`` needs of the learnable parameters; called once per rollout."""
@@ -34,3 +39,7 @@ class AbstractEffect(nn.Module, ABC):
     @abstractmethod
     def force(self, c: Any, state: ClothState, surface: Surface, mass: Tensor) -> Tensor:
         """[..., V, 3] or [..., E, 3] N (see ``acts_on``); ``mass`` is the vertices' [..., V, 1] kg."""
+
+    def rates(self, c: Any, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """(bound on omega^2 [1/s^2], bound on the linear damping rate [1/s]) that this effect adds; limits the step."""
+        return mass.new_zeros(()), mass.new_zeros(())

@@ -1,0 +1,212 @@
+"""Cloth in MuJoCo flex: truth for synthetic episodes from an engine that shares no code with torchcloth.
+
+What the engine computes (MuJoCo >= 4.0, XML reference, flex/elasticity): linear triangles with the Saint
+Venant-Kirchhoff membrane, energy per unit area ``t (mu tr(e^2) + lambda*/2 tr(e)^2)``, ``e`` the Green strain, ``mu =
+E / (2 (1 + nu))`` and the plane-stress ``lambda* = E nu / (1 - nu^2)``; optionally a discrete hinge bending energy of
+rigidity ``E t^3 / (12 (1 - nu^2))``. MuJoCo before 4.0 used a quarter of mu (its changelog, commit 7ba52b533): such a
+version is refused.
+
+Integration is MuJoCo's semi-implicit Euler: symplectic, so without numerical damping, and with a step limited by the
+membrane wave. MuJoCo's implicit "discrete" integrator would allow larger steps at the price of numerical damping. Air
+drag is computed here, in numpy. Vertices inside a grasp are prescribed at every step; what it takes to do so is the
+gripper's force.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from flex_sheet import Air, SheetSpec, flex_xml, grid, largest_step, vertex_masses
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from torchcloth.errors import InvalidInput, MissingDependency, SimulationDiverged
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Grip:
+    """One gripper: the vertices that it holds and its motion.
+
+    Attributes:
+        vertices: [N] indices of the held vertices.
+        t: [K] s, increasing.
+        pose: [K, 4, 4] body to world, m; splines (C2) between the knots, constant outside them.
+    """
+
+    vertices: Array
+    t: Array
+    pose: Array
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run returns.
+
+    Attributes:
+        t: [T] s.
+        x, v: [T, V, 3] m and m/s, world.
+        force, torque: name -> [T, 3] N and N m: what the cloth exerts on the gripper, about the gripper's own origin,
+            world axes, mean over the interval that ends at the frame (frame 0: the first step).
+        grasp_error: m, largest distance between a held vertex, where MuJoCo has it, and its place in the gripper.
+    """
+
+    t: Array
+    x: Array
+    v: Array
+    force: dict[str, Array]
+    torque: dict[str, Array]
+    grasp_error: float
+
+
+class _Held:
+    """The prescribed vertices of one gripper, and the wrench gathered from them."""
+
+    def __init__(self, grip: Grip, x0: Array, clock: Array, frames: int) -> None:
+        t = np.clip(clock, grip.t[0], grip.t[-1])
+        self.index = grip.vertices
+        self.origin = CubicSpline(grip.t, grip.pose[:, :3, 3])(t)
+        self.turn = RotationSpline(grip.t, Rotation.from_matrix(grip.pose[:, :3, :3]))(t).as_matrix()
+        self.local = (x0[self.index] - self.origin[0]) @ self.turn[0]
+        self.wrench = np.zeros((frames, 6))
+        self.sum, self.count = np.zeros(6), 0
+
+    def place(self, step: int) -> Array:
+        """Positions [N, 3] m at a step."""
+        return self.origin[step] + self.local @ self.turn[step].T
+
+    def gather(self, step: int, pull: Array) -> None:
+        """Add the forces [N, 3] N of one step."""
+        arm = self.place(step) - self.origin[step]
+        self.sum += np.concatenate([pull.sum(0), np.cross(arm, pull).sum(0)])
+        self.count += 1
+
+    def close(self, frame: int) -> None:
+        """Store the mean since the last frame."""
+        self.wrench[frame] = self.sum / self.count
+        self.sum, self.count = np.zeros(6), 0
+
+
+class MujocoCloth:
+    """A sheet in MuJoCo whose grasped vertices follow grippers.
+
+    Args:
+        spec: the cloth and the air.
+        dt: s, time step; None takes :func:`flex_sheet.largest_step`.
+
+    Raises:
+        MissingDependency: a MuJoCo whose 2-D elasticity is not the documented one.
+    """
+
+    def __init__(self, spec: SheetSpec, dt: float | None = None) -> None:
+        if int(mujoco.__version__.split(".")[0]) < 4:
+            raise MissingDependency(
+                "MuJoCo's 2-D flex elasticity",
+                got=mujoco.__version__,
+                expected=">= 4.0",
+                remedy='pip install "mujoco>=4"',
+            )
+        self.spec = spec
+        self.dt = float(dt if dt is not None else largest_step(spec))
+        self.uv, self.faces = grid(spec)
+        self.mass = vertex_masses(spec)
+        self.model = mujoco.MjModel.from_xml_string(flex_xml(spec, self.dt))
+        if self.model.nv != 3 * len(self.uv):
+            raise InvalidInput("the flex's degrees of freedom", got=self.model.nv, expected=str(3 * len(self.uv)))
+        self.model.body_mass[1:] = self.mass  # flexcomp gives all points the same mass; the rim must have less
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_setConst(self.model, self.data)
+        self._rest = np.column_stack([self.uv, np.zeros(len(self.uv))])
+        self._air = Air(spec, self.faces, len(self.uv)) if spec.drag_normal > 0 else None
+
+    def run(
+        self,
+        x0: Array,
+        times: Array,
+        grips: Mapping[str, Grip],
+        *,
+        v0: Array | None = None,
+        brake: float = 0.0,
+        load: Array | None = None,
+    ) -> Result:
+        """Simulate from ``times[0]`` to ``times[-1]``.
+
+        Args:
+            x0, v0: [V, 3] m and m/s at ``times[0]``.
+            times: [T] s, frame times; rounded to multiples of the step.
+            grips: the grippers by name; the held vertices keep the place in the gripper that they have at the start.
+            brake: 1/s, drag on every vertex in proportion to its mass, to settle a cloth.
+            load: [V, 3] N, constant additional force.
+
+        Raises:
+            SimulationDiverged: a state that is not finite or that MuJoCo warns of.
+        """
+        frames = np.rint((np.asarray(times) - times[0]) / self.dt).astype(int)
+        clock = times[0] + self.dt * np.arange(frames[-1] + 1)
+        held = {name: _Held(grip, x0, clock, len(frames)) for name, grip in grips.items()}
+        mujoco.mj_resetData(self.model, self.data)
+        # views of MuJoCo's memory: slide joints, so that qpos is each vertex's displacement
+        q, v = self.data.qpos.reshape(-1, 3), self.data.qvel.reshape(-1, 3)
+        q[:] = x0 - self._rest
+        v[:] = 0.0 if v0 is None else v0
+        xs, vs, error, frame = [x0], [v.copy()], 0.0, 1
+        for step in range(frames[-1]):
+            error = max(error, self._step(q, v, held, step, brake, load))
+            if step == 0:
+                for grip in held.values():
+                    grip.wrench[0] = grip.sum
+            if step + 1 == frames[frame]:
+                xs.append(q + self._rest)
+                vs.append(v.copy())
+                for grip in held.values():
+                    grip.close(frame)
+                self._check(xs[-1], clock[step + 1])
+                frame += 1
+        force = {name: grip.wrench[:, :3] for name, grip in held.items()}
+        torque = {name: grip.wrench[:, 3:] for name, grip in held.items()}
+        return Result(clock[frames], np.stack(xs), np.stack(vs), force, torque, error)
+
+    def _step(self, q: Array, v: Array, held: dict[str, _Held], step: int, brake: float, load: Array | None) -> float:
+        """Advance the state by one step in place; returns the grasp error in m at its start."""
+        data, error = self.data, 0.0
+        x = q + self._rest
+        applied = np.zeros_like(x) if self._air is None else self._air.force(x, v)
+        if load is not None:
+            applied += load
+        if brake:
+            applied -= brake * self.mass[:, None] * v
+        data.qfrc_applied[:] = applied.ravel()
+        before = v.copy()
+        mujoco.mj_step(self.model, data)
+        push = data.qfrc_passive.reshape(-1, 3) + applied
+        for grip in held.values():
+            i = grip.index
+            error = max(error, float(np.linalg.norm(data.flexvert_xpos[i] - grip.place(step), axis=1).max()))
+            target = grip.place(step + 1)
+            q[i] = target - self._rest[i]
+            v[i] = (target - x[i]) / self.dt  # what semi-implicit Euler would have needed to get there
+            gained = (v[i] - before[i]) / self.dt - [0.0, 0.0, self.spec.gravity]
+            grip.gather(step, push[i] - self.mass[i, None] * gained)
+        return error
+
+    def _check(self, x: Array, t: float) -> None:
+        if not np.isfinite(x).all() or any(w.number for w in self.data.warning):
+            raise SimulationDiverged(
+                "MuJoCo's cloth",
+                got=f"a state that is not finite or huge by {t:.4f} s",
+                remedy=f"use dt < {self.dt:.2g} s",
+            )
+
+
+def settle(spec: SheetSpec, x0: Array, grips: Mapping[str, Grip], seconds: float, brake: float = 8.0) -> Array:
+    """Positions [V, 3] m of the cloth at rest with the grippers at their first pose, reached with a temporary brake
+    in 1/s.
+    """
+    still = {
+        name: replace(grip, t=np.array([0.0, 1.0]), pose=np.repeat(grip.pose[:1], 2, 0)) for name, grip in grips.items()
+    }
+    return MujocoCloth(spec).run(x0, np.array([0.0, seconds]), still, brake=brake).x[-1]

@@ -1,0 +1,63 @@
+import numpy as np
+import pytest
+
+from torchcloth.errors import InvalidInput
+from torchcloth.observe import DepthCamera, look_at
+
+
+@pytest.fixture
+def camera():
+    return DepthCamera.azure_kinect_nfov(look_at([1.5, 0.4, 0.6], [0.5, 0.0, 0.3]))
+
+
+def test_projecting_what_was_unprojected_returns_the_pixel(camera):
+    rng = np.random.default_rng(0)
+    pixels, depth = rng.uniform([0, 0], [639, 575], (50, 2)), rng.uniform(0.5, 3.8, 50)
+    back, z = camera.project(camera.unproject(pixels, depth))
+    np.testing.assert_allclose(back, pixels, atol=1e-9)  # rounding only
+    np.testing.assert_allclose(z, depth, atol=1e-12)
+
+
+def test_the_target_is_seen_at_the_principal_point_and_up_is_up(camera):
+    pixel, depth = camera.project([0.5, 0.0, 0.3])
+    np.testing.assert_allclose(pixel, [321.5, 329.0], atol=1e-9)
+    assert depth == pytest.approx(np.linalg.norm([1.0, 0.4, 0.3]))
+    assert camera.project([0.5, 0.0, 0.4])[0][1] < 329.0  # rows count downwards
+    assert camera.project([0.5, 0.1, 0.3])[0][0] > 321.5  # seen from +x, +y is on the right
+
+
+def test_a_ray_s_parameter_is_its_depth(camera):
+    origin, directions = camera.rays()
+    assert directions.shape == (576, 640, 3)
+    np.testing.assert_allclose(origin + 1.7 * directions[100, 200], camera.unproject([200, 100], 1.7), atol=1e-12)
+
+
+def test_field_of_view_is_near_the_maker_s_75_by_65_degrees(camera):
+    # Microsoft gives a field of interest of 75 x 65 degrees; the undistorted pinhole spans a little less across
+    across = np.rad2deg(np.arctan(321.5 / 503.8) + np.arctan((639 - 321.5) / 503.8))
+    down = np.rad2deg(np.arctan(329.0 / 503.8) + np.arctan((575 - 329.0) / 503.8))
+    assert across == pytest.approx(75, abs=11)
+    assert down == pytest.approx(65, abs=6)
+    assert (camera.width, camera.height, camera.range) == (640, 576, (0.5, 3.86))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 0}, "camera size"),
+        ({"K": np.diag([500.0, -500.0, 1.0])}, "K"),
+        ({"T_world_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "T_world_camera"),
+        ({"T_world_camera": np.eye(3)}, "T_world_camera"),
+        ({"range": (2.0, 1.0)}, "range"),
+    ],
+)
+def test_an_impossible_camera_is_refused(change, message):
+    good = {"width": 4, "height": 3, "K": np.diag([500.0, 500.0, 1.0]), "T_world_camera": np.eye(4)}
+    with pytest.raises(InvalidInput, match=message):
+        DepthCamera(**{**good, **change})
+
+
+def test_looking_along_up_is_refused():
+    with pytest.raises(InvalidInput, match="target"):
+        look_at([0, 0, 1], [0, 0, 0])
+    assert look_at([0, 0, 1], [0, 0, 0], up=[1, 0, 0])[2, 2] == -1

@@ -1,0 +1,39 @@
+import numpy as np
+import pytest
+
+from torchcloth.errors import InvalidInput
+from torchcloth.observe import solid_mesh
+
+
+def volume(vertices, faces):
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "expected"),
+    [
+        ("box", (0.1, 0.2, 0.3), 0.006),
+        ("cylinder", (0.1, 0.5), np.pi * 0.01 * 0.5),
+        ("sphere", (0.2,), 4 / 3 * np.pi * 0.008),
+    ],
+)
+def test_volume_and_place(kind, size, expected):
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    pose[:3, 3] = 1.0, 2.0, 3.0
+    vertices, faces = solid_mesh(kind, size, pose, segments=96)
+    # outward faces give a positive volume; 96 corners lose 0.2 %
+    assert volume(vertices, faces) == pytest.approx(expected, rel=0.004)
+    np.testing.assert_allclose((vertices.min(0) + vertices.max(0)) / 2, [1, 2, 3], atol=1e-3)
+
+
+def test_the_cylinder_s_axis_is_z():
+    vertices, _ = solid_mesh("cylinder", (0.1, 0.5), np.eye(4))
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), [0.2, 0.2, 0.5], atol=1e-3)
+
+
+@pytest.mark.parametrize(("kind", "size"), [("capsule", (1.0, 1.0)), ("box", (1.0,)), ("sphere", (-1.0,))])
+def test_unknown_or_impossible_solids_are_refused(kind, size):
+    with pytest.raises(InvalidInput):
+        solid_mesh(kind, size, np.eye(4))

@@ -1,0 +1,42 @@
+"""Damping in proportion to mass."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ..parameters import PhysicalParameter
+from ..types import ClothState, Surface
+from .base import AbstractEffect
+
+
+class MassDamping(AbstractEffect):
+    """Viscous force against absolute velocity, f = -rate m v.
+
+    Not a property of cloth; useful to let a sheet come to rest (``Cloth.settle``) and as a catch-all to be suspected.
+
+    Args:
+        rate: [1/s], >= 0.
+
+    Raises:
+        InvalidInput: negative rate.
+    """
+
+    unit, typical, smallest = "1/s", 1.0, 0.05
+    equivalences = ("air",)
+
+    def __init__(self, rate: float | Tensor = 1.0) -> None:
+        super().__init__()
+        self.rate = PhysicalParameter(rate, "1/s", "nonnegative", name="mass damping rate")
+
+    def coefficients(self) -> Tensor:
+        """[] or [..., 1, 1] 1/s."""
+        value = self.rate.value
+        return value.unsqueeze(-1) if value.ndim else value
+
+    def force(self, c: Tensor, state: ClothState, surface: Surface, mass: Tensor) -> Tensor:
+        """Force on each vertex."""
+        return -(c * mass) * state.v
+
+    def rates(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """The rate itself."""
+        return mass.new_zeros(()), c.amax()

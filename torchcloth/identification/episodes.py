@@ -1,0 +1,162 @@
+"""Recordings as the simulator takes them: a cloth with its boundaries, motion, frame times, clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..boundaries import Grasp, Plane
+from ..cloth import Cloth
+from ..effects import AbstractEffect, AirDrag, Bending, Gravity
+from ..errors import InvalidInput, RecordingError
+from ..materials import AEP, AbstractMaterial
+from ..meshes import Mesh, rectangle
+from ..recordings import Recording
+from ..robots import replay
+from ..transfer import Contact
+from ..types import Trajectory
+
+DEFAULT_STIFFNESS = 300.0  # N/m, a start in the middle of the published fabrics, where an episode names none
+DEFAULT_POISSON = 0.2
+SHEET_TRIANGLES = 288
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One recording, as tensors.
+
+    Attributes:
+        name: how messages and pictures call it.
+        motion: grippers' trajectories by name.
+        times: [T] s, frame times on the motion's clock.
+        clouds: T tensors [N_t, 3] m.
+        initial: [V, 3] m, vertex positions at the first frame.
+        settles: whether ``initial`` was measured, so that its noise is damped out before the first frame.
+        noise: standard deviation of one point [m], or None when unknown.
+    """
+
+    name: str
+    motion: Mapping[str, Trajectory]
+    times: Tensor
+    clouds: list[Tensor]
+    initial: Tensor
+    settles: bool
+    noise: float | None
+
+
+def cloth_from(
+    recording: Recording,
+    material: AbstractMaterial | None = None,
+    effects: Mapping[str, AbstractEffect] | None = None,
+    contact: Contact | None = None,
+) -> Cloth:
+    """The cloth that an episode describes, with its grasps and colliders.
+
+    Args:
+        recording: names mesh or sheet, density, grasps, colliders, gravity, air.
+        material: None: A-EP at the episode's nominal values, or at a start in the middle of published fabrics.
+        effects: None: gravity, bending where the episode has a nominal value, air drag where it states the air's density.
+        contact: between layers; None leaves it out.
+
+    Raises:
+        RecordingError: the episode has neither mesh nor sheet.
+        InvalidInput: parts that do not fit each other.
+    """
+    mesh = mesh_of(recording)
+    if effects is None:
+        effects = _effects(recording)
+    boundaries = {}
+    for name, collider in recording.colliders.items():
+        friction = 0.4 if collider.friction is None else collider.friction
+        boundaries[name] = Plane(collider.point.tolist(), collider.normal.tolist(), friction)
+    for name, grasp in recording.grasps.items():
+        boundaries[name] = Grasp(uv=grasp.uv, radius=grasp.radius)
+    density = recording.cloth.areal_density
+    return Cloth(mesh, material or _nominal(recording), density, effects, boundaries, contact)
+
+
+def mesh_of(recording: Recording) -> Mesh:
+    """The episode's rest mesh, or its rectangular sheet.
+
+    Raises:
+        RecordingError: neither is given.
+    """
+    cloth = recording.cloth
+    if cloth.vertices is not None and cloth.faces is not None:
+        return Mesh.build(cloth.vertices, cloth.faces, cloth.uv)
+    if cloth.sheet is not None:
+        return rectangle(*cloth.sheet, triangles=SHEET_TRIANGLES)
+    raise RecordingError(
+        f"{recording.path}: cloth", got="neither mesh nor sheet", expected="cloth.mesh or cloth.sheet in episode.json"
+    )
+
+
+def episode(cloth: Cloth, recording: Recording) -> Episode:
+    """Check a recording against a cloth and turn it into tensors of the cloth's dtype.
+
+    Raises:
+        RecordingError: no points, or no motion for one of the cloth's grasps.
+        InvalidInput: initial vertices that do not belong to the cloth's mesh.
+    """
+    points = recording.require("points", by="identify")
+    name = recording.path.name if recording.path else "recording"
+    dtype = cloth.state(torch.as_tensor(cloth.mesh.vertices)).x.dtype
+    motion = replay(recording, dtype)
+    needed = [key for key, boundary in cloth.boundaries.items() if boundary.driven]
+    missing = [key for key in needed if key not in motion]
+    if missing:
+        raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=f"motion of {sorted(motion)}")
+    if len(points) < 2:
+        raise RecordingError(f"{name}: points", got=f"{len(points)} frame(s)", expected="at least two")
+    times, kept = _overlap(points.t + recording.clock_offset, motion, needed)
+    clouds = [torch.as_tensor(np.asarray(points.frame(i)), dtype=dtype) for i in kept]
+    initial = recording.cloth.initial_vertices
+    vertices = cloth.mesh.vertices if initial is None else initial
+    if vertices.shape != cloth.mesh.vertices.shape:
+        raise InvalidInput(
+            f"{name}: initial_vertices", got=f"{len(vertices)} rows", expected=f"{len(cloth.mesh.vertices)}, one per vertex",
+            remedy="give the mesh that the initial vertices belong to",
+        )  # fmt: skip
+    return Episode(
+        name=name,
+        motion={key: motion[key] for key in needed},
+        times=torch.as_tensor(times),
+        clouds=clouds,
+        initial=torch.as_tensor(vertices, dtype=dtype),
+        settles=initial is not None,
+        noise=recording.observation_noise_std,
+    )
+
+
+def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[str]) -> tuple[np.ndarray, list[int]]:
+    """Frames that the motion covers; the first frame must be one of them, it is where the cloth is known."""
+    start = max((float(motion[key].t[0]) for key in needed), default=-np.inf)
+    end = min((float(motion[key].t[-1]) for key in needed), default=np.inf)
+    inside = np.flatnonzero((times >= start - 1e-6) & (times <= end + 1e-6))
+    if len(inside) < 2 or inside[0] != 0:
+        raise RecordingError(
+            "points and motion", got=f"frames in [{times[0]:g}, {times[-1]:g}] s, motion in [{start:g}, {end:g}] s",
+            expected="motion that covers the first frame", remedy="check clock_offset",
+        )  # fmt: skip
+    return times[inside], inside.tolist()
+
+
+def _effects(recording: Recording) -> dict[str, AbstractEffect]:
+    """Weight; bending at its data-sheet value, if there is one; drag of a flat plate, if there is air."""
+    effects: dict[str, AbstractEffect] = {"gravity": Gravity(recording.gravity.tolist())}
+    nominal = recording.cloth.nominal
+    if "bending_stiffness" in nominal:
+        effects["bending"] = Bending(nominal["bending_stiffness"], nominal.get("bending_damping_time", 0.0))
+    if recording.air_density is not None:
+        effects["air"] = AirDrag(normal=AirDrag.typical, density=recording.air_density)
+    return effects
+
+
+def _nominal(recording: Recording) -> AEP:
+    nominal, h = recording.cloth.nominal, recording.cloth.thickness or 1e-3
+    youngs = nominal.get("youngs_modulus") or nominal.get("membrane_stiffness", DEFAULT_STIFFNESS) / h
+    return AEP(float(youngs), float(nominal.get("poisson_ratio", DEFAULT_POISSON)), thickness=h)

@@ -1,0 +1,38 @@
+"""The rigid-carry null: cloth that moves with the grippers and never deforms. A fit that does not beat it is worthless."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..boundaries.motion import interpolate
+from .episodes import Episode
+
+ARM = 0.05  # m, length of the axes that carry a gripper's orientation into the alignment
+
+
+def rigid_carry(episode: Episode) -> Tensor:
+    """Frames [T, V, 3] m of the initial shape under the rigid motion that best follows all grippers."""
+    times = episode.times
+    marks = [_marks(interpolate(trajectory, times.to(trajectory.pose))) for trajectory in episode.motion.values()]
+    if not marks:
+        return episode.initial.expand(len(times), -1, -1)
+    rotation, shift = _align(torch.cat(marks, dim=1))
+    return episode.initial @ rotation.mT + shift.unsqueeze(-2)
+
+
+def _marks(pose: Tensor) -> Tensor:
+    """[T, 7, 3] m: a gripper's origin and points on its axes."""
+    tips = ARM * torch.cat([torch.zeros(1, 3), torch.eye(3), -torch.eye(3)]).to(pose)
+    return tips @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
+
+
+def _align(marks: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations [T, 3, 3] and translations [T, 3] that carry the first frame's marks to each frame's (Kabsch)."""
+    centre = marks.mean(1, keepdim=True)
+    moved = marks - centre
+    U, _, Vt = torch.linalg.svd(moved.mT @ moved[:1].expand_as(moved))
+    sign = torch.linalg.det(U @ Vt)
+    fix = torch.diag_embed(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], dim=-1))
+    rotation = U @ fix @ Vt
+    return rotation, centre.squeeze(1) - (rotation @ centre[0].mT).squeeze(-1)

@@ -1,0 +1,129 @@
+"""From covariance to statements: estimates, identifiability, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..cloth import Cloth
+from ..materials import AEP
+from .episodes import Episode
+from .result import Estimate
+from .unknowns import Unknown, available, collect
+
+TRUSTED = 0.25  # a parameter counts as identified when its standard error is below a quarter of its value
+CONFUSED = 0.95  # correlation above which two parameters are called hard to tell apart
+
+
+class Found(NamedTuple):
+    """Estimates and their correlation."""
+
+    parameters: dict[str, Estimate]
+    correlation: dict[str, dict[str, float]]
+
+
+def estimates(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, covariance: Tensor) -> Found:
+    """Physical values, standard errors (delta method), 95 % intervals (in the unconstrained coordinate)."""
+    deviation = covariance.diagonal().sqrt()
+    parameters = {u.name: _estimate(u, float(r), float(s)) for u, r, s in zip(unknowns, raw, deviation, strict=True)}
+    if isinstance(cloth.material, AEP) and "youngs_modulus" in parameters:
+        parameters = {
+            "membrane_stiffness": _times(parameters["youngs_modulus"], cloth.material.thickness, "N/m"),
+            **parameters,
+        }
+    absent = [
+        name for name, path in available(cloth).items() if path.startswith("material.") and name not in parameters
+    ]
+    for unknown in collect(cloth, absent, None):
+        parameters[unknown.name] = _absent(unknown)
+    matrix = covariance / deviation[:, None] / deviation[None, :]
+    names = [u.name for u in unknowns]
+    correlation = {a: {b: float(matrix[i, j]) for j, b in enumerate(names)} for i, a in enumerate(names)}
+    return Found(parameters, correlation)
+
+
+def warnings_of(
+    cloth: Cloth,
+    episodes: Sequence[Episode],
+    found: Found,
+    fit: dict[str, float],
+    frames: Sequence[Tensor],
+    faces: Tensor,
+) -> list[str]:
+    """What a reader must know before he uses the numbers."""
+    out = []
+    if fit["chamfer_after"] >= fit["chamfer_null"]:
+        out.append("the fit is no better than cloth carried rigidly by the grippers: these data say nothing about it")
+    for name, estimate in found.parameters.items():
+        if not estimate.identifiable and estimate.source == "data":
+            out.append(f"{name} is not identifiable from these data: its value is the start's, not the fabric's")
+    names = [n for n in found.correlation if found.parameters[n].source == "data"]
+    for i, a in enumerate(names):
+        for b in names[:i]:
+            if abs(found.correlation[a][b]) > CONFUSED:
+                out.append(f"{a} and {b} can hardly be told apart (correlation {found.correlation[a][b]:+.2f})")
+    if "areal_density" not in found.correlation:
+        out.append(
+            "areal density was taken as exact: without force readings stiffness and density enter only as a ratio"
+        )
+    noise = [e.noise for e in episodes if e.noise]
+    if noise and fit["rms_after"] > 2 * max(noise):
+        out.append(
+            f"the residual ({fit['rms_after'] * 1e3:.1f} mm rms) exceeds twice the sensor noise ({max(noise) * 1e3:.1f} mm): "
+            "the model misses something, and the standard errors do not cover it"
+        )
+    if not all(e.settles for e in episodes):
+        out.append(
+            "an episode has no initial_vertices: the rest mesh, as placed in the file, was taken as the first frame"
+        )
+    if cloth.contact is None and _layers_meet(cloth, frames, faces):
+        out.append("layers of the cloth come near each other, and contact was left out: fit with contact")
+    return out
+
+
+def _estimate(unknown: Unknown, raw: float, deviation: float) -> Estimate:
+    value = unknown.value(raw)
+    std = unknown.slope(raw) * deviation
+    low, high = (unknown.value(unknown.clip(raw + sign * 1.96 * deviation)) for sign in (-1, 1))
+    identifiable = std < TRUSTED * max(abs(value), _typical(unknown))
+    return Estimate(
+        value, std, (low, high), unknown.parameter.unit, unknown.value(unknown.start), identifiable,
+        "prior" if unknown.measured else "data",
+    )  # fmt: skip
+
+
+def _typical(unknown: Unknown) -> float:
+    """Amplitudes may be zero: they are judged against their typical size (half their prior)."""
+    return 0.5 * unknown.prior_std if unknown.parameter.domain == "nonnegative" else 0.0
+
+
+def _absent(unknown: Unknown) -> Estimate:
+    """A material parameter that the model does not contain: only its prior is known."""
+    value, spread = unknown.value(unknown.start), 1.96 * unknown.prior_std
+    low, high = (unknown.value(unknown.clip(unknown.start + sign * spread)) for sign in (-1, 1))
+    std = unknown.slope(unknown.start) * unknown.prior_std
+    return Estimate(value, std, (low, high), unknown.parameter.unit, value, False, "not in the model")
+
+
+def _times(estimate: Estimate, factor: float, unit: str) -> Estimate:
+    low, high = estimate.ci95
+    return Estimate(
+        estimate.value * factor, estimate.std * factor, (low * factor, high * factor), unit, estimate.initial * factor,
+        estimate.identifiable, "derived",
+    )  # fmt: skip
+
+
+def _layers_meet(cloth: Cloth, frames: Sequence[Tensor], faces: Tensor) -> bool:
+    """Whether triangles that are far apart in the fabric come within 1.5 edges of each other."""
+    rest = torch.as_tensor(cloth.mesh.vertices, dtype=frames[0].dtype)[faces].mean(1)
+    edge = cloth.mesh.mean_edge
+    apart = torch.cdist(rest, rest) > 4 * edge
+    for motion in frames:
+        for x in motion[:: max(1, len(motion) // 8)]:
+            centres = x[faces].mean(1)
+            if bool(((torch.cdist(centres, centres) < 1.5 * edge) & apart).any()):
+                return True
+    return False

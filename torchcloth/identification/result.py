@@ -1,0 +1,97 @@
+"""What a fit says: numbers with their errors, distances before and after, and what to mistrust."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from ..cloth import Cloth
+
+CONVENTION = (
+    "SI units. chamfer: one-sided, cloud to surface: mean over frames of the mean distance [m] from each measured point to "
+    "the nearest point of the simulated triangles. rms: root mean square of the same distances over all points. "
+    "null: the cloth moves rigidly with the grippers, undeformed. std: standard error of the estimate, noise correlated "
+    "between nearby frames allowed for, persistent model error not; ci95 is computed in the log (logit) coordinate."
+)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter. ``identifiable`` is False when the data leave it within its prior, whatever its value says."""
+
+    value: float
+    std: float
+    ci95: tuple[float, float]
+    unit: str
+    initial: float
+    identifiable: bool
+    source: str = "data"  # "data", "prior" (a measurement stated by the recording), "derived", "not in the model"
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """The result of ``identify``.
+
+    Attributes:
+        parameters: estimates by name.
+        fit: distances [m] before, after and for the null, counts, seconds.
+        correlation: of the fitted parameters, name -> name -> correlation.
+        warnings: what to mistrust, in sentences.
+        history: one entry per iteration: chamfer [m] and parameter values.
+        frames_before, frames_after, frames_null: [T, V, 3] m for each episode.
+    """
+
+    parameters: dict[str, Estimate]
+    fit: dict[str, float]
+    correlation: dict[str, dict[str, float]]
+    warnings: list[str]
+    history: list[dict[str, Any]]
+    frames_before: list[Tensor] = field(repr=False)
+    frames_after: list[Tensor] = field(repr=False)
+    frames_null: list[Tensor] = field(repr=False)
+    keys: dict[str, str] = field(default_factory=dict, repr=False)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of identification.json."""
+        return {
+            "parameters": {name: asdict(estimate) for name, estimate in self.parameters.items()},
+            "fit": self.fit,
+            "correlation": self.correlation,
+            "convention": CONVENTION,
+            "warnings": self.warnings,
+            "history": self.history,
+        }
+
+    def save(self, folder: str | Path) -> Path:
+        """Write identification.json into ``folder``, atomically; returns its path."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        return write_atomically(folder / "identification.json", json.dumps(self.as_dict(), indent=1) + "\n")
+
+    def apply(self, cloth: Cloth) -> Cloth:
+        """Set the fitted values in ``cloth``, leaving what is not identifiable as it is; returns it."""
+        for name, path in self.keys.items():
+            if self.parameters[name].identifiable:
+                cloth.get_submodule(path).set(self.parameters[name].value)  # type: ignore[operator]
+        return cloth
+
+
+def write_atomically(path: Path, text: str) -> Path:
+    """Write a text file so that a crash leaves the old content or the new, never half."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+    return path

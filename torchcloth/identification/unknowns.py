@@ -1,0 +1,101 @@
+"""What a fit may change: parameters by public name, as one unconstrained vector with a prior."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..cloth import Cloth
+from ..errors import InvalidInput
+from ..parameters import PhysicalParameter, to_value
+
+DECADE = math.log(10.0)
+PRIOR_LOGIT = 1.5  # of logit(2 nu): 95 % of the prior between 0.02 and 0.48
+
+
+@dataclass(frozen=True, eq=False)
+class Unknown:
+    """One scalar parameter of the fit.
+
+    Attributes:
+        name: public name, e.g. "youngs_modulus" or "air.normal".
+        key: name of the stored tensor in the cloth's state.
+        parameter: the parameter at its start value.
+        start: unconstrained start value.
+        prior_std: standard deviation of the prior around ``start``, in the unconstrained coordinate.
+        measured: the prior is a measurement (areal density), not ignorance.
+    """
+
+    name: str
+    key: str
+    parameter: PhysicalParameter
+    start: float
+    prior_std: float
+    measured: bool = False
+
+    def value(self, raw: float) -> float:
+        """Physical value of an unconstrained one."""
+        return float(to_value(torch.tensor(raw, dtype=torch.float64), self.parameter.domain))
+
+    def slope(self, raw: float) -> float:
+        """d value / d raw."""
+        x = torch.tensor(raw, dtype=torch.float64, requires_grad=True)
+        return float(torch.autograd.grad(to_value(x, self.parameter.domain), x)[0])
+
+    def clip(self, raw: float) -> float:
+        """The nearest legal unconstrained value (amplitudes are stored as they are)."""
+        return max(raw, 0.0) if self.parameter.domain == "nonnegative" else raw
+
+
+def available(cloth: Cloth) -> dict[str, str]:
+    """Public name -> module path of every scalar physical parameter of a cloth."""
+    found = {}
+    for path, module in cloth.named_modules():
+        if isinstance(module, PhysicalParameter) and module.raw.ndim == 0:
+            head, _, tail = path.partition(".")
+            found[tail if head in ("material", "effects", "boundaries") else path] = path
+    return found
+
+
+def collect(cloth: Cloth, names: Sequence[str], density_std: float | None) -> list[Unknown]:
+    """The unknowns of a fit, by public name; areal density joins with its measured prior when that is known.
+
+    Raises:
+        InvalidInput: an unknown name or a field-valued parameter.
+    """
+    known = available(cloth)
+    out = []
+    for name in dict.fromkeys(names):
+        if name not in known:
+            raise InvalidInput("parameter to fit", got=repr(name), expected=f"one of {', '.join(sorted(known))}")
+        out.append(_unknown(cloth, name, known[name]))
+    density = float(cloth.areal_density.value.mean())
+    if density_std and "areal_density" in known and "areal_density" not in names:
+        raw = math.log(density)
+        key = known["areal_density"] + ".raw"
+        out.append(Unknown("areal_density", key, cloth.areal_density, raw, density_std / density, measured=True))
+    return out
+
+
+def _unknown(cloth: Cloth, name: str, path: str) -> Unknown:
+    parameter = cloth.get_submodule(path)
+    if not isinstance(parameter, PhysicalParameter):
+        raise InvalidInput("parameter to fit", got=repr(name), expected="a scalar physical parameter")
+    start = float(parameter.raw.detach())
+    if parameter.domain == "positive":
+        std = DECADE
+    elif parameter.domain == "unit_half":
+        std = PRIOR_LOGIT
+    else:
+        owner = cloth.get_submodule(path.rpartition(".")[0])
+        std = 2.0 * float(getattr(owner, "typical", 1.0))
+    return Unknown(name, f"{path}.raw", parameter, start, std)
+
+
+def overrides(unknowns: Sequence[Unknown], raw: Tensor) -> dict[str, Tensor]:
+    """State entries for ``torch.func.functional_call`` from the vector ``raw`` [..., K]."""
+    return {u.key: raw[..., i] for i, u in enumerate(unknowns)}

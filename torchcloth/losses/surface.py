@@ -1,0 +1,117 @@
+"""Point-to-surface distances: the residuals that identification uses, and the Chamfer distance for reports."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .._math import cross, dot
+
+
+class Hits(NamedTuple):
+    """Closest surface points of N measured points; held constant while differentiating (envelope theorem)."""
+
+    corners: Tensor  # [N, 3] int64, vertices of the triangle that was hit
+    weights: Tensor  # [N, 3] -, barycentric coordinates
+    beyond: Tensor  # [N] bool, the point lies beyond the sheet's edge
+
+    def on(self, vertices: Tensor) -> Tensor:
+        """[..., N, 3] m, the material points that were hit, on vertices [..., V, 3]."""
+        picked = vertices.index_select(-2, self.corners.reshape(-1)).unflatten(-2, (-1, 3))
+        return (self.weights.unsqueeze(-1) * picked).sum(-2)
+
+
+def closest(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 400_000) -> Hits:
+    """Exact closest points on a triangle mesh, by brute force in chunks.
+
+    Args:
+        points: [N, 3] m.
+        vertices: [V, 3] m.
+        faces: [F, 3] int64.
+        chunk: point-triangle pairs per pass.
+    """
+    with torch.no_grad():
+        points, vertices = points.detach(), vertices.detach()
+        corners = vertices[faces]
+        found = [_closest(part, corners) for part in points.split(max(1, chunk // len(faces)))]
+        face = torch.cat([f for f, _ in found])
+        weights = torch.cat([w for _, w in found])
+        return Hits(faces[face], weights, _on_boundary(faces, face, weights))
+
+
+def residuals(points: Tensor, vertices: Tensor, hits: Hits) -> tuple[Tensor, Tensor]:
+    """Signed distances [m] of points from the surface, split by direction.
+
+    Returns:
+        (along the normal [N], for every point; in the surface's plane [N], for points beyond the sheet's edge and 0
+        elsewhere: points beyond pull the edge outwards, missing points do not pull it back, occlusion explains them)
+    """
+    x0, x1, x2 = vertices.index_select(-2, hits.corners.reshape(-1)).unflatten(-2, (-1, 3)).unbind(-2)
+    normal = cross(x1 - x0, x2 - x0)
+    normal = normal / dot(normal, normal).sqrt()
+    offset = points - hits.on(vertices)
+    along = dot(normal, offset)
+    beside = offset - along * normal
+    length = torch.where(hits.beyond.unsqueeze(-1), dot(beside, beside), 1.0).sqrt()
+    return along.squeeze(-1), torch.where(hits.beyond, length.squeeze(-1), torch.zeros_like(length.squeeze(-1)))
+
+
+def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:
+    """One-sided Chamfer distance cloud -> surface [m]: mean over the points of the distance to the nearest triangle.
+
+    Differentiable in ``vertices``. Its floor is the sensor noise, and it is blind to motion within the surface: use it
+    to report, and ``residuals`` to infer.
+    """
+    hits = closest(points, vertices, faces)
+    offset = points - hits.on(vertices)
+    squared = (offset * offset).sum(-1)
+    zero = squared == 0
+    return torch.where(zero, 0.0, torch.where(zero, 1.0, squared).sqrt()).mean()
+
+
+def _closest(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
+    """(nearest triangle [N], barycentric coordinates [N, 3]) of points [N, 3] on triangles [F, 3, 3]."""
+    a, b, c = corners.unbind(1)
+    inside = _project_inside(points, a, b, c)
+    candidates = [inside, *(_project_edge(points, corners, i) for i in range(3))]
+    weights = torch.stack(candidates)  # [4, N, F, 3]
+    on = torch.einsum("knfc,fcd->knfd", weights, corners)
+    distance = (points[:, None] - on).pow(2).sum(-1)
+    best, kind = distance.min(0)
+    face = best.argmin(-1)
+    row = torch.arange(len(points), device=points.device)
+    return face, weights[kind[row, face], row, face]
+
+
+def _project_inside(points: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """Barycentric coordinates [N, F, 3] of the plane projection; the first corner where that falls outside."""
+    e1, e2 = b - a, c - a
+    normal = cross(e1, e2)
+    scale = 1.0 / dot(normal, normal)
+    offset = points[:, None] - a
+    v = (cross(offset, e2.expand_as(offset)) * (normal * scale)).sum(-1)
+    w = (cross(e1.expand_as(offset), offset) * (normal * scale)).sum(-1)
+    weights = torch.stack([1 - v - w, v, w], dim=-1)
+    outside = (weights < 0).any(-1, keepdim=True)
+    return torch.where(outside, torch.eye(3, dtype=a.dtype, device=a.device)[0], weights)
+
+
+def _project_edge(points: Tensor, corners: Tensor, start: int) -> Tensor:
+    """Barycentric coordinates [N, F, 3] of the closest point on the edge from corner ``start`` to the next."""
+    end = (start + 1) % 3
+    a, edge = corners[:, start], corners[:, end] - corners[:, start]
+    t = ((points[:, None] - a) * edge).sum(-1) / dot(edge, edge).squeeze(-1)
+    t = t.clamp(0.0, 1.0)
+    weights = t.new_zeros(*t.shape, 3)
+    weights[..., start], weights[..., end] = 1 - t, t
+    return weights
+
+
+def _on_boundary(faces: Tensor, face: Tensor, weights: Tensor) -> Tensor:
+    """[N] bool, whether the closest point lies on an edge that only one triangle has."""
+    edges = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], dim=1).sort(-1).values
+    _, inverse, count = edges.reshape(-1, 2).unique(dim=0, return_inverse=True, return_counts=True)
+    open_edge = (count[inverse] == 1).reshape(-1, 3)  # the edge opposite to each corner
+    return ((weights <= 0) & open_edge[face]).any(-1)

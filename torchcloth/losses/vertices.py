@@ -1,0 +1,20 @@
+"""Point-to-vertex distances, for comparison with papers that use them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
+    """One-sided Chamfer distance cloud -> vertices [m]: mean over the points of the distance to the nearest vertex.
+
+    The DiffCP paper's loss. It depends on the mesh density and its floor is about a third of an edge.
+
+    Args:
+        points: [N, 3] m.
+        vertices: [V, 3] m, differentiable.
+    """
+    with torch.no_grad():
+        nearest = torch.cdist(points, vertices).argmin(-1)
+    return (points - vertices[nearest]).norm(dim=-1).mean()

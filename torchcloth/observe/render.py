@@ -1,0 +1,78 @@
+"""Depth images of triangle meshes by ray casting (open3d, imported when called)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from ..errors import InvalidInput, MissingDependency
+from .camera import DepthCamera
+
+Array = np.ndarray
+
+
+def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """What the camera would see without noise.
+
+    Both sides of every triangle are seen, so that a sheet needs no thickness. What lies nearer than the camera's range
+    still hides what is behind it.
+
+    Args:
+        camera: the camera.
+        meshes: for each body its vertices [V, 3] m in world coordinates and triangles [F, 3].
+
+    Returns:
+        Depth [H, W] float32, m along the optical axis, 0 where nothing is seen, and ids [H, W] int32: the index in
+        ``meshes`` of the body that was hit, -1 where none was (or it was out of range).
+
+    Raises:
+        MissingDependency: open3d cannot be imported.
+        InvalidInput: a mesh that has the wrong shape, an index out of bounds or a vertex that is not finite.
+    """
+    o3d = _open3d()
+    scene = o3d.t.geometry.RaycastingScene()
+    body = []
+    for index, (vertices, faces) in enumerate(meshes):
+        vertices, faces = _checked(index, vertices, faces)
+        if len(faces) == 0:
+            continue
+        scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
+        body.append(index)
+    origin, directions = camera.rays()
+    if not body:
+        return np.zeros(directions.shape[:2], np.float32), np.full(directions.shape[:2], -1, np.int32)
+    rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1).astype(np.float32)
+    hit = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)))
+    depth, geometry = hit["t_hit"].numpy(), hit["geometry_ids"].numpy()
+    seen = np.isfinite(depth) & (depth >= camera.range[0]) & (depth <= camera.range[1])
+    ids = np.full(depth.shape, -1, np.int32)
+    ids[seen] = np.array(body, np.int32)[geometry[seen]]
+    return np.where(seen, depth, 0).astype(np.float32), ids
+
+
+def _checked(index: int, vertices: Array, faces: Array) -> tuple[Array, Array]:
+    vertices, faces = np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.uint32)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise InvalidInput(
+            f"meshes[{index}]", got=f"shapes {vertices.shape} and {faces.shape}", expected="[V, 3] and [F, 3]"
+        )
+    if not np.isfinite(vertices).all():
+        raise InvalidInput(f"meshes[{index}]", got="a vertex that is not finite", expected="finite positions in m")
+    if faces.size and int(faces.max()) >= len(vertices):
+        raise InvalidInput(f"meshes[{index}]", got=f"vertex index {faces.max()}", expected=f"below {len(vertices)}")
+    return vertices, faces
+
+
+def _open3d() -> Any:
+    try:
+        return import_module("open3d")  # here, not above: it takes seconds and needs a system library
+    except ImportError as error:
+        raise MissingDependency(
+            "rendering depth needs open3d",
+            got=str(error),
+            remedy='pip install "torchcloth[observe]"; a missing libusb-1.0.so.0 is the system package libusb-1.0-0 '
+            "(apt-get install libusb-1.0-0)",
+        ) from error

@@ -1,0 +1,61 @@
+"""Triangle meshes of simple solids, so that robots and furniture can hide things from a camera."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import InvalidInput
+
+Array = np.ndarray
+
+_BOX = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_BOX_FACES = np.array(
+    [0, 1, 3, 0, 3, 2, 4, 6, 7, 4, 7, 5, 0, 4, 5, 0, 5, 1, 2, 3, 7, 2, 7, 6, 0, 2, 6, 0, 6, 4, 1, 5, 7, 1, 7, 3]
+).reshape(-1, 3)
+
+
+def solid_mesh(kind: str, size: tuple[float, ...], pose: Array, segments: int = 24) -> tuple[Array, Array]:
+    """Vertices [V, 3] m in the world and triangles [F, 3] of a box, a cylinder or a sphere.
+
+    Args:
+        kind: "box", "cylinder" or "sphere".
+        size: m; box: edges x, y, z; cylinder: radius, length along z; sphere: radius.
+        pose: [4, 4] of the centre in the world, m.
+        segments: corners of a circle; the mesh lies inside the true solid by up to radius * (1 - cos(pi / segments)).
+
+    Raises:
+        InvalidInput: an unknown kind, or sizes that do not fit it.
+    """
+    wanted = {"box": 3, "cylinder": 2, "sphere": 1}
+    if kind not in wanted:
+        raise InvalidInput("kind", got=repr(kind), expected=f"one of {', '.join(wanted)}")
+    if len(size) != wanted[kind] or min(size) <= 0 or segments < 3:
+        raise InvalidInput("size", got=size, expected=f"{wanted[kind]} positive lengths in m", remedy="segments >= 3")
+    if kind == "box":
+        vertices, faces = _BOX * np.asarray(size, float), _BOX_FACES
+    else:
+        vertices, faces = _turned(*_outline(kind, size, segments), segments)
+    pose = np.asarray(pose, dtype=float)
+    return vertices @ pose[:3, :3].T + pose[:3, 3], faces
+
+
+def _outline(kind: str, size: tuple[float, ...], segments: int) -> tuple[Array, Array]:
+    """Radius and height [N] of the curve that turns about z; it starts and ends on the axis."""
+    if kind == "cylinder":
+        return np.array([0, size[0], size[0], 0]), size[1] * np.array([-0.5, -0.5, 0.5, 0.5])
+    angle = np.linspace(0, np.pi, segments // 2 + 1)
+    return size[0] * np.sin(angle), -size[0] * np.cos(angle)
+
+
+def _turned(radius: Array, height: Array, segments: int) -> tuple[Array, Array]:
+    angle = 2 * np.pi * np.arange(segments) / segments
+    ring = np.stack([np.cos(angle), np.sin(angle)], -1)
+    flat = radius[:, None, None] * ring
+    vertices = np.concatenate([flat, np.broadcast_to(height[:, None, None], (*flat.shape[:2], 1))], -1).reshape(-1, 3)
+    here = np.arange(segments)
+    after = (here + 1) % segments
+    faces = []
+    for k in range(len(radius) - 1):
+        a, b = k * segments, (k + 1) * segments
+        faces += [np.stack([a + here, a + after, b + after], 1), np.stack([a + here, b + after, b + here], 1)]
+    return vertices, np.concatenate(faces)
