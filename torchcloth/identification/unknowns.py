@@ -73,7 +73,7 @@ def collect(cloth: Cloth, names: Sequence[str], density_std: float | None) -> li
         if name not in known:
             raise InvalidInput("parameter to fit", got=repr(name), expected=f"one of {', '.join(sorted(known))}")
         out.append(_unknown(cloth, name, known[name]))
-    density = float(cloth.areal_density.value.mean())
+    density = float(cloth.areal_density.value.detach().mean())
     if density_std and "areal_density" in known and "areal_density" not in names:
         raw = math.log(density)
         key = known["areal_density"] + ".raw"
