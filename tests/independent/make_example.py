@@ -31,7 +31,7 @@ from torchcloth import recordings, robots
 Array = np.ndarray
 ROOT = Path(__file__).resolve().parents[2]
 CORNER = {"left": (0.0, 0.40), "right": (0.40, 0.40)}  # m, material coordinates
-RADIUS = 0.02  # m
+RADIUS = 0.026  # m, a finger pad of 15 x 38 mm across its diagonal
 NOMINAL = {  # a data sheet: a start for fits, wrong in stiffness and Poisson ratio
     "membrane_stiffness": 150.0,
     "youngs_modulus": 1.5e5,
@@ -63,7 +63,7 @@ class Plan:
     swing: Swing = field(default_factory=lambda: Swing(stretch=0.02))
     view: View = field(default_factory=View)
     every: int = 4  # motion knots per frame: 25 Hz
-    fit_nodes: int = 21
+    fit_nodes: int = 17
     initial_error: float = 1e-3  # m, along the cloth's normal
     force_noise: float = 0.05  # N
     torque_noise: float = 0.005  # N m
@@ -208,7 +208,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "torchcloth" / "examples" / "bimanual_swing")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--fit-nodes", type=int, default=21, help="vertices along each side of cloth.obj")
+    parser.add_argument("--fit-nodes", type=int, default=17, help="vertices along each side of cloth.obj")
     parser.add_argument("--overwrite", action="store_true")
     args = parser.parse_args()
     recording, facts = make(Plan(seed=args.seed, fit_nodes=args.fit_nodes))

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 import torch
-import torchcloth.robots as robots
 from torch.autograd import forward_ad
 
+import torchcloth.robots as robots
 from torchcloth.errors import InvalidInput, MissingDependency
 
 ORACLE = json.loads((Path(__file__).parent / "data" / "rizon_fk_samples.json").read_text())

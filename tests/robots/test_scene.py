@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-import torchcloth.robots as robots
 
+import torchcloth.robots as robots
 from torchcloth.errors import InvalidInput
 
 T = torch.tensor([0.0, 1.0], dtype=torch.float64)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+
 import torchcloth.robots as robots
 
 FOLDER = Path(robots.__file__).parent / "urdf"

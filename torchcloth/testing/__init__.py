@@ -1,1 +1,25 @@
-"""placeholder."""
+"""Contracts for your own parts: inherit one, say how to make the part, and pytest runs what the layer relies on.
+
+    class TestMyFabric(torchcloth.testing.MaterialContract):
+        def make(self):
+            return MyFabric(stiffness=300.0)
+
+Needs no pytest: ``MyContract().check()`` runs the same promises anywhere.
+"""
+
+from .boundary import BoundaryContract, GraspContract
+from .contract import Contract
+from .effect import EffectContract
+from .finite_differences import Sweep, check_gradients, finite_difference_sweep
+from .material import MaterialContract
+
+__all__ = [
+    "BoundaryContract",
+    "Contract",
+    "EffectContract",
+    "GraspContract",
+    "MaterialContract",
+    "Sweep",
+    "check_gradients",
+    "finite_difference_sweep",
+]

@@ -1,0 +1,88 @@
+# torchcloth: `make demo` to see it, `make test` to trust it. Everything goes into .venv; `make clean-all` removes it.
+# Other Python: `make demo PYTHON=python3.12`. Only some tests: `make test PYTEST_ARGS=tests/robots`.
+
+PYTHON ?= python3
+PYTEST_ARGS ?=
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check --no-input
+INSTALL := $(PIP) install --constraint constraints.txt
+LISTED := pyproject.toml constraints.txt
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q --durations=15 -n 2
+OPEN3D_PACKAGES := libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0 libgomp1
+
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-slow example lint format types clean clean-all
+
+help:  ## this list
+	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
+
+demo: .venv/.installed-demo  ## install the library with its robots and run the demonstration
+	$(BIN)/torchcloth demo
+
+test: .venv/.open3d-works lint types  ## install everything for development, then lint, types and tests
+	$(PYTEST) $(PYTEST_ARGS)
+
+test-slow: .venv/.open3d-works  ## the tests that take minutes
+	$(PYTEST) -m "slow and not gpu" $(PYTEST_ARGS)
+
+example: .venv/.open3d-works  ## make the shipped example again (MuJoCo simulates it, minutes)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/independent/make_example.py --out torchcloth/examples/bimanual_swing --overwrite
+
+lint: .venv/.installed-dev  ## style, without changing files
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: .venv/.installed-dev  ## put files into shape
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+types: .venv/.installed-dev  ## type check, by path
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright torchcloth robots training
+
+clean:  ## remove what tools leave behind
+	rm -rf build dist ./*.egg-info .pytest_cache .ruff_cache
+	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+
+clean-all: clean  ## clean, and remove .venv
+	rm -rf .venv
+
+# Installation. Stamps remember what was done; they age with pyproject.toml and constraints.txt.
+
+.venv/.created:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { echo "torchcloth needs Python 3.11 or newer, '$(PYTHON)' is: $$($(PYTHON) --version 2>&1 | tail -1). Choose another: make PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "Python's venv module is missing. On Debian or Ubuntu: apt-get install python3-venv" >&2; exit 1; }
+	@echo "creating .venv with $$($(PYTHON) --version)"
+	@$(PYTHON) -m venv .venv
+	@touch $@
+
+# PyTorch first and pinned: pulled in by another package, pip would take the newest, with gigabytes of CUDA.
+.venv/.torch: .venv/.created constraints.txt
+	@echo "installing PyTorch (once; 0.2 GB without CUDA, several GB with)"
+	@$(INSTALL) torch
+	@touch $@
+
+.venv/.installed-demo: .venv/.torch $(LISTED)
+	@echo "installing torchcloth with robots"
+	@$(INSTALL) --editable '.[robots]'
+	@touch $@
+
+.venv/.installed-dev: .venv/.torch $(LISTED)
+	@echo "installing torchcloth with everything for development"
+	@$(INSTALL) --editable '.[dev]'
+	@touch .venv/.installed-demo $@
+
+# open3d's wheel needs libraries of the system. Root installs them, others are told how.
+.venv/.open3d-works: .venv/.installed-dev
+	@$(BIN)/python -c 'import open3d' 2>/dev/null || { \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    echo "installing the system libraries of open3d: $(OPEN3D_PACKAGES)"; \
+	    export DEBIAN_FRONTEND=noninteractive; \
+	    apt-get update -qq && apt-get install -qq --yes --no-install-recommends $(OPEN3D_PACKAGES) >/dev/null; \
+	  else \
+	    echo "open3d lacks system libraries. On Debian or Ubuntu: sudo apt-get install $(OPEN3D_PACKAGES)" >&2; exit 1; \
+	  fi; }
+	@$(BIN)/python -c 'import open3d'
+	@touch $@

@@ -1,0 +1,171 @@
+"""Every file imports from its own room or from a floor below; rooms on one floor do not know each other.
+
+A room is a module or package directly under ``torchcloth`` (robots/ and training/ are rooms too, "" is the package
+itself). Imports inside functions and under TYPE_CHECKING count: a cycle is a cycle when it runs, and to a reader.
+"""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+COMPANIONS = ("robots", "training")  # folders of their own, installed as torchcloth.robots, torchcloth.training
+
+FLOORS = (
+    ("errors", "_math", "forward_mode"),
+    ("types", "parameters"),
+    ("meshes",),
+    ("materials", "effects", "boundaries", "transfer"),
+    ("functional", "stability", "recordings", "observe", "losses"),
+    ("cloth", "robots"),
+    ("identification", "diagnosis", "plan", "testing"),
+    ("",),  # torchcloth/__init__.py: the names a user sees
+    ("training", "demo"),
+    ("cli",),
+    ("__main__",),
+)
+
+# Rooms that must know less than their floor allows.
+ONLY = {
+    "robots": {"errors", "types", "recordings"},  # tensors cross to the cloth, nothing else
+    "recordings": {"errors", "types"},  # an episode can be read without any physics
+    "observe": {"errors"},  # to a camera a cloth is one more triangle mesh
+}
+
+# (file, room): reason. An entry that is no longer needed fails the test.
+EXCEPTIONS: dict[tuple[str, str], str] = {}
+
+
+def floor(room: str) -> int:
+    for number, rooms in enumerate(FLOORS):
+        if room in rooms:
+            return number
+    raise AssertionError(f"room {room!r} stands on no floor: place it in FLOORS, above all that it imports")
+
+
+def sources() -> dict[str, Path]:
+    """Files by dotted name, as installed: {"torchcloth.robots.arm": robots/arm.py}; packages end in ".__init__"."""
+    found = {}
+    for folder in ("torchcloth", *COMPANIONS):
+        prefix = ("torchcloth", folder) if folder in COMPANIONS else (folder,)
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            found[".".join((*prefix, *file.relative_to(ROOT / folder).with_suffix("").parts))] = file
+    return found
+
+
+SOURCES = sources()
+NAMES = {name.removesuffix(".__init__") for name in SOURCES}
+
+
+def room_of(name: str) -> str:
+    """Room of a dotted name: torchcloth.robots.arm -> robots, torchcloth.__init__ -> ""."""
+    part = [*name.split("."), ""][1]
+    return "" if part == "__init__" else part
+
+
+def imported(name: str, tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and dotted name of every import of the package in the file called ``name``."""
+    package = name.split(".")[:-1]
+    for node in ast.walk(tree):
+        found = []
+        if isinstance(node, ast.Import):
+            found = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            start = package[: len(package) - node.level + 1] if node.level else []
+            base = ".".join([*start, *([node.module] if node.module else [])])
+            names = [f"{base}.{alias.name}" for alias in node.names]
+            found = [n if n in NAMES else base for n in names]
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            called = getattr(node.func, "id", getattr(node.func, "attr", None))
+            target = node.args[0].value
+            if called in ("import_module", "__import__") and isinstance(target, str):
+                dots = len(target) - len(target.lstrip("."))
+                start = package[: len(package) - dots + 1] if dots else []
+                found = [".".join([*start, *filter(None, [target.lstrip(".")])])]
+        yield from ((getattr(node, "lineno", 0), n) for n in found if n.split(".")[0] == "torchcloth")
+
+
+def violations(name: str, text: str) -> list[tuple[int, str, str]]:
+    """(line, room, why) for every import in this source that its floor does not allow."""
+    own = room_of(name)
+    bad = []
+    for line, target in imported(name, ast.parse(text)):
+        room = room_of(target)
+        if room == own:
+            continue
+        if floor(room) >= floor(own):
+            bad.append((line, room, "sibling" if floor(room) == floor(own) else "floor above"))
+        elif own in ONLY and room not in ONLY[own]:
+            bad.append((line, room, f"{own} may import only {sorted(ONLY[own])}"))
+    return bad
+
+
+def test_every_room_has_one_floor():
+    rooms = [room for level in FLOORS for room in level]
+    assert len(rooms) == len(set(rooms))
+    for name in SOURCES:
+        floor(room_of(name))
+
+
+def test_imports_go_down():
+    wrong, used = [], set()
+    for name, file in SOURCES.items():
+        path = file.relative_to(ROOT).as_posix()
+        for line, room, why in violations(name, file.read_text(encoding="utf-8")):
+            if (path, room) in EXCEPTIONS:
+                used.add((path, room))
+            else:
+                wrong.append(f"{path}:{line} imports torchcloth{room and '.'}{room} ({why})")
+    assert not wrong, "\n" + "\n".join(wrong)
+    assert used == set(EXCEPTIONS), f"exceptions no longer needed: {set(EXCEPTIONS) - used}"
+
+
+def test_the_walk_sees_the_house():
+    """It reads files, and resolves imports that are known to be there."""
+    assert {"", "cloth", "materials", "robots", "training"} <= {room_of(name) for name in SOURCES}
+    rooms = {
+        room_of(target)
+        for _, target in imported("torchcloth.cloth", ast.parse(SOURCES["torchcloth.cloth"].read_text()))
+    }
+    assert {"functional", "materials", "boundaries"} <= rooms
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "room"),
+    [
+        ("torchcloth.meshes.mesh", "from ..cloth import Cloth", "cloth"),
+        ("torchcloth.effects.air", "from ..materials import AEP", "materials"),
+        ("torchcloth.effects.__init__", "from .. import materials", "materials"),
+        ("torchcloth.functional", "def f():\n    from .cloth import Cloth", "cloth"),
+        ("torchcloth.functional", "from . import cloth", "cloth"),
+        ("torchcloth.functional", "import torchcloth.cloth as c", "cloth"),
+        ("torchcloth.cloth", "from torchcloth import robots", "robots"),
+        ("torchcloth.cloth", "from torchcloth import Rollout", ""),
+        ("torchcloth.cloth", "import torchcloth as tc", ""),
+        ("torchcloth.cloth", "importlib.import_module('torchcloth.robots')", "robots"),
+        ("torchcloth.cloth", "import_module('.robots', __package__)", "robots"),
+        ("torchcloth.robots.arm", "from torchcloth.functional import rollout", "functional"),
+        ("torchcloth.robots.arm", "if TYPE_CHECKING:\n    from torchcloth.cloth import Cloth", "cloth"),
+        ("torchcloth.observe.render", "from ..meshes import Mesh", "meshes"),
+        ("torchcloth.training.fit", "from torchcloth.cli import main", "cli"),
+        ("torchcloth.__init__", "from . import training", "training"),
+    ],
+)
+def test_a_wrong_import_is_found(name, text, room):
+    assert [found for _, found, _ in violations(name, text)] == [room]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("torchcloth.effects.air", "from .base import AbstractEffect\nfrom ..types import Surface"),
+        ("torchcloth.cloth", "from . import functional\nfrom .boundaries.motion import drive"),
+        ("torchcloth.robots.arm", "from . import inverse\nfrom torchcloth.types import Trajectory"),
+        ("torchcloth.training.fit", "import torchcloth as tc\nfrom torchcloth.robots import load"),
+        ("torchcloth.errors", "import torch\nfrom importlib import resources"),
+    ],
+)
+def test_a_right_import_passes(name, text):
+    assert violations(name, text) == []

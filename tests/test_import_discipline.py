@@ -1,0 +1,69 @@
+"""``import torchcloth`` costs little more than ``import torch``; heavy packages are imported where they are used."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = (
+    "lightning",
+    "matplotlib",
+    "mujoco",
+    "open3d",
+    "pytorch_kinematics",
+    "pytorch_lightning",
+    "rich",
+    "scipy",
+    "trimesh",
+    "yourdfpy",
+)
+ALLOWED = 0.5  # s beyond torch; the package takes about 0.02 s, the rest is for busy machines
+
+IMPORT = """
+import json, sys, time
+import torch
+before, start = set(sys.modules), time.perf_counter()
+import torchcloth
+print(json.dumps({"seconds": time.perf_counter() - start, "modules": sorted(set(sys.modules) - before)}))
+"""
+
+
+def run(code: str) -> str:
+    """Standard output of ``code`` in a fresh interpreter."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def imports() -> list[dict]:
+    """Seconds and new modules of ``import torchcloth``, three times."""
+    return [json.loads(run(IMPORT)) for _ in range(3)]
+
+
+def test_nothing_heavy_is_imported(imports):
+    loaded = {module.partition(".")[0] for module in imports[0]["modules"]}
+    assert "torchcloth" in loaded
+    assert not loaded & set(HEAVY)
+
+
+def test_import_is_quick(imports):
+    seconds = min(found["seconds"] for found in imports)
+    assert seconds < ALLOWED, f"import torchcloth took {seconds:.2f} s beyond torch"
+
+
+@pytest.mark.parametrize("attribute", ["robots.load", "recordings.read"])
+def test_companions_come_with_the_package(attribute):
+    """``import torchcloth as tc`` is the only import that a user needs, and rooms do not pull heavy packages either."""
+    loaded = f"sorted(m for m in {HEAVY} if m in sys.modules)"
+    out = run(f"import sys, torchcloth as tc; print(callable(tc.{attribute}), *{loaded})")
+    assert out.split() == ["True"]
+
+
+def test_an_unknown_attribute_is_refused():
+    """The lazy lookup answers as a module does, so that ``hasattr`` and misspellings work."""
+    assert run("import torchcloth as tc; print(hasattr(tc, 'robotz'))").strip() == "False"

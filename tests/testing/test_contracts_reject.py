@@ -1,0 +1,259 @@
+"""A contract is worth what it rejects: every promise is broken once, on purpose, and its test must notice."""
+
+import pytest
+import torch
+
+import torchcloth as tc
+from torchcloth._math import dot
+from torchcloth.testing import BoundaryContract, EffectContract, GraspContract, MaterialContract
+
+
+def material_contract(law):
+    class Contract(MaterialContract):
+        def make(self):
+            return law(1e5, 0.3, 4e5, 7e4, cone=0.4)
+
+    return Contract()
+
+
+class WrongSign(tc.materials.AEP):
+    def membrane_stress(self, c, surface):
+        return tuple(-column for column in super().membrane_stress(c, surface))
+
+
+class SlightlyWrongStress(tc.materials.AEP):
+    def membrane_stress(self, c, surface):
+        return super().membrane_stress(c._replace(lam=c.lam * (1 + 1e-6)), surface)
+
+
+class WorldAxes(tc.materials.AEP):
+    """Stiffer along the world's x: what a QR in world axes does."""
+
+    def membrane_energy(self, c, surface):
+        return super().membrane_energy(c, surface) + 0.01 * c.mu * (surface.f1[..., :1] ** 2)
+
+    def membrane_stress(self, c, surface):
+        first, second = super().membrane_stress(c, surface)
+        axis = torch.tensor([1.0, 0.0, 0.0]).to(first)
+        return first + 0.02 * c.mu * surface.f1 * axis, second
+
+
+class Prestressed(tc.materials.AEP):
+    def membrane_stress(self, c, surface):
+        first, second = super().membrane_stress(c, surface)
+        return first + 1e-6 * c.mu * surface.f1, second
+
+
+class CreepingReturnMap(tc.materials.AEP):
+    def return_map(self, c, n, d3):
+        once = super().return_map(c, n, d3)
+        return once + 0.5 * (n - once) * (dot(n, once) < 1)
+
+
+class DetachedParameter(tc.materials.AEP):
+    def coefficients(self):
+        c = super().coefficients()
+        return c._replace(shear=c.shear.detach())
+
+
+class NaNAtRest(tc.materials.AEP):
+    def director_energy(self, c, n, d3):
+        r = d3 - dot(n, d3) * n
+        return super().director_energy(c, n, d3) + 0 * r.norm(dim=-1, keepdim=True).sqrt()
+
+
+class Understated(tc.materials.AEP):
+    def stiffness(self, c):
+        return super().stiffness(c)._replace(lame_mu=0.9 * c.mu)
+
+
+class ForgetsTheBatch(tc.materials.AEP):
+    def membrane_stress(self, c, surface):
+        return tuple(column - 1e-9 * column.mean(0) for column in super().membrane_stress(c, surface))
+
+
+class AlwaysDouble(tc.materials.AEP):
+    def membrane_energy(self, c, surface):
+        return super().membrane_energy(c, surface).double()
+
+
+@pytest.mark.parametrize(
+    ("law", "promise"),
+    [
+        (WrongSign, "test_stress_is_the_derivative_of_the_energy"),
+        (SlightlyWrongStress, "test_stress_is_the_derivative_of_the_energy"),
+        (WorldAxes, "test_is_frame_indifferent"),
+        (Prestressed, "test_rest_is_stress_free"),
+        (CreepingReturnMap, "test_return_map_is_idempotent"),
+        (DetachedParameter, "test_gradients_in_state_and_parameters"),
+        (NaNAtRest, "test_gradients_are_finite_at_rest"),
+        (Understated, "test_stiffness_bounds_the_tangents_at_rest"),
+        (ForgetsTheBatch, "test_batches_equal_loops"),
+        (AlwaysDouble, "test_works_in_float32"),
+    ],
+)
+def test_material(law, promise):
+    contract = material_contract(law)
+    with pytest.raises(AssertionError):
+        getattr(contract, promise)()
+    with pytest.raises(AssertionError):
+        contract.check()
+
+
+def test_world_axes_are_caught_by_symmetry_alone():
+    """Its stress is the exact derivative of its energy: only the turned frame shows the mistake."""
+    material_contract(WorldAxes).test_stress_is_the_derivative_of_the_energy()
+
+
+def effect_contract(kind):
+    class Contract(EffectContract):
+        def make(self, amplitude):
+            return kind(amplitude)
+
+    return Contract()
+
+
+class Leaks(tc.effects.MassDamping):
+    def force(self, c, state, surface, mass):
+        return super().force(c, state, surface, mass) - 1e-12 * mass * state.v
+
+
+class Undeclared(tc.effects.MassDamping):
+    acts_on = "triangles"
+
+
+class OffByOneInTenThousand(tc.effects.MassDamping):
+    def force(self, c, state, surface, mass):
+        force = super().force(c, state, surface, mass)
+        return force - 1e-4 * (force - force.detach())  # right value, derivative off by 1e-4
+
+
+class RootOfSpeed(tc.effects.MassDamping):
+    def force(self, c, state, surface, mass):
+        speed = dot(state.v, state.v).sqrt()
+        return super().force(c, state, surface, mass) * speed / (speed + 1.0)
+
+
+class SilentlyStiff(tc.effects.Bending):
+    def rates(self, c, mass):
+        return mass.new_zeros(()), mass.new_zeros(())
+
+
+class StiffAtZero(tc.effects.MassDamping):
+    def rates(self, c, mass):
+        return mass.new_full((), 1e9), c.amax()
+
+
+class MixesTheBatch(tc.effects.MassDamping):
+    def force(self, c, state, surface, mass):
+        return super().force(c, state, surface, mass) * (1 + state.v.mean())
+
+
+@pytest.mark.parametrize(
+    ("kind", "promise"),
+    [
+        (Leaks, "test_amplitude_zero_is_bitwise_the_base_model"),
+        (StiffAtZero, "test_amplitude_zero_is_bitwise_the_base_model"),
+        (Undeclared, "test_declares_itself"),
+        (OffByOneInTenThousand, "test_gradients"),
+        (RootOfSpeed, "test_gradients_are_finite_at_rest"),
+        (SilentlyStiff, "test_rates_bound_the_spectrum_at_rest"),
+        (MixesTheBatch, "test_batches_equal_loops"),
+    ],
+)
+def test_effect(kind, promise):
+    with pytest.raises(AssertionError):
+        getattr(effect_contract(kind), promise)()
+
+
+def boundary_contract(kind):
+    class Contract(BoundaryContract):
+        def make(self):
+            return kind()
+
+    return Contract()
+
+
+class PlainNorm(tc.boundaries.Plane):
+    def apply(self, x, v, mass, dt, drive, substep):
+        after, impulse = super().apply(x, v, mass, dt, drive, substep)
+        return after + 0 * v.norm(dim=-1, keepdim=True).sqrt(), impulse
+
+
+class Brakes(tc.boundaries.Plane):
+    def apply(self, x, v, mass, dt, drive, substep):
+        after, impulse = super().apply(x, v, mass, dt, drive, substep)
+        return 0.9 * after, impulse
+
+
+class FarAway(tc.boundaries.Plane):
+    def __init__(self):
+        super().__init__(point=(0.0, 0.0, -9.0))
+
+
+class DetachedFriction(tc.boundaries.Plane):
+    def apply(self, x, v, mass, dt, drive, substep):
+        value = self.friction.value
+        after, impulse = super().apply(x, v, mass, dt, drive, substep)
+        return after - 0.1 * (value - value.detach()) * (after - v), impulse
+
+
+@pytest.mark.parametrize(
+    ("kind", "promise"),
+    [
+        (PlainNorm, "test_gradients_are_finite_at_rest"),
+        (Brakes, "test_applying_twice_changes_nothing"),
+        (FarAway, "test_acts"),
+        (DetachedFriction, "test_gradients"),
+    ],
+)
+def test_boundary(kind, promise):
+    with pytest.raises(AssertionError):
+        getattr(boundary_contract(kind), promise)()
+
+
+def grasp_contract(kind):
+    class Contract(GraspContract):
+        def make(self):
+            return kind(self.held())
+
+        def held(self):
+            return [0, 3, 4]
+
+    return Contract()
+
+
+class Drifts(tc.boundaries.Grasp):
+    def apply(self, x, v, mass, dt, drive, substep):
+        after, impulse = super().apply(x, v, mass, dt, drive, substep)
+        return after if drive is None else after * (1 + 1e-9), impulse
+
+
+class ForceAtTheBase(tc.boundaries.Grasp):
+    """Moment about the world's origin instead of the gripper's."""
+
+    def apply(self, x, v, mass, dt, drive, substep):
+        return super().apply(x, v, mass, dt, drive._replace(origin=0 * drive.origin), substep)
+
+
+class NeverOpens(tc.boundaries.Grasp):
+    def apply(self, x, v, mass, dt, drive, substep):
+        return super().apply(x, v, mass, dt, drive._replace(closed=(True,) * len(drive.closed)), substep)
+
+
+class Undriven(tc.boundaries.Grasp):
+    driven = False
+
+
+@pytest.mark.parametrize(
+    ("kind", "promise"),
+    [
+        (Drifts, "test_held_vertices_follow_the_pose_exactly"),
+        (ForceAtTheBase, "test_impulse_is_the_change_of_momentum"),
+        (NeverOpens, "test_an_open_gripper_lets_go"),
+        (Undriven, "test_is_driven"),
+    ],
+)
+def test_grasp(kind, promise):
+    with pytest.raises(AssertionError):
+        getattr(grasp_contract(kind), promise)()

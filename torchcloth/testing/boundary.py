@@ -1,0 +1,198 @@
+"""The contracts of boundaries."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import torch
+from torch import Tensor
+
+from ..boundaries import AbstractBoundary, Drive, drive
+from ..cloth import Cloth
+from ..materials import AEP
+from ..meshes import Mesh, rectangle
+from ..types import Trajectory
+from . import samples
+from .contract import Contract, batched, call_with, close, demand, finite_gradients, float64, parameters_of, single
+from .finite_differences import check_gradients
+
+
+class BoundaryContract(Contract):
+    """What the layer relies on in a boundary. Override ``make``; ``sample`` if it does not act near z = 0.
+
+    Attributes:
+        dt: substep of the trials [s].
+    """
+
+    dt = 1e-3
+
+    @abstractmethod
+    def make(self) -> AbstractBoundary:
+        """The boundary, not yet bound to a mesh."""
+
+    def mesh(self) -> Mesh:
+        """The sheet on which the boundary is tried."""
+        return rectangle(0.3, 0.2, resolution=(4, 4))
+
+    def sample(self) -> tuple[Tensor, Tensor]:
+        """Positions and velocities [V, 3] of which some feel the boundary and some do not, none exactly between."""
+        rest = torch.as_tensor(self.mesh().vertices)
+        lift = torch.tensor([0.0, 0.0, 0.001], dtype=rest.dtype)  # a step of dt at 1 m/s: some arrive, some do not
+        return rest + lift * samples.normal((len(rest), 1), 1), samples.normal(tuple(rest.shape), 2)
+
+    def rest(self) -> tuple[Tensor, Tensor]:
+        """A state exactly on the boundary and still, where square roots and switches lose their derivatives."""
+        x = torch.as_tensor(self.mesh().vertices)
+        return x, torch.zeros_like(x)
+
+    def _boundary(self) -> AbstractBoundary:
+        with float64():
+            return self.make().double().bind(self.mesh()).double()
+
+    def _mass(self) -> Tensor:
+        with float64():
+            return Cloth(self.mesh(), AEP(1e5), 0.2, contact=None).model().mass.detach()
+
+    def _drive(self, pose: Tensor | None) -> Drive | None:
+        return None
+
+    def _pose(self) -> Tensor | None:
+        return None
+
+    def _apply(self, boundary: AbstractBoundary, x: Tensor, v: Tensor, pose: Tensor | None = None) -> Tensor:
+        return boundary.apply(x, v, self._mass().to(x), self.dt, self._drive(pose), 1)[0]
+
+    def _inputs(self) -> dict[str, Tensor]:
+        x, v = self.sample()
+        pose = self._pose()
+        return {"x": x, "v": v} if pose is None else {"x": x, "v": v, "pose": pose}
+
+    def test_acts(self) -> None:
+        """On the sampled state it changes some velocities; else the other tests show nothing."""
+        inputs = self._inputs()
+        changed = (self._apply(self._boundary(), **inputs).detach() != inputs["v"]).any(-1)
+        demand(changed.any(), "the boundary changes nothing on sample(); override sample()")
+
+    def test_applying_twice_changes_nothing(self) -> None:
+        """The layer applies boundaries before and after contact: the second time must find nothing to do."""
+        boundary, inputs = self._boundary(), self._inputs()
+        once = self._apply(boundary, **inputs).detach()
+        twice = self._apply(boundary, **{**inputs, "v": once}).detach()
+        close(twice, once, 1e-11, "applying the boundary twice differs from once")
+
+    def test_gradients(self) -> None:
+        """Sweeps in positions, velocities, poses and every parameter."""
+        boundary = self._boundary()
+        names = parameters_of(boundary)
+
+        def evaluate(**values: Tensor) -> Tensor:
+            own = {name: values.pop(name) for name in names}
+            return call_with(boundary, own, self._apply, values["x"], values["v"], values.get("pose"))
+
+        # steps small enough that no vertex changes between touching and free
+        check_gradients(evaluate, {**self._inputs(), **names}, 1e-7, steps=[10.0 ** (-2 - k / 2) for k in range(9)])
+
+    def test_gradients_are_finite_at_rest(self) -> None:
+        """Exactly on the boundary, still."""
+        boundary = self._boundary()
+        x, v = self.rest()
+        pose = self._pose()
+        state = {"x": x, "v": v} if pose is None else {"x": x, "v": v, "pose": pose}
+        leaves = {name: value.clone().requires_grad_() for name, value in state.items()}
+        result = self._apply(boundary, **leaves)
+        demand(torch.isfinite(result).all(), "velocities are not finite at rest on the boundary")
+        finite_gradients(result, {**leaves, **dict(boundary.named_parameters())}, "at rest on the boundary")
+
+    def test_batches_equal_loops(self) -> None:
+        """Batched states, poses and parameters give what a loop gives."""
+        boundary = self._boundary()
+        parameters = parameters_of(boundary)
+        many = batched(parameters, 3)
+        stacks = {name: torch.stack([value] * 3) for name, value in self._inputs().items()}
+        stacks["v"] = stacks["v"] * torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64)[:, None, None]
+        if "pose" in stacks:
+            shift = torch.zeros_like(stacks["pose"])
+            shift[..., :3, 3] = 0.01 * samples.normal((*shift.shape[:-2], 3), 8)
+            stacks["pose"] = stacks["pose"] + shift
+        together = call_with(boundary, many, self._apply, *stacks.values()).detach()
+        for k in range(3):
+            one = [value[k] for value in stacks.values()]
+            alone = call_with(boundary, single(many, parameters, k), self._apply, *one).detach()
+            close(together[k], alone, 1e-12, f"batch entry {k} differs from the loop")
+
+    def test_works_in_float32(self) -> None:
+        """Same velocities to single precision, and no silent promotion."""
+        inputs = self._inputs()
+        exact = self._apply(self._boundary(), **inputs).detach()
+        got = self._apply(self._boundary().float(), **{k: value.float() for k, value in inputs.items()}).detach()
+        demand(got.dtype == torch.float32, f"apply answers float32 with {got.dtype}")
+        # positions of 0.3 m in float32 over a step of 1 ms: 2e-8 m / 1e-3 s = 2e-5 m/s
+        close(got.double(), exact, 1e-4, "velocities in float32")
+
+
+class GraspContract(BoundaryContract):
+    """What the layer relies on in a boundary that carries vertices along a trajectory. Override ``make``, ``held``."""
+
+    substeps = 200
+
+    @abstractmethod
+    def held(self) -> list[int]:
+        """The vertices that are carried."""
+
+    def _pose(self) -> Tensor:
+        """[K, 4, 4]: a turn about a tilted axis while the body travels."""
+        angle = torch.linspace(0.0, 1.2, 5, dtype=torch.float64)[:, None, None]
+        a, b, c = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+        o = torch.zeros((), dtype=torch.float64)
+        axis = torch.stack([o, -c, b, c, o, -a, -b, a, o]).reshape(3, 3)
+        pose = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+        pose[:, :3, :3] = torch.linalg.matrix_exp(angle * axis)
+        pose[:, :3, 3] = 0.1 * angle[:, 0] ** 2 * pose.new_tensor([1.0, -0.5, 0.7])
+        return pose
+
+    def _times(self, pose: Tensor) -> Tensor:
+        return torch.linspace(0.0, self.substeps * self.dt, pose.shape[-3], dtype=pose.dtype)
+
+    def _drive(self, pose: Tensor | None, closed: bool = True) -> Drive:
+        demand(pose is not None, "a driven boundary needs a pose")
+        assert pose is not None  # for the type checker
+        t = self._times(pose)
+        flags = torch.full((len(t),), closed)
+        substeps = torch.linspace(0.0, float(t[-1]), self.substeps + 1, dtype=pose.dtype)
+        return drive(Trajectory(t, pose, flags), substeps)
+
+    def test_is_driven(self) -> None:
+        """Without a trajectory the layer must refuse to run."""
+        demand(type(self._boundary()).driven, "a grasp must declare driven = True")
+
+    def test_held_vertices_follow_the_pose_exactly(self) -> None:
+        """No drift over many substeps, whatever the rest of the cloth does."""
+        boundary, mass = self._boundary(), self._mass()
+        pose, held = self._pose(), self.held()
+        motion = self._drive(pose)
+        x, v = self.sample()
+        start, wild = x[held], v
+        for k in range(self.substeps):
+            v, _ = boundary.apply(x, v + 0.1 * wild, mass, self.dt, motion, k)
+            x = x + self.dt * v
+        turn = pose[-1, :3, :3] @ pose[0, :3, :3].mT
+        expected = (start - pose[0, :3, 3]) @ turn.mT + pose[-1, :3, 3]
+        close(x[held], expected, 1e-12, "held vertices do not follow the pose")
+
+    def test_impulse_is_the_change_of_momentum(self) -> None:
+        """The reaction that a force sensor reads, about the body's own origin, at the end of the substep."""
+        boundary, mass = self._boundary(), self._mass()
+        motion = self._drive(self._pose())
+        x, v = self.sample()
+        after, impulse = boundary.apply(x, v, mass, self.dt, motion, 3)
+        demand(impulse is not None, "a closed gripper reports no impulse")
+        change = mass * (after - v)
+        moment = torch.linalg.cross(x + self.dt * after - motion.origin[3], change).sum(0)
+        assert impulse is not None  # for the type checker
+        close(impulse, torch.cat([change.sum(0), moment]), 1e-12, "impulse differs from the change of momentum")
+
+    def test_an_open_gripper_lets_go(self) -> None:
+        """Velocities pass untouched and no impulse is reported."""
+        x, v = self.sample()
+        after, impulse = self._boundary().apply(x, v, self._mass(), self.dt, self._drive(self._pose(), False), 0)
+        demand(torch.equal(after, v) and impulse is None, "an open gripper changes the cloth")

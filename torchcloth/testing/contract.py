@@ -1,0 +1,101 @@
+"""What all contracts share."""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+
+class Contract(ABC):  # noqa: B024 - what is abstract differs between the contracts
+    """Promises that a part must keep, as ``test_...`` methods without arguments.
+
+    Inherit it in a class called ``Test...`` and pytest collects it; or call ``check`` from anywhere.
+    """
+
+    def check(self) -> None:
+        """Run every promise; the first broken one raises AssertionError."""
+        for name in dir(self):
+            if name.startswith("test_"):
+                getattr(self, name)()
+
+
+@contextmanager
+def float64() -> Iterator[None]:
+    """Parts made in here are float64 from the start, not float32 numbers written out in float64."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+class _Caller(nn.Module):
+    def __init__(self, part: nn.Module, function: Callable[..., Any]) -> None:
+        super().__init__()
+        self.part, self.function = part, function
+
+    def forward(self, *args: Any) -> Any:
+        return self.function(self.part, *args)
+
+
+def call_with(part: nn.Module, parameters: dict[str, Tensor], function: Callable[..., Any], *args: Any) -> Any:
+    """``function(part, *args)`` with the part's parameters replaced, so that gradients and batches reach them."""
+    named = {f"part.{name}": value for name, value in parameters.items()}
+    return functional_call(_Caller(part, function), named, args)
+
+
+def parameters_of(part: nn.Module) -> dict[str, Tensor]:
+    """The part's own parameters by name, detached."""
+    return {name: value.detach() for name, value in part.named_parameters()}
+
+
+def batched(parameters: dict[str, Tensor], size: int, spread: float = 0.1) -> dict[str, Tensor]:
+    """``size`` different copies of each parameter in the layout of a batch: [] -> [B, 1], [...] -> [B, ...]."""
+    factor = 1 + spread * torch.linspace(-1, 1, size, dtype=torch.float64)
+    return {name: factor.reshape(-1, *[1] * max(1, p.ndim)) * p for name, p in parameters.items()}
+
+
+def single(parameters: dict[str, Tensor], like: dict[str, Tensor], k: int) -> dict[str, Tensor]:
+    """Copy ``k`` of a batch of parameters, in the shape of the unbatched ones."""
+    return {name: value[k].reshape(like[name].shape) for name, value in parameters.items()}
+
+
+def close(got: Tensor, expected: Tensor, tolerance: float, message: str) -> None:
+    """Demand |got - expected| <= tolerance x largest |expected|.
+
+    Raises:
+        AssertionError: shapes that differ, anything not finite, or a larger difference.
+    """
+    if got.shape != expected.shape:
+        raise AssertionError(f"{message}: shape {tuple(got.shape)}, expected {tuple(expected.shape)}")
+    if got.numel() == 0:
+        return
+    got, expected = got.detach(), expected.detach()
+    scale = float(expected.abs().max())
+    error = float((got - expected).abs().max())
+    if not error <= tolerance * scale:
+        raise AssertionError(f"{message}: off by {error:.2e}, allowed {tolerance:.0e} of {scale:.3e}")
+
+
+def demand(condition: bool | Tensor, message: str) -> None:
+    """Raise AssertionError with ``message`` unless ``condition``; unlike ``assert``, also under ``python -O``."""
+    if not bool(condition):
+        raise AssertionError(message)
+
+
+def finite_gradients(result: Tensor, leaves: dict[str, Tensor], where: str) -> None:
+    """Demand finite gradients of ``result``'s sum.
+
+    Raises:
+        AssertionError: naming the leaf.
+    """
+    gradients = torch.autograd.grad(result.sum(), list(leaves.values()), allow_unused=True)
+    for name, gradient in zip(leaves, gradients, strict=True):
+        demand(gradient is None or torch.isfinite(gradient).all(), f"the gradient in {name!r} is not finite {where}")
