@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -46,6 +46,11 @@ class Episode:
     initial: Tensor
     settles: bool
     noise: float | None
+
+    def until(self, share: float) -> Episode:
+        """The first ``share`` of the frames, at least four."""
+        count = max(4, round(share * len(self.clouds)))
+        return replace(self, times=self.times[:count], clouds=self.clouds[:count])
 
 
 def cloth_from(

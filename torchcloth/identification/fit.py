@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
@@ -12,18 +11,22 @@ from torch import Tensor
 
 from ..cloth import Cloth
 from ..errors import InvalidInput
+from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from . import gauss_newton
 from .descent import descend
-from .episodes import Episode, episode
-from .misfit import Figures, figures, rows
+from .episodes import episode
+from .misfit import Figures, figures
 from .null import rigid_carry
-from .replays import simulate, tangents
+from .objective import Objective
 from .report import estimates, warnings_of
 from .result import Identification
-from .unknowns import Unknown, collect
+from .unknowns import collect
 
 PAPER_ITERATIONS, PAPER_CHAMFER = 35, 0.015  # the DiffCP paper's stop rule: iterations, metres
+EARLY = 0.35  # share of the frames that the first stage of the fit sees
+NONLINEAR = 0.5  # relative error of the tangents over one standard error above which they are not used for errors
+SECANT = 0.01  # smallest finite step, in units of the prior's standard deviation
 
 Progress = Callable[[int, float, dict[str, float]], None]
 
@@ -70,8 +73,8 @@ def identify(
         raise InvalidInput("recordings", got="none", expected="at least one episode")
     names = default_parameters(cloth) if parameters is None else list(parameters)
     unknowns = collect(cloth, names, episodes_in[0].cloth.areal_density_std)
-    run = _Run(cloth, unknowns, [episode(cloth, r) for r in episodes_in], stop, on_progress)
-    return run.solve(method, iterations, rate)
+    objective = Objective(cloth, unknowns, [episode(cloth, r) for r in episodes_in])
+    return _Run(objective, stop, on_progress).solve(method, iterations, rate)
 
 
 def default_parameters(cloth: Cloth) -> list[str]:
@@ -79,115 +82,81 @@ def default_parameters(cloth: Cloth) -> list[str]:
     names = [name for name, _ in cloth.material.named_children()]
     if cloth.contact is None:
         names = [name for name in names if name in ("youngs_modulus", "poisson_ratio")]
-    return names + [f"{key}.normal" for key, effect in cloth.effects.items() if hasattr(effect, "normal")]
+    for key, effect in cloth.effects.items():
+        names += [f"{key}.{name}" for name, part in effect.named_children() if isinstance(part, PhysicalParameter)]
+    return names
 
 
 class _Run:
-    """State of one fit: counts simulations, keeps the history, knows when to stop."""
+    """One fit: keeps the history, knows when to stop, turns the final point into statements."""
 
-    def __init__(
-        self,
-        cloth: Cloth,
-        unknowns: list[Unknown],
-        episodes: list[Episode],
-        stop: str,
-        on_progress: Progress | None,
-    ) -> None:
-        self.cloth, self.unknowns, self.episodes = cloth, unknowns, episodes
-        self.stop, self.on_progress = stop, on_progress
-        self.faces = torch.as_tensor(cloth.mesh.faces)
-        self.start = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
+    def __init__(self, objective: Objective, stop: str, on_progress: Progress | None) -> None:
+        self.objective, self.stop, self.on_progress = objective, stop, on_progress
         self.history: list[dict[str, Any]] = []
-        self.frames: dict[tuple[float, ...], list[Tensor]] = {}
         self.simulations, self.began = 0, time.perf_counter()
 
     def solve(self, method: str, iterations: int, rate: float) -> Identification:
-        null = [rigid_carry(e) for e in self.episodes]
-        problem = self._problem()
+        full = self.objective
+        before = full.frames(full.start)
         if method == "adam":
-            raw = descend(
-                self.cloth, self.unknowns, self.episodes, self.start, iterations, rate, self._record_descent
-            )  # fmt: skip
-            final = gauss_newton.minimise(problem, raw, 0, lambda _: True)
+            raw = descend(full, iterations, rate, self._record)
+            final = gauss_newton.minimise(full.problem(), raw, 0, lambda _: True)
         else:
-            final = gauss_newton.minimise(problem, self.start, iterations, lambda it: self._record(it.raw))
-        before = self._frames(self.start)
-        after = self._frames(final.raw)
-        found = estimates(self.cloth, self.unknowns, final.raw, gauss_newton.covariance(problem, final))
-        distances = [figures(x, self.episodes, self.faces) for x in (before, after, null)]
-        fit = self._fit_figures(*distances)
-        warnings = warnings_of(self.cloth, self.episodes, found, fit, after, self.faces)
-        keys = {u.name: u.key.removesuffix(".raw") for u in self.unknowns}
+            final = self._gauss_newton(iterations)
+        after = full.frames(final.raw)
+        final, warnings = self._check_linearity(final)
+        covariance = gauss_newton.covariance(full.problem(), final)
+        found = estimates(full.cloth, full.unknowns, final.raw, covariance)
+        null = [rigid_carry(e) for e in full.episodes]
+        distances = (figures(x, full.episodes, full.faces) for x in (before, after, null))
+        fit = self._fit_figures(*distances, independent=final.share * float((final.linear.value != 0).sum()))
+        warnings += warnings_of(full.cloth, full.episodes, found, fit, after, full.faces)
+        keys = {u.name: u.key.removesuffix(".raw") for u in full.unknowns}
         return Identification(
             found.parameters, fit, found.correlation, warnings, self.history, before, after, null, keys
         )
 
-    def _problem(self) -> gauss_newton.Problem:
-        noises = [e.noise for e in self.episodes if e.noise is not None]
-        return gauss_newton.Problem(
-            linearise=self._linearise,
-            evaluate=self._evaluate,
-            clip=lambda raw: torch.tensor(
-                [u.clip(float(r)) for u, r in zip(self.unknowns, raw, strict=True)], dtype=raw.dtype
-            ),
-            prior_mean=self.start,
-            prior_std=torch.tensor([u.prior_std for u in self.unknowns], dtype=torch.float64),
-            noise=max(noises) if noises else None,
+    def _gauss_newton(self, iterations: int) -> gauss_newton.Iterate:
+        """First the early frames, where a wrong start has not yet led the cloth elsewhere; then all of them."""
+        full = self.objective
+        early = Objective(full.cloth, full.unknowns, [e.until(EARLY) for e in full.episodes])
+        first = gauss_newton.minimise(early.problem(), full.start, iterations, lambda it: self._record(it.raw, early))
+        self.simulations += early.simulations
+        left = max(1, iterations - len(self.history))
+        return gauss_newton.minimise(full.problem(), first.raw, left, lambda it: self._record(it.raw, full))
+
+    def _check_linearity(self, final: gauss_newton.Iterate) -> tuple[gauss_newton.Iterate, list[str]]:
+        """Compare the tangents with a finite step of one standard error; where they fail, differences replace them."""
+        full = self.objective
+        covariance = gauss_newton.covariance(full.problem(), final)
+        deviation = covariance.diagonal().sqrt()
+        values, vectors = torch.linalg.eigh(covariance / deviation[:, None] / deviation[None, :])
+        step = full.clip(final.raw + values[-1].sqrt() * vectors[:, -1] * deviation) - final.raw
+        seen = full.evaluate(final.raw + step)[0] - final.linear.value
+        told = final.linear.jacobian @ step
+        error = float((seen - told).norm() / seen.norm().clamp(min=1e-12))
+        if error < NONLINEAR:
+            return final, []
+        steps = torch.maximum(deviation, torch.tensor([SECANT * u.prior_std for u in full.unknowns]))
+        linear = full.secants(final.raw, steps)
+        warning = (
+            f"the motion is unstable or strongly nonlinear at the solution (tangents miss a step of one standard error by "
+            f"{100 * error:.0f} %): errors come from finite differences and are rough"
         )
+        return final._replace(linear=linear), [warning]
 
-    def _linearise(self, raw: Tensor) -> gauss_newton.Linearised:
-        parts, frames, clusters, first = [], [], [], 0
-        for e in self.episodes:
-            x, tangent = tangents(self.cloth, self.unknowns, raw, e)
-            frames.append(x)
-            parts.append(rows(x, tangent, e, self.faces))
-            clusters.append(parts[-1].frame + first)
-            first += len(e.clouds)
-        self.simulations += len(self.unknowns) * len(self.episodes)
-        self._remember(raw, frames)
-        jacobian = torch.cat([p.jacobian for p in parts if p.jacobian is not None])
-        value, factor = torch.cat([p.value for p in parts]), torch.cat([p.factor for p in parts])
-        double = torch.float64
-        return gauss_newton.Linearised(value.to(double), jacobian.to(double), factor.to(double), torch.cat(clusters))
-
-    def _evaluate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        frames = self._frames(raw)
-        parts = [rows(x, None, e, self.faces) for x, e in zip(frames, self.episodes, strict=True)]
-        return (
-            torch.cat([p.value for p in parts]).to(torch.float64),
-            torch.cat([p.factor for p in parts]).to(torch.float64),
-        )
-
-    def _frames(self, raw: Tensor) -> list[Tensor]:
-        key = tuple(raw.tolist())
-        if key not in self.frames:
-            with torch.no_grad():
-                frames = [simulate(self.cloth, self.unknowns, raw, e) for e in self.episodes]
-            self.simulations += len(self.episodes)
-            self._remember(raw, frames)
-        return self.frames[key]
-
-    def _remember(self, raw: Tensor, frames: list[Tensor]) -> None:
-        start = tuple(self.start.tolist())
-        kept = {k: v for k, v in self.frames.items() if k == start or k == next(reversed(self.frames))}
-        self.frames = {**kept, tuple(raw.tolist()): frames}
-
-    def _record(self, raw: Tensor) -> bool:
-        now = figures(self._frames(raw), self.episodes, self.faces)
-        values = {u.name: u.value(float(r)) for u, r in zip(self.unknowns, raw, strict=True)}
-        self.history.append({"iteration": len(self.history), "chamfer": now.chamfer, "rms": now.rms, **values})
+    def _record(self, raw: Tensor, objective: Objective) -> bool:
+        now = figures(objective.frames(raw), objective.episodes, objective.faces)
+        values = objective.values(raw)
+        share = len(objective.episodes[0].clouds) / len(self.objective.episodes[0].clouds)
+        entry = {"iteration": len(self.history), "frames": share, "chamfer": now.chamfer, "rms": now.rms}
+        self.history.append({**entry, **values})
         if self.on_progress is not None:
             self.on_progress(len(self.history) - 1, now.chamfer, values)
-        return self.stop == "paper" and now.chamfer < PAPER_CHAMFER
+        return self.stop == "paper" and objective is self.objective and now.chamfer < PAPER_CHAMFER
 
-    def _record_descent(self, raw: Tensor, frames: list[Tensor]) -> bool:
-        self.simulations += len(self.episodes)
-        self._remember(raw, frames)
-        return self._record(raw)
-
-    def _fit_figures(self, before: Figures, after: Figures, null: Figures) -> dict[str, float]:
-        seconds = time.perf_counter() - self.began
-        out: dict[str, float] = {
+    def _fit_figures(self, before: Figures, after: Figures, null: Figures, independent: float) -> dict[str, float]:
+        return {
             "chamfer_before": before.chamfer,
             "chamfer_after": after.chamfer,
             "chamfer_null": null.chamfer,
@@ -195,10 +164,9 @@ class _Run:
             "rms_after": after.rms,
             "rms_null": null.rms,
             "iterations": max(0, len(self.history) - 1),
-            "simulations": self.simulations,
-            "seconds": seconds,
-            "stable_step": self.cloth.stable_step(),
+            "simulations": self.simulations + self.objective.simulations,
+            "seconds": time.perf_counter() - self.began,
+            "points": sum(len(c) for e in self.objective.episodes for c in e.clouds),
+            "independent_observations": independent,
+            "stable_step": self.objective.cloth.stable_step(),
         }
-        if not all(math.isfinite(value) for value in out.values()):
-            raise InvalidInput("fit", got=str(out), expected="finite figures")
-        return out

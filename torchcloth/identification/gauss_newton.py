@@ -12,22 +12,25 @@ from ..errors import SimulationDiverged, UnstableStep
 from .misfit import huber, noise_scale
 
 LONGEST_STEP = 1.5  # in unconstrained units: a factor of 4.5 on a log parameter
+TRUSTED_GAIN = 0.5  # share of the predicted decrease above which an updated Jacobian is good enough
+WINDOW = 5  # frames within which residuals of one patch count as one observation
 
 
 class Linearised(NamedTuple):
-    """Residuals of all episodes at one point."""
+    """Residuals of all episodes at one point; rows keep their meaning between points."""
 
     value: Tensor  # [R] m
     jacobian: Tensor  # [R, K]
     factor: Tensor  # [R]
-    cluster: Tensor  # [R] int64, consecutive frames of one episode follow each other
+    frame: Tensor  # [R] int64, counted through all episodes
+    patch: Tensor  # [R] int64
 
 
 class Problem(NamedTuple):
     """Callbacks of the fit."""
 
     linearise: Callable[[Tensor], Linearised]
-    evaluate: Callable[[Tensor], tuple[Tensor, Tensor]]  # raw -> (value, factor), without derivatives
+    evaluate: Callable[[Tensor], tuple[Tensor, Tensor]]  # raw -> (value [R], patch [R]), without derivatives
     clip: Callable[[Tensor], Tensor]
     prior_mean: Tensor  # [K]
     prior_std: Tensor  # [K]
@@ -39,52 +42,130 @@ class Iterate(NamedTuple):
 
     raw: Tensor
     linear: Linearised
-    cost: float
-    scale: float  # m
+    exact: bool  # the Jacobian was computed here, not updated from elsewhere
+    scale: float  # m, of one residual
+    share: float  # independent observations per residual, <= 1
 
 
 def minimise(problem: Problem, start: Tensor, iterations: int, on_iterate: Callable[[Iterate], bool]) -> Iterate:
     """Minimise the robust cost; ``on_iterate`` sees every accepted point and returns True to stop.
 
-    The noise scale is re-estimated at every accepted point, and the damping is adapted to how well the linear model
-    predicted the last step.
+    Between exact linearisations the Jacobian is updated by Broyden's rank-one formula as long as the linear model
+    predicts the steps. Scale and correlation of the residuals are re-estimated at every accepted point. The returned
+    point is linearised exactly.
     """
     current = _linearise(problem, start)
     damping = 1e-3
     for _ in range(iterations):
         if on_iterate(current):
+            return _exact(problem, current)
+        trial, gain, damping = _step(problem, current, damping)
+        if trial is None and current.exact:
             return current
-        gradient, hessian = _normal_equations(problem, current)
-        for _attempt in range(8):
-            step = torch.linalg.solve(hessian + damping * torch.diag(hessian.diagonal()), -gradient)
-            step = step * min(1.0, LONGEST_STEP / float(step.abs().max().clamp(min=1e-12)))
-            trial = problem.clip(current.raw + step)
-            cost = _cost(problem, trial, current.scale)
-            if cost < current.cost:
+        if trial is None:
+            current = _linearise(problem, current.raw)
+            continue
+        moved, before = trial.raw - current.raw, current
+        current = trial if gain > TRUSTED_GAIN else _linearise(problem, trial.raw)
+        if _is_small(problem, before, moved):
+            if before.exact:
                 break
-            damping = max(10 * damping, 1e-2)
-        else:
-            return current
-        settled = _is_small(trial - current.raw, hessian) or current.cost - cost < 1e-4 * current.cost
-        damping = max(damping / 5, 1e-6)
-        current = _linearise(problem, trial)
-        if settled:
-            break
+            current = _exact(problem, current)
     on_iterate(current)
-    return current
+    return _exact(problem, current)
+
+
+def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None, float, float]:
+    """(accepted point or None, actual over predicted decrease, next damping)."""
+    gradient, hessian = _normal_equations(problem, at)
+    cost = _cost(problem, at, at.raw, at.linear.value)
+    for _ in range(6):
+        step = torch.linalg.solve(hessian + damping * torch.diag(hessian.diagonal()), -gradient)
+        step = step * min(1.0, LONGEST_STEP / float(step.abs().max().clamp(min=1e-12)))
+        raw = problem.clip(at.raw + step)
+        step = raw - at.raw
+        value, patch = _try(problem, raw)
+        if value is not None:
+            predicted = -float(gradient @ step + 0.5 * step @ hessian @ step)
+            decrease = cost - _cost(problem, at, raw, value)
+            if decrease > 0:
+                gain = decrease / max(predicted, 1e-12)
+                return _updated(problem, at, raw, step, value, patch), gain, max(damping / 5, 1e-6)
+        damping = max(10 * damping, 1e-2)
+    return None, 0.0, damping
+
+
+def _try(problem: Problem, raw: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    try:
+        return problem.evaluate(raw)
+    except (SimulationDiverged, UnstableStep):
+        return None, None
+
+
+def _updated(problem: Problem, at: Iterate, raw: Tensor, step: Tensor, value: Tensor, patch: Tensor | None) -> Iterate:
+    """The new point with Broyden's update of the Jacobian."""
+    missed = value - at.linear.value - at.linear.jacobian @ step
+    jacobian = at.linear.jacobian + torch.outer(missed, step) / (step @ step)
+    return _iterate(problem, raw, at.linear._replace(value=value, jacobian=jacobian, patch=patch), exact=False)
+
+
+def _linearise(problem: Problem, raw: Tensor) -> Iterate:
+    return _iterate(problem, raw, problem.linearise(raw), exact=True)
+
+
+def _exact(problem: Problem, at: Iterate) -> Iterate:
+    return at if at.exact else _linearise(problem, at.raw)
+
+
+def _iterate(problem: Problem, raw: Tensor, linear: Linearised, exact: bool) -> Iterate:
+    scale = noise_scale(linear.value, problem.noise)
+    return Iterate(raw, linear, exact, scale, _independent_share(linear, scale))
+
+
+def _independent_share(linear: Linearised, scale: float) -> float:
+    """Effective over nominal number of observations, from how residuals add up within patches and windows.
+
+    Residuals of a wrong shape agree over centimetres and frames; counted one by one they would overrule every prior
+    and promise errors far too small.
+    """
+    _, weight = huber(linear.value / scale)
+    z = weight * linear.value / scale
+    z = torch.where(linear.factor < 1, 0.0, z)  # in-plane rows are one-sided: their sum says nothing
+    group = (linear.frame // WINDOW) * (int(linear.patch.max()) + 1) + linear.patch
+    summed = z.new_zeros(int(group.max()) + 1).index_add(0, group, z)
+    return min(1.0, float((z * z).sum() / (summed * summed).sum().clamp(min=1e-12)))
+
+
+def _cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
+    """Robust cost with the scales of ``at``, so that points can be compared."""
+    prior = ((raw - problem.prior_mean) / problem.prior_std).square().sum()
+    return float(at.share * (at.linear.factor * huber(value / at.scale)[0]).sum() + 0.5 * prior)
+
+
+def _normal_equations(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
+    _, weight = huber(at.linear.value / at.scale)
+    weighted = (at.share * at.linear.factor * weight / at.scale**2)[:, None] * at.linear.jacobian
+    gradient = weighted.mT @ at.linear.value + (at.raw - problem.prior_mean) / problem.prior_std**2
+    return gradient, weighted.mT @ at.linear.jacobian + torch.diag(problem.prior_std**-2)
+
+
+def _is_small(problem: Problem, at: Iterate, step: Tensor) -> bool:
+    """Below a tenth of a standard error in every direction."""
+    _, hessian = _normal_equations(problem, at)
+    return float(step @ hessian @ step) < 0.01
 
 
 def covariance(problem: Problem, at: Iterate) -> Tensor:
     """Covariance of the estimate [K, K]: sandwich with residuals correlated within and between nearby frames.
 
-    Never smaller than what independent noise would give. Model error that persists over a whole episode is beyond it.
+    Never smaller than what the counted independent observations would give. Model error that persists over a whole episode is beyond it.
     """
     gradient, hessian = _normal_equations(problem, at)
     inverse = torch.linalg.inv(hessian)
     _, weight = huber(at.linear.value / at.scale)
-    scores = (at.linear.factor * weight * at.linear.value / at.scale**2)[:, None] * at.linear.jacobian
-    count = int(at.linear.cluster.max()) + 1
-    summed = torch.zeros(count, scores.shape[1], dtype=scores.dtype).index_add(0, at.linear.cluster, scores)
+    scores = (at.share * at.linear.factor * weight * at.linear.value / at.scale**2)[:, None] * at.linear.jacobian
+    count = int(at.linear.frame.max()) + 1
+    summed = torch.zeros(count, scores.shape[1], dtype=scores.dtype).index_add(0, at.linear.frame, scores)
     summed = summed[summed.abs().sum(1) > 0]
     meat = _long_run(summed) * len(summed) / max(1, len(summed) - len(gradient))
     robust = inverse @ (meat + torch.diag(problem.prior_std**-2)) @ inverse
@@ -100,34 +181,3 @@ def _long_run(scores: Tensor) -> Tensor:
         cross = scores[lag:].mT @ scores[:-lag]
         total = total + (1 - lag / (lags + 1)) * (cross + cross.mT)
     return total
-
-
-def _linearise(problem: Problem, raw: Tensor) -> Iterate:
-    linear = problem.linearise(raw)
-    scale = noise_scale(linear.value, problem.noise)
-    return Iterate(raw, linear, _total(problem, raw, linear.value, linear.factor, scale), scale)
-
-
-def _cost(problem: Problem, raw: Tensor, scale: float) -> float:
-    try:
-        value, factor = problem.evaluate(raw)
-    except (SimulationDiverged, UnstableStep):
-        return float("inf")
-    return _total(problem, raw, value, factor, scale)
-
-
-def _total(problem: Problem, raw: Tensor, value: Tensor, factor: Tensor, scale: float) -> float:
-    prior = ((raw - problem.prior_mean) / problem.prior_std).square().sum()
-    return float((factor * huber(value / scale)[0]).sum() + 0.5 * prior)
-
-
-def _normal_equations(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
-    _, weight = huber(at.linear.value / at.scale)
-    weighted = (at.linear.factor * weight / at.scale**2)[:, None] * at.linear.jacobian
-    gradient = weighted.mT @ at.linear.value + (at.raw - problem.prior_mean) / problem.prior_std**2
-    return gradient, weighted.mT @ at.linear.jacobian + torch.diag(problem.prior_std**-2)
-
-
-def _is_small(step: Tensor, hessian: Tensor) -> bool:
-    """Below a tenth of a standard error in every direction."""
-    return float(step @ hessian @ step) < 0.01

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from ..forward_mode import real_tangents
 from ..losses import closest, residuals
+from ..meshes import Mesh
 from .episodes import Episode
 
 HUBER = 1.5  # in units of the noise scale: quadratic below, linear above
@@ -26,12 +28,16 @@ class Figures(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Residual rows of all frames of one episode, normal rows first within each frame."""
+    """Residual rows of all frames of one episode: for each frame the N normal ones, then the N in-plane ones.
+
+    A point has both rows whether it lies beyond the edge or not, so that rows keep their meaning between iterations.
+    """
 
     value: Tensor  # [R] m
     jacobian: Tensor | None  # [R, K] m per unit of the unconstrained parameters
     factor: Tensor  # [R] prior weight of the row
     frame: Tensor  # [R] int64
+    patch: Tensor  # [R] int64, part of the fabric that was hit
 
 
 def figures(frames: Sequence[Tensor], episodes: Sequence[Episode], faces: Tensor) -> Figures:
@@ -47,37 +53,50 @@ def figures(frames: Sequence[Tensor], episodes: Sequence[Episode], faces: Tensor
     return Figures(float(per_frame.mean()), (squares / count) ** 0.5, per_frame)
 
 
-def rows(frames: Tensor, tangent: Tensor | None, episode: Episode, faces: Tensor) -> Rows:
+def rows(frames: Tensor, tangent: Tensor | None, episode: Episode, faces: Tensor, patches: Tensor) -> Rows:
     """Residuals of one episode, and their derivatives when ``tangent`` [K, T, V, 3] is given.
 
-    The first frame is left out: it is where the simulation was started.
+    The first frame is left out: it is where the simulation was started. ``patches`` [V] names each vertex's part of the
+    fabric.
     """
-    value, jacobian, factor, frame = [], [], [], []
+    value, jacobian, factor, frame, patch = [], [], [], [], []
     for t in range(1, len(episode.clouds)):
         cloud = episode.clouds[t]
         hits = closest(cloud, frames[t], faces)
         along, beside = residuals(cloud, frames[t], hits)
-        edge = hits.beyond
-        value += [along, beside[edge]]
-        factor += [torch.ones_like(along), torch.full_like(beside[edge], EDGE_WEIGHT)]
-        frame.append(torch.full((len(along) + int(edge.sum()),), t))
+        value += [along, beside]
+        factor += [torch.ones_like(along), torch.full_like(beside, EDGE_WEIGHT)]
+        frame.append(torch.full((2 * len(cloud),), t))
+        patch.append(patches[hits.corners[:, 0]].repeat(2))
         if tangent is not None:
             with forward_ad.dual_level(), real_tangents():
-                count = len(tangent)
-                dual = forward_ad.make_dual(frames[t].expand(count, -1, -1).contiguous(), tangent[:, t].contiguous())
-                by_normal, by_edge = (forward_ad.unpack_dual(r).tangent for r in residuals(cloud, dual, hits))
-                jacobian += [by_normal.mT, by_edge[:, edge].mT]
+                start = frames[t].expand(len(tangent), -1, -1).contiguous()
+                dual = forward_ad.make_dual(start, tangent[:, t].contiguous())
+                jacobian += [forward_ad.unpack_dual(r).tangent.mT for r in residuals(cloud, dual, hits)]
     return Rows(
         torch.cat(value),
         torch.cat(jacobian) if jacobian else None,
         torch.cat(factor),
         torch.cat(frame),
+        torch.cat(patch),
     )
+
+
+def patches_of(mesh: Mesh, across: int = 4) -> Tensor:
+    """[V] int64, which of across x across parts of the fabric a vertex belongs to, along its principal axes."""
+    rest = mesh.uv if mesh.uv is not None else mesh.vertices
+    centred = rest - rest.mean(0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
+    place = centred @ axes.T
+    low, high = place.min(0), place.max(0)
+    cell = np.minimum((across * (place - low) / np.maximum(high - low, 1e-12)).astype(int), across - 1)
+    return torch.as_tensor(cell[:, 0] * across + cell[:, 1])
 
 
 def noise_scale(value: Tensor, floor: float | None) -> float:
     """Robust standard deviation of residuals [m], not below the sensor's."""
-    spread = 1.4826 * float(value.abs().median())
+    seen = value[value != 0]
+    spread = 1.4826 * float(seen.abs().median()) if len(seen) else 0.0
     return max(spread, floor or 0.0, 1e-6)
 
 
