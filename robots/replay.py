@@ -36,9 +36,11 @@ def replay(recording: Recording, dtype: torch.dtype = torch.float64) -> dict[str
     for name, joints in recording.joints.items():
         if name not in recording.robots:
             raise RecordingError(
-                f"{recording.path}: joints of {name!r}", got="no robot of that name", expected=f"robots.{name} in episode.json",
+                f"{recording.path}: joints of {name!r}",
+                got="no robot of that name",
+                expected=f"robots.{name} in episode.json",
                 remedy="name the model and its base pose",
-            )  # fmt: skip
+            )
         robot = recording.robots[name]
         arm = load(robot.model, frame=robot.tool_frame or "flange", base=_tensor(robot.T_world_base))
         out[name] = Trajectory(_tensor(joints.t), arm(_tensor(joints.q)).to(dtype), _closed(joints))

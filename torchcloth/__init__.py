@@ -1,16 +1,23 @@
 """torchcloth: a differentiable cloth layer for robotics.
 
-import torchcloth as tc
-
 ``tc.Cloth`` is the layer; ``tc.meshes``, ``tc.materials``, ``tc.effects``, ``tc.boundaries`` are its parts;
 ``tc.robots`` gives end-effector poses, ``tc.recordings`` episodes, ``tc.identify`` parameters with errors.
 """
 
-from . import boundaries, effects, errors, functional, materials, meshes
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from . import boundaries, effects, errors, functional, losses, materials, meshes
 from .cloth import Cloth
 from .parameters import PhysicalParameter
 from .transfer import Contact
 from .types import ClothState, Rollout, Trajectory
+
+if TYPE_CHECKING:
+    from . import identification, observe, recordings, robots
+    from .identification import identify
 
 __version__ = "0.1.0"
 __all__ = [
@@ -24,6 +31,21 @@ __all__ = [
     "effects",
     "errors",
     "functional",
+    "identification",
+    "identify",
+    "losses",
     "materials",
     "meshes",
+    "observe",
+    "recordings",
+    "robots",
 ]
+
+
+def __getattr__(name: str):
+    """Rooms that are opened when they are first asked for: importing the layer stays cheap."""
+    if name in ("identification", "observe", "recordings", "robots"):
+        return import_module(f".{name}", __name__)
+    if name == "identify":
+        return import_module(".identification", __name__).identify
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -42,6 +43,13 @@ class Cloth(nn.Module):
         InvalidInput: a part that does not fit.
     """
 
+    _corners: Tensor
+    _gradient: Tensor
+    _area: Tensor
+    _share: Tensor
+    _points: Tensor
+    _vertices: Tensor
+
     def __init__(
         self,
         mesh: Mesh,
@@ -53,7 +61,11 @@ class Cloth(nn.Module):
     ) -> None:
         super().__init__()
         self.mesh, self.material = mesh, material
+        for path, part in material.named_children():
+            if isinstance(part, PhysicalParameter):
+                _check_field(path, part.raw, mesh)
         self.areal_density = PhysicalParameter(areal_density, "kg/m^2", name="areal_density")
+        _check_field("areal_density", self.areal_density.raw, mesh)
         self.effects = nn.ModuleDict({name: part.bind(mesh) for name, part in (effects or {}).items()})
         self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in (boundaries or {}).items()})
         self.contact = contact
@@ -90,7 +102,11 @@ class Cloth(nn.Module):
             raise InvalidInput(
                 "x", got=f"shape {tuple(x.shape)}", expected=f"[..., {len(self._vertices)}, 3] in metres"
             )
-        v = torch.zeros_like(x) if v is None else torch.as_tensor(v, dtype=x.dtype, device=x.device).expand_as(x)
+        v = torch.zeros_like(x) if v is None else torch.as_tensor(v, dtype=x.dtype, device=x.device)
+        if v.shape != x.shape:
+            raise InvalidInput("v", got=f"shape {tuple(v.shape)}", expected=f"x's, {tuple(x.shape)}")
+        if not bool(torch.isfinite(x.detach()).all()):
+            raise InvalidInput("x", got="NaN or infinite entries", expected="finite positions in metres")
         n = functional.surface(self._geometry(), x, v).n
         return ClothState(x, v, n.repeat_interleave(len(self._points), dim=-2))
 
@@ -123,12 +139,12 @@ class Cloth(nn.Module):
         motion = self._check_motion(dict(motion or {}), frames)
         model = self.model()
         limit = self._choose_step(dt)
-        self._check_extent(state.x)
+        state = self._check_state(state, model, motion)
         states, wrenches = [state], []
-        for start, end in zip(frames[:-1], frames[1:], strict=True):
+        for start, end in pairwise(frames):
             count = max(1, int(np.ceil((end - start) / limit - 1e-9)))
             state, impulses = self._advance(model, state, motion, start, end, count, checkpoint)
-            self._check_finite(state, start, end)
+            self._check_finite(model, states[-1], state, motion, start, end, count)
             states.append(state)
             wrenches.append({name: -impulse / (end - start) for name, impulse in impulses.items()})
         return _collect(frames, states, wrenches, [name for name, b in self.boundaries.items() if b.driven])
@@ -163,10 +179,11 @@ class Cloth(nn.Module):
         held = self._check_motion(held, frames)
         damping = MassDamping(rate).to(self._area)
         model = self.model()
+        state = self._check_state(state, model, held)
         model = model._replace(effects=[*model.effects, (damping, damping.coefficients().detach())])
         count = int(np.ceil(duration * (1 / self.stable_step() + rate)))
-        settled, _ = self._advance(model, state, held, *frames, count, checkpoint=True)
-        self._check_finite(settled, *frames)
+        settled, _ = self._advance(model, state, held, start, start + duration, count, checkpoint=True)
+        self._check_finite(model, state, settled, held, start, start + duration, count)
         return settled._replace(v=torch.zeros_like(settled.v))
 
     def stable_step(self) -> float:
@@ -177,7 +194,7 @@ class Cloth(nn.Module):
             spacing = self.spacing if self.contact is not None else None
             model = self.model()
             extra = [effect.rates(k, model.mass) for effect, k in model.effects]
-            elastic, damping = (float(sum(rate[i] for rate in extra)) for i in (0, 1))
+            elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
             return stable_step(self._gradient, density, self.material.stiffness(c), spacing, elastic, damping)
 
     def model(self) -> functional.Model:
@@ -228,15 +245,19 @@ class Cloth(nn.Module):
             raise InvalidInput("dt", got=f"{dt:g} s", expected="a step > 0")
         if dt > limit * (1 + 1e-9):
             raise UnstableStep(
-                "dt", got=f"{dt:.4g} s", expected=f"at most {limit:.4g} s for these parameters and this mesh",
+                "dt",
+                got=f"{dt:.4g} s",
+                expected=f"at most {limit:.4g} s for these parameters and this mesh",
                 remedy="lower dt, or leave it out",
-            )  # fmt: skip
+            )
         return float(dt)
 
     def _check_motion(self, motion: dict[str, Trajectory], frames: list[float]) -> dict[str, Trajectory]:
         driven = {name for name, boundary in self.boundaries.items() if boundary.driven}
         if set(motion) != driven:
-            raise InvalidInput("motion", got=f"trajectories for {sorted(motion)}", expected=f"one for each of {sorted(driven)}")  # fmt: skip
+            raise InvalidInput(
+                "motion", got=f"trajectories for {sorted(motion)}", expected=f"one for each of {sorted(driven)}"
+            )
         out = {}
         for name, trajectory in motion.items():
             check_motion(trajectory, name, frames[0], frames[-1])
@@ -251,35 +272,83 @@ class Cloth(nn.Module):
         total: dict[str, Tensor] = {}
         for first in range(0, count, CHUNK):
             run = partial(
-                functional.rollout, model, dt=(end - start) / count, drives=drives,
-                substeps=min(CHUNK, count - first), first=first,
-            )  # fmt: skip
+                functional.rollout,
+                model,
+                dt=(end - start) / count,
+                drives=drives,
+                substeps=min(CHUNK, count - first),
+                first=first,
+            )
             state, impulses = (
                 recompute(run, state, use_reentrant=False, preserve_rng_state=False) if store else run(state)
             )
             total = {name: total[name] + value if name in total else value for name, value in impulses.items()}
         return state, total
 
+    def _check_state(self, state: ClothState, model: functional.Model, motion: Mapping[str, Trajectory]) -> ClothState:
+        """Refuse a state that is not this cloth's; expand it to the batch of parameters and motion."""
+        shapes = [tuple(field.shape[-2:]) for field in state]
+        expected = [tuple(self._vertices.shape)] * 2 + [(len(self._area) * len(self._points), 3)]
+        if shapes != expected:
+            raise InvalidInput(
+                "state",
+                got=f"x, v, d3 of {shapes}",
+                expected=f"{expected}",
+                remedy="make states with this cloth's rest_state() or state()",
+            )
+        if not all(bool(torch.isfinite(field).all()) for field in state):
+            raise InvalidInput("state", got="NaN or infinite entries", expected="finite x, v, d3")
+        coefficients = [model.coefficients, (model.areal_density, model.mass), *(c for _, c in model.effects)]
+        tensors = [t for c in coefficients for t in (c if isinstance(c, tuple) else (c,)) if isinstance(t, Tensor)]
+        batches = [t.shape[:-2] for t in tensors if t.ndim > 2] + [m.pose.shape[:-3] for m in motion.values()]
+        batch = torch.broadcast_shapes(state.x.shape[:-2], *batches)
+        state = ClothState(*(field.expand(*batch, *field.shape[-2:]) for field in state))
+        self._check_extent(state.x)
+        return state
+
     def _check_extent(self, x: Tensor) -> None:
         if self.contact is None:
             return
+        x = x.detach()
         extent = float((x.amax(-2) - x.amin(-2)).max())
         if extent > (self.nodes - 4) * self.spacing:
             raise SimulationDiverged(
-                "the cloth's extent", got=f"{extent:.3g} m", expected=f"below {(self.nodes - 4) * self.spacing:.3g} m",
+                "the cloth's extent",
+                got=f"{extent:.3g} m",
+                expected=f"below {(self.nodes - 4) * self.spacing:.3g} m",
                 remedy="the sheet is stretched far beyond its rest shape: check initial positions and motion",
-            )  # fmt: skip
+            )
 
-    def _check_finite(self, state: ClothState, start: float, end: float) -> None:
-        x = state.x.detach()
-        finite = torch.isfinite(x).all(-1)
-        if not bool(finite.all()):
-            vertex = int((~finite).reshape(-1, finite.shape[-1]).any(0).nonzero()[0])
-            raise SimulationDiverged(
-                f"simulation diverged between t = {start:.6g} and {end:.6g} s", got=f"vertex {vertex} not finite",
-                remedy="check the initial positions and the motion for jumps, or lower dt",
-            )  # fmt: skip
-        self._check_extent(x)
+    def _check_finite(
+        self,
+        model: functional.Model,
+        before: ClothState,
+        after: ClothState,
+        motion: Mapping[str, Trajectory],
+        start: float,
+        end: float,
+        count: int,
+    ) -> None:
+        """Raise when an interval ended without finiteness, naming the substep and the vertex where it was lost."""
+        if bool(torch.isfinite(after.x.detach()).all()):
+            self._check_extent(after.x)
+            return
+        times = torch.linspace(start, end, count + 1, dtype=torch.float64)
+        state, k, vertex = before, 0, 0
+        with torch.no_grad():
+            drives = {name: drive(trajectory, times.to(trajectory.pose)) for name, trajectory in motion.items()}
+            for k in range(count):  # the interval again, substep by substep
+                state, _ = functional.step(model, state, (end - start) / count, drives, k)
+                lost = ~torch.isfinite(state.x).all(-1)
+                if bool(lost.any()):
+                    vertex = int(lost.reshape(-1, lost.shape[-1]).any(0).nonzero()[0])
+                    break
+        raise SimulationDiverged(
+            f"simulation diverged at t = {float(times[k + 1]):.6g} s",
+            got=f"vertex {vertex} not finite after substep {k + 1} of {count}",
+            expected="finite positions",
+            remedy="check the initial positions and the motion for jumps, or lower dt",
+        )
 
     def extra_repr(self) -> str:
         """Data sheet: size, contact, step."""
@@ -290,6 +359,16 @@ class Cloth(nn.Module):
             else f"spacing {self.spacing:.3g} m, {len(self._points)} point(s) per triangle"
         )
         return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s"
+
+
+def _check_field(name: str, raw: Tensor, mesh: Mesh) -> None:
+    """Fields have one value per triangle; batches of scalars are [B, 1]."""
+    if raw.ndim and raw.shape[-1] not in (1, len(mesh.faces)):
+        raise InvalidInput(
+            name,
+            got=f"shape {tuple(raw.shape)}",
+            expected=f"a scalar, [{len(mesh.faces)}] (one per triangle) or [B, 1]",
+        )
 
 
 def _per_triangle(value: Tensor) -> Tensor:
@@ -305,9 +384,14 @@ def _grid_size(mesh: Mesh, spacing: float) -> int:
 
 
 def _check_times(times: Tensor | Sequence[float]) -> list[float]:
-    frames = [float(t) for t in (times.tolist() if isinstance(times, Tensor) else times)]
+    flat = torch.as_tensor(times, dtype=torch.float64)
+    frames = flat.tolist() if flat.ndim == 1 else []
     if len(frames) < 2 or not np.all(np.isfinite(frames)) or not np.all(np.diff(frames) > 0):
-        raise InvalidInput("times", got=f"{len(frames)} values, first {frames[:3]}", expected="at least two, increasing, finite seconds")  # fmt: skip
+        raise InvalidInput(
+            "times",
+            got=f"shape {tuple(flat.shape)}, first {frames[:3]}",
+            expected="at least two, increasing, finite seconds",
+        )
     return frames
 
 

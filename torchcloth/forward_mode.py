@@ -33,9 +33,9 @@ class real_tangents(TorchFunctionMode):
             a, b = args
             if isinstance(a, Tensor) and isinstance(b, Tensor):
                 first, second = _has_tangent(a), _has_tangent(b)
-                if first and not second:
+                if first and not second and b.is_floating_point():
                     return func(a, _promote(b))
-                if second and not first:
+                if second and not first and a.is_floating_point():
                     return func(_promote(a), b)
             elif isinstance(a, Tensor) and func in _SCALAR:
                 return _SCALAR[func](a, b)

@@ -160,7 +160,8 @@ def _contact(model: Model, state: ClothState, v: Tensor, s: Surface, pull: Tenso
     change, gradient = exchange(*flat, spacing=g.spacing, nodes=g.nodes, dt=dt)
     change, gradient = change.reshape(*batch, -1, 3), gradient.reshape(*batch, -1, 3, 3)
     momentum = (mass * change).unflatten(-2, (-1, count))
-    shares = tuple((momentum * g.points[:, corner, None]).sum(-2) for corner in range(3))
+    a, b, c = (g.points[:, corner, None] for corner in range(3))
+    shares = ((a * momentum).sum(-2), (b * momentum).sum(-2), (c * momentum).sum(-2))
     d3 = state.d3 + dt * (gradient @ state.d3.unsqueeze(-1)).squeeze(-1)
     return _assemble(g, shares, state.x) / model.mass, d3
 

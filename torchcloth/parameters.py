@@ -53,7 +53,8 @@ class PhysicalParameter(nn.Module):
         super().__init__()
         if domain not in _DOMAINS:
             raise InvalidInput("domain", got=repr(domain), expected=f"one of {sorted(_DOMAINS)}")
-        self.unit, self.domain, self.label = unit, domain, name
+        self.unit, self.label = unit, name
+        self.domain: Domain = domain
         self.raw = nn.Parameter(self._to_raw(value))
 
     @property
@@ -73,6 +74,8 @@ class PhysicalParameter(nn.Module):
 
     def _to_raw(self, value: float | Tensor) -> Tensor:
         tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).detach().clone()
+        if not tensor.is_floating_point():
+            tensor = tensor.to(torch.get_default_dtype())
         interval = _DOMAINS[self.domain]
         if not interval.contains(tensor):
             shown = f"{tensor.item():g}" if tensor.numel() == 1 else f"a field in [{tensor.min():g}, {tensor.max():g}]"

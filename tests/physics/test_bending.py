@@ -296,9 +296,13 @@ def cantilever(mesh, bending, **effects):
     """Two columns of vertices are held, so that the strip leaves the clamp without slope at 5 mm."""
     clamped = np.flatnonzero(mesh.vertices[:, 0] < 0.0051).tolist()
     cloth = tc.Cloth(
-        mesh, tc.materials.AEP(1e5, 0.02), 0.2, {"bending": tc.effects.Bending(bending), **effects},
-        {"clamp": tc.boundaries.Grasp(clamped)}, contact=None,
-    )  # fmt: skip
+        mesh,
+        tc.materials.AEP(1e5, 0.02),
+        0.2,
+        {"bending": tc.effects.Bending(bending), **effects},
+        {"clamp": tc.boundaries.Grasp(clamped)},
+        contact=None,
+    )
     still = tc.Trajectory(torch.tensor([0.0, 9.0]), torch.eye(4).repeat(2, 1, 1), torch.ones(2, dtype=bool))
     return cloth, {"clamp": still}, torch.as_tensor(mesh.vertices[:, 0] > mesh.vertices[:, 0].max() - 1e-9)
 
@@ -328,8 +332,10 @@ def test_heavy_elastica():
     s = np.linspace(0, free, 200)
     solution = solve_bvp(
         lambda s, y: np.array([y[1], -weight * (free - s) * np.cos(y[0]) / B, np.cos(y[0]), np.sin(y[0])]),
-        lambda a, b: np.array([a[0], b[1], a[2], a[3]]), s, np.zeros((4, 200)),
-    )  # fmt: skip
+        lambda a, b: np.array([a[0], b[1], a[2], a[3]]),
+        s,
+        np.zeros((4, 200)),
+    )
     cloth, motion, end = cantilever(strip("aligned"), B, gravity=tc.effects.Gravity())
     with torch.no_grad():
         state = cloth.settle(cloth.rest_state(), motion, duration=0.8, rate=20.0)

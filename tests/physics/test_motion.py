@@ -90,9 +90,13 @@ def test_hanging_strip_stretches_by_its_own_weight():
     top = torch.nonzero(torch.as_tensor(mesh.uv[:, 1]) > length - 1e-9).flatten().tolist()
     material = tc.materials.AEP(Y * 1e3, 0.02)
     cloth = tc.Cloth(
-        mesh, material, density, {"gravity": tc.effects.Gravity((0.0, -9.81, 0.0))},
-        {"clamp": tc.boundaries.Grasp(top)}, contact=None,
-    )  # fmt: skip
+        mesh,
+        material,
+        density,
+        {"gravity": tc.effects.Gravity((0.0, -9.81, 0.0))},
+        {"clamp": tc.boundaries.Grasp(top)},
+        contact=None,
+    )
     still = tc.Trajectory(torch.tensor([0.0, 9.0]), torch.eye(4).repeat(2, 1, 1), torch.ones(2, dtype=bool))
     state, sags = cloth.rest_state(), []
     for _ in range(2):  # no damping in the model: let it oscillate and average over whole periods
@@ -112,9 +116,11 @@ def test_sticks_and_slides_on_an_incline():
         angle = math.atan(mu * slope)
         g = (9.81 * math.sin(angle), 0.0, -9.81 * math.cos(angle))
         cloth = sheet(
-            n=4, effects={"gravity": tc.effects.Gravity(g)}, contact=None,
+            n=4,
+            effects={"gravity": tc.effects.Gravity(g)},
+            contact=None,
             boundaries={"table": tc.boundaries.Plane(friction=mu)},
-        )  # fmt: skip
+        )
         out = cloth(cloth.rest_state(), times=[0.0, 0.3])
         moved = float((out.x[-1] - out.x[0])[:, 0].mean())
         expected = 0.5 * 9.81 * (math.sin(angle) - mu * math.cos(angle)) * 0.09 if slides else 0.0
@@ -128,13 +134,17 @@ def test_one_sheet_comes_to_rest_on_another():
     vertices = torch.as_tensor(lower.vertices)
     import numpy as np
 
-    both = np.concatenate([lower.vertices, lower.vertices + [0.005, 0.003, 0.08]])
+    both = np.concatenate([lower.vertices, lower.vertices + np.array([0.005, 0.003, 0.08])])
     faces = np.concatenate([lower.faces, lower.faces + len(vertices)])
     mesh = tc.meshes.Mesh.build(both, faces)
     cloth = tc.Cloth(
-        mesh, tc.materials.AEP(3e5, 0.3, 1e6, 2e5), 0.15, {"gravity": tc.effects.Gravity()},
-        {"pin": tc.boundaries.Grasp(range(len(vertices)))}, tc.Contact(spacing=0.02, subdivisions=2),
-    )  # fmt: skip
+        mesh,
+        tc.materials.AEP(3e5, 0.3, 1e6, 2e5),
+        0.15,
+        {"gravity": tc.effects.Gravity()},
+        {"pin": tc.boundaries.Grasp(range(len(vertices)))},
+        tc.Contact(spacing=0.02, subdivisions=2),
+    )
     v = torch.zeros(len(both), 3)
     v[len(vertices) :, 2] = -1.0
     still = tc.Trajectory(torch.tensor([0.0, 9.0]), torch.eye(4).repeat(2, 1, 1), torch.ones(2, dtype=bool))

@@ -41,7 +41,8 @@ class Grasp(AbstractBoundary):
         super().__init__()
         if (vertices is None) == (uv is None):
             raise InvalidInput("Grasp", got="both or neither of vertices and uv", expected="exactly one of them")
-        self._uv, self._corner, self.radius = uv, None, float(radius)
+        self._uv, self.radius = uv, float(radius)
+        self._corner: Corner | None = None
         self.register_buffer("index", torch.as_tensor([] if vertices is None else list(vertices), dtype=torch.long))
         self.index: Tensor
 
@@ -49,7 +50,9 @@ class Grasp(AbstractBoundary):
     def corner(cls, corner: Corner, radius: float = 0.015) -> Grasp:
         """The patch at a corner of the pattern's bounding box: "lower-left", "upper-right", ..."""
         if corner not in ("lower-left", "lower-right", "upper-left", "upper-right"):
-            raise InvalidInput("corner", got=repr(corner), expected='"lower-left", "lower-right", "upper-left" or "upper-right"')  # fmt: skip
+            raise InvalidInput(
+                "corner", got=repr(corner), expected='"lower-left", "lower-right", "upper-left" or "upper-right"'
+            )
         grasp = cls(uv=[[0.0, 0.0]], radius=radius)
         grasp._corner = corner
         return grasp
@@ -64,10 +67,13 @@ class Grasp(AbstractBoundary):
             self._uv = [[(low if horizontal == "left" else high)[0], (low if vertical == "lower" else high)[1]]]
         if self._uv is not None:
             self.index = torch.as_tensor(mesh.nearest_vertices(self._uv, self.radius), device=self.index.device)
+        self.index = self.index.unique()  # a vertex named twice would count twice in the wrench
         if len(self.index) == 0 or int(self.index.min()) < 0 or int(self.index.max()) >= len(mesh.vertices):
             raise InvalidInput(
-                "Grasp vertices", got=np.asarray(self.index.cpu()).tolist(), expected=f"indices in 0..{len(mesh.vertices) - 1}"
-            )  # fmt: skip
+                "Grasp vertices",
+                got=np.asarray(self.index.cpu()).tolist(),
+                expected=f"indices in 0..{len(mesh.vertices) - 1}",
+            )
         return self
 
     def apply(

@@ -37,12 +37,17 @@ def check(trajectory: Trajectory, name: str, start: float, end: float) -> None:
     if not bool(torch.isfinite(pose).all()):
         raise InvalidInput(f"{where}.pose", got="NaN or infinite entries", expected="finite poses")
     rotation = pose.detach()[..., :3, :3]
+    error = (rotation @ rotation.mT - torch.eye(3).to(rotation)).abs().amax()
+    if float(error) > 1e-3 or bool((torch.linalg.det(rotation) < 0).any()):
+        raise InvalidInput(f"{where}.pose", got="matrices that are not rotations", expected="rigid poses [R p; 0 1]")
     turn = (rotation[..., 1:, :, :] * rotation[..., :-1, :, :]).sum((-2, -1))  # trace of the relative rotation
     if bool((turn < 1.0).any()):
         raise InvalidInput(
-            f"{where}.pose", got="a turn of over 90 degrees between knots", expected="smaller steps",
+            f"{where}.pose",
+            got="a turn of over 90 degrees between knots",
+            expected="smaller steps",
             remedy="give the trajectory at more knots",
-        )  # fmt: skip
+        )
 
 
 def interpolate(trajectory: Trajectory, times: Tensor) -> Tensor:

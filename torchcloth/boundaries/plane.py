@@ -34,10 +34,13 @@ class Plane(AbstractBoundary):
     ) -> None:
         super().__init__()
         direction = torch.as_tensor(normal, dtype=torch.get_default_dtype())
-        if direction.shape != (3,) or not direction.norm() > 0:
-            raise InvalidInput("plane normal", got=normal, expected="three numbers, not all zero")
+        origin = torch.as_tensor(point, dtype=direction.dtype)
+        if direction.shape != (3,) or not 0 < float(direction.norm()) < float("inf"):
+            raise InvalidInput("plane normal", got=normal, expected="three finite numbers, not all zero")
+        if origin.shape != (3,) or not bool(torch.isfinite(origin).all()):
+            raise InvalidInput("plane point", got=point, expected="three finite numbers in metres")
         self.friction = PhysicalParameter(friction, "-", "nonnegative", name="friction")
-        self.register_buffer("point", torch.as_tensor(point, dtype=direction.dtype))
+        self.register_buffer("point", origin)
         self.register_buffer("normal", direction / direction.norm())
         self.point: Tensor
         self.normal: Tensor

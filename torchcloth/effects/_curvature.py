@@ -100,8 +100,13 @@ def _triangles_beyond(mesh: Mesh) -> dict[tuple[int, int], tuple[int, complex]]:
     for k in range(3):
         p, q, r = k, (k + 1) % 3, (k + 2) % 3
         ratio = (rest[:, r] - rest[:, p]) / (rest[:, q] - rest[:, p])
-        out.update(zip(map(tuple, mesh.faces[:, [p, q]].tolist()),
-                       zip(mesh.faces[:, r].tolist(), ratio.tolist(), strict=True), strict=True))  # fmt: skip
+        out.update(
+            zip(
+                map(tuple, mesh.faces[:, [p, q]].tolist()),
+                zip(mesh.faces[:, r].tolist(), ratio.tolist(), strict=True),
+                strict=True,
+            )
+        )
     return out
 
 

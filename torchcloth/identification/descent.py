@@ -13,19 +13,19 @@ from .replays import simulate
 
 
 def descend(
-    objective: Objective, iterations: int, rate: float, on_iterate: Callable[[Tensor, Objective], bool]
+    objective: Objective, start: Tensor, iterations: int, rate: float, on_iterate: Callable[[Tensor, Objective], bool]
 ) -> Tensor:
     """Adam on the unconstrained parameters [K]; ``on_iterate(raw, objective)`` returns True to stop.
 
     The loss is the DiffCP paper's one-sided Chamfer distance, cloud to nearest vertex.
     """
-    raw = objective.start.clone().requires_grad_()
+    raw = start.clone().requires_grad_()
     optimiser = torch.optim.Adam([raw], lr=rate)
     for _ in range(iterations):
         optimiser.zero_grad()
         frames = []
         for episode in objective.episodes:
-            x = simulate(objective.cloth, objective.unknowns, raw, episode)
+            x = simulate(objective.cloth, objective.unknowns, raw, episode, objective.dt)
             clouds = zip(episode.clouds, x, strict=True)
             loss = torch.stack([chamfer_to_vertices(cloud, vertices) for cloud, vertices in clouds]).mean()
             (loss / len(objective.episodes)).backward()

@@ -16,7 +16,7 @@ from ..errors import InvalidInput, RecordingError
 from ..materials import AEP, AbstractMaterial
 from ..meshes import Mesh, rectangle
 from ..recordings import Recording
-from ..robots import replay
+from ..robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..transfer import Contact
 from ..types import Trajectory
 
@@ -64,7 +64,7 @@ def cloth_from(
     Args:
         recording: names mesh or sheet, density, grasps, colliders, gravity, air.
         material: None: A-EP at the episode's nominal values, or at a start in the middle of published fabrics.
-        effects: None: gravity, bending where the episode has a nominal value, air drag where it states the air's density.
+        effects: None: gravity; bending where the episode has a nominal value; air drag where it states a density.
         contact: between layers; None leaves it out.
 
     Raises:
@@ -123,9 +123,11 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
     vertices = cloth.mesh.vertices if initial is None else initial
     if vertices.shape != cloth.mesh.vertices.shape:
         raise InvalidInput(
-            f"{name}: initial_vertices", got=f"{len(vertices)} rows", expected=f"{len(cloth.mesh.vertices)}, one per vertex",
+            f"{name}: initial_vertices",
+            got=f"{len(vertices)} rows",
+            expected=f"{len(cloth.mesh.vertices)}, one per vertex",
             remedy="give the mesh that the initial vertices belong to",
-        )  # fmt: skip
+        )
     return Episode(
         name=name,
         motion={key: motion[key] for key in needed},
@@ -144,9 +146,11 @@ def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[s
     inside = np.flatnonzero((times >= start - 1e-6) & (times <= end + 1e-6))
     if len(inside) < 2 or inside[0] != 0:
         raise RecordingError(
-            "points and motion", got=f"frames in [{times[0]:g}, {times[-1]:g}] s, motion in [{start:g}, {end:g}] s",
-            expected="motion that covers the first frame", remedy="check clock_offset",
-        )  # fmt: skip
+            "points and motion",
+            got=f"frames in [{times[0]:g}, {times[-1]:g}] s, motion in [{start:g}, {end:g}] s",
+            expected="motion that covers the first frame",
+            remedy="check clock_offset",
+        )
     return times[inside], inside.tolist()
 
 

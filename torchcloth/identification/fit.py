@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -25,8 +25,9 @@ from .unknowns import collect
 
 PAPER_ITERATIONS, PAPER_CHAMFER = 35, 0.015  # the DiffCP paper's stop rule: iterations, metres
 EARLY = 0.35  # share of the frames that the first stage of the fit sees
-NONLINEAR = 0.5  # relative error of the tangents over one standard error above which they are not used for errors
-SECANT = 0.01  # smallest finite step, in units of the prior's standard deviation
+EARLY_ITERATIONS = 10
+NONLINEAR = 0.5  # relative error of the tangents over a finite step above which they are not used for errors
+SMALLEST, LARGEST = 0.005, 0.1  # finite steps, in units of the prior's standard deviation
 
 Progress = Callable[[int, float, dict[str, float]], None]
 
@@ -40,6 +41,8 @@ def identify(
     stop: Literal["converged", "paper"] = "converged",
     iterations: int = PAPER_ITERATIONS,
     rate: float = 0.1,
+    guess: Mapping[str, float] | None = None,
+    dt: float | None = None,
     on_progress: Progress | None = None,
 ) -> Identification:
     """Fit scalar parameters of a cloth to point clouds, by gradients through the simulation.
@@ -54,6 +57,9 @@ def identify(
         stop: "converged", or "paper": as soon as Chamfer (one-sided, cloud to surface) is below 1.5 cm.
         iterations: at most this many.
         rate: learning rate of "adam", in unconstrained units (0.1: about 10 % a step).
+        guess: values by name to start the search from, e.g. of an interrupted fit; the cloth's values stay the start
+            that the result is compared with.
+        dt: largest substep [s]; None: the stable one, chosen anew for every set of values.
         on_progress: called with (iteration, chamfer, values) after every iteration.
 
     Returns:
@@ -65,7 +71,9 @@ def identify(
         SimulationDiverged: the start values cannot be simulated.
     """
     if method not in ("gauss-newton", "adam") or stop not in ("converged", "paper"):
-        raise InvalidInput("method or stop", got=f"{method!r}, {stop!r}", expected='"gauss-newton" or "adam"; "converged" or "paper"')  # fmt: skip
+        raise InvalidInput(
+            "method or stop", got=f"{method!r}, {stop!r}", expected='"gauss-newton" or "adam"; "converged" or "paper"'
+        )
     if iterations < 1:
         raise InvalidInput("iterations", got=iterations, expected="at least 1")
     episodes_in = [recordings] if isinstance(recordings, Recording) else list(recordings)
@@ -73,8 +81,8 @@ def identify(
         raise InvalidInput("recordings", got="none", expected="at least one episode")
     names = default_parameters(cloth) if parameters is None else list(parameters)
     unknowns = collect(cloth, names, episodes_in[0].cloth.areal_density_std)
-    objective = Objective(cloth, unknowns, [episode(cloth, r) for r in episodes_in])
-    return _Run(objective, stop, on_progress).solve(method, iterations, rate)
+    objective = Objective(cloth, unknowns, [episode(cloth, r) for r in episodes_in], dt)
+    return _Run(objective, stop, on_progress).solve(method, iterations, rate, dict(guess or {}))
 
 
 def default_parameters(cloth: Cloth) -> list[str]:
@@ -95,14 +103,15 @@ class _Run:
         self.history: list[dict[str, Any]] = []
         self.simulations, self.began = 0, time.perf_counter()
 
-    def solve(self, method: str, iterations: int, rate: float) -> Identification:
+    def solve(self, method: str, iterations: int, rate: float, guess: dict[str, float]) -> Identification:
         full = self.objective
         before = full.frames(full.start)
+        start = full.raw(guess)
         if method == "adam":
-            raw = descend(full, iterations, rate, self._record)
+            raw = descend(full, start, iterations, rate, self._record)
             final = gauss_newton.minimise(full.problem(), raw, 0, lambda _: True)
         else:
-            final = self._gauss_newton(iterations)
+            final = self._gauss_newton(iterations, start, skip_early=bool(guess))
         after = full.frames(final.raw)
         final, warnings = self._check_linearity(final)
         covariance = gauss_newton.covariance(full.problem(), final)
@@ -116,34 +125,38 @@ class _Run:
             found.parameters, fit, found.correlation, warnings, self.history, before, after, null, keys
         )
 
-    def _gauss_newton(self, iterations: int) -> gauss_newton.Iterate:
+    def _gauss_newton(self, iterations: int, start: Tensor, skip_early: bool) -> gauss_newton.Iterate:
         """First the early frames, where a wrong start has not yet led the cloth elsewhere; then all of them."""
         full = self.objective
-        early = Objective(full.cloth, full.unknowns, [e.until(EARLY) for e in full.episodes])
-        first = gauss_newton.minimise(early.problem(), full.start, iterations, lambda it: self._record(it.raw, early))
+        if skip_early:
+            return gauss_newton.minimise(full.problem(), start, iterations, lambda it: self._record(it.raw, full))
+        early = Objective(full.cloth, full.unknowns, [e.until(EARLY) for e in full.episodes], full.dt)
+        first = gauss_newton.minimise(
+            early.problem(), start, min(EARLY_ITERATIONS, iterations), lambda it: self._record(it.raw, early), 1.0
+        )
         self.simulations += early.simulations
         left = max(1, iterations - len(self.history))
         return gauss_newton.minimise(full.problem(), first.raw, left, lambda it: self._record(it.raw, full))
 
     def _check_linearity(self, final: gauss_newton.Iterate) -> tuple[gauss_newton.Iterate, list[str]]:
-        """Compare the tangents with a finite step of one standard error; where they fail, differences replace them."""
+        """Compare the tangents with finite steps of about a standard error; where they fail, differences replace them.
+
+        Tangents are exact, but where the motion is unstable they describe a neighbourhood too small to matter.
+        """
         full = self.objective
-        covariance = gauss_newton.covariance(full.problem(), final)
-        deviation = covariance.diagonal().sqrt()
-        values, vectors = torch.linalg.eigh(covariance / deviation[:, None] / deviation[None, :])
-        step = full.clip(final.raw + values[-1].sqrt() * vectors[:, -1] * deviation) - final.raw
-        seen = full.evaluate(final.raw + step)[0] - final.linear.value
-        told = final.linear.jacobian @ step
-        error = float((seen - told).norm() / seen.norm().clamp(min=1e-12))
-        if error < NONLINEAR:
+        deviation = gauss_newton.covariance(full.problem(), final).diagonal().sqrt()
+        prior = full.problem().prior_std
+        steps = torch.minimum(torch.maximum(deviation, SMALLEST * prior), LARGEST * prior)
+        secants = full.secants(final.raw, steps)
+        missed = (secants.jacobian - final.linear.jacobian).norm(dim=0) / secants.jacobian.norm(dim=0).clamp(min=1e-12)
+        if float(missed.max()) < NONLINEAR:
             return final, []
-        steps = torch.maximum(deviation, torch.tensor([SECANT * u.prior_std for u in full.unknowns]))
-        linear = full.secants(final.raw, steps)
+        names = ", ".join(u.name for u, error in zip(full.unknowns, missed, strict=True) if error >= NONLINEAR)
         warning = (
-            f"the motion is unstable or strongly nonlinear at the solution (tangents miss a step of one standard error by "
-            f"{100 * error:.0f} %): errors come from finite differences and are rough"
+            f"the motion is unstable or strongly nonlinear at the solution (tangents of {names} miss finite steps "
+            f"by up to {100 * float(missed.max()):.0f} %): standard errors come from finite differences"
         )
-        return final._replace(linear=linear), [warning]
+        return final._replace(linear=secants), [warning]
 
     def _record(self, raw: Tensor, objective: Objective) -> bool:
         now = figures(objective.frames(raw), objective.episodes, objective.faces)

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..errors import SimulationDiverged, UnstableStep
 from .misfit import huber, noise_scale
 
-LONGEST_STEP = 1.5  # in unconstrained units: a factor of 4.5 on a log parameter
+LONGEST_STEP = 1.0  # in unconstrained units: a factor of 2.7 on a log parameter
 TRUSTED_GAIN = 0.5  # share of the predicted decrease above which an updated Jacobian is good enough
 WINDOW = 5  # frames within which residuals of one patch count as one observation
 
@@ -47,31 +47,40 @@ class Iterate(NamedTuple):
     share: float  # independent observations per residual, <= 1
 
 
-def minimise(problem: Problem, start: Tensor, iterations: int, on_iterate: Callable[[Iterate], bool]) -> Iterate:
-    """Minimise the robust cost; ``on_iterate`` sees every accepted point and returns True to stop.
+def minimise(
+    problem: Problem,
+    start: Tensor,
+    iterations: int,
+    on_iterate: Callable[[Iterate], bool],
+    tolerance: float = 0.1,
+) -> Iterate:
+    """Minimise the robust cost until a step is below ``tolerance`` standard errors.
+
+    ``on_iterate`` sees the start and every accepted point and returns True to stop.
 
     Between exact linearisations the Jacobian is updated by Broyden's rank-one formula as long as the linear model
     predicts the steps. Scale and correlation of the residuals are re-estimated at every accepted point. The returned
     point is linearised exactly.
     """
     current = _linearise(problem, start)
-    damping = 1e-3
+    stop, damping = on_iterate(current), 1e-3
     for _ in range(iterations):
-        if on_iterate(current):
-            return _exact(problem, current)
+        if stop:
+            break
         trial, gain, damping = _step(problem, current, damping)
-        if trial is None and current.exact:
-            return current
         if trial is None:
+            if current.exact:
+                break
             current = _linearise(problem, current.raw)
             continue
-        moved, before = trial.raw - current.raw, current
-        current = trial if gain > TRUSTED_GAIN else _linearise(problem, trial.raw)
-        if _is_small(problem, before, moved):
+        before, current = current, trial
+        stop = on_iterate(current)
+        if _is_small(problem, before, trial.raw - before.raw, tolerance):
             if before.exact:
                 break
-            current = _exact(problem, current)
-    on_iterate(current)
+            current = _linearise(problem, trial.raw)
+        elif gain < TRUSTED_GAIN and not stop:
+            current = _linearise(problem, trial.raw)
     return _exact(problem, current)
 
 
@@ -81,7 +90,7 @@ def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None
     cost = _cost(problem, at, at.raw, at.linear.value)
     for _ in range(6):
         step = torch.linalg.solve(hessian + damping * torch.diag(hessian.diagonal()), -gradient)
-        step = step * min(1.0, LONGEST_STEP / float(step.abs().max().clamp(min=1e-12)))
+        step = step.clamp(-LONGEST_STEP, LONGEST_STEP)  # one by one: a runaway must not hold back the others
         raw = problem.clip(at.raw + step)
         step = raw - at.raw
         value, patch = _try(problem, raw)
@@ -149,16 +158,17 @@ def _normal_equations(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
     return gradient, weighted.mT @ at.linear.jacobian + torch.diag(problem.prior_std**-2)
 
 
-def _is_small(problem: Problem, at: Iterate, step: Tensor) -> bool:
-    """Below a tenth of a standard error in every direction."""
+def _is_small(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> bool:
+    """Below ``tolerance`` standard errors in every direction."""
     _, hessian = _normal_equations(problem, at)
-    return float(step @ hessian @ step) < 0.01
+    return float(step @ hessian @ step) < tolerance**2
 
 
 def covariance(problem: Problem, at: Iterate) -> Tensor:
     """Covariance of the estimate [K, K]: sandwich with residuals correlated within and between nearby frames.
 
-    Never smaller than what the counted independent observations would give. Model error that persists over a whole episode is beyond it.
+    Never smaller than what the counted independent observations would give. Model error that persists over a whole
+    episode is beyond it.
     """
     gradient, hessian = _normal_equations(problem, at)
     inverse = torch.linalg.inv(hessian)

@@ -72,7 +72,8 @@ def rows(frames: Tensor, tangent: Tensor | None, episode: Episode, faces: Tensor
             with forward_ad.dual_level(), real_tangents():
                 start = frames[t].expand(len(tangent), -1, -1).contiguous()
                 dual = forward_ad.make_dual(start, tangent[:, t].contiguous())
-                jacobian += [forward_ad.unpack_dual(r).tangent.mT for r in residuals(cloud, dual, hits)]
+                slopes = (forward_ad.unpack_dual(r).tangent for r in residuals(cloud, dual, hits))
+                jacobian += [slope.mT for slope in slopes if slope is not None]
     return Rows(
         torch.cat(value),
         torch.cat(jacobian) if jacobian else None,

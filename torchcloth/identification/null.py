@@ -1,4 +1,4 @@
-"""The rigid-carry null: cloth that moves with the grippers and never deforms. A fit that does not beat it is worthless."""
+"""The rigid-carry null: cloth that moves with the grippers undeformed. A fit that does not beat it is worthless."""
 
 from __future__ import annotations
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from ..cloth import Cloth
+from ..errors import InvalidInput
+from ..parameters import PhysicalParameter
 from . import gauss_newton
 from .episodes import Episode
 from .misfit import patches_of, rows
@@ -18,8 +20,10 @@ from .unknowns import Unknown
 class Objective:
     """Residuals and simulated frames as functions of the unknowns; counts simulations."""
 
-    def __init__(self, cloth: Cloth, unknowns: Sequence[Unknown], episodes: Sequence[Episode]) -> None:
-        self.cloth, self.unknowns, self.episodes = cloth, list(unknowns), list(episodes)
+    def __init__(
+        self, cloth: Cloth, unknowns: Sequence[Unknown], episodes: Sequence[Episode], dt: float | None = None
+    ) -> None:
+        self.cloth, self.unknowns, self.episodes, self.dt = cloth, list(unknowns), list(episodes), dt
         self.faces, self.patches = torch.as_tensor(cloth.mesh.faces), patches_of(cloth.mesh)
         self.start = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
         self.simulations = 0
@@ -41,6 +45,17 @@ class Objective:
         """The nearest legal point."""
         return torch.tensor([u.clip(float(r)) for u, r in zip(self.unknowns, raw, strict=True)], dtype=raw.dtype)
 
+    def raw(self, values: Mapping[str, float]) -> Tensor:
+        """Unconstrained start with some values by name replaced; unknown names are refused."""
+        known = {u.name: i for i, u in enumerate(self.unknowns)}
+        out = self.start.clone()
+        for name, value in values.items():
+            if name not in known:
+                raise InvalidInput("guess", got=repr(name), expected=f"one of {', '.join(known)}")
+            parameter = self.unknowns[known[name]].parameter
+            out[known[name]] = PhysicalParameter(value, parameter.unit, parameter.domain, name=name).raw.detach()
+        return out
+
     def values(self, raw: Tensor) -> dict[str, float]:
         """Physical values by name."""
         return {u.name: u.value(float(r)) for u, r in zip(self.unknowns, raw, strict=True)}
@@ -50,7 +65,7 @@ class Objective:
         key = tuple(raw.tolist())
         if key not in self._recent:
             with torch.no_grad():
-                frames = [simulate(self.cloth, self.unknowns, raw, e) for e in self.episodes]
+                frames = [simulate(self.cloth, self.unknowns, raw, e, self.dt) for e in self.episodes]
             self.simulations += len(self.episodes)
             self.remember(raw, frames)
         return self._recent[key]
@@ -70,7 +85,7 @@ class Objective:
 
     def linearise(self, raw: Tensor) -> gauss_newton.Linearised:
         """Residual rows with exact sensitivities, by forward mode through the whole simulation."""
-        both = [tangents(self.cloth, self.unknowns, raw, e) for e in self.episodes]
+        both = [tangents(self.cloth, self.unknowns, raw, e, self.dt) for e in self.episodes]
         self.simulations += len(self.unknowns) * len(self.episodes)
         self.remember(raw, [x for x, _ in both])
         return self._rows(both)

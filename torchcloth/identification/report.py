@@ -59,7 +59,7 @@ def warnings_of(
         out.append("the fit is no better than cloth carried rigidly by the grippers: these data say nothing about it")
     for name, estimate in found.parameters.items():
         if not estimate.identifiable and estimate.source == "data":
-            out.append(f"{name} is not identifiable from these data: its value is the start's, not the fabric's")
+            out.append(f"{name} is not identifiable from these data: its value is no estimate")
     names = [n for n in found.correlation if found.parameters[n].source == "data"]
     for i, a in enumerate(names):
         for b in names[:i]:
@@ -72,8 +72,8 @@ def warnings_of(
     noise = [e.noise for e in episodes if e.noise]
     if noise and fit["rms_after"] > 2 * max(noise):
         out.append(
-            f"the residual ({fit['rms_after'] * 1e3:.1f} mm rms) exceeds twice the sensor noise ({max(noise) * 1e3:.1f} mm): "
-            "the model misses something, and the standard errors do not cover it"
+            f"the residual ({fit['rms_after'] * 1e3:.1f} mm rms) exceeds twice the sensor noise "
+            f"({max(noise) * 1e3:.1f} mm): the model misses something, and the standard errors do not cover it"
         )
     if not all(e.settles for e in episodes):
         out.append(
@@ -90,9 +90,14 @@ def _estimate(unknown: Unknown, raw: float, deviation: float) -> Estimate:
     low, high = (unknown.value(unknown.clip(raw + sign * 1.96 * deviation)) for sign in (-1, 1))
     identifiable = std < TRUSTED * max(abs(value), _typical(unknown))
     return Estimate(
-        value, std, (low, high), unknown.parameter.unit, unknown.value(unknown.start), identifiable,
+        value,
+        std,
+        (low, high),
+        unknown.parameter.unit,
+        unknown.value(unknown.start),
+        identifiable,
         "prior" if unknown.measured else "data",
-    )  # fmt: skip
+    )
 
 
 def _typical(unknown: Unknown) -> float:
@@ -111,9 +116,14 @@ def _absent(unknown: Unknown) -> Estimate:
 def _times(estimate: Estimate, factor: float, unit: str) -> Estimate:
     low, high = estimate.ci95
     return Estimate(
-        estimate.value * factor, estimate.std * factor, (low * factor, high * factor), unit, estimate.initial * factor,
-        estimate.identifiable, "derived",
-    )  # fmt: skip
+        estimate.value * factor,
+        estimate.std * factor,
+        (low * factor, high * factor),
+        unit,
+        estimate.initial * factor,
+        estimate.identifiable,
+        "derived",
+    )
 
 
 def _layers_meet(cloth: Cloth, frames: Sequence[Tensor], faces: Tensor) -> bool:

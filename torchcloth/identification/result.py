@@ -14,10 +14,11 @@ from torch import Tensor
 from ..cloth import Cloth
 
 CONVENTION = (
-    "SI units. chamfer: one-sided, cloud to surface: mean over frames of the mean distance [m] from each measured point to "
-    "the nearest point of the simulated triangles. rms: root mean square of the same distances over all points. "
-    "null: the cloth moves rigidly with the grippers, undeformed. std: standard error of the estimate, noise correlated "
-    "between nearby frames allowed for, persistent model error not; ci95 is computed in the log (logit) coordinate."
+    "SI units. chamfer: one-sided, cloud to surface: mean over frames of the mean distance [m] from each measured "
+    "point to the nearest point of the simulated triangles. rms: root mean square of the same distances over all "
+    "points. null: the cloth moves rigidly with the grippers, undeformed. std: standard error of the estimate; noise "
+    "correlated within patches of the fabric and nearby frames is allowed for, persistent model error is not; ci95 is "
+    "computed in the log (logit) coordinate. identifiable: std below a quarter of the value."
 )
 
 

@@ -14,7 +14,7 @@ from ..errors import InvalidInput
 from ..parameters import PhysicalParameter, to_value
 
 DECADE = math.log(10.0)
-PRIOR_LOGIT = 1.5  # of logit(2 nu): 95 % of the prior between 0.02 and 0.48
+PRIOR_LOGIT = 1.0  # of logit(2 nu): around 0.2, 95 % of the prior between 0.04 and 0.42
 
 
 @dataclass(frozen=True, eq=False)

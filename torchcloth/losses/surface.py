@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._math import cross, dot
+from .._math import cross, dot, safe_norm
 
 
 class Hits(NamedTuple):
@@ -54,8 +54,8 @@ def residuals(points: Tensor, vertices: Tensor, hits: Hits) -> tuple[Tensor, Ten
     offset = points - hits.on(vertices)
     along = dot(normal, offset)
     beside = offset - along * normal
-    length = torch.where(hits.beyond.unsqueeze(-1), dot(beside, beside), 1.0).sqrt()
-    return along.squeeze(-1), torch.where(hits.beyond, length.squeeze(-1), torch.zeros_like(length.squeeze(-1)))
+    beside = safe_norm(torch.where(hits.beyond.unsqueeze(-1), beside, torch.zeros_like(beside)))
+    return along.squeeze(-1), beside.squeeze(-1)
 
 
 def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:

@@ -63,7 +63,7 @@ class AEP(AbstractMaterial):
         super().__init__()
         if convention not in ("plane_stress", "paper"):
             raise InvalidInput("convention", got=repr(convention), expected='"plane_stress" or "paper"')
-        if not thickness > 0:
+        if not 0 < thickness < float("inf"):
             raise InvalidInput("thickness", got=f"{thickness} m", expected="a value > 0")
         self.youngs_modulus = PhysicalParameter(youngs_modulus, "Pa", name="youngs_modulus")
         self.poisson_ratio = PhysicalParameter(poisson_ratio, "-", "unit_half", name="poisson_ratio")

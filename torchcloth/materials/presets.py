@@ -16,8 +16,9 @@ class Fabric(NamedTuple):
 
 
 _DIFFCP = (
-    "DiffCP (Zheng et al.), table of mean fabric parameters. The table has no units; read as kPa at a thickness of 1 mm "
-    "it gives plausible membrane stiffnesses, and that is a reading, not a statement of the paper. Areal density: ours."
+    "DiffCP (Zheng et al.), table of mean fabric parameters. The table has no units; read as kPa at a thickness of "
+    "1 mm it gives plausible membrane stiffnesses, and that is a reading, not a statement of the paper. The areal "
+    "density is ours."
 )
 
 

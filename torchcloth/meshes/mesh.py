@@ -61,7 +61,7 @@ class Mesh:
             rest = rest * np.array([-1.0, 1.0])
             area = -area
         scale = np.median(np.abs(area))
-        bad = np.flatnonzero(area <= 1e-9 * scale)
+        bad = np.flatnonzero(~(area > 1e-9 * scale))
         if len(bad):
             raise InvalidInput(
                 "faces",
@@ -94,8 +94,12 @@ class Mesh:
             InvalidInput: the mesh has no pattern coordinates, or no vertex lies that near.
         """
         if self.uv is None:
-            raise InvalidInput("uv", got="a mesh without pattern coordinates", expected="a mesh with uv",
-                               remedy="name the grasped vertices instead")  # fmt: skip
+            raise InvalidInput(
+                "uv",
+                got="a mesh without pattern coordinates",
+                expected="a mesh with uv",
+                remedy="name the grasped vertices instead",
+            )
         distance = np.linalg.norm(self.uv[:, None] - np.atleast_2d(uv)[None], axis=-1).min(1)
         found = np.flatnonzero(distance <= radius * (1 + 1e-9))
         if len(found) == 0:

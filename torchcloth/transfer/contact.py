@@ -40,9 +40,11 @@ class Contact:
         s = needed if self.subdivisions is None else int(self.subdivisions)
         if s < needed:
             raise InvalidInput(
-                "contact subdivisions", got=s, expected=f">= {needed} (mean edge {edge:.3g} m, spacing {spacing:.3g} m)",
+                "contact subdivisions",
+                got=s,
+                expected=f">= {needed} (mean edge {edge:.3g} m, spacing {spacing:.3g} m)",
                 remedy="sparser points would let layers pass through each other",
-            )  # fmt: skip
+            )
         return spacing, _centroids(s)
 
 

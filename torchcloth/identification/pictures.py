@@ -1,0 +1,127 @@
+"""Pictures of a fit: the cloth over the cloud, the distance over time and iterations, the parameters with intervals."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..losses import closest
+from .episodes import Episode
+from .result import Identification
+
+BEFORE, AFTER, NULL = "#b0653a", "#1f6f8b", "#888888"
+
+
+def draw(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray, folder: Path) -> list[Path]:
+    """Write fit.png, distances.png and parameters.png into ``folder``; returns their paths."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    folder.mkdir(parents=True, exist_ok=True)
+    return [
+        _save(_shapes(fit, episodes[0], faces), folder / "fit.png"),
+        _save(_distances(fit, episodes, faces), folder / "distances.png"),
+        _save(_parameters(fit), folder / "parameters.png"),
+    ]
+
+
+def _save(figure: Any, path: Path) -> Path:
+    import matplotlib.pyplot as plt
+
+    part = path.with_name(f".{path.name}.part.png")
+    figure.savefig(part, dpi=110, bbox_inches="tight")
+    plt.close(figure)
+    os.replace(part, path)
+    return path
+
+
+def _distance(cloud: Tensor, vertices: Tensor, faces: Tensor) -> np.ndarray:
+    return (cloud - closest(cloud, vertices, faces).on(vertices)).norm(dim=-1).numpy()
+
+
+def _shapes(fit: Identification, episode: Episode, faces: np.ndarray) -> Any:
+    """Four frames: measured points coloured by their distance, over the cloth with start and with fitted values."""
+    import matplotlib.pyplot as plt
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    index = torch.as_tensor(faces)
+    shown = np.linspace(0, len(episode.clouds) - 1, 5).round().astype(int)[1:]
+    figure, axes = plt.subplots(2, 4, figsize=(15, 7.5), subplot_kw={"projection": "3d", "computed_zorder": False})
+    figure.subplots_adjust(wspace=0.02, hspace=0.05, top=0.92, bottom=0.02, left=0.02)
+    everything = torch.cat([fit.frames_after[0][shown].reshape(-1, 3), *(episode.clouds[i] for i in shown)]).numpy()
+    middle, half = (everything.max(0) + everything.min(0)) / 2, np.ptp(everything, axis=0).max() / 2
+    worst = 1e3 * max(np.quantile(_distance(episode.clouds[i], fit.frames_before[0][i], index), 0.95) for i in shown)
+    for row, (label, frames) in enumerate((("start", fit.frames_before[0]), ("fitted", fit.frames_after[0]))):
+        for column, i in enumerate(shown):
+            axis, x, cloud = axes[row, column], frames[i].numpy(), episode.clouds[i].numpy()
+            axis.plot_trisurf(
+                *x.T, triangles=faces, color="#dde5ea", edgecolor="#8fa3ad", linewidth=0.2, alpha=0.6, zorder=1
+            )
+            distance = 1e3 * _distance(episode.clouds[i], frames[i], index)
+            axis.scatter(*cloud.T, c=distance, s=5, cmap="inferno_r", vmin=0, vmax=worst, depthshade=False, zorder=2)
+            axis.set_title(f"{label}, t = {float(episode.times[i]):.2f} s: {distance.mean():.2f} mm", fontsize=10)
+            axis.set(**{f"{a}lim": (m - half, m + half) for a, m in zip("xyz", middle, strict=True)})
+            axis.set_box_aspect((1, 1, 1), zoom=1.15)
+            axis.tick_params(labelsize=6)
+            axis.view_init(elev=12, azim=-60)
+    scale = ScalarMappable(Normalize(0, worst), "inferno_r")
+    figure.colorbar(scale, ax=axes, shrink=0.6, label="distance of a measured point from the surface [mm]")
+    figure.suptitle(f"{episode.name}: measured points over the simulated cloth (axes in m)")
+    return figure
+
+
+def _distances(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray) -> Any:
+    """Mean distance over time, and over the iterations of the fit."""
+    import matplotlib.pyplot as plt
+
+    index = torch.as_tensor(faces)
+    figure, (over_time, over_fit) = plt.subplots(1, 2, figsize=(12, 4))
+    sources = (
+        ("carried rigidly", fit.frames_null, NULL),
+        ("start", fit.frames_before, BEFORE),
+        ("fitted", fit.frames_after, AFTER),
+    )
+    for label, frames, colour in sources:
+        for k, (x, episode) in enumerate(zip(frames, episodes, strict=True)):
+            mean = [1e3 * _distance(c, v, index).mean() for c, v in zip(episode.clouds, x, strict=True)]
+            over_time.plot(episode.times, mean, color=colour, label=label if k == 0 else None)
+    over_time.set(xlabel="time [s]", ylabel="mean distance cloud to surface [mm]", yscale="log")
+    over_time.legend()
+    for share in sorted({entry["frames"] for entry in fit.history}):
+        part = [entry for entry in fit.history if entry["frames"] == share]
+        style = {"marker": "o", "color": AFTER, "alpha": 1.0 if share == 1 else 0.4}
+        label = "all frames" if share == 1 else f"first {100 * share:.0f} % of the frames"
+        over_fit.plot([e["iteration"] for e in part], [1e3 * e["chamfer"] for e in part], label=label, **style)
+    over_fit.axhline(1e3 * fit.fit["chamfer_null"], color=NULL, linestyle="--", label="carried rigidly")
+    over_fit.set(xlabel="iteration", ylabel="Chamfer cloud to surface [mm]", yscale="log")
+    over_fit.legend()
+    figure.tight_layout()
+    return figure
+
+
+def _parameters(fit: Identification) -> Any:
+    """Start, estimate and 95 % interval of every fitted parameter."""
+    import matplotlib.pyplot as plt
+
+    shown = {n: e for n, e in fit.parameters.items() if e.source in ("data", "prior")}
+    figure, axes = plt.subplots(len(shown), 1, figsize=(8, 1.1 * len(shown) + 0.6), squeeze=False)
+    for axis, (name, e) in zip(axes[:, 0], shown.items(), strict=True):
+        colour = AFTER if e.identifiable else NULL
+        axis.plot(e.ci95, [0, 0], color=colour, linewidth=4, alpha=0.4, solid_capstyle="butt")
+        axis.plot(e.value, 0, "o", color=colour)
+        axis.plot(e.initial, 0, "x", color=BEFORE)
+        note = {"prior": " (measured)"}.get(e.source, "") if e.identifiable else "\n(not identifiable)"
+        axis.set_ylabel(f"{name}{note}\n[{e.unit}]", rotation=0, ha="right", va="center", fontsize=9)
+        axis.set_yticks([])
+        axis.spines[["left", "top", "right"]].set_visible(False)
+        axis.margins(x=0.1)
+    figure.suptitle("estimate and 95 % interval; cross: start", fontsize=10)
+    figure.tight_layout()
+    return figure

@@ -1,0 +1,62 @@
+"""A fit as a table for a terminal."""
+
+from __future__ import annotations
+
+import math
+
+from .result import Estimate, Identification
+
+COLUMNS = {
+    "parameter": "left",
+    "start": "right",
+    "fitted": "right",
+    "std. error": "right",
+    "95 % interval": "right",
+    "unit": "left",
+    "": "left",
+}
+REMARKS = {"prior": "measured", "derived": "= E h", "not in the model": "not in the model: no contact"}
+
+
+def print_fit(fit: Identification) -> None:
+    """Parameters, distances and warnings, 100 columns wide."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    console.width = max(console.width, 100)
+    table = Table(title="Parameters", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading, side in COLUMNS.items():
+        table.add_column(heading, justify=side, no_wrap=True)  # type: ignore[arg-type]
+    for name, e in fit.parameters.items():
+        table.add_row(name, f"{e.initial:.4g}", *_statement(e), e.unit, _remark(e))
+    console.print(table)
+    distances = Table(title="Distance cloud to surface, one-sided, metres", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("", "Chamfer", "rms"):
+        distances.add_column(heading, justify="right" if heading else "left")
+    f = fit.fit
+    for label, key in (("null: carried rigidly", "null"), ("start values", "before"), ("fitted values", "after")):
+        distances.add_row(label, f"{f[f'chamfer_{key}']:.6f}", f"{f[f'rms_{key}']:.6f}")
+    console.print(distances)
+    console.print(
+        f"{f['iterations']:.0f} iterations, {f['simulations']:.0f} simulations, {f['seconds']:.0f} s; "
+        f"{f['points']:.0f} points count as {f['independent_observations']:.0f} independent observations"
+    )
+    for warning in fit.warnings:
+        console.print(f"note: {warning}", style="yellow", markup=False)
+
+
+def _statement(e: Estimate) -> tuple[str, str, str]:
+    """Value, error, interval: never a number without its error, and no number where the data say nothing."""
+    interval = f"{e.ci95[0]:.3g} … {e.ci95[1]:.3g}"
+    if not e.identifiable:
+        return "–", "–", interval
+    digits = math.floor(math.log10(abs(e.value) / e.std)) + 2 if e.std > 0 and e.value else 4
+    return f"{e.value:.{min(max(digits, 3), 6)}g}", f"{e.std:.2g}", interval
+
+
+def _remark(e: Estimate) -> str:
+    if e.source == "data" and not e.identifiable:
+        return "not identifiable from these data"
+    return REMARKS.get(e.source, "")
