@@ -19,6 +19,7 @@ FLOORS = (
     ("meshes",),
     ("materials", "effects", "boundaries", "transfer"),
     ("functional", "stability", "recordings", "observe", "losses"),
+    ("intervals", "validation"),
     ("cloth", "robots"),
     ("identification", "diagnosis", "plan", "testing"),
     ("",),  # torchcloth/__init__.py: the names a user sees

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
+from typing import cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint as recompute
 
 from . import functional
 from .boundaries import AbstractBoundary
 from .boundaries.motion import check as check_motion
 from .boundaries.motion import drive, interpolate
 from .effects import AbstractEffect, MassDamping
-from .errors import InvalidInput, SimulationDiverged, UnstableStep
+from .errors import InvalidInput, UnstableStep
+from .intervals import Interval, advance
 from .materials import AbstractMaterial
 from .meshes import Mesh
 from .parameters import PhysicalParameter
 from .stability import stable_step
 from .transfer import Contact
 from .types import ClothState, Rollout, Trajectory
-
-CHUNK = 48  # substeps between checkpoints of a long frame interval: memory ~ frames + CHUNK, one extra forward pass
+from .validation import check_extent, check_field, check_state, check_times, expand_state
 
 
 class Cloth(nn.Module):
@@ -63,9 +62,9 @@ class Cloth(nn.Module):
         self.mesh, self.material = mesh, material
         for path, part in material.named_children():
             if isinstance(part, PhysicalParameter):
-                _check_field(path, part.raw, mesh)
+                check_field(path, part.raw, len(mesh.faces))
         self.areal_density = PhysicalParameter(areal_density, "kg/m^2", name="areal_density")
-        _check_field("areal_density", self.areal_density.raw, mesh)
+        check_field("areal_density", self.areal_density.raw, len(mesh.faces))
         self.effects = nn.ModuleDict({name: part.bind(mesh) for name, part in (effects or {}).items()})
         self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in (boundaries or {}).items()})
         self.contact = contact
@@ -135,16 +134,16 @@ class Cloth(nn.Module):
             UnstableStep: ``dt`` beyond the stability limit.
             SimulationDiverged: the state lost finiteness.
         """
-        frames = _check_times(times)
+        frames = check_times(times)
         motion = self._check_motion(dict(motion or {}), frames)
         model = self.model()
         limit = self._choose_step(dt)
-        state = self._check_state(state, model, motion)
+        state = self._start(state, model, motion)
         states, wrenches = [state], []
         for start, end in pairwise(frames):
             count = max(1, int(np.ceil((end - start) / limit - 1e-9)))
-            state, impulses = self._advance(model, state, motion, start, end, count, checkpoint)
-            self._check_finite(model, states[-1], state, motion, start, end, count)
+            state, impulses = advance(Interval(model, motion, start, end, count), state, checkpoint)
+            self._check_extent(state.x)
             states.append(state)
             wrenches.append({name: -impulse / (end - start) for name, impulse in impulses.items()})
         return _collect(frames, states, wrenches, [name for name, b in self.boundaries.items() if b.driven])
@@ -179,11 +178,11 @@ class Cloth(nn.Module):
         held = self._check_motion(held, frames)
         damping = MassDamping(rate).to(self._area)
         model = self.model()
-        state = self._check_state(state, model, held)
+        state = self._start(state, model, held)
         model = model._replace(effects=[*model.effects, (damping, damping.coefficients().detach())])
         count = int(np.ceil(duration * (1 / self.stable_step() + rate)))
-        settled, _ = self._advance(model, state, held, start, start + duration, count, checkpoint=True)
-        self._check_finite(model, state, settled, held, start, start + duration, count)
+        settled, _ = advance(Interval(model, held, start, start + duration, count), state, checkpoint=True)
+        self._check_extent(settled.x)
         return settled._replace(v=torch.zeros_like(settled.v))
 
     def stable_step(self) -> float:
@@ -201,14 +200,15 @@ class Cloth(nn.Module):
         """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
         density = self.areal_density.value
         mass = self._vertex_mass(density)
-        effects = [(effect, effect.coefficients()) for effect in self.effects.values()]
+        parts = cast("Iterable[AbstractEffect]", self.effects.values())
+        effects = [(effect, effect.coefficients()) for effect in parts]
         return functional.Model(
             geometry=self._geometry(),
             mass=mass,
             areal_density=_per_triangle(density),
             material=self.material,
             coefficients=self.material.coefficients(),
-            effects=effects,  # type: ignore[arg-type]
+            effects=effects,
             boundaries=dict(self.boundaries.items()),  # type: ignore[arg-type]
         )
 
@@ -264,91 +264,15 @@ class Cloth(nn.Module):
             out[name] = Trajectory(trajectory.t, trajectory.pose.to(self._area), trajectory.closed)
         return out
 
-    def _advance(self, model, state, motion, start, end, count, checkpoint):
-        """One frame interval in ``count`` substeps; impulses summed over it."""
-        times = torch.linspace(start, end, count + 1, dtype=torch.float64)
-        drives = {name: drive(trajectory, times.to(trajectory.pose)) for name, trajectory in motion.items()}
-        store = checkpoint and torch.is_grad_enabled()
-        total: dict[str, Tensor] = {}
-        for first in range(0, count, CHUNK):
-            run = partial(
-                functional.rollout,
-                model,
-                dt=(end - start) / count,
-                drives=drives,
-                substeps=min(CHUNK, count - first),
-                first=first,
-            )
-            state, impulses = (
-                recompute(run, state, use_reentrant=False, preserve_rng_state=False) if store else run(state)
-            )
-            total = {name: total[name] + value if name in total else value for name, value in impulses.items()}
-        return state, total
-
-    def _check_state(self, state: ClothState, model: functional.Model, motion: Mapping[str, Trajectory]) -> ClothState:
-        """Refuse a state that is not this cloth's; expand it to the batch of parameters and motion."""
-        shapes = [tuple(field.shape[-2:]) for field in state]
-        expected = [tuple(self._vertices.shape)] * 2 + [(len(self._area) * len(self._points), 3)]
-        if shapes != expected:
-            raise InvalidInput(
-                "state",
-                got=f"x, v, d3 of {shapes}",
-                expected=f"{expected}",
-                remedy="make states with this cloth's rest_state() or state()",
-            )
-        if not all(bool(torch.isfinite(field).all()) for field in state):
-            raise InvalidInput("state", got="NaN or infinite entries", expected="finite x, v, d3")
-        coefficients = [model.coefficients, (model.areal_density, model.mass), *(c for _, c in model.effects)]
-        tensors = [t for c in coefficients for t in (c if isinstance(c, tuple) else (c,)) if isinstance(t, Tensor)]
-        batches = [t.shape[:-2] for t in tensors if t.ndim > 2] + [m.pose.shape[:-3] for m in motion.values()]
-        batch = torch.broadcast_shapes(state.x.shape[:-2], *batches)
-        state = ClothState(*(field.expand(*batch, *field.shape[-2:]) for field in state))
+    def _start(self, state: ClothState, model: functional.Model, motion: Mapping[str, Trajectory]) -> ClothState:
+        check_state(state, len(self._vertices), len(self._area) * len(self._points))
+        state = expand_state(state, model, motion)
         self._check_extent(state.x)
         return state
 
     def _check_extent(self, x: Tensor) -> None:
-        if self.contact is None:
-            return
-        x = x.detach()
-        extent = float((x.amax(-2) - x.amin(-2)).max())
-        if extent > (self.nodes - 4) * self.spacing:
-            raise SimulationDiverged(
-                "the cloth's extent",
-                got=f"{extent:.3g} m",
-                expected=f"below {(self.nodes - 4) * self.spacing:.3g} m",
-                remedy="the sheet is stretched far beyond its rest shape: check initial positions and motion",
-            )
-
-    def _check_finite(
-        self,
-        model: functional.Model,
-        before: ClothState,
-        after: ClothState,
-        motion: Mapping[str, Trajectory],
-        start: float,
-        end: float,
-        count: int,
-    ) -> None:
-        """Raise when an interval ended without finiteness, naming the substep and the vertex where it was lost."""
-        if bool(torch.isfinite(after.x.detach()).all()):
-            self._check_extent(after.x)
-            return
-        times = torch.linspace(start, end, count + 1, dtype=torch.float64)
-        state, k, vertex = before, 0, 0
-        with torch.no_grad():
-            drives = {name: drive(trajectory, times.to(trajectory.pose)) for name, trajectory in motion.items()}
-            for k in range(count):  # the interval again, substep by substep
-                state, _ = functional.step(model, state, (end - start) / count, drives, k)
-                lost = ~torch.isfinite(state.x).all(-1)
-                if bool(lost.any()):
-                    vertex = int(lost.reshape(-1, lost.shape[-1]).any(0).nonzero()[0])
-                    break
-        raise SimulationDiverged(
-            f"simulation diverged at t = {float(times[k + 1]):.6g} s",
-            got=f"vertex {vertex} not finite after substep {k + 1} of {count}",
-            expected="finite positions",
-            remedy="check the initial positions and the motion for jumps, or lower dt",
-        )
+        if self.contact is not None:
+            check_extent(x, (self.nodes - 4) * self.spacing)
 
     def extra_repr(self) -> str:
         """Data sheet: size, contact, step."""
@@ -361,16 +285,6 @@ class Cloth(nn.Module):
         return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s"
 
 
-def _check_field(name: str, raw: Tensor, mesh: Mesh) -> None:
-    """Fields have one value per triangle; batches of scalars are [B, 1]."""
-    if raw.ndim and raw.shape[-1] not in (1, len(mesh.faces)):
-        raise InvalidInput(
-            name,
-            got=f"shape {tuple(raw.shape)}",
-            expected=f"a scalar, [{len(mesh.faces)}] (one per triangle) or [B, 1]",
-        )
-
-
 def _per_triangle(value: Tensor) -> Tensor:
     return value.unsqueeze(-1) if value.ndim else value.reshape(1, 1)
 
@@ -381,18 +295,6 @@ def _grid_size(mesh: Mesh, spacing: float) -> int:
     if mesh.uv is not None:
         longest = np.concatenate([longest, np.ptp(mesh.uv, axis=0)])
     return int(np.ceil(1.6 * np.linalg.norm(longest) / 2**0.5 / spacing)) + 6
-
-
-def _check_times(times: Tensor | Sequence[float]) -> list[float]:
-    flat = torch.as_tensor(times, dtype=torch.float64)
-    frames = flat.tolist() if flat.ndim == 1 else []
-    if len(frames) < 2 or not np.all(np.isfinite(frames)) or not np.all(np.diff(frames) > 0):
-        raise InvalidInput(
-            "times",
-            got=f"shape {tuple(flat.shape)}, first {frames[:3]}",
-            expected="at least two, increasing, finite seconds",
-        )
-    return frames
 
 
 def _collect(frames: list[float], states: list[ClothState], wrenches: list[dict[str, Tensor]], names: list[str]):

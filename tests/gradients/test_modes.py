@@ -129,9 +129,6 @@ def test_float32_agrees_with_float64(scene):
         assert torch.isfinite(gradient).all(), name
 
 
-@pytest.mark.xfail(
-    reason="Cloth broadcasts batched states only, not poses or parameters against one state", strict=True
-)
 @pytest.mark.parametrize(
     ("scene_name", "what"), [("swing", "poses"), ("swing", "parameters"), ("pressed", "parameters")]
 )

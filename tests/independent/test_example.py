@@ -100,14 +100,15 @@ def test_measured_first_positions_are_the_truth_s_with_a_smooth_error():
     uv, _ = grid(plan.sheet)
     x = np.column_stack([0.02 * np.sin(8 * uv[:, 0]), uv])
     fit_uv, faces, first = make_example.fit_mesh(plan, x, np.random.default_rng(0))
-    assert len(fit_uv) == 169
-    assert faces.shape == (288, 3)
+    n = plan.fit_nodes
+    assert len(fit_uv) == n * n
+    assert faces.shape == (2 * (n - 1) ** 2, 3)
     error = first - bilinear(plan.sheet, x, fit_uv)[0]
     assert np.sqrt((error**2).sum(1).mean()) == pytest.approx(1e-3, rel=0.05)
-    corners = [12 * 13, 12 * 13 + 12]
+    corners = [(n - 1) * n, n * n - 1]
     np.testing.assert_allclose(error[corners], 0, atol=1e-12)
-    edges = np.linalg.norm(np.diff(first.reshape(13, 13, 3), axis=1), axis=-1)
-    clean = np.linalg.norm(np.diff(bilinear(plan.sheet, x, fit_uv)[0].reshape(13, 13, 3), axis=1), axis=-1)
+    edges = np.linalg.norm(np.diff(first.reshape(n, n, 3), axis=1), axis=-1)
+    clean = np.linalg.norm(np.diff(bilinear(plan.sheet, x, fit_uv)[0].reshape(n, n, 3), axis=1), axis=-1)
     assert np.abs(edges / clean - 1).max() < 0.02
 
 

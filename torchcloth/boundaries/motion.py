@@ -38,7 +38,7 @@ def check(trajectory: Trajectory, name: str, start: float, end: float) -> None:
         raise InvalidInput(f"{where}.pose", got="NaN or infinite entries", expected="finite poses")
     rotation = pose.detach()[..., :3, :3]
     error = (rotation @ rotation.mT - torch.eye(3).to(rotation)).abs().amax()
-    if float(error) > 1e-3 or bool((torch.linalg.det(rotation) < 0).any()):
+    if float(error) > 1e-2 or bool((torch.linalg.det(rotation) < 0).any()):
         raise InvalidInput(f"{where}.pose", got="matrices that are not rotations", expected="rigid poses [R p; 0 1]")
     turn = (rotation[..., 1:, :, :] * rotation[..., :-1, :, :]).sum((-2, -1))  # trace of the relative rotation
     if bool((turn < 1.0).any()):
@@ -86,7 +86,8 @@ def drive(trajectory: Trajectory, times: Tensor) -> Drive:
     shift = after[..., :3, 3:] - turn @ before[..., :3, 3:]
     increment = torch.cat([torch.cat([turn, shift], dim=-1), after[..., 3:, :]], dim=-2)
     knot = (torch.searchsorted(trajectory.t.to(times), times[:-1] + 1e-9, right=True) - 1).clamp(min=0)
-    return Drive(increment, after[..., :3, 3], tuple(trajectory.closed[knot].tolist()))
+    closed = trajectory.closed.cpu()[knot.cpu()]
+    return Drive(increment, after[..., :3, 3], tuple(closed.tolist()))
 
 
 def _slopes(t: Tensor, pose: Tensor) -> Tensor:

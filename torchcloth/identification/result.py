@@ -73,7 +73,9 @@ class Identification:
         """Write identification.json into ``folder``, atomically; returns its path."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        return write_atomically(folder / "identification.json", json.dumps(self.as_dict(), indent=1) + "\n")
+        return write_atomically(
+            folder / "identification.json", json.dumps(self.as_dict(), indent=1, allow_nan=False) + "\n"
+        )
 
     def apply(self, cloth: Cloth) -> Cloth:
         """Set the fitted values in ``cloth``, leaving what is not identifiable as it is; returns it."""

@@ -1,0 +1,78 @@
+"""Substeps between two frames: checkpointed, and retraced when they go wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint as recompute
+
+from . import functional
+from .boundaries import Drive, drive
+from .errors import SimulationDiverged
+from .types import ClothState, Trajectory
+
+CHUNK = 48  # substeps between checkpoints of a long interval: memory ~ frames + CHUNK, one extra forward pass
+
+
+class Interval(NamedTuple):
+    """The time between two frames, in ``count`` equal substeps."""
+
+    model: functional.Model
+    motion: Mapping[str, Trajectory]
+    start: float  # s
+    end: float  # s
+    count: int
+
+    @property
+    def dt(self) -> float:
+        """Substep [s]."""
+        return (self.end - self.start) / self.count
+
+    def times(self) -> Tensor:
+        """[count + 1] s."""
+        return torch.linspace(self.start, self.end, self.count + 1, dtype=torch.float64)
+
+    def drives(self) -> dict[str, Drive]:
+        """The trajectories on the substeps."""
+        times = self.times()
+        return {name: drive(trajectory, times.to(trajectory.pose)) for name, trajectory in self.motion.items()}
+
+
+def advance(interval: Interval, state: ClothState, checkpoint: bool) -> tuple[ClothState, dict[str, Tensor]]:
+    """Simulate one interval; impulses are summed over it.
+
+    Raises:
+        SimulationDiverged: positions are not finite at its end.
+    """
+    before, drives, total = state, interval.drives(), {}
+    for first in range(0, interval.count, CHUNK):
+        substeps = min(CHUNK, interval.count - first)
+        run = partial(functional.rollout, interval.model, dt=interval.dt, drives=drives, substeps=substeps, first=first)
+        store = checkpoint and torch.is_grad_enabled()
+        state, impulses = recompute(run, state, use_reentrant=False, preserve_rng_state=False) if store else run(state)
+        total = {name: total[name] + value if name in total else value for name, value in impulses.items()}
+    if not bool(torch.isfinite(state.x.detach()).all()):
+        raise _divergence(interval, before)
+    return state, total
+
+
+@torch.no_grad()
+def _divergence(interval: Interval, state: ClothState) -> SimulationDiverged:
+    """Go through the interval again, substep by substep, to name the first vertex that was lost."""
+    drives, k, vertex = interval.drives(), 0, 0
+    for k in range(interval.count):
+        state, _ = functional.step(interval.model, state, interval.dt, drives, k)
+        lost = ~torch.isfinite(state.x).all(-1)
+        if bool(lost.any()):
+            vertex = int(lost.reshape(-1, lost.shape[-1]).any(0).nonzero()[0])
+            break
+    return SimulationDiverged(
+        f"simulation diverged at t = {float(interval.times()[k + 1]):.6g} s",
+        got=f"vertex {vertex} not finite after substep {k + 1} of {interval.count}",
+        expected="finite positions",
+        remedy="check the initial positions and the motion for jumps, or lower dt",
+    )

@@ -1,0 +1,67 @@
+"""Checks of what a user hands to the layer. They raise with the argument's name; they never change physics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .errors import InvalidInput, SimulationDiverged
+from .functional import Model
+from .types import ClothState, Trajectory
+
+
+def check_field(name: str, raw: Tensor, triangles: int) -> None:
+    """Fields have one value per triangle; batches of scalars are [B, 1]."""
+    if raw.ndim and raw.shape[-1] not in (1, triangles):
+        expected = f"a scalar, [{triangles}] (one per triangle) or [B, 1]"
+        raise InvalidInput(name, got=f"shape {tuple(raw.shape)}", expected=expected)
+
+
+def check_times(times: Tensor | Sequence[float]) -> list[float]:
+    """Frame times as a list of increasing seconds."""
+    flat = torch.as_tensor(times, dtype=torch.float64)
+    frames = flat.tolist() if flat.ndim == 1 else []
+    if len(frames) < 2 or not np.all(np.isfinite(frames)) or not np.all(np.diff(frames) > 0):
+        got = f"shape {tuple(flat.shape)}, first {frames[:3]}"
+        raise InvalidInput("times", got=got, expected="at least two, increasing, finite seconds")
+    return frames
+
+
+def check_state(state: ClothState, vertices: int, points: int) -> None:
+    """Refuse a state that was made for another cloth, or is not finite."""
+    shapes = [tuple(field.shape[-2:]) for field in state]
+    expected = [(vertices, 3), (vertices, 3), (points, 3)]
+    if shapes != expected:
+        raise InvalidInput(
+            "state",
+            got=f"x, v, d3 of {shapes}",
+            expected=f"{expected}",
+            remedy="make states with this cloth's rest_state() or state()",
+        )
+    if not all(bool(torch.isfinite(field).all()) for field in state):
+        raise InvalidInput("state", got="NaN or infinite entries", expected="finite x, v, d3")
+
+
+def expand_state(state: ClothState, model: Model, motion: Mapping[str, Trajectory]) -> ClothState:
+    """The state with the batch dimensions of parameters and motion, so that one state serves many of them."""
+    coefficients = [model.coefficients, (model.areal_density, model.mass), *(c for _, c in model.effects)]
+    tensors = [t for c in coefficients for t in (c if isinstance(c, tuple) else (c,)) if isinstance(t, Tensor)]
+    batches = [t.shape[:-2] for t in tensors if t.ndim > 2] + [m.pose.shape[:-3] for m in motion.values()]
+    batch = torch.broadcast_shapes(state.x.shape[:-2], *batches)
+    return ClothState(*(field.expand(*batch, *field.shape[-2:]) for field in state))
+
+
+def check_extent(x: Tensor, limit: float) -> None:
+    """A cloth wider than the contact grid would touch its own copies."""
+    x = x.detach()
+    extent = float((x.amax(-2) - x.amin(-2)).max())
+    if extent > limit:
+        raise SimulationDiverged(
+            "the cloth's extent",
+            got=f"{extent:.3g} m",
+            expected=f"below {limit:.3g} m",
+            remedy="the sheet is stretched far beyond its rest shape: check initial positions and motion",
+        )
