@@ -111,7 +111,7 @@ class _Run:
             raw = descend(full, start, iterations, rate, self._record)
             final = gauss_newton.minimise(full.problem(), raw, 0, lambda _: True)
         else:
-            final = self._gauss_newton(iterations, start, skip_early=bool(guess))
+            final = self._gauss_newton(iterations, start, skip_early=bool(guess) or self.stop == "paper")
         after = full.frames(final.raw)
         final, warnings = self._check_linearity(final)
         covariance = gauss_newton.covariance(full.problem(), final)

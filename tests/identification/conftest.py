@@ -1,0 +1,45 @@
+"""One twin episode, and one fit of it, for all tests of this folder."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))  # helpers beside the tests
+
+import twins
+
+from torchcloth.identification import identify
+
+
+@pytest.fixture(scope="session")
+def recording():
+    with twins.doubles():
+        return twins.twin()
+
+
+@pytest.fixture(scope="session")
+def brief(recording):
+    """Its first six frames."""
+    return twins.first(recording, 6)
+
+
+@pytest.fixture
+def model(recording):
+    """The start: the data sheet's values, twice the true stiffness."""
+    return twins.at(recording)
+
+
+@pytest.fixture(scope="session")
+def fitted(recording):
+    """(result, what on_progress was called with): everything the model contains, from the data sheet's values."""
+    calls = []
+    with twins.doubles():
+        return identify(twins.at(recording), recording, on_progress=lambda *call: calls.append(call)), calls
+
+
+@pytest.fixture(scope="session")
+def pair(recording):
+    """Stiffness and air only, from 20 N/m: half the true stiffness, a quarter of the data sheet's."""
+    with twins.doubles():
+        return identify(twins.at(recording, youngs_modulus=2e4), recording, ["youngs_modulus", "air.normal"])

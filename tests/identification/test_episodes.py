@@ -1,0 +1,213 @@
+"""From recordings to what the solver takes: clocks, frames, refusals; what ``identify`` refuses before it begins."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import twins
+from twins import at, shifted
+
+from torchcloth import recordings as rec
+from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.identification import cloth_from, episode, identify
+from torchcloth.identification.episodes import mesh_of
+from torchcloth.identification.objective import Objective
+from torchcloth.identification.unknowns import available, collect
+
+
+def with_cloth(recording, **changes):
+    return replace(recording, cloth=replace(recording.cloth, **changes))
+
+
+# -- episode() -------------------------------------------------------------------------------------------------------
+
+
+def test_an_episode_holds_what_was_recorded(recording, model):
+    seen = episode(model, recording)
+    assert set(seen.motion) == {"left", "right"}
+    assert [len(cloud) for cloud in seen.clouds] == recording.points.counts.tolist()
+    np.testing.assert_array_equal(torch.cat(seen.clouds).numpy(), recording.points.xyz)
+    np.testing.assert_array_equal(seen.initial.numpy(), recording.cloth.initial_vertices)
+    assert seen.settles
+    assert seen.noise == recording.observation_noise_std
+    assert seen.clouds[0].dtype == seen.initial.dtype == torch.float64
+
+
+def test_a_cloud_takes_the_cloths_dtype(recording):
+    torch.set_default_dtype(torch.float32)
+    seen = episode(cloth_from(recording), recording)
+    assert seen.clouds[0].dtype == seen.initial.dtype == seen.motion["left"].pose.dtype == torch.float32
+    assert seen.times.dtype == torch.float64  # seconds since an epoch do not fit into float32
+
+
+def test_without_initial_vertices_the_mesh_is_the_first_frame(recording, model):
+    seen = episode(model, with_cloth(recording, initial_vertices=None))
+    assert not seen.settles
+    np.testing.assert_array_equal(seen.initial.numpy(), model.mesh.vertices)
+
+
+def test_initial_vertices_of_another_mesh_are_refused(recording, model):
+    bad = with_cloth(recording, initial_vertices=recording.cloth.initial_vertices[:-3])
+    with pytest.raises(InvalidInput, match=r"initial_vertices; got 46 rows; expected 49"):
+        episode(model, bad)
+
+
+def test_a_grasp_without_motion_is_refused(recording, model):
+    bad = replace(recording, grippers={"left": recording.grippers["left"]})
+    with pytest.raises(RecordingError, match=r"no motion for grasp 'right'; got motion of \['left'\]"):
+        episode(model, bad)
+
+
+def test_motion_that_no_grasp_needs_is_left_aside(recording, model):
+    more = replace(recording, grippers={**recording.grippers, "third": recording.grippers["left"]})
+    assert set(episode(model, more).motion) == {"left", "right"}
+
+
+def test_an_episode_without_points_is_refused(recording, model):
+    with pytest.raises(RecordingError, match="has no points, which identify needs"):
+        episode(model, replace(recording, points=None))
+
+
+def test_a_single_frame_is_refused(recording, model):
+    p = recording.points
+    one = rec.PointClouds(p.t[:1], p.xyz[: p.counts[0]], p.counts[:1])
+    with pytest.raises(RecordingError, match=r"1 frame.*at least two"):
+        episode(model, replace(recording, points=one))
+
+
+@pytest.mark.parametrize("offset", [12.5, -0.3])
+def test_the_clock_offset_is_added_to_the_observations(recording, model, offset):
+    """t_motion = t_observation + clock_offset, as the format says; the wrong sign would be off by twice it."""
+    moved = shifted(recording, offset)
+    np.testing.assert_allclose(moved.points.t, recording.points.t - offset)
+    seen = episode(model, moved)
+    np.testing.assert_allclose(seen.times.numpy(), recording.points.t, atol=1e-9)
+    assert len(seen.clouds) == len(recording.points)
+
+
+def test_a_clock_that_is_off_is_refused_with_the_remedy(recording, model):
+    for offset in (-0.1, 5.0):
+        with pytest.raises(RecordingError, match=r"covers the first frame; check clock_offset"):
+            episode(model, replace(recording, clock_offset=offset))
+
+
+def test_frames_after_the_motion_are_left_out(recording, model):
+    late = replace(recording, clock_offset=0.12)  # two and a half frames beyond 0.72 s
+    seen = episode(model, late)
+    assert len(seen.times) == len(seen.clouds) == twins.FRAMES - 2
+    assert float(seen.times[-1]) <= 0.72
+
+
+def test_until_keeps_the_early_frames(recording, model):
+    seen = episode(model, recording)
+    assert len(seen.until(0.5).clouds) == len(seen.until(0.5).times) == round(0.5 * twins.FRAMES)
+    assert len(seen.until(0.0).clouds) == 4  # fewer would not be a motion
+
+
+# -- cloth_from() ----------------------------------------------------------------------------------------------------
+
+
+def test_the_cloth_starts_at_the_data_sheet(recording):
+    cloth = cloth_from(recording)
+    assert cloth.material.youngs_modulus.value.item() == pytest.approx(8e4)
+    assert cloth.material.poisson_ratio.value.item() == pytest.approx(0.15)
+    assert cloth.effects["bending"].stiffness.value.item() == pytest.approx(3e-5)
+    assert cloth.effects["bending"].damping_time == 5e-3
+    assert cloth.effects["air"].density == 1.204
+    assert cloth.areal_density.value.item() == pytest.approx(0.3)
+    assert cloth.contact is None
+    assert [len(cloth.boundaries[name].index) for name in ("left", "right")] == [7, 7]
+
+
+def test_without_a_data_sheet_and_air_the_base_model_is_bare(recording):
+    bare = replace(with_cloth(recording, nominal={}), air_density=None)
+    cloth = cloth_from(bare)
+    assert set(cloth.effects) == {"gravity"}
+    assert cloth.material.youngs_modulus.value.item() * cloth.material.thickness == pytest.approx(300.0)  # N/m
+
+
+def test_a_sheet_needs_no_mesh_and_something_is_needed(recording):
+    nothing = with_cloth(recording, vertices=None, faces=None, uv=None, initial_vertices=None)
+    with pytest.raises(RecordingError, match="neither mesh nor sheet"):
+        mesh_of(nothing)
+    sheet = with_cloth(nothing, sheet=(0.3, 0.2))
+    np.testing.assert_allclose(np.ptp(mesh_of(sheet).vertices, axis=0)[:2], [0.3, 0.2])
+
+
+def test_a_collider_becomes_a_plane(recording):
+    table = rec.Collider(np.array([0.0, 0.0, 0.2]), np.array([0.0, 0.0, 1.0]), 0.3)
+    assert set(cloth_from(replace(recording, colliders={"table": table})).boundaries) == {"table", "left", "right"}
+
+
+# -- unknowns --------------------------------------------------------------------------------------------------------
+
+
+def test_unknowns_by_public_name(model):
+    names = set(available(model))
+    assert names >= {"youngs_modulus", "poisson_ratio", "air.normal", "bending.stiffness", "areal_density"}
+    one = collect(model, ["air.normal", "youngs_modulus", "air.normal"], 0.005)
+    assert [u.name for u in one] == ["air.normal", "youngs_modulus", "areal_density"]
+    assert [u.measured for u in one] == [False, False, True]
+    assert one[2].prior_std == pytest.approx(0.005 / 0.3)  # of the logarithm
+    assert one[0].clip(-0.1) == 0.0
+    assert one[1].clip(-0.1) == -0.1
+
+
+def test_slopes_are_those_of_the_values(model):
+    for unknown in collect(model, ["youngs_modulus", "poisson_ratio", "air.normal"], None):
+        h = 1e-5
+        finite = (unknown.value(unknown.start + h) - unknown.value(unknown.start - h)) / (2 * h)
+        assert unknown.slope(unknown.start) == pytest.approx(finite, rel=1e-6)
+
+
+def test_values_and_raw_are_inverse(model, recording):
+    problem = Objective(model, collect(model, ["youngs_modulus", "poisson_ratio"], None), [episode(model, recording)])
+    values = {"youngs_modulus": 3.3e4, "poisson_ratio": 0.31}
+    assert problem.values(problem.raw(values)) == pytest.approx(values)
+
+
+# -- what identify() refuses before it simulates ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"parameters": ["stiffness"]}, r"parameter to fit; got 'stiffness'; expected one of .*youngs_modulus"),
+        ({"parameters": ["gravity"]}, r"parameter to fit; got 'gravity'"),
+        ({"method": "newton"}, r"method.*'newton'"),
+        ({"stop": "never"}, r"stop.*'never'"),
+        ({"iterations": 0}, r"iterations; got 0; expected at least 1"),
+        ({"iterations": -3}, r"iterations; got -3"),
+        ({"guess": {"stiffness": 1.0}}, r"guess; got 'stiffness'; expected one of youngs_modulus"),
+        ({"guess": {"youngs_modulus": -1.0}}, r"youngs_modulus; got -1 Pa; expected a value > 0"),
+        ({"dt": -1.0}, r"dt; got -1"),
+        ({"dt": 0.05}, r"dt; got 0.05 s; expected at most 0\.00\d+ s"),
+    ],
+)
+def test_wrong_arguments_are_named(model, recording, arguments, said):
+    with pytest.raises(ValueError, match=said) as caught:
+        identify(model, recording, **{"parameters": ["youngs_modulus"], **arguments})
+    assert "\n" not in str(caught.value)
+
+
+def test_no_recordings_are_refused(model):
+    with pytest.raises(InvalidInput, match="recordings; got none"):
+        identify(model, [])
+
+
+@pytest.mark.xfail(strict=True, reason="an empty list of parameters ends in an IndexError of the simulation")
+def test_no_parameters_are_refused(model, recording):
+    exact = with_cloth(recording, areal_density_std=None)
+    with pytest.raises(InvalidInput, match="parameters"):
+        identify(model, exact, [])
+
+
+def test_a_field_is_not_a_scalar(recording):
+    cloth = at(recording)
+    from torchcloth import PhysicalParameter
+
+    field = torch.full((len(cloth.mesh.faces),), 0.3)
+    cloth.areal_density = PhysicalParameter(field, "kg/m^2", name="areal_density")
+    with pytest.raises(InvalidInput, match="areal_density"):
+        identify(cloth, recording, ["areal_density"])

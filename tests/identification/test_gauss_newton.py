@@ -1,0 +1,212 @@
+"""The solver and its error bars on problems whose answer is known."""
+
+from itertools import pairwise
+
+import pytest
+import torch
+import toys
+from toys import TRUE, curved, linear
+
+from torchcloth.errors import SimulationDiverged, UnstableStep
+from torchcloth.identification import gauss_newton
+from torchcloth.identification.gauss_newton import covariance, minimise
+from torchcloth.identification.misfit import huber
+
+START = torch.zeros(3, dtype=torch.float64)
+FITS = 200
+
+
+def solve(toy, iterations=35, start=START, **options):
+    return minimise(toy.problem(), start, iterations, lambda _: False, **options)
+
+
+def optimum(toy):
+    """The robust cost's own minimum near the solver's answer, by plain Newton to convergence from the truth."""
+    raw = TRUE.clone()
+    final = solve(toy, start=TRUE.clone(), tolerance=1e-6)
+    scale, share = final.scale, final.share
+    for _ in range(50):
+        linear = toy._linearise(raw)
+        _, weight = huber(linear.value / scale)
+        weighted = (share * weight / scale**2)[:, None] * linear.jacobian
+        hessian = weighted.mT @ linear.jacobian + torch.eye(3) / toy.prior_std**2
+        raw = raw - torch.linalg.solve(hessian, weighted.mT @ linear.value + raw / toy.prior_std**2)
+    return raw
+
+
+def deviations(toy, at):
+    return covariance(toy.problem(), at).diagonal().sqrt()
+
+
+def test_a_linear_problem_is_solved():
+    toy, _ = linear(0)
+    final = solve(toy, tolerance=1e-3)
+    assert final.exact
+    missed = (final.raw - optimum(toy)).abs() / deviations(toy, final)
+    assert float(missed.max()) < 1e-2  # standard errors: a tenth of nothing is lost to the stop rule
+    assert float(((final.raw - TRUE).abs() / deviations(toy, final)).max()) < 3.5
+    assert final.scale == pytest.approx(toys.SIGMA, rel=0.1)
+    assert final.share > 0.5  # independent residuals count as such
+
+
+@pytest.fixture(scope="module")
+def coverage():
+    """Share of 95 % intervals that hold the truth, by kind of noise and of error bar, over 200 seeds."""
+    hits = {}
+    for shared in (0.0, 1.0):
+        stated, naive = [], []
+        for seed in range(FITS):
+            toy, jacobian = linear(1000 + seed, shared)
+            final = solve(toy)
+            error = (final.raw - TRUE).abs()
+            stated.append(error < 1.96 * deviations(toy, final))
+            alone = torch.linalg.inv(jacobian.mT @ jacobian).diagonal().sqrt() * final.scale
+            naive.append(error < 1.96 * alone)
+        hits[shared] = {"stated": torch.stack(stated), "naive": torch.stack(naive)}
+    return hits
+
+
+def share(hits):
+    return float(hits.double().mean())
+
+
+def test_intervals_cover_when_noise_is_independent(coverage):
+    """600 intervals: 95 % has a sampling error of 0.9 %; the sandwich of 40 frames is a little short or long."""
+    assert 0.88 <= share(coverage[0.0]["stated"]) <= 1.0
+    assert share(coverage[0.0]["naive"]) > 0.90  # here the simple formula is right: the toy is what it claims to be
+
+
+def test_intervals_cover_when_noise_is_shared_where_naive_ones_fail(coverage):
+    """Half the variance belongs to a patch for five frames; the errors that count points are three times too small."""
+    assert share(coverage[1.0]["naive"]) < 0.75
+    assert share(coverage[1.0]["stated"]) >= 0.85
+
+
+def test_intervals_are_not_needlessly_wide():
+    """Coverage alone would be met by infinite intervals: for independent noise they are near the best."""
+    ratio = []
+    for seed in range(20):
+        toy, jacobian = linear(5000 + seed)
+        final = solve(toy)
+        ratio.append(deviations(toy, final) / (torch.linalg.inv(jacobian.mT @ jacobian).diagonal().sqrt() * 1e-3))
+    assert 0.9 < float(torch.stack(ratio).mean()) < 1.5
+
+
+def test_shared_noise_counts_as_few_observations():
+    alone, shared = (solve(linear(0, s)[0]).share for s in (0.0, 1.0))
+    assert shared < 0.4 * alone
+
+
+def test_broyden_and_exact_jacobians_end_at_the_same_point(monkeypatch):
+    """To a fraction of a standard error; Broyden saves linearisations, which are what a simulation pays for."""
+    saving = curved()
+    a = solve(saving, tolerance=0.01)
+    monkeypatch.setattr(gauss_newton, "TRUSTED_GAIN", float("inf"))
+    exact = curved()
+    b = solve(exact, tolerance=0.01)
+    assert float(((a.raw - b.raw).abs() / deviations(exact, b)).max()) < 0.05
+    assert len(saving.linearised) < len(exact.linearised)
+    assert a.exact
+    assert b.exact
+
+
+def test_the_final_point_is_linearised_exactly():
+    toy = curved()
+    final = solve(toy, iterations=2)  # stopped in the middle
+    assert torch.equal(toy.linearised[-1], final.raw)
+    torch.testing.assert_close(final.linear.jacobian, toy._linearise(final.raw).jacobian)
+
+
+@pytest.mark.parametrize("error", [SimulationDiverged, UnstableStep])
+def test_steps_that_cannot_be_simulated_are_survived(error):
+    """Beyond 0.2 from the last accepted point the simulation is lost; the solver shortens its steps and arrives."""
+    toy, _ = linear(0)
+    accepted = []
+
+    def forbidden(raw):
+        return error("lost") if float((raw - accepted[-1]).abs().max()) > 0.2 else None
+
+    toy.forbidden = forbidden
+    final = minimise(toy.problem(), START, 60, lambda it: accepted.append(it.raw))
+    assert len(toy.evaluated) > len(accepted)  # some were refused
+    assert float(((final.raw - optimum(toy)).abs() / deviations(toy, final)).max()) < 0.5
+
+
+def test_when_nothing_can_be_simulated_the_start_is_returned():
+    toy, _ = linear(0)
+    toy.forbidden = lambda raw: SimulationDiverged("lost")
+    final = solve(toy)
+    assert torch.equal(final.raw, START)
+    assert final.exact
+
+
+def test_other_errors_are_not_swallowed():
+    toy, _ = linear(0)
+    toy.forbidden = lambda raw: ZeroDivisionError("a bug")
+    with pytest.raises(ZeroDivisionError):
+        solve(toy)
+
+
+@pytest.mark.parametrize("after", [0, 2])
+def test_on_iterate_stops(after):
+    toy, points = curved(), []
+
+    def stop(it):
+        points.append(it.raw)
+        return len(points) == after + 1
+
+    final = minimise(toy.problem(), START, 35, stop)
+    assert len(points) == after + 1
+    assert torch.equal(final.raw, points[-1])
+    assert final.exact
+
+
+def test_no_iterations_only_linearise():
+    toy, points = curved(), []
+    final = minimise(toy.problem(), START, 0, lambda it: points.append(it.raw))
+    assert torch.equal(final.raw, START)
+    assert len(points) == 1
+    assert not toy.evaluated
+
+
+def test_the_cost_never_grows():
+    toy, costs = curved(), []
+    problem = toy.problem()
+    minimise(problem, START, 35, lambda it: costs.append(float(it.linear.value.square().sum())))
+    for before, now in pairwise(costs):  # squares, where the solver's cost is robust and has a prior
+        assert now < before * (1 + 1e-3)
+    assert costs[-1] < 0.5 * costs[0]
+
+
+def test_outliers_do_not_move_the_answer():
+    """5 % of the points 50 sigma off: least squares would move by many standard errors."""
+    toy, jacobian = linear(0)
+    spoilt, _ = linear(0)
+    pick = torch.randperm(len(spoilt.data), generator=torch.Generator().manual_seed(1))[: len(spoilt.data) // 20]
+    spoilt.data = spoilt.data.clone()
+    spoilt.data[pick] += 50 * toys.SIGMA
+    clean, dirty = solve(toy), solve(spoilt)
+    least = torch.linalg.lstsq(jacobian, spoilt.data[:, None]).solution.squeeze()
+    moved, deviation = (dirty.raw - clean.raw).abs(), deviations(toy, clean)
+    assert float((moved / deviation).max()) < 2.0
+    assert float(moved.norm()) < 0.5 * float((least - clean.raw).norm())
+
+
+def test_a_prior_decides_where_the_data_are_silent():
+    toy, jacobian = linear(0)
+    blind = jacobian.clone()
+    blind[:, 2] = 0.0
+    toy.model = lambda raw: blind @ raw
+    toy.data = blind @ TRUE + toys.noise(torch.Generator().manual_seed(0), 0.0)
+    final = solve(toy)
+    assert float(final.raw[2]) == 0.0
+    assert float(deviations(toy, final)[2]) == pytest.approx(toy.prior_std, rel=1e-6)
+    assert float(((final.raw - TRUE)[:2].abs() / deviations(toy, final)[:2]).max()) < 3.5
+
+
+def test_covariance_is_symmetric_and_positive():
+    for shared in (0.0, 1.0):
+        toy, _ = linear(0, shared)
+        matrix = covariance(toy.problem(), solve(toy))
+        torch.testing.assert_close(matrix, matrix.mT)
+        assert float(torch.linalg.eigvalsh(matrix).min()) > 0

@@ -1,0 +1,181 @@
+"""Statements: every warning can be reached, none comes without its reason, and numbers are never bare."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from twins import at
+
+import torchcloth as tc
+from torchcloth.identification import fit as fits
+from torchcloth.identification import gauss_newton, result
+from torchcloth.identification.misfit import Figures
+from torchcloth.identification.report import Found, estimates, warnings_of
+from torchcloth.identification.result import Estimate, Identification, write_atomically
+from torchcloth.identification.unknowns import collect
+
+GOOD = Estimate(2.0, 0.1, (1.8, 2.2), "-", 1.0, True)
+LOST = Estimate(2.0, 1.9, (0.1, 9.0), "-", 1.0, False)
+FIT = {"chamfer_after": 0.8e-3, "chamfer_null": 10e-3, "rms_after": 1e-3}
+EPISODE = SimpleNamespace(noise=1e-3, settles=True)
+
+
+def found(a=GOOD, b=GOOD, correlation=0.0, density=True):
+    parameters = {"a": a, "b": b}
+    if density:
+        parameters["areal_density"] = Estimate(0.3, 0.005, (0.29, 0.31), "kg/m^2", 0.3, True, "prior")
+    matrix = {m: {n: float(m == n) for n in parameters} for m in parameters}
+    matrix["a"]["b"] = matrix["b"]["a"] = correlation
+    return Found(parameters, matrix)
+
+
+def warn(model, what=None, fit=None, episodes=(EPISODE,), frames=None):
+    flat = torch.as_tensor(model.mesh.vertices).expand(2, -1, -1)
+    faces = torch.as_tensor(model.mesh.faces)
+    frames = [flat] if frames is None else frames
+    return warnings_of(model, episodes, what or found(), {**FIT, **(fit or {})}, frames, faces)
+
+
+def folded(model):
+    """The sheet doubled over itself, the halves 5 mm apart."""
+    x = torch.as_tensor(model.mesh.vertices).clone()
+    over = x[:, 0] > 0.15
+    x[over, 2] = 5e-3
+    x[over, 0] = 0.3 - x[over, 0]
+    return x.expand(2, -1, -1)
+
+
+def test_a_good_fit_has_no_warnings(model):
+    assert warn(model) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"fit": {"chamfer_after": 11e-3}}, "no better than cloth carried rigidly"),
+        ({"what": found(a=LOST)}, "a is not identifiable from these data"),
+        ({"what": found(correlation=-0.97)}, "b and a can hardly be told apart (correlation -0.97)"),
+        ({"what": found(density=False)}, "areal density was taken as exact"),
+        ({"fit": {"rms_after": 2.1e-3}}, "the residual (2.1 mm rms) exceeds twice the sensor noise (1.0 mm)"),
+        ({"episodes": (EPISODE, SimpleNamespace(noise=1e-3, settles=False))}, "an episode has no initial_vertices"),
+    ],
+)
+def test_every_warning_comes_alone_with_its_reason(model, change, said):
+    (warning,) = warn(model, **change)
+    assert said in warning
+
+
+def test_layers_that_meet_are_noticed_where_contact_was_left_out(model, recording):
+    (warning,) = warn(model, frames=[folded(model)])
+    assert warning == "layers of the cloth come near each other, and contact was left out: fit with contact"
+    with_contact = tc.Cloth(model.mesh, tc.materials.AEP(4e4, 0.3), 0.3)
+    assert warn(with_contact, frames=[folded(model)]) == []
+
+
+def test_unknown_noise_is_not_compared(model):
+    assert warn(model, fit={"rms_after": 1.0}, episodes=(SimpleNamespace(noise=None, settles=True),)) == []
+
+
+def test_what_was_measured_or_absent_is_not_called_unidentifiable(model):
+    absent = Estimate(1.0, 9.0, (0.1, 9.0), "-", 1.0, False, "not in the model")
+    assert warn(model, found(a=absent)) == []
+
+
+def test_an_unstable_motion_is_said_and_differences_replace_tangents():
+    """A residual that wobbles: its slope at a point is not its slope over a standard error."""
+    rows, one = 60, torch.ones(60)
+    frame, patch = torch.arange(rows) % 6 + 1, torch.arange(rows) % 4
+    noise = 1e-3 * torch.randn(rows, generator=torch.Generator().manual_seed(0))
+    spread = torch.linspace(-1, 1, rows)
+
+    def linear(slope):
+        return gauss_newton.Linearised(noise, slope * 1e-2 * spread[:, None], one, frame, patch)
+
+    class Fake(SimpleNamespace):
+        def problem(self):
+            std = torch.ones(1)
+            return gauss_newton.Problem(None, None, None, torch.zeros(1), std, 1e-3)
+
+        def secants(self, raw, steps):
+            assert 0.005 <= float(steps[0]) <= 0.1
+            return linear(self.secant)
+
+    at_start = gauss_newton.Iterate(torch.zeros(1), linear(1.0), True, 1e-3, 1.0)
+    for secant, warned in ((1.2, False), (5.0, True)):
+        fake = Fake(unknowns=[SimpleNamespace(name="youngs_modulus")], secant=secant)
+        final, warnings = fits._Run(fake, "converged", None)._check_linearity(at_start)
+        assert bool(warnings) == warned
+        assert (final.linear is not at_start.linear) == warned
+    assert "tangents of youngs_modulus miss finite steps by up to 80 %" in warnings[0]
+
+
+# -- estimates -------------------------------------------------------------------------------------------------------
+
+
+def stated(model, deviation, names=("youngs_modulus", "air.normal")):
+    unknowns = collect(model, names, None)
+    raw = torch.tensor([u.start for u in unknowns])
+    return estimates(model, unknowns, raw, torch.diag(torch.tensor(deviation) ** 2)).parameters
+
+
+def test_errors_of_logarithms_become_errors_of_values(model):
+    p = stated(model, [0.1, 0.05])["youngs_modulus"]
+    assert p.std == pytest.approx(0.1 * 8e4)
+    assert p.ci95 == pytest.approx((8e4 * math.exp(-0.196), 8e4 * math.exp(0.196)))
+    assert p.identifiable
+
+
+def test_identifiable_is_an_error_below_a_quarter(model):
+    assert stated(model, [0.24, 0.05])["youngs_modulus"].identifiable
+    assert not stated(model, [0.26, 0.05])["youngs_modulus"].identifiable
+
+
+def test_an_amplitude_of_zero_can_be_known(recording):
+    """No drag, known to 0.1 where 1.2 is typical, is a finding; its interval ends at zero."""
+    p = stated(at(recording, **{"air.normal": 0.0}), [0.1, 0.1])["air.normal"]
+    assert p.identifiable
+    assert p.ci95[0] == 0.0
+    assert p.ci95[1] == pytest.approx(0.196)
+
+
+# -- result ----------------------------------------------------------------------------------------------------------
+
+
+def outcome(**changes):
+    filled = {f"{k}_{w}": 1e-3 for k in ("chamfer", "rms") for w in ("before", "after", "null")}
+    parts = {"parameters": {"a": GOOD}, "fit": filled, "correlation": {}, "warnings": [], "history": []}
+    return Identification(**{**parts, "frames_before": [], "frames_after": [], "frames_null": [], **changes})
+
+
+def test_saving_is_atomic(tmp_path, monkeypatch):
+    """A failure in the middle leaves the old file, and no part of the new one beside it."""
+    path = outcome().save(tmp_path)
+    old = path.read_text()
+    monkeypatch.setattr(result.os, "fsync", lambda handle: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        outcome(warnings=["new"]).save(tmp_path)
+    assert path.read_text() == old
+    assert [p.name for p in tmp_path.iterdir()] == ["identification.json"]
+
+
+def test_an_interrupt_while_writing_leaves_the_old_text(tmp_path, monkeypatch):
+    path = write_atomically(tmp_path / "progress.json", "old")
+    monkeypatch.setattr(result.os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(path, "new")
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["progress.json"]
+
+
+def test_what_is_not_json_is_not_written(tmp_path):
+    broken = outcome(parameters={"a": Estimate(math.nan, math.inf, (0.0, math.inf), "-", 1.0, False)})
+    with pytest.raises(ValueError, match="JSON"):
+        broken.save(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_figures_of_a_fit_name_what_they_count():
+    """``fit`` is one flat object of numbers."""
+    assert set(Figures._fields) == {"chamfer", "rms", "per_frame"}
+    assert all(isinstance(value, float) for value in outcome().as_dict()["fit"].values())

@@ -1,0 +1,266 @@
+"""The command line as a user meets it: one readable result, or one line that says what is wrong."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "identification"))
+
+from twins import doubles, first, twin
+
+from torchcloth import recordings
+from torchcloth.cli import main
+
+COMMAND = [sys.executable, "-m", "torchcloth.cli"]
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "80", "PYTHONUNBUFFERED": "1"}
+QUICK = ["--fit", "youngs_modulus", "air.normal"]
+CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f\x9b]")
+LONGEST = 120
+
+
+def call(*arguments, **options):
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, env=ENVIRONMENT, timeout=300, **options
+    )
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    """The twin episode on disk."""
+    with doubles():
+        return recordings.write(first(twin(), 8), tmp_path_factory.mktemp("episodes") / "twin")
+
+
+@pytest.fixture
+def spoiled(folder, tmp_path):
+    """A copy to break."""
+    return Path(shutil.copytree(folder, tmp_path / "spoiled"))
+
+
+def one_line(text):
+    assert text.endswith("\n")
+    assert text.count("\n") == 1, text
+    assert text.startswith("torchcloth: ")
+    assert "Traceback" not in text
+    return text
+
+
+def refuse(capsys, out, *arguments):
+    """What stderr says when ``main`` refuses; nothing may be left behind."""
+    code = main([str(a) for a in arguments] + ["--out", str(out)])
+    said = one_line(capsys.readouterr().err)
+    assert code == 2
+    assert not out.exists() or list(out.iterdir()) == [], "something was written into a fresh --out"
+    return said
+
+
+WRONG = {
+    "unstable step": (["--dt", "0.05"], "dt; got 0.05 s; expected at most 0.0"),
+    "negative modulus": (["--start", "youngs_modulus=-1"], "Young's modulus|youngs_modulus; got -1 Pa; expected"),
+    "infinite modulus": (["--start", "youngs_modulus=inf"], "got inf Pa"),
+    "start without value": (["--start", "youngs_modulus"], "--start; got 'youngs_modulus'; expected NAME=NUMBER"),
+    "start without number": (["--start", "youngs_modulus=stiff"], "--start; got 'youngs_modulus=stiff'"),
+    "start of nothing": (["--start", "stiffness=3"], "--start; got 'stiffness'; expected one of .*youngs_modulus"),
+    "fit of nothing": (["--fit", "stiffness"], "got 'stiffness'; expected one of .*youngs_modulus"),
+    "no iterations": (["--iterations", "0"], "iterations; got 0; expected at least 1"),
+    "resume of nothing": (["--resume"], "--resume; got no .*progress.json"),
+    "negative contact": (["--contact", "-0.01"], "spacing"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_options_are_one_line_and_exit_code_2(folder, tmp_path, capsys, case):
+    options, said = WRONG[case]
+    assert re.search(said, refuse(capsys, tmp_path / "out", "identify", folder, *options))
+
+
+LEAVES_A_FOLDER = ("unstable step", "fit of nothing", "no iterations")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(
+            case,
+            marks=pytest.mark.xfail(strict=True, reason="DIR is made before identify has looked at its arguments")
+            if case in LEAVES_A_FOLDER
+            else (),
+        )
+        for case in WRONG
+    ],
+)
+def test_a_refused_run_does_not_even_make_its_folder(folder, tmp_path, capsys, case):
+    main(["identify", str(folder), "--out", str(tmp_path / "deep" / "out"), *WRONG[case][0]])
+    assert not (tmp_path / "deep").exists()
+
+
+def test_a_missing_folder(tmp_path, capsys):
+    said = refuse(capsys, tmp_path / "out", "identify", tmp_path / "nowhere")
+    assert f"{tmp_path / 'nowhere'} does not exist" in said
+
+
+def test_a_truncated_file(spoiled, tmp_path, capsys):
+    points = spoiled / "points.npz"
+    points.write_bytes(points.read_bytes()[:-200])
+    assert "points.npz" in refuse(capsys, tmp_path / "out", "identify", spoiled)
+
+
+@pytest.mark.parametrize("stream", ["points", "motion"])
+def test_millimetres_for_metres(spoiled, tmp_path, capsys, stream):
+    path = spoiled / f"{stream}.npz"
+    with np.load(path) as file:
+        arrays = dict(file)
+    scale = arrays.pop("scale", 1.0)
+    for key in arrays:
+        if key == "xyz" or key.endswith("/position"):
+            arrays[key] = (arrays[key] * scale * 1000.0).astype(np.float32)
+    np.savez(path, **arrays)
+    said = refuse(capsys, tmp_path / "out", "identify", spoiled)
+    assert "millimetres" in said
+    assert path.name in said
+
+
+def test_an_unreadable_progress_file(folder, tmp_path, capsys):
+    for content in ("{", "[1, 2]", '{"youngs_modulus": "soft"}'):
+        (tmp_path / "progress.json").write_text(content)
+        assert main(["identify", str(folder), "--out", str(tmp_path), "--resume"]) == 2
+        assert "progress.json: unreadable; delete it" in one_line(capsys.readouterr().err)
+        assert (tmp_path / "progress.json").read_text() == content
+
+
+@pytest.mark.xfail(strict=True, raises=FileExistsError, reason="mkdir of DIR is not turned into a message")
+def test_out_that_is_a_file(folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    out.write_text("mine")
+    assert main(["identify", str(folder), "--out", str(out)]) == 2
+    one_line(capsys.readouterr().err)
+    assert out.read_text() == "mine"
+
+
+def test_refusals_of_the_real_command(folder, tmp_path):
+    """The same through a process of its own: the exit code and stderr are what a shell sees."""
+    done = call("identify", tmp_path / "nowhere", "--out", tmp_path / "out")
+    assert done.returncode == 2
+    one_line(done.stderr)
+    assert done.stdout == ""
+    done = call("identify", folder, "--out", tmp_path / "out", "--start", "youngs_modulus=-1")
+    assert done.returncode == 2
+    one_line(done.stderr)
+    assert not (tmp_path / "out").exists()
+
+
+def test_help_lists_the_verbs(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--help"])
+    assert stopped.value.code == 0
+    said = capsys.readouterr().out
+    for verb in ("identify", "demo", "doctor"):
+        assert re.search(rf"^ +{verb} ", said, re.MULTILINE)
+
+
+@pytest.mark.parametrize("arguments", [[], ["identify"], ["conquer"], ["identify", "x", "--iterations", "few"]])
+def test_wrong_usage_is_exit_code_2(capsys, arguments):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    assert "usage: torchcloth" in capsys.readouterr().err
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--version"])
+    assert stopped.value.code == 0
+    assert capsys.readouterr().out.strip() == metadata.version("torchcloth")
+
+
+def test_doctor_says_what_is_installed(capsys):
+    assert main(["doctor"]) == 0
+    said = capsys.readouterr().out
+    assert f"torchcloth {metadata.version('torchcloth')}" in said
+    assert re.search(r"^trimesh +installed$", said, re.MULTILINE)
+
+
+@pytest.fixture(scope="session")
+def done(folder, tmp_path_factory):
+    """(process, output folder) of a small fit whose output goes into a pipe."""
+    out = tmp_path_factory.mktemp("fit") / "new"
+    return call("identify", folder, "--out", out, *QUICK, "--start", "youngs_modulus=5e4"), out
+
+
+def test_a_fit_leaves_its_files(done):
+    process, out = done
+    assert process.returncode == 0, process.stderr
+    names = {path.name for path in out.iterdir()}
+    assert names == {"identification.json", "fit.png", "distances.png", "parameters.png"}
+    for picture in out.glob("*.png"):
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        assert picture.stat().st_size > 5000  # an empty axis has some 3 kB
+    content = json.loads((out / "identification.json").read_text())
+    assert 36 < content["parameters"]["membrane_stiffness"]["value"] < 44  # N/m; the truth is 40
+
+
+def test_the_table_names_distances_and_pictures(done):
+    process, out = done
+    content = json.loads((out / "identification.json").read_text())["fit"]
+    for label, key in (("null", "chamfer_null"), ("start", "chamfer_before"), ("fitted", "chamfer_after")):
+        assert re.search(rf"^ +{label}.* {content[key]:.6f} ", process.stdout, re.MULTILINE), label
+    for name in ("fit.png", "distances.png", "parameters.png", "identification.json"):
+        assert str(out / name) in process.stdout
+
+
+def test_output_in_a_pipe_is_plain_text(done):
+    process, out = done
+    assert process.stderr == ""
+    assert not CONTROL.search(process.stdout)
+    for line in process.stdout.splitlines():
+        assert len(line) <= LONGEST or str(out.parent) in line  # paths are as long as they are
+
+
+@pytest.mark.xfail(strict=True, reason="eight columns do not fit into 100 characters: names and numbers end in '…'")
+def test_no_name_and_no_number_of_the_table_is_cut(done):
+    process, _ = done
+    for name in ("membrane_stiffness", "youngs_modulus", "air.normal", "contact_stiffness", "std. error"):
+        assert name in process.stdout
+    table = process.stdout.split("Parameters")[1].split("Distance")[0]
+    assert not re.search(r"\S…|…\S", table)  # "a … b" is an interval, "4.0…" a lost number
+
+
+def test_an_interrupted_fit_can_be_resumed(folder, tmp_path):
+    """SIGINT after the first iteration: its values stay, and the next run begins there."""
+    out = tmp_path / "out"
+    progress = out / "progress.json"
+    process = subprocess.Popen(
+        [*COMMAND, "identify", str(folder), "--out", str(out), "--start", "youngs_modulus=5e4", *QUICK],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
+    )
+    deadline = time.monotonic() + 120
+    while not progress.exists() and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "--resume" in one_line(said)
+    assert [path.name for path in out.iterdir()] == ["progress.json"]
+    reached = json.loads(progress.read_text())
+    assert set(reached) == {"youngs_modulus", "air.normal", "areal_density"}
+
+    resumed = call(
+        "identify", folder, "--out", out, "--start", "youngs_modulus=5e4", *QUICK, "--resume", "--iterations", "1"
+    )
+    assert resumed.returncode == 0, resumed.stderr
+    history = json.loads((out / "identification.json").read_text())["history"]
+    assert history[0]["youngs_modulus"] == pytest.approx(reached["youngs_modulus"])
+    assert not progress.exists()
