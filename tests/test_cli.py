@@ -226,7 +226,6 @@ def test_output_in_a_pipe_is_plain_text(done):
         assert len(line) <= LONGEST or str(out.parent) in line  # paths are as long as they are
 
 
-@pytest.mark.xfail(strict=True, reason="eight columns do not fit into 100 characters: names and numbers end in '…'")
 def test_no_name_and_no_number_of_the_table_is_cut(done):
     process, _ = done
     for name in ("membrane_stiffness", "youngs_modulus", "air.normal", "contact_stiffness", "std. error"):

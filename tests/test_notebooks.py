@@ -26,7 +26,6 @@ def test_there_are_notebooks():
     assert NOTEBOOKS
 
 
-@pytest.mark.slow
 @each
 def test_it_runs(path, tmp_path, monkeypatch):
     from jupyter_client.manager import AsyncKernelManager

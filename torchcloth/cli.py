@@ -79,6 +79,7 @@ def _identify(options: argparse.Namespace) -> int:
     from . import recordings
 
     torch.set_default_dtype(torch.float64)  # sensitivities lose digits over thousands of substeps in float32
+    torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
     episodes = [recordings.read(path) for path in options.episodes]
     cloth = _cloth(options, episodes[0])
     guess = _resume(options.out) if options.resume else None
@@ -121,13 +122,16 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording], g
 
     options.out.mkdir(parents=True, exist_ok=True)
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, refresh_per_second=2) as progress:
-        task = progress.add_task("simulating with the start values", total=options.iterations)
+    with Progress(*columns, refresh_per_second=2, disable=not sys.stdout.isatty()) as progress:
+        task = progress.add_task("simulating with the start values", total=None)
 
         def advance(iteration: int, chamfer: float, values: dict[str, float]) -> None:
             write_atomically(options.out / "progress.json", json.dumps(values) + "\n")
             shown = ", ".join(f"{name} {value:.4g}" for name, value in list(values.items())[:3])
-            progress.update(task, completed=iteration, description=f"Chamfer {1e3 * chamfer:.2f} mm, {shown}")
+            text = f"Chamfer {1e3 * chamfer:.2f} mm, {shown}"
+            progress.update(task, completed=iteration, description=text)
+            if not progress.console.is_terminal:  # a log file shows a bar once, at the end
+                print(f"iteration {iteration}: {text}", flush=True)
 
         return identify(
             cloth,
@@ -137,6 +141,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording], g
             stop=options.stop,
             iterations=options.iterations,
             guess=guess,
+            warm_start=guess is not None,
             dt=options.dt,
             on_progress=advance,
         )

@@ -42,6 +42,7 @@ def test_a_linear_problem_is_solved():
     toy, _ = linear(0)
     final = solve(toy, tolerance=1e-3)
     assert final.exact
+    assert final.converged
     missed = (final.raw - optimum(toy)).abs() / deviations(toy, final)
     assert float(missed.max()) < 1e-2  # standard errors: a tenth of nothing is lost to the stop rule
     assert float(((final.raw - TRUE).abs() / deviations(toy, final)).max()) < 3.5
@@ -113,6 +114,7 @@ def test_broyden_and_exact_jacobians_end_at_the_same_point(monkeypatch):
 def test_the_final_point_is_linearised_exactly():
     toy = curved()
     final = solve(toy, iterations=2)  # stopped in the middle
+    assert not final.converged
     assert torch.equal(toy.linearised[-1], final.raw)
     torch.testing.assert_close(final.linear.jacobian, toy._linearise(final.raw).jacobian)
 

@@ -61,6 +61,7 @@ def test_the_fit_is_better_than_its_start_and_the_null(fitted):
     # mean |z| of 1 mm noise is 0.80 mm, its rms 1 mm; half as much again for another mesh
     assert 0.7e-3 < f["chamfer_after"] < 1.2e-3
     assert 0.9e-3 < f["rms_after"] < 1.5e-3
+    assert f["converged"] is True
 
 
 def test_progress_and_history_tell_the_same(fitted):
@@ -115,14 +116,12 @@ def test_frames_of_the_result_are_those_of_the_figures(fitted, recording):
     torch.testing.assert_close(fit.frames_null[0][0], torch.as_tensor(recording.cloth.initial_vertices))
 
 
-def test_the_start_does_not_matter(fitted, pair):
-    """From 20 and from 80 N/m, a factor of 4: the same answer within one standard error.
-
-    The second start is that of the fit of everything, which has more to say about and so a larger error.
-    """
+def test_the_start_does_not_matter(model, recording, pair):
+    """From 20 and from 80 N/m, a factor of 4: the same answer within one standard error, which is all one can ask."""
+    other = identify(model, recording, PAIR)
     for name in PAIR:
-        a, b = fitted[0].parameters[name], pair.parameters[name]
-        assert abs(a.value - b.value) < max(a.std, b.std), name
+        a, b = other.parameters[name], pair.parameters[name]
+        assert abs(a.value - b.value) < min(a.std, b.std), name
     assert pair.parameters["membrane_stiffness"].value == pytest.approx(TRUE.membrane, rel=0.10)
 
 
@@ -183,6 +182,8 @@ def test_adam_lowers_the_chamfer_in_three_iterations(model, brief):
     fit = identify(model, brief, PAIR, method="adam", iterations=3)
     assert fit.fit["chamfer_after"] < 0.9 * fit.fit["chamfer_before"]
     assert len(fit.history) == 3
+    assert not fit.fit["converged"]
+    assert any("gradient descent has no test of convergence" in w for w in fit.warnings)
     assert fit.parameters["youngs_modulus"].value < 0.85 * fit.parameters["youngs_modulus"].initial
 
 
@@ -192,19 +193,23 @@ def test_the_papers_stop_rule_ends_a_fit_that_is_good_enough(model, brief, metho
     fit = identify(model, brief, PAIR, method=method, stop="paper")
     assert fit.fit["chamfer_before"] < 0.015
     assert fit.fit["iterations"] == 0
+    assert not fit.fit["converged"]
     assert fit.parameters["youngs_modulus"].value == pytest.approx(8e4)
     assert fit.fit["chamfer_after"] == pytest.approx(fit.fit["chamfer_before"], rel=1e-12)
 
 
-@pytest.mark.xfail(strict=True, reason="each stage takes at least one iteration, and the second start is counted too")
 def test_iterations_are_at_most_what_was_asked(model, brief):
+    """In each of the two stages; the reader is told that the search was cut short."""
     fit = identify(model, brief, ["youngs_modulus"], iterations=1)
-    assert fit.fit["iterations"] <= 1
+    for early in (True, False):
+        assert 1 <= sum((entry["frames"] < 1) == early for entry in fit.history) <= 2  # its start, and one step
+    assert fit.fit["converged"] is False
+    assert any(w.startswith("stopped after 1 iterations before converging") for w in fit.warnings)
 
 
 def test_a_guess_is_where_the_search_begins_and_not_what_it_is_compared_with(model, recording, pair):
     guess = {name: pair.parameters[name].value for name in (*PAIR, "areal_density")}
-    fit = identify(model, recording, PAIR, guess=guess)
+    fit = identify(model, recording, PAIR, guess=guess, warm_start=True)
     assert fit.history[0]["youngs_modulus"] == pytest.approx(guess["youngs_modulus"])
     assert all(entry["frames"] == 1 for entry in fit.history)  # no early stage: the guess is past it
     assert fit.parameters["youngs_modulus"].initial == pytest.approx(8e4)

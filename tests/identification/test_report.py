@@ -94,8 +94,8 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
 
     class Fake(SimpleNamespace):
         def problem(self):
-            std = torch.ones(1)
-            return gauss_newton.Problem(None, None, None, torch.zeros(1), std, 1e-3)
+            one = torch.ones(1)
+            return gauss_newton.Problem(None, None, None, prior_mean=0 * one, prior_std=one, longest=one, noise=1e-3)
 
         def secants(self, raw, steps):
             assert 0.005 <= float(steps[0]) <= 0.1

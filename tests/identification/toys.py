@@ -34,7 +34,15 @@ class Toy:
         """The solver's view."""
         mean = torch.zeros(len(TRUE), dtype=torch.float64)
         std = torch.full_like(mean, self.prior_std)
-        return Problem(self._linearise, self._evaluate, lambda raw: raw, mean, std, None)
+        return Problem(
+            linearise=self._linearise,
+            evaluate=self._evaluate,
+            clip=lambda raw: raw,
+            prior_mean=mean,
+            prior_std=std,
+            longest=torch.ones_like(mean),
+            noise=None,
+        )
 
     def _linearise(self, raw: Tensor) -> Linearised:
         self.linearised.append(raw)

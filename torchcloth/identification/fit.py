@@ -42,6 +42,7 @@ def identify(
     iterations: int = PAPER_ITERATIONS,
     rate: float = 0.1,
     guess: Mapping[str, float] | None = None,
+    warm_start: bool = False,
     dt: float | None = None,
     on_progress: Progress | None = None,
 ) -> Identification:
@@ -55,10 +56,11 @@ def identify(
         method: "gauss-newton" (robust point-to-surface residuals, forward-mode sensitivities) or "adam" (the paper's
             Chamfer distance to vertices, reverse mode).
         stop: "converged", or "paper": as soon as Chamfer (one-sided, cloud to surface) is below 1.5 cm.
-        iterations: at most this many.
+        iterations: at most this many with all frames, and at most 10 with the early ones before.
         rate: learning rate of "adam", in unconstrained units (0.1: about 10 % a step).
         guess: values by name to start the search from, e.g. of an interrupted fit; the cloth's values stay the start
             that the result is compared with.
+        warm_start: the guess is near the solution (an interrupted fit): skip the stage on the early frames.
         dt: largest substep [s]; None: the stable one, chosen anew for every set of values.
         on_progress: called with (iteration, chamfer, values) after every iteration.
 
@@ -82,11 +84,13 @@ def identify(
     names = default_parameters(cloth) if parameters is None else list(parameters)
     unknowns = collect(cloth, names, episodes_in[0].cloth.areal_density_std)
     objective = Objective(cloth, unknowns, [episode(cloth, r) for r in episodes_in], dt)
-    return _Run(objective, stop, on_progress).solve(method, iterations, rate, dict(guess or {}))
+    return _Run(objective, stop, on_progress).solve(
+        method, iterations, rate, dict(guess or {}), early=not warm_start and stop != "paper"
+    )
 
 
 def default_parameters(cloth: Cloth) -> list[str]:
-    """Membrane parameters, contact parameters if the model has contact, and the amplitudes of air."""
+    """Membrane parameters, contact parameters if the model has contact, and the amplitudes of all effects."""
     names = [name for name, _ in cloth.material.named_children()]
     if cloth.contact is None:
         names = [name for name in names if name in ("youngs_modulus", "poisson_ratio")]
@@ -103,7 +107,7 @@ class _Run:
         self.history: list[dict[str, Any]] = []
         self.simulations, self.began = 0, time.perf_counter()
 
-    def solve(self, method: str, iterations: int, rate: float, guess: dict[str, float]) -> Identification:
+    def solve(self, method: str, iterations: int, rate: float, guess: dict[str, float], early: bool) -> Identification:
         full = self.objective
         before = full.frames(full.start)
         start = full.raw(guess)
@@ -111,32 +115,44 @@ class _Run:
             raw = descend(full, start, iterations, rate, self._record)
             final = gauss_newton.minimise(full.problem(), raw, 0, lambda _: True)
         else:
-            final = self._gauss_newton(iterations, start, skip_early=bool(guess) or self.stop == "paper")
+            final = self._gauss_newton(iterations, start, early)
         after = full.frames(final.raw)
+        stopped = "" if final.converged else self._unfinished(method, iterations)
         final, warnings = self._check_linearity(final)
         covariance = gauss_newton.covariance(full.problem(), final)
         found = estimates(full.cloth, full.unknowns, final.raw, covariance)
         null = [rigid_carry(e) for e in full.episodes]
         distances = (figures(x, full.episodes, full.faces) for x in (before, after, null))
-        fit = self._fit_figures(*distances, independent=final.share * float((final.linear.value != 0).sum()))
+        fit: dict[str, Any] = self._fit_figures(*distances)
+        fit["independent_observations"] = final.share * float((final.linear.value != 0).sum())
+        fit["converged"] = final.converged
+        warnings += [stopped] if stopped else []
         warnings += warnings_of(full.cloth, full.episodes, found, fit, after, full.faces)
         keys = {u.name: u.key.removesuffix(".raw") for u in full.unknowns}
         return Identification(
             found.parameters, fit, found.correlation, warnings, self.history, before, after, null, keys
         )
 
-    def _gauss_newton(self, iterations: int, start: Tensor, skip_early: bool) -> gauss_newton.Iterate:
+    def _gauss_newton(self, iterations: int, start: Tensor, early: bool) -> gauss_newton.Iterate:
         """First the early frames, where a wrong start has not yet led the cloth elsewhere; then all of them."""
         full = self.objective
-        if skip_early:
-            return gauss_newton.minimise(full.problem(), start, iterations, lambda it: self._record(it.raw, full))
-        early = Objective(full.cloth, full.unknowns, [e.until(EARLY) for e in full.episodes], full.dt)
-        first = gauss_newton.minimise(
-            early.problem(), start, min(EARLY_ITERATIONS, iterations), lambda it: self._record(it.raw, early), 1.0
+        if early:
+            part = Objective(full.cloth, full.unknowns, [e.until(EARLY) for e in full.episodes], full.dt)
+            budget = min(EARLY_ITERATIONS, iterations)
+            start = gauss_newton.minimise(
+                part.problem(), start, budget, lambda it: self._record(it.raw, part), tolerance=1.0
+            ).raw
+            self.simulations += part.simulations
+        return gauss_newton.minimise(full.problem(), start, iterations, lambda it: self._record(it.raw, full))
+
+    def _unfinished(self, method: str, iterations: int) -> str:
+        if method == "adam":
+            return "gradient descent has no test of convergence: values and errors may be those of an unfinished search"
+        if self.stop == "paper" and self.history[-1]["chamfer"] < PAPER_CHAMFER:
+            return "stopped by the paper's rule, Chamfer below 1.5 cm: the values still depend on the start"
+        return (
+            f"stopped after {iterations} iterations without converging: values and errors are of an unfinished search"
         )
-        self.simulations += early.simulations
-        left = max(1, iterations - len(self.history))
-        return gauss_newton.minimise(full.problem(), first.raw, left, lambda it: self._record(it.raw, full))
 
     def _check_linearity(self, final: gauss_newton.Iterate) -> tuple[gauss_newton.Iterate, list[str]]:
         """Compare the tangents with finite steps of about a standard error; where they fail, differences replace them.
@@ -168,7 +184,7 @@ class _Run:
             self.on_progress(len(self.history) - 1, now.chamfer, values)
         return self.stop == "paper" and objective is self.objective and now.chamfer < PAPER_CHAMFER
 
-    def _fit_figures(self, before: Figures, after: Figures, null: Figures, independent: float) -> dict[str, float]:
+    def _fit_figures(self, before: Figures, after: Figures, null: Figures) -> dict[str, float]:
         return {
             "chamfer_before": before.chamfer,
             "chamfer_after": after.chamfer,
@@ -180,6 +196,5 @@ class _Run:
             "simulations": self.simulations + self.objective.simulations,
             "seconds": time.perf_counter() - self.began,
             "points": sum(len(c) for e in self.objective.episodes for c in e.clouds),
-            "independent_observations": independent,
             "stable_step": self.objective.cloth.stable_step(),
         }

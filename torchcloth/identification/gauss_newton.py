@@ -11,7 +11,6 @@ from torch import Tensor
 from ..errors import SimulationDiverged, UnstableStep
 from .misfit import huber, noise_scale
 
-LONGEST_STEP = 1.0  # in unconstrained units: a factor of 2.7 on a log parameter
 TRUSTED_GAIN = 0.5  # share of the predicted decrease above which an updated Jacobian is good enough
 WINDOW = 5  # frames within which residuals of one patch count as one observation
 
@@ -34,6 +33,7 @@ class Problem(NamedTuple):
     clip: Callable[[Tensor], Tensor]
     prior_mean: Tensor  # [K]
     prior_std: Tensor  # [K]
+    longest: Tensor  # [K], longest step
     noise: float | None
 
 
@@ -45,6 +45,7 @@ class Iterate(NamedTuple):
     exact: bool  # the Jacobian was computed here, not updated from elsewhere
     scale: float  # m, of one residual
     share: float  # independent observations per residual, <= 1
+    converged: bool = False  # set on the point that is returned
 
 
 def minimise(
@@ -63,13 +64,14 @@ def minimise(
     point is linearised exactly.
     """
     current = _linearise(problem, start)
-    stop, damping = on_iterate(current), 1e-3
+    stop, converged, damping = on_iterate(current), False, 1e-3
     for _ in range(iterations):
         if stop:
             break
         trial, gain, damping = _step(problem, current, damping)
         if trial is None:
-            if current.exact:
+            if current.exact:  # no step helps: as good as it gets
+                converged = True
                 break
             current = _linearise(problem, current.raw)
             continue
@@ -77,11 +79,12 @@ def minimise(
         stop = on_iterate(current)
         if _is_small(problem, before, trial.raw - before.raw, tolerance):
             if before.exact:
+                converged = True
                 break
             current = _linearise(problem, trial.raw)
         elif gain < TRUSTED_GAIN and not stop:
             current = _linearise(problem, trial.raw)
-    return _exact(problem, current)
+    return _exact(problem, current)._replace(converged=converged)
 
 
 def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None, float, float]:
@@ -90,7 +93,7 @@ def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None
     cost = _cost(problem, at, at.raw, at.linear.value)
     for _ in range(6):
         step = torch.linalg.solve(hessian + damping * torch.diag(hessian.diagonal()), -gradient)
-        step = step.clamp(-LONGEST_STEP, LONGEST_STEP)  # one by one: a runaway must not hold back the others
+        step = step.clamp(-problem.longest, problem.longest)  # one by one: a runaway must not hold back the others
         raw = problem.clip(at.raw + step)
         step = raw - at.raw
         value, patch = _try(problem, raw)

@@ -38,6 +38,7 @@ class Objective:
             clip=self.clip,
             prior_mean=self.start,
             prior_std=torch.tensor([u.prior_std for u in self.unknowns], dtype=torch.float64),
+            longest=torch.tensor([u.longest_step for u in self.unknowns], dtype=torch.float64),
             noise=max(noises) if noises else None,
         )
 

@@ -20,23 +20,17 @@ BEFORE, AFTER, NULL = "#b0653a", "#1f6f8b", "#888888"
 
 def draw(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray, folder: Path) -> list[Path]:
     """Write fit.png, distances.png and parameters.png into ``folder``; returns their paths."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     folder.mkdir(parents=True, exist_ok=True)
     return [
-        _save(_shapes(fit, episodes[0], faces), folder / "fit.png"),
-        _save(_distances(fit, episodes, faces), folder / "distances.png"),
-        _save(_parameters(fit), folder / "parameters.png"),
+        _save(shapes(fit, episodes[0], faces), folder / "fit.png"),
+        _save(distances(fit, episodes, faces), folder / "distances.png"),
+        _save(parameters(fit), folder / "parameters.png"),
     ]
 
 
 def _save(figure: Any, path: Path) -> Path:
-    import matplotlib.pyplot as plt
-
     part = path.with_name(f".{path.name}.part.png")
     figure.savefig(part, dpi=110, bbox_inches="tight")
-    plt.close(figure)
     os.replace(part, path)
     return path
 
@@ -45,15 +39,16 @@ def _distance(cloud: Tensor, vertices: Tensor, faces: Tensor) -> np.ndarray:
     return (cloud - closest(cloud, vertices, faces).on(vertices)).norm(dim=-1).numpy()
 
 
-def _shapes(fit: Identification, episode: Episode, faces: np.ndarray) -> Any:
+def shapes(fit: Identification, episode: Episode, faces: np.ndarray) -> Any:
     """Four frames: measured points coloured by their distance, over the cloth with start and with fitted values."""
-    import matplotlib.pyplot as plt
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
 
     index = torch.as_tensor(faces)
     shown = np.linspace(0, len(episode.clouds) - 1, 5).round().astype(int)[1:]
-    figure, axes = plt.subplots(2, 4, figsize=(15, 7.5), subplot_kw={"projection": "3d", "computed_zorder": False})
+    figure = Figure(figsize=(15, 7.5))
+    axes = figure.subplots(2, 4, subplot_kw={"projection": "3d", "computed_zorder": False})
     figure.subplots_adjust(wspace=0.02, hspace=0.05, top=0.92, bottom=0.02, left=0.02)
     everything = torch.cat([fit.frames_after[0][shown].reshape(-1, 3), *(episode.clouds[i] for i in shown)]).numpy()
     middle, half = (everything.max(0) + everything.min(0)) / 2, np.ptp(everything, axis=0).max() / 2
@@ -70,6 +65,8 @@ def _shapes(fit: Identification, episode: Episode, faces: np.ndarray) -> Any:
             axis.set(**{f"{a}lim": (m - half, m + half) for a, m in zip("xyz", middle, strict=True)})
             axis.set_box_aspect((1, 1, 1), zoom=1.15)
             axis.tick_params(labelsize=6)
+            axis.locator_params(nbins=4)
+            axis.patch.set_alpha(0)
             axis.view_init(elev=12, azim=-60)
     scale = ScalarMappable(Normalize(0, worst), "inferno_r")
     figure.colorbar(scale, ax=axes, shrink=0.6, label="distance of a measured point from the surface [mm]")
@@ -77,12 +74,13 @@ def _shapes(fit: Identification, episode: Episode, faces: np.ndarray) -> Any:
     return figure
 
 
-def _distances(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray) -> Any:
+def distances(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray) -> Any:
     """Mean distance over time, and over the iterations of the fit."""
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     index = torch.as_tensor(faces)
-    figure, (over_time, over_fit) = plt.subplots(1, 2, figsize=(12, 4))
+    figure = Figure(figsize=(12, 4))
+    over_time, over_fit = figure.subplots(1, 2)
     sources = (
         ("carried rigidly", fit.frames_null, NULL),
         ("start", fit.frames_before, BEFORE),
@@ -106,12 +104,13 @@ def _distances(fit: Identification, episodes: Sequence[Episode], faces: np.ndarr
     return figure
 
 
-def _parameters(fit: Identification) -> Any:
+def parameters(fit: Identification) -> Any:
     """Start, estimate and 95 % interval of every fitted parameter."""
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     shown = {n: e for n, e in fit.parameters.items() if e.source in ("data", "prior")}
-    figure, axes = plt.subplots(len(shown), 1, figsize=(8, 1.1 * len(shown) + 0.6), squeeze=False)
+    figure = Figure(figsize=(8, 1.1 * len(shown) + 0.6))
+    axes = figure.subplots(len(shown), 1, squeeze=False)
     for axis, (name, e) in zip(axes[:, 0], shown.items(), strict=True):
         colour = AFTER if e.identifiable else NULL
         axis.plot(e.ci95, [0, 0], color=colour, linewidth=4, alpha=0.4, solid_capstyle="butt")

@@ -49,7 +49,7 @@ class Identification:
     """
 
     parameters: dict[str, Estimate]
-    fit: dict[str, float]
+    fit: dict[str, Any]
     correlation: dict[str, dict[str, float]]
     warnings: list[str]
     history: list[dict[str, Any]]

@@ -15,23 +15,27 @@ COLUMNS = {
     "unit": "left",
     "": "left",
 }
-REMARKS = {"prior": "measured", "derived": "= E h", "not in the model": "not in the model: no contact"}
+REMARKS = {"prior": "measured", "derived": "= E h"}
 
 
 def print_fit(fit: Identification) -> None:
-    """Parameters, distances and warnings, 100 columns wide."""
+    """Parameters, distances and warnings, 112 columns wide or more."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
     console = Console(highlight=False)
-    console.width = max(console.width, 100)
+    console.width = max(console.width, 112)
     table = Table(title="Parameters", title_justify="left", box=box.SIMPLE_HEAD)
     for heading, side in COLUMNS.items():
         table.add_column(heading, justify=side, no_wrap=True)  # type: ignore[arg-type]
+    absent = [name for name, e in fit.parameters.items() if e.source == "not in the model"]
     for name, e in fit.parameters.items():
-        table.add_row(name, f"{e.initial:.4g}", *_statement(e), e.unit, _remark(e))
+        if name not in absent:
+            table.add_row(name, f"{e.initial:.4g}", *_statement(e), e.unit, _remark(e))
     console.print(table)
+    if absent:
+        console.print(f"Not in the model, because contact was left out: {', '.join(absent)}")
     distances = Table(title="Distance cloud to surface, one-sided, metres", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("", "Chamfer", "rms"):
         distances.add_column(heading, justify="right" if heading else "left")
@@ -39,8 +43,9 @@ def print_fit(fit: Identification) -> None:
     for label, key in (("null: carried rigidly", "null"), ("start values", "before"), ("fitted values", "after")):
         distances.add_row(label, f"{f[f'chamfer_{key}']:.6f}", f"{f[f'rms_{key}']:.6f}")
     console.print(distances)
+    end = "" if f["converged"] else " (not converged)"
     console.print(
-        f"{f['iterations']:.0f} iterations, {f['simulations']:.0f} simulations, {f['seconds']:.0f} s; "
+        f"{f['iterations']:.0f} iterations{end}, {f['simulations']:.0f} simulations, {f['seconds']:.0f} s; "
         f"{f['points']:.0f} points count as {f['independent_observations']:.0f} independent observations"
     )
     for warning in fit.warnings:
@@ -58,5 +63,5 @@ def _statement(e: Estimate) -> tuple[str, str, str]:
 
 def _remark(e: Estimate) -> str:
     if e.source == "data" and not e.identifiable:
-        return "not identifiable from these data"
+        return "not identifiable"
     return REMARKS.get(e.source, "")

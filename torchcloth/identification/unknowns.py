@@ -37,6 +37,11 @@ class Unknown:
     prior_std: float
     measured: bool = False
 
+    @property
+    def longest_step(self) -> float:
+        """Of one iteration: a factor of 2.7 on a log parameter, half the typical size of an amplitude."""
+        return 0.25 * self.prior_std if self.parameter.domain == "nonnegative" else 1.0
+
     def value(self, raw: float) -> float:
         """Physical value of an unconstrained one."""
         return float(to_value(torch.tensor(raw, dtype=torch.float64), self.parameter.domain))
