@@ -70,7 +70,7 @@ def shapes(fit: Identification, episode: Episode, faces: np.ndarray) -> Any:
             axis.view_init(elev=12, azim=-60)
     scale = ScalarMappable(Normalize(0, worst), "inferno_r")
     figure.colorbar(scale, ax=axes, shrink=0.6, label="distance of a measured point from the surface [mm]")
-    figure.suptitle(f"{episode.name}: measured points over the simulated cloth (axes in m)")
+    figure.suptitle(f"{episode.name}: measured points over the simulated cloth (axes in m)", x=0.45)
     return figure
 
 
