@@ -49,13 +49,14 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from flattening import Edge, area_of, boundary_loops, cut, edges_of, flatten, shortest_path
+from flattening import Edge, area_of, boundary_loops, cut, edges_of, flatten, heights_of, shortest_path, thicken
 
 from torchcloth import recordings
 from torchcloth.recordings import ClothInfo, Collider, GraspInfo, GripperMotion, PointClouds, Recording
 
 SECONDS_PER_STEP = 0.002
 STEPS_PER_CLOUD = 100
+THINNEST = 0.010  # m
 SMOOTH, KNOT = 11, 5  # steps
 MASS = 0.5  # kg
 TABLE = 0.02  # m
@@ -96,21 +97,23 @@ def garment(path: Path) -> Garment:
     pinched = [edge for edge, owners in edges_of(faces).items() if len(owners) > 2]
     opened, source = cut(faces, [*_seams(vertices, faces), *pinched])
     flat = flatten(vertices[source], opened)
-    kept = opened[area_of(flat.uv[opened]) > 0]
-    if len(np.unique(kept)) != len(source):
-        raise ValueError("a vertex is in no triangle after the clean-up: the mesh is not the one this was written for")
+    unfolded = opened[area_of(flat.uv[opened]) > 0]
+    kept, old = thicken(flat.uv, unfolded, THINNEST)
     notes = {
         "vertices_in_file": len(vertices),
         "vertices_after_cutting": len(source),
         "triangles_in_file": len(faces),
         "triangles_dropped_pocket": len(faces) - len(opened),
-        "triangles_dropped_folded": len(opened) - len(kept),
+        "triangles_dropped_folded": len(opened) - len(unfolded),
+        "vertices_kept": len(old),
+        "triangles_kept": len(kept),
+        "thinnest_triangle_m": float(heights_of(flat.uv[old][kept]).min()),
         "flattening_stretch_5_percent": float(np.quantile(flat.stretch, 0.05)),
         "flattening_stretch_95_percent": float(np.quantile(flat.stretch, 0.95)),
         "area_in_file_m2": float(mesh.area),
-        "area_of_pattern_m2": float(area_of(flat.uv[kept]).sum()),
+        "area_of_pattern_m2": float(area_of(flat.uv[old][kept]).sum()),
     }
-    return Garment(vertices[source], kept, flat.uv, notes)
+    return Garment(vertices[source[old]], kept, flat.uv[old], notes)
 
 
 def _seams(vertices: np.ndarray, faces: np.ndarray) -> list[Edge]:
@@ -182,7 +185,7 @@ def convert(source: Path, seconds_per_step: float = SECONDS_PER_STEP, count: int
                 "first cloud": "step 100, placed at step 0, where the shape is known",
                 "gripper path": f"mean over {SMOOTH} steps, every {KNOT}th kept, orientation not recorded: identity",
                 "areal density": "0.5 kg in the released code over the mesh's area",
-                "assumed": "thickness, Poisson's ratio, stiffness and bending to start from, table height, friction, air",
+                "assumed": "thickness, Poisson's ratio, start stiffness, bending, table height, friction, air density",
                 "held vertices": {n: int(v) for n, v in zip(names, held, strict=True)},
                 "held vertex to gripper (m)": {n: float(d) for n, d in zip(names, nearest.min(0), strict=True)},
                 "left out": "rigid cube (not reached), self-contact; cut seams are not sewn",

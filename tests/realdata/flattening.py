@@ -109,6 +109,50 @@ def flatten(vertices: np.ndarray, faces: np.ndarray, iterations: int = 500) -> F
     return Flat(uv, stretch, int((area_of(flat) <= 0).sum()))
 
 
+def thicken(uv: np.ndarray, faces: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """Collapse edges of slivers in the plane until no triangle is thinner than ``height`` [m], where that is possible.
+
+    A vertex is merged into a neighbour; nothing else moves. A merge that would fold a triangle over or change the
+    topology is skipped; vertices on the boundary move along it only.
+
+    Returns:
+        (faces [F', 3] of the new mesh, [V'] the old vertex of each new one)
+    """
+    faces = faces.copy()
+    while (merge := _best_merge(uv, faces, height)) is not None:
+        faces = merge
+    old, new = np.unique(faces, return_inverse=True)
+    return new.reshape(-1, 3), old
+
+
+def heights_of(corners: np.ndarray) -> np.ndarray:
+    """Smallest heights [F] m of plane triangles [F, 3, 2]."""
+    return 2 * area_of(corners) / np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(1)
+
+
+def _best_merge(uv: np.ndarray, faces: np.ndarray, height: float) -> np.ndarray | None:
+    """Faces after the first merge that thickens one of the thin triangles, thinnest first; None when there is none."""
+    heights = heights_of(uv[faces])
+    edges = edges_of(faces)
+    outline = {v for edge, owners in edges.items() if len(owners) == 1 for v in edge}
+    for f in np.flatnonzero(heights < height)[np.argsort(heights[heights < height])]:
+        ring = [(int(faces[f, i]), int(faces[f, j])) for i, j in ((0, 1), (1, 2), (2, 0))]
+        ways = sorted([*ring, *((b, a) for a, b in ring)], key=lambda way: np.linalg.norm(uv[way[0]] - uv[way[1]]))
+        for gone, into in ways:
+            owners = edges[min(gone, into), max(gone, into)]
+            if gone in outline and len(owners) == 2:
+                continue
+            around = faces[(faces == gone).any(1)]
+            if len(np.intersect1d(around, faces[(faces == into).any(1)])) != 2 + len(owners):
+                continue  # they share more neighbours than the triangles between them
+            changed = np.where(around == gone, into, around)[~(around == into).any(1)]
+            if len(changed) and heights_of(uv[changed]).min() <= max(heights[f], 0):
+                continue
+            merged = np.where(faces == gone, into, faces)
+            return merged[~((faces == gone).any(1) & (faces == into).any(1))]
+    return None
+
+
 def area_of(corners: np.ndarray) -> np.ndarray:
     """Signed areas of plane triangles [F, 3, 2]."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
