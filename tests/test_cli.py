@@ -84,17 +84,11 @@ def test_wrong_options_are_one_line_and_exit_code_2(folder, tmp_path, capsys, ca
     assert re.search(said, refuse(capsys, tmp_path / "out", "identify", folder, *options))
 
 
-LEAVES_A_FOLDER = ("unstable step", "fit of nothing", "no iterations")
-
-
 @pytest.mark.parametrize(
     "case",
     [
         pytest.param(
             case,
-            marks=pytest.mark.xfail(strict=True, reason="DIR is made before identify has looked at its arguments")
-            if case in LEAVES_A_FOLDER
-            else (),
         )
         for case in WRONG
     ],
@@ -138,7 +132,6 @@ def test_an_unreadable_progress_file(folder, tmp_path, capsys):
         assert (tmp_path / "progress.json").read_text() == content
 
 
-@pytest.mark.xfail(strict=True, raises=FileExistsError, reason="mkdir of DIR is not turned into a message")
 def test_out_that_is_a_file(folder, tmp_path, capsys):
     out = tmp_path / "out"
     out.write_text("mine")

@@ -29,6 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except TorchclothError as error:
         print(f"torchcloth: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        print(f"torchcloth: {error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("torchcloth: stopped; `--resume` continues from the last iteration", file=sys.stderr)
         return 130
@@ -120,12 +123,12 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording], g
     from .identification import identify
     from .identification.result import write_atomically
 
-    options.out.mkdir(parents=True, exist_ok=True)
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*columns, refresh_per_second=2, disable=not sys.stdout.isatty()) as progress:
         task = progress.add_task("simulating with the start values", total=None)
 
         def advance(iteration: int, chamfer: float, values: dict[str, float]) -> None:
+            options.out.mkdir(parents=True, exist_ok=True)  # not before the arguments were found good
             write_atomically(options.out / "progress.json", json.dumps(values) + "\n")
             shown = ", ".join(f"{name} {value:.4g}" for name, value in list(values.items())[:3])
             text = f"Chamfer {1e3 * chamfer:.2f} mm, {shown}"

@@ -196,7 +196,6 @@ def test_no_recordings_are_refused(model):
         identify(model, [])
 
 
-@pytest.mark.xfail(strict=True, reason="an empty list of parameters ends in an IndexError of the simulation")
 def test_no_parameters_are_refused(model, recording):
     exact = with_cloth(recording, areal_density_std=None)
     with pytest.raises(InvalidInput, match="parameters"):

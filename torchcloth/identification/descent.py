@@ -19,7 +19,7 @@ def descend(
 
     The loss is the DiffCP paper's one-sided Chamfer distance, cloud to nearest vertex.
     """
-    raw = start.clone().requires_grad_()
+    raw, seen = start.clone().requires_grad_(), start
     optimiser = torch.optim.Adam([raw], lr=rate)
     for _ in range(iterations):
         optimiser.zero_grad()
@@ -32,9 +32,10 @@ def descend(
             frames.append(x.detach())
         objective.simulations += len(frames)
         objective.remember(raw.detach(), frames)
-        if on_iterate(raw.detach().clone(), objective):
+        seen = raw.detach().clone()
+        if on_iterate(seen, objective):
             break
         optimiser.step()
         with torch.no_grad():
             raw.copy_(objective.clip(raw))
-    return raw.detach()
+    return seen

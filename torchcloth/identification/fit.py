@@ -83,6 +83,8 @@ def identify(
         raise InvalidInput("recordings", got="none", expected="at least one episode")
     names = default_parameters(cloth) if parameters is None else list(parameters)
     unknowns = collect(cloth, names, episodes_in[0].cloth.areal_density_std)
+    if not unknowns:
+        raise InvalidInput("parameters", got="none", expected="at least one name")
     objective = Objective(cloth, unknowns, [episode(cloth, r) for r in episodes_in], dt)
     return _Run(objective, stop, on_progress).solve(
         method, iterations, rate, dict(guess or {}), early=not warm_start and stop != "paper"
@@ -150,9 +152,7 @@ class _Run:
             return "gradient descent has no test of convergence: values and errors may be those of an unfinished search"
         if self.stop == "paper" and self.history[-1]["chamfer"] < PAPER_CHAMFER:
             return "stopped by the paper's rule, Chamfer below 1.5 cm: the values still depend on the start"
-        return (
-            f"stopped after {iterations} iterations without converging: values and errors are of an unfinished search"
-        )
+        return f"stopped after {iterations} iterations before converging: the search is unfinished, so are its errors"
 
     def _check_linearity(self, final: gauss_newton.Iterate) -> tuple[gauss_newton.Iterate, list[str]]:
         """Compare the tangents with finite steps of about a standard error; where they fail, differences replace them.

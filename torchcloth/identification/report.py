@@ -15,6 +15,7 @@ from .result import Estimate
 from .unknowns import Unknown, available, collect
 
 TRUSTED = 0.25  # a parameter counts as identified when its standard error is below a quarter of its value
+MISSED = 1.3  # rms over the sensor noise above which what the model misses may matter more than the noise
 CONFUSED = 0.95  # correlation above which two parameters are called hard to tell apart
 
 
@@ -57,6 +58,10 @@ def warnings_of(
     out = []
     if fit["chamfer_after"] >= fit["chamfer_null"]:
         out.append("the fit is no better than cloth carried rigidly by the grippers: these data say nothing about it")
+    if fit["chamfer_after"] > fit["chamfer_before"]:
+        out.append(
+            "the fitted values are farther from the points than the start: the robust cost fell, the mean did not"
+        )
     for name, estimate in found.parameters.items():
         if not estimate.identifiable and estimate.source == "data":
             out.append(f"{name} is not identifiable from these data: its value is no estimate")
@@ -70,9 +75,9 @@ def warnings_of(
             "areal density was taken as exact: without force readings stiffness and density enter only as a ratio"
         )
     noise = [e.noise for e in episodes if e.noise]
-    if noise and fit["rms_after"] > 2 * max(noise):
+    if noise and fit["rms_after"] > MISSED * max(noise):
         out.append(
-            f"the residual ({fit['rms_after'] * 1e3:.1f} mm rms) exceeds twice the sensor noise "
+            f"the residual ({fit['rms_after'] * 1e3:.1f} mm rms) exceeds {MISSED:g} times the sensor noise "
             f"({max(noise) * 1e3:.1f} mm): the model misses something, and the standard errors do not cover it"
         )
     if not all(e.settles for e in episodes):
