@@ -5,14 +5,31 @@ from pathlib import Path
 
 import torch
 
+from torchcloth.cli import main
+
 README = Path(__file__).resolve().parents[1] / "README.md"
 
 
-def test_python_blocks_run(capsys):
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
-    assert blocks
-    for block in blocks:
-        scope: dict = {}
-        exec(compile(block, "README.md", "exec"), scope)
-        assert torch.isfinite(scope["q"].grad).all()
-        assert float(scope["q"].grad.abs().max()) > 0
+BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+
+
+def run(block: str) -> dict:
+    scope: dict = {}
+    exec(compile(block, "README.md", "exec"), scope)
+    return scope
+
+
+def test_the_layer():
+    (block,) = (b for b in BLOCKS if "tc.Cloth(" in b)
+    q = run(block)["q"]
+    assert torch.isfinite(q.grad).all()
+    assert float(q.grad.abs().max()) > 0
+
+
+def test_the_own_recording_can_be_identified(tmp_path, monkeypatch, capsys):
+    """What a reader does next: write it, then the command."""
+    monkeypatch.chdir(tmp_path)
+    (block,) = (b for b in BLOCKS if "rec.write" in b)
+    run(block)
+    assert main(["identify", "my_episode", "--out", "fit", "--fit", "air.normal", "--iterations", "1"]) == 0
+    assert "null: carried rigidly" in capsys.readouterr().out

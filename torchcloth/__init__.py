@@ -42,6 +42,10 @@ __all__ = [
 ]
 
 
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])
+
+
 def __getattr__(name: str):
     """Rooms that are opened when they are first asked for: importing the layer stays cheap."""
     if name in ("identification", "observe", "recordings", "robots"):

@@ -47,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     identify.set_defaults(run=_identify)
     _add_fit_options(identify)
     demo = verbs.add_parser("demo", help="identify the shipped example")
-    demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
+    demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default out/demo")
     demo.set_defaults(run=_demo)
     _add_fit_options(demo)
     doctor = verbs.add_parser("doctor", help="say what is installed and what works")
@@ -60,11 +60,22 @@ def _add_fit_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--start", nargs="+", default=[], metavar="NAME=VALUE", help="start values, SI units, e.g. youngs_modulus=2e5"
     )
-    parser.add_argument("--method", choices=["gauss-newton", "adam"], default="gauss-newton")
+    parser.add_argument(
+        "--method",
+        choices=["gauss-newton", "adam"],
+        default="gauss-newton",
+        help="default gauss-newton; adam: the paper's descent",
+    )
     parser.add_argument(
         "--stop", choices=["converged", "paper"], default="converged", help="paper: Chamfer below 1.5 cm"
     )
-    parser.add_argument("--iterations", type=int, default=35, metavar="N")
+    parser.add_argument(
+        "--iterations",
+        type=int,
+        default=35,
+        metavar="N",
+        help="at most N on all frames, after up to 10 on early ones (35)",
+    )
     parser.add_argument("--contact", type=float, metavar="SPACING", help="contact grid [m]; left out: no contact")
     parser.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
     parser.add_argument("--resume", action="store_true", help="continue from DIR/progress.json")
@@ -83,6 +94,8 @@ def _identify(options: argparse.Namespace) -> int:
 
     torch.set_default_dtype(torch.float64)  # sensitivities lose digits over thousands of substeps in float32
     torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
+    if options.out.exists() and not options.out.is_dir():
+        raise InvalidInput("--out", got=f"{options.out}, a file", expected="a folder, new or existing")
     episodes = [recordings.read(path) for path in options.episodes]
     cloth = _cloth(options, episodes[0])
     guess = _resume(options.out) if options.resume else None

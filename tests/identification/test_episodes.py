@@ -41,10 +41,29 @@ def test_a_cloud_takes_the_cloths_dtype(recording):
     assert seen.times.dtype == torch.float64  # seconds since an epoch do not fit into float32
 
 
-def test_without_initial_vertices_the_mesh_is_the_first_frame(recording, model):
-    seen = episode(model, with_cloth(recording, initial_vertices=None))
+def test_without_initial_vertices_the_mesh_is_the_first_frame(recording):
+    placed = with_cloth(recording, vertices=recording.cloth.initial_vertices, initial_vertices=None)
+    model = cloth_from(placed)
+    seen = episode(model, placed)
     assert not seen.settles
     np.testing.assert_array_equal(seen.initial.numpy(), model.mesh.vertices)
+
+
+def test_a_cloth_far_from_its_grippers_is_refused(recording, model):
+    """Without initial vertices the flat rest mesh lies at the origin, a metre below the hands."""
+    with pytest.raises(InvalidInput, match=r"grasp 'left'; got the held patch 1\.\d+ m .*initial_vertices in world"):
+        episode(model, with_cloth(recording, initial_vertices=None))
+
+
+def test_parameters_of_contact_need_contact(recording, model):
+    with pytest.raises(InvalidInput, match="'cone'; .*needs contact"):
+        identify(model, recording, ["cone"])
+
+
+@pytest.mark.parametrize("key", ["youngs_modulus", "poisson_ratio", "bending_stiffness"])
+def test_a_nominal_value_that_is_no_number_is_refused(recording, key):
+    with pytest.raises(RecordingError, match=f"nominal.{key}; got 'soft'"):
+        cloth_from(with_cloth(recording, nominal={key: "soft"}))
 
 
 def test_initial_vertices_of_another_mesh_are_refused(recording, model):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..boundaries import Grasp, Plane
+from ..boundaries.motion import interpolate
 from ..cloth import Cloth
 from ..effects import AbstractEffect, AirDrag, Bending, Gravity
 from ..errors import InvalidInput, RecordingError
@@ -23,6 +25,7 @@ from ..types import Trajectory
 DEFAULT_STIFFNESS = 300.0  # N/m, a start in the middle of the published fabrics, where an episode names none
 DEFAULT_POISSON = 0.2
 SHEET_TRIANGLES = 288
+FARTHEST = 0.2  # m, of a held patch from its gripper's origin at the first frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +131,7 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
             expected=f"{len(cloth.mesh.vertices)}, one per vertex",
             remedy="give the mesh that the initial vertices belong to",
         )
+    _check_place(name, cloth, motion, torch.as_tensor(vertices, dtype=dtype), times[0])
     return Episode(
         name=name,
         motion={key: motion[key] for key in needed},
@@ -137,6 +141,29 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
         settles=initial is not None,
         noise=recording.observation_noise_std,
     )
+
+
+def _check_place(name: str, cloth: Cloth, motion: Mapping[str, Trajectory], x: Tensor, start: float) -> None:
+    """Refuse a cloth that is not where its grippers are: only their increments move it, so nothing else would show."""
+    for key, boundary in cloth.boundaries.items():
+        if isinstance(boundary, Grasp):
+            pose = interpolate(motion[key], torch.tensor([start], dtype=x.dtype))
+            gap = float((x[boundary.index].mean(0) - pose[0, :3, 3]).norm())
+            if gap > FARTHEST:
+                raise InvalidInput(
+                    f"{name}: grasp {key!r}",
+                    got=f"the held patch {gap:.2f} m from its gripper at the first frame",
+                    expected=f"within {FARTHEST:g} m",
+                    remedy="give cloth.initial_vertices in world coordinates, or check the gripper's path and frame",
+                )
+
+
+def _number(nominal: Mapping[str, Any], key: str, default: float) -> float:
+    """A data-sheet value; refuses what is not a number."""
+    try:
+        return float(nominal.get(key, default))
+    except (TypeError, ValueError):
+        raise RecordingError(f"cloth.nominal.{key}", got=repr(nominal[key]), expected="a number in SI units") from None
 
 
 def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[str]) -> tuple[np.ndarray, list[int]]:
@@ -159,7 +186,9 @@ def _effects(recording: Recording) -> dict[str, AbstractEffect]:
     effects: dict[str, AbstractEffect] = {"gravity": Gravity(recording.gravity.tolist())}
     nominal = recording.cloth.nominal
     if "bending_stiffness" in nominal:
-        effects["bending"] = Bending(nominal["bending_stiffness"], nominal.get("bending_damping_time", 0.0))
+        effects["bending"] = Bending(
+            _number(nominal, "bending_stiffness", 0.0), _number(nominal, "bending_damping_time", 0.0)
+        )
     if recording.air_density is not None:
         effects["air"] = AirDrag(normal=AirDrag.typical, density=recording.air_density)
     return effects
@@ -167,5 +196,6 @@ def _effects(recording: Recording) -> dict[str, AbstractEffect]:
 
 def _nominal(recording: Recording) -> AEP:
     nominal, h = recording.cloth.nominal, recording.cloth.thickness or 1e-3
-    youngs = nominal.get("youngs_modulus") or nominal.get("membrane_stiffness", DEFAULT_STIFFNESS) / h
-    return AEP(float(youngs), float(nominal.get("poisson_ratio", DEFAULT_POISSON)), thickness=h)
+    stiffness = _number(nominal, "membrane_stiffness", DEFAULT_STIFFNESS)
+    youngs = _number(nominal, "youngs_modulus", stiffness / h)
+    return AEP(youngs, _number(nominal, "poisson_ratio", DEFAULT_POISSON), thickness=h)

@@ -19,7 +19,7 @@ from .episodes import episode
 from .misfit import Figures, figures
 from .null import rigid_carry
 from .objective import Objective
-from .report import estimates, warnings_of
+from .report import estimates, warnings_of, withdraw
 from .result import Identification
 from .unknowns import collect
 
@@ -129,6 +129,8 @@ class _Run:
         fit["independent_observations"] = final.share * float((final.linear.value != 0).sum())
         fit["converged"] = final.converged
         warnings += [stopped] if stopped else []
+        if fit["chamfer_after"] >= fit["chamfer_null"]:  # whatever the tangents promise
+            found = withdraw(found)
         warnings += warnings_of(full.cloth, full.episodes, found, fit, after, full.faces)
         keys = {u.name: u.key.removesuffix(".raw") for u in full.unknowns}
         return Identification(
@@ -170,7 +172,7 @@ class _Run:
         names = ", ".join(u.name for u, error in zip(full.unknowns, missed, strict=True) if error >= NONLINEAR)
         warning = (
             f"the motion is unstable or strongly nonlinear at the solution (tangents of {names} miss finite steps "
-            f"by up to {100 * float(missed.max()):.0f} %): standard errors come from finite differences"
+            f"by up to {min(1000.0, 100 * float(missed.max())):.0f} %): standard errors come from finite differences"
         )
         return final._replace(linear=secants), [warning]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -38,12 +39,20 @@ def estimates(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, covariance
     absent = [
         name for name, path in available(cloth).items() if path.startswith("material.") and name not in parameters
     ]
-    for unknown in collect(cloth, absent, None):
+    for unknown in collect(cloth, absent, None, absent=True):
         parameters[unknown.name] = _absent(unknown)
     matrix = covariance / deviation[:, None] / deviation[None, :]
     names = [u.name for u in unknowns]
     correlation = {a: {b: float(matrix[i, j]) for j, b in enumerate(names)} for i, a in enumerate(names)}
     return Found(parameters, correlation)
+
+
+def withdraw(found: Found) -> Found:
+    """No parameter counts as identified: the model does not describe these data."""
+    parameters = {
+        name: e if e.source == "prior" else replace(e, identifiable=False) for name, e in found.parameters.items()
+    }
+    return found._replace(parameters=parameters)
 
 
 def warnings_of(

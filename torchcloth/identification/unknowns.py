@@ -66,8 +66,15 @@ def available(cloth: Cloth) -> dict[str, str]:
     return found
 
 
-def collect(cloth: Cloth, names: Sequence[str], density_std: float | None) -> list[Unknown]:
+def _needs_contact(cloth: Cloth, path: str) -> bool:
+    """Parameters of the director law do nothing in a model without contact."""
+    return cloth.contact is None and path in ("material.contact_stiffness", "material.shear_stiffness", "material.cone")
+
+
+def collect(cloth: Cloth, names: Sequence[str], density_std: float | None, absent: bool = False) -> list[Unknown]:
     """The unknowns of a fit, by public name; areal density joins with its measured prior when that is known.
+
+    ``absent`` admits parameters that the model does not contain, for reports.
 
     Raises:
         InvalidInput: an unknown name or a field-valued parameter.
@@ -76,7 +83,15 @@ def collect(cloth: Cloth, names: Sequence[str], density_std: float | None) -> li
     out = []
     for name in dict.fromkeys(names):
         if name not in known:
-            raise InvalidInput("parameter to fit", got=repr(name), expected=f"one of {', '.join(sorted(known))}")
+            possible = sorted(n for n, path in known.items() if not _needs_contact(cloth, path))
+            raise InvalidInput("parameter to fit", got=repr(name), expected=f"one of {', '.join(possible)}")
+        if _needs_contact(cloth, known[name]) and not absent:
+            raise InvalidInput(
+                "parameter to fit",
+                got=repr(name),
+                expected="a parameter of the model",
+                remedy="it needs contact (--contact)",
+            )
         out.append(_unknown(cloth, name, known[name]))
     density = float(cloth.areal_density.value.detach().mean())
     if density_std and "areal_density" in known and "areal_density" not in names:
