@@ -56,7 +56,7 @@ def test_a_cloth_far_from_its_grippers_is_refused(recording, model):
 
 
 def test_parameters_of_contact_need_contact(recording, model):
-    with pytest.raises(InvalidInput, match="'cone'; .*needs contact"):
+    with pytest.raises(InvalidInput, match=r"'cone'; .*needs contact"):
         identify(model, recording, ["cone"])
 
 
