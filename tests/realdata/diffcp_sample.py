@@ -54,7 +54,7 @@ from flattening import Edge, area_of, boundary_loops, cut, edges_of, flatten, he
 from torchcloth import recordings
 from torchcloth.recordings import ClothInfo, Collider, GraspInfo, GripperMotion, PointClouds, Recording
 
-SECONDS_PER_STEP = 0.002
+SECONDS_PER_STEP = 0.001
 STEPS_PER_CLOUD = 100
 THINNEST = 0.010  # m
 SMOOTH, KNOT = 11, 5  # steps
@@ -64,8 +64,8 @@ THICKNESS = 5e-4  # m
 NOMINAL = {
     "membrane_stiffness": 100.0,
     "poisson_ratio": 0.2,
-    "bending_stiffness": 2e-4,
-    "bending_damping_time": 0.03,
+    "bending_stiffness": 5e-5,
+    "bending_damping_time": 0.2,
     "units": {
         "membrane_stiffness": "N/m",
         "poisson_ratio": "-",
