@@ -118,9 +118,8 @@ def check_result(folder: Path, printed: str) -> dict[str, float]:
     for key in ("null", "before", "after"):
         assert f"{fit[f'chamfer_{key}']:.6f}" in printed
     assert "null" in printed
-    # the robust cost falls, the mean need not: 31 points a frame on an unknown clock say nothing about stiffness
-    assert fit["chamfer_after"] < 1.01 * fit["chamfer_before"]
-    assert fit["chamfer_after"] < fit["chamfer_null"]
+    # Not compared with the start's: slack layers move chaotically, and E h from 10 to 1500 N/m changes 23 mm by 1.5 mm.
+    assert fit["chamfer_after"] < 0.5 * fit["chamfer_null"]
     return fit
 
 

@@ -13,7 +13,7 @@ from ..cloth import Cloth
 from ..materials import AEP
 from .episodes import Episode
 from .result import Estimate
-from .unknowns import Unknown, available, collect
+from .unknowns import Unknown, available, collect, needs_contact
 
 TRUSTED = 0.25  # a parameter counts as identified when its standard error is below a quarter of its value
 MISSED = 1.3  # rms over the sensor noise above which what the model misses may matter more than the noise
@@ -40,7 +40,8 @@ def estimates(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, covariance
         name for name, path in available(cloth).items() if path.startswith("material.") and name not in parameters
     ]
     for unknown in collect(cloth, absent, None, absent=True):
-        parameters[unknown.name] = _absent(unknown)
+        outside = needs_contact(cloth, unknown.key.removesuffix(".raw"))
+        parameters[unknown.name] = _absent(unknown, "not in the model" if outside else "held fixed")
     matrix = covariance / deviation[:, None] / deviation[None, :]
     names = [u.name for u in unknowns]
     correlation = {a: {b: float(matrix[i, j]) for j, b in enumerate(names)} for i, a in enumerate(names)}
@@ -119,12 +120,12 @@ def _typical(unknown: Unknown) -> float:
     return 0.5 * unknown.prior_std if unknown.parameter.domain == "nonnegative" else 0.0
 
 
-def _absent(unknown: Unknown) -> Estimate:
-    """A material parameter that the model does not contain: only its prior is known."""
+def _absent(unknown: Unknown, source: str) -> Estimate:
+    """A material parameter that was not fitted: only its prior is known."""
     value, spread = unknown.value(unknown.start), 1.96 * unknown.prior_std
     low, high = (unknown.value(unknown.clip(unknown.start + sign * spread)) for sign in (-1, 1))
     std = unknown.slope(unknown.start) * unknown.prior_std
-    return Estimate(value, std, (low, high), unknown.parameter.unit, value, False, "not in the model")
+    return Estimate(value, std, (low, high), unknown.parameter.unit, value, False, source)
 
 
 def _times(estimate: Estimate, factor: float, unit: str) -> Estimate:

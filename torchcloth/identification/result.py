@@ -20,7 +20,7 @@ CONVENTION = (
     "correlated within patches of the fabric and nearby frames is allowed for, persistent model error is not. ci95: in "
     "the log (logit) coordinate; linear, cut at 0, for amplitudes of effects and the cone. identifiable: std below a "
     "quarter of the value (of a typical amplitude, where the amplitude is smaller), and the fit beats the null. "
-    "source 'not in the model': value, std and ci95 are those of the prior."
+    "source 'not in the model' or 'held fixed': value, std and ci95 are those of the prior."
 )
 
 
@@ -34,7 +34,9 @@ class Estimate:
     unit: str
     initial: float
     identifiable: bool
-    source: str = "data"  # "data", "prior" (a measurement stated by the recording), "derived", "not in the model"
+    source: str = (
+        "data"  # "data", "prior" (a measurement stated by the recording), "derived", "not in the model", "held fixed"
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ COLUMNS = {
     "unit": "left",
     "": "left",
 }
-REMARKS = {"prior": "measured", "derived": "= E h"}
+REMARKS = {"prior": "measured", "derived": "= E h", "held fixed": "held fixed"}
 
 
 def print_fit(fit: Identification) -> None:

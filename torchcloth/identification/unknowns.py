@@ -66,7 +66,7 @@ def available(cloth: Cloth) -> dict[str, str]:
     return found
 
 
-def _needs_contact(cloth: Cloth, path: str) -> bool:
+def needs_contact(cloth: Cloth, path: str) -> bool:
     """Parameters of the director law do nothing in a model without contact."""
     return cloth.contact is None and path in ("material.contact_stiffness", "material.shear_stiffness", "material.cone")
 
@@ -83,9 +83,9 @@ def collect(cloth: Cloth, names: Sequence[str], density_std: float | None, absen
     out = []
     for name in dict.fromkeys(names):
         if name not in known:
-            possible = sorted(n for n, path in known.items() if not _needs_contact(cloth, path))
+            possible = sorted(n for n, path in known.items() if not needs_contact(cloth, path))
             raise InvalidInput("parameter to fit", got=repr(name), expected=f"one of {', '.join(possible)}")
-        if _needs_contact(cloth, known[name]) and not absent:
+        if needs_contact(cloth, known[name]) and not absent:
             raise InvalidInput(
                 "parameter to fit",
                 got=repr(name),
