@@ -65,10 +65,7 @@ def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tenso
     to report, and ``residuals`` to infer.
     """
     hits = closest(points, vertices, faces)
-    offset = points - hits.on(vertices)
-    squared = (offset * offset).sum(-1)
-    zero = squared == 0
-    return torch.where(zero, 0.0, torch.where(zero, 1.0, squared).sqrt()).mean()
+    return safe_norm(points - hits.on(vertices)).mean()
 
 
 def _closest(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
