@@ -22,7 +22,7 @@ from .meshes import Mesh
 from .parameters import PhysicalParameter
 from .stability import stable_step
 from .transfer import Contact
-from .types import ClothState, Rollout, Trajectory
+from .types import ClothState, Memory, Rollout, Trajectory
 from .validation import check_extent, check_field, check_state, check_times, expand_state
 
 
@@ -107,7 +107,7 @@ class Cloth(nn.Module):
         if not bool(torch.isfinite(x.detach()).all()):
             raise InvalidInput("x", got="NaN or infinite entries", expected="finite positions in metres")
         n = functional.surface(self._geometry(), x, v).n
-        return ClothState(x, v, n.repeat_interleave(len(self._points), dim=-2))
+        return ClothState(x, v, n.repeat_interleave(len(self._points), dim=-2), self._virgin(x))
 
     # -- simulation -----------------------------------------------------------------------------------------------
 
@@ -179,7 +179,7 @@ class Cloth(nn.Module):
         damping = MassDamping(rate).to(self._area)
         model = self.model()
         state = self._start(state, model, held)
-        model = model._replace(effects=[*model.effects, (damping, damping.coefficients().detach())])
+        model = model._replace(effects={**model.effects, "settling": (damping, damping.coefficients().detach())})
         count = int(np.ceil(duration * (1 / self.stable_step() + rate)))
         settled, _ = advance(Interval(model, held, start, start + duration, count), state, checkpoint=True)
         self._check_extent(settled.x)
@@ -189,10 +189,10 @@ class Cloth(nn.Module):
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
         with torch.no_grad():
             c = self.material.coefficients()
-            density = _per_triangle(self.areal_density.value)
+            density = self.areal_density.field
             spacing = self.spacing if self.contact is not None else None
             model = self.model()
-            extra = [effect.rates(k, model.mass) for effect, k in model.effects]
+            extra = [effect.rates(k, model.mass) for effect, k in model.effects.values()]
             elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
             return stable_step(self._gradient, density, self.material.stiffness(c), spacing, elastic, damping)
 
@@ -200,16 +200,19 @@ class Cloth(nn.Module):
         """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
         density = self.areal_density.value
         mass = self._vertex_mass(density)
-        parts = cast("Iterable[AbstractEffect]", self.effects.values())
-        effects = [(effect, effect.coefficients()) for effect in parts]
+        effects = {name: (effect, effect.coefficients()) for name, effect in self._parts()}
+        for effect, c in effects.values():
+            extra = effect.mass(c)
+            mass = mass if extra is None else mass + extra
         return functional.Model(
             geometry=self._geometry(),
             mass=mass,
-            areal_density=_per_triangle(density),
+            areal_density=self.areal_density.field,
             material=self.material,
             coefficients=self.material.coefficients(),
             effects=effects,
             boundaries=dict(self.boundaries.items()),  # type: ignore[arg-type]
+            rest=_rest(effect.growth(c) for effect, c in effects.values()),
         )
 
     def energy(self, state: ClothState) -> dict[str, Tensor]:
@@ -217,6 +220,16 @@ class Cloth(nn.Module):
         return functional.energy(self.model(), state)
 
     # -- parts of the above ---------------------------------------------------------------------------------------
+
+    def _parts(self) -> Iterable[tuple[str, AbstractEffect]]:
+        return cast("Iterable[tuple[str, AbstractEffect]]", self.effects.items())
+
+    def _virgin(self, x: Tensor) -> Memory:
+        """Internal variables of a cloth that has never been strained."""
+        own = self.material.start(len(self._area))
+        found = {"material": None if own is None else own.to(x).expand(*x.shape[:-2], -1, -1)}
+        found |= {f"effects.{name}": effect.start(x) for name, effect in self._parts()}
+        return {name: value for name, value in found.items() if value is not None}
 
     def _geometry(self) -> functional.Geometry:
         g = self._gradient
@@ -265,7 +278,7 @@ class Cloth(nn.Module):
         return out
 
     def _start(self, state: ClothState, model: functional.Model, motion: Mapping[str, Trajectory]) -> ClothState:
-        check_state(state, len(self._vertices), len(self._area) * len(self._points))
+        check_state(state, self.rest_state())
         state = expand_state(state, model, motion)
         self._check_extent(state.x)
         return state
@@ -285,8 +298,13 @@ class Cloth(nn.Module):
         return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s"
 
 
-def _per_triangle(value: Tensor) -> Tensor:
-    return value.unsqueeze(-1) if value.ndim else value.reshape(1, 1)
+def _rest(growths: Iterable[Tensor | None]) -> Tensor | None:
+    """Inverse of the composed growths [..., E or 1, 4] by rows."""
+    total = None
+    for growth in growths:
+        if growth is not None:
+            total = growth if total is None else total @ growth
+    return None if total is None else torch.linalg.inv(total).flatten(-2)
 
 
 def _grid_size(mesh: Mesh, spacing: float) -> int:

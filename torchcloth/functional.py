@@ -1,14 +1,14 @@
 """The algorithm on one page. Read this file first.
 
-One substep:  forces on the mesh -> velocities -> boundaries -> contact through the grid -> boundaries -> positions ->
-directors. Elasticity and effects act on the vertices, which carry all the mass; the grid carries only contact. That
-split is what makes the solution converge when the step is halved: forces filtered through the grid do not.
+One substep:  internal variables -> forces on the mesh -> velocities -> contact through the grid -> boundaries ->
+positions -> directors. Elasticity and effects act on the vertices, which carry all the mass; the grid carries only
+contact. That split is what makes the solution converge when the step is halved: forces filtered through the grid do not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from .boundaries import AbstractBoundary, Drive
 from .effects import AbstractEffect
 from .materials import AbstractMaterial
 from .transfer import exchange
-from .types import ClothState, Surface
+from .types import ClothState, Memory, Moment, Surface
 
 
 class Geometry(NamedTuple):
@@ -41,8 +41,9 @@ class Model(NamedTuple):
     areal_density: Tensor  # [] or [..., 1 or E, 1] kg/m^2
     material: AbstractMaterial
     coefficients: Any
-    effects: Sequence[tuple[AbstractEffect, Any]]
+    effects: Mapping[str, tuple[AbstractEffect, Any]]
     boundaries: Mapping[str, AbstractBoundary]
+    rest: Tensor | None = None  # [..., E or 1, 4]: F_E = F A for a rest shape that differs from the pattern
 
 
 def surface(geometry: Geometry, x: Tensor, v: Tensor) -> Surface:
@@ -66,25 +67,28 @@ def step(model: Model, state: ClothState, dt: float, drives: Mapping[str, Drive]
     """
     geometry = model.geometry
     s = surface(geometry, state.x, state.v)
-    columns = model.material.membrane_stress(model.coefficients, s)
+    memory = _evolve(model, state, s)
+    columns = _membrane_stress(model, s, memory)
     touching = geometry.points.shape[0] > 0
     director = None
     if touching:
         director = _director_forces(model, s, state.d3)
         columns = (columns[0] + director.column1, columns[1] + director.column2)
-    v = state.v + dt * (_vertex_forces(model, state, s, columns) / model.mass)
-    v, impulses = _constrain(model, state.x, v, dt, drives, substep)
+    resistance = _resistance(model, s, state.x)
+    force = _vertex_forces(model, state, s, memory, columns)
+    free = state.v + dt * _resisted(resistance, force / model.mass)
     d3 = state.d3
     if director is not None:
-        change, d3 = _contact(model, state, v, s, director.pull, dt)
-        v, more = _constrain(model, state.x, v + change, dt, drives, substep)
-        impulses = {name: impulses[name] + more[name] for name in impulses}
+        held, _ = _constrain(model, state.x, free, dt, drives, substep)
+        change, d3 = _contact(model, state, held, s, director.pull, dt)
+        free = free + _resisted(resistance, change)
+    v, impulses = _constrain(model, state.x, free, dt, drives, substep)
     x = state.x + dt * v
     if touching:
         n = surface(geometry, x, v).n.unsqueeze(-2)
         split = d3.unflatten(-2, (-1, geometry.points.shape[0]))
         d3 = model.material.return_map(_per_point(model.coefficients), n, split).flatten(-3, -2)
-    return ClothState(x, v, d3), impulses
+    return ClothState(x, v, d3, memory), impulses
 
 
 def rollout(model: Model, state: ClothState, dt: float, drives: Mapping[str, Drive], substeps: int, first: int = 0):
@@ -100,9 +104,11 @@ def energy(model: Model, state: ClothState) -> dict[str, Tensor]:
     """Energies [...] J: kinetic, membrane, director."""
     s = surface(model.geometry, state.x, state.v)
     area = model.geometry.area
+    elastic, share = _elastic(model, s, state.memory)
+    density = model.material.membrane_energy(model.coefficients, elastic)
     out = {
         "kinetic": 0.5 * (model.mass * dot(state.v, state.v)).sum((-2, -1)),
-        "membrane": (area * model.material.membrane_energy(model.coefficients, s)).sum((-2, -1)),
+        "membrane": (area * (density if share is None else share * density)).sum((-2, -1)),
     }
     points = model.geometry.points.shape[0]
     if points:
@@ -129,7 +135,70 @@ def _director_forces(model: Model, s: Surface, d3: Tensor) -> _Director:
     return _Director(cross(s.f2, turn), cross(turn, s.f1), pull.flatten(-3, -2))
 
 
-def _vertex_forces(model: Model, state: ClothState, s: Surface, columns: tuple[Tensor, Tensor]) -> Tensor:
+def _evolve(model: Model, state: ClothState, s: Surface) -> Memory:
+    """Plastic set, internal friction and creases follow the cloth to where it is now."""
+    memory = dict(state.memory)
+    if "material" in memory:
+        grown = s if model.rest is None else _unstretched(s, model.rest)
+        memory["material"] = model.material.flow(model.coefficients, grown, memory["material"])
+    for name, (effect, c) in model.effects.items():
+        own = memory.get(f"effects.{name}")
+        if own is not None:
+            memory[f"effects.{name}"] = effect.evolve(c, Moment(state.x, state.v, s, model.mass, own))
+    return memory
+
+
+def _elastic(model: Model, s: Surface, memory: Memory) -> tuple[Surface, Tensor | None]:
+    """(elastic deformation F A, true rest area over the pattern's or None for 1)."""
+    share = None
+    if model.rest is not None:
+        s = _unstretched(s, model.rest)
+        a11, a12, a21, a22 = model.rest.split(1, dim=-1)
+        share = 1 / (a11 * a22 - a12 * a21)
+    return (_unstretched(s, memory["material"]) if "material" in memory else s), share
+
+
+def _unstretched(s: Surface, inverse: Tensor) -> Surface:
+    """The surface seen from another rest shape: F -> F A with A [..., E or 1, 4] by rows."""
+    a11, a12, a21, a22 = inverse.split(1, dim=-1)
+    f1, f2 = a11 * s.f1 + a21 * s.f2, a12 * s.f1 + a22 * s.f2
+    return s._replace(f1=f1, f2=f2, cofactor1=cross(f2, s.n), cofactor2=cross(s.n, f1), J=(a11 * a22 - a12 * a21) * s.J)
+
+
+def _membrane_stress(model: Model, s: Surface, memory: Memory) -> tuple[Tensor, Tensor]:
+    """Columns of d(energy)/dF per area of the pattern [..., E, 3] N/m: P = P_E A^T, times the growth of the area."""
+    elastic, share = _elastic(model, s, memory)
+    p1, p2 = model.material.membrane_stress(model.coefficients, elastic)
+    for inverse in (memory.get("material"), model.rest):
+        if inverse is not None:
+            a11, a12, a21, a22 = inverse.split(1, dim=-1)
+            p1, p2 = a11 * p1 + a12 * p2, a21 * p1 + a22 * p2
+    return (p1, p2) if share is None else (share * p1, share * p2)
+
+
+def _resistance(model: Model, s: Surface, x: Tensor) -> Tensor | None:
+    """Mass that moves along with the normal only, relative to the vertices' own [..., V, 3, 3]; None without any."""
+    found = [effect.inertia(c, s) for effect, c in model.effects.values()]
+    triangles = [m for m in found if m is not None]
+    if not triangles:
+        return None
+    share = (sum(triangles) / 3 * s.n).unsqueeze(-1) * s.n.unsqueeze(-2)
+    flat = share.flatten(-2)
+    total = _assemble(model.geometry, (flat, flat, flat), x[..., :1].expand(*x.shape[:-1], 9))
+    return (total / model.mass).unflatten(-1, (3, 3))
+
+
+def _resisted(resistance: Tensor | None, change: Tensor) -> Tensor:
+    """(1 + B)^-1 y, written so that B = 0 changes nothing, bitwise."""
+    if resistance is None:
+        return change
+    excess = (resistance @ change.unsqueeze(-1)).squeeze(-1)
+    return change - torch.linalg.solve(torch.eye(3).to(change) + resistance, excess)
+
+
+def _vertex_forces(
+    model: Model, state: ClothState, s: Surface, memory: Memory, columns: tuple[Tensor, Tensor]
+) -> Tensor:
     """Internal forces and effects, assembled on the vertices [..., V, 3] N."""
     g = model.geometry
     p1, p2 = columns
@@ -137,8 +206,10 @@ def _vertex_forces(model: Model, state: ClothState, s: Surface, columns: tuple[T
     third = -g.area * (g.warp[1] * p1 + g.weft[1] * p2)
     first = -(second + third)
     direct = None
-    for effect, c in model.effects:
-        force = effect.force(c, state, s, model.mass)
+    for name, (effect, c) in model.effects.items():
+        force = effect.force(c, Moment(state.x, state.v, s, model.mass, memory.get(f"effects.{name}")))
+        if force is None:
+            continue
         if effect.acts_on == "triangles":
             part = force / 3
             first, second, third = first + part, second + part, third + part
@@ -180,12 +251,26 @@ def _mesh_gradient(g: Geometry, v: Tensor, s: Surface) -> Tensor:
 
 
 def _constrain(model: Model, x: Tensor, v: Tensor, dt: float, drives: Mapping[str, Drive], substep: int):
+    """Velocities that obey the boundaries, and what each driven one gave: impulse and its moment about the body."""
     impulses: dict[str, Tensor] = {}
     for name, boundary in model.boundaries.items():
-        v, impulse = boundary.apply(x, v, model.mass, dt, drives.get(name), substep)
-        if impulse is not None:
-            impulses[name] = impulse
+        drive = drives.get(name)
+        after = boundary.apply(x, v, dt, drive, substep)
+        if drive is not None:
+            after = _slipped(model, name, v, after, dt)
+            momentum = model.mass * (after - v)
+            arm = x + dt * after - drive.pose[..., substep, None, :3, 3]
+            impulses[name] = torch.cat([momentum.sum(-2), cross(arm, momentum).sum(-2)], dim=-1)
+        v = after
     return v, impulses
+
+
+def _slipped(model: Model, grasp: str, free: Tensor, held: Tensor, dt: float) -> Tensor:
+    for effect, c in model.effects.values():
+        if effect.grasp == grasp:
+            index = cast("Tensor", model.boundaries[grasp].index)
+            held = effect.loosen(c, index, free, held, model.mass, dt)
+    return held
 
 
 def _corners(g: Geometry, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -62,6 +62,12 @@ class PhysicalParameter(nn.Module):
         """Physical value in ``unit``, differentiable with respect to ``raw``."""
         return to_value(self.raw, self.domain)
 
+    @property
+    def field(self) -> Tensor:
+        """Physical value [..., E or 1, 1], as it meets fields [..., E, 3] of the triangles."""
+        value = self.value
+        return value.unsqueeze(-1) if value.ndim else value.reshape(1, 1)
+
     def set(self, value: float | Tensor) -> None:
         """Assign a physical value in place; refuses an illegal one and leaves the old value."""
         with torch.no_grad():

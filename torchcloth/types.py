@@ -5,9 +5,12 @@ NamedTuples: the one container that survives Lightning's device transfer, vmap, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from torch import Tensor
+
+Memory = dict[str, Tensor]  # internal variables by owner, "material" or "effects.NAME": [..., N, K] each
 
 
 class ClothState(NamedTuple):
@@ -19,6 +22,12 @@ class ClothState(NamedTuple):
     x: Tensor  # [..., V, 3] m, vertex positions
     v: Tensor  # [..., V, 3] m/s, vertex velocities
     d3: Tensor  # [..., P, 3] -, elastic director of each contact point (P = 0 without contact)
+    memory: Memory = {}  # what the material and effects remember: plastic set, internal friction, creases
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> ClothState:
+        """The state with ``function`` applied to every tensor."""
+        memory = {name: function(value) for name, value in self.memory.items()}
+        return ClothState(function(self.x), function(self.v), function(self.d3), memory)
 
 
 class Surface(NamedTuple):
@@ -32,6 +41,16 @@ class Surface(NamedTuple):
     J: Tensor  # [..., E, 1] -, area ratio
     area: Tensor  # [E, 1] m^2, rest area
     v: Tensor  # [..., E, 3] m/s, centroid velocity
+
+
+class Moment(NamedTuple):
+    """What an effect sees of the cloth in one substep."""
+
+    x: Tensor  # [..., V, 3] m
+    v: Tensor  # [..., V, 3] m/s
+    surface: Surface
+    mass: Tensor  # [..., V, 1] kg
+    memory: Tensor | None = None  # [..., N, K], the effect's own internal variables
 
 
 class Trajectory(NamedTuple):

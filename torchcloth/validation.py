@@ -30,28 +30,31 @@ def check_times(times: Tensor | Sequence[float]) -> list[float]:
     return frames
 
 
-def check_state(state: ClothState, vertices: int, points: int) -> None:
-    """Refuse a state that was made for another cloth, or is not finite."""
-    shapes = [tuple(field.shape[-2:]) for field in state]
-    expected = [(vertices, 3), (vertices, 3), (points, 3)]
-    if shapes != expected:
+def check_state(state: ClothState, like: ClothState) -> None:
+    """Refuse a state that was made for another cloth (than ``like``, one of its own), or is not finite."""
+    got, expected = ({name: tuple(t.shape[-2:]) for name, t in _named(s).items()} for s in (state, like))
+    if got != expected:
         raise InvalidInput(
             "state",
-            got=f"x, v, d3 of {shapes}",
+            got=f"{got}",
             expected=f"{expected}",
             remedy="make states with this cloth's rest_state() or state()",
         )
-    if not all(bool(torch.isfinite(field).all()) for field in state):
-        raise InvalidInput("state", got="NaN or infinite entries", expected="finite x, v, d3")
+    if not all(bool(torch.isfinite(field).all()) for field in _named(state).values()):
+        raise InvalidInput("state", got="NaN or infinite entries", expected="finite x, v, d3 and memory")
+
+
+def _named(state: ClothState) -> dict[str, Tensor]:
+    return {"x": state.x, "v": state.v, "d3": state.d3, **state.memory}
 
 
 def expand_state(state: ClothState, model: Model, motion: Mapping[str, Trajectory]) -> ClothState:
     """The state with the batch dimensions of parameters and motion, so that one state serves many of them."""
-    coefficients = [model.coefficients, (model.areal_density, model.mass), *(c for _, c in model.effects)]
+    coefficients = [model.coefficients, (model.areal_density, model.mass), *(c for _, c in model.effects.values())]
     tensors = [t for c in coefficients for t in (c if isinstance(c, tuple) else (c,)) if isinstance(t, Tensor)]
     batches = [t.shape[:-2] for t in tensors if t.ndim > 2] + [m.pose.shape[:-3] for m in motion.values()]
     batch = torch.broadcast_shapes(state.x.shape[:-2], *batches)
-    return ClothState(*(field.expand(*batch, *field.shape[-2:]) for field in state))
+    return state.map(lambda field: field.expand(*batch, *field.shape[-2:]))
 
 
 def check_extent(x: Tensor, limit: float) -> None:

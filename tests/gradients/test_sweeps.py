@@ -52,7 +52,7 @@ def test_reaction_wrench_of_a_swing(swing):
 
 def test_initial_state_and_gripper_pose(swing):
     base = swing.motion["hand"]
-    x, v, _ = swing.state
+    x, v, *_ = swing.state
     inputs = {"dx": torch.zeros_like(x), "dv": torch.zeros_like(v), "dpose": torch.zeros_like(base.pose)}
 
     def run(dx, dv, dpose):
@@ -91,7 +91,7 @@ def test_a_pressed_sheet_slides_and_sticks(pressed):
 
 
 def test_initial_state_and_directors_of_a_pressed_sheet(pressed):
-    x, v, d3 = pressed.state
+    x, v, d3, _ = pressed.state
     inputs = {"dx": torch.zeros_like(x), "dv": torch.zeros_like(v), "dd": torch.zeros_like(d3)}
 
     def run(dx, dv, dd):

@@ -149,11 +149,11 @@ def test_a_cloth_that_hangs_still_says_nothing_about_air():
     fit = identify(at(still, youngs_modulus=4e4), still, ["air.normal"], iterations=3)
     air = fit.parameters["air.normal"]
     assert not air.identifiable
-    assert air.std > 0.5 * 2 * tc.effects.AirDrag.typical  # no less than half its prior
+    assert air.std > 0.5 * 2 * tc.effects.AirDrag.amplitudes["normal"].typical  # no less than half its prior
     assert "air.normal is not identifiable from these data: its value is no estimate" in fit.warnings
     cloth = at(still)
     fit.apply(cloth)
-    assert cloth.effects["air"].normal.value.item() == tc.effects.AirDrag.typical
+    assert cloth.effects["air"].normal.value.item() == tc.effects.AirDrag.amplitudes["normal"].typical
 
 
 @pytest.mark.slow

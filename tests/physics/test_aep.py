@@ -41,7 +41,7 @@ def test_forces_are_minus_the_gradient_of_the_energy(convention, seed):
     s = functional.surface(model.geometry, state.x, state.v)
     director = functional._director_forces(model, s, state.d3)
     p1, p2 = model.material.membrane_stress(model.coefficients, s)
-    force = functional._vertex_forces(model, state, s, (p1 + director.column1, p2 + director.column2))
+    force = functional._vertex_forces(model, state, s, {}, (p1 + director.column1, p2 + director.column2))
     torch.testing.assert_close(force, -by_x, rtol=1e-10, atol=1e-10 * by_x.abs().max())
     torch.testing.assert_close(director.pull, by_d3, rtol=1e-10, atol=1e-10 * by_d3.abs().max())
 

@@ -8,6 +8,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 
 import torchcloth as tc
+from torchcloth.types import Moment
 
 
 def irregular(n, amount=0.25, size=0.3):
@@ -37,7 +38,7 @@ def matrix(bending):
     count = bending.columns.shape[1]
     unit = torch.eye(count).unsqueeze(-1).expand(-1, -1, 3)
     c = tc.effects.bending.Coefficients(torch.ones(()), torch.zeros(()))
-    return -bending.force(c, tc.ClothState(unit, torch.zeros_like(unit), unit[:, :0]), None, None)[..., 0].T
+    return -bending.force(c, Moment(unit, torch.zeros_like(unit), None, None))[..., 0].T
 
 
 def share(mesh):
@@ -161,9 +162,9 @@ def test_force_is_minus_the_gradient_of_the_energy():
     x = (torch.as_tensor(mesh.vertices) + 0.02 * torch.randn(2, 36, 3)).requires_grad_()
     c = bending.coefficients()
     (gradient,) = torch.autograd.grad(bending.energy(c, x).sum(), x)
-    force = bending.force(c, tc.ClothState(x, torch.zeros_like(x), x[:, :0]), None, None)
+    force = bending.force(c, Moment(x, torch.zeros_like(x), None, None))
     torch.testing.assert_close(force, -gradient, rtol=1e-10, atol=1e-12)
-    damping = bending.force(c, tc.ClothState(torch.zeros_like(x), x, x[:, :0]), None, None)
+    damping = bending.force(c, Moment(torch.zeros_like(x), x, None, None))
     torch.testing.assert_close(damping, 0.01 * force, rtol=1e-10, atol=1e-14)
 
 
@@ -171,7 +172,7 @@ def test_force_has_no_resultant():
     mesh = irregular(6)
     bending = tc.effects.Bending(2e-5).bind(mesh)
     x = torch.as_tensor(mesh.vertices) + 0.02 * torch.randn(36, 3) + 5.0
-    force = bending.force(bending.coefficients(), tc.ClothState(x, x, x[:0]), None, None)
+    force = bending.force(bending.coefficients(), Moment(x, x, None, None))
     scale = force.abs().sum()
     assert force.sum(0).norm() < 1e-12 * scale
     assert torch.linalg.cross(x, force).sum(0).norm() < 1e-11 * scale
@@ -185,7 +186,7 @@ def test_rigid_motion_and_affine_stretch_cost_nothing():
     for transform in (torch.linalg.qr(torch.randn(3, 3))[0], torch.randn(3, 3)):
         x = torch.as_tensor(mesh.vertices) @ transform.mT + 1.0
         assert bending.energy(bending.coefficients(), x).item() < 1e-20
-        force = bending.force(bending.coefficients(), tc.ClothState(x, x, x[:0]), None, None)
+        force = bending.force(bending.coefficients(), Moment(x, x, None, None))
         assert force.abs().max() < 1e-13
 
 
@@ -194,7 +195,7 @@ def test_float32_far_from_the_origin():
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(21, 21))
     bending = tc.effects.Bending(1e-5).bind(mesh).float()
     x = (torch.as_tensor(mesh.vertices) + 1.0).float()
-    force = bending.force(bending.coefficients(), tc.ClothState(x, x, x[:0]), None, None)
+    force = bending.force(bending.coefficients(), Moment(x, x, None, None))
     assert force.dtype == torch.float32
     assert force.abs().max() < 0.01 * 0.2 * 9.81 * 1e-4
     assert force.sum(0).abs().max() < 1e-5 * 0.2 * 9.81 * 0.04
@@ -210,7 +211,7 @@ def test_derivatives_in_both_modes_and_in_batches():
     def force(raw, x):
         value = raw.unsqueeze(-1)
         c = tc.effects.bending.Coefficients(value, value * bending.damping_time)
-        return bending.force(c, tc.ClothState(x, v, x[:, :0]), None, None)
+        return bending.force(c, Moment(x, v, None, None))
 
     with forward_ad.dual_level():
         out = force(forward_ad.make_dual(raw, torch.ones_like(raw)), forward_ad.make_dual(x, tangent))
@@ -218,10 +219,10 @@ def test_derivatives_in_both_modes_and_in_batches():
     torch.testing.assert_close(derivative, force(torch.ones_like(raw), x) + force(raw, tangent) - force(raw, 0 * x))
     single = tc.effects.Bending(3e-5, damping_time=0.01).bind(mesh)
     c = single.coefficients()
-    torch.testing.assert_close(force(raw, x)[1], single.force(c, tc.ClothState(x[1], v[1], x[1, :0]), None, None))
+    torch.testing.assert_close(force(raw, x)[1], single.force(c, Moment(x[1], v[1], None, None)))
     assert torch.autograd.gradcheck(force, (raw.requires_grad_(), x.requires_grad_()), atol=1e-8)
     c = bending.coefficients()
-    bending.force(c, tc.ClothState(x, v, x[:, :0]), None, None).square().sum().backward()
+    bending.force(c, Moment(x, v, None, None)).square().sum().backward()
     assert bending.stiffness.raw.grad.shape == (2, 1)
 
 

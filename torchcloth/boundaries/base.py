@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor, nn
 
@@ -14,17 +14,17 @@ class Drive(NamedTuple):
     """A trajectory resolved on the substeps of one frame interval."""
 
     increment: Tensor  # [..., N, 4, 4] rigid motion of the world points carried along during each substep
-    origin: Tensor  # [..., N, 3] m, position of the body at the end of each substep
+    pose: Tensor  # [..., N, 4, 4] m, of the body at the end of each substep
     closed: tuple[bool, ...]  # N flags
 
 
 class AbstractBoundary(nn.Module, ABC):
     """Changes velocities so that the constraint holds at the end of the substep.
 
-    ``driven`` boundaries need a trajectory in ``motion``; they report the impulse that they gave the cloth.
+    ``driven`` boundaries need a trajectory in ``motion``; the layer reports the wrench that the cloth exerts on them.
     """
 
-    driven: ClassVar[bool] = False
+    driven: bool = False
 
     @abstractmethod
     def bind(self, mesh: Mesh) -> AbstractBoundary:
@@ -35,7 +35,5 @@ class AbstractBoundary(nn.Module, ABC):
         """
 
     @abstractmethod
-    def apply(
-        self, x: Tensor, v: Tensor, mass: Tensor, dt: float, drive: Drive | None, substep: int
-    ) -> tuple[Tensor, Tensor | None]:
-        """(new velocities [..., V, 3], impulse and its moment about the body [..., 6] N s, N m s, or None)."""
+    def apply(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
+        """New velocities [..., V, 3] from positions at the start of the substep and velocities free of the boundary."""

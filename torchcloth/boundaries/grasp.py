@@ -10,7 +10,6 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from .._math import cross
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from .base import AbstractBoundary, Drive
@@ -76,21 +75,16 @@ class Grasp(AbstractBoundary):
             )
         return self
 
-    def apply(
-        self, x: Tensor, v: Tensor, mass: Tensor, dt: float, drive: Drive | None, substep: int
-    ) -> tuple[Tensor, Tensor | None]:
+    def apply(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
         """Held vertices arrive exactly where the body carries them."""
         if drive is None or not drive.closed[substep]:
-            return v, None
+            return v
         motion = drive.increment[..., substep, :, :]
         held = x.index_select(-2, self.index)
         target = held @ motion[..., :3, :3].mT + motion[..., None, :3, 3]
         wanted = (target - held) / dt
-        free = v.index_select(-2, self.index)
-        change = mass.index_select(-2, self.index) * (wanted - free)
-        moment = cross(target - drive.origin[..., substep, None, :], change)
-        impulse = torch.cat([change.sum(-2), moment.sum(-2)], dim=-1)
-        return v.index_copy(-2, self.index, wanted.expand_as(free)), impulse
+        v = v.expand(*wanted.shape[:-2], *v.shape[-2:])
+        return v.index_copy(-2, self.index, wanted)
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""

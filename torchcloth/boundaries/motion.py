@@ -87,7 +87,7 @@ def drive(trajectory: Trajectory, times: Tensor) -> Drive:
     increment = torch.cat([torch.cat([turn, shift], dim=-1), after[..., 3:, :]], dim=-2)
     knot = (torch.searchsorted(trajectory.t.to(times), times[:-1] + 1e-9, right=True) - 1).clamp(min=0)
     closed = trajectory.closed.cpu()[knot.cpu()]
-    return Drive(increment, after[..., :3, 3], tuple(closed.tolist()))
+    return Drive(increment, after, tuple(closed.tolist()))
 
 
 def _slopes(t: Tensor, pose: Tensor) -> Tensor:

@@ -49,9 +49,7 @@ class Plane(AbstractBoundary):
         """Nothing depends on the mesh."""
         return self
 
-    def apply(
-        self, x: Tensor, v: Tensor, mass: Tensor, dt: float, drive: Drive | None, substep: int
-    ) -> tuple[Tensor, Tensor | None]:
+    def apply(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
         """Stop the approach at the surface; friction takes at most mu times the normal impulse from the slip."""
         height = ((x - self.point) * self.normal).sum(-1, keepdim=True)
         approach = (v * self.normal).sum(-1, keepdim=True)
@@ -63,7 +61,7 @@ class Plane(AbstractBoundary):
         moving = speed > limit
         keep = torch.where(moving, 1 - limit / torch.where(moving, speed, 1.0), 0.0)
         slides = torch.where(push > 0, keep, 1.0)
-        return slides * slip + (approach + push) * self.normal, None
+        return slides * slip + (approach + push) * self.normal
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""

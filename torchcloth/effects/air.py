@@ -9,8 +9,8 @@ from torch import Tensor
 from .._math import dot
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
-from ..types import ClothState, Surface
-from .base import AbstractEffect
+from ..types import Moment
+from .base import AbstractEffect, Amplitude
 
 
 class Coefficients(NamedTuple):
@@ -32,8 +32,7 @@ class AirDrag(AbstractEffect):
         InvalidInput: negative coefficient or non-positive density.
     """
 
-    unit, typical, smallest = "-", 1.2, 0.05
-    equivalences = ("mass_damping",)
+    amplitudes = {"normal": Amplitude("-", 1.2, 0.05, ("mass_damping",))}
     acts_on = "triangles"
 
     def __init__(self, normal: float | Tensor = 1.2, density: float = 1.204) -> None:
@@ -45,11 +44,11 @@ class AirDrag(AbstractEffect):
 
     def coefficients(self) -> Coefficients:
         """Dynamic pressure per squared velocity."""
-        value = self.normal.value
-        return Coefficients(0.5 * self.density * (value.unsqueeze(-1) if value.ndim else value))
+        return Coefficients(0.5 * self.density * self.normal.field)
 
-    def force(self, c: Coefficients, state: ClothState, surface: Surface, mass: Tensor) -> Tensor:
+    def force(self, c: Coefficients, now: Moment) -> Tensor:
         """Drag on each triangle."""
+        surface = now.surface
         speed = dot(surface.v, surface.n)
         return -(c.pressure * surface.area * surface.J * speed.abs() * speed) * surface.n
 

@@ -3,30 +3,39 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal, NamedTuple
 
 from torch import Tensor, nn
 
 from ..meshes import Mesh
-from ..types import ClothState, Surface
+from ..types import Moment, Surface
+
+
+class Amplitude(NamedTuple):
+    """How large a parameter of an effect is; 0 switches that part of the effect off."""
+
+    unit: str
+    typical: float  # of an ordinary case
+    smallest: float  # below this nobody cares
+    equivalences: tuple[str, ...] = ()  # effects or parameters that data can hardly tell from it
 
 
 class AbstractEffect(nn.Module, ABC):
-    """A force that the bare membrane does not have. Amplitude 0 must leave the base model bitwise unchanged.
+    """Something real that the bare membrane does not have. Amplitude 0 must leave the base model bitwise unchanged.
+
+    An effect may be a force, and may also add mass, air that moves along, another rest shape, or slip in a gripper:
+    override what it is. Everything else answers None and costs nothing.
 
     Class attributes:
-        unit: of the amplitude.
-        typical: amplitude of a typical case, in ``unit``.
-        smallest: the smallest amplitude of interest.
-        equivalences: names of effects or parameters that data can hardly tell from this one.
+        amplitudes: by parameter name, the main one first.
         acts_on: whether ``force`` returns one row per vertex, or one per triangle (shared equally by its corners).
+        grasp: name of the boundary that ``loosen`` belongs to.
     """
 
-    unit: ClassVar[str]
-    typical: ClassVar[float]
-    smallest: ClassVar[float]
-    equivalences: ClassVar[tuple[str, ...]] = ()
+    amplitudes: ClassVar[Mapping[str, Amplitude]]
     acts_on: ClassVar[Literal["vertices", "triangles"]] = "vertices"
+    grasp: str | None = None
 
     def bind(self, mesh: Mesh) -> AbstractEffect:
         """Resolve what depends on the mesh; returns self."""
@@ -34,11 +43,38 @@ class AbstractEffect(nn.Module, ABC):
 
     @abstractmethod
     def coefficients(self) -> Any:
-        """What ``force`` needs of the learnable parameters; called once per rollout."""
+        """What the methods below need of the learnable parameters; called once per rollout."""
 
-    @abstractmethod
-    def force(self, c: Any, state: ClothState, surface: Surface, mass: Tensor) -> Tensor:
-        """[..., V, 3] or [..., E, 3] N (see ``acts_on``); ``mass`` is the vertices' [..., V, 1] kg."""
+    def force(self, c: Any, now: Moment) -> Tensor | None:
+        """[..., V, 3] or [..., E, 3] N (see ``acts_on``)."""
+        return None
+
+    def mass(self, c: Any) -> Tensor | None:
+        """[..., V, 1] kg, carried along by the vertices."""
+        return None
+
+    def inertia(self, c: Any, surface: Surface) -> Tensor | None:
+        """[..., E, 1] kg that a triangle must move along its normal only."""
+        return None
+
+    def growth(self, c: Any) -> Tensor | None:
+        """[..., E or 1, 2, 2], columns: where the warp and weft of the pattern lie in the true rest shape."""
+        return None
+
+    def loosen(self, c: Any, index: Tensor, free: Tensor, held: Tensor, mass: Tensor, dt: float) -> Tensor:
+        """Velocities of the held vertices ``index`` in an imperfect grip, from those ``free`` of it and ``held`` by it.
+
+        All of ``free``, ``held`` and the result are [..., V, 3] m/s.
+        """
+        return held
+
+    def start(self, x: Tensor) -> Tensor | None:
+        """Internal variables [..., N, K] of a virgin cloth at positions [..., V, 3]; None: remembers nothing."""
+        return None
+
+    def evolve(self, c: Any, now: Moment) -> Tensor:
+        """Internal variables at ``now``, from those of the substep before (``now.memory``); called before ``force``."""
+        raise NotImplementedError(f"{type(self).__name__} starts internal variables but does not evolve them")
 
     def rates(self, c: Any, mass: Tensor) -> tuple[Tensor, Tensor]:
         """(bound on omega^2 [1/s^2], bound on the linear damping rate [1/s]) that this effect adds; limits the step."""

@@ -11,9 +11,9 @@ from torch import Tensor
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
-from ..types import ClothState, Surface
+from ..types import Moment
 from ._curvature import assemble, curvature_stencils, largest_eigenvalue, mixed_area
-from .base import AbstractEffect
+from .base import AbstractEffect, Amplitude
 
 
 class Coefficients(NamedTuple):
@@ -41,7 +41,7 @@ class Bending(AbstractEffect):
         InvalidInput: values out of range.
     """
 
-    unit, typical, smallest = "N m", 1e-5, 1e-6
+    amplitudes = {"stiffness": Amplitude("N m", 1e-5, 1e-6)}
 
     def __init__(self, stiffness: float | Tensor = 1e-5, damping_time: float = 0.0, poisson: float = 0.0) -> None:
         super().__init__()
@@ -81,15 +81,14 @@ class Bending(AbstractEffect):
 
     def coefficients(self) -> Coefficients:
         """Resolved once per rollout."""
-        value = self.stiffness.value
-        value = value.unsqueeze(-1) if value.ndim else value
+        value = self.stiffness.field
         return Coefficients(value, value * self.damping_time)
 
-    def force(self, c: Coefficients, state: ClothState, surface: Surface, mass: Tensor) -> Tensor:
+    def force(self, c: Coefficients, now: Moment) -> Tensor:
         """-B Q (x + damping_time v) on each vertex."""
-        field = c.stiffness * state.x
+        field = c.stiffness * now.x
         if self.damping_time:
-            field = field + c.viscosity * state.v
+            field = field + c.viscosity * now.v
         return (self.operator * _differences(field, self.columns)).sum(-3)
 
     def energy(self, c: Coefficients, x: Tensor) -> Tensor:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from torch import Tensor
 
 from ..parameters import PhysicalParameter
-from ..types import ClothState, Surface
-from .base import AbstractEffect
+from ..types import Moment
+from .base import AbstractEffect, Amplitude
 
 
 class MassDamping(AbstractEffect):
@@ -21,21 +21,19 @@ class MassDamping(AbstractEffect):
         InvalidInput: negative rate.
     """
 
-    unit, typical, smallest = "1/s", 1.0, 0.05
-    equivalences = ("air",)
+    amplitudes = {"rate": Amplitude("1/s", 1.0, 0.05, ("air",))}
 
     def __init__(self, rate: float | Tensor = 1.0) -> None:
         super().__init__()
         self.rate = PhysicalParameter(rate, "1/s", "nonnegative", name="mass damping rate")
 
     def coefficients(self) -> Tensor:
-        """[] or [..., 1, 1] 1/s."""
-        value = self.rate.value
-        return value.unsqueeze(-1) if value.ndim else value
+        """[..., 1, 1] 1/s."""
+        return self.rate.field
 
-    def force(self, c: Tensor, state: ClothState, surface: Surface, mass: Tensor) -> Tensor:
+    def force(self, c: Tensor, now: Moment) -> Tensor:
         """Force on each vertex."""
-        return -(c * mass) * state.v
+        return -(c * now.mass) * now.v
 
     def rates(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
         """The rate itself."""

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import InvalidInput
-from ..types import ClothState, Surface
-from .base import AbstractEffect
+from ..types import Moment
+from .base import AbstractEffect, Amplitude
 
 
 class Gravity(AbstractEffect):
@@ -22,8 +22,7 @@ class Gravity(AbstractEffect):
         InvalidInput: not three finite numbers.
     """
 
-    unit, typical, smallest = "m/s^2", 9.81, 0.05
-    equivalences = ("areal_density",)
+    amplitudes = {"acceleration": Amplitude("m/s^2", 9.81, 0.05, ("areal_density",))}
 
     def __init__(self, acceleration: Sequence[float] = (0.0, 0.0, -9.81)) -> None:
         super().__init__()
@@ -36,9 +35,9 @@ class Gravity(AbstractEffect):
         """[..., 1, 3] m/s^2."""
         return self.acceleration.unsqueeze(-2)
 
-    def force(self, c: Tensor, state: ClothState, surface: Surface, mass: Tensor) -> Tensor:
+    def force(self, c: Tensor, now: Moment) -> Tensor:
         """m g on each vertex."""
-        return mass * c
+        return now.mass * c
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""

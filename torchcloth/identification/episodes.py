@@ -190,7 +190,7 @@ def _effects(recording: Recording) -> dict[str, AbstractEffect]:
             _number(nominal, "bending_stiffness", 0.0), _number(nominal, "bending_damping_time", 0.0)
         )
     if recording.air_density is not None:
-        effects["air"] = AirDrag(normal=AirDrag.typical, density=recording.air_density)
+        effects["air"] = AirDrag(normal=AirDrag.amplitudes["normal"].typical, density=recording.air_density)
     return effects
 
 

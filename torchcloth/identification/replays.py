@@ -11,7 +11,6 @@ from torch.func import functional_call
 
 from ..cloth import Cloth
 from ..forward_mode import real_tangents
-from ..types import ClothState
 from .episodes import Episode
 from .unknowns import Unknown, overrides
 
@@ -27,7 +26,7 @@ class Replay(nn.Module):
         """Vertices at the frame times [T, V, 3] m, or [copies, T, V, 3]."""
         state = self.cloth.state(episode.initial)
         if copies:
-            state = ClothState(*(a.expand(copies, *a.shape) for a in state))
+            state = state.map(lambda field: field.expand(copies, *field.shape))
         if episode.settles:
             state = self.cloth.settle(state, episode.motion, start=float(episode.times[0]))
         return self.cloth(state, episode.motion, episode.times, dt=dt).x

@@ -87,14 +87,14 @@ class AEP(AbstractMaterial):
     def coefficients(self) -> Coefficients:
         """Lame parameters and director stiffnesses times thickness."""
         paper = self.convention == "paper"
-        youngs, nu = _field(self.membrane_stiffness), _field(self.poisson_ratio.value)
+        youngs, nu = self.youngs_modulus.field * self.thickness, self.poisson_ratio.field
         lam = youngs * nu / ((1 + nu) * (1 - 2 * nu)) if paper else youngs * nu / (1 - nu * nu)
         return Coefficients(
             mu=youngs / (2 * (1 + nu)),
             lam=lam,
-            contact=_field(self.contact_stiffness.value) * self.thickness,
-            shear=_field(self.shear_stiffness.value) * (self.thickness * (2 if paper else 1)),
-            cone=_field(self.cone.value),
+            contact=self.contact_stiffness.field * self.thickness,
+            shear=self.shear_stiffness.field * (self.thickness * (2 if paper else 1)),
+            cone=self.cone.field,
         )
 
     def membrane_energy(self, c: Coefficients, surface: Surface) -> Tensor:
@@ -144,11 +144,6 @@ class AEP(AbstractMaterial):
     def extra_repr(self) -> str:
         """Constants of the data sheet."""
         return f"thickness={self.thickness:g} m, convention={self.convention}"
-
-
-def _field(value: Tensor) -> Tensor:
-    """[] or [..., E] -> broadcastable against [..., E, 3]."""
-    return value.unsqueeze(-1) if value.ndim else value.reshape(1, 1)
 
 
 def _invariants(surface: Surface) -> tuple[Tensor, Tensor]:

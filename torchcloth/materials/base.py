@@ -52,6 +52,17 @@ class AbstractMaterial(nn.Module, ABC):
     def return_map(self, c: Any, n: Tensor, d3: Tensor) -> Tensor:
         """The elastic director after plastic flow, [..., E, S, 3]; idempotent."""
 
+    def start(self, triangles: int) -> Tensor | None:
+        """Inelastic part A of a virgin sheet's deformation [E, 4] = (A11, A12, A21, A22); None: always elastic.
+
+        The membrane law is given the elastic deformation F_E = F A, A the inverse of the plastic set.
+        """
+        return None
+
+    def flow(self, c: Any, surface: Surface, inelastic: Tensor) -> Tensor:
+        """The inelastic part [..., E, 4] after plastic flow under the total deformation; idempotent."""
+        raise NotImplementedError(f"{type(self).__name__} starts a plastic set but does not let it flow")
+
     @abstractmethod
     def stiffness(self, c: Any) -> Stiffness:
         """Largest tangents, for the stable step."""

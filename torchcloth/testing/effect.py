@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from .. import functional
+from ..boundaries import Grasp
 from ..cloth import Cloth
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, Amplitude
 from ..materials import AEP
 from ..meshes import Mesh, rectangle
-from ..types import ClothState
+from ..types import ClothState, Moment, Trajectory
 from . import samples
 from .contract import Contract, batched, call_with, close, demand, finite_gradients, float64, parameters_of, single
 from .finite_differences import check_gradients
@@ -22,18 +23,27 @@ from .finite_differences import check_gradients
 class EffectContract(Contract):
     """What the layer relies on in an effect. Override ``make``, and ``mesh`` if the effect needs another."""
 
+    amplitude: str | None = None  # the parameter that ``make`` sets; None: the main one
+
     @abstractmethod
     def make(self, amplitude: float) -> AbstractEffect:
-        """The effect, not yet bound to a mesh, with this amplitude in its own unit."""
+        """The effect, not yet bound to a mesh, with this amplitude in its own unit and all others 0."""
 
     def mesh(self) -> Mesh:
         """The sheet on which the effect is tried."""
         return rectangle(0.3, 0.2, resolution=(4, 4))
 
     def _effect(self, amplitude: float | None = None) -> AbstractEffect:
-        typical = type(self.make(0.0)).typical if amplitude is None else amplitude
         with float64():
-            return self.make(typical).double().bind(self.mesh()).double()
+            size = self._size(self.make(0.0)).typical if amplitude is None else amplitude
+            return self.make(size).double().bind(self.mesh()).double()
+
+    def _size(self, effect: AbstractEffect) -> Amplitude:
+        amplitudes = getattr(type(effect), "amplitudes", {})
+        demand(len(amplitudes) > 0, "the effect declares no amplitudes")
+        name = next(iter(amplitudes)) if self.amplitude is None else self.amplitude
+        demand(name in amplitudes, f"the effect declares no amplitude {name!r}")
+        return amplitudes[name]
 
     def _cloth(self, effects: dict[str, AbstractEffect]) -> Cloth:
         with float64():
@@ -45,19 +55,40 @@ class EffectContract(Contract):
         x = rest + 0.01 * samples.normal(tuple(rest.shape), 3)
         return {"x": x, "v": samples.normal(tuple(rest.shape), 4)}
 
-    def _force(self) -> Callable[..., Tensor]:
-        """force(effect, x, v) [..., V or E, 3] on the mesh."""
+    def _answers(self) -> Callable[..., dict[str, Tensor]]:
+        """answers(effect, x, v): by hook, what the effect says there; hooks that it does not use are left out.
+
+        An effect that remembers has come from the flat sheet, through half the way, to ``x``.
+        """
         model = self._cloth({}).model()
+        rest = torch.as_tensor(self.mesh().vertices)
 
-        def force(effect: AbstractEffect, x: Tensor, v: Tensor) -> Tensor:
+        def answers(effect: AbstractEffect, x: Tensor, v: Tensor) -> dict[str, Tensor]:
             geometry, mass = _cast(model.geometry, x.dtype), model.mass.to(x.dtype).detach()
-            surface = functional.surface(geometry, x, v)
-            return effect.force(effect.coefficients(), ClothState(x, v, x[..., :0, :]), surface, mass)
+            c = effect.coefficients()
+            now = Moment(x, v, functional.surface(geometry, x, v), mass, effect.start(rest.to(x).expand_as(x)))
+            if now.memory is not None:
+                half = (rest.to(x) + x) / 2
+                between = now._replace(x=half, surface=functional.surface(geometry, half, v))
+                now = now._replace(memory=effect.evolve(c, between))
+                now = now._replace(memory=effect.evolve(c, now))
+            index = torch.arange(3)
+            held = v.index_fill(-2, index, 0.0)
+            loose = effect.loosen(c, index, v, held, mass, 1e-3)
+            found = {
+                "force": effect.force(c, now),
+                "mass": effect.mass(c),
+                "inertia": effect.inertia(c, now.surface),
+                "growth": effect.growth(c),
+                "memory": now.memory,
+                "grip": None if effect.grasp is None else loose,
+            }
+            return {name: value for name, value in found.items() if value is not None}
 
-        return force
+        return answers
 
     def _on_vertices(self, effect: AbstractEffect, x: Tensor, v: Tensor) -> Tensor:
-        force = self._force()(effect, x, v)
+        force = self._answers()(effect, x, v).get("force", torch.zeros_like(x))
         if effect.acts_on == "vertices":
             return force
         index = torch.as_tensor(self.mesh().faces)
@@ -70,42 +101,57 @@ class EffectContract(Contract):
         """Unit, typical and smallest amplitude, equivalences, and one row of force per vertex or triangle."""
         effect = self._effect()
         kind = type(effect)
-        demand(isinstance(getattr(kind, "unit", None), str), "the effect declares no unit")
-        demand(getattr(kind, "typical", 0) > 0, "the effect declares no typical amplitude")
-        demand(0 < getattr(kind, "smallest", 0) <= kind.typical, "smallest must lie in (0, typical]")
-        demand(all(isinstance(name, str) for name in kind.equivalences), "equivalences must be names")
+        for name, size in kind.amplitudes.items():
+            demand(hasattr(effect, name), f"the effect has no parameter {name!r} for its amplitude")
+            demand(bool(size.unit), f"the amplitude {name!r} has no unit")
+            demand(0 < size.smallest <= size.typical, f"smallest of {name!r} must lie in (0, typical]")
+            demand(all(isinstance(other, str) for other in size.equivalences), "equivalences must be names")
         demand(kind.acts_on in ("vertices", "triangles"), f"acts_on must not be {kind.acts_on!r}")
         mesh = self.mesh()
         rows = len(mesh.vertices if kind.acts_on == "vertices" else mesh.faces)
-        shape = tuple(self._force()(effect, **self._state()).shape)
+        answers = self._answers()(effect, **self._state())
+        demand(len(answers) > 0, "the effect answers nothing")
+        shape = tuple(answers["force"].shape) if "force" in answers else (rows, 3)
         demand(shape == (rows, 3), f"force has shape {shape}; acts_on = {kind.acts_on!r} promises ({rows}, 3)")
 
     def test_amplitude_zero_is_bitwise_the_base_model(self) -> None:
         """Also the stable step must be the same, or the comparison of models would compare steps."""
-        state = self._state()
-        runs = []
-        for effects in ({}, {"effect": self.make(0.0)}):
-            cloth = self._cloth(effects)
-            with torch.no_grad():
-                runs.append(cloth(cloth.state(**state), times=[0.0, 6 * self._cloth({}).stable_step()]))
+        runs = [self._run(effects) for effects in ({}, {"effect": self.make(0.0)})]
         demand(torch.equal(runs[0].x, runs[1].x), "amplitude 0 changes the positions of the base model")
         demand(torch.equal(runs[0].v, runs[1].v), "amplitude 0 changes the velocities of the base model")
 
-    def test_amplitude_reaches_the_force(self) -> None:
+    def test_amplitude_reaches_the_motion(self) -> None:
         """The typical amplitude does something."""
-        force = self._force()(self._effect(), **self._state()).detach()
-        demand(bool((force != 0).any()) and bool(torch.isfinite(force).all()), "the typical amplitude gives no force")
+        runs = [self._run({"effect": self.make(size)}) for size in (0.0, self._size(self.make(0.0)).typical)]
+        demand(torch.isfinite(runs[1].x).all(), "the typical amplitude gives no finite motion")
+        demand(not torch.equal(runs[0].x, runs[1].x), "the typical amplitude changes nothing")
+
+    def _run(self, effects: dict[str, AbstractEffect]) -> ClothState:
+        """A few substeps of the sample, with a gripper that moves on if the effect belongs to one."""
+        grasp = next((effect.grasp for effect in effects.values()), self.make(0.0).grasp)
+        with float64():
+            boundaries = {} if grasp is None else {grasp: Grasp([0, 1])}
+            cloth = Cloth(self.mesh(), AEP(1e5, 0.3), 0.2, effects, boundaries, contact=None).double()
+        span = 6 * self._cloth({}).stable_step()
+        pose = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+        pose[1, 2, 3] = 3.0 * span
+        t = torch.tensor([0.0, span], dtype=torch.float64)
+        motion = {name: Trajectory(t, pose, torch.tensor([True, True])) for name in boundaries}
+        with torch.no_grad():
+            return cloth(cloth.state(**self._state()), motion, t).state
 
     def test_gradients(self) -> None:
         """Sweeps in positions, velocities and every parameter."""
         effect = self._effect()
         parameters = parameters_of(effect)
-        force = self._force()
+        answers = self._answers()
 
-        def evaluate(x: Tensor, v: Tensor, **values: Tensor) -> Tensor:
-            return call_with(effect, values, force, x, v)
+        for name in answers(effect, **self._state()):
 
-        check_gradients(evaluate, {**self._state(), **parameters}, 1e-7)
+            def evaluate(x: Tensor, v: Tensor, _name: str = name, **values: Tensor) -> Tensor:
+                return call_with(effect, values, answers, x, v)[_name]
+
+            check_gradients(evaluate, {**self._state(), **parameters}, 1e-7)
 
     def test_gradients_are_finite_at_rest(self) -> None:
         """Flat and still, with typical amplitude and with 0: where every fit starts."""
@@ -115,10 +161,10 @@ class EffectContract(Contract):
             v = torch.zeros_like(x).requires_grad_()
             leaves = {"x": x, "v": v, **dict(effect.named_parameters())}
             where = f"at rest with {'typical amplitude' if amplitude is None else 'amplitude 0'}"
-            force = self._force()(effect, x, v)
-            demand(torch.isfinite(force).all(), f"the force is not finite {where}")
-            if force.requires_grad:
-                finite_gradients(force, leaves, where)
+            for name, answer in self._answers()(effect, x, v).items():
+                demand(torch.isfinite(answer).all(), f"{name} is not finite {where}")
+                if answer.requires_grad:
+                    finite_gradients(answer, leaves, where)
 
     def test_rates_bound_the_spectrum_at_rest(self) -> None:
         """A stiff or strongly damping effect must say so, or the step that the layer chooses is not stable."""
@@ -133,7 +179,7 @@ class EffectContract(Contract):
             matrix = -jacobian(effect, x, still).reshape(len(root), -1) / root[:, None] / root
             largest = float(torch.linalg.eigvals(matrix).real.max())
             allowed = float(bound.detach()) * (1 + 1e-9) + 1e-9
-            demand(largest <= allowed, f"rates() bounds the {name} by {float(bound):.4g}, it is {largest:.4g}")
+            demand(largest <= allowed, f"rates() bounds the {name} by {allowed:.4g}, it is {largest:.4g}")
 
     def _stiffness(self, effect: AbstractEffect, x: Tensor, v: Tensor) -> Tensor:
         return torch.autograd.functional.jacobian(lambda moved: self._on_vertices(effect, moved, v), x)  # type: ignore[return-value]
@@ -143,24 +189,27 @@ class EffectContract(Contract):
 
     def test_batches_equal_loops(self) -> None:
         """Batched states and parameters give what a loop gives."""
-        effect, force = self._effect(), self._force()
+        effect, answers = self._effect(), self._answers()
         parameters = parameters_of(effect)
         many, state = batched(parameters, 3), self._state()
         x = torch.stack([state["x"], 1.1 * state["x"], 0.9 * state["x"]])
         v = torch.stack([state["v"], -state["v"], 2.0 * state["v"]])
-        together = call_with(effect, many, force, x, v).detach()
-        together = together.expand(3, *together.shape[-2:])
+        together = call_with(effect, many, answers, x, v)
         for k in range(3):
-            alone = call_with(effect, single(many, parameters, k), force, x[k], v[k]).detach()
-            close(together[k], alone, 1e-12, f"batch entry {k} differs from the loop")
+            alone = call_with(effect, single(many, parameters, k), answers, x[k], v[k])
+            for name, answer in alone.items():
+                batch = together[name].detach()
+                batch = batch.expand(3, *batch.shape[-answer.ndim :])
+                close(batch[k], answer.detach(), 1e-12, f"{name} of batch entry {k} differs from the loop")
 
     def test_works_in_float32(self) -> None:
-        """Same force to single precision, and no silent promotion."""
+        """Same answers to single precision, and no silent promotion."""
         state = self._state()
-        exact = self._force()(self._effect(), **state).detach()
-        got = self._force()(self._effect().float(), **{name: value.float() for name, value in state.items()}).detach()
-        demand(got.dtype == torch.float32, f"force answers float32 with {got.dtype}")
-        close(got.double(), exact, 1e-4, "force in float32")
+        exact = self._answers()(self._effect(), **state)
+        single_state = {name: value.float() for name, value in state.items()}
+        for name, got in self._answers()(self._effect().float(), **single_state).items():
+            demand(got.dtype == torch.float32, f"{name} answers float32 with {got.dtype}")
+            close(got.detach().double(), exact[name].detach(), 1e-4, f"{name} in float32")
 
 
 def _cast(geometry: functional.Geometry, dtype: torch.dtype) -> functional.Geometry:
