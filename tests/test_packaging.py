@@ -109,7 +109,7 @@ def test_all_modules_are_inside_and_nothing_else(inside):
 def test_data_is_inside(inside):
     urdf = {f"torchcloth/robots/urdf/{file.name}" for file in (ROOT / "robots" / "urdf").glob("*.urdf")}
     assert len(urdf) >= 3
-    assert urdf | {"torchcloth/py.typed"} <= inside
+    assert urdf | {"torchcloth/py.typed", "torchcloth/materials/fabrics.csv"} <= inside
     assert any(name.endswith("licenses/LICENSE") for name in inside)
 
 

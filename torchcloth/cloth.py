@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from . import functional
-from .boundaries import AbstractBoundary
+from .boundaries import AbstractBoundary, Grasp
 from .boundaries.motion import check as check_motion
 from .boundaries.motion import drive, interpolate
 from .effects import AbstractEffect, MassDamping
@@ -21,7 +21,7 @@ from .materials import AbstractMaterial
 from .meshes import Mesh
 from .parameters import PhysicalParameter
 from .stability import stable_step
-from .transfer import Contact
+from .transfer import SKIN, TURNED, Contact, Grid, apart
 from .types import ClothState, Memory, Rollout, Trajectory
 from .validation import check_extent, check_field, check_state, check_times, expand_state
 
@@ -48,6 +48,7 @@ class Cloth(nn.Module):
     _share: Tensor
     _points: Tensor
     _vertices: Tensor
+    _apart: Tensor
 
     def __init__(
         self,
@@ -60,17 +61,26 @@ class Cloth(nn.Module):
     ) -> None:
         super().__init__()
         self.mesh, self.material = mesh, material
-        for path, part in material.named_children():
+        for path, part in material.named_modules():
             if isinstance(part, PhysicalParameter):
                 check_field(path, part.raw, len(mesh.faces))
         self.areal_density = PhysicalParameter(areal_density, "kg/m^2", name="areal_density")
         check_field("areal_density", self.areal_density.raw, len(mesh.faces))
         self.effects = nn.ModuleDict({name: part.bind(mesh) for name, part in (effects or {}).items()})
         self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in (boundaries or {}).items()})
+        self._check_grasps()
         self.contact = contact
         self.spacing, points = (1.0, np.zeros((0, 3))) if contact is None else contact.resolve(mesh)
         self.nodes = _grid_size(mesh, self.spacing) if contact is not None else 0
         self._store_geometry(points)
+        self._store_neighbours()
+
+    def _store_neighbours(self) -> None:
+        """Fixed by mesh and contact grid: which triangles cannot touch because they are neighbours."""
+        self.reach = 0.0 if self.contact is None else self.contact.reach(self.mesh)
+        search = self.contact is not None and not self.contact.everywhere
+        far = apart(self.mesh, TURNED * self.reach) if search else np.zeros((0, 0), dtype=bool)
+        self.register_buffer("_apart", torch.as_tensor(far), persistent=False)
 
     def _store_geometry(self, points: np.ndarray) -> None:
         gradient, area = self.mesh.shape_gradient, self.mesh.area
@@ -194,7 +204,8 @@ class Cloth(nn.Module):
             model = self.model()
             extra = [effect.rates(k, model.mass) for effect, k in model.effects.values()]
             elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
-            return stable_step(self._gradient, density, self.material.stiffness(c), spacing, elastic, damping)
+            gradient = self._gradient if model.rest is None else _grown(self._gradient, model.rest)
+            return stable_step(gradient, density, self.material.stiffness(c), spacing, elastic, damping)
 
     def model(self) -> functional.Model:
         """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
@@ -212,6 +223,7 @@ class Cloth(nn.Module):
             coefficients=self.material.coefficients(),
             effects=effects,
             boundaries=dict(self.boundaries.items()),  # type: ignore[arg-type]
+            grid=self._grid(),
             rest=_rest(effect.growth(c) for effect, c in effects.values()),
         )
 
@@ -221,6 +233,16 @@ class Cloth(nn.Module):
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
+    def _check_grasps(self) -> None:
+        grasps = [name for name, boundary in self.boundaries.items() if isinstance(boundary, Grasp)]
+        for name, effect in self._parts():
+            if effect.grasp is not None and effect.grasp not in grasps:
+                raise InvalidInput(
+                    f"grasp of effect {name!r}",
+                    got=repr(effect.grasp),
+                    expected=f"a Grasp among the boundaries {grasps}",
+                )
+
     def _parts(self) -> Iterable[tuple[str, AbstractEffect]]:
         return cast("Iterable[tuple[str, AbstractEffect]]", self.effects.items())
 
@@ -228,6 +250,8 @@ class Cloth(nn.Module):
         """Internal variables of a cloth that has never been strained."""
         own = self.material.start(len(self._area))
         found = {"material": None if own is None else own.to(x).expand(*x.shape[:-2], -1, -1)}
+        if self.contact is not None:
+            found["contact"] = x.new_zeros(*x.shape[:-2], len(self._area) * len(self._points), 1)
         found |= {f"effects.{name}": effect.start(x) for name, effect in self._parts()}
         return {name: value for name, value in found.items() if value is not None}
 
@@ -238,10 +262,14 @@ class Cloth(nn.Module):
             warp=(g[:, 1, 0:1], g[:, 2, 0:1]),
             weft=(g[:, 1, 1:2], g[:, 2, 1:2]),
             area=self._area,
-            points=self._points,
-            spacing=self.spacing,
-            nodes=self.nodes,
         )
+
+    def _grid(self) -> Grid | None:
+        if self.contact is None:
+            return None
+        far = None if self.contact.everywhere else self._apart
+        play, damping = self.contact.play, self.contact.damping
+        return Grid(self._points, self.spacing, self.nodes, SKIN * self.spacing, self.reach, play, damping, far)
 
     def _vertex_mass(self, density: Tensor) -> Tensor:
         if density.ndim == 0:
@@ -307,12 +335,16 @@ def _rest(growths: Iterable[Tensor | None]) -> Tensor | None:
     return None if total is None else torch.linalg.inv(total).flatten(-2)
 
 
+def _grown(gradient: Tensor, rest: Tensor) -> Tensor:
+    """Gradients of the shape functions in the true rest shape, weighted so that their squares are per pattern area."""
+    inverse = rest.unflatten(-1, (2, 2))
+    return gradient @ inverse * inverse.det().rsqrt()[..., None, None]
+
+
 def _grid_size(mesh: Mesh, spacing: float) -> int:
-    """Nodes before the grid wraps: 1.6 times the longest diagonal of the rest shape, so layers never alias."""
-    longest = np.ptp(mesh.vertices, axis=0)
-    if mesh.uv is not None:
-        longest = np.concatenate([longest, np.ptp(mesh.uv, axis=0)])
-    return int(np.ceil(1.6 * np.linalg.norm(longest) / 2**0.5 / spacing)) + 6
+    """Nodes before the grid wraps: 1.6 times the cloth's longest extent, so layers never alias."""
+    longest = max(float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), mesh.extent)
+    return int(np.ceil(1.6 * longest / spacing)) + 6
 
 
 def _collect(frames: list[float], states: list[ClothState], wrenches: list[dict[str, Tensor]], names: list[str]):

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from .materials import Stiffness
 
-SAFETY = 0.7  # of the linear limit at rest: leaves room for tangents that double under large strain
+SAFETY = 0.7  # of the linear limit: leaves room for tangents that double beyond what the material states
 
 
 def stable_step(
@@ -48,9 +48,13 @@ def stable_step(
 
 
 def _root(stiffness: Stiffness) -> Tensor:
-    """Square root of the plane elasticity matrix [..., 3, 3] in engineering strains."""
-    mu, lam = stiffness.lame_mu, stiffness.lame_lambda
-    bulk, shear = (2 * (lam + mu)).sqrt(), (2 * mu).sqrt()
-    diagonal, off, zero = (bulk + shear) / 2, (bulk - shear) / 2, torch.zeros_like(mu)
-    rows = [[diagonal, off, zero], [off, diagonal, zero], [zero, zero, mu.sqrt()]]
+    """Square root of the plane elasticity matrix [..., 3, 3] in engineering strains.
+
+    Of a positive 2 x 2 matrix M it is (M + d 1) / sqrt(tr M + 2 d), d = sqrt(det M).
+    """
+    warp, weft, coupling, shear = torch.broadcast_tensors(*stiffness[:4])
+    d = (warp * weft - coupling * coupling).sqrt()
+    trace, zero = (warp + weft + 2 * d).sqrt(), torch.zeros_like(d)
+    off = coupling / trace
+    rows = [[(warp + d) / trace, off, zero], [off, (weft + d) / trace, zero], [zero, zero, shear.sqrt()]]
     return torch.stack([torch.cat(row, -1) for row in rows], dim=-2)

@@ -51,6 +51,7 @@ class Moment(NamedTuple):
     surface: Surface
     mass: Tensor  # [..., V, 1] kg
     memory: Tensor | None = None  # [..., N, K], the effect's own internal variables
+    dt: float = 0.0  # s, since the internal variables were last evolved
 
 
 class Trajectory(NamedTuple):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .errors import InvalidInput, SimulationDiverged
-from .functional import Model
+from .model import Model
 from .types import ClothState, Trajectory
 
 

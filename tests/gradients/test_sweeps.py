@@ -84,9 +84,9 @@ def test_a_pressed_sheet_slides_and_sticks(pressed):
         n = pressed.cloth.state(d3.x).d3
         height = (n * d3.d3).sum(-1)
         shear = (d3.d3 - height[:, None] * n).norm(dim=-1)
-        ratio = 5e4 * shear / (0.3 * 1e5 * (1 - height) ** 2)
+        ratio = 5e4 * shear / (0.3 * 1e5 * (1 - pressed.cloth.contact.play - height) ** 2)
         slides.append(ratio > 1 - 1e-9)
-        assert float(height.max()) < 0.99
+        assert float(height.max()) < 0.89
     assert 0 < int(slides[0].sum()) < len(slides[0])
 
 
@@ -95,7 +95,7 @@ def test_initial_state_and_directors_of_a_pressed_sheet(pressed):
     inputs = {"dx": torch.zeros_like(x), "dv": torch.zeros_like(v), "dd": torch.zeros_like(d3)}
 
     def run(dx, dv, dd):
-        state = tc.ClothState(x + 0.001 * dx, v + 0.1 * dv, d3 + 0.01 * dd)
+        state = pressed.state._replace(x=x + 0.001 * dx, v=v + 0.1 * dv, d3=d3 + 0.01 * dd)
         return directors(pressed.cloth(state, None, pressed.times, dt=pressed.dt))
 
     check_gradients(run, inputs, MARK, STEPS)

@@ -132,7 +132,7 @@ def test_the_cloth_starts_at_the_data_sheet(recording):
     assert cloth.material.youngs_modulus.value.item() == pytest.approx(8e4)
     assert cloth.material.poisson_ratio.value.item() == pytest.approx(0.15)
     assert cloth.effects["bending"].stiffness.value.item() == pytest.approx(3e-5)
-    assert cloth.effects["bending"].damping_time == 5e-3
+    assert cloth.effects["bending"].damping_time.value.item() == 5e-3
     assert cloth.effects["air"].density == 1.204
     assert cloth.areal_density.value.item() == pytest.approx(0.3)
     assert cloth.contact is None

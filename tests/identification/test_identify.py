@@ -136,7 +136,8 @@ def test_apply_sets_what_is_identifiable_and_nothing_else(fitted, recording):
     assert "effects.bending.stiffness.raw" in kept
     untouched = (
         kept
-        | {"effects.gravity.acceleration"}
+        | {"effects.gravity.acceleration", "effects.gravity.tilt"}
+        | {"effects.air.tangential.raw", "effects.air.wind", "effects.bending.damping_time.raw"}
         | {f"material.{name}.raw" for name in ("contact_stiffness", "shear_stiffness", "cone")}
     )
     for name, value in cloth.named_parameters():

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.recordings import writing
@@ -52,6 +53,50 @@ def test_a_bare_sheet_is_an_episode(assert_same, tmp_path):
     back = rec.read(rec.write(bare, tmp_path / "ep"))
     assert_same(bare, back)
     assert back.cloth.pattern_box()[1].tolist() == [0.3, 0.4]
+
+
+def test_a_sheet_carries_its_first_frame_as_a_grid(assert_same, tmp_path):
+    u, v = np.meshgrid(np.linspace(0, 0.3, 5), np.linspace(0, 0.4, 3), indexing="ij")
+    first = np.stack([u + 1.0, u * v, 2.0 - v], axis=-1)  # bilinear, so that interpolation is exact
+    bare = rec.Recording(
+        cloth=rec.ClothInfo(areal_density=0.2, sheet=(0.3, 0.4), initial_vertices=first), provenance="measured"
+    )
+    back = rec.read(rec.write(bare, tmp_path / "ep"))
+    assert_same(bare, back)
+    uv = np.random.default_rng(0).uniform(0, [0.3, 0.4], (50, 2))
+    uv[:2] = [[0.0, 0.0], [0.3, 0.4]]
+    expected = np.stack([uv[:, 0] + 1.0, uv[:, 0] * uv[:, 1], 2.0 - uv[:, 1]], axis=1)
+    np.testing.assert_allclose(back.cloth.initial_at(uv), expected, atol=1e-14)
+    with pytest.raises(RecordingError, match="uv is not on the sheet"):
+        back.cloth.initial_at(uv + 0.2)
+    with pytest.raises(RecordingError, match="no initial grid"):
+        replace(back.cloth, initial_vertices=None).initial_at(uv)
+
+
+def test_a_sewn_garment_is_an_episode(assert_same, tmp_path):
+    """Pattern coordinates per corner, a grasp that names vertices: read back exactly, and the mesh is the same."""
+    mesh = tc.meshes.shirt(triangles=300)
+    cloth = rec.ClothInfo(
+        areal_density=0.15,
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        uv=mesh.pattern,
+        initial_vertices=mesh.vertices + np.array([0.0, 0.0, 1.0]),
+    )
+    t, held = np.array([0.0, 1.0]), mesh.places["left shoulder"]
+    quat = np.array([[1.0, 0, 0, 0]] * 2)
+    gripper = rec.GripperMotion(t, np.zeros((2, 3)), quat, np.array([True, True]))
+    whole = rec.Recording(
+        cloth=cloth, provenance="synthetic: test", grasps={"g": rec.GraspInfo(vertices=held)}, grippers={"g": gripper}
+    )
+    back = rec.read(rec.write(whole, tmp_path / "ep"))
+    assert_same(whole, back)
+    stored = json.loads((tmp_path / "ep" / "episode.json").read_text())
+    assert stored["grasps"] == {"g": {"vertices": held.tolist()}}
+    again = tc.meshes.Mesh.build(back.cloth.vertices, back.cloth.faces, back.cloth.uv)
+    np.testing.assert_array_equal(again.rest, mesh.rest)
+    np.testing.assert_array_equal(again.seams, mesh.seams)
+    np.testing.assert_array_equal(tc.meshes.load(tmp_path / "ep" / "cloth.obj").rest, mesh.rest)
 
 
 def test_the_format_texts_example_is_read(tmp_path):

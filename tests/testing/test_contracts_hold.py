@@ -1,9 +1,16 @@
 """The parts that torchcloth ships keep the contracts that it ships."""
 
 import torch
+import trimesh
 
 import torchcloth as tc
-from torchcloth.testing import BoundaryContract, EffectContract, GraspContract, MaterialContract
+from torchcloth.testing import (
+    BoundaryContract,
+    ColliderContract,
+    EffectContract,
+    GraspContract,
+    MaterialContract,
+)
 
 
 class TestAEP(MaterialContract):
@@ -20,6 +27,32 @@ class TestAEPWithFields(MaterialContract):
     def make(self):
         field = torch.linspace(0.8, 1.2, self.triangles)
         return tc.materials.AEP(1e5 * field, 0.3 * field, 4e5 / field, 7e4 * field, cone=0.4 / field)
+
+
+class TestOrthotropicAEP(MaterialContract):
+    def make(self):
+        return tc.materials.OrthotropicAEP(1e5, 3e4, 2e3, 0.3, 4e5, 7e4, cone=0.4)
+
+
+class TestStiffeningOrthotropicAEPWithFields(MaterialContract):
+    def make(self):
+        field = torch.linspace(0.8, 1.2, self.triangles)
+        moduli = (1e5 * field, 3e6 / field, 2e3 * field, 0.3 * field, 4e5 / field, 7e4 * field)
+        return tc.materials.OrthotropicAEP(
+            *moduli, cone=0.4 / field, warp_stiffening=30 * field, weft_stiffening=10 / field
+        )
+
+
+class TestPlasticAEP(MaterialContract):
+    def make(self):
+        return tc.materials.AEP(1e5, 0.3, 4e5, 7e4, cone=0.4, plastic=tc.materials.NormYield(0.02))
+
+
+class TestPlasticOrthotropicAEPWithFields(MaterialContract):
+    def make(self):
+        limit = torch.linspace(0.02, 0.04, self.triangles)
+        plastic = tc.materials.NormYield(limit)
+        return tc.materials.OrthotropicAEP(1e5, 3e4, 2e3, 0.3, 4e5, 7e4, cone=0.4, plastic=plastic)
 
 
 class TestCottonPreset(MaterialContract):
@@ -47,6 +80,150 @@ class TestBending(EffectContract):
         return tc.effects.Bending(amplitude, damping_time=0.01)
 
 
+class TestWovenBending(EffectContract):
+    def make(self, amplitude):
+        curls = {"curl_warp": 3.0, "curl_weft": -1.0}
+        return tc.effects.Bending(amplitude, 0.01, 0.3, weft_ratio=0.5, twist_ratio=0.7, **curls)
+
+
+class TestBendingField(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.Bending(amplitude * torch.linspace(0.5, 2.0, 18), 0.01)
+
+
+class TestBendingDamping(EffectContract):
+    amplitude = "damping_time"
+
+    def make(self, amplitude):
+        return tc.effects.Bending(1e-3, amplitude)
+
+    def base(self):
+        return {"bending": tc.effects.Bending(1e-3)}
+
+
+class TestCurlWarp(EffectContract):
+    amplitude = "curl_warp"
+
+    def make(self, amplitude):
+        return tc.effects.Bending(1e-3, curl_warp=amplitude)
+
+    def base(self):
+        return {"bending": tc.effects.Bending(1e-3)}
+
+
+class TestCurlWeft(TestCurlWarp):
+    amplitude = "curl_weft"
+
+    def make(self, amplitude):
+        return tc.effects.Bending(1e-3, curl_weft=amplitude)
+
+
+class TestSaturatingBending(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.SaturatingBending(amplitude, 2.0)
+
+
+class TestBendingFriction(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.BendingFriction(amplitude, 2.0)
+
+
+class TestShearFriction(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.ShearFriction(amplitude, 0.05)
+
+
+class TestCreasingBending(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.CreasingBending(1e-3, amplitude, yield_curvature=0.2, weft_ratio=0.5, curl_warp=1.0)
+
+    def base(self):
+        return {"bending": tc.effects.Bending(1e-3, weft_ratio=0.5, curl_warp=1.0)}
+
+
+class TestTilt(EffectContract):
+    amplitude = "tilt"
+
+    def make(self, amplitude):
+        return tc.effects.Gravity((0.5, 1.0, -9.0), tilt=(0.6 * amplitude, -0.8 * amplitude))
+
+    def base(self):
+        return {"gravity": tc.effects.Gravity((0.5, 1.0, -9.0))}
+
+
+class TestTangentialAirDrag(EffectContract):
+    amplitude = "tangential"
+
+    def make(self, amplitude):
+        return tc.effects.AirDrag(0.0, tangential=amplitude)
+
+
+class TestWind(EffectContract):
+    amplitude = "wind"
+
+    def make(self, amplitude):
+        return tc.effects.AirDrag(1.2, tangential=0.016, wind=(0.6 * amplitude, 0.0, 0.8 * amplitude))
+
+    def base(self):
+        return {"air": tc.effects.AirDrag(1.2, tangential=0.016)}
+
+
+class TestAddedMass(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.AddedMass(amplitude)
+
+
+class TestKelvinVoigt(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.KelvinVoigt(amplitude)
+
+
+class TestKelvinVoigtWithAField(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.KelvinVoigt(amplitude * torch.linspace(0.5, 1.5, len(self.mesh().faces)))
+
+
+class TestHem(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.LineMass(amplitude)
+
+
+class TestShrinkWarp(EffectContract):
+    amplitude = "shrink_warp"
+
+    def make(self, amplitude):
+        return tc.effects.RestShape(shrink_warp=amplitude)
+
+
+class TestShrinkWeft(EffectContract):
+    amplitude = "shrink_weft"
+
+    def make(self, amplitude):
+        return tc.effects.RestShape(shrink_weft=amplitude)
+
+
+class TestSkew(EffectContract):
+    amplitude = "skew"
+
+    def make(self, amplitude):
+        return tc.effects.RestShape(skew=amplitude)
+
+
+class TestGripMobility(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.GripSlip("hand", amplitude, hold=0.0)
+
+
+class TestGripHold(EffectContract):
+    amplitude = "hold"
+
+    def make(self, amplitude):
+        return tc.effects.GripSlip("hand", 0.01, hold=amplitude)
+
+    def base(self):
+        return {"slip": tc.effects.GripSlip("hand", 0.01, hold=0.0)}
+
+
 class TestPlane(BoundaryContract):
     def make(self):
         return tc.boundaries.Plane(friction=0.4)
@@ -58,6 +235,81 @@ class TestGrasp(GraspContract):
 
     def held(self):
         return [0, 3, 4]
+
+
+class TestSphere(ColliderContract):
+    def collider(self, **options):
+        return tc.boundaries.Sphere(0.12, (0.02, 0.0, -0.03), friction=0.4, **options)
+
+
+class TestBox(ColliderContract):
+    def collider(self, **options):
+        pose = torch.eye(4)
+        pose[:3, :3] = torch.tensor([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+        pose[:3, 3] = torch.tensor([0.01, 0.02, -0.03])
+        return tc.boundaries.Box((0.2, 0.15, 0.1), pose, friction=0.4, **options)
+
+
+class TestCapsule(ColliderContract):
+    def collider(self, **options):
+        return tc.boundaries.Capsule((-0.1, 0.0, 0.0), (0.08, 0.05, 0.0), 0.08, friction=0.4, **options)
+
+
+class TestCylinder(ColliderContract):
+    def collider(self, **options):
+        return tc.boundaries.Cylinder((0.0, 0.0, -0.1), (0.0, 0.0, 0.1), 0.09, friction=0.4, **options)
+
+
+class TestSolidPlane(ColliderContract):
+    def collider(self, **options):
+        return tc.boundaries.Plane((0.0, 0.0, 0.0), (0.6, 0.0, 0.8), friction=0.4, **options)
+
+
+class TestMeshSolid(ColliderContract):
+    """A ball of triangles; the distance is interpolated on cells of 1 cm."""
+
+    moving = True
+    rounding = 4e-4
+    slant = 0.04
+    projections = 8
+
+    def collider(self, **options):
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=0.12)
+        return tc.boundaries.MeshSolid(ball.vertices, ball.faces, cell=0.01, friction=0.4, **options)
+
+
+class TestMovingPlane(TestSolidPlane):
+    moving = True
+
+
+class TestMovingSphere(TestSphere):
+    moving = True
+
+
+class TestMovingBox(TestBox):
+    moving = True
+
+
+class TestMovingCapsule(TestCapsule):
+    moving = True
+
+
+class TestMovingCylinder(TestCylinder):
+    moving = True
+
+
+class TestStribeck(TestMovingSphere):
+    test_friction_stays_in_the_cone = None  # mu depends on the speed
+
+    def collider(self, **options):
+        return tc.boundaries.Sphere(0.12, friction=tc.boundaries.Stribeck(0.3, 0.5, 0.5), **options)
+
+
+class TestElliptic(TestSolidPlane):
+    test_friction_stays_in_the_cone = None  # mu depends on the direction
+
+    def collider(self, **options):
+        return tc.boundaries.Plane(friction=tc.boundaries.Elliptic(0.4, 0.2, (0.6, 0.8, 0.0)), **options)
 
 
 def test_contracts_do_not_depend_on_the_default_precision():

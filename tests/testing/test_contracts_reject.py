@@ -5,7 +5,7 @@ import torch
 
 import torchcloth as tc
 from torchcloth._math import dot
-from torchcloth.testing import BoundaryContract, EffectContract, GraspContract, MaterialContract
+from torchcloth.testing import BoundaryContract, ColliderContract, EffectContract, GraspContract, MaterialContract
 
 
 def material_contract(law):
@@ -56,6 +56,18 @@ class DetachedParameter(tc.materials.AEP):
         return c._replace(shear=c.shear.detach())
 
 
+class YieldsWhenTurned(tc.materials.AEP):
+    """The DiffCP paper's |F - 1| <= c: a rotation sets."""
+
+    def start(self, triangles):
+        return torch.eye(2).flatten().expand(triangles, 4)
+
+    def flow(self, c, elastic, inelastic):
+        f = torch.stack([elastic.f1, elastic.f2], dim=-1)
+        length = (f - torch.eye(3, 2).to(f)).flatten(-2).norm(dim=-1, keepdim=True)
+        return inelastic * (0.02 / length).clamp(max=1.0)
+
+
 class NaNAtRest(tc.materials.AEP):
     def director_energy(self, c, n, d3):
         r = d3 - dot(n, d3) * n
@@ -64,7 +76,7 @@ class NaNAtRest(tc.materials.AEP):
 
 class Understated(tc.materials.AEP):
     def stiffness(self, c):
-        return super().stiffness(c)._replace(lame_mu=0.9 * c.mu)
+        return super().stiffness(c)._replace(in_plane_shear=0.9 * c.mu)
 
 
 class ForgetsTheBatch(tc.materials.AEP):
@@ -86,6 +98,7 @@ class AlwaysDouble(tc.materials.AEP):
         (Prestressed, "test_rest_is_stress_free"),
         (CreepingReturnMap, "test_return_map_is_idempotent"),
         (DetachedParameter, "test_gradients_in_state_and_parameters"),
+        (YieldsWhenTurned, "test_is_frame_indifferent"),
         (NaNAtRest, "test_gradients_are_finite_at_rest"),
         (Understated, "test_stiffness_bounds_the_tangents_at_rest"),
         (ForgetsTheBatch, "test_batches_equal_loops"),
@@ -210,6 +223,79 @@ class DetachedFriction(tc.boundaries.Plane):
 def test_boundary(kind, promise):
     with pytest.raises(AssertionError):
         getattr(boundary_contract(kind), promise)()
+
+
+def collider_contract(kind):
+    class Contract(ColliderContract):
+        def collider(self, **options):
+            return kind(0.12, friction=0.4, **options)
+
+    return Contract()
+
+
+class Sphere(tc.boundaries.Sphere):
+    """What the broken ones below start from."""
+
+
+class Squared(Sphere):
+    def distance(self, p):
+        distance, normal = super().distance(p)
+        return distance + 5 * distance**2, normal
+
+
+class Leaning(Sphere):
+    def distance(self, p):
+        distance, normal = super().distance(p)
+        tilt = normal + 1e-3 * normal.roll(1, -1)
+        return distance, tilt / tilt.norm(dim=-1, keepdim=True)
+
+
+class NaNAtTheCentre(Sphere):
+    def distance(self, p):
+        q = p - self.centre
+        length = q.norm(dim=-1, keepdim=True)
+        return length - self.radius.value, q / length
+
+
+class ThrowsOut(Sphere):
+    def __init__(self, *args, **options):
+        super().__init__(*args, **{**options, "recovery": 1e9})
+
+
+class HalfHearted(Sphere):
+    def apply(self, x, v, dt, drive, substep):
+        return (super().apply(x, v, dt, drive, substep) + v) / 2
+
+
+class TooSticky(Sphere):
+    def apply(self, x, v, dt, drive, substep):
+        after = super().apply(x, v, dt, drive, substep)
+        return after + 0.01 * (after - v)
+
+
+class StandsStill(Sphere):
+    def apply(self, x, v, dt, drive, substep):
+        still = None if drive is None else drive._replace(increment=torch.eye(4).to(drive.pose).expand_as(drive.pose))
+        return super().apply(x, v, dt, still, substep)
+
+
+@pytest.mark.parametrize(
+    ("kind", "promise"),
+    [
+        (Squared, "test_the_normal_is_the_gradient_of_the_distance"),
+        (Squared, "test_the_distance_leads_to_the_surface"),
+        (Leaning, "test_the_normal_is_the_gradient_of_the_distance"),
+        (NaNAtTheCentre, "test_is_finite_everywhere"),
+        (ThrowsOut, "test_what_starts_inside_is_moved_out_gently"),
+        (HalfHearted, "test_nothing_enters"),
+        (TooSticky, "test_friction_stays_in_the_cone"),
+        (StandsStill, "test_moves_as_a_rigid_body"),
+    ],
+)
+def test_collider(kind, promise):
+    getattr(collider_contract(Sphere), promise)()
+    with pytest.raises(AssertionError):
+        getattr(collider_contract(kind), promise)()
 
 
 def grasp_contract(kind):

@@ -42,6 +42,7 @@ class Grasp(AbstractBoundary):
             raise InvalidInput("Grasp", got="both or neither of vertices and uv", expected="exactly one of them")
         self._uv, self.radius = uv, float(radius)
         self._corner: Corner | None = None
+        self._place: str | None = None
         self.register_buffer("index", torch.as_tensor([] if vertices is None else list(vertices), dtype=torch.long))
         self.index: Tensor
 
@@ -56,12 +57,28 @@ class Grasp(AbstractBoundary):
         grasp._corner = corner
         return grasp
 
+    @classmethod
+    def at(cls, place: str, radius: float = 0.015) -> Grasp:
+        """The vertices of a named place of the mesh, such as "left shoulder", and those within ``radius`` [m] of it.
+
+        Layers that lie on each other are pinched together; see ``mesh.places`` for the names.
+        """
+        grasp = cls(vertices=[], radius=radius)
+        grasp._place = place
+        return grasp
+
     def bind(self, mesh: Mesh) -> Grasp:
-        """Find the held vertices in the mesh's pattern coordinates."""
+        """Find the held vertices in the mesh's pattern coordinates, or among its places."""
+        if self._place is not None:
+            self.index = torch.as_tensor(mesh.around(self._place, self.radius), device=self.index.device)
         if self._corner is not None:
-            if mesh.uv is None:
-                raise InvalidInput("Grasp.corner", got="a mesh without pattern coordinates", expected="a mesh with uv")
-            low, high = mesh.uv.min(0), mesh.uv.max(0)
+            uv = mesh.uv
+            if uv is None:
+                got = "a mesh without pattern coordinates" if mesh.pattern is None else "a mesh of several panels"
+                raise InvalidInput(
+                    "Grasp.corner", got=got, expected="a mesh with uv", remedy="use Grasp.at or name the vertices"
+                )
+            low, high = uv.min(0), uv.max(0)
             vertical, horizontal = self._corner.split("-")
             self._uv = [[(low if horizontal == "left" else high)[0], (low if vertical == "lower" else high)[1]]]
         if self._uv is not None:

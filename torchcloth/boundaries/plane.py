@@ -3,66 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Unpack
 
-import torch
 from torch import Tensor
 
-from .._math import safe_norm
+from .._math import dot
 from ..errors import InvalidInput
-from ..meshes import Mesh
-from ..parameters import PhysicalParameter
-from .base import AbstractBoundary, Drive
+from .collider import AbstractCollider, Options
+from .friction import Coulomb, Elliptic, direction, place
 
 
-class Plane(AbstractBoundary):
-    """A fixed half-space that vertices cannot enter, with Coulomb friction (stick and slip).
+class Plane(AbstractCollider):
+    """A half-space that cloth cannot enter, with friction.
 
     Args:
         point: [3] m, any point of the surface.
         normal: [3], pointing to the free side; normalised here.
-        friction: Coulomb coefficient, >= 0.
+        friction: Coulomb coefficient >= 0, or a law; ``Elliptic`` for one that depends on the direction.
+        options: as for every collider (``AbstractCollider``).
 
     Raises:
-        InvalidInput: zero normal or negative friction.
+        InvalidInput: zero normal, negative friction, a friction axis that leaves the plane.
     """
 
     def __init__(
         self,
         point: Sequence[float] = (0.0, 0.0, 0.0),
         normal: Sequence[float] = (0.0, 0.0, 1.0),
-        friction: float = 0.4,
+        friction: float | Coulomb = 0.4,
+        **options: Unpack[Options],
     ) -> None:
-        super().__init__()
-        direction = torch.as_tensor(normal, dtype=torch.get_default_dtype())
-        origin = torch.as_tensor(point, dtype=direction.dtype)
-        if direction.shape != (3,) or not 0 < float(direction.norm()) < float("inf"):
-            raise InvalidInput("plane normal", got=normal, expected="three finite numbers, not all zero")
-        if origin.shape != (3,) or not bool(torch.isfinite(origin).all()):
-            raise InvalidInput("plane point", got=point, expected="three finite numbers in metres")
-        self.friction = PhysicalParameter(friction, "-", "nonnegative", name="friction")
-        self.register_buffer("point", origin)
-        self.register_buffer("normal", direction / direction.norm())
+        super().__init__(friction, **options)
+        self.register_buffer("point", place("plane point", point))
+        self.register_buffer("normal", direction("plane normal", normal))
         self.point: Tensor
         self.normal: Tensor
+        if isinstance(friction, Elliptic) and float((friction.axis * self.normal).sum().abs()) > 1e-5:
+            raise InvalidInput("friction axis", got=friction.axis.tolist(), expected="a direction in the plane")
 
-    def bind(self, mesh: Mesh) -> Plane:
-        """Nothing depends on the mesh."""
-        return self
-
-    def apply(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
-        """Stop the approach at the surface; friction takes at most mu times the normal impulse from the slip."""
-        height = ((x - self.point) * self.normal).sum(-1, keepdim=True)
-        approach = (v * self.normal).sum(-1, keepdim=True)
-        push = (-height / dt - approach).clamp(min=0)
-        slip = v - approach * self.normal
-        speed = safe_norm(slip)
-        friction = self.friction.value
-        limit = (friction.unsqueeze(-1) if friction.ndim else friction) * push
-        moving = speed > limit
-        keep = torch.where(moving, 1 - limit / torch.where(moving, speed, 1.0), 0.0)
-        slides = torch.where(push > 0, keep, 1.0)
-        return slides * slip + (approach + push) * self.normal
+    def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """Height over the plane, and its normal."""
+        return dot(p - self.point, self.normal), self.normal.expand_as(p)
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""
-        return f"point={self.point.tolist()} m, normal={self.normal.tolist()}"
+        return f"point={self.point.tolist()} m, normal={self.normal.tolist()}, {super().extra_repr()}"

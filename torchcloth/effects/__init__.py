@@ -1,9 +1,33 @@
 """Physical effects on the bare membrane, one per file, keyed by name. They add, so their order cannot matter."""
 
+from .added_mass import AddedMass
 from .air import AirDrag
 from .base import AbstractEffect, Amplitude
 from .bending import Bending
+from .crease import CreasingBending
 from .damping import MassDamping
+from .friction import BendingFriction, ShearFriction
 from .gravity import Gravity
+from .grip_slip import GripSlip
+from .hem import LineMass
+from .rest_shape import RestShape
+from .saturating import SaturatingBending
+from .viscous import KelvinVoigt
 
-__all__ = ["AbstractEffect", "AirDrag", "Amplitude", "Bending", "Gravity", "MassDamping"]
+__all__ = [
+    "AbstractEffect",
+    "AddedMass",
+    "AirDrag",
+    "Amplitude",
+    "Bending",
+    "BendingFriction",
+    "CreasingBending",
+    "Gravity",
+    "GripSlip",
+    "KelvinVoigt",
+    "LineMass",
+    "MassDamping",
+    "RestShape",
+    "SaturatingBending",
+    "ShearFriction",
+]

@@ -1,8 +1,9 @@
-"""Second derivatives of a field on a triangle mesh in material axes, as constant stencils."""
+"""Derivatives of a field on a triangle mesh in material axes, as constant stencils."""
 
 from __future__ import annotations
 
 import cmath
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,25 +13,33 @@ GROWTHS = 3  # rings of triangles that may be added to a vertex's own
 DETERMINED = 0.15  # smallest over largest singular value of a fit that needs no more neighbours
 
 
-def curvature_stencils(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Neighbours [V, N] and weights [V, N, 3] 1/m^2 of the second derivatives (ww, ff, sqrt 2 wf) at every vertex.
+class Stencils(NamedTuple):
+    """Derivatives of a field f at every vertex v: sum_n weight_n (f_n - f_v). Rows are padded with v, weight 0."""
 
-    The derivatives of a field f are sum_n weight_n (f_n - f_v). They come from a least-squares quadratic through the
+    near: np.ndarray  # [V, N] int
+    second: np.ndarray  # [V, N, 3] 1/m^2, along ww, ff, and sqrt 2 times wf
+    first: np.ndarray  # [V, N, 2] 1/m, along w, f
+
+
+def curvature_stencils(mesh: Mesh) -> Stencils:
+    """First and second derivatives at every vertex.
+
+    They come from a least-squares quadratic through the
     vertex over its ring, weighted by 1 / distance^4 (residuals count as the curvature they make); the ring grows by the
     triangles beyond its edges where it does not determine the quadratic (rim, valence 4). What stays undetermined (a
     strip of one cell) is taken as 0. Quadratics are differentiated exactly and linear functions give 0 on any mesh.
     The ring is unfolded by laying the triangles' rest shapes edge to edge, so seams and folded garments are no special
-    case, and axes are those of the vertex's first triangle. Rows are padded with the vertex, weight 0.
+    case, and axes are those of the vertex's first triangle.
     """
     beyond = _triangles_beyond(mesh)
     spokes = _spokes(mesh, beyond)
     rows = [_fit(patch) for patch in (_determined(v, spokes[v], beyond) for v in range(len(mesh.vertices)))]
     depth = max(len(near) for near, _ in rows)
     stencil = np.repeat(np.arange(len(rows))[:, None], depth, axis=1)
-    weight = np.zeros((len(rows), depth, 3))
+    weight = np.zeros((len(rows), depth, 5))
     for v, (near, w) in enumerate(rows):
         stencil[v, : len(near)], weight[v, : len(near)] = near, w
-    return stencil, weight
+    return Stencils(stencil, weight[..., :3], weight[..., 3:])
 
 
 def mixed_area(mesh: Mesh) -> np.ndarray:
@@ -51,27 +60,46 @@ def mixed_area(mesh: Mesh) -> np.ndarray:
     return area
 
 
-def assemble(stencil: np.ndarray, form: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The matrix of sum_v |sum_n form_vn (f_n - f_v)|^2 by rows: columns [V, D] and off-diagonal entries [V, D].
+class Pattern(NamedTuple):
+    """Where a matrix that couples the vertices of each stencil is not zero, by rows."""
 
-    Rows sum to zero, so (Q f)_i = sum_d entry_id (f_d - f_i). Padded with the vertex itself, entry 0.
+    columns: np.ndarray  # [V, D] int, padded with the row itself
+    slots: np.ndarray  # [V, N + 1, N + 1] int, place of each stencil's local entry in the flat columns; V D for none
+
+
+def pattern(near: np.ndarray, local: np.ndarray) -> Pattern:
+    """Entries that are not negligible where local matrices [V, N + 1, N + 1] (the vertex first) are summed.
+
+    The diagonal is left out: rows sum to zero, so (Q f)_i = sum_d entry_id (f_d - f_i).
     """
-    count = len(stencil)
-    nodes = np.concatenate([np.arange(count)[:, None], stencil], axis=1)
-    full = np.concatenate([-form.sum(1, keepdims=True), form], axis=1)
-    local = full @ full.swapaxes(1, 2)
+    count = len(near)
+    nodes = np.concatenate([np.arange(count)[:, None], near], axis=1)
     key = (nodes[:, :, None] * count + nodes[:, None, :]).ravel()
     key, inverse = np.unique(key, return_inverse=True)
     entry = np.bincount(inverse.ravel(), weights=local.ravel())
     row, column = key // count, key % count
     kept = (row != column) & (np.abs(entry) > 1e-12 * np.abs(entry).max())
-    row, column, entry = row[kept], column[kept], entry[kept]
-    length = np.bincount(row, minlength=count)
-    place = np.arange(len(row)) - np.repeat(np.cumsum(length) - length, length)
+    length = np.bincount(row[kept], minlength=count)
+    place = np.arange(kept.sum()) - np.repeat(np.cumsum(length) - length, length)
     columns = np.repeat(np.arange(count)[:, None], max(1, length.max(initial=0)), axis=1)
-    entries = np.zeros(columns.shape)
-    columns[row, place], entries[row, place] = column, entry
-    return columns, entries
+    columns[row[kept], place] = column[kept]
+    slot = np.full(len(key), columns.size)
+    slot[kept] = row[kept] * columns.shape[1] + place
+    return Pattern(columns, slot[inverse.ravel()].reshape(local.shape))
+
+
+def gathered(shape: Pattern, local: np.ndarray) -> np.ndarray:
+    """Off-diagonal entries [V, D] of the sum of the local matrices."""
+    flat = np.bincount(shape.slots.ravel(), weights=local.ravel(), minlength=shape.columns.size + 1)
+    return flat[:-1].reshape(shape.columns.shape)
+
+
+def local_matrices(form: np.ndarray, other: np.ndarray | None = None) -> np.ndarray:
+    """[V, N + 1, N + 1] of sum_c (sum_n form_nc (f_n - f_v)) (sum_n other_nc (f_n - f_v)), from forms [V, N, C]."""
+    full, second = (
+        np.concatenate([-part.sum(1, keepdims=True), part], axis=1) for part in (form, form if other is None else other)
+    )
+    return full @ second.swapaxes(1, 2)
 
 
 def largest_eigenvalue(columns: np.ndarray, entries: np.ndarray, mass: np.ndarray, steps: int = 300) -> float:
@@ -174,22 +202,33 @@ def _design(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
     Taking the linear part out first keeps linear functions free of curvature where the quadratic is undetermined.
     """
+    _, _, quadratic, project, length = _split(z)
+    return project @ quadratic, project, length
+
+
+def _split(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+    """Weights of the rows [N, N], what maps weighted values to the linear part [2, N], quadratic columns [N, 3]
+    unweighted, what maps values to the weighted remainder [N, N], and the unit of length.
+    """
     length = float(np.abs(z).mean())
     x, y = np.real(z) / length, np.imag(z) / length
     root = np.diag(1 / (x * x + y * y))
     linear = root @ np.stack([x, y], axis=-1)
-    project = (np.eye(len(z)) - linear @ np.linalg.pinv(linear)) @ root
+    slope = np.linalg.pinv(linear)
+    project = (np.eye(len(z)) - linear @ slope) @ root
     # with sqrt 2 wf as the third unknown, turned material axes turn the unknowns: the fit does not depend on them
-    return project @ np.stack([x * x / 2, y * y / 2, x * y / 2**0.5], axis=-1), project, length
+    return root, slope, np.stack([x * x / 2, y * y / 2, x * y / 2**0.5], axis=-1), project, length
 
 
 def _fit(patch: dict[int, complex]) -> tuple[list[int], np.ndarray]:
-    """Neighbours and their weights [N, 3]."""
-    quadratic, project, length = _design(np.array(list(patch.values())))
-    left, singular, right = np.linalg.svd(quadratic, full_matrices=False)
+    """Neighbours and their weights [N, 5]: second derivatives, first derivatives."""
+    root, slope, quadratic, project, length = _split(np.array(list(patch.values())))
+    left, singular, right = np.linalg.svd(project @ quadratic, full_matrices=False)
     kept = singular > DETERMINED / 20 * len(patch) ** 0.5  # before the linear part went, every row had length 1/2
     inverse = np.where(kept, 1 / np.where(kept, singular, 1.0), 0.0)
-    return list(patch), ((right.T * inverse) @ left.T @ project).T / length**2
+    second = (right.T * inverse) @ left.T @ project
+    first = slope @ root @ (np.eye(len(patch)) - quadratic @ second)
+    return list(patch), np.concatenate([second / length**2, first / length]).T
 
 
 def _cotangents(mesh: Mesh) -> np.ndarray:

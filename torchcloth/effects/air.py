@@ -1,57 +1,109 @@
-"""Air."""
+"""Air that resists motion."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-from torch import Tensor
+import numpy as np
+import torch
+from torch import Tensor, nn
 
-from .._math import dot
+from .._math import dot, safe_norm
 from ..errors import InvalidInput
+from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from ..types import Moment
 from .base import AbstractEffect, Amplitude
 
 
 class Coefficients(NamedTuple):
-    """Half the air's density times the drag coefficient [kg/m^3], [..., 1 or E, 1]."""
+    """Half the air's density times the drag coefficients [kg/m^3], [..., 1 or E, 1], and the air's velocity."""
 
     pressure: Tensor
+    friction: Tensor
+    wind: Tensor  # [..., 1, 3] m/s
 
 
 class AirDrag(AbstractEffect):
-    """Quadratic drag against motion along the surface normal in still air: f = -1/2 rho C_n a |v_n| v_n n.
+    """Quadratic drag against motion through the air: f = -1/2 rho a (C_n |u_n| u_n n + C_t |u_t| u_t).
 
-    ``a`` is the triangle's current area and v_n the normal component of its centroid velocity.
+    ``a`` is the triangle's current area, u = v - wind the velocity of its centroid relative to the air, u_n its normal
+    component and u_t its tangential vector. C_t counts both sides of the sheet. The wind is uniform and steady; gusts
+    and the sheet's own wake are not modelled. A wind without drag coefficients does nothing, and has no gradient there.
 
     Args:
         normal: drag coefficient C_n >= 0; a flat plate has about 1.2.
+        tangential: friction coefficient C_t >= 0 of both sides together; laminar flow at Re 3e4 has about 0.016.
+        wind: [3] m/s, velocity of the air in world axes. Learnable.
         density: of the air [kg/m^3], a constant.
 
     Raises:
-        InvalidInput: negative coefficient or non-positive density.
+        InvalidInput: negative coefficient, non-positive density, or a wind that is not three finite numbers.
     """
 
-    amplitudes = {"normal": Amplitude("-", 1.2, 0.05, ("mass_damping",))}
+    amplitudes = {
+        "normal": Amplitude("-", 1.2, 0.05, ("mass_damping",)),
+        "tangential": Amplitude("-", 0.016, 0.005, ("mass_damping",)),
+        "wind": Amplitude("m/s", 0.3, 0.05, ("gravity.tilt",)),
+    }
     acts_on = "triangles"
 
-    def __init__(self, normal: float | Tensor = 1.2, density: float = 1.204) -> None:
+    def __init__(
+        self,
+        normal: float | Tensor = 1.2,
+        density: float = 1.204,
+        tangential: float | Tensor = 0.0,
+        wind: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
         super().__init__()
         if not density > 0:
             raise InvalidInput("air density", got=f"{density} kg/m^3", expected="a value > 0")
+        vector = torch.as_tensor(wind, dtype=torch.get_default_dtype())
+        if vector.shape != (3,) or not torch.isfinite(vector).all():
+            raise InvalidInput("wind", got=wind, expected="three finite numbers in m/s")
         self.normal = PhysicalParameter(normal, "-", "nonnegative", name="air drag coefficient")
+        self.tangential = PhysicalParameter(tangential, "-", "nonnegative", name="tangential air drag coefficient")
+        self.wind = nn.Parameter(vector.clone())
         self.density = float(density)
+        self.register_buffer("share", torch.zeros(0, 1), persistent=False)
+        self.register_buffer("rim", torch.zeros(0, 1), persistent=False)
+        self.share: Tensor  # [V, 1] m^2, a third of each vertex's triangles
+        self.rim: Tensor  # [V, 1] m, half the perimeters of each vertex's triangles
+
+    def bind(self, mesh: Mesh) -> AirDrag:
+        """Sizes of the triangles, for the bounds on what a wind does."""
+        perimeter = np.linalg.norm(np.roll(mesh.rest, -1, axis=1) - mesh.rest, axis=-1).sum(1)
+        sizes = (np.bincount(mesh.faces.ravel(), np.repeat(size, 3)) for size in (mesh.area / 3, perimeter / 2))
+        like = {"dtype": torch.get_default_dtype(), "device": self.wind.device}
+        self.share, self.rim = (torch.as_tensor(size, **like).unsqueeze(-1) for size in sizes)
+        return self
 
     def coefficients(self) -> Coefficients:
-        """Dynamic pressure per squared velocity."""
-        return Coefficients(0.5 * self.density * self.normal.field)
+        """Dynamic pressures per squared velocity, and the wind."""
+        half = 0.5 * self.density
+        return Coefficients(half * self.normal.field, half * self.tangential.field, self.wind.unsqueeze(-2))
 
     def force(self, c: Coefficients, now: Moment) -> Tensor:
         """Drag on each triangle."""
         surface = now.surface
-        speed = dot(surface.v, surface.n)
-        return -(c.pressure * surface.area * surface.J * speed.abs() * speed) * surface.n
+        relative = surface.v - c.wind
+        speed = dot(relative, surface.n)
+        along = relative - speed * surface.n
+        area = surface.area * surface.J
+        return -(c.pressure * area * speed.abs() * speed) * surface.n - (c.friction * area * safe_norm(along)) * along
+
+    def rates(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """Of a sheet at rest in the wind (row sums): drag is linear about it, and its pressure turns with the sheet.
+
+        With f(u, N) for the area vector N: |df/du| <= 2 max(P, Q) |u| a, |df/dN| <= 3 (P + Q) |u|^2, and a corner moves
+        N by half the edge that faces it. Both are 0 in still air.
+        """
+        wind, normal, along = safe_norm(c.wind).amax(), c.pressure.amax(), c.friction.amax()
+        turning = (normal + along) * wind * wind * (self.rim / mass).amax()
+        return turning, 2 * torch.maximum(normal, along) * wind * (self.share / mass).amax()
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""
-        return f"density={self.density:g} kg/m^3"
+        wind = [round(value, 6) for value in self.wind.flatten().tolist()]
+        return f"density={self.density:g} kg/m^3" + (f", wind={wind} m/s" if any(wind) else "")

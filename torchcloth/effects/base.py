@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 from torch import Tensor, nn
 
+from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..types import Moment, Surface
 
@@ -79,3 +80,16 @@ class AbstractEffect(nn.Module, ABC):
     def rates(self, c: Any, mass: Tensor) -> tuple[Tensor, Tensor]:
         """(bound on omega^2 [1/s^2], bound on the linear damping rate [1/s]) that this effect adds; limits the step."""
         return mass.new_zeros(()), mass.new_zeros(())
+
+
+def remembered(now: Moment) -> Tensor:
+    """The internal variables, for an effect that cannot do without.
+
+    Raises:
+        InvalidInput: the state carries none.
+    """
+    if now.memory is None:
+        raise InvalidInput(
+            "memory of an effect", got="none", expected="internal variables", remedy="take the state from Cloth.state"
+        )
+    return now.memory

@@ -1,4 +1,4 @@
-"""Bending stiffness, and its damping."""
+"""Bending stiffness, along warp and weft, with damping and rest curvature."""
 
 from __future__ import annotations
 
@@ -12,107 +12,207 @@ from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from ..types import Moment
-from ._curvature import assemble, curvature_stencils, largest_eigenvalue, mixed_area
+from ._bent import BentSheet, differences, thirds
+from ._curvature import curvature_stencils, gathered, largest_eigenvalue, local_matrices, mixed_area, pattern
+from ._plate import Operator, Plate
 from .base import AbstractEffect, Amplitude
 
 
 class Coefficients(NamedTuple):
-    """Bending stiffness [N m] and the same times the damping time [N m s]; [] or [..., 1, 1]."""
+    """What the force needs; the optional ones where the sheet is not isotropic and uniform, or not flat at rest."""
 
-    stiffness: Tensor
-    viscosity: Tensor
+    stiffness: Tensor  # [] or [..., 1, 1] N m, or 1 where ``operator`` holds it
+    viscosity: Tensor  # the same times the damping time, N m s or s
+    operator: Tensor | None = None  # [..., D V, 1] N/m
+    plate: Plate | None = None
+    curl: Tensor | None = None  # [..., 1, 3] 1/m, rest curvature along ww, ff, sqrt 2 wf
+    mobility: Tensor | None = None  # [..., 1, 1] 1/s, of creases
 
 
 class Bending(AbstractEffect):
-    """Isotropic bending of a sheet that is flat at rest: a Kirchhoff plate on the material's second derivatives.
+    """Bending of a sheet: a Kirchhoff plate, orthotropic in material axes, on the material's second derivatives.
 
-    Energy per area B/2 [(1 - nu) (k_ww^2 + k_ff^2 + 2 k_wf^2) + nu (k_ww + k_ff)^2] with the vector-valued curvature
-    k_ab = d^2 x / da db in material axes a, b: equal to that of the surface where bending does not stretch. k is a
-    weighted least-squares fit about every vertex, linear in x with constant weights, so the force is -B Q (x + time v)
-    with one constant matrix Q. The direction of the mesh's diagonals does not matter; hinge formulas are wrong by
-    factors of 3 to 4.5 on our sheets, and the Laplacian alone lets a free edge curl at no cost (it is nu = 1).
+    Energy per area 1/2 (k - k0 n) . P (k - k0 n) with the vector-valued curvature k_ab = d^2 x / da db in material axes
+    a, b: equal to that of the surface where bending does not stretch. Isotropic P is B/2 [(1 - nu) (k_ww^2 + k_ff^2 +
+    2 k_wf^2) + nu (k_ww + k_ff)^2]. k is a weighted least-squares fit about every vertex, linear in x with constant
+    weights, so without rest curvature k0 the force is -Q (x + damping_time v) with one constant matrix Q. The direction
+    of the mesh's diagonals does not matter; hinge formulas are wrong by factors of 3 to 4.5 on our sheets, and the
+    Laplacian alone lets a free edge curl at no cost (it is nu = 1).
+
+    Woven cloth: B_weft = weft_ratio B_warp, coupling nu sqrt(B_warp B_weft), and twisting stiffness (1 - nu)
+    sqrt(B_warp B_weft) twist_ratio (1: Huber's estimate). A narrow strip at an angle a to the warp then has, at
+    nu = 0, 1/B = cos^4 a / B_warp + sin^4 a / B_weft + 2 cos^2 a sin^2 a / B_twist.
+
+    What is None is not there: no parameter to learn, no cost. 0 is there to be learned.
 
     Args:
-        stiffness: B [N m], >= 0; fabrics have 1e-6 to 1e-4. A number, or [B, 1] for a batch.
-        damping_time: ratio of viscous to elastic bending moment [s], a constant.
+        stiffness: B, along the warp where it differs [N m], >= 0; fabrics have 1e-6 to 1e-4. A number, one value per
+            triangle [E] (a hem is stiffer), or [B, 1] for a batch.
+        damping_time: tau_b, ratio of viscous to elastic bending moment [s], >= 0; fabrics have 0.01 to 0.1.
         poisson: nu of bending, in (-1, 1), a constant. 0: bending one way does not curl the other way.
+        weft_ratio: stiffness along the weft over that along the warp, > 0.
+        twist_ratio: twisting stiffness over Huber's estimate, > 0.
+        curl_warp: rest curvature along the warp [1/m]; > 0 where the centre lies on the side of the normal (from which
+            faces are counter-clockwise), so the cloth curls the other way when it is turned over. Knits have 1 to 5.
+        curl_weft: likewise along the weft.
 
     Raises:
         InvalidInput: values out of range.
     """
 
-    amplitudes = {"stiffness": Amplitude("N m", 1e-5, 1e-6)}
+    amplitudes = {
+        "stiffness": Amplitude("N m", 1e-5, 1e-6),
+        "damping_time": Amplitude("s", 0.03, 3e-3, ("internal_friction", "mass_damping")),
+        "curl_warp": Amplitude("1/m", 3.0, 0.3, ("crease",)),
+        "curl_weft": Amplitude("1/m", 3.0, 0.3, ("crease",)),
+    }
 
-    def __init__(self, stiffness: float | Tensor = 1e-5, damping_time: float = 0.0, poisson: float = 0.0) -> None:
+    def __init__(
+        self,
+        stiffness: float | Tensor = 1e-5,
+        damping_time: float | Tensor | None = None,
+        poisson: float = 0.0,
+        *,
+        weft_ratio: float | Tensor | None = None,
+        twist_ratio: float | Tensor | None = None,
+        curl_warp: float | Tensor | None = None,
+        curl_weft: float | Tensor | None = None,
+    ) -> None:
         super().__init__()
-        if not damping_time >= 0:
-            raise InvalidInput("bending damping_time", got=f"{damping_time} s", expected="a time >= 0")
         if not -1 < poisson < 1:
             raise InvalidInput("bending poisson", got=poisson, expected="a number in (-1, 1)")
-        if isinstance(stiffness, Tensor) and stiffness.ndim and stiffness.shape[-1] != 1:
-            raise InvalidInput(
-                "bending stiffness", got=f"shape {tuple(stiffness.shape)}", expected="a number or [B, 1]"
-            )
+        self.poisson = float(poisson)
         self.stiffness = PhysicalParameter(stiffness, "N m", "nonnegative", name="bending stiffness")
-        self.damping_time, self.poisson = float(damping_time), float(poisson)
-        for name, like in (("near", torch.long), ("form", None), ("columns", torch.long), ("operator", None)):
+        self.damping_time = _optional(damping_time, "s", "nonnegative", "bending damping_time")
+        self.weft_ratio = _optional(weft_ratio, "-", "positive", "bending weft_ratio")
+        self.twist_ratio = _optional(twist_ratio, "-", "positive", "bending twist_ratio")
+        self.curl_warp = _optional(curl_warp, "1/m", "real", "curl_warp")
+        self.curl_weft = _optional(curl_weft, "1/m", "real", "curl_weft")
+        for name, like in (("columns", torch.long), ("operator", None), ("bound", None), ("faces", torch.long)):
             self.register_buffer(name, torch.zeros(0, dtype=like), persistent=False)
-        self.register_buffer("bound", torch.zeros(0, 1), persistent=False)
-        self.near: Tensor  # [N, V] neighbours that a vertex's curvature is fitted to
-        self.form: Tensor  # [3, N, V, 1] 1/m: energy = B/2 |sum_n form (x_n - x)|^2
         self.columns: Tensor  # [D, V] vertices that a vertex's force depends on
-        self.operator: Tensor  # [D, V, 1] 1/m^2: minus the off-diagonal entries of Q
+        self.operator: Tensor  # [D, V, 1] 1/m^2: minus the off-diagonal entries of Q for B = 1
         self.bound: Tensor  # [V, 1] 1/m^2: each vertex's area times the largest eigenvalue of Q over the areas
+        self.faces: Tensor  # [E, 3]
+        self.sheet, self.woven = BentSheet(), Operator()
 
     def bind(self, mesh: Mesh) -> Bending:
-        """Build the curvature stencils of the mesh's vertices and the matrix Q."""
-        stencil, weight = curvature_stencils(mesh)
-        area = mixed_area(mesh)
-        form = weight @ np.linalg.cholesky(_plate(self.poisson)) * np.sqrt(area)[:, None, None]
-        columns, entries = assemble(stencil, form)
-        share = np.zeros(len(area))
-        np.add.at(share, mesh.faces.ravel(), np.repeat(mesh.area / 3, 3))
-        dtype = torch.get_default_dtype()
-        self.near, self.columns = torch.as_tensor(stencil.T.copy()), torch.as_tensor(columns.T.copy())
-        self.form = torch.as_tensor(form.transpose(2, 1, 0).copy(), dtype=dtype).unsqueeze(-1)
-        self.operator = torch.as_tensor(-entries.T.copy(), dtype=dtype).unsqueeze(-1)
-        self.bound = torch.as_tensor(share * largest_eigenvalue(columns, entries, share), dtype=dtype).unsqueeze(-1)
+        """Build the curvature stencils of the mesh's vertices and the matrix Q.
+
+        Raises:
+            InvalidInput: a field that does not have one value per triangle.
+        """
+        size = self.stiffness.raw.shape[-1] if self.stiffness.raw.ndim else 1
+        if size not in (1, len(mesh.faces)):
+            got, want = f"shape {tuple(self.stiffness.raw.shape)}", f"a number, [{len(mesh.faces)}] or [B, 1]"
+            raise InvalidInput("bending stiffness", got=got, expected=want)
+        dtype, device = torch.get_default_dtype(), self.stiffness.raw.device
+        stencils, area, share = curvature_stencils(mesh), mixed_area(mesh), thirds(mesh)
+        form = stencils.second @ np.linalg.cholesky(_isotropic(self.poisson)) * np.sqrt(area)[:, None, None]
+        local = local_matrices(form)
+        shape = pattern(stencils.near, local)
+        entries = gathered(shape, local)
+        bound = share * largest_eigenvalue(shape.columns, entries, share)
+        self.columns = torch.as_tensor(shape.columns.T.copy(), device=device)
+        self.operator = torch.as_tensor(-entries.T.copy(), dtype=dtype, device=device).unsqueeze(-1)
+        self.bound = torch.as_tensor(bound, dtype=dtype, device=device).unsqueeze(-1)
+        self.faces = torch.as_tensor(mesh.faces.copy(), device=device)
+        self.sheet.bind(mesh, stencils, device)
+        if self._uneven(size):
+            self.woven.bind(stencils, area, device)
         return self
+
+    def _uneven(self, size: int) -> bool:
+        return size > 1 or self.weft_ratio is not None or self.twist_ratio is not None
 
     def coefficients(self) -> Coefficients:
         """Resolved once per rollout."""
-        value = self.stiffness.field
-        return Coefficients(value, value * self.damping_time)
+        field = self.stiffness.field
+        time = None if self.damping_time is None else self.damping_time.field
+        curl = self._curl(field)
+        if not self._uneven(field.shape[-2]):
+            viscosity = torch.zeros_like(field) if time is None else field * time
+            plate = None if curl is None else self._plate(field)
+            return Coefficients(field, viscosity, None, plate, curl)
+        plate = self._plate(field if field.shape[-2] == 1 else self._on_vertices(field))
+        time = torch.zeros_like(field[..., :1, :]) if time is None else time
+        return Coefficients(torch.ones_like(time), time, self.woven.entries(plate), plate, curl)
+
+    def curved(self) -> bool:
+        """Whether the sheet may be other than flat at rest."""
+        return self.curl_warp is not None or self.curl_weft is not None
+
+    def _curl(self, like: Tensor) -> Tensor | None:
+        if not self.curved():
+            return None
+        zero = like.new_zeros(1, 1)
+        warp, weft = (zero if curl is None else curl.field for curl in (self.curl_warp, self.curl_weft))
+        return torch.cat(torch.broadcast_tensors(warp, weft, zero), dim=-1)
+
+    def _plate(self, warp: Tensor) -> Plate:
+        one = torch.ones_like(warp)
+        ratio = one if self.weft_ratio is None else self.weft_ratio.field
+        twist = one if self.twist_ratio is None else self.twist_ratio.field
+        mean = ratio.sqrt() * warp
+        return Plate(warp, ratio * warp, self.poisson * mean, (1 - self.poisson) * twist * mean)
+
+    def _on_vertices(self, field: Tensor) -> Tensor:
+        """Means [..., V, 1] of values [..., E, 1], by the triangles at each vertex."""
+        index = self.faces.flatten()
+        spread = field.repeat_interleave(3, dim=-2)
+        count = self.columns.shape[1]
+        total = field.new_zeros(*field.shape[:-2], count, 1).index_add(-2, index, spread)
+        return total / torch.bincount(index, minlength=count).unsqueeze(-1)
 
     def force(self, c: Coefficients, now: Moment) -> Tensor:
-        """-B Q (x + damping_time v) on each vertex."""
+        """-Q (x + damping_time v) on each vertex, and what rest curvature adds."""
         field = c.stiffness * now.x
-        if self.damping_time:
+        if self.damping_time is not None:
             field = field + c.viscosity * now.v
-        return (self.operator * _differences(field, self.columns)).sum(-3)
+        if c.operator is None:
+            force = (self.operator * differences(field, self.columns)).sum(-3)
+        else:
+            operator = c.operator.unflatten(-2, self.woven.columns.shape)
+            force = (operator * differences(field, self.woven.columns)).sum(-3)
+        if c.curl is None or c.plate is None:
+            return force
+        return force - self.sheet.force(self.sheet.see(now.x), c.plate.moment(self.rest_curvature(c.curl, now)))
+
+    def rest_curvature(self, curl: Tensor, now: Moment) -> Tensor:
+        """[..., V or 1, 3] 1/m along ww, ff, sqrt 2 wf; ``curl`` is that of the virgin sheet."""
+        return curl
 
     def energy(self, c: Coefficients, x: Tensor) -> Tensor:
         """Bending energy [...] J."""
-        curvature = (self.form * _differences(x, self.near).unsqueeze(-4)).sum(-3)
-        return 0.5 * (c.stiffness * (curvature**2).sum(-3)).sum((-2, -1))
+        bent = self.sheet.see(x)
+        second = bent.second
+        if c.curl is not None:
+            second = second - c.curl.mT.unsqueeze(-1) * bent.normal.unsqueeze(-3)
+        plate = self._plate(c.stiffness) if c.plate is None else c.plate
+        return (self.sheet.area * plate.energy(second)).sum((-2, -1))
 
     def rates(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
         """B times the largest eigenvalue of Q over the vertices' masses, bounded by that for equal areal density."""
-        largest = (self.bound / mass).amax()
-        return c.stiffness.amax() * largest, c.viscosity.amax() * largest
+        if c.operator is None or c.plate is None:
+            stiffness = c.stiffness.amax() * (self.bound / mass).amax()
+            damping = c.viscosity.amax() * (self.bound / mass).amax()
+        else:
+            stiffness = c.plate.largest() * self.sheet.bend_rate(mass)
+            damping = c.viscosity.amax() * stiffness
+        if c.curl is not None and c.plate is not None:
+            moment = c.plate.moment(c.curl).square().sum(-1).amax().sqrt()
+            stiffness = stiffness + moment * self.sheet.turn_rate(mass)
+        return stiffness, damping
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""
-        return f"damping_time={self.damping_time:g} s, poisson={self.poisson:g}"
+        return f"poisson={self.poisson:g}"
 
 
-def _plate(poisson: float) -> np.ndarray:
-    """Energy k . P k / 2 per unit stiffness in k = (k_ww, k_ff, sqrt 2 k_wf). A woven plate has more than one such P,
-    each with a stiffness of its own: then ``form`` and ``operator`` get an axis for them, summed in ``coefficients``.
-    """
+def _optional(value: float | Tensor | None, unit: str, domain, name: str) -> PhysicalParameter | None:
+    return None if value is None else PhysicalParameter(value, unit, domain, name=name)
+
+
+def _isotropic(poisson: float) -> np.ndarray:
+    """Energy k . P k / 2 per unit stiffness in k = (k_ww, k_ff, sqrt 2 k_wf)."""
     return np.array([[1.0, poisson, 0.0], [poisson, 1.0, 0.0], [0.0, 0.0, 1.0 - poisson]])
-
-
-def _differences(field: Tensor, index: Tensor) -> Tensor:
-    """Values at each vertex's ``index`` [D, V] less its own [..., D, V, 3]: small numbers, wherever the sheet is."""
-    return field.index_select(-2, index.flatten()).unflatten(-2, index.shape) - field.unsqueeze(-3)

@@ -82,7 +82,8 @@ def cloth_from(
         friction = 0.4 if collider.friction is None else collider.friction
         boundaries[name] = Plane(collider.point.tolist(), collider.normal.tolist(), friction)
     for name, grasp in recording.grasps.items():
-        boundaries[name] = Grasp(uv=grasp.uv, radius=grasp.radius)
+        held = None if grasp.vertices is None else grasp.vertices.tolist()
+        boundaries[name] = Grasp(held) if grasp.uv is None else Grasp(uv=grasp.uv, radius=grasp.radius)
     density = recording.cloth.areal_density
     return Cloth(mesh, material or _nominal(recording), density, effects, boundaries, contact)
 
@@ -123,6 +124,8 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
     times, kept = _overlap(points.t + recording.clock_offset, motion, needed)
     clouds = [torch.as_tensor(np.asarray(points.frame(i)), dtype=dtype) for i in kept]
     initial = recording.cloth.initial_vertices
+    if initial is not None and initial.ndim == 3 and cloth.mesh.uv is not None:
+        initial = recording.cloth.initial_at(cloth.mesh.uv)
     vertices = cloth.mesh.vertices if initial is None else initial
     if vertices.shape != cloth.mesh.vertices.shape:
         raise InvalidInput(
@@ -186,9 +189,8 @@ def _effects(recording: Recording) -> dict[str, AbstractEffect]:
     effects: dict[str, AbstractEffect] = {"gravity": Gravity(recording.gravity.tolist())}
     nominal = recording.cloth.nominal
     if "bending_stiffness" in nominal:
-        effects["bending"] = Bending(
-            _number(nominal, "bending_stiffness", 0.0), _number(nominal, "bending_damping_time", 0.0)
-        )
+        damping = _number(nominal, "bending_damping_time", 0.0) or None  # nothing to learn where none is stated
+        effects["bending"] = Bending(_number(nominal, "bending_stiffness", 0.0), damping)
     if recording.air_density is not None:
         effects["air"] = AirDrag(normal=AirDrag.amplitudes["normal"].typical, density=recording.air_density)
     return effects

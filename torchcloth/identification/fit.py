@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
 
 from ..cloth import Cloth
+from ..effects import AbstractEffect
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
@@ -92,12 +93,18 @@ def identify(
 
 
 def default_parameters(cloth: Cloth) -> list[str]:
-    """Membrane parameters, contact parameters if the model has contact, and the amplitudes of all effects."""
-    names = [name for name, _ in cloth.material.named_children()]
+    """Membrane parameters, contact parameters if the model has contact, and each effect's main amplitude.
+
+    Other amplitudes are fitted only if they are not 0: an effect that is switched off is not part of the model.
+    """
+    names = [name for name, part in cloth.material.named_modules() if isinstance(part, PhysicalParameter)]
     if cloth.contact is None:
         names = [name for name in names if name in ("youngs_modulus", "poisson_ratio")]
-    for key, effect in cloth.effects.items():
-        names += [f"{key}.{name}" for name, part in effect.named_children() if isinstance(part, PhysicalParameter)]
+    for key, effect in cast("Iterable[tuple[str, AbstractEffect]]", cloth.effects.items()):
+        main = next(iter(effect.amplitudes))
+        for name, part in effect.named_children():
+            if isinstance(part, PhysicalParameter) and (name == main or bool((part.value != 0).any())):
+                names.append(f"{key}.{name}")
     return names
 
 

@@ -111,8 +111,9 @@ def _unknown(cloth: Cloth, name: str, path: str) -> Unknown:
     elif parameter.domain == "unit_half":
         std = PRIOR_LOGIT
     else:
-        owner = cloth.get_submodule(path.rpartition(".")[0])
-        std = 2.0 * float(getattr(owner, "typical", 1.0))
+        owner, _, own = path.rpartition(".")
+        size = getattr(cloth.get_submodule(owner), "amplitudes", {}).get(own)
+        std = 2.0 * (1.0 if size is None else size.typical)
     return Unknown(name, f"{path}.raw", parameter, start, std)
 
 

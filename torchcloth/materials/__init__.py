@@ -1,6 +1,10 @@
 """Constitutive laws, one per file."""
 
+from . import presets
 from .aep import AEP
 from .base import AbstractMaterial, Stiffness
+from .director import DirectorMaterial
+from .orthotropic import OrthotropicAEP
+from .yielding import NormYield
 
-__all__ = ["AEP", "AbstractMaterial", "Stiffness"]
+__all__ = ["AEP", "AbstractMaterial", "DirectorMaterial", "NormYield", "OrthotropicAEP", "Stiffness", "presets"]

@@ -11,12 +11,24 @@ from ..types import Surface
 
 
 class Stiffness(NamedTuple):
-    """Largest tangents of a material as stress resultants [N/m], each [..., E or 1, 1]; they bound the stable step."""
+    """Largest tangents of a material as stress resultants [N/m], each [..., E or 1, 1]; they bound the stable step.
 
-    lame_lambda: Tensor  # in-plane
-    lame_mu: Tensor  # in-plane
+    In the plane, in the material's axes: a strain e does not raise the energy by more than half of
+    warp e11^2 + weft e22^2 + 2 coupling e11 e22 + in_plane_shear (2 e12)^2. Where a law stiffens with strain, take its
+    stiffest state; ``stability.SAFETY`` covers a factor of two beyond what is stated here.
+    """
+
+    warp: Tensor  # lambda + 2 mu of an isotropic law
+    weft: Tensor  # likewise
+    coupling: Tensor  # lambda
+    in_plane_shear: Tensor  # mu
     normal: Tensor  # of the director's compression
     shear: Tensor  # of the director's shear
+
+    @classmethod
+    def isotropic(cls, lam: Tensor, mu: Tensor, normal: Tensor, shear: Tensor) -> Stiffness:
+        """From Lame parameters."""
+        return cls(lam + 2 * mu, lam + 2 * mu, lam, mu, normal, shear)
 
 
 class AbstractMaterial(nn.Module, ABC):
@@ -59,8 +71,11 @@ class AbstractMaterial(nn.Module, ABC):
         """
         return None
 
-    def flow(self, c: Any, surface: Surface, inelastic: Tensor) -> Tensor:
-        """The inelastic part [..., E, 4] after plastic flow under the total deformation; idempotent."""
+    def flow(self, c: Any, elastic: Surface, inelastic: Tensor) -> Tensor:
+        """The inelastic part [..., E, 4] after plastic flow; idempotent.
+
+        ``elastic`` is the deformation F A that would be elastic if nothing flowed.
+        """
         raise NotImplementedError(f"{type(self).__name__} starts a plastic set but does not let it flow")
 
     @abstractmethod

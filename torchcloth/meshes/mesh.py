@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InvalidInput
+from . import topology
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,58 +19,75 @@ class Mesh:
     Attributes:
         vertices: [V, 3] m, a world placement of the unstrained cloth.
         faces: [F, 3] int64, counter-clockwise seen from the side of the normal.
-        rest: [F, 3, 2] m, each triangle's corners in material axes (warp, weft). From ``uv`` when the mesh has pattern
-            coordinates, so that seams may have two; else from the vertices, warp along the triangle's first edge.
-        uv: [V, 2] m or None, pattern coordinates (u = warp, v = weft).
+        rest: [F, 3, 2] m, each triangle's corners in material axes (warp, weft). From the pattern where there is one,
+            a panel drawn from behind turned over; else from the vertices, warp along the triangle's first edge.
+        pattern: [F, 3, 2] m or None, pattern coordinates (u = warp, v = weft) of each triangle's corners. A vertex on
+            a seam belongs to several panels and has a place on each.
+        places: vertex indices by name, such as "left shoulder", for gripping and measuring.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     rest: np.ndarray
-    uv: np.ndarray | None = None
+    pattern: np.ndarray | None = None
+    places: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @staticmethod
-    def build(vertices: ArrayLike, faces: ArrayLike, uv: ArrayLike | None = None) -> Mesh:
+    def build(
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        uv: ArrayLike | None = None,
+        places: Mapping[str, ArrayLike] | None = None,
+    ) -> Mesh:
         """Check the arrays and derive the rest shape.
+
+        Args:
+            vertices: [V, 3] m.
+            faces: [F, 3] vertex indices.
+            uv: pattern coordinates in metres, [V, 2], or [F, 3, 2] per triangle corner for sewn panels.
+            places: vertex indices by name.
 
         Raises:
             InvalidInput: wrong shapes, indices out of range, unused vertices, degenerate or flipped triangles.
         """
         x = np.array(vertices, dtype=np.float64)
         f = np.array(faces, dtype=np.int64)
-        if x.ndim != 2 or x.shape[1] != 3 or not np.isfinite(x).all():
-            raise InvalidInput("vertices", got=f"shape {x.shape}", expected="finite [V, 3] in metres")
-        if f.ndim != 2 or f.shape[1] != 3 or len(f) == 0:
-            raise InvalidInput("faces", got=f"shape {f.shape}", expected="[F, 3] vertex indices, F > 0")
-        if f.min() < 0 or f.max() >= len(x):
-            raise InvalidInput(
-                "faces", got=f"indices {f.min()}..{f.max()}", expected=f"0..{len(x) - 1}, one per row of vertices"
-            )
-        unused = np.setdiff1d(np.arange(len(x)), f)
-        if len(unused):
-            raise InvalidInput(
-                "vertices",
-                got=f"{len(unused)} in no triangle (first: {unused[0]})",
-                expected="every vertex in a triangle",
-                remedy="a vertex without area has no mass; remove it",
-            )
-        pattern = None if uv is None else np.array(uv, dtype=np.float64)
-        if pattern is not None and pattern.shape != (len(x), 2):
-            raise InvalidInput("uv", got=f"shape {pattern.shape}", expected=f"[{len(x)}, 2] in metres")
-        rest = _flatten(x[f]) if pattern is None else pattern[f]
+        _check_triangles(x, f)
+        pattern = None if uv is None else _per_corner(np.array(uv, dtype=np.float64), f, len(x))
+        rest = _flatten(x[f]) if pattern is None else _turned_over(f, pattern)
         area = signed_area(rest)
-        if pattern is not None and (area < 0).all():  # a pattern seen from behind: same cloth, other side up
-            rest = rest * np.array([-1.0, 1.0])
-            area = -area
-        scale = np.median(np.abs(area))
-        bad = np.flatnonzero(~(area > 1e-9 * scale))
+        bad = np.flatnonzero(~(area > 1e-9 * np.median(np.abs(area))))
         if len(bad):
             raise InvalidInput(
                 "faces",
                 got=f"{len(bad)} degenerate or flipped triangles (first: {bad[0]}, area {area[bad[0]]:.3g} m^2)",
                 expected="positive area in the rest shape",
             )
-        return Mesh(x, f, rest, pattern)
+        named = {name: _check_place(name, np.array(index), len(x)) for name, index in (places or {}).items()}
+        return Mesh(x, f, rest, pattern, named)
+
+    @property
+    def uv(self) -> np.ndarray | None:
+        """[V, 2] m, pattern coordinates of the vertices; None without a pattern, or where a seam gives a vertex two."""
+        return None if self.pattern is None else per_vertex(self.faces, self.pattern)
+
+    @property
+    def seams(self) -> np.ndarray:
+        """[N, 2] int64, edges along which panels are sewn; empty without a pattern."""
+        return np.zeros((0, 2), np.int64) if self.pattern is None else topology.seams(self.faces, self.pattern)
+
+    @property
+    def boundary_edges(self) -> np.ndarray:
+        """[N, 2] int64, free edges (hems): those of one triangle only."""
+        edges, triangles = topology.edges(self.faces)
+        return edges[triangles == 1]
+
+    @property
+    def panels(self) -> np.ndarray:
+        """[F] int64, the number of each triangle's panel: pieces that were one before sewing; 0 without a pattern."""
+        return (
+            np.zeros(len(self.faces), np.int64) if self.pattern is None else topology.panels(self.faces, self.pattern)
+        )
 
     @property
     def area(self) -> np.ndarray:
@@ -87,21 +106,32 @@ class Mesh:
         """Mean edge length of the rest shape [m]."""
         return float(np.linalg.norm(self.rest - np.roll(self.rest, 1, axis=1), axis=-1).mean())
 
+    @property
+    def extent(self) -> float:
+        """Longest way [m] along the edges of the rest shape, from the vertex farthest from the first: how far the cloth
+        can extend in any state without strain, up to the zigzag of the edges.
+        """
+        start, _ = topology.farthest(self.faces, self.rest, 0)
+        return topology.farthest(self.faces, self.rest, start)[1]
+
     def nearest_vertices(self, uv: ArrayLike, radius: float) -> np.ndarray:
         """Indices of the vertices within ``radius`` [m] of any of the pattern points ``uv`` [G, 2].
 
         Raises:
             InvalidInput: the mesh has no pattern coordinates, or no vertex lies that near.
         """
-        if self.uv is None:
+        if self.pattern is None:
             raise InvalidInput(
                 "uv",
                 got="a mesh without pattern coordinates",
                 expected="a mesh with uv",
                 remedy="name the grasped vertices instead",
             )
-        distance = np.linalg.norm(self.uv[:, None] - np.atleast_2d(uv)[None], axis=-1).min(1)
-        found = np.flatnonzero(distance <= radius * (1 + 1e-9))
+        corners, owner = np.unique(
+            np.column_stack([self.faces.ravel(), self.pattern.reshape(-1, 2)]), axis=0, return_index=True
+        )
+        distance = np.linalg.norm(corners[:, None, 1:] - np.atleast_2d(uv)[None], axis=-1).min(1)
+        found = np.unique(self.faces.ravel()[owner[distance <= radius * (1 + 1e-9)]])
         if len(found) == 0:
             raise InvalidInput(
                 "grasp",
@@ -111,11 +141,84 @@ class Mesh:
             )
         return found
 
+    def around(self, place: str, radius: float = 0.0) -> np.ndarray:
+        """Indices of the vertices of a named place, and of those within ``radius`` [m] of it in ``vertices``.
+
+        The radius reaches through layers that lie on each other, as a gripper that pinches them does.
+
+        Raises:
+            InvalidInput: the mesh has no place of that name.
+        """
+        if place not in self.places:
+            raise InvalidInput(
+                "place",
+                got=repr(place),
+                expected=f"one of {', '.join(self.places)}" if self.places else "a mesh with named places",
+                remedy="" if self.places else "name the grasped vertices instead",
+            )
+        centres = self.vertices[self.places[place]]
+        distance = np.linalg.norm(self.vertices[:, None] - centres[None], axis=-1).min(1)
+        return np.flatnonzero(distance <= radius * (1 + 1e-9))
+
 
 def signed_area(rest: np.ndarray) -> np.ndarray:
     """[F] m^2 from corners [F, 3, 2]."""
     a, b = rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0]
     return 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def per_vertex(faces: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
+    """[V, D] from the values [F, 3, D] of triangles' corners, or None where a vertex has several."""
+    values = np.zeros((faces.max() + 1, corners.shape[-1]))
+    values[faces] = corners
+    return values if np.array_equal(values[faces], corners) else None
+
+
+def _check_triangles(x: np.ndarray, f: np.ndarray) -> None:
+    if x.ndim != 2 or x.shape[1] != 3 or not np.isfinite(x).all():
+        raise InvalidInput("vertices", got=f"shape {x.shape}", expected="finite [V, 3] in metres")
+    if f.ndim != 2 or f.shape[1] != 3 or len(f) == 0:
+        raise InvalidInput("faces", got=f"shape {f.shape}", expected="[F, 3] vertex indices, F > 0")
+    if f.min() < 0 or f.max() >= len(x):
+        raise InvalidInput(
+            "faces", got=f"indices {f.min()}..{f.max()}", expected=f"0..{len(x) - 1}, one per row of vertices"
+        )
+    unused = np.setdiff1d(np.arange(len(x)), f)
+    if len(unused):
+        raise InvalidInput(
+            "vertices",
+            got=f"{len(unused)} in no triangle (first: {unused[0]})",
+            expected="every vertex in a triangle",
+            remedy="a vertex without area has no mass; remove it",
+        )
+
+
+def _per_corner(uv: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
+    if uv.shape not in ((count, 2), (*faces.shape, 2)) or not np.isfinite(uv).all():
+        raise InvalidInput(
+            "uv",
+            got=f"shape {uv.shape}",
+            expected=f"finite [{count}, 2] or, per corner, [{len(faces)}, 3, 2] in metres",
+        )
+    return uv if uv.ndim == 3 else uv[faces]
+
+
+def _check_place(name: str, index: np.ndarray, count: int) -> np.ndarray:
+    if index.ndim != 1 or not len(index) or index.dtype.kind not in "iu" or index.min() < 0 or index.max() >= count:
+        raise InvalidInput(
+            f"places[{name!r}]", got=f"{index.tolist()}", expected=f"a list of vertex indices in 0..{count - 1}"
+        )
+    return index.astype(np.int64)
+
+
+def _turned_over(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """The pattern with every panel that is drawn from behind mirrored: same cloth, other side up."""
+    area = signed_area(pattern)
+    if (area > 0).all():
+        return pattern
+    panel = topology.panels(faces, pattern)
+    behind = np.bincount(panel, area >= 0) == 0
+    return np.where(behind[panel][:, None, None], pattern * np.array([-1.0, 1.0]), pattern)
 
 
 def _flatten(corners: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InvalidInput, MissingDependency
+from . import obj
 from .mesh import Mesh
 
 
@@ -49,20 +50,32 @@ def rectangle(
 def load(path: str | Path) -> Mesh:
     """A cloth mesh from OBJ or PLY (metres); pattern coordinates are taken from the file's texture coordinates if any.
 
+    Where an OBJ gives a vertex several texture coordinates, panels are sewn there: the mesh stays whole and has the
+    edges as ``seams``.
+
     Raises:
         InvalidInput: missing or unreadable file, or not a usable triangle mesh.
-        MissingDependency: trimesh is not installed.
+        MissingDependency: trimesh, which reads all but OBJ, is not installed.
     """
-    try:
-        import trimesh
-    except ImportError as error:
-        raise MissingDependency("reading meshes needs trimesh", remedy='pip install "torchcloth[robots]"') from error
     path = Path(path)
     if not path.is_file():
         raise InvalidInput("mesh file", got=str(path), expected="an existing OBJ or PLY file")
+    if path.suffix.lower() == ".obj":
+        return Mesh.build(*_read_obj(path))
+    try:
+        import trimesh
+    except ImportError as error:
+        raise MissingDependency("reading PLY needs trimesh", remedy='pip install "torchcloth[robots]"') from error
     try:
         mesh = trimesh.load_mesh(path, process=False, maintain_order=True)
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, OSError) as error:
         raise InvalidInput("mesh file", got=f"{path} ({error})", expected="a readable OBJ or PLY file") from error
     uv = getattr(mesh.visual, "uv", None)
     return Mesh.build(mesh.vertices, mesh.faces, None if uv is None or len(uv) != len(mesh.vertices) else uv)
+
+
+def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    try:
+        return obj.parse(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInput("mesh file", got=f"{path} ({error})", expected="a readable OBJ or PLY file") from error

@@ -10,7 +10,7 @@ from ..errors import RecordingError
 from . import scene, streams
 from .checks import Fields
 from .files import Folder
-from .types import Recording
+from .types import GraspInfo, Recording
 
 EPISODE = "episode.json"
 FORMAT, VERSION = "torchcloth-recording", 1
@@ -116,10 +116,10 @@ def _split(root: Fields) -> dict:
 
 
 def _check_cloth(recording: Recording, folder: Folder) -> None:
-    cloth = recording.cloth
-    if cloth.sheet is None or cloth.uv is None:
+    cloth, box = recording.cloth, recording.cloth.pattern_box()
+    if cloth.sheet is None or cloth.uv is None or box is None:
         return
-    got = np.ptp(cloth.uv, axis=0)
+    got = box[1] - box[0]
     if not np.allclose(got, cloth.sheet, rtol=0.01):
         expected = f"{list(cloth.sheet)}"
         raise RecordingError(
@@ -143,22 +143,40 @@ def _check_grasp(recording: Recording, name: str, folder: Folder) -> None:
         raise RecordingError(
             f"{folder.place(streams.MOTION)}: {name}/closed is missing", expected="closed or width [K]"
         )
-    grasp, box = recording.grasps[name], recording.cloth.pattern_box()
+    grasp = recording.grasps[name]
+    if grasp.uv is None:
+        _check_held_vertices(recording, grasp, place)
+    else:
+        _check_held_pattern(recording, grasp.uv, grasp.radius, place)
+
+
+def _check_held_vertices(recording: Recording, grasp: GraspInfo, place: str) -> None:
+    mesh, held = recording.cloth.vertices, grasp.vertices
+    if mesh is None or held is None:
+        raise RecordingError(f"{place} has no vertices to hold", expected="cloth.mesh, and vertices or uv")
+    if not len(held) or held.min() < 0 or held.max() >= len(mesh):
+        got, expected = f"vertices {held.tolist()}", f"indices in 0 to {len(mesh) - 1}"
+        raise RecordingError(f"{place} holds nothing", got=got, expected=expected, remedy="count vertices from 0")
+
+
+def _check_held_pattern(recording: Recording, uv: np.ndarray, radius: float, place: str) -> None:
+    box = recording.cloth.pattern_box()
     if box is None:
         raise RecordingError(
             f"{place} cannot be found on the mesh", expected="vt in the mesh file", remedy="export with uv"
         )
-    outside = np.linalg.norm(np.maximum(np.maximum(box[0] - grasp.uv, grasp.uv - box[1]), 0), axis=1)
-    if outside.max() > grasp.radius:
-        got = f"uv {grasp.uv[int(outside.argmax())].tolist()}, {outside.max():.3g} m outside"
+    outside = np.linalg.norm(np.maximum(np.maximum(box[0] - uv, uv - box[1]), 0), axis=1)
+    if outside.max() > radius:
+        got = f"uv {uv[int(outside.argmax())].tolist()}, {outside.max():.3g} m outside"
         expected = f"within {box[0].tolist()} to {box[1].tolist()}"
         raise RecordingError(
             f"{place} holds nothing", got=got, expected=expected, remedy="use pattern coordinates in metres"
         )
     if recording.cloth.uv is not None:
-        nearest = min(float(np.linalg.norm(recording.cloth.uv - point, axis=1).min()) for point in grasp.uv)
-        if nearest > grasp.radius:
-            got = f"radius {grasp.radius:g}, nearest vertex at {nearest:.3g} m"
+        points = recording.cloth.uv.reshape(-1, 2)
+        nearest = min(float(np.linalg.norm(points - point, axis=1).min()) for point in uv)
+        if nearest > radius:
+            got = f"radius {radius:g}, nearest vertex at {nearest:.3g} m"
             raise RecordingError(
                 f"{place} holds no vertex", got=got, expected="one vertex within", remedy="refine the mesh"
             )

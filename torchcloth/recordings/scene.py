@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from ..errors import RecordingError
-from . import checks, images, obj
+from ..errors import InvalidInput, RecordingError
+from ..meshes import obj
+from ..meshes.mesh import per_vertex
+from . import checks, images
 from .checks import Fields
 from .files import Folder
 from .types import Camera, ClothInfo, Collider, GraspInfo, RobotInfo
@@ -13,6 +17,14 @@ from .types import Camera, ClothInfo, Collider, GraspInfo, RobotInfo
 HEAVIEST = 20.0  # kg/m^2; above this a density was given in g/m^2
 THICKEST = 0.05  # m
 WIDEST_GRASP = 1.0  # m
+NOMINAL = (
+    "membrane_stiffness",
+    "youngs_modulus",
+    "poisson_ratio",
+    "bending_stiffness",
+    "bending_damping_time",
+    "units",
+)
 
 
 def cloth(fields: Fields, folder: Folder) -> ClothInfo:
@@ -33,13 +45,17 @@ def cloth(fields: Fields, folder: Folder) -> ClothInfo:
         faces=faces,
         uv=uv,
         initial_vertices=None if start is None else _initial(folder, start, vertices),
-        nominal=fields.inside("nominal").rest,
+        nominal=_nominal(fields.inside("nominal")),
         extra=fields.left(sheet=sheet),
     )
 
 
 def grasp(fields: Fields) -> GraspInfo:
-    """Read one grasp."""
+    """Read one grasp: pattern points with a radius, or vertices."""
+    if fields.has("vertices"):
+        if fields.has("uv"):
+            raise RecordingError(f"{fields.place} holds twice", got="uv and vertices", expected="one of them")
+        return GraspInfo(vertices=fields.array("vertices", "N", kind="int"), extra=fields.left())
     radius = fields.number("radius", above=0, most=WIDEST_GRASP, suspect="millimetres")
     return GraspInfo(fields.array("uv", "G", 2), radius, fields.rest)
 
@@ -95,22 +111,45 @@ def _sheet(fields: Fields) -> tuple[float, float]:
 
 
 def _mesh(folder: Folder, file: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    vertices, faces, uv = obj.parse(folder.text(file), folder.place(file))
+    """Vertices, faces, and pattern coordinates per vertex, or per corner where panels are sewn."""
+    try:
+        vertices, faces, corners = obj.parse(folder.text(file), folder.place(file))
+    except InvalidInput as error:
+        raise RecordingError(error.what, got=error.got, expected=error.expected, remedy=error.remedy) from error
     checks.metres(vertices, f"{folder.place(file)}: v")
-    if uv is not None:
-        checks.metres(uv, f"{folder.place(file)}: vt")
-    return vertices, faces, uv
+    if corners is None:
+        return vertices, faces, None
+    checks.metres(corners, f"{folder.place(file)}: vt")
+    uv = per_vertex(faces, corners)
+    return vertices, faces, corners if uv is None else uv
 
 
 def _initial(folder: Folder, file: str, vertices: np.ndarray | None) -> np.ndarray:
     place = folder.place(file)
-    if vertices is None:
+    initial = folder.npy(file)
+    if vertices is not None:
+        initial = checks.array(initial, place, (len(vertices), 3))
+    elif initial.ndim == 3 and min(initial.shape[:2]) > 1:
+        initial = checks.array(initial, place, ("M", "N", 3))
+    else:
         raise RecordingError(
-            f"{place} belongs to no mesh", expected="cloth.mesh in episode.json", remedy="write the mesh too"
+            f"{place} belongs to no mesh",
+            got=list(initial.shape),
+            expected="[M, N, 3], a grid on the sheet, or cloth.mesh in episode.json",
+            remedy="write the mesh too",
         )
-    initial = checks.array(folder.npy(file), place, (len(vertices), 3))
     checks.metres(initial, place)
     return initial
+
+
+def _nominal(fields: Fields) -> dict[str, Any]:
+    """Data-sheet values by name; an unknown one is refused, for a misspelt one would be ignored."""
+    for key in fields.rest:
+        if key not in NOMINAL:
+            raise RecordingError(
+                f"{fields.at(key)} is unknown", expected=f"one of {', '.join(NOMINAL)}", remedy="correct its spelling"
+            )
+    return fields.rest
 
 
 def _transform(fields: Fields, key: str) -> np.ndarray:

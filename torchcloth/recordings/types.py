@@ -19,7 +19,7 @@ from .images import ImageStream
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClothInfo:
-    """The sheet at rest: a mesh with pattern coordinates, or a plain rectangle; what is known of its weight."""
+    """The cloth at rest: a mesh with pattern coordinates, or a plain rectangle; what is known of its weight."""
 
     areal_density: float  # kg/m^2
     areal_density_std: float | None = None  # kg/m^2, one standard deviation
@@ -27,25 +27,46 @@ class ClothInfo:
     sheet: tuple[float, float] | None = None  # m, (width, height) of a rectangle with pattern corner (0, 0)
     vertices: np.ndarray | None = None  # [V, 3] m, rest mesh
     faces: np.ndarray | None = None  # [F, 3] vertex indices
-    uv: np.ndarray | None = None  # [V, 2] m, pattern coordinates (u warp, v weft)
-    initial_vertices: np.ndarray | None = None  # [V, 3] m, world, at the first frame; measured, with error
+    uv: np.ndarray | None = None  # m, pattern coordinates (u warp, v weft): [V, 2], or [F, 3, 2] of sewn panels
+    # m, world, at the first frame; measured, with error: [V, 3], or [M, N, 3] of a regular grid on a sheet without a
+    initial_vertices: np.ndarray | None = None  # mesh, from pattern corner to corner, along the width first
     nominal: dict[str, Any] = field(default_factory=dict)  # data-sheet values: a start for fits, possibly wrong
     extra: dict[str, Any] = field(default_factory=dict)
 
     def pattern_box(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Lower and upper corner, each [2] m, of the pattern; None for a mesh without pattern coordinates."""
         if self.uv is not None:
-            return self.uv.min(axis=0), self.uv.max(axis=0)
+            points = self.uv.reshape(-1, 2)
+            return points.min(axis=0), points.max(axis=0)
         return None if self.sheet is None else (np.zeros(2), np.asarray(self.sheet, dtype=float))
+
+    def initial_at(self, uv: np.ndarray) -> np.ndarray:
+        """Positions [N, 3] m at the first frame of the points ``uv`` [N, 2] m of a sheet, bilinear on its grid.
+
+        Raises:
+            RecordingError: no sheet with a grid of initial positions, or points outside it.
+        """
+        grid = self.initial_vertices
+        if self.sheet is None or grid is None or grid.ndim != 3:
+            raise RecordingError("cloth has no initial grid", expected="a sheet with initial_vertices [M, N, 3]")
+        place = np.asarray(uv) / self.sheet
+        if place.min() < -1e-9 or place.max() > 1 + 1e-9:
+            raise RecordingError("uv is not on the sheet", got=f"{place.min():g} to {place.max():g} of its sides")
+        cells = np.array(grid.shape[:2]) - 1
+        lower = np.clip((place * cells).astype(int), 0, cells - 1)
+        (a, b), (i, j) = (place * cells - lower).T[..., None], lower.T
+        low = (1 - a) * grid[i, j] + a * grid[i + 1, j]
+        return (1 - b) * low + b * ((1 - a) * grid[i, j + 1] + a * grid[i + 1, j + 1])
 
 
 @dataclass(frozen=True, eq=False)
 class GraspInfo:
-    """Where a gripper holds: all material within ``radius`` of any of the pattern points."""
+    """Where a gripper holds: all material within ``radius`` of any of the pattern points, or vertices of the mesh."""
 
-    uv: np.ndarray  # [G, 2] m, pattern coordinates
-    radius: float  # m
+    uv: np.ndarray | None = None  # [G, 2] m, pattern coordinates
+    radius: float = 0.0  # m, around uv; of no use with vertices
     extra: dict[str, Any] = field(default_factory=dict)
+    vertices: np.ndarray | None = None  # [N] indices, instead of uv
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import RecordingError
-from . import checks, images, obj, streams
+from ..meshes import obj
+from . import checks, images, streams
 from .files import Folder, save_npz
 from .reading import EPISODE, FORMAT, VERSION, read_folder
-from .types import Camera, ClothInfo, Recording
+from .types import Camera, ClothInfo, GraspInfo, Recording
 
 MESH, INITIAL = "cloth.obj", "cloth_initial.npy"
 POINT_SCALE = 1e-4  # m; far below any sensor's noise
@@ -89,7 +90,7 @@ def _episode(recording: Recording) -> dict[str, Any]:
         "format": FORMAT,
         "version": VERSION,
         "cloth": _cloth(recording.cloth),
-        "grasps": {name: _held(g) for name, g in recording.grasps.items()},
+        "grasps": {name: _grasp(g) for name, g in recording.grasps.items()},
         "colliders": {
             name: _with(c.extra, plane={"point": c.point, "normal": c.normal}, friction=c.friction)
             for name, c in recording.colliders.items()
@@ -115,6 +116,10 @@ def _cloth(cloth: ClothInfo) -> dict[str, Any]:
     }
     plain = ("areal_density", "areal_density_std", "thickness", "nominal")
     return _with(cloth.extra, **known, **{key: getattr(cloth, key) for key in plain})
+
+
+def _grasp(grasp: GraspInfo) -> dict[str, Any]:
+    return _held(grasp, skip=("radius",) if grasp.uv is None else ())
 
 
 def _write_cloth(part: Path, cloth: ClothInfo) -> None:

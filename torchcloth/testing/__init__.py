@@ -8,6 +8,7 @@ Needs no pytest: ``MyContract().check()`` runs the same promises anywhere.
 """
 
 from .boundary import BoundaryContract, GraspContract
+from .collider import ColliderContract
 from .contract import Contract
 from .effect import EffectContract
 from .finite_differences import Sweep, check_gradients, finite_difference_sweep
@@ -15,6 +16,7 @@ from .material import MaterialContract
 
 __all__ = [
     "BoundaryContract",
+    "ColliderContract",
     "Contract",
     "EffectContract",
     "GraspContract",

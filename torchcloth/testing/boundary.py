@@ -20,9 +20,11 @@ class BoundaryContract(Contract):
 
     Attributes:
         dt: substep of the trials [s].
+        substeps: of a travelling body.
     """
 
     dt = 1e-3
+    substeps = 200
 
     @abstractmethod
     def make(self) -> AbstractBoundary:
@@ -47,14 +49,29 @@ class BoundaryContract(Contract):
         with float64():
             return self.make().double().bind(self.mesh()).double()
 
-    def _drive(self, pose: Tensor | None) -> Drive | None:
-        return None
+    def _travel(self) -> Tensor:
+        """[K, 4, 4]: from the origin, a turn about a tilted axis while the body travels."""
+        angle = torch.linspace(0.0, 1.2, 5, dtype=torch.float64)[:, None, None]
+        a, b, c = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+        o = torch.zeros((), dtype=torch.float64)
+        axis = torch.stack([o, -c, b, c, o, -a, -b, a, o]).reshape(3, 3)
+        pose = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+        pose[:, :3, :3] = torch.linalg.matrix_exp(angle * axis)
+        pose[:, :3, 3] = 0.1 * angle[:, 0] ** 2 * pose.new_tensor([1.0, -0.5, 0.7])
+        return pose
+
+    def _drive(self, pose: Tensor, closed: bool = True) -> Drive:
+        """The substeps of a body that goes through the poses at equal times."""
+        t = torch.linspace(0.0, self.substeps * self.dt, pose.shape[-3], dtype=pose.dtype)
+        substeps = torch.linspace(0.0, float(t[-1]), self.substeps + 1, dtype=pose.dtype)
+        return drive(Trajectory(t, pose, torch.full((len(t),), closed)), substeps)
 
     def _pose(self) -> Tensor | None:
+        """[K, 4, 4] of a body that moves; None: the boundary stands still."""
         return None
 
     def _apply(self, boundary: AbstractBoundary, x: Tensor, v: Tensor, pose: Tensor | None = None) -> Tensor:
-        return boundary.apply(x, v, self.dt, self._drive(pose), 1)
+        return boundary.apply(x, v, self.dt, None if pose is None else self._drive(pose), 1)
 
     def _inputs(self) -> dict[str, Tensor]:
         x, v = self.sample()
@@ -84,7 +101,7 @@ class BoundaryContract(Contract):
             return call_with(boundary, own, self._apply, values["x"], values["v"], values.get("pose"))
 
         # steps small enough that no vertex changes between touching and free
-        check_gradients(evaluate, {**self._inputs(), **names}, 1e-7, steps=[10.0 ** (-2 - k / 2) for k in range(9)])
+        check_gradients(evaluate, {**self._inputs(), **names}, 1e-7, steps=[10.0 ** (-2 - k / 2) for k in range(11)])
 
     def test_gradients_are_finite_at_rest(self) -> None:
         """Exactly on the boundary, still."""
@@ -127,33 +144,12 @@ class BoundaryContract(Contract):
 class GraspContract(BoundaryContract):
     """What the layer relies on in a boundary that carries vertices along a trajectory. Override ``make``, ``held``."""
 
-    substeps = 200
-
     @abstractmethod
     def held(self) -> list[int]:
         """The vertices that are carried."""
 
     def _pose(self) -> Tensor:
-        """[K, 4, 4]: a turn about a tilted axis while the body travels."""
-        angle = torch.linspace(0.0, 1.2, 5, dtype=torch.float64)[:, None, None]
-        a, b, c = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-        o = torch.zeros((), dtype=torch.float64)
-        axis = torch.stack([o, -c, b, c, o, -a, -b, a, o]).reshape(3, 3)
-        pose = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
-        pose[:, :3, :3] = torch.linalg.matrix_exp(angle * axis)
-        pose[:, :3, 3] = 0.1 * angle[:, 0] ** 2 * pose.new_tensor([1.0, -0.5, 0.7])
-        return pose
-
-    def _times(self, pose: Tensor) -> Tensor:
-        return torch.linspace(0.0, self.substeps * self.dt, pose.shape[-3], dtype=pose.dtype)
-
-    def _drive(self, pose: Tensor | None, closed: bool = True) -> Drive:
-        demand(pose is not None, "a driven boundary needs a pose")
-        assert pose is not None  # for the type checker
-        t = self._times(pose)
-        flags = torch.full((len(t),), closed)
-        substeps = torch.linspace(0.0, float(t[-1]), self.substeps + 1, dtype=pose.dtype)
-        return drive(Trajectory(t, pose, flags), substeps)
+        return self._travel()
 
     def test_is_driven(self) -> None:
         """Without a trajectory the layer must refuse to run."""

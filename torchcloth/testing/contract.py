@@ -96,6 +96,6 @@ def finite_gradients(result: Tensor, leaves: dict[str, Tensor], where: str) -> N
     Raises:
         AssertionError: naming the leaf.
     """
-    gradients = torch.autograd.grad(result.sum(), list(leaves.values()), allow_unused=True)
+    gradients = torch.autograd.grad(result.sum(), list(leaves.values()), retain_graph=True, allow_unused=True)
     for name, gradient in zip(leaves, gradients, strict=True):
         demand(gradient is None or torch.isfinite(gradient).all(), f"the gradient in {name!r} is not finite {where}")

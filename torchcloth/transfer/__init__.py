@@ -1,6 +1,7 @@
 """Particle-grid transfer: how contact passes between layers of cloth."""
 
-from .contact import Contact
-from .reference import exchange
+from .contact import SKIN, TURNED, Contact, Grid
+from .neighbours import apart
+from .reference import Stencil, push, stencil, velocity_gradient
 
-__all__ = ["Contact", "exchange"]
+__all__ = ["SKIN", "TURNED", "Contact", "Grid", "Stencil", "apart", "push", "stencil", "velocity_gradient"]

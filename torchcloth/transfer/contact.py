@@ -3,28 +3,72 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from torch import Tensor
 
 from ..errors import InvalidInput
 from ..meshes import Mesh
+
+SKIN = 2.0  # grid spacings that layers may approach each other before the search for near ones is repeated
+RANGE = 4.0  # grid spacings: the splines of points farther apart have no node of any weight in common
+GAP = 1.4  # grid spacings between layers at rest, with the default play
+SPARSEST = 1.4  # grid spacings between corners of sub-triangles: no hole between the points exceeds 0.7 spacings
+TURNED = 1.7  # layers are folded on each other where the way along the cloth is that much longer than through space
+
+
+class Grid(NamedTuple):
+    """What contact through the grid needs."""
+
+    points: Tensor  # [S, 3] barycentric coordinates of each triangle's contact points
+    spacing: float  # m
+    nodes: int  # per axis before the grid wraps
+    skin: float  # m, see SKIN
+    reach: float  # m, centroids of triangles that may touch before the search is repeated
+    play: float  # compression 1 - R33 of the director before layers press
+    damping: float  # s
+    apart: Tensor | None  # [E, E] bool, not neighbours along the cloth; None: every triangle always takes part
 
 
 @dataclass(frozen=True)
 class Contact:
     """How finely layers of cloth see each other.
 
-    Layers come to rest about 1.3 to 1.8 ``spacing`` apart. The points must be no farther apart than the grid's
-    spacing, or layers pass through each other.
+    Layers come to rest ``GAP`` = 1.4 spacings apart (1.3 to 1.5, for pressures from a fabric's weight to a hundred
+    times that). Only triangles near another layer take part, and cost anything; within about 0.4 ``reach`` of a sharp
+    fold the two sides are still neighbours and do not see each other.
 
     Args:
-        spacing: grid spacing [m]; None: the mesh's mean edge.
+        spacing: grid spacing [m]; None: the mesh's mean edge. See ``with_gap``.
         subdivisions: contact points per triangle edge (points per triangle = its square); None: as many as the
-            spacing asks for.
+            spacing asks for; sparser points would let layers pass through each other.
+        damping: of the collision [s] (Hunt and Crossley 1975): the pressure of closing layers grows, that of parting
+            layers falls by damping times the rate of the director's compression. 0: layers bounce like rubber.
+        play: compression 1 - R33 of the director at which layers begin to press. The splines of layers 2.3 spacings
+            apart still overlap: with play 0, as published, they rest there.
+        everywhere: let all triangles take part always, as material point methods do; for comparison.
+
+    Raises:
+        InvalidInput: negative damping, or a play outside [0, 0.5].
     """
 
     spacing: float | None = None
     subdivisions: int | None = None
+    damping: float = 0.1
+    play: float = 0.25
+    everywhere: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.damping < float("inf"):
+            raise InvalidInput("contact damping", got=f"{self.damping} s", expected="a time >= 0")
+        if not 0 <= self.play <= 0.5:
+            raise InvalidInput("contact play", got=self.play, expected="a number in [0, 0.5]")
+
+    @classmethod
+    def with_gap(cls, gap: float, **changes) -> Contact:
+        """Contact whose layers rest ``gap`` [m] apart, from centre to centre; ``changes`` as for the class."""
+        return cls(spacing=gap / GAP, **changes)
 
     def resolve(self, mesh: Mesh) -> tuple[float, np.ndarray]:
         """(spacing [m], barycentric coordinates of the points of one triangle [S, 3]).
@@ -36,7 +80,7 @@ class Contact:
         spacing = edge if self.spacing is None else float(self.spacing)
         if not spacing > 0:
             raise InvalidInput("contact spacing", got=f"{spacing:g} m", expected="a length > 0")
-        needed = max(1, int(np.ceil(edge / spacing - 0.2)))
+        needed = max(1, int(np.ceil(edge / (SPARSEST * spacing))))
         s = needed if self.subdivisions is None else int(self.subdivisions)
         if s < needed:
             raise InvalidInput(
@@ -46,6 +90,11 @@ class Contact:
                 remedy="sparser points would let layers pass through each other",
             )
         return spacing, _centroids(s)
+
+    def reach(self, mesh: Mesh) -> float:
+        """Largest distance [m] between the centroids of two triangles whose points may soon touch."""
+        corner = mesh.rest - mesh.rest.mean(1, keepdims=True)
+        return float((RANGE + SKIN) * self.resolve(mesh)[0] + 2 * np.linalg.norm(corner, axis=-1).max())
 
 
 def _centroids(s: int) -> np.ndarray:

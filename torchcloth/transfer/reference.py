@@ -6,63 +6,84 @@ so the cloth may travel anywhere in space without leaving the grid.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
+from .contact import Grid
 
-def exchange(
-    position: Tensor,
-    velocity: Tensor,
-    affine: Tensor,
-    mass: Tensor,
-    pull: Tensor,
-    director: Tensor,
-    spacing: float,
-    nodes: int,
-    dt: float,
-) -> tuple[Tensor, Tensor]:
-    """Carry the points' momentum to the grid, let the directors' forces act there, bring the change back.
+
+class Stencil(NamedTuple):
+    """The 27 nodes around each point."""
+
+    weight: Tensor  # [P, 27]
+    slope: Tensor  # [P, 27, 3] 1/m, gradient of the weight
+    offset: Tensor  # [P, 3] grid spacings, from the lowest node
+    node: Tensor  # [27 P] int64, rows of a grid that holds only the nodes that are touched
+    inverse: Tensor  # [P, 27] 1/kg, one over the mass on the node
+
+
+def stencil(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, slots: Tensor) -> Stencil:
+    """Place points on the grid.
 
     Args:
-        position: [B, P, 3] m. The extent along each axis must stay below (nodes - 3) spacing.
-        velocity: [B, P, 3] m/s, before contact.
-        affine: [B, P, 3, 3] 1/s, velocity gradient at each point, derived from the mesh.
-        mass: [B or 1, P, 1] kg, share of each point.
-        pull: [B, P, 3] N m, V d(psi)/d(d3): what the director's energy does through the grid's velocity gradient.
-        director: [B, P, 3], d3.
-        spacing: grid spacing [m].
-        nodes: nodes per axis before the grid repeats.
-        dt: substep [s].
-
-    Returns:
-        (change of each point's velocity [B, P, 3] m/s from the contact forces,
-        velocity gradient of the grid at each point [B, P, 3, 3] 1/s)
+        position: [P, 3] m. The extent of a scene along each axis must stay below (nodes - 3) spacing.
+        mass: [P, 1] kg, share of each point.
+        scene: [P] int64; points of different scenes do not meet.
+        grid: its spacing and size.
+        slots: int32 scratch, one entry per node and scene, overwritten.
     """
-    batch, points, _ = position.shape
-    scaled = position / spacing
+    scaled = position / grid.spacing
     base = torch.floor(scaled.detach() - 0.5)
     offset = scaled - base  # in [0.5, 1.5)
-    weight, slope = _splines(offset, spacing)
-    index = _node_index(base.long(), nodes)
+    weight, slope = _splines(offset, grid.spacing)
+    node = _compact(_node_index(base.long(), scene, grid.nodes).reshape(-1), slots)
+    total = _through(node, mass * weight)
+    return Stencil(weight, slope, offset, node, 1.0 / torch.where(total > 0, total, 1.0))  # a weight may be exactly 0
 
-    step = torch.arange(3, dtype=position.dtype, device=position.device)
+
+def push(nodes: Stencil, pull: Tensor, director: Tensor, dt: float) -> Tensor:
+    """Change of each point's velocity [P, 3] m/s by the directors' forces -pull (d3 . grad w) on the nodes.
+
+    Args:
+        nodes: of the points.
+        pull: [P, 3] N m, V d(psi)/d(d3): what the director's energy does through the grid's velocity gradient.
+        director: [P, 3], d3.
+        dt: substep [s].
+    """
+    force = -(nodes.slope @ director.unsqueeze(-1)) * pull.unsqueeze(-2)
+    change = dt * _through(nodes.node, force) * nodes.inverse.unsqueeze(-1)
+    return (nodes.weight.unsqueeze(-1) * change).sum(-2)
+
+
+def velocity_gradient(nodes: Stencil, mass: Tensor, velocity: Tensor, affine: Tensor, spacing: float) -> Tensor:
+    """Gradient [P, 3, 3] 1/s at each point of the velocity that all points together have on the grid.
+
+    Args:
+        nodes: of the points.
+        mass: [P, 1] kg.
+        velocity: [P, 3] m/s.
+        affine: [P, 3, 3] 1/s, velocity gradient at each point, derived from the mesh.
+        spacing: grid spacing [m].
+    """
+    step = torch.arange(3, dtype=velocity.dtype, device=velocity.device)
     lattice = torch.cartesian_prod(step, step, step)
-    arm = (lattice - offset.unsqueeze(-2)) * spacing  # [B, P, 27, 3]
-    carried = velocity.unsqueeze(-2) + arm @ affine.mT
-    share = mass.unsqueeze(-2) * weight.unsqueeze(-1)
-    force = -(slope @ director.unsqueeze(-1)) * pull.unsqueeze(-2)
-    payload = torch.cat([share, share * carried, force], dim=-1)
+    spread = spacing * affine
+    lowest = velocity - (spread @ nodes.offset.unsqueeze(-1)).squeeze(-1)  # the affine field at the lowest node
+    carried = lowest.unsqueeze(-2) + lattice @ spread.mT  # [P, 27, 3]
+    moved = _through(nodes.node, (mass * nodes.weight).unsqueeze(-1) * carried) * nodes.inverse.unsqueeze(-1)
+    return moved.mT @ nodes.slope
 
-    grid = payload.new_zeros(batch * nodes**3, 7).index_add(0, index.reshape(-1), payload.reshape(-1, 7))
-    seen = grid.index_select(0, index.reshape(-1)).reshape(batch, points, 27, 7)
-    inverse = 1.0 / torch.where(seen[..., :1] > 0, seen[..., :1], 1.0)  # a weight of exactly 0 leaves an empty node
-    change = dt * seen[..., 4:] * inverse
-    moved = seen[..., 1:4] * inverse + change
-    return (weight.unsqueeze(-1) * change).sum(-2), moved.mT @ slope
+
+def _through(node: Tensor, field: Tensor) -> Tensor:
+    """Sum on the nodes, seen from each point again: [P, 27, ...] -> [P, 27, ...]."""
+    flat = field.flatten(0, 1)
+    return torch.zeros_like(flat).index_add(0, node, flat).index_select(0, node).view(field.shape)
 
 
 def _splines(offset: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
-    """Weights [B, P, 27] and their gradients [B, P, 27, 3] 1/m from the offset to the lowest node [B, P, 3]."""
+    """Weights [P, 27] and their gradients [P, 27, 3] 1/m from the offset to the lowest node [P, 3]."""
     w = torch.stack([0.5 * (1.5 - offset) ** 2, 0.75 - (offset - 1) ** 2, 0.5 * (offset - 0.5) ** 2], dim=-2)
     d = torch.stack([offset - 1.5, 2 - 2 * offset, offset - 0.5], dim=-2) / spacing
 
@@ -75,9 +96,17 @@ def _splines(offset: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
     return outer(wx, wy, wz), slope
 
 
-def _node_index(base: Tensor, nodes: int) -> Tensor:
-    """Flat index of the 27 nodes of each point [B, P, 27], batches apart, wrapped around."""
-    step = torch.arange(3, device=base.device)
-    near = (base.unsqueeze(-2) + torch.cartesian_prod(step, step, step)) % nodes
-    scene = torch.arange(base.shape[0], device=base.device)[:, None, None]
-    return ((scene * nodes + near[..., 0]) * nodes + near[..., 1]) * nodes + near[..., 2]
+def _node_index(base: Tensor, scene: Tensor, nodes: int) -> Tensor:
+    """Number of each of the 27 nodes of each point [P, 27], scenes apart, wrapped around."""
+    x, y, z = ((base.unsqueeze(-1) + torch.arange(3, device=base.device)) % nodes).unbind(-2)
+    plane = (scene[:, None] * nodes + x) * nodes
+    return (((plane.unsqueeze(-1) + y.unsqueeze(-2)) * nodes).unsqueeze(-1) + z[:, None, None, :]).flatten(-3)
+
+
+def _compact(node: Tensor, slots: Tensor) -> Tensor:
+    """Rows [N] of a grid that holds only the nodes that are touched; equal nodes share a row.
+
+    Each node remembers the last visitor that wrote its number there, whoever that was: no sorting, no clearing.
+    """
+    slots[node] = torch.arange(len(node), dtype=slots.dtype, device=node.device)
+    return slots[node].long()

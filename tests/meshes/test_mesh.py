@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
-from torchcloth.meshes import Mesh
+from torchcloth.meshes import Mesh, obj
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -23,6 +24,8 @@ FACES = np.array([[0, 1, 2], [0, 2, 3]])
         (SQUARE, FACES - 1, None, "faces; got indices -1"),
         (SQUARE, FACES[:1], None, r"1 in no triangle \(first: 3\)"),
         (SQUARE, FACES, SQUARE, r"uv; got shape \(4, 3\)"),
+        (SQUARE, FACES, SQUARE[None, :3, :2], r"uv; got shape \(1, 3, 2\); .* per corner, \[2, 3, 2\]"),
+        (SQUARE, FACES, SQUARE[:, :2] * np.nan, r"uv; .* expected finite"),
         (SQUARE, [[0, 1, 2], [0, 2, 2], [0, 2, 3]], None, r"1 degenerate or flipped triangles \(first: 1"),
         (SQUARE, FACES, [[0, 0], [1, 0], [1, 1], [2, 0.5]], "degenerate or flipped"),
     ],
@@ -149,7 +152,6 @@ def test_load_refuses_what_is_no_mesh(tmp_path):
 
 
 def test_load_reads_an_obj_with_pattern_coordinates(tmp_path):
-    pytest.importorskip("trimesh")
     mesh = tc.meshes.rectangle(0.4, 0.3, resolution=(3, 3))
     lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices] + [f"vt {u} {v}" for u, v in mesh.uv]
     lines += ["f " + " ".join(f"{k + 1}/{k + 1}" for k in face) for face in mesh.faces]
@@ -159,3 +161,116 @@ def test_load_reads_an_obj_with_pattern_coordinates(tmp_path):
     np.testing.assert_allclose(loaded.area.sum(), 0.12)
     np.testing.assert_allclose(loaded.vertices, mesh.vertices)
     np.testing.assert_allclose(loaded.uv, mesh.uv)
+
+
+def sewn_pair(turn=1.0):
+    """Two squares that share an edge in the world and lie apart on the pattern, the second perhaps from behind."""
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]])
+    laid = x[faces][..., :2].copy()
+    laid[2:] = laid[2:] * [turn, 1.0] + [5.0, 0.3]
+    return x, faces, laid
+
+
+def test_where_the_pattern_parts_two_panels_are_sewn():
+    x, faces, laid = sewn_pair()
+    mesh = Mesh.build(x, faces, laid)
+    assert mesh.seams.tolist() == [[1, 2]]
+    assert mesh.panels.tolist() == [0, 0, 1, 1]
+    assert mesh.uv is None
+    assert len(mesh.boundary_edges) == 6
+    np.testing.assert_array_equal(mesh.rest, laid)
+    np.testing.assert_array_equal(mesh.nearest_vertices([[7.0, 0.3]], 1e-9), [4])
+    np.testing.assert_array_equal(mesh.nearest_vertices([[6.0, 0.3]], 1e-9), [1])
+    np.testing.assert_array_equal(mesh.nearest_vertices([[1.0, 0.0]], 1e-9), [1])
+
+
+def test_corner_coordinates_that_agree_are_vertex_coordinates():
+    flat = tc.meshes.rectangle(0.4, 0.3, resolution=(5, 4))
+    mesh = Mesh.build(flat.vertices, flat.faces, flat.uv[flat.faces])
+    np.testing.assert_array_equal(mesh.uv, flat.uv)
+    np.testing.assert_array_equal(mesh.rest, flat.rest)
+    assert mesh.seams.shape == (0, 2)
+    assert mesh.panels.max() == 0
+    rim = mesh.uv[mesh.boundary_edges]
+    assert len(rim) == 2 * (4 + 3)
+    assert (((rim == 0) | np.isclose(rim, [0.4, 0.3])).all(1).any(1)).all()  # both ends on the same side
+
+
+def test_each_panel_drawn_from_behind_is_turned_over_by_itself():
+    x, faces, laid = sewn_pair(turn=-1.0)
+    mesh = Mesh.build(x, faces, laid)
+    np.testing.assert_allclose(mesh.area, 0.5)
+    np.testing.assert_array_equal(mesh.pattern, laid)
+    folded = laid.copy()
+    folded[3, 2] = folded[2, 1]  # the second triangle of the panel laid back on the first
+    with pytest.raises(InvalidInput, match="degenerate or flipped"):
+        Mesh.build(x, faces, folded)
+
+
+def test_a_sewn_mesh_is_strained_by_its_own_pattern():
+    """The energy of a garment made of strips does not depend on where the strips lie on the pattern."""
+    flat = tc.meshes.rectangle(0.4, 0.3, resolution=(5, 4))
+    strips = (flat.uv[flat.faces][..., 1].mean(1) > 0.1).astype(float)[:, None, None] * [3.0, -1.0]
+    sewn = Mesh.build(flat.vertices, flat.faces, flat.uv[flat.faces] + strips)
+    assert sewn.panels.max() == 1
+    assert len(sewn.seams) == 4
+    x = torch.as_tensor(flat.vertices * [1.1, 0.95, 1.0])
+    energies = []
+    for mesh in (flat, sewn):
+        cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, contact=None)
+        energies.append(float(cloth.energy(cloth.state(x))["membrane"].detach()))
+    assert energies[0] > 0.01
+    assert energies[1] == pytest.approx(energies[0], rel=1e-5)
+
+
+@pytest.mark.parametrize("index", [[4], [-1], [], [0.5], [[0]]])
+def test_places_are_vertices(index):
+    with pytest.raises(InvalidInput, match=r"places\['tip'\]; got .* 0..3"):
+        Mesh.build(SQUARE, FACES, places={"tip": index})
+
+
+def test_places_and_what_lies_around_them():
+    mesh = Mesh.build(SQUARE, FACES, places={"tip": [2]})
+    assert mesh.around("tip").tolist() == [2]
+    assert mesh.around("tip", 1.0).tolist() == [1, 2, 3]
+    with pytest.raises(InvalidInput, match="place; got 'top'; expected one of tip"):
+        mesh.around("top")
+
+
+def test_extent_is_the_cloth_s_whatever_its_placement():
+    flat = tc.meshes.rectangle(0.5, 0.5, resolution=(9, 9))
+    rolled = np.column_stack([0.02 * np.cos(flat.uv[:, 0] / 0.02), flat.uv[:, 1], 0.02 * np.sin(flat.uv[:, 0] / 0.02)])
+    mesh = Mesh.build(rolled, flat.faces, flat.uv)
+    assert 0.5 * 2**0.5 <= mesh.extent + 1e-12 <= 1.09 * 0.5 * 2**0.5  # edges of a square grid zigzag by up to 8 %
+    assert mesh.extent == pytest.approx(flat.extent)
+
+
+def test_load_keeps_an_obj_with_texture_seams_sewn(tmp_path):
+    x, faces, laid = sewn_pair()
+    path = tmp_path / "pair.OBJ"
+    path.write_text(obj.dump(x, faces, laid))
+    mesh = tc.meshes.load(path)
+    assert len(mesh.vertices) == 6  # not split
+    assert mesh.seams.tolist() == [[1, 2]]
+    np.testing.assert_array_equal(mesh.rest, laid)
+
+
+def test_load_refuses_a_damaged_obj(tmp_path):
+    path = tmp_path / "sheet.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 7")
+    with pytest.raises(InvalidInput, match=r"sheet.obj is damaged at line 4; got 'f 1 2 7'"):
+        tc.meshes.load(path)
+    path.write_bytes(b"v \xff")
+    with pytest.raises(InvalidInput, match="expected a readable OBJ or PLY file"):
+        tc.meshes.load(path)
+
+
+def test_load_reads_a_ply(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    flat = tc.meshes.rectangle(0.4, 0.3, resolution=(3, 3))
+    trimesh.Trimesh(flat.vertices, flat.faces, process=False).export(tmp_path / "sheet.ply")
+    mesh = tc.meshes.load(tmp_path / "sheet.ply")
+    np.testing.assert_allclose(mesh.vertices, flat.vertices, atol=1e-7)
+    np.testing.assert_array_equal(mesh.faces, flat.faces)
+    assert mesh.pattern is None

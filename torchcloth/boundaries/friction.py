@@ -1,0 +1,128 @@
+"""Dry friction: how much of the slip a push along the normal takes away."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from .._math import dot, safe_norm
+from ..errors import InvalidInput
+from ..parameters import PhysicalParameter
+
+
+class Coulomb(PhysicalParameter):
+    """Coulomb's law, stick and slip: the tangential impulse is at most mu times the normal one.
+
+    Args:
+        friction: mu [-], >= 0.
+
+    Raises:
+        InvalidInput: a negative coefficient.
+    """
+
+    def __init__(self, friction: float | Tensor) -> None:
+        super().__init__(friction, "-", "nonnegative", name="friction")
+
+    def taken(self, slip: Tensor, push: Tensor) -> Tensor:
+        """Share of the slip that is lost [..., N, 1]; 1 where the surfaces stick.
+
+        Args:
+            slip: [..., N, 3] m/s, tangential velocity relative to the body before friction, in the body's axes.
+            push: [..., N, 1] m/s, change of the normal velocity by the contact, >= 0.
+        """
+        size = self._size(slip)
+        limit = self._coefficient(size) * push
+        sticks = (size <= limit) & (limit > 0)
+        return torch.where(sticks, 1.0, limit / torch.where(size > 0, size, 1.0))
+
+    def _size(self, slip: Tensor) -> Tensor:
+        """The length of the slip that is compared with mu times the push."""
+        return safe_norm(slip)
+
+    def _coefficient(self, size: Tensor) -> Tensor:
+        return per_point(self.value)
+
+
+class Stribeck(Coulomb):
+    """Friction that falls with the speed: mu = kinetic + (static - kinetic) exp(-(|slip| / speed)^2).
+
+    ``static == kinetic`` is Coulomb's law, bitwise. The law of Stribeck 1902 in the form of Bo and Pavelescu 1982.
+
+    Args:
+        kinetic: mu of fast slip [-], >= 0.
+        static: mu at rest [-], >= kinetic.
+        speed: at which the excess has fallen to 1 / e [m/s].
+
+    Raises:
+        InvalidInput: a coefficient or speed outside its range.
+    """
+
+    def __init__(self, kinetic: float, static: float, speed: float = 0.01) -> None:
+        super().__init__(kinetic)
+        self.excess = PhysicalParameter(static - kinetic, "-", "nonnegative", name="static minus kinetic friction")
+        self.speed = PhysicalParameter(speed, "m/s", name="speed of the Stribeck law")
+
+    def _coefficient(self, size: Tensor) -> Tensor:
+        fall = torch.exp(-((size / per_point(self.speed.value)) ** 2))
+        return per_point(self.value) + per_point(self.excess.value) * fall
+
+
+class Elliptic(Coulomb):
+    """Friction that depends on the direction of slip: an elliptical cone, on planes.
+
+    Not associated: the force opposes the slip, with the size of the cone in that direction; slip is never deflected.
+    ``across == along`` is Coulomb's law, bitwise.
+
+    Args:
+        along: mu of slip along ``axis`` [-], > 0.
+        across: mu of slip perpendicular to it [-], > 0.
+        axis: [3], in the surface, in the shape's own coordinates; normalised here.
+
+    Raises:
+        InvalidInput: a coefficient that is not positive, or no direction.
+    """
+
+    def __init__(self, along: float, across: float, axis: Sequence[float] = (1.0, 0.0, 0.0)) -> None:
+        super().__init__(along)
+        if not along > 0:
+            raise InvalidInput("along", got=f"{along:g}", expected="a coefficient > 0")
+        self.ratio = PhysicalParameter(across / along, "-", name="friction across over along")
+        self.register_buffer("axis", direction("friction axis", axis))
+        self.axis: Tensor
+
+    def _size(self, slip: Tensor) -> Tensor:
+        across = slip - dot(slip, self.axis) * self.axis
+        return safe_norm(slip + (1 / per_point(self.ratio.value) - 1) * across)
+
+
+def per_point(value: Tensor) -> Tensor:
+    """A body's scalar [] or batch [..., 1] as it meets points [..., N, 1]."""
+    return value.unsqueeze(-1) if value.ndim else value
+
+
+def direction(what: str, given: Sequence[float]) -> Tensor:
+    """[3] unit vector.
+
+    Raises:
+        InvalidInput: not three finite numbers, or all zero.
+    """
+    vector = place(what, given)
+    length = float(vector.norm())
+    if not 0 < length < math.inf:
+        raise InvalidInput(what, got=given, expected="three finite numbers, not all zero")
+    return vector / length
+
+
+def place(what: str, given: Sequence[float]) -> Tensor:
+    """[3] a point or vector.
+
+    Raises:
+        InvalidInput: not three finite numbers.
+    """
+    vector = torch.as_tensor(given, dtype=torch.get_default_dtype())
+    if vector.shape != (3,) or not bool(torch.isfinite(vector).all()):
+        raise InvalidInput(what, got=given, expected="three finite numbers")
+    return vector

@@ -1,0 +1,167 @@
+"""Round and edged solids with closed-form distances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Unpack
+
+import torch
+from torch import Tensor
+
+from .._math import cross, dot, safe_norm
+from ..errors import InvalidInput
+from ..parameters import PhysicalParameter
+from .collider import AbstractCollider, Options
+from .friction import Coulomb, per_point, place
+
+
+class Sphere(AbstractCollider):
+    """A ball.
+
+    Args:
+        radius: [m], learnable.
+        centre: [3] m.
+        friction: Coulomb coefficient >= 0, or a law.
+        options: as for every collider (``AbstractCollider``).
+
+    Raises:
+        InvalidInput: a radius that is not positive.
+    """
+
+    def __init__(
+        self,
+        radius: float,
+        centre: Sequence[float] = (0.0, 0.0, 0.0),
+        friction: float | Coulomb = 0.4,
+        **options: Unpack[Options],
+    ) -> None:
+        super().__init__(friction, **options)
+        self.radius = PhysicalParameter(radius, "m", name="radius")
+        self.register_buffer("centre", place("centre", centre))
+        self.register_buffer("up", place("up", (0.0, 0.0, 1.0)), persistent=False)
+        self.centre: Tensor
+        self.up: Tensor
+
+    def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """To the surface; the normal at the centre is the z axis."""
+        length, normal = _polar(p - self.centre, self.up)
+        return length - per_point(self.radius.value), normal
+
+
+class Box(AbstractCollider):
+    """A rectangular block.
+
+    Args:
+        size: [3] m, edge lengths along its own axes, learnable.
+        pose: [4, 4], of the block's centre and axes in the world, or in the body when it moves. None: at the origin.
+        friction: Coulomb coefficient >= 0, or a law.
+        options: as for every collider (``AbstractCollider``).
+
+    Raises:
+        InvalidInput: sizes that are not three positive lengths, or a pose that is not rigid.
+    """
+
+    def __init__(
+        self,
+        size: Sequence[float],
+        pose: Tensor | None = None,
+        friction: float | Coulomb = 0.4,
+        **options: Unpack[Options],
+    ) -> None:
+        super().__init__(friction, pose=pose, **options)
+        self.size = PhysicalParameter(place("box size", size), "m", name="box size")
+
+    def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """To the nearest face, edge or corner."""
+        half = self.size.value.unsqueeze(-2) / 2
+        distance, part = _beyond(p.abs() - half)
+        return distance, torch.where(p < 0, -part, part)
+
+
+class _Axial(AbstractCollider):
+    """What has an axis and a radius."""
+
+    def __init__(
+        self,
+        start: Sequence[float],
+        end: Sequence[float],
+        radius: float,
+        friction: float | Coulomb = 0.4,
+        **options: Unpack[Options],
+    ) -> None:
+        super().__init__(friction, **options)
+        a, b = place("start", start), place("end", end)
+        if not float((b - a).norm()) > 0:
+            raise InvalidInput("axis", got=f"from {start} to {end}", expected="two different points")
+        self.radius = PhysicalParameter(radius, "m", name="radius")
+        self.register_buffer("start", a)
+        self.register_buffer("end", b)
+        aside = cross(b - a, torch.eye(3).to(a)[(b - a).abs().argmin()])
+        self.register_buffer("aside", aside / aside.norm(), persistent=False)
+        self.start: Tensor
+        self.end: Tensor
+        self.aside: Tensor  # [3], a unit vector perpendicular to the axis
+
+
+class Capsule(_Axial):
+    """All points within ``radius`` of a segment: a cylinder with round ends.
+
+    Args:
+        start: [3] m, one end of the segment.
+        end: [3] m, the other.
+        radius: [m], learnable.
+        friction: Coulomb coefficient >= 0, or a law.
+        options: as for every collider (``AbstractCollider``).
+
+    Raises:
+        InvalidInput: a radius that is not positive, or a segment without length.
+    """
+
+    def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """To the surface; on the segment the normal is some perpendicular."""
+        axis = self.end - self.start
+        along = (dot(p - self.start, axis) / dot(axis, axis)).clamp(0, 1)
+        length, normal = _polar(p - self.start - along * axis, self.aside)
+        return length - per_point(self.radius.value), normal
+
+
+class Cylinder(_Axial):
+    """A round bar with flat ends.
+
+    Args:
+        start: [3] m, centre of one end.
+        end: [3] m, centre of the other.
+        radius: [m], learnable.
+        friction: Coulomb coefficient >= 0, or a law.
+        options: as for every collider (``AbstractCollider``).
+
+    Raises:
+        InvalidInput: a radius that is not positive, or a cylinder without length.
+    """
+
+    def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """To the barrel, an end, or the rim; on the axis the barrel's normal is some perpendicular."""
+        length = (self.end - self.start).norm()
+        axis = (self.end - self.start) / length
+        q = p - (self.start + self.end) / 2
+        height = dot(q, axis)
+        radial, outwards = _polar(q - height * axis, self.aside)
+        gaps = torch.broadcast_tensors(radial - per_point(self.radius.value), height.abs() - length / 2)
+        distance, part = _beyond(torch.cat(gaps, dim=-1))
+        side, top = part.split(1, dim=-1)
+        return distance, side * outwards + torch.where(height < 0, -top, top) * axis
+
+
+def _polar(q: Tensor, fallback: Tensor) -> tuple[Tensor, Tensor]:
+    """(length [..., 1], unit vector [..., 3]); the fallback where there is no direction."""
+    length = safe_norm(q)
+    zero = length == 0
+    return length, torch.where(zero, fallback, q / torch.where(zero, 1.0, length))
+
+
+def _beyond(gap: Tensor) -> tuple[Tensor, Tensor]:
+    """Signed distance [..., 1] to a block and the normal's components [..., K] >= 0, from the signed distances to its
+    pairs of parallel sides [..., K]."""
+    nearest, side = gap.max(-1, keepdim=True)
+    outside, part = _polar(gap.clamp(min=0), torch.zeros_like(gap).scatter(-1, side, 1.0))
+    return torch.where(outside > 0, outside, nearest), part

@@ -1,0 +1,129 @@
+"""Curvature of a moving sheet in material axes, and the forces of bending moments, both per vertex."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from .._math import cross, dot
+from ..meshes import Mesh
+from ._curvature import Pattern, Stencils, curvature_stencils, gathered, largest_eigenvalue, local_matrices, mixed_area
+from ._curvature import pattern as pattern_of
+
+
+class Bent(NamedTuple):
+    """How a sheet is bent at its vertices."""
+
+    second: Tensor  # [..., 3, V, 3] 1/m, second derivatives of x along ww, ff, and sqrt 2 times wf
+    warp: Tensor  # [..., V, 3] -, tangent
+    weft: Tensor  # [..., V, 3] -
+    normal: Tensor  # [..., V, 3] -, unit, on the side from which warp turns to weft counter-clockwise
+    stretch: Tensor  # [..., V, 1] -, area ratio
+
+    @property
+    def curvature(self) -> Tensor:
+        """[..., V, 3] 1/m along ww, ff, sqrt 2 wf: > 0 where the centre lies on the normal's side.
+
+        Its length does not depend on the material axes.
+        """
+        return (self.second * self.normal.unsqueeze(-3)).sum(-1).mT
+
+
+class BentSheet(nn.Module):
+    """Constant stencils of a mesh that see how it is bent, and answer moments with forces.
+
+    The curvature is k = n . d^2 x / da db with the unit normal n of the same quadratic fit. The forces are the exact
+    transpose of its derivative, n's included, so they do the moments' work and have neither resultant nor moment.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name in ("near", "weight", "area", "bending_bound", "turning_bound"):
+            like = torch.long if name == "near" else None
+            self.register_buffer(name, torch.zeros(0, dtype=like), persistent=False)
+        self.near: Tensor  # [N, V] neighbours that a vertex's derivatives are fitted to
+        self.weight: Tensor  # [5, N, V, 1] 1/m^2 (three), 1/m (two)
+        self.area: Tensor  # [V, 1] m^2
+        self.bending_bound: Tensor  # [V, 1] 1/m^2: over mass, bounds omega^2 per unit bending stiffness [N m]
+        self.turning_bound: Tensor  # [V, 1] 1/m: over mass, bounds omega^2 per unit bending moment [N]
+
+    def bind(self, mesh: Mesh, stencils: Stencils | None = None, device: torch.device | None = None) -> BentSheet:
+        """Build the stencils of a mesh, or take them if they are there already."""
+        near, second, first = curvature_stencils(mesh) if stencils is None else stencils
+        area, share = mixed_area(mesh), thirds(mesh)
+        bending, slope = (_largest(near, part, area, share) for part in (second, first))
+        weight = np.concatenate([second, first], axis=-1).transpose(2, 1, 0)[..., None]
+        self.near = torch.as_tensor(near.T.copy(), device=device)
+        self.weight, self.area, self.bending_bound, self.turning_bound = (
+            torch.as_tensor(value.copy(), dtype=torch.get_default_dtype(), device=device)
+            for value in (
+                weight,
+                area[:, None],
+                (share * bending)[:, None],
+                (share * (bending * slope) ** 0.5)[:, None],
+            )
+        )
+        return self
+
+    def see(self, x: Tensor) -> Bent:
+        """Derivatives at positions [..., V, 3] m."""
+        values = self._derivatives(self.weight, x)
+        warp, weft = values[..., 3, :, :], values[..., 4, :, :]
+        normal = cross(warp, weft)
+        stretch = dot(normal, normal).sqrt()
+        return Bent(values[..., :3, :, :], warp, weft, normal / stretch, stretch)
+
+    def second(self, x: Tensor) -> Tensor:
+        """Second derivatives alone [..., 3, V, 3] 1/m."""
+        return self._derivatives(self.weight[:3], x)
+
+    def force(self, bent: Bent, moment: Tensor) -> Tensor:
+        """Forces [..., V, 3] N whose virtual work is minus that of ``moment`` [..., V, 3] N on the curvature."""
+        couples = moment.mT.unsqueeze(-1)
+        pull = (couples * bent.second).sum(-3)
+        turn = (pull - dot(pull, bent.normal) * bent.normal) / bent.stretch  # on the normal
+        slopes = torch.stack([cross(bent.weft, turn), cross(turn, bent.warp)], dim=-3)
+        stress = torch.cat([couples * bent.normal.unsqueeze(-3), slopes], dim=-3)
+        return self._transposed(self.weight, stress)
+
+    def pull(self, stress: Tensor) -> Tensor:
+        """Forces [..., V, 3] N of vector moments [..., 3, V, 3] N on the second derivatives."""
+        return self._transposed(self.weight[:3], stress)
+
+    def _derivatives(self, weight: Tensor, x: Tensor) -> Tensor:
+        return (weight * differences(x, self.near).unsqueeze(-4)).sum(-3)
+
+    def _transposed(self, weight: Tensor, stress: Tensor) -> Tensor:
+        """Minus the area-weighted transpose of ``_derivatives``."""
+        shares = (weight * (self.area * stress).unsqueeze(-3)).sum(-4)
+        total = shares.sum(-3)
+        flat = shares.flatten(-3, -2)
+        index = self.near.flatten().unsqueeze(-1).expand(flat.shape)
+        return total - torch.zeros_like(total).scatter_add(-2, index, flat)
+
+    def bend_rate(self, mass: Tensor) -> Tensor:
+        """Bound on omega^2 [1/s^2] per unit of bending stiffness."""
+        return (self.bending_bound / mass).amax()
+
+    def turn_rate(self, mass: Tensor) -> Tensor:
+        """Bound on omega^2 [1/s^2] that a unit of bending moment adds: it couples in-plane motion with tilting."""
+        return (self.turning_bound / mass).amax()
+
+
+def differences(field: Tensor, index: Tensor) -> Tensor:
+    """Values at each vertex's ``index`` [D, V] less its own [..., D, V, 3]: small numbers, wherever the sheet is."""
+    return field.index_select(-2, index.flatten()).unflatten(-2, index.shape) - field.unsqueeze(-3)
+
+
+def thirds(mesh: Mesh) -> np.ndarray:
+    """[V] m^2, a third of each triangle to each corner, as mass is shared."""
+    return np.bincount(mesh.faces.ravel(), np.repeat(mesh.area / 3, 3), minlength=len(mesh.vertices))
+
+
+def _largest(near: np.ndarray, weight: np.ndarray, area: np.ndarray, share: np.ndarray) -> float:
+    local = local_matrices(weight * np.sqrt(area)[:, None, None])
+    found: Pattern = pattern_of(near, local)
+    return largest_eigenvalue(found.columns, gathered(found, local), share)

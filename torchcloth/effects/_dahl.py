@@ -1,0 +1,38 @@
+"""Dahl's law of friction inside the cloth: z' = s (k' - |k'| z / Z), from sticking with stiffness s to sliding at Z."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .._math import safe_norm
+from ..errors import InvalidInput
+
+
+def dragged(share: Tensor, change: Tensor, threshold: float) -> Tensor:
+    """Share z / Z [..., K] of the sliding friction after the strain has gone straight by ``change`` [..., K].
+
+    Exact, so it depends on the path and not on steps or time. Friction opposes motion as a vector: where K > 1 its
+    length never exceeds 1, in any direction.
+    """
+    path = change / threshold
+    length = safe_norm(path)
+    return share * torch.exp(-length) + path * _mean_decay(length)
+
+
+def check_threshold(value: float, name: str, unit: str) -> float:
+    """The strain over which friction builds up, Z / s.
+
+    Raises:
+        InvalidInput: unless it is positive.
+    """
+    if not value > 0:
+        raise InvalidInput(f"{name} threshold", got=f"{value} {unit}", expected="a value > 0")
+    return float(value)
+
+
+def _mean_decay(length: Tensor) -> Tensor:
+    """(1 - exp(-y)) / y, with its derivatives where y = 0."""
+    small = length < 1e-4
+    safe = torch.where(small, 1.0, length)
+    return torch.where(small, 1 - length / 2 + length**2 / 6, -torch.expm1(-safe) / safe)

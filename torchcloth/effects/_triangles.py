@@ -1,0 +1,47 @@
+"""Deformation gradients of a mesh's triangles, and the forces of stresses, for effects with a law of their own."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..meshes import Mesh
+
+
+class Triangles(nn.Module):
+    """Constants of a mesh's triangles."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name, like in (("corners", torch.long), ("gradient", None), ("area", None), ("shear_bound", None)):
+            self.register_buffer(name, torch.zeros(0, dtype=like), persistent=False)
+        self.corners: Tensor  # [3 E], all first corners, then all second, then all third
+        self.gradient: Tensor  # [3, 2, E, 1] 1/m, of the corners' shape functions along warp and weft
+        self.area: Tensor  # [E, 1] m^2
+        self.shear_bound: Tensor  # [V, 1] -: over mass, bounds omega^2 per unit of shear stiffness [N/m]
+
+    def bind(self, mesh: Mesh, device: torch.device | None = None) -> Triangles:
+        """Resolve the mesh."""
+        dtype, gradient = torch.get_default_dtype(), mesh.shape_gradient
+        share = np.bincount(mesh.faces.ravel(), np.repeat(mesh.area / 3, 3), minlength=len(mesh.vertices))
+        largest = 3 * (gradient**2).sum((1, 2)).max()  # a triangle on its own share of the mass (Irons, Treharne)
+        self.corners = torch.as_tensor(mesh.faces.T.ravel().copy(), device=device)
+        self.gradient, self.area, self.shear_bound = (
+            torch.as_tensor(value, dtype=dtype, device=device).unsqueeze(-1)
+            for value in (gradient.transpose(1, 2, 0).copy(), mesh.area, share * largest)
+        )
+        return self
+
+    def columns(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Deformation gradient's warp and weft columns [..., E, 3]."""
+        x0, x1, x2 = x.index_select(-2, self.corners).unflatten(-2, (3, -1)).unbind(-3)
+        (a1, b1), (a2, b2) = self.gradient[1], self.gradient[2]
+        return a1 * (x1 - x0) + a2 * (x2 - x0), b1 * (x1 - x0) + b2 * (x2 - x0)
+
+    def force(self, p1: Tensor, p2: Tensor) -> Tensor:
+        """Forces [..., V, 3] N of the columns [..., E, 3] N/m of a first Piola stress."""
+        second, third = (-self.area * (g[0] * p1 + g[1] * p2) for g in self.gradient[1:])
+        shares = torch.cat([-(second + third), second, third], dim=-2)
+        zero = shares.new_zeros(*shares.shape[:-2], len(self.shear_bound), 3)
+        return zero.scatter_add(-2, self.corners.unsqueeze(-1).expand(shares.shape), shares)

@@ -1,0 +1,66 @@
+"""A cloth that is not the size of its pattern."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInput
+from ..parameters import PhysicalParameter
+from .base import AbstractEffect, Amplitude
+
+
+class Coefficients(NamedTuple):
+    """Of the parameters, each [..., E or 1, 1]."""
+
+    shrink_warp: Tensor
+    shrink_weft: Tensor
+    skew: Tensor
+
+
+class RestShape(AbstractEffect):
+    """The true rest shape after washing or cutting askew: threads shorter than the pattern's, at another angle.
+
+    The warp keeps its direction and 1 - shrink_warp of its length, the weft keeps 1 - shrink_weft and leans by ``skew``
+    towards the warp. The mass stays what the pattern says; the material law is measured per area of the true shape.
+    Bending keeps the pattern's lengths (an error of second order: shrinkage times bending).
+
+    Args:
+        shrink_warp: s1 < 1; negative where the cloth has grown. Each is a scalar, one value per triangle, or [B, 1].
+        shrink_weft: s2 < 1.
+        skew: [rad], within a right angle.
+
+    Raises:
+        InvalidInput: values out of range.
+    """
+
+    amplitudes = {
+        "shrink_warp": Amplitude("-", 0.02, 0.005, ("areal_density", "grip_slip.mobility", "material.orthotropy")),
+        "shrink_weft": Amplitude("-", 0.02, 0.005, ("areal_density", "grip_slip.mobility", "material.orthotropy")),
+        "skew": Amplitude("rad", 0.02, 0.005, ("material.orthotropy",)),
+    }
+
+    def __init__(
+        self, shrink_warp: float | Tensor = 0.0, shrink_weft: float | Tensor = 0.0, skew: float | Tensor = 0.0
+    ) -> None:
+        super().__init__()
+        for name, value in (("shrink_warp", shrink_warp), ("shrink_weft", shrink_weft)):
+            if not bool((torch.as_tensor(value) < 1).all()):
+                raise InvalidInput(name, got=value, expected="a share below 1 of the length")
+        if not bool((torch.as_tensor(skew).abs() < torch.pi / 2).all()):
+            raise InvalidInput("skew", got=f"{skew} rad", expected="an angle within a right angle")
+        self.shrink_warp = PhysicalParameter(shrink_warp, "-", "real", name="shrinkage along the warp")
+        self.shrink_weft = PhysicalParameter(shrink_weft, "-", "real", name="shrinkage along the weft")
+        self.skew = PhysicalParameter(skew, "rad", "real", name="skew")
+
+    def coefficients(self) -> Coefficients:
+        """The parameters as fields."""
+        return Coefficients(self.shrink_warp.field, self.shrink_weft.field, self.skew.field)
+
+    def growth(self, c: Coefficients) -> Tensor:
+        """Columns: the true warp and weft."""
+        warp, weft = 1 - c.shrink_warp, 1 - c.shrink_weft
+        rows = torch.broadcast_tensors(warp, weft * c.skew.sin(), torch.zeros_like(warp), weft * c.skew.cos())
+        return torch.cat(rows, dim=-1).unflatten(-1, (2, 2))

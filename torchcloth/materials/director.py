@@ -1,0 +1,96 @@
+"""Contact and friction across the sheet (Jiang, Gast, Teran 2017), shared by all laws of A-EP.
+
+The paper's QR decomposition is not computed: with the unit normal n, its entries are R33 = d3.n and
+|r|^2 = |d3|^2 - R33^2. The stresses below are the exact derivatives with respect to n and d3.
+"""
+
+from __future__ import annotations
+
+from abc import ABC
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .._math import dot, safe_norm
+from ..errors import InvalidInput
+from ..parameters import PhysicalParameter
+from ..types import Surface
+from .base import AbstractMaterial
+from .yielding import NormYield
+
+
+class DirectorMaterial(AbstractMaterial, ABC):
+    """A sheet with the director law of A-EP; a subclass adds the membrane.
+
+    Director energy: gamma/2 |r|^2 + k/3 (1 - R33)^3 for R33 < 1; friction |gamma r| <= c_F k (1 - R33)^2.
+
+    The subclass's coefficients carry the entries of ``_director`` by the same names.
+    """
+
+    def __init__(self, thickness: float) -> None:
+        super().__init__()
+        if not 0 < thickness < float("inf"):
+            raise InvalidInput("thickness", got=f"{thickness} m", expected="a value > 0")
+        self.thickness = float(thickness)
+        self.plastic: NormYield | None = None
+
+    def _complete(
+        self,
+        contact_stiffness: float | Tensor,
+        shear_stiffness: float | Tensor,
+        cone: float | Tensor,
+        plastic: NormYield | None,
+    ) -> None:
+        """Add the other parameters after those of the membrane: reports list them in this order."""
+        self.contact_stiffness = PhysicalParameter(contact_stiffness, "Pa", name="contact_stiffness")
+        self.shear_stiffness = PhysicalParameter(shear_stiffness, "Pa", name="shear_stiffness")
+        self.cone = PhysicalParameter(cone, "-", "nonnegative", name="cone")
+        self.plastic = plastic
+
+    def _director(self) -> dict[str, Tensor]:
+        """k h and gamma h [N/m], c_F, and the limit of elastic stretch (infinite without plasticity)."""
+        cone = self.cone.field
+        return {
+            "contact": self.contact_stiffness.field * self.thickness,
+            "shear": self.shear_stiffness.field * self.thickness,
+            "cone": cone,
+            "limit": torch.full_like(cone, float("inf")) if self.plastic is None else self.plastic.limit.field,
+        }
+
+    def director_energy(self, c: Any, n: Tensor, d3: Tensor) -> Tensor:
+        """gamma/2 |r|^2 + k/3 (1 - R33)^3 for R33 < 1."""
+        height = dot(n, d3)
+        gap = (1 - height).clamp(min=0)
+        return 0.5 * c.shear * (dot(d3, d3) - height * height) + c.contact / 3 * gap**3
+
+    def director_stress(self, c: Any, n: Tensor, d3: Tensor) -> tuple[Tensor, Tensor]:
+        """Derivatives with respect to n and d3."""
+        height = dot(n, d3)
+        gap = (1 - height).clamp(min=0)
+        slope = c.shear * height + c.contact * gap * gap
+        return -slope * d3, c.shear * d3 - slope * n
+
+    def return_map(self, c: Any, n: Tensor, d3: Tensor) -> Tensor:
+        """Separation (R33 > 1) relaxes the director to n; otherwise the shear is cut to the friction cone."""
+        height = dot(n, d3)
+        r = d3 - height * n
+        length = safe_norm(r)
+        gap = (1 - height).clamp(min=0)
+        limit = c.cone * c.contact * gap * gap
+        friction = c.shear * length
+        slips = friction > limit
+        keep = torch.where(slips, limit / torch.where(slips, friction, 1.0), 1.0)
+        return torch.where(height > 1, n, keep * r + height * n)
+
+    def start(self, triangles: int) -> Tensor | None:
+        """No plastic set yet."""
+        return None if self.plastic is None else self.plastic.start(triangles)
+
+    def flow(self, c: Any, elastic: Surface, inelastic: Tensor) -> Tensor:
+        """The plastic law's."""
+        return inelastic if self.plastic is None else self.plastic.flow(c.limit, elastic, inelastic)
+
+    def extra_repr(self) -> str:
+        """Constants of the data sheet."""
+        return f"thickness={self.thickness:g} m"

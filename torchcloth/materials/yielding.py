@@ -1,0 +1,48 @@
+"""Plastic set in the plane of the sheet."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from .._math import safe_norm
+from ..parameters import PhysicalParameter
+from ..types import Surface
+from .stretch import right_stretch
+
+
+class NormYield(nn.Module):
+    """Elastic stretches stay within sum (sigma_i - 1)^2 <= c^2; what goes beyond is a lasting set.
+
+    The DiffCP paper bounds |F - 1|, which a rigid rotation violates; this is its objective form. It acts on the right
+    stretch: the rotation is kept, the strain U - 1 is shortened to length c without turning, and the set is recorded in
+    the material's axes. Rate-independent: a strain held for longer sets no further.
+
+    Args:
+        limit: c [-], the elastic strain that does not set; 0.02 is 2 % along one axis. Scalar or one per triangle.
+
+    Raises:
+        InvalidInput: a limit that is not positive.
+    """
+
+    def __init__(self, limit: float | Tensor) -> None:
+        super().__init__()
+        self.limit = PhysicalParameter(limit, "-", name="yield limit")
+
+    def start(self, triangles: int) -> Tensor:
+        """No set: the identity, by rows [E, 4]."""
+        return torch.eye(2).flatten().expand(triangles, 4)
+
+    def flow(self, limit: Tensor, elastic: Surface, inelastic: Tensor) -> Tensor:
+        """A -> A U^-1 (1 + c (U - 1) / |U - 1|) where |U - 1| > c, U the elastic stretch; [..., E, 4] by rows."""
+        u = right_stretch(elastic)
+        strain = torch.cat([u.warp - 1, u.shear, u.shear, u.weft - 1], dim=-1)
+        length = safe_norm(strain)
+        yields = length > limit
+        keep = torch.where(yields, limit / torch.where(yields, length, 1.0), 1.0)
+        # U^-1 (1 + keep (U - 1)) = keep + (1 - keep) U^-1, with U^-1 = adj U / J
+        adjugate = torch.cat([u.weft, -u.shear, -u.shear, u.warp], dim=-1)
+        one = torch.eye(2, dtype=strain.dtype, device=strain.device).flatten()
+        change = (1 - keep) / elastic.J * adjugate + keep * one
+        set_now = (inelastic.unflatten(-1, (2, 2)) @ change.unflatten(-1, (2, 2))).flatten(-2)
+        return torch.where(yields, set_now, inelastic)

@@ -1,0 +1,87 @@
+"""The little of Wavefront OBJ that a rest mesh needs: v, vt and f."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from ..errors import InvalidInput
+
+
+def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Read vertices [V, 3], faces [F, 3] (polygons are fanned) and vt of their corners [F, 3, 2], or None without.
+
+    Args:
+        text: the file's text.
+        place: its name, for messages.
+
+    Raises:
+        InvalidInput: a damaged line, numbers that are not finite, no faces, a vertex in no face.
+    """
+    v, vt, corners = [], [], []
+    for number, line in enumerate(text.splitlines(), 1):
+        word, *items = line.split("#")[0].split() or [""]
+        try:
+            if word == "v":
+                v.append([float(x) for x in items[:3]])
+            elif word == "vt":
+                vt.append([float(x) for x in items[:2]])
+            elif word == "f":
+                ring = [_corner(item, len(v), len(vt)) for item in items]
+                corners += [(ring[0], *pair) for pair in pairwise(ring[1:])]
+        except ValueError as error:
+            raise InvalidInput(
+                f"{place} is damaged at line {number}", got=repr(line[:60]), expected="v, vt or f"
+            ) from error
+    vertices = _rows(v, f"{place}: v", 3)
+    index = _rows(corners, f"{place}: f", 3, 2).astype(np.int64)
+    faces, patches = index[..., 0], index[..., 1]
+    unused = np.setdiff1d(np.arange(len(vertices)), faces)
+    if unused.size:
+        raise InvalidInput(
+            f"{place} has a vertex in no face", got=f"vertex {unused[0] + 1}", remedy="remove loose vertices"
+        )
+    if not vt or (patches < 0).any():
+        return vertices, faces, None
+    return vertices, faces, _rows(vt, f"{place}: vt", 2)[patches]
+
+
+def dump(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None) -> str:
+    """The OBJ text of a mesh with pattern coordinates [V, 2], [F, 3, 2] or None; numbers read back exactly."""
+    rows, corner = np.zeros((0, 2)), np.asarray(faces)
+    if uv is not None and uv.ndim == 2:
+        rows = uv
+    elif uv is not None:
+        rows, corner = np.unique(uv.reshape(-1, 2), axis=0, return_inverse=True)
+        corner = corner.reshape(-1, 3)
+    lines = [f"v {' '.join(map(repr, row))}" for row in vertices.tolist()]
+    lines += [f"vt {' '.join(map(repr, row))}" for row in rows.tolist()]
+    form = "{0}" if uv is None else "{0}/{1}"
+    pairs = np.stack([faces, corner], axis=-1) + 1
+    lines += ["f " + " ".join(form.format(*pair) for pair in face) for face in pairs.tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def _corner(item: str, vertices: int, coordinates: int) -> tuple[int, int]:
+    """Zero-based vertex and vt index of "v", "v/vt" or "v/vt/vn" (-1 without vt); negative ones count from the end."""
+    first, second, *_ = [*item.split("/"), ""]
+    i = int(first) - 1 if int(first) > 0 else vertices + int(first)
+    k = -1 if not second else int(second) - 1 if int(second) > 0 else coordinates + int(second)
+    if not 0 <= i < vertices or not -1 <= k < coordinates:
+        raise ValueError(f"index out of range: {item}")
+    return i, k
+
+
+def _rows(rows: list, place: str, *shape: int) -> np.ndarray:
+    """Finite numbers [N, *shape], N > 0 unless there are none of their kind to be had."""
+    try:
+        data = np.array(rows, dtype=np.float64)
+    except (ValueError, OverflowError):
+        raise InvalidInput(f"{place} is not a rectangular array", expected=f"{shape} numbers each") from None
+    if data.shape[1:] != shape:
+        expected = f"[{', '.join(map(str, ('N', *shape)))}]"
+        raise InvalidInput(f"{place} has the wrong shape", got=list(data.shape), expected=expected)
+    if not (np.abs(data) < 1e100).all():
+        raise InvalidInput(f"{place} is not finite", expected="numbers", remedy="drop or repair that line")
+    return data

@@ -1,0 +1,62 @@
+"""Which triangles meet along which edges, in the world and on the pattern."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(edges [N, 2] with the lower vertex first, triangles at each [N]) of faces [F, 3]."""
+    return np.unique(np.sort(_sides(faces), axis=1), axis=0, return_counts=True)
+
+
+def seams(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """Edges [N, 2] whose triangles lie apart on the pattern [F, 3, 2] m: there, two panels are sewn."""
+    pairs = np.unique(_laid_sides(faces, pattern), axis=0)[:, :2]
+    once, laid = np.unique(pairs, axis=0, return_counts=True)
+    return once[laid > 1].astype(np.int64)
+
+
+def panels(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """[F] number of the panel of each triangle: those that are joined on the pattern, without crossing a seam."""
+    _, side = np.unique(_laid_sides(faces, pattern), axis=0, return_inverse=True)
+    side = side.reshape(-1, 3)
+    label = np.arange(len(faces))
+    while True:
+        lowest = np.full(side.max() + 1, len(faces))
+        np.minimum.at(lowest, side.ravel(), np.repeat(label, 3))
+        spread = lowest[side].min(1)
+        spread = spread[spread]  # a label's own label: paths are halved
+        if np.array_equal(spread, label):
+            return np.unique(label, return_inverse=True)[1]
+        label = spread
+
+
+def farthest(faces: np.ndarray, rest: np.ndarray, start: int) -> tuple[int, float]:
+    """(vertex, m): the one farthest from ``start`` along the edges of the rest shape, and how far; within its piece."""
+    ends = _sides(faces)
+    length = np.linalg.norm(rest[:, [1, 2, 0]] - rest, axis=-1).ravel()
+    distance = np.full(faces.max() + 1, np.inf)
+    distance[start] = 0.0
+    while True:
+        nearer = distance.copy()
+        for a, b in ((0, 1), (1, 0)):
+            np.minimum.at(nearer, ends[:, b], distance[ends[:, a]] + length)
+        if np.array_equal(nearer, distance):
+            break
+        distance = nearer
+    distance[np.isinf(distance)] = -1.0
+    return int(distance.argmax()), float(distance.max())
+
+
+def _sides(faces: np.ndarray) -> np.ndarray:
+    """[3 F, 2] the sides of every triangle, in its own direction."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def _laid_sides(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """[3 F, 6] lower vertex, higher vertex, and the pattern coordinates of both."""
+    sides, ends = _sides(faces), pattern[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2, 2)
+    order = np.argsort(sides, axis=1)
+    ends = np.take_along_axis(ends, order[..., None], axis=1).reshape(-1, 4)
+    return np.column_stack([np.take_along_axis(sides, order, axis=1), ends])

@@ -1,0 +1,100 @@
+"""What is known of a cloth's shape unseen: edges keep their length, it bends little, layers stay together."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..meshes import Mesh
+from .least_squares import Equations, along_axes
+
+SHARPEST = np.pi / 3  # rad; sharper edges of the placement are folds and keep no shape
+LAYER = 0.6  # mean edges; vertices of other parts nearer than this lie on each other
+GIVE = 0.005  # m, standard deviation of the distance between layers
+CURVATURE = 5.0  # 1/m, standard deviation of a cloth's curvature, averaged over an edge
+
+
+class ShapePrior:
+    """Equations in standard deviations, for vertices of ``mesh`` that lay at ``start`` [V, 3] m before."""
+
+    def __init__(self, mesh: Mesh, start: Tensor, strain: float) -> None:
+        self.strain = strain
+        self.start = start
+        edges, length = _edges(mesh)
+        self.edges, self.length = torch.as_tensor(edges), torch.as_tensor(length)
+        corners, weights, angle = _hinges(mesh, start.numpy())
+        self.corners, self.weights = torch.as_tensor(corners), torch.as_tensor(weights / angle[:, None])
+        self.pairs = torch.as_tensor(_layers(start.numpy(), edges, LAYER * mesh.mean_edge))
+
+    def stretch(self, x: Tensor) -> Tensor:
+        """[N] strain of the edges."""
+        return (x[self.edges[:, 1]] - x[self.edges[:, 0]]).norm(dim=-1) / self.length - 1
+
+    def local_rotations(self, x: Tensor) -> Tensor:
+        """[V, 3, 3] best rotations of each vertex's edges from the start (Sorkine and Alexa 2007)."""
+        i, j = torch.cat([self.edges, self.edges.flip(1)]).T
+        outer = (x[j] - x[i]).unsqueeze(-1) * (self.start[j] - self.start[i]).unsqueeze(-2)
+        U, _, Vh = torch.linalg.svd(x.new_zeros(len(x), 3, 3).index_add(0, i, outer))
+        sign = x.new_ones(len(x), 1, 3)
+        sign[:, 0, 2] = torch.linalg.det(U @ Vh)
+        return (U * sign) @ Vh
+
+    def equations(self, x: Tensor) -> list[Equations]:
+        """Linearised at ``x``; the layers' offsets turn with the vertices."""
+        i, j = self.edges.T
+        along = (x[j] - x[i]) / (self.length * (1 + self.stretch(x))).unsqueeze(-1)
+        pull = along / (self.length * self.strain).unsqueeze(-1)
+        bend = (self.weights.unsqueeze(-1) * x[self.corners]).sum(1)
+        upper, lower = self.pairs.T
+        offset = self.start[lower] - self.start[upper]
+        offset = (self.local_rotations(x)[upper] @ offset.unsqueeze(-1)).squeeze(-1)
+        return [
+            Equations(self.edges, torch.stack([-pull, pull], dim=1), -self.stretch(x) / self.strain),
+            *along_axes(self.corners, self.weights, -bend),
+            *along_axes(self.pairs, x.new_tensor([-1.0, 1.0]) / GIVE, (offset - x[lower] + x[upper]) / GIVE),
+        ]
+
+
+def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """(edges [N, 2], rest lengths [N] m)."""
+    sides = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    length = np.linalg.norm(mesh.rest[:, [1, 2, 0]] - mesh.rest, axis=-1).ravel()
+    edges, first = np.unique(sides, axis=0, return_index=True)
+    return edges, length[first]
+
+
+def _hinges(mesh: Mesh, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners a, b, c, d [N, 4] of neighbours abc and bad, weights [N, 4] 1/m of their angle, its deviation [N] rad.
+
+    The angle is how far d lies off the plane of abc, over its height above the edge ab; shapes come from ``rest``.
+    """
+    half: dict[tuple[int, int], tuple[int, float, float]] = {}
+    for face, rest in zip(mesh.faces.tolist(), mesh.rest, strict=True):
+        for k in range(3):
+            edge, rim = rest[(k + 1) % 3] - rest[k], rest[(k + 2) % 3] - rest[k]
+            length = float(np.linalg.norm(edge))
+            along, height = float(rim @ edge) / length**2, float(edge[0] * rim[1] - edge[1] * rim[0]) / length
+            half[face[k], face[(k + 1) % 3]] = (face[(k + 2) % 3], along, height)
+    corners, weights, angle = [], [], []
+    for (a, b), (c, t, h) in half.items():
+        if a < b and (b, a) in half:
+            d, s, g = half[b, a]
+            s = 1 - s
+            corners.append((a, b, c, d))
+            weights.append(((s - 1) / g + (t - 1) / h, -s / g - t / h, 1 / h, 1 / g))
+            angle.append(CURVATURE * (h + g) / 3)
+    found = np.array(corners), np.array(weights), np.array(angle)
+    size = np.linalg.norm((found[1][..., None] * x[found[0]]).sum(1), axis=-1)
+    kept = size < 2 * np.sin(SHARPEST / 2)
+    return found[0][kept], found[1][kept], found[2][kept]
+
+
+def _layers(x: np.ndarray, edges: np.ndarray, near: float) -> np.ndarray:
+    """Pairs [N, 2] of vertices that lie on each other without an edge, or a vertex, between them."""
+    distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    distance[edges[:, 0], edges[:, 1]] = distance[edges[:, 1], edges[:, 0]] = np.inf
+    nearest = distance.argmin(1)
+    i = np.flatnonzero(distance[np.arange(len(x)), nearest] < near)
+    return np.unique(np.sort(np.stack([i, nearest[i]], axis=1), axis=1), axis=0).reshape(-1, 2)

@@ -1,0 +1,54 @@
+"""Elastic strain of a sheet whose rest shape is not its pattern: grown, shrunk or plastically set."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ._math import cross
+from .model import Model
+from .types import ClothState, Memory, Moment, Surface
+
+
+def evolve(model: Model, state: ClothState, s: Surface, dt: float) -> Memory:
+    """Plastic set, internal friction and creases follow the cloth to where it is now, ``dt`` [s] later."""
+    memory = dict(state.memory)
+    if "material" in memory:
+        trial, _ = elastic(model, s, memory)
+        memory["material"] = model.material.flow(model.coefficients, trial, memory["material"])
+    for name, (effect, c) in model.effects.items():
+        own = memory.get(f"effects.{name}")
+        if own is not None:
+            memory[f"effects.{name}"] = effect.evolve(c, Moment(state.x, state.v, s, model.mass, own, dt))
+    return memory
+
+
+def elastic(model: Model, s: Surface, memory: Memory) -> tuple[Surface, Tensor | None]:
+    """(elastic deformation F A, true rest area over the pattern's or None for 1)."""
+    share = None
+    if model.rest is not None:
+        s = _seen_from(s, model.rest)
+        share = 1 / _determinant(model.rest)
+    return (_seen_from(s, memory["material"]) if "material" in memory else s), share
+
+
+def membrane_stress(model: Model, s: Surface, memory: Memory) -> tuple[Tensor, Tensor]:
+    """Columns of d(energy)/dF per area of the pattern [..., E, 3] N/m: P = P_E A^T, times the growth of the area."""
+    strained, share = elastic(model, s, memory)
+    p1, p2 = model.material.membrane_stress(model.coefficients, strained)
+    for inverse in (memory.get("material"), model.rest):
+        if inverse is not None:
+            a11, a12, a21, a22 = inverse.split(1, dim=-1)
+            p1, p2 = a11 * p1 + a12 * p2, a21 * p1 + a22 * p2
+    return (p1, p2) if share is None else (share * p1, share * p2)
+
+
+def _seen_from(s: Surface, inverse: Tensor) -> Surface:
+    """The surface seen from another rest shape: F -> F A with A [..., E or 1, 4] by rows."""
+    a11, a12, a21, a22 = inverse.split(1, dim=-1)
+    f1, f2 = a11 * s.f1 + a21 * s.f2, a12 * s.f1 + a22 * s.f2
+    return s._replace(f1=f1, f2=f2, cofactor1=cross(f2, s.n), cofactor2=cross(s.n, f1), J=_determinant(inverse) * s.J)
+
+
+def _determinant(inverse: Tensor) -> Tensor:
+    a11, a12, a21, a22 = inverse.split(1, dim=-1)
+    return a11 * a22 - a12 * a21

@@ -1,0 +1,165 @@
+"""The contract of colliders."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .._math import cross, dot
+from ..boundaries import AbstractCollider
+from . import samples
+from .boundary import BoundaryContract
+from .contract import close, demand, finite_gradients, float64
+
+
+class ColliderContract(BoundaryContract):
+    """What the layer relies on in a solid body. Override ``collider``; run it once fixed and once with ``moving``.
+
+    Attributes:
+        moving: the collider travels and turns during the trials.
+        extent: the body lies within this distance of its origin [m].
+        rounding: error of distances [m]; and
+        slant: of normals against the gradient of the distance, both 0 but for rounding where they have closed forms.
+        projections: steps along the normal that bring a point to the surface.
+    """
+
+    moving = False
+    extent = 0.2
+    rounding = 1e-12
+    slant = 1e-9
+    projections = 2  # more would gather points where two sides are equally near
+
+    @abstractmethod
+    def collider(self, **options: Any) -> AbstractCollider:
+        """The collider with Coulomb friction > 0, given these options (``moving``, ``recovery``)."""
+
+    def make(self) -> AbstractCollider:
+        """The collider of the general promises."""
+        return self.collider(moving=self.moving)
+
+    def _pose(self) -> Tensor | None:
+        return self._travel() if self.moving else None
+
+    def _body(self, **options: Any) -> AbstractCollider:
+        with float64():
+            return self.collider(**options).double()
+
+    def _at(self, height: Tensor) -> tuple[Tensor, Tensor]:
+        """(points [N, 3] about ``height`` [N, 1] m above the surface, all around, velocities [N, 3])."""
+        body = self._body()
+        p = 0.7 * self.extent * samples.normal((len(height), 3), 1)
+        for _ in range(self.projections):
+            distance, normal = (part.detach() for part in body.clearance(p))
+            p = p - (distance - height) * normal
+        return p, samples.normal(tuple(p.shape), 2)
+
+    def sample(self) -> tuple[Tensor, Tensor]:
+        """All around the surface: inside, arriving, leaving."""
+        return self._at(0.001 * samples.normal((len(self.mesh().vertices), 1), 3))
+
+    def rest(self) -> tuple[Tensor, Tensor]:
+        """Exactly on the surface, still."""
+        x, _ = self._at(torch.zeros(len(self.mesh().vertices), 1, dtype=torch.float64))
+        return x, torch.zeros_like(x)
+
+    def _lattice(self) -> Tensor:
+        """Points through and around the body, with the origin, axes and planes of symmetry."""
+        steps = self.extent * torch.tensor([-5.0, -1.5, -0.6, 0.0, 0.3, 1.0, 2.0], dtype=torch.float64)
+        return torch.cartesian_prod(steps, steps, steps)
+
+    def test_the_normal_is_the_gradient_of_the_distance(self) -> None:
+        """And has unit length; near the surface, inside and outside."""
+        body = self._body()
+        p = self._at(0.02 * self.extent * samples.normal((200, 1), 4))[0].requires_grad_()
+        distance, normal = body.clearance(p)
+        (slope,) = torch.autograd.grad(distance.sum(), p)
+        close(dot(normal, normal), torch.ones_like(distance), 1e-12, "normals are not unit vectors")
+        close(slope, normal, self.slant, "the normal is not the gradient of the distance")
+
+    def test_the_distance_leads_to_the_surface(self) -> None:
+        """Going back along the normal by the distance ends at distance 0: it is in metres."""
+        body = self._body()
+        p, _ = self._at(0.02 * self.extent * samples.normal((200, 1), 4))
+        distance, normal = body.clearance(p)
+        left = float(body.clearance(p - distance * normal)[0].detach().abs().max())
+        demand(left <= self.rounding, f"the surface is missed by {left:.2e} m")
+
+    def test_is_finite_everywhere(self) -> None:
+        """Distances, normals and derivatives at centres, axes, edges and far away."""
+        body = self._body()
+        p = self._lattice().requires_grad_()
+        distance, normal = body.clearance(p)
+        demand(torch.isfinite(distance).all() and torch.isfinite(normal).all(), "distance or normal is not finite")
+        close(dot(normal, normal), torch.ones_like(distance), 1e-12, "normals are not unit vectors everywhere")
+        leaves = {"p": p, **dict(body.named_parameters())}
+        finite_gradients(torch.cat([distance, normal], dim=-1), leaves, "on a lattice through the body")
+
+    def test_nothing_enters(self) -> None:
+        """What starts outside ends outside, but for the curvature within one substep."""
+        body = self._body()
+        x, v = self._at(0.001 * samples.normal((200, 1), 5).abs())
+        after = body.apply(x, v, self.dt, None, 0)
+        curved = float((self.dt * after.detach()).norm(dim=-1).max()) ** 2 / self.extent
+        deepest = float(body.clearance(x + self.dt * after)[0].detach().min())
+        demand(deepest >= -curved - self.rounding, f"{-deepest:.2e} m deep after a substep")
+
+    def test_what_starts_inside_is_moved_out_gently(self) -> None:
+        """At the given speed, not at depth over dt; and it does not go deeper."""
+        body = self._body(recovery=0.05)
+        x, v = self._at(torch.full((200, 1), -0.1 * self.extent, dtype=torch.float64))
+        distance, normal = (part.detach() for part in body.clearance(x))
+        still = body.apply(x, torch.zeros_like(x), self.dt, None, 0).detach()
+        speed = dot(still, normal)
+        demand((distance < 0).all(), "the trial did not start inside")
+        demand((speed > 0).all() and (still.norm(dim=-1) <= 0.05 * (1 + 1e-9)).all(), "not moved out at <= 0.05 m/s")
+        moved = dot(body.apply(x, v, self.dt, None, 0).detach(), normal)
+        demand((moved >= 0.05 * (1 - 1e-9)).all(), "what is inside goes deeper")
+
+    def test_friction_stays_in_the_cone(self) -> None:
+        """It opposes the slip, takes at most mu times the push, and exactly that from what still slips."""
+        body = self._body()
+        x, v = self._at(torch.zeros(200, 1, dtype=torch.float64))
+        after, normal = body.apply(x, v, self.dt, None, 0).detach(), body.clearance(x)[1].detach()
+        change, mu = after - v, float(body.friction.value.detach())
+        push, slip, left = dot(change, normal), v - dot(v, normal) * normal, after - dot(after, normal) * normal
+        taken = (change - push * normal).norm(dim=-1, keepdim=True)
+        demand((push > 0).any() and mu > 0, "nothing touches, or without friction")
+        demand((push >= 0).all() and (taken <= mu * push + 1e-9).all(), "outside the friction cone")
+        demand((cross(left, slip).norm(dim=-1) <= 1e-9).all() and (dot(left, slip) >= -1e-9).all(), "slip is deflected")
+        slides = left.norm(dim=-1, keepdim=True) > 1e-6
+        demand((slides & (push > 0)).any(), "nothing slides")
+        close(taken[slides], mu * push[slides], 1e-9, "sliding friction is not mu times the push")
+
+    def test_forward_mode_agrees_with_reverse_mode(self) -> None:
+        """In positions and velocities."""
+        body, (x, v) = self._body(moving=self.moving), self.sample()
+        motion, k = (self._drive(self._travel()) if self.moving else None), 1
+        weight, along = samples.normal(tuple(x.shape), 6), samples.normal((2, *x.shape), 7)
+
+        def answer(x: Tensor, v: Tensor) -> Tensor:
+            return (weight * body.apply(x, v, self.dt, motion, k)).sum()
+
+        forward = torch.func.jvp(answer, (x, v), (along[0], along[1]))[1]
+        leaves = (x.clone().requires_grad_(), v.clone().requires_grad_())
+        slopes = torch.autograd.grad(answer(*leaves), leaves)
+        reverse = sum((a * b).sum() for a, b in zip(slopes, along, strict=True))
+        close(forward, torch.as_tensor(reverse), 1e-10, "forward and reverse mode differ")
+
+    def test_moves_as_a_rigid_body(self) -> None:
+        """Seen from the travelling body, cloth meets what it meets at a body that stands still."""
+        x, v = self.sample()
+        motion, k = self._drive(self._travel()), 77
+        step, end = motion.increment[k], motion.pose[k]
+        turn, origin = end[:3, :3], end[:3, 3]
+        start = torch.linalg.inv(step) @ end
+        world = x @ start[:3, :3].mT + start[:3, 3]
+        carried = (world @ step[:3, :3].mT + step[:3, 3] - world) / self.dt
+        moving = self._body(moving=True)
+        demand(moving.driven, "a moving collider must declare driven = True")
+        got = moving.apply(world, v @ turn.mT + carried, self.dt, motion, k).detach()
+        fixed = self._body(moving=False).apply(x, v, self.dt, None, k).detach()
+        close(got, fixed @ turn.mT + carried, 1e-9, "a moving body answers differently from a fixed one")
+        demand((origin.abs() > 0.01).any(), "the body did not travel")
