@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
-from typing import cast
+from typing import Literal, cast
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from .intervals import Interval, advance
 from .materials import AbstractMaterial
 from .meshes import Mesh
 from .parameters import PhysicalParameter
+from .self_contact import first_directors
 from .stability import stable_step
 from .transfer import SKIN, TURNED, Contact, Grid, apart
 from .types import ClothState, Memory, Rollout, Trajectory
@@ -37,6 +39,9 @@ class Cloth(nn.Module):
         boundaries: grasps and colliders by name, applied in order.
         contact: discretisation of contact between layers; None leaves contact out, and with it the parameters k, gamma
             and c_F of the material.
+        transfer: "mesh": elastic forces act on the vertices, the grid carries contact only. "apic": the usual material
+            point method, everything through the grid, for comparison; one contact point per triangle, no play, no
+            collision damping, no added mass.
 
     Raises:
         InvalidInput: a part that does not fit.
@@ -58,8 +63,12 @@ class Cloth(nn.Module):
         effects: Mapping[str, AbstractEffect] | None = None,
         boundaries: Mapping[str, AbstractBoundary] | None = None,
         contact: Contact | None = Contact(),  # noqa: B008 - frozen, carries no state
+        transfer: Literal["mesh", "apic"] = "mesh",
     ) -> None:
         super().__init__()
+        self.transfer: Literal["mesh", "apic"] = transfer
+        if transfer != "mesh":
+            contact = _usual(transfer, contact)
         self.mesh, self.material = mesh, material
         for path, part in material.named_modules():
             if isinstance(part, PhysicalParameter):
@@ -116,8 +125,7 @@ class Cloth(nn.Module):
             raise InvalidInput("v", got=f"shape {tuple(v.shape)}", expected=f"x's, {tuple(x.shape)}")
         if not bool(torch.isfinite(x.detach()).all()):
             raise InvalidInput("x", got="NaN or infinite entries", expected="finite positions in metres")
-        n = functional.surface(self._geometry(), x, v).n
-        return ClothState(x, v, n.repeat_interleave(len(self._points), dim=-2), self._virgin(x))
+        return ClothState(x, v, self._directors(x), self._virgin(x))
 
     # -- simulation -----------------------------------------------------------------------------------------------
 
@@ -224,6 +232,7 @@ class Cloth(nn.Module):
             effects=effects,
             boundaries=dict(self.boundaries.items()),  # type: ignore[arg-type]
             grid=self._grid(),
+            transfer=self.transfer,
             rest=_rest(effect.growth(c) for effect, c in effects.values()),
         )
 
@@ -246,12 +255,18 @@ class Cloth(nn.Module):
     def _parts(self) -> Iterable[tuple[str, AbstractEffect]]:
         return cast("Iterable[tuple[str, AbstractEffect]]", self.effects.items())
 
+    def _directors(self, x: Tensor) -> Tensor:
+        grid = self._grid()
+        return x[..., :0, :] if grid is None else first_directors(self.model(), grid, x)
+
     def _virgin(self, x: Tensor) -> Memory:
         """Internal variables of a cloth that has never been strained."""
         own = self.material.start(len(self._area))
         found = {"material": None if own is None else own.to(x).expand(*x.shape[:-2], -1, -1)}
         if self.contact is not None:
             found["contact"] = x.new_zeros(*x.shape[:-2], len(self._area) * len(self._points), 1)
+        if self.transfer == "apic":
+            found["apic"] = x.new_zeros(*x.shape[:-2], x.shape[-2] + len(self._area), 9)
         found |= {f"effects.{name}": effect.start(x) for name, effect in self._parts()}
         return {name: value for name, value in found.items() if value is not None}
 
@@ -324,6 +339,15 @@ class Cloth(nn.Module):
             else f"spacing {self.spacing:.3g} m, {len(self._points)} point(s) per triangle"
         )
         return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s"
+
+
+def _usual(transfer: str, contact: Contact | None) -> Contact:
+    """The contact of the usual material point method on the same grid."""
+    if transfer != "apic":
+        raise InvalidInput("transfer", got=repr(transfer), expected='"mesh" or "apic"')
+    if contact is None:
+        raise InvalidInput("contact", got="None", expected='a Contact: transfer="apic" needs a grid')
+    return replace(contact, subdivisions=1, everywhere=True, play=0.0, damping=0.0)
 
 
 def _rest(growths: Iterable[Tensor | None]) -> Tensor | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -36,6 +36,7 @@ class Model(NamedTuple):
     effects: Mapping[str, tuple[AbstractEffect, Any]]
     boundaries: Mapping[str, AbstractBoundary]
     grid: Grid | None = None  # of the contact between layers; None without contact
+    transfer: Literal["mesh", "apic"] = "mesh"  # where elastic forces act: on the vertices, or through the grid
     rest: Tensor | None = None  # [..., E or 1, 4]: F_E = F A for a rest shape that differs from the pattern
 
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from ._math import cross, dot
-from .model import Model, corners
-from .transfer import Grid, Stencil, push, stencil, velocity_gradient
+from .model import Model, corners, surface
+from .transfer import FADING, RANGE, SKIN, TOUCH, Grid, Stencil, push, stencil, velocity_gradient
 from .types import ClothState, Surface
 
 
@@ -59,6 +59,26 @@ def near_layers(model: Model, grid: Grid, x: Tensor, before: Layers | None = Non
     return Layers(scene * triangles + triangle, scene, own, slots, x)
 
 
+@torch.no_grad()
+def first_directors(model: Model, grid: Grid, x: Tensor) -> Tensor:
+    """Directors [..., P, 3] of a cloth whose layers have come to where they are without being pressed.
+
+    Layers that start within each other's splines would else have to give way by the whole play from there.
+    """
+    s = surface(model.geometry, x, x)
+    centre, n = s.v.reshape(-1, *s.v.shape[-2:]), s.n.reshape(-1, *s.n.shape[-2:])
+    compression = torch.zeros_like(centre[..., :1])
+    if grid.apart is not None and grid.play > 0:
+        side = (grid.reach - (RANGE + SKIN) * grid.spacing) / 2
+        for k, (points, normals) in enumerate(zip(centre, n, strict=True)):
+            height = (points @ normals.mT - (points * normals).sum(-1)).abs()  # [E, E], of the row over the column
+            beside = (torch.cdist(points, points) ** 2 - height**2).clamp(min=0).sqrt() > side
+            distance = height.masked_fill(beside | ~grid.apart, float("inf")).amin(-1, keepdim=True)
+            compression[k] = ((TOUCH - distance / grid.spacing) / FADING).clamp(0, grid.play)
+    d3 = (1 - compression) * n
+    return d3.view(s.n.shape).repeat_interleave(grid.points.shape[0], dim=-2)
+
+
 def pressure(model: Model, grid: Grid, layers: Layers, state: ClothState, s: Surface) -> Pressure:
     """Split the director's stress into what acts on the surface columns (through n) and on d3 itself."""
     count = grid.points.shape[0]
@@ -66,7 +86,7 @@ def pressure(model: Model, grid: Grid, layers: Layers, state: ClothState, s: Sur
     d3 = state.d3.reshape(-1, count, 3).index_select(0, layers.active)
     normal = n.unsqueeze(-2)
     by_normal, by_director = model.material.director_stress(
-        _per_point(model, layers, s), normal, d3 + grid.play * normal
+        per_point(model, layers, s), normal, d3 + grid.play * normal
     )
     by_normal = by_normal + grid.play * by_director
     closing = state.memory["contact"].reshape(-1, count, 1).index_select(0, layers.active)
@@ -118,7 +138,7 @@ def follow(
     before, after = (field.unflatten(0, (-1, count)) for field in (p.d3, moved))
     old, n = (_pick(layers, field, field).unsqueeze(-2) for field in (s.n, now.n))
     height = dot(after, n)
-    mapped = model.material.return_map(_per_point(model, layers, s), n, after + grid.play * n) - grid.play * n
+    mapped = model.material.return_map(per_point(model, layers, s), n, after + grid.play * n) - grid.play * n
     mapped = torch.where(height > 1 - grid.play, height.clamp(max=1) * n, mapped)
     rate = (dot(before, old) - height) / dt
     return _put(layers, d3, mapped), _put(layers, closing, rate)
@@ -169,7 +189,7 @@ def _points(grid: Grid, layers: Layers, field: Tensor) -> Tensor:
     return torch.einsum("sc,cak->ask", grid.points, own).flatten(0, 1)
 
 
-def _per_point(model: Model, layers: Layers, s: Surface) -> Any:
+def per_point(model: Model, layers: Layers, s: Surface) -> Any:
     """The material's coefficients at the active triangles, with an axis for the contact points."""
     coefficients = model.coefficients
     return type(coefficients)(*(_pick(layers, c, s.n).unsqueeze(-2) for c in coefficients))

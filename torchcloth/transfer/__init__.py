@@ -1,7 +1,23 @@
 """Particle-grid transfer: how contact passes between layers of cloth."""
 
-from .contact import SKIN, TURNED, Contact, Grid
+from .contact import FADING, RANGE, SKIN, TOUCH, TURNED, Contact, Grid
 from .neighbours import apart
-from .reference import Stencil, push, stencil, velocity_gradient
+from .reference import Stencil, carried_momentum, lattice, push, stencil, through, velocity_gradient
 
-__all__ = ["SKIN", "TURNED", "Contact", "Grid", "Stencil", "apart", "push", "stencil", "velocity_gradient"]
+__all__ = [
+    "FADING",
+    "RANGE",
+    "SKIN",
+    "TOUCH",
+    "TURNED",
+    "Contact",
+    "Grid",
+    "Stencil",
+    "apart",
+    "carried_momentum",
+    "lattice",
+    "push",
+    "stencil",
+    "through",
+    "velocity_gradient",
+]

@@ -13,6 +13,8 @@ from ..meshes import Mesh
 
 SKIN = 2.0  # grid spacings that layers may approach each other before the search for near ones is repeated
 RANGE = 4.0  # grid spacings: the splines of points farther apart have no node of any weight in common
+TOUCH = 2.26  # grid spacings at which approaching layers begin to compress each other's directors
+FADING = 3.5  # and by how many they must approach for each unit of 1 - R33 (both measured, tests/physics/test_contact)
 GAP = 1.4  # grid spacings between layers at rest, with the default play
 SPARSEST = 1.4  # grid spacings between corners of sub-triangles: no hole between the points exceeds 0.7 spacings
 TURNED = 1.7  # layers are folded on each other where the way along the cloth is that much longer than through space

@@ -39,7 +39,7 @@ def stencil(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, slots: Te
     offset = scaled - base  # in [0.5, 1.5)
     weight, slope = _splines(offset, grid.spacing)
     node = _compact(_node_index(base.long(), scene, grid.nodes).reshape(-1), slots)
-    total = _through(node, mass * weight)
+    total = through(node, mass * weight)
     return Stencil(weight, slope, offset, node, 1.0 / torch.where(total > 0, total, 1.0))  # a weight may be exactly 0
 
 
@@ -53,7 +53,7 @@ def push(nodes: Stencil, pull: Tensor, director: Tensor, dt: float) -> Tensor:
         dt: substep [s].
     """
     force = -(nodes.slope @ director.unsqueeze(-1)) * pull.unsqueeze(-2)
-    change = dt * _through(nodes.node, force) * nodes.inverse.unsqueeze(-1)
+    change = dt * through(nodes.node, force) * nodes.inverse.unsqueeze(-1)
     return (nodes.weight.unsqueeze(-1) * change).sum(-2)
 
 
@@ -67,16 +67,25 @@ def velocity_gradient(nodes: Stencil, mass: Tensor, velocity: Tensor, affine: Te
         affine: [P, 3, 3] 1/s, velocity gradient at each point, derived from the mesh.
         spacing: grid spacing [m].
     """
-    step = torch.arange(3, dtype=velocity.dtype, device=velocity.device)
-    lattice = torch.cartesian_prod(step, step, step)
+    momentum = carried_momentum(nodes, mass, velocity, affine, spacing)
+    return (through(nodes.node, momentum) * nodes.inverse.unsqueeze(-1)).mT @ nodes.slope
+
+
+def carried_momentum(nodes: Stencil, mass: Tensor, velocity: Tensor, affine: Tensor, spacing: float) -> Tensor:
+    """What each point gives to its nodes [P, 27, 3] kg m/s: its mass times the affine velocity field around it."""
     spread = spacing * affine
     lowest = velocity - (spread @ nodes.offset.unsqueeze(-1)).squeeze(-1)  # the affine field at the lowest node
-    carried = lowest.unsqueeze(-2) + lattice @ spread.mT  # [P, 27, 3]
-    moved = _through(nodes.node, (mass * nodes.weight).unsqueeze(-1) * carried) * nodes.inverse.unsqueeze(-1)
-    return moved.mT @ nodes.slope
+    carried = lowest.unsqueeze(-2) + lattice(velocity) @ spread.mT
+    return (mass * nodes.weight).unsqueeze(-1) * carried
 
 
-def _through(node: Tensor, field: Tensor) -> Tensor:
+def lattice(like: Tensor) -> Tensor:
+    """[27, 3] grid spacings, the nodes of a stencil from its lowest one."""
+    step = torch.arange(3, dtype=like.dtype, device=like.device)
+    return torch.cartesian_prod(step, step, step)
+
+
+def through(node: Tensor, field: Tensor) -> Tensor:
     """Sum on the nodes, seen from each point again: [P, 27, ...] -> [P, 27, ...]."""
     flat = field.flatten(0, 1)
     return torch.zeros_like(flat).index_add(0, node, flat).index_select(0, node).view(field.shape)

@@ -1,0 +1,70 @@
+"""The usual scheme, kept for comparison: all forces pass through the grid (APIC; Jiang, Gast, Teran 2017).
+
+Vertices and triangles are particles; a quarter of a triangle's mass goes to each corner and to itself. The transfer
+filters velocities at every substep, so its damping depends on dt: docs/verification.md shows both schemes side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from .boundaries import Drive
+from .dynamics import Impulses, constrain, vertex_forces
+from .model import Model, corners, surface
+from .self_contact import Layers, add_columns, near_layers, per_point, pressure
+from .strain import evolve, membrane_stress
+from .transfer import carried_momentum, lattice, stencil, through
+from .types import ClothState
+
+
+def step(
+    model: Model, state: ClothState, dt: float, drives: Mapping[str, Drive], substep: int, layers: Layers | None = None
+) -> tuple[ClothState, Impulses]:
+    """Advance one substep; ``memory["apic"]`` [..., V + E, 9] 1/s is the particles' affine velocity."""
+    grid = model.grid
+    assert grid is not None  # Cloth sees to it
+    s = surface(model.geometry, state.x, state.v)
+    memory = evolve(model, state, s, dt)
+    layers = near_layers(model, grid, state.x, layers)
+    press = pressure(model, grid, layers, state, s)
+    force = vertex_forces(model, state, s, memory, add_columns(layers, membrane_stress(model, s, memory), press))
+
+    batch, vertices = state.x.shape[:-2], state.x.shape[-2]
+    x0, x1, x2 = corners(model.geometry, state.x)
+    position = torch.cat([state.x, (x0 + x1 + x2) / 3], dim=-2).reshape(-1, 3)
+    velocity = torch.cat([state.v, s.v], dim=-2).reshape(-1, 3)
+    mass = _masses(model, state, s).reshape(-1, 1)
+    each = position.shape[0] // max(1, batch.numel())
+    scene = torch.arange(batch.numel(), device=position.device).repeat_interleave(each)
+    nodes = stencil(position, mass, scene, grid, layers.slots)
+
+    affine = memory["apic"].reshape(-1, 3, 3)
+    momentum = carried_momentum(nodes, mass, velocity, affine, grid.spacing)
+    slope = nodes.slope.unflatten(0, (-1, each))[:, vertices:].flatten(0, 1)
+    director = -(slope @ press.d3.unsqueeze(-1)) * press.pull.unsqueeze(-2)
+    weight = nodes.weight.unflatten(0, (-1, each))[:, :vertices].flatten(0, 1)
+    mesh = weight.unsqueeze(-1) * force.reshape(-1, 1, 3)
+    both = torch.cat([part.unflatten(0, (batch.numel(), -1)) for part in (mesh, director)], dim=1).flatten(0, 1)
+    seen = through(nodes.node, momentum + dt * both) * nodes.inverse.unsqueeze(-1)
+
+    arm = (lattice(position) - nodes.offset.unsqueeze(-2)) * grid.spacing
+    weighted = nodes.weight.unsqueeze(-1) * seen
+    memory["apic"] = (4 / grid.spacing**2 * weighted.mT @ arm).view(*batch, each, 9)
+    free = weighted.sum(-2).view(*batch, each, 3)[..., :vertices, :]
+    v, impulses = constrain(model, state.x, free, dt, drives, substep, None)
+    x = state.x + dt * v
+
+    gradient = (seen.mT @ nodes.slope).unflatten(0, (-1, each))[:, vertices:].flatten(0, 1)
+    moved = press.d3 + dt * (gradient @ press.d3.unsqueeze(-1)).squeeze(-1)
+    n = surface(model.geometry, x, v).n.reshape(-1, 1, 3)
+    mapped = model.material.return_map(per_point(model, layers, s), n, moved.unsqueeze(-2))
+    return ClothState(x, v, mapped.view(state.d3.shape), memory), impulses
+
+
+def _masses(model: Model, state: ClothState, s) -> Tensor:
+    """[..., V + E, 1] kg."""
+    triangle = (model.areal_density * s.area / 4).expand(*s.n.shape[:-1], 1)
+    return torch.cat([(0.75 * model.mass).expand(*state.x.shape[:-1], 1), triangle], dim=-2)

@@ -1,0 +1,101 @@
+"""What acts on the vertices: forces, the air that moves along, and the boundaries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from ._math import cross
+from .boundaries import Drive
+from .model import Model, assemble
+from .types import ClothState, Memory, Moment, Surface
+
+Impulses = dict[str, Tensor]  # name of a driven boundary -> [..., 6] N s, N m s: what it gave the cloth
+
+
+def vertex_forces(
+    model: Model, state: ClothState, s: Surface, memory: Memory, columns: tuple[Tensor, Tensor]
+) -> Tensor:
+    """Internal forces and effects, assembled on the vertices [..., V, 3] N."""
+    g = model.geometry
+    p1, p2 = columns
+    second = -g.area * (g.warp[0] * p1 + g.weft[0] * p2)
+    third = -g.area * (g.warp[1] * p1 + g.weft[1] * p2)
+    first = -(second + third)
+    direct = None
+    for name, (effect, c) in model.effects.items():
+        force = effect.force(c, Moment(state.x, state.v, s, model.mass, memory.get(f"effects.{name}")))
+        if force is None:
+            continue
+        if effect.acts_on == "triangles":
+            part = force / 3
+            first, second, third = first + part, second + part, third + part
+        else:
+            direct = force if direct is None else direct + force
+    total = assemble(g, (first, second, third), state.x)
+    return total if direct is None else total + direct
+
+
+def resistance_of(model: Model, s: Surface, x: Tensor) -> Tensor | None:
+    """Mass that moves along with the normal only, relative to the vertices' own [..., V, 3, 3]; None without any."""
+    found = [effect.inertia(c, s) for effect, c in model.effects.values()]
+    triangles = [m for m in found if m is not None]
+    if not triangles:
+        return None
+    share = (sum(triangles) / 3 * s.n).unsqueeze(-1) * s.n.unsqueeze(-2)
+    flat = share.flatten(-2)
+    total = assemble(model.geometry, (flat, flat, flat), x[..., :1].expand(*x.shape[:-1], 9))
+    return (total / model.mass).unflatten(-1, (3, 3))
+
+
+def resisted(resistance: Tensor | None, change: Tensor) -> Tensor:
+    """(1 + B)^-1 y, written so that B = 0 changes nothing, bitwise."""
+    if resistance is None:
+        return change
+    excess = (resistance @ change.unsqueeze(-1)).squeeze(-1)
+    return change - torch.linalg.solve(torch.eye(3).to(change) + resistance, excess)
+
+
+def _loaded(resistance: Tensor | None, change: Tensor) -> Tensor:
+    """(1 + B) y: what a gripper gives the cloth and the air that moves along."""
+    return change if resistance is None else change + (resistance @ change.unsqueeze(-1)).squeeze(-1)
+
+
+def constrain(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    dt: float,
+    drives: Mapping[str, Drive],
+    substep: int,
+    resistance: Tensor | None,
+) -> tuple[Tensor, Impulses]:
+    """Velocities that obey the boundaries, and what each driven one gave: impulse and its moment about the body."""
+    impulses: Impulses = {}
+    for name, boundary in model.boundaries.items():
+        drive = drives.get(name)
+        after = boundary.apply(x, v, dt, drive, substep)
+        if drive is not None:
+            after = _slipped(model, name, v, after, dt)
+            momentum = model.mass * _loaded(resistance, after - v)
+            arm = x - _origin(drive, substep)
+            impulses[name] = torch.cat([momentum.sum(-2), cross(arm, momentum).sum(-2)], dim=-1)
+        v = after
+    return v, impulses
+
+
+def _origin(drive: Drive, substep: int) -> Tensor:
+    """Where the body's origin is at the start of the substep [..., 1, 3] m; with x there, angular momentum balances."""
+    step, end = drive.increment[..., substep, :, :], drive.pose[..., substep, None, :3, 3]
+    return (end - step[..., None, :3, 3]) @ step[..., :3, :3]
+
+
+def _slipped(model: Model, grasp: str, free: Tensor, held: Tensor, dt: float) -> Tensor:
+    for effect, c in model.effects.values():
+        if effect.grasp == grasp:
+            index = cast("Tensor", model.boundaries[grasp].index)
+            held = effect.loosen(c, index, free, held, model.mass, dt)
+    return held
