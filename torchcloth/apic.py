@@ -30,12 +30,16 @@ def step(
     memory = evolve(model, state, s, dt)
     layers = near_layers(model, grid, state.x, layers)
     press = pressure(model, grid, layers, state, s)
-    force = vertex_forces(model, state, s, memory, add_columns(layers, membrane_stress(model, s, memory), press))
+    columns = add_columns(layers, membrane_stress(model, s, memory), press)
+    nothing = (torch.zeros_like(columns[0]), torch.zeros_like(columns[1]))
+    outer = vertex_forces(model, state, s, memory, nothing)  # weight, air: triangles get their share of it as well
+    force = vertex_forces(model, state, s, memory, columns) - outer
+    v = state.v + dt * outer / model.mass
 
     batch, vertices = state.x.shape[:-2], state.x.shape[-2]
     x0, x1, x2 = corners(model.geometry, state.x)
     position = torch.cat([state.x, (x0 + x1 + x2) / 3], dim=-2).reshape(-1, 3)
-    velocity = torch.cat([state.v, s.v], dim=-2).reshape(-1, 3)
+    velocity = torch.cat([v, sum(corners(model.geometry, v)) / 3], dim=-2).reshape(-1, 3)
     mass = _masses(model, state, s).reshape(-1, 1)
     each = position.shape[0] // max(1, batch.numel())
     scene = torch.arange(batch.numel(), device=position.device).repeat_interleave(each)

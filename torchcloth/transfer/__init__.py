@@ -1,11 +1,12 @@
 """Particle-grid transfer: how contact passes between layers of cloth."""
 
-from .contact import FADING, RANGE, SKIN, TOUCH, TURNED, Contact, Grid
+from .contact import FADING, GAP, RANGE, SKIN, TOUCH, TURNED, Contact, Grid
 from .neighbours import apart
 from .reference import Stencil, carried_momentum, lattice, push, stencil, through, velocity_gradient
 
 __all__ = [
     "FADING",
+    "GAP",
     "RANGE",
     "SKIN",
     "TOUCH",
