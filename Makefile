@@ -3,6 +3,7 @@
 
 PYTHON ?= python3
 PYTEST_ARGS ?=
+VERIFY_ARGS ?=
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check --no-input
@@ -14,7 +15,7 @@ OPEN3D_PACKAGES := libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0 libgo
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow example lint format types clean clean-all
+.PHONY: help demo test test-slow verify example lint format types clean clean-all
 
 help:  ## this list
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -27,6 +28,9 @@ test: .venv/.open3d-works lint types  ## install everything for development, the
 
 test-slow: .venv/.open3d-works  ## the tests that take minutes
 	$(PYTEST) -m "slow and not gpu" $(PYTEST_ARGS)
+
+verify: .venv/.installed-dev  ## physics against closed forms and symmetry, writes docs/verification.md (VERIFY_ARGS=--help)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/verification/run.py $(VERIFY_ARGS)
 
 example: .venv/.open3d-works  ## make the shipped example again (MuJoCo simulates it, minutes)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/independent/make_example.py --out torchcloth/examples/bimanual_swing --overwrite

@@ -20,10 +20,19 @@ def run(block: str) -> dict:
 
 
 def test_the_layer():
-    (block,) = (b for b in BLOCKS if "tc.Cloth(" in b)
+    (block,) = (b for b in BLOCKS if "arm.motion" in b)
     q = run(block)["q"]
     assert torch.isfinite(q.grad).all()
     assert float(q.grad.abs().max()) > 0
+
+
+def test_a_shirt_is_lifted():
+    (block,) = (b for b in BLOCKS if "tc.meshes.shirt" in b)
+    scope = run(block)
+    frames, held = scope["frames"], scope["mesh"].places["left shoulder"]
+    assert torch.isfinite(frames).all()
+    torch.testing.assert_close(frames[-1, held, 2] - frames[0, held, 2], torch.full((len(held),), 0.04))
+    assert float(frames[..., 2].min()) > -0.0061
 
 
 def test_the_own_recording_can_be_identified(tmp_path, monkeypatch, capsys):

@@ -17,7 +17,7 @@ from .model import Model, corners, surface
 from .self_contact import Layers, add_columns, near_layers, per_point, pressure
 from .strain import evolve, membrane_stress
 from .transfer import carried_momentum, lattice, stencil, through
-from .types import ClothState
+from .types import ClothState, Surface
 
 
 def step(
@@ -39,7 +39,7 @@ def step(
     batch, vertices = state.x.shape[:-2], state.x.shape[-2]
     x0, x1, x2 = corners(model.geometry, state.x)
     position = torch.cat([state.x, (x0 + x1 + x2) / 3], dim=-2).reshape(-1, 3)
-    velocity = torch.cat([v, sum(corners(model.geometry, v)) / 3], dim=-2).reshape(-1, 3)
+    velocity = torch.cat([v, torch.stack(corners(model.geometry, v)).mean(0)], dim=-2).reshape(-1, 3)
     mass = _masses(model, state, s).reshape(-1, 1)
     each = position.shape[0] // max(1, batch.numel())
     scene = torch.arange(batch.numel(), device=position.device).repeat_interleave(each)
@@ -68,7 +68,7 @@ def step(
     return ClothState(x, v, mapped.view(state.d3.shape), memory), impulses
 
 
-def _masses(model: Model, state: ClothState, s) -> Tensor:
+def _masses(model: Model, state: ClothState, s: Surface) -> Tensor:
     """[..., V + E, 1] kg."""
     triangle = (model.areal_density * s.area / 4).expand(*s.n.shape[:-1], 1)
     return torch.cat([(0.75 * model.mass).expand(*state.x.shape[:-1], 1), triangle], dim=-2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import Literal, cast
 
@@ -12,20 +11,30 @@ import torch
 from torch import Tensor, nn
 
 from . import functional
-from .boundaries import AbstractBoundary, Grasp
-from .boundaries.motion import check as check_motion
+from .boundaries import AbstractBoundary
 from .boundaries.motion import drive, interpolate
 from .effects import AbstractEffect, MassDamping
-from .errors import InvalidInput, UnstableStep
+from .errors import InvalidInput
 from .intervals import Interval, advance
 from .materials import AbstractMaterial
 from .meshes import Mesh
 from .parameters import PhysicalParameter
 from .self_contact import first_directors
 from .stability import stable_step
-from .transfer import SKIN, TURNED, Contact, Grid, apart
+from .strain import grown_gradient, inverse_growth
+from .transfer import Contact, Grid
 from .types import ClothState, Memory, Rollout, Trajectory
-from .validation import check_extent, check_field, check_state, check_times, expand_state
+from .validation import (
+    check_extent,
+    check_field,
+    check_grasps,
+    check_motions,
+    check_state,
+    check_step,
+    check_times,
+    check_transfer,
+    expand_state,
+)
 
 
 class Cloth(nn.Module):
@@ -53,7 +62,7 @@ class Cloth(nn.Module):
     _share: Tensor
     _points: Tensor
     _vertices: Tensor
-    _apart: Tensor
+    _apart: Tensor | None
 
     def __init__(
         self,
@@ -68,7 +77,7 @@ class Cloth(nn.Module):
         super().__init__()
         self.transfer: Literal["mesh", "apic"] = transfer
         if transfer != "mesh":
-            contact = _usual(transfer, contact)
+            contact = check_transfer(transfer, contact).usual()
         self.mesh, self.material = mesh, material
         for path, part in material.named_modules():
             if isinstance(part, PhysicalParameter):
@@ -77,21 +86,11 @@ class Cloth(nn.Module):
         check_field("areal_density", self.areal_density.raw, len(mesh.faces))
         self.effects = nn.ModuleDict({name: part.bind(mesh) for name, part in (effects or {}).items()})
         self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in (boundaries or {}).items()})
-        self._check_grasps()
-        self.contact = contact
-        self.spacing, points = (1.0, np.zeros((0, 3))) if contact is None else contact.resolve(mesh)
-        self.nodes = _grid_size(mesh, self.spacing) if contact is not None else 0
-        self._store_geometry(points)
-        self._store_neighbours()
+        check_grasps(dict(self._parts()), self.boundaries)
+        self.contact, self._grid = contact, None if contact is None else contact.grid(mesh)
+        self._store_geometry()
 
-    def _store_neighbours(self) -> None:
-        """Fixed by mesh and contact grid: which triangles cannot touch because they are neighbours."""
-        self.reach = 0.0 if self.contact is None else self.contact.reach(self.mesh)
-        search = self.contact is not None and not self.contact.everywhere
-        far = apart(self.mesh, TURNED * self.reach) if search else np.zeros((0, 0), dtype=bool)
-        self.register_buffer("_apart", torch.as_tensor(far), persistent=False)
-
-    def _store_geometry(self, points: np.ndarray) -> None:
+    def _store_geometry(self) -> None:
         gradient, area = self.mesh.shape_gradient, self.mesh.area
         dtype = torch.get_default_dtype()
         share = np.zeros(len(self.mesh.vertices))
@@ -101,8 +100,9 @@ class Cloth(nn.Module):
             "_gradient": torch.as_tensor(gradient, dtype=dtype),
             "_area": torch.as_tensor(area, dtype=dtype).unsqueeze(-1),
             "_share": torch.as_tensor(share, dtype=dtype).unsqueeze(-1),
-            "_points": torch.as_tensor(points, dtype=dtype),
             "_vertices": torch.as_tensor(self.mesh.vertices, dtype=dtype),
+            "_points": torch.zeros(0, 3, dtype=dtype) if self._grid is None else self._grid.points,
+            "_apart": None if self._grid is None else self._grid.apart,
         }
         for name, tensor in arrays.items():
             self.register_buffer(name, tensor, persistent=False)
@@ -153,9 +153,9 @@ class Cloth(nn.Module):
             SimulationDiverged: the state lost finiteness.
         """
         frames = check_times(times)
-        motion = self._check_motion(dict(motion or {}), frames)
+        motion = check_motions(motion or {}, self.boundaries, frames, self._area)
         model = self.model()
-        limit = self._choose_step(dt)
+        limit = check_step(dt, self.stable_step())
         state = self._start(state, model, motion)
         states, wrenches = [state], []
         for start, end in pairwise(frames):
@@ -193,11 +193,12 @@ class Cloth(nn.Module):
             closed = drive(trajectory, torch.tensor([start, start], dtype=trajectory.pose.dtype)).closed[0]
             pose = pose.expand(*pose.shape[:-3], 2, 4, 4)
             held[name] = Trajectory(torch.tensor(frames, dtype=torch.float64), pose, torch.tensor([closed, closed]))
-        held = self._check_motion(held, frames)
+        held = check_motions(held, self.boundaries, frames, self._area)
         damping = MassDamping(rate).to(self._area)
         model = self.model()
         state = self._start(state, model, held)
-        model = model._replace(effects={**model.effects, "settling": (damping, damping.coefficients().detach())})
+        kept = {name: part for name, part in model.effects.items() if part[0].grasp is None}  # grips do not slip yet
+        model = model._replace(effects={**kept, "settling": (damping, damping.coefficients().detach())})
         count = int(np.ceil(duration * (1 / self.stable_step() + rate)))
         settled, _ = advance(Interval(model, held, start, start + duration, count), state, checkpoint=True)
         self._check_extent(settled.x)
@@ -208,11 +209,11 @@ class Cloth(nn.Module):
         with torch.no_grad():
             c = self.material.coefficients()
             density = self.areal_density.field
-            spacing = self.spacing if self.contact is not None else None
+            spacing = None if self._grid is None else self._grid.spacing
             model = self.model()
             extra = [effect.rates(k, model.mass) for effect, k in model.effects.values()]
             elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
-            gradient = self._gradient if model.rest is None else _grown(self._gradient, model.rest)
+            gradient = self._gradient if model.rest is None else grown_gradient(self._gradient, model.rest)
             return stable_step(gradient, density, self.material.stiffness(c), spacing, elastic, damping)
 
     def model(self) -> functional.Model:
@@ -231,9 +232,9 @@ class Cloth(nn.Module):
             coefficients=self.material.coefficients(),
             effects=effects,
             boundaries=dict(self.boundaries.items()),  # type: ignore[arg-type]
-            grid=self._grid(),
+            grid=self.grid(),
             transfer=self.transfer,
-            rest=_rest(effect.growth(c) for effect, c in effects.values()),
+            rest=inverse_growth(effect.growth(c) for effect, c in effects.values()),
         )
 
     def energy(self, state: ClothState) -> dict[str, Tensor]:
@@ -242,21 +243,11 @@ class Cloth(nn.Module):
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
-    def _check_grasps(self) -> None:
-        grasps = [name for name, boundary in self.boundaries.items() if isinstance(boundary, Grasp)]
-        for name, effect in self._parts():
-            if effect.grasp is not None and effect.grasp not in grasps:
-                raise InvalidInput(
-                    f"grasp of effect {name!r}",
-                    got=repr(effect.grasp),
-                    expected=f"a Grasp among the boundaries {grasps}",
-                )
-
     def _parts(self) -> Iterable[tuple[str, AbstractEffect]]:
         return cast("Iterable[tuple[str, AbstractEffect]]", self.effects.items())
 
     def _directors(self, x: Tensor) -> Tensor:
-        grid = self._grid()
+        grid = self.grid()
         return x[..., :0, :] if grid is None else first_directors(self.model(), grid, x)
 
     def _virgin(self, x: Tensor) -> Memory:
@@ -279,12 +270,9 @@ class Cloth(nn.Module):
             area=self._area,
         )
 
-    def _grid(self) -> Grid | None:
-        if self.contact is None:
-            return None
-        far = None if self.contact.everywhere else self._apart
-        play, damping = self.contact.play, self.contact.damping
-        return Grid(self._points, self.spacing, self.nodes, SKIN * self.spacing, self.reach, play, damping, far)
+    def grid(self) -> Grid | None:
+        """The contact grid; None without contact."""
+        return None if self._grid is None else self._grid._replace(points=self._points, apart=self._apart)
 
     def _vertex_mass(self, density: Tensor) -> Tensor:
         if density.ndim == 0:
@@ -293,33 +281,6 @@ class Cloth(nn.Module):
         corners = torch.cat([triangle] * 3, dim=-2)
         return triangle.new_zeros(*triangle.shape[:-2], *self._share.shape).index_add(-2, self._corners, corners)
 
-    def _choose_step(self, dt: float | None) -> float:
-        limit = self.stable_step()
-        if dt is None:
-            return limit
-        if not dt > 0:
-            raise InvalidInput("dt", got=f"{dt:g} s", expected="a step > 0")
-        if dt > limit * (1 + 1e-9):
-            raise UnstableStep(
-                "dt",
-                got=f"{dt:.4g} s",
-                expected=f"at most {limit:.4g} s for these parameters and this mesh",
-                remedy="lower dt, or leave it out",
-            )
-        return float(dt)
-
-    def _check_motion(self, motion: dict[str, Trajectory], frames: list[float]) -> dict[str, Trajectory]:
-        driven = {name for name, boundary in self.boundaries.items() if boundary.driven}
-        if set(motion) != driven:
-            raise InvalidInput(
-                "motion", got=f"trajectories for {sorted(motion)}", expected=f"one for each of {sorted(driven)}"
-            )
-        out = {}
-        for name, trajectory in motion.items():
-            check_motion(trajectory, name, frames[0], frames[-1])
-            out[name] = Trajectory(trajectory.t, trajectory.pose.to(self._area), trajectory.closed)
-        return out
-
     def _start(self, state: ClothState, model: functional.Model, motion: Mapping[str, Trajectory]) -> ClothState:
         check_state(state, self.rest_state())
         state = expand_state(state, model, motion)
@@ -327,48 +288,18 @@ class Cloth(nn.Module):
         return state
 
     def _check_extent(self, x: Tensor) -> None:
-        if self.contact is not None:
-            check_extent(x, (self.nodes - 4) * self.spacing)
+        if self._grid is not None:
+            check_extent(x, (self._grid.nodes - 4) * self._grid.spacing)
 
     def extra_repr(self) -> str:
         """Data sheet: size, contact, step."""
         size = f"{len(self.mesh.vertices)} vertices, {len(self.mesh.faces)} triangles, {self.mesh.area.sum():.4g} m^2"
         grid = (
             "none"
-            if self.contact is None
-            else f"spacing {self.spacing:.3g} m, {len(self._points)} point(s) per triangle"
+            if self._grid is None
+            else f"spacing {self._grid.spacing:.3g} m, {len(self._points)} point(s) per triangle"
         )
         return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s"
-
-
-def _usual(transfer: str, contact: Contact | None) -> Contact:
-    """The contact of the usual material point method on the same grid."""
-    if transfer != "apic":
-        raise InvalidInput("transfer", got=repr(transfer), expected='"mesh" or "apic"')
-    if contact is None:
-        raise InvalidInput("contact", got="None", expected='a Contact: transfer="apic" needs a grid')
-    return replace(contact, subdivisions=1, everywhere=True, play=0.0, damping=0.0)
-
-
-def _rest(growths: Iterable[Tensor | None]) -> Tensor | None:
-    """Inverse of the composed growths [..., E or 1, 4] by rows."""
-    total = None
-    for growth in growths:
-        if growth is not None:
-            total = growth if total is None else total @ growth
-    return None if total is None else torch.linalg.inv(total).flatten(-2)
-
-
-def _grown(gradient: Tensor, rest: Tensor) -> Tensor:
-    """Gradients of the shape functions in the true rest shape, weighted so that their squares are per pattern area."""
-    inverse = rest.unflatten(-1, (2, 2))
-    return gradient @ inverse * inverse.det().rsqrt()[..., None, None]
-
-
-def _grid_size(mesh: Mesh, spacing: float) -> int:
-    """Nodes before the grid wraps: 1.6 times the cloth's longest extent, so layers never alias."""
-    longest = max(float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), mesh.extent)
-    return int(np.ceil(1.6 * longest / spacing)) + 6
 
 
 def _collect(frames: list[float], states: list[ClothState], wrenches: list[dict[str, Tensor]], names: list[str]):

@@ -42,7 +42,7 @@ def step(
     force = vertex_forces(model, state, s, memory, columns)
     free = state.v + dt * resisted(resistance, force / model.mass)
     if grid is not None and layers is not None and press is not None:
-        free = free + resisted(resistance, repulsion(model, grid, layers, press, free, dt))
+        free = free + resisted(resistance, repulsion(model, grid, layers, press, state.x, dt))
     v, impulses = constrain(model, state.x, free, dt, drives, substep, resistance)
 
     x, d3 = state.x + dt * v, state.d3

@@ -109,12 +109,24 @@ def add_columns(layers: Layers, columns: tuple[Tensor, Tensor], p: Pressure) -> 
     return first, second
 
 
-def repulsion(model: Model, grid: Grid, layers: Layers, p: Pressure, like: Tensor, dt: float) -> Tensor:
-    """Change of the vertices' velocities [..., V, 3] m/s by contact; momentum is conserved to rounding."""
-    momentum = (p.mass * push(p.nodes, p.pull, p.d3, dt)).unflatten(0, (-1, grid.points.shape[0]))
-    shares = torch.cat([(grid.points[:, corner, None] * momentum).sum(-2) for corner in range(3)])
-    total = torch.zeros_like(like).reshape(-1, 3).index_add(0, layers.vertices.flatten(), shares)
-    return total.view(like.shape) / model.mass
+def repulsion(model: Model, grid: Grid, layers: Layers, p: Pressure, x: Tensor, dt: float) -> Tensor:
+    """Change of the vertices' velocities [..., V, 3] m/s by contact; momentum and its moment are kept to rounding."""
+    count = grid.points.shape[0]
+    change, spin = push(p.nodes, p.pull, p.d3, grid.spacing, dt)
+    momentum, moment = ((p.mass * field).unflatten(0, (-1, count)) for field in (change, spin))
+    own = _corners(layers, x)
+    shares = torch.stack([(grid.points[:, corner, None] * momentum).sum(-2) for corner in range(3)])
+    shares = shares + _couple(own, moment.sum(-2))
+    total = torch.zeros_like(x).reshape(-1, 3).index_add(0, layers.vertices.flatten(), shares.flatten(0, 1))
+    return total.view(x.shape) / model.mass
+
+
+def _couple(corners: Tensor, moment: Tensor) -> Tensor:
+    """Impulses [3, A, 3] N s at the corners of triangles that sum to nothing and turn with ``moment`` [A, 3] N m s."""
+    arm = corners - corners.mean(0)
+    square = (arm * arm).sum((0, -1))[:, None, None]
+    inertia = square * torch.eye(3).to(arm) - (arm.unsqueeze(-1) * arm.unsqueeze(-2)).sum(0)
+    return cross(torch.linalg.solve(inertia, moment).expand_as(arm), arm)
 
 
 def follow(
@@ -185,8 +197,12 @@ def _each(rows: Tensor, count: int) -> Tensor:
 
 def _points(grid: Grid, layers: Layers, field: Tensor) -> Tensor:
     """Values [A S, 3] at the contact points of the active triangles."""
-    own = field.reshape(-1, 3).index_select(0, layers.vertices.flatten()).unflatten(0, (3, -1))
-    return torch.einsum("sc,cak->ask", grid.points, own).flatten(0, 1)
+    return torch.einsum("sc,cak->ask", grid.points, _corners(layers, field)).flatten(0, 1)
+
+
+def _corners(layers: Layers, field: Tensor) -> Tensor:
+    """Values [3, A, 3] at the corners of the active triangles."""
+    return field.reshape(-1, 3).index_select(0, layers.vertices.flatten()).unflatten(0, (3, -1))
 
 
 def per_point(model: Model, layers: Layers, s: Surface) -> Any:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+import torch
 from torch import Tensor
 
 from ._math import cross
@@ -40,6 +43,21 @@ def membrane_stress(model: Model, s: Surface, memory: Memory) -> tuple[Tensor, T
             a11, a12, a21, a22 = inverse.split(1, dim=-1)
             p1, p2 = a11 * p1 + a12 * p2, a21 * p1 + a22 * p2
     return (p1, p2) if share is None else (share * p1, share * p2)
+
+
+def inverse_growth(growths: Iterable[Tensor | None]) -> Tensor | None:
+    """A = (G1 G2 ...)^-1 [..., E or 1, 4] by rows, of growths [..., E or 1, 2, 2]; None without any."""
+    total = None
+    for growth in growths:
+        if growth is not None:
+            total = growth if total is None else total @ growth
+    return None if total is None else torch.linalg.inv(total).flatten(-2)
+
+
+def grown_gradient(gradient: Tensor, rest: Tensor) -> Tensor:
+    """Gradients of the shape functions in the true rest shape, weighted so that their squares are per pattern area."""
+    inverse = rest.unflatten(-1, (2, 2))
+    return gradient @ inverse * inverse.det().rsqrt()[..., None, None]
 
 
 def _seen_from(s: Surface, inverse: Tensor) -> Surface:

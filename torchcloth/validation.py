@@ -6,10 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from .errors import InvalidInput, SimulationDiverged
+from .boundaries import Grasp
+from .boundaries.motion import check as check_motion
+from .effects import AbstractEffect
+from .errors import InvalidInput, SimulationDiverged, UnstableStep
 from .model import Model
+from .transfer import Contact
 from .types import ClothState, Trajectory
 
 
@@ -28,6 +32,57 @@ def check_times(times: Tensor | Sequence[float]) -> list[float]:
         got = f"shape {tuple(flat.shape)}, first {frames[:3]}"
         raise InvalidInput("times", got=got, expected="at least two, increasing, finite seconds")
     return frames
+
+
+def check_step(dt: float | None, limit: float) -> float:
+    """The substep to use [s]: the limit, or the user's if it is no larger."""
+    if dt is None:
+        return limit
+    if not dt > 0:
+        raise InvalidInput("dt", got=f"{dt:g} s", expected="a step > 0")
+    if dt > limit * (1 + 1e-9):
+        raise UnstableStep(
+            "dt",
+            got=f"{dt:.4g} s",
+            expected=f"at most {limit:.4g} s for these parameters and this mesh",
+            remedy="lower dt, or leave it out",
+        )
+    return float(dt)
+
+
+def check_transfer(transfer: str, contact: Contact | None) -> Contact:
+    """Refuse unknown schemes, and the material point method without its grid."""
+    if transfer != "apic":
+        raise InvalidInput("transfer", got=repr(transfer), expected='"mesh" or "apic"')
+    if contact is None:
+        raise InvalidInput("contact", got="None", expected='a Contact: transfer="apic" needs a grid')
+    return contact
+
+
+def check_grasps(effects: Mapping[str, AbstractEffect], boundaries: nn.ModuleDict) -> None:
+    """An effect on a grip needs that grip."""
+    grasps = [name for name, boundary in boundaries.items() if isinstance(boundary, Grasp)]
+    for name, effect in effects.items():
+        if effect.grasp is not None and effect.grasp not in grasps:
+            raise InvalidInput(
+                f"grasp of effect {name!r}",
+                got=repr(effect.grasp),
+                expected=f"a Grasp among the boundaries {grasps}",
+            )
+
+
+def check_motions(
+    motion: Mapping[str, Trajectory], boundaries: nn.ModuleDict, frames: list[float], like: Tensor
+) -> dict[str, Trajectory]:
+    """One usable trajectory for every driven boundary, in the precision and on the device of ``like``."""
+    driven = {name for name, boundary in boundaries.items() if boundary.driven}
+    if set(motion) != driven:
+        raise InvalidInput(
+            "motion", got=f"trajectories for {sorted(motion)}", expected=f"one for each of {sorted(driven)}"
+        )
+    for name, trajectory in motion.items():
+        check_motion(trajectory, name, frames[0], frames[-1])
+    return {name: Trajectory(m.t, m.pose.to(like), m.closed) for name, m in motion.items()}
 
 
 def check_state(state: ClothState, like: ClothState) -> None:

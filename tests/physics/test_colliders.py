@@ -1,18 +1,16 @@
 """Solid bodies against closed forms, conservation and each other."""
 
 import math
-import sys
 
-import numpy as np
 import pytest
 import torch
+from colliding import G, about_z, block, lowered, path, sheet, slide
 from torch.func import functional_call
 
 import torchcloth as tc
 from torchcloth.boundaries import (
     Box,
     Capsule,
-    Coulomb,
     Cylinder,
     Elliptic,
     MeshSolid,
@@ -20,47 +18,7 @@ from torchcloth.boundaries import (
     Sphere,
     Stribeck,
 )
-from torchcloth.boundaries.points import TrianglePoints
-from torchcloth.errors import InvalidInput, MissingDependency
 from torchcloth.testing import check_gradients
-
-G = 9.81
-
-
-def sheet(boundaries, gravity=(0.0, 0.0, -G), size=0.1, n=4, effects=None, E=1e5, density=0.15, shape=None):
-    mesh = tc.meshes.rectangle(*(shape or (size, size)), resolution=n if isinstance(n, tuple) else (n, n))
-    forces = {"gravity": tc.effects.Gravity(gravity)} if gravity is not None else {}
-    return tc.Cloth(mesh, tc.materials.AEP(E, 0.05), density, forces | (effects or {}), boundaries, contact=None)
-
-
-def path(t, position, rotation=None):
-    """A trajectory from positions [K, 3] and rotations [K, 3, 3]."""
-    t = torch.as_tensor(t)
-    pose = torch.eye(4).repeat(len(t), 1, 1)
-    pose[:, :3, 3] = torch.as_tensor(position)
-    if rotation is not None:
-        pose[:, :3, :3] = rotation
-    return tc.Trajectory(t, pose, torch.ones(len(t), dtype=bool))
-
-
-def about_z(angle):
-    c, s, o = torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)
-    return torch.stack([c, -s, o, s, c, o, o, o, o + 1], -1).reshape(-1, 3, 3)
-
-
-def block(size, centre):
-    """A box as a triangle mesh."""
-    corners = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)])
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
-    faces += [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
-    return corners * np.array(size) + np.array(centre), np.array(faces)
-
-
-def lowered(z):
-    pose = torch.eye(4)
-    pose[2, 3] = z
-    return pose
-
 
 GROUND = {  # bodies whose highest place is flat, or nearly, at z = 0
     "plane": lambda **o: Plane(**o),
@@ -72,18 +30,6 @@ GROUND = {  # bodies whose highest place is flat, or nearly, at z = 0
     "sphere": lambda **o: Sphere(1e3, (0, 0, -1e3), **o),
     "mesh": lambda **o: MeshSolid(*block((0.5, 0.5, 0.2), (0, 0, -0.1)), cell=0.05, **o),
 }
-
-
-def slide(body, angle, direction=(1.0, 0.0), start=0.0, time=0.3):
-    """(displacement [V, 3] m, final velocity [V, 3]) of a sheet on a body at z = 0 under tilted gravity."""
-    a, b = direction
-    cloth = sheet({"body": body}, (G * math.sin(angle) * a, G * math.sin(angle) * b, -G * math.cos(angle)))
-    x = cloth.rest_state().x - torch.tensor([0.05, 0.05, 0.0])
-    v = torch.zeros_like(x)
-    v[:, 0], v[:, 1] = start * a, start * b
-    with torch.no_grad():
-        out = cloth(cloth.state(x, v), times=[0.0, time])
-    return out.x[-1] - x, out.v[-1]
 
 
 @pytest.mark.parametrize("ground", GROUND)
@@ -243,65 +189,6 @@ def test_what_starts_inside_adds_little_energy(sampling):
     assert float(energies.max()) < 4 * 0.5 * float(mass) * 0.2**2  # 2.6: it is stretched a little, too
 
 
-def test_points_on_triangles_do_not_make_a_landing_bounce():
-    """Impulses of many points per vertex: of the energy at 1 m/s less than a hundredth comes back (0.1 % measured)."""
-    cloth = sheet({"block": Box((1.0, 1.0, 0.2), lowered(-0.1), sampling=0.01)}, n=6)
-    x = cloth.rest_state().x + torch.tensor([-0.05, -0.05, 0.002])
-    with torch.no_grad():
-        out = cloth(cloth.state(x, torch.tensor([0.0, 0.0, -1.0]).expand_as(x)), times=torch.linspace(0, 0.03, 16))
-    energy = (out.v**2).sum((-2, -1))
-    assert float(energy[2:].max()) < 0.01 * float(energy[0])
-    assert float(out.x[..., 2].min()) > -1e-9
-
-
-@pytest.mark.parametrize(
-    ("body", "vertices_alone", "sampled"),
-    [
-        (lambda **o: Sphere(0.08, (0, 0, -0.08), **o), 1.0, 0.2),
-        (lambda **o: Capsule((-0.1, 0, -0.02), (0.1, 0, -0.02), 0.02, **o), 2.5, 0.5),
-        (lambda **o: Box((0.1, 0.1, 0.1), lowered(-0.05), **o), 4.0, 2.0),
-    ],
-    ids=["sphere", "capsule", "box"],
-)
-def test_points_on_triangles_keep_small_bodies_out(body, vertices_alone, sampled):
-    """A sheet of 2 cm edges draped over the body: deepest place of any triangle [mm], without points and with."""
-    fine = TrianglePoints(tc.meshes.rectangle(0.2, 0.2, resolution=(11, 11)), 0.002)
-    depths = []
-    for sampling in (None, 0.005):
-        solid = body(sampling=sampling, friction=0.3)
-        damping = {"air": tc.effects.AirDrag(1.2)}
-        cloth = sheet({"body": solid}, size=0.2, n=11, effects=damping, E=5e4)
-        x = cloth.rest_state().x - torch.tensor([0.103, 0.102, -0.002])
-        with torch.no_grad():
-            out = cloth(cloth.state(x), times=torch.linspace(0, 0.25, 6))
-            depths.append(-1e3 * float(solid.clearance(fine.at(out.x))[0].min()))
-    assert depths[0] > vertices_alone
-    assert depths[1] < sampled
-
-
-def test_an_offset_is_a_thicker_body():
-    thick, large = (slide(Sphere(r, (0, 0, -0.3), friction=0.3, offset=o), 0.4) for r, o in ((0.29, 0.01), (0.3, 0.0)))
-    torch.testing.assert_close(thick, large, rtol=0, atol=1e-8)
-
-
-def test_points_share_impulses_without_losing_momentum():
-    mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(5, 4))
-    points = TrianglePoints(mesh, 0.008)
-    x, mass = torch.as_tensor(mesh.vertices), 1 / points.mobility
-    torch.manual_seed(0)
-    some = torch.randn_like(points.at(x)) * (torch.rand(len(points.at(x)), 1) < 0.3)
-    alone = torch.zeros_like(some)
-    alone[37] = some.abs().amax(0) + 1
-    torch.testing.assert_close(points.at(points.share(alone))[37], alone[37])  # one point: exactly as wanted
-    same = torch.ones_like(some)
-    torch.testing.assert_close(points.share(same), torch.ones_like(x), rtol=0, atol=0.15)  # all alike: nearly
-    change = points.share(alone)
-    linear, angular = (mass * change).sum(0), torch.linalg.cross(x, mass * change).sum(0)
-    torch.testing.assert_close(angular, torch.linalg.cross(points.at(x)[37], linear))  # it acts at the point
-    batch = points.share(torch.stack([some, alone]))
-    torch.testing.assert_close(batch[1], change)
-
-
 def test_gradients_of_a_rollout():
     """Final positions with respect to the body's path, its size and its friction."""
     cloth = sheet({"ball": Sphere(0.06, (0, 0, -0.06), friction=0.3, moving=True, sampling=0.02)}, size=0.1, n=4)
@@ -324,67 +211,3 @@ def test_gradients_of_a_rollout():
     }
     steps = [10.0 ** (-3 - k / 2) for k in range(9)]
     check_gradients(final, inputs, 1e-6, steps)
-
-
-@pytest.mark.parametrize("cell", [0.012, 0.006])
-def test_a_mesh_solid_is_the_solid_that_its_mesh_draws(cell):
-    """Against closed forms: a ball's surface to cell^2 / (4 r), a box's faces exactly and its edges to half a cell."""
-    trimesh = pytest.importorskip("trimesh")
-    torch.manual_seed(0)
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.06)
-    with torch.no_grad():
-        p = 0.06 * torch.nn.functional.normalize(torch.randn(2000, 3), dim=-1)
-        distance, normal = MeshSolid(ball.vertices, ball.faces, cell=cell).distance(p)
-        assert float(distance.abs().max()) < 1.1 * cell**2 / (4 * 0.06) + 1e-4  # the mesh itself cuts corners
-        assert float(torch.linalg.cross(normal, p / 0.06).norm(dim=-1).max()) < 1.0 * cell / 0.06
-        size = (0.16, 0.12, 0.1)
-        p = 0.18 * (torch.rand(20000, 3) - 0.5)
-        got, _ = MeshSolid(*block(size, (0, 0, 0)), cell=cell).distance(p)
-        exact, _ = Box(size).distance(p)
-        error = (got - exact).abs()
-        near = exact.abs() < 0.003
-        inner = (p.abs() - torch.tensor(size) / 2).sort(-1).values[:, 1:2] < -2 * cell  # far from edges
-        assert float(error[near].max()) < 0.5 * cell
-        assert float(error[near & inner].max()) < 1e-7  # open3d computes in float32
-
-
-@pytest.mark.parametrize(
-    ("make", "word"),
-    [
-        (lambda: Sphere(0.0), "radius"),
-        (lambda: Sphere(0.1, (0.0, 0.0)), "centre"),
-        (lambda: Box((0.1, -0.1, 0.1)), "box size"),
-        (lambda: Box((0.1, 0.1)), "box size"),
-        (lambda: Box((0.1, 0.1, 0.1), 2 * torch.eye(4)), "pose"),
-        (lambda: Capsule((0, 0, 0), (0, 0, 0), 0.1), "axis"),
-        (lambda: Cylinder((0, 0, 0), (0, 0, 1), -0.1), "radius"),
-        (lambda: Plane(normal=(0.0, 0.0, 0.0)), "plane normal"),
-        (lambda: Plane(friction=-0.1), "friction"),
-        (lambda: Plane(friction=Elliptic(0.3, 0.2, (0.0, 0.0, 1.0))), "friction axis"),
-        (lambda: Elliptic(0.3, 0.2, (0.0, 0.0, 0.0)), "friction axis"),
-        (lambda: Elliptic(0.0, 0.2), "along"),
-        (lambda: Stribeck(0.4, 0.3), "static minus kinetic"),
-        (lambda: Stribeck(0.3, 0.4, 0.0), "speed"),
-        (lambda: Coulomb(float("nan")), "friction"),
-        (lambda: Plane(offset=-1e-3), "offset"),
-        (lambda: Plane(sampling=0.0), "sampling"),
-        (lambda: Plane(recovery=-1.0), "recovery"),
-        (lambda: MeshSolid(*_open_block()), "solid mesh"),
-        (lambda: MeshSolid(*block((1, 1, 1), (0, 0, 0)), cell=0.0), "cell"),
-        (lambda: MeshSolid(*block((1, 1, 1), (0, 0, 0)), cell=1e-3), "grid nodes"),
-    ],
-)
-def test_refuses_what_is_no_body(make, word):
-    with pytest.raises(InvalidInput, match=word):
-        make()
-
-
-def test_a_mesh_solid_without_open3d_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(MissingDependency, match="torchcloth\\[observe\\]"):
-        MeshSolid(*block((1, 1, 1), (0, 0, 0)))
-
-
-def _open_block():
-    vertices, faces = block((1, 1, 1), (0, 0, 0))
-    return vertices, faces[1:]

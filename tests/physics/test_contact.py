@@ -150,6 +150,8 @@ def test_momentum_passes_between_layers_without_loss():
     out = cloth(state, times=[0.0, 0.03])
     before, after = (mass * state.v).sum(0), (mass * out.v[-1]).sum(0)
     torch.testing.assert_close(after, before, rtol=0, atol=1e-12 * float(mass.sum()))
+    turning = [(mass * torch.linalg.cross(x, v)).sum(0) for x, v in ((state.x, state.v), (out.x[-1], out.v[-1]))]
+    torch.testing.assert_close(turning[1], turning[0], rtol=0, atol=1e-10 * float(turning[0].norm()))
     assert float((mass * out.v[-1])[: upper.start].sum(0).norm()) > 0.1 * float(before.norm())  # they did collide
 
 

@@ -1,7 +1,6 @@
 """Particle-grid transfer: how contact passes between layers of cloth."""
 
-from .contact import FADING, GAP, RANGE, SKIN, TOUCH, TURNED, Contact, Grid
-from .neighbours import apart
+from .contact import FADING, GAP, RANGE, SKIN, TOUCH, Contact, Grid
 from .reference import Stencil, carried_momentum, lattice, push, stencil, through, velocity_gradient
 
 __all__ = [
@@ -10,11 +9,9 @@ __all__ = [
     "RANGE",
     "SKIN",
     "TOUCH",
-    "TURNED",
     "Contact",
     "Grid",
     "Stencil",
-    "apart",
     "carried_momentum",
     "lattice",
     "push",

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..errors import InvalidInput
 from ..meshes import Mesh
+from .neighbours import apart
 
 SKIN = 2.0  # grid spacings that layers may approach each other before the search for near ones is repeated
 RANGE = 4.0  # grid spacings: the splines of points farther apart have no node of any weight in common
@@ -17,6 +19,7 @@ TOUCH = 2.26  # grid spacings at which approaching layers begin to compress each
 FADING = 3.5  # and by how many they must approach for each unit of 1 - R33 (both measured, tests/physics/test_contact)
 GAP = 1.4  # grid spacings between layers at rest, with the default play
 SPARSEST = 1.4  # grid spacings between corners of sub-triangles: no hole between the points exceeds 0.7 spacings
+ROOM = 1.6  # times the longest way along the cloth: the extent at which the grid wraps, so that layers never alias
 TURNED = 1.7  # layers are folded on each other where the way along the cloth is that much longer than through space
 
 
@@ -72,6 +75,31 @@ class Contact:
         """Contact whose layers rest ``gap`` [m] apart, from centre to centre; ``changes`` as for the class."""
         return cls(spacing=gap / GAP, **changes)
 
+    def usual(self) -> Contact:
+        """As material point methods have it, on the same grid: for ``transfer="apic"``."""
+        return replace(self, subdivisions=1, everywhere=True, play=0.0, damping=0.0)
+
+    def grid(self, mesh: Mesh) -> Grid:
+        """Everything that mesh and contact fix, in the default precision.
+
+        Raises:
+            InvalidInput: non-positive spacing, or points too sparse for it.
+        """
+        spacing, points = self.resolve(mesh)
+        corner = mesh.rest - mesh.rest.mean(1, keepdims=True)
+        reach = float((RANGE + SKIN) * spacing + 2 * np.linalg.norm(corner, axis=-1).max())
+        longest = max(float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), mesh.extent)
+        return Grid(
+            points=torch.as_tensor(points, dtype=torch.get_default_dtype()),
+            spacing=spacing,
+            nodes=int(np.ceil(ROOM * longest / spacing)) + 6,
+            skin=SKIN * spacing,
+            reach=reach,
+            play=self.play,
+            damping=self.damping,
+            apart=None if self.everywhere else torch.as_tensor(apart(mesh, TURNED * reach)),
+        )
+
     def resolve(self, mesh: Mesh) -> tuple[float, np.ndarray]:
         """(spacing [m], barycentric coordinates of the points of one triangle [S, 3]).
 
@@ -92,11 +120,6 @@ class Contact:
                 remedy="sparser points would let layers pass through each other",
             )
         return spacing, _centroids(s)
-
-    def reach(self, mesh: Mesh) -> float:
-        """Largest distance [m] between the centroids of two triangles whose points may soon touch."""
-        corner = mesh.rest - mesh.rest.mean(1, keepdims=True)
-        return float((RANGE + SKIN) * self.resolve(mesh)[0] + 2 * np.linalg.norm(corner, axis=-1).max())
 
 
 def _centroids(s: int) -> np.ndarray:

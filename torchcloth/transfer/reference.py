@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .._math import cross
 from .contact import Grid
 
 
@@ -43,18 +44,24 @@ def stencil(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, slots: Te
     return Stencil(weight, slope, offset, node, 1.0 / torch.where(total > 0, total, 1.0))  # a weight may be exactly 0
 
 
-def push(nodes: Stencil, pull: Tensor, director: Tensor, dt: float) -> Tensor:
-    """Change of each point's velocity [P, 3] m/s by the directors' forces -pull (d3 . grad w) on the nodes.
+def push(nodes: Stencil, pull: Tensor, director: Tensor, spacing: float, dt: float) -> tuple[Tensor, Tensor]:
+    """What the directors' forces -pull (d3 . grad w) on the nodes do to the points: momentum, and its moment.
 
     Args:
         nodes: of the points.
         pull: [P, 3] N m, V d(psi)/d(d3): what the director's energy does through the grid's velocity gradient.
         director: [P, 3], d3.
+        spacing: grid spacing [m].
         dt: substep [s].
+
+    Returns:
+        (change of each point's velocity [P, 3] m/s, angular momentum about the point over its mass [P, 3] m^2/s)
     """
     force = -(nodes.slope @ director.unsqueeze(-1)) * pull.unsqueeze(-2)
     change = dt * through(nodes.node, force) * nodes.inverse.unsqueeze(-1)
-    return (nodes.weight.unsqueeze(-1) * change).sum(-2)
+    weighted = nodes.weight.unsqueeze(-1) * change
+    arm = (lattice(director) - nodes.offset.unsqueeze(-2)) * spacing
+    return weighted.sum(-2), cross(arm, weighted).sum(-2)
 
 
 def velocity_gradient(nodes: Stencil, mass: Tensor, velocity: Tensor, affine: Tensor, spacing: float) -> Tensor:
