@@ -28,8 +28,8 @@ def step(
     assert grid is not None  # Cloth sees to it
     s = surface(model.geometry, state.x, state.v)
     memory = evolve(model, state, s, dt)
-    layers = near_layers(model, grid, state.x, layers)
-    press = pressure(model, grid, layers, state, s)
+    layers = near_layers(model, grid, state.x) if layers is None else layers
+    press = pressure(model, grid, layers, state, s, dt)
     columns = add_columns(layers, membrane_stress(model, s, memory), press)
     nothing = (torch.zeros_like(columns[0]), torch.zeros_like(columns[1]))
     outer = vertex_forces(model, state, s, memory, nothing)  # weight, air: triangles get their share of it as well

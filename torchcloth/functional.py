@@ -27,22 +27,22 @@ __all__ = ["Geometry", "Impulses", "Model", "energy", "rollout", "step", "surfac
 def step(
     model: Model, state: ClothState, dt: float, drives: Mapping[str, Drive], substep: int, layers: Layers | None = None
 ) -> tuple[ClothState, Impulses]:
-    """Advance one substep (symplectic Euler); ``layers`` may be those of a nearby state."""
+    """Advance one substep (symplectic Euler); ``layers``: of this state or one nearby, None: to be found."""
     s = surface(model.geometry, state.x, state.v)
     memory = evolve(model, state, s, dt)
     columns = membrane_stress(model, s, memory)
     grid, press = model.grid, None
     if grid is not None:
-        layers = near_layers(model, grid, state.x, layers)
+        layers = near_layers(model, grid, state.x) if layers is None else layers
         if len(layers.active):
-            press = pressure(model, grid, layers, state, s)
+            press = pressure(model, grid, layers, state, s, dt)
             columns = add_columns(layers, columns, press)
 
     resistance = resistance_of(model, s, state.x)
     force = vertex_forces(model, state, s, memory, columns)
     free = state.v + dt * resisted(resistance, force / model.mass)
     if grid is not None and layers is not None and press is not None:
-        free = free + resisted(resistance, repulsion(model, grid, layers, press, state.x, dt))
+        free = free + resisted(resistance, repulsion(model, grid, layers, press, s, free, dt))
     v, impulses = constrain(model, state.x, free, dt, drives, substep, resistance)
 
     x, d3 = state.x + dt * v, state.d3

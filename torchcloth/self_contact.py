@@ -59,28 +59,36 @@ def near_layers(model: Model, grid: Grid, x: Tensor, before: Layers | None = Non
     return Layers(scene * triangles + triangle, scene, own, slots, x)
 
 
-@torch.no_grad()
 def first_directors(model: Model, grid: Grid, x: Tensor) -> Tensor:
     """Directors [..., P, 3] of a cloth whose layers have come to where they are without being pressed.
 
     Layers that start within each other's splines would else have to give way by the whole play from there.
     """
     s = surface(model.geometry, x, x)
-    centre, n = s.v.reshape(-1, *s.v.shape[-2:]), s.n.reshape(-1, *s.n.shape[-2:])
-    compression = torch.zeros_like(centre[..., :1])
+    d3 = s.n
     if grid.apart is not None and grid.play > 0:
-        side = (grid.reach - (RANGE + SKIN) * grid.spacing) / 2
-        for k, (points, normals) in enumerate(zip(centre, n, strict=True)):
-            height = (points @ normals.mT - (points * normals).sum(-1)).abs()  # [E, E], of the row over the column
-            beside = (torch.cdist(points, points) ** 2 - height**2).clamp(min=0).sqrt() > side
-            distance = height.masked_fill(beside | ~grid.apart, float("inf")).amin(-1, keepdim=True)
-            compression[k] = ((TOUCH - distance / grid.spacing) / FADING).clamp(0, grid.play)
-    d3 = (1 - compression) * n
-    return d3.view(s.n.shape).repeat_interleave(grid.points.shape[0], dim=-2)
+        d3 = (1 - _unpressed(grid, grid.apart, s.v.detach(), s.n.detach())) * s.n
+    return d3.repeat_interleave(grid.points.shape[0], dim=-2)
 
 
-def pressure(model: Model, grid: Grid, layers: Layers, state: ClothState, s: Surface) -> Pressure:
-    """Split the director's stress into what acts on the surface columns (through n) and on d3 itself."""
+def _unpressed(grid: Grid, apart: Tensor, centre: Tensor, n: Tensor) -> Tensor:
+    """Compression [..., E, 1] at which layers that are as near as the triangles with these centres do not yet press."""
+    side = (grid.reach - (RANGE + SKIN) * grid.spacing) / 2
+    found = []
+    for points, normals in zip(centre.reshape(-1, *n.shape[-2:]), n.reshape(-1, *n.shape[-2:]), strict=True):
+        height = (points @ normals.mT - (points * normals).sum(-1)).abs()  # [E, E], of the row over the column
+        beside = (torch.cdist(points, points) ** 2 - height**2).clamp(min=0).sqrt() > side
+        distance = height.masked_fill(beside | ~apart, float("inf")).amin(-1, keepdim=True)
+        found.append(((TOUCH - distance / grid.spacing) / FADING).clamp(0, grid.play))
+    return torch.stack(found).view(*n.shape[:-1], 1)
+
+
+def pressure(model: Model, grid: Grid, layers: Layers, state: ClothState, s: Surface, dt: float) -> Pressure:
+    """Split the director's stress into what acts on the surface columns (through n) and on d3 itself.
+
+    The collision's damping knows the rate of closing from the substep before; divided as if it were implicit, it stays
+    stable however hard layers are pressed.
+    """
     count = grid.points.shape[0]
     n, J, f1, f2, area = (_pick(layers, field, s.n) for field in (s.n, s.J, s.f1, s.f2, s.area))
     d3 = state.d3.reshape(-1, count, 3).index_select(0, layers.active)
@@ -90,7 +98,10 @@ def pressure(model: Model, grid: Grid, layers: Layers, state: ClothState, s: Sur
     )
     by_normal = by_normal + grid.play * by_director
     closing = state.memory["contact"].reshape(-1, count, 1).index_select(0, layers.active)
-    loss = dot(by_director, normal).clamp(max=0) * (grid.damping * closing).clamp(min=-1)
+    press = dot(by_director, normal).clamp(max=0)
+    density = _pick(layers, model.areal_density, s.n).unsqueeze(-2)
+    slowed = 1 - (2 * dt * grid.damping / (FADING * grid.spacing) ** 2) * press / density
+    loss = press * (grid.damping * closing / slowed).clamp(min=-1)
     by_normal, by_director = by_normal + loss * d3, by_director + loss * normal
     turn = by_normal.sum(-2) / count
     turn = (turn - dot(turn, n) * n) / J  # n has unit length: only its tangential change is real
@@ -109,24 +120,35 @@ def add_columns(layers: Layers, columns: tuple[Tensor, Tensor], p: Pressure) -> 
     return first, second
 
 
-def repulsion(model: Model, grid: Grid, layers: Layers, p: Pressure, x: Tensor, dt: float) -> Tensor:
-    """Change of the vertices' velocities [..., V, 3] m/s by contact; momentum and its moment are kept to rounding."""
+def repulsion(model: Model, grid: Grid, layers: Layers, p: Pressure, s: Surface, like: Tensor, dt: float) -> Tensor:
+    """Change of the vertices' velocities [..., V, 3] m/s by contact.
+
+    The exact transpose of how vertices carry velocity to the nodes, with the affine part: momentum and its moment are
+    kept to rounding, and contact is as symmetric as elasticity. Without the affine part folds flutter.
+    """
     count = grid.points.shape[0]
-    change, spin = push(p.nodes, p.pull, p.d3, grid.spacing, dt)
-    momentum, moment = ((p.mass * field).unflatten(0, (-1, count)) for field in (change, spin))
-    own = _corners(layers, x)
+    change, moment = push(p.nodes, p.pull, p.d3, grid.spacing, dt)
+    momentum = (p.mass * change).unflatten(0, (-1, count))
     shares = torch.stack([(grid.points[:, corner, None] * momentum).sum(-2) for corner in range(3)])
-    shares = shares + _couple(own, moment.sum(-2))
-    total = torch.zeros_like(x).reshape(-1, 3).index_add(0, layers.vertices.flatten(), shares.flatten(0, 1))
-    return total.view(x.shape) / model.mass
+    shares = shares + _affine_shares(model, layers, s, (p.mass.unsqueeze(-1) * moment).unflatten(0, (-1, count)).sum(1))
+    total = torch.zeros_like(like).reshape(-1, 3).index_add(0, layers.vertices.flatten(), shares.flatten(0, 1))
+    return total.view(like.shape) / model.mass
 
 
-def _couple(corners: Tensor, moment: Tensor) -> Tensor:
-    """Impulses [3, A, 3] N s at the corners of triangles that sum to nothing and turn with ``moment`` [A, 3] N m s."""
-    arm = corners - corners.mean(0)
-    square = (arm * arm).sum((0, -1))[:, None, None]
-    inertia = square * torch.eye(3).to(arm) - (arm.unsqueeze(-1) * arm.unsqueeze(-2)).sum(0)
-    return cross(torch.linalg.solve(inertia, moment).expand_as(arm), arm)
+def _affine_shares(model: Model, layers: Layers, s: Surface, moment: Tensor) -> Tensor:
+    """Impulses [3, A, 3] N s at the corners: the transpose of ``_mesh_gradient`` applied to ``moment`` [A, 3, 3]."""
+    n, J, dual1, dual2 = (_pick(layers, field, s.n) for field in (s.n, s.J, s.cofactor1, s.cofactor2))
+    dual1, dual2 = dual1 / J, dual2 / J
+    normal = _times(moment, n)
+    first = _times(moment, dual1) - dot(normal, dual1) * n
+    second = _times(moment, dual2) - dot(normal, dual2) * n
+    warp, weft = ([_pick(layers, part, s.n) for part in pair] for pair in (model.geometry.warp, model.geometry.weft))
+    b, c = (warp[k] * first + weft[k] * second for k in range(2))
+    return torch.stack([-(b + c), b, c])
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
 def follow(
@@ -197,12 +219,8 @@ def _each(rows: Tensor, count: int) -> Tensor:
 
 def _points(grid: Grid, layers: Layers, field: Tensor) -> Tensor:
     """Values [A S, 3] at the contact points of the active triangles."""
-    return torch.einsum("sc,cak->ask", grid.points, _corners(layers, field)).flatten(0, 1)
-
-
-def _corners(layers: Layers, field: Tensor) -> Tensor:
-    """Values [3, A, 3] at the corners of the active triangles."""
-    return field.reshape(-1, 3).index_select(0, layers.vertices.flatten()).unflatten(0, (3, -1))
+    own = field.reshape(-1, 3).index_select(0, layers.vertices.flatten()).unflatten(0, (3, -1))
+    return torch.einsum("sc,cak->ask", grid.points, own).flatten(0, 1)
 
 
 def per_point(model: Model, layers: Layers, s: Surface) -> Any:

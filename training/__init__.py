@@ -1,4 +1,4 @@
-"""Lightning fitting runs and studies. Empty so far: ``tc.identify`` fits in one process."""
+"""Studies: ``actions`` of grippers, the paper's ``ablation`` (``python -m torchcloth.training.ablation``)."""
 
 if __name__ != "torchcloth.training":
     raise ImportError(f"got {__name__!r}; import this package as torchcloth.training")

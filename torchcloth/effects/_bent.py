@@ -76,14 +76,6 @@ class BentSheet(nn.Module):
         stretch = dot(normal, normal).sqrt()
         return Bent(values[..., :3, :, :], warp, weft, normal / stretch, stretch)
 
-    def rate(self, bent: Bent, v: Tensor) -> Tensor:
-        """[..., V, 3] 1/(m s), how fast the curvature grows at velocities [..., V, 3]; 0 for rigid motions."""
-        values = self._derivatives(self.weight, v)
-        raw = cross(values[..., 3, :, :], bent.weft) + cross(bent.warp, values[..., 4, :, :])
-        turning = (raw - dot(raw, bent.normal) * bent.normal) / bent.stretch
-        rate = values[..., :3, :, :] * bent.normal.unsqueeze(-3) + bent.second * turning.unsqueeze(-3)
-        return rate.sum(-1).mT
-
     def second(self, x: Tensor) -> Tensor:
         """Second derivatives alone [..., 3, V, 3] 1/m."""
         return self._derivatives(self.weight[:3], x)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,9 +21,9 @@ from .base import AbstractEffect, Amplitude
 class Coefficients(NamedTuple):
     """What the force needs; the optional ones where the sheet is not isotropic and uniform, or not flat at rest."""
 
-    stiffness: Tensor  # [..., 1, 1] N m
-    time: Tensor | None = None  # [..., 1, 1] s, of the damping
-    operator: Tensor | None = None  # [..., D V, 1] N/m, in place of the stiffness
+    stiffness: Tensor  # [] or [..., 1, 1] N m, or 1 where ``operator`` holds it
+    viscosity: Tensor  # the same times the damping time, N m s or s
+    operator: Tensor | None = None  # [..., D V, 1] N/m
     plate: Plate | None = None
     curl: Tensor | None = None  # [..., 1, 3] 1/m, rest curvature along ww, ff, sqrt 2 wf
     mobility: Tensor | None = None  # [..., 1, 1] 1/s, of creases
@@ -35,10 +35,9 @@ class Bending(AbstractEffect):
     Energy per area 1/2 (k - k0 n) . P (k - k0 n) with the vector-valued curvature k_ab = d^2 x / da db in material axes
     a, b: equal to that of the surface where bending does not stretch. Isotropic P is B/2 [(1 - nu) (k_ww^2 + k_ff^2 +
     2 k_wf^2) + nu (k_ww + k_ff)^2]. k is a weighted least-squares fit about every vertex, linear in x with constant
-    weights, so without rest curvature k0 the force is -Q x with one constant matrix Q. The direction of the mesh's
-    diagonals does not matter; hinge formulas are wrong by factors of 3 to 4.5 on our sheets, and the Laplacian alone
-    lets a free edge curl at no cost (it is nu = 1). Damping acts on the rate of the normal curvature n . k: a curved
-    sheet that turns as a whole is not braked.
+    weights, so without rest curvature k0 the force is -Q (x + damping_time v) with one constant matrix Q. The direction
+    of the mesh's diagonals does not matter; hinge formulas are wrong by factors of 3 to 4.5 on our sheets, and the
+    Laplacian alone lets a free edge curl at no cost (it is nu = 1).
 
     Woven cloth: B_weft = weft_ratio B_warp, coupling nu sqrt(B_warp B_weft), and twisting stiffness (1 - nu)
     sqrt(B_warp B_weft) twist_ratio (1: Huber's estimate). A narrow strip at an angle a to the warp then has, at
@@ -132,10 +131,12 @@ class Bending(AbstractEffect):
         time = None if self.damping_time is None else self.damping_time.field
         curl = self._curl(field)
         if not self._uneven(field.shape[-2]):
-            plate = None if curl is None and time is None else self._plate(field)
-            return Coefficients(field, time, None, plate, curl)
+            viscosity = torch.zeros_like(field) if time is None else field * time
+            plate = None if curl is None else self._plate(field)
+            return Coefficients(field, viscosity, None, plate, curl)
         plate = self._plate(field if field.shape[-2] == 1 else self._on_vertices(field))
-        return Coefficients(torch.ones_like(field[..., :1, :]), time, self.woven.entries(plate), plate, curl)
+        time = torch.zeros_like(field[..., :1, :]) if time is None else time
+        return Coefficients(torch.ones_like(time), time, self.woven.entries(plate), plate, curl)
 
     def curved(self) -> bool:
         """Whether the sheet may be other than flat at rest."""
@@ -164,19 +165,18 @@ class Bending(AbstractEffect):
         return total / torch.bincount(index, minlength=count).unsqueeze(-1)
 
     def force(self, c: Coefficients, now: Moment) -> Tensor:
-        """-Q x on each vertex, and what damping and rest curvature add."""
+        """-Q (x + damping_time v) on each vertex, and what rest curvature adds."""
+        field = c.stiffness * now.x
+        if self.damping_time is not None:
+            field = field + c.viscosity * now.v
         if c.operator is None:
-            force = (self.operator * differences(c.stiffness * now.x, self.columns)).sum(-3)
+            force = (self.operator * differences(field, self.columns)).sum(-3)
         else:
             operator = c.operator.unflatten(-2, self.woven.columns.shape)
-            force = (operator * differences(now.x, self.woven.columns)).sum(-3)
-        if c.plate is None or (c.time is None and c.curl is None):
+            force = (operator * differences(field, self.woven.columns)).sum(-3)
+        if c.curl is None or c.plate is None:
             return force
-        bent = self.sheet.see(now.x)
-        curvature = 0.0 if c.curl is None else -self.rest_curvature(c.curl, now)
-        if c.time is not None:
-            curvature = curvature + c.time * self.sheet.rate(bent, now.v)
-        return force + self.sheet.force(bent, c.plate.moment(cast("Tensor", curvature)))
+        return force - self.sheet.force(self.sheet.see(now.x), c.plate.moment(self.rest_curvature(c.curl, now)))
 
     def rest_curvature(self, curl: Tensor, now: Moment) -> Tensor:
         """[..., V or 1, 3] 1/m along ww, ff, sqrt 2 wf; ``curl`` is that of the virgin sheet."""
@@ -195,9 +195,10 @@ class Bending(AbstractEffect):
         """B times the largest eigenvalue of Q over the vertices' masses, bounded by that for equal areal density."""
         if c.operator is None or c.plate is None:
             stiffness = c.stiffness.amax() * (self.bound / mass).amax()
+            damping = c.viscosity.amax() * (self.bound / mass).amax()
         else:
             stiffness = c.plate.largest() * self.sheet.bend_rate(mass)
-        damping = mass.new_zeros(()) if c.time is None else c.time.amax() * stiffness
+            damping = c.viscosity.amax() * stiffness
         if c.curl is not None and c.plate is not None:
             moment = c.plate.moment(c.curl).square().sum(-1).amax().sqrt()
             stiffness = stiffness + moment * self.sheet.turn_rate(mass)

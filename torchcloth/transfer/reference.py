@@ -11,7 +11,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._math import cross
 from .contact import Grid
 
 
@@ -45,7 +44,7 @@ def stencil(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, slots: Te
 
 
 def push(nodes: Stencil, pull: Tensor, director: Tensor, spacing: float, dt: float) -> tuple[Tensor, Tensor]:
-    """What the directors' forces -pull (d3 . grad w) on the nodes do to the points: momentum, and its moment.
+    """What the directors' forces -pull (d3 . grad w) on the nodes do to the points: the transpose of how they carry.
 
     Args:
         nodes: of the points.
@@ -55,13 +54,13 @@ def push(nodes: Stencil, pull: Tensor, director: Tensor, spacing: float, dt: flo
         dt: substep [s].
 
     Returns:
-        (change of each point's velocity [P, 3] m/s, angular momentum about the point over its mass [P, 3] m^2/s)
+        (change of each point's velocity [P, 3] m/s, its moment about the point: change (x) arm [P, 3, 3] m^2/s)
     """
     force = -(nodes.slope @ director.unsqueeze(-1)) * pull.unsqueeze(-2)
     change = dt * through(nodes.node, force) * nodes.inverse.unsqueeze(-1)
     weighted = nodes.weight.unsqueeze(-1) * change
     arm = (lattice(director) - nodes.offset.unsqueeze(-2)) * spacing
-    return weighted.sum(-2), cross(arm, weighted).sum(-2)
+    return weighted.sum(-2), weighted.mT @ arm
 
 
 def velocity_gradient(nodes: Stencil, mass: Tensor, velocity: Tensor, affine: Tensor, spacing: float) -> Tensor:

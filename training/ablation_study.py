@@ -1,0 +1,164 @@
+"""A study on disk: every finished run is a file, so that it can be stopped at any time, continued and extended."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from torchcloth.errors import InvalidInput, RecordingError, TorchclothError
+
+from .ablation_measures import WITHOUT
+from .ablation_scenes import Run, Scene, Setup, Variant
+
+TRIANGLES_AT_ONCE = 6000  # of all runs that one process simulates together; fewer leave it idle, more leave the cache
+Name = tuple[str, str]  # of a scene: garment, action
+
+
+class Study(NamedTuple):
+    """Where runs are kept; nothing is written before ``begin``."""
+
+    folder: Path
+    setup: Setup
+
+    def check(self) -> None:
+        """Raises InvalidInput where the folder cannot hold this study's runs."""
+        if self.folder.exists() and not self.folder.is_dir():
+            raise InvalidInput("--out", got=f"{self.folder}, a file", expected="a folder, new or existing")
+        try:
+            found = json.loads((self.folder / "study.json").read_text())
+        except FileNotFoundError:
+            return
+        except ValueError:
+            raise _unreadable(self.folder / "study.json") from None
+        own = asdict(self.setup)
+        other = {key: found.get(key) for key in own if found.get(key) != own[key]}
+        if other:
+            raise InvalidInput(
+                "--out",
+                got=f"a study with {', '.join(f'{key} {value}' for key, value in other.items())}",
+                expected=", ".join(f"{key} {own[key]}" for key in other),
+                remedy="use the same settings, or another folder",
+            )
+
+    def begin(self) -> None:
+        """Make the folder and note the settings."""
+        (self.folder / "runs").mkdir(parents=True, exist_ok=True)
+        text = json.dumps(asdict(self.setup), indent=1) + "\n"
+        replace(self.folder / "study.json", lambda path: path.write_text(text))
+
+    def path(self, scene: Name, variant: Variant) -> Path:
+        """The file of a run."""
+        return self.folder / "runs" / f"{'-'.join(scene)}-{variant.name}.npz"
+
+    def has(self, scene: Name, variant: Variant) -> bool:
+        """Whether a run is finished."""
+        return self.path(scene, variant).exists()
+
+    def write(self, scene: Name, variant: Variant, run: Run) -> None:
+        """Keep a finished run; a crash leaves no half file."""
+        arrays: dict[str, Any] = {"t": run.t, "x": run.x, **run.energy}
+        replace(self.path(scene, variant), lambda path: np.savez(path, **arrays))
+
+    def read(self, scene: Name, variant: Variant) -> Run:
+        """A finished run.
+
+        Raises:
+            RecordingError: the file is damaged.
+        """
+        path = self.path(scene, variant)
+        try:
+            with np.load(path) as found:
+                return Run(found["t"], found["x"], {key: found[key] for key in ("total", *WITHOUT)})
+        except (ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            raise _unreadable(path) from None
+
+
+class Task(NamedTuple):
+    """Runs of one scene that are simulated together."""
+
+    scene: Name
+    variants: list[Variant]
+
+    def work(self, study: Study) -> Iterator[float]:
+        """Simulate and keep the runs; yields the share done."""
+        try:
+            for share, runs in Scene(study.setup, *self.scene).simulate(self.variants):
+                for variant, run in zip(self.variants, runs, strict=False):
+                    study.write(self.scene, variant, run)
+                yield share
+        except TorchclothError as error:
+            names = ", ".join(variant.name for variant in self.variants)
+            raise TorchclothError(f"{' '.join(self.scene)} ({names}): {error}") from error
+
+
+def missing(study: Study, scenes: list[Name], variants: list[Variant], batch: int | None = None) -> list[Task]:
+    """What is still to be simulated, in batches; references first, so that a partial study can be read."""
+    size = batch or max(1, TRIANGLES_AT_ONCE // study.setup.triangles)
+    tasks = []
+    for scene in scenes:
+        left = [variant for variant in variants if not study.has(scene, variant)]
+        tasks += [Task(scene, left[i : i + size]) for i in range(0, len(left), size)]
+    return sorted(tasks, key=lambda task: variants.index(task.variants[0]))
+
+
+def simulate(study: Study, tasks: list[Task], jobs: int, report: Callable[[float, Task], None]) -> None:
+    """Do all tasks, in ``jobs`` processes; ``report`` hears the number of tasks done (with fractions) and the last.
+
+    Raises:
+        TorchclothError: the first failure; the other finished runs are kept.
+    """
+    study.begin()
+    if jobs == 1:
+        for done, task in enumerate(tasks):
+            for share in task.work(study):
+                report(done + share, task)
+        return
+    pool = ProcessPoolExecutor(min(jobs, len(tasks) or 1), get_context("spawn"), initializer=_prepare)
+    try:
+        pending = {pool.submit(_work, study, task): task for task in tasks}
+        for done, future in enumerate(as_completed(pending)):
+            future.result()
+            report(done + 1.0, pending[future])
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _prepare() -> None:
+    """A worker: one thread, the default floats of the study, quiet when the terminal interrupts."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    torch.set_num_threads(1)
+    torch.set_default_dtype(torch.float64)
+
+
+def _work(study: Study, task: Task) -> None:
+    for _ in task.work(study):
+        pass
+
+
+def replace(path: Path, write: Callable[[Path], object]) -> None:
+    """Let ``write`` make a file beside ``path``, and move it there: never half a file."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".part-", suffix=path.suffix)
+    os.close(handle)
+    try:
+        write(Path(name))
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _unreadable(path: Path) -> RecordingError:
+    return RecordingError(f"{path}: unreadable", remedy="delete it; it is made again")
