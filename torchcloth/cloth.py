@@ -22,7 +22,7 @@ from .parameters import PhysicalParameter
 from .self_contact import first_directors
 from .stability import stable_step
 from .strain import grown_gradient, inverse_growth
-from .transfer import Contact, Grid
+from .transfer import GAP, TURNED, Contact, Grid
 from .types import ClothState, Memory, Rollout, Trajectory
 from .validation import (
     check_extent,
@@ -297,7 +297,8 @@ class Cloth(nn.Module):
         grid = (
             "none"
             if self._grid is None
-            else f"spacing {self._grid.spacing:.3g} m, {len(self._points)} point(s) per triangle"
+            else f"layers rest {1e3 * GAP * self._grid.spacing:.3g} mm apart, unseen within "
+            f"{1e3 * TURNED * self._grid.reach:.3g} mm along the cloth; {len(self._points)} point(s) per triangle"
         )
         return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s"
 

@@ -66,11 +66,14 @@ class Trajectory(NamedTuple):
 
 
 class Rollout(NamedTuple):
-    """A simulated motion at the requested frame times."""
+    """A simulated motion at the requested frame times.
+
+    ``wrench`` holds, for every driven boundary, what the cloth exerts on the body: force [N] and moment [N m] in world
+    axes about the body's own origin, as the mean over the interval that ends at the frame (frame 0: zero).
+    """
 
     t: Tensor  # [T] s
     x: Tensor  # [..., T, V, 3] m
     v: Tensor  # [..., T, V, 3] m/s
-    # wrench: name -> [..., T, 6] N and N m, what the cloth exerts on the gripper, about its own origin, world axes,
-    wrench: dict[str, Tensor]  # mean over the interval that ends at the frame (frame 0: zero)
+    wrench: dict[str, Tensor]  # name -> [..., T, 6] N, N m
     state: ClothState  # the state at the last frame: pass it on to continue

@@ -149,7 +149,7 @@ class Scene:
             self.mesh,
             AEP(**self._parameters(variants), convention="paper"),
             self.setup.areal_density,
-            {"gravity": Gravity(), "air": AirDrag(), "bending": Bending(1e-5)},
+            {"gravity": Gravity(), "air": AirDrag(), "bending": Bending(1e-5, damping_time=0.03)},
             {name: Grasp.at(place, radius=0.03 * self.setup.scale) for name, place in self.garment.grips.items()}
             | {"table": Plane(friction=0.4, offset=LAYERS / 2)},
             Contact(self.spacing, everywhere=self.setup.everywhere),

@@ -1,5 +1,7 @@
 """The parts that torchcloth ships keep the contracts that it ships."""
 
+import textwrap
+
 import torch
 import trimesh
 
@@ -320,3 +322,14 @@ def test_contracts_do_not_depend_on_the_default_precision():
     TestPlane().check()
     TestGrasp().check()
     assert torch.get_default_dtype() == torch.float32
+
+
+def test_the_example_in_the_docstring():
+    """What a reader copies keeps the contract."""
+    text = textwrap.dedent(
+        tc.effects.AbstractEffect.__doc__.split("A constant force per vertex:\n\n")[1].split("    Class attributes")[0]
+    )
+    scope = {"torch": torch, "torchcloth": tc, "PhysicalParameter": tc.PhysicalParameter}
+    scope |= {name: getattr(tc.effects, name) for name in ("AbstractEffect", "Amplitude")}
+    exec(text, scope)
+    scope["TestPull"]().check()

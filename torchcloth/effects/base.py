@@ -26,7 +26,24 @@ class AbstractEffect(nn.Module, ABC):
     """Something real that the bare membrane does not have. Amplitude 0 must leave the base model bitwise unchanged.
 
     An effect may be a force, and may also add mass, air that moves along, another rest shape, or slip in a gripper:
-    override what it is. Everything else answers None and costs nothing.
+    override what it is. Everything else answers None and costs nothing. A constant force per vertex:
+
+        class Pull(AbstractEffect):
+            amplitudes = {"strength": Amplitude("N", 1e-3, 1e-4)}
+
+            def __init__(self, strength=1e-3):
+                super().__init__()
+                self.strength = PhysicalParameter(strength, "N", "nonnegative", name="pull")  # 0 must be allowed
+
+            def coefficients(self):
+                return self.strength.field  # [..., 1, 1]: numbers, fields and batches alike
+
+            def force(self, c, now):
+                return c * torch.tensor([1.0, 0.0, 0.0]).to(now.x).expand_as(now.x)
+
+        class TestPull(torchcloth.testing.EffectContract):
+            def make(self, amplitude):
+                return Pull(amplitude)
 
     Class attributes:
         amplitudes: by parameter name, the main one first.

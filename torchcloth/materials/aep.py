@@ -74,6 +74,9 @@ class AEP(DirectorMaterial):
     def preset(cls, name: str, **changes) -> AEP:
         """A published isotropic fabric by name; ``changes`` override or complete its numbers. See ``presets``.
 
+        The paper's k = 6520 N/m / h makes contact on a fine grid slow (steps of 1e-5 s at 4 mm); where only the contact
+        itself matters, ``contact_stiffness=5e4, shear_stiffness=2e4`` is ten times faster.
+
         Raises:
             InvalidInput: no such fabric, or one whose membrane stiffness was not published or is not isotropic.
         """

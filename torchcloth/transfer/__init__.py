@@ -1,6 +1,6 @@
 """Particle-grid transfer: how contact passes between layers of cloth."""
 
-from .contact import FADING, GAP, RANGE, SKIN, TOUCH, Contact, Grid
+from .contact import FADING, GAP, RANGE, SKIN, TOUCH, TURNED, Contact, Grid
 from .reference import Stencil, carried_momentum, lattice, push, stencil, through, velocity_gradient
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "RANGE",
     "SKIN",
     "TOUCH",
+    "TURNED",
     "Contact",
     "Grid",
     "Stencil",
