@@ -25,6 +25,7 @@ from .result import Identification
 from .unknowns import collect
 
 PAPER_ITERATIONS, PAPER_CHAMFER = 35, 0.015  # the DiffCP paper's stop rule: iterations, metres
+ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
 EARLY = 0.35  # share of the frames that the first stage of the fit sees
 EARLY_ITERATIONS = 10
 NONLINEAR = 0.5  # relative error of the tangents over a finite step above which they are not used for errors
@@ -95,16 +96,16 @@ def identify(
 def default_parameters(cloth: Cloth) -> list[str]:
     """Membrane parameters, contact parameters if the model has contact, and each effect's main amplitude.
 
-    Other amplitudes are fitted only if they are not 0: an effect that is switched off is not part of the model.
+    Others (damping times, wind, curl) are fitted when they are named.
     """
-    names = [name for name, part in cloth.material.named_modules() if isinstance(part, PhysicalParameter)]
+    own = {name: part for name, part in cloth.material.named_modules() if isinstance(part, PhysicalParameter)}
+    names = [name for name, part in own.items() if bool((part.value != 0).any())]
     if cloth.contact is None:
-        names = [name for name in names if name in ("youngs_modulus", "poisson_ratio")]
+        names = [name for name in names if name not in ONLY_IN_CONTACT]
     for key, effect in cast("Iterable[tuple[str, AbstractEffect]]", cloth.effects.items()):
         main = next(iter(effect.amplitudes))
-        for name, part in effect.named_children():
-            if isinstance(part, PhysicalParameter) and (name == main or bool((part.value != 0).any())):
-                names.append(f"{key}.{name}")
+        if isinstance(getattr(effect, main), PhysicalParameter):
+            names.append(f"{key}.{main}")
     return names
 
 
