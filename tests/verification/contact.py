@@ -156,6 +156,22 @@ def carry(
     return path(t, way, (t >= start) & (t < release))
 
 
+def lay_over(t: Tensor, start: float, direction: int, size: float, height: float, time: float) -> tc.Trajectory:
+    """An edge lifted a little, carried low over the cloth and laid down from the inside outwards; it turns over.
+
+    An edge of two layers that did not turn would arrive with the layers crossed.
+    """
+    s = (t - start) / time
+    lift, over, down = (smooth((s - begin) / share) for begin, share in ((0.0, 0.25), (0.15, 0.6), (0.7, 0.3)))
+    turn = math.pi * smooth(s)
+    pose = torch.eye(4).repeat(len(t), 1, 1)
+    pose[:, direction, direction] = pose[:, 2, 2] = turn.cos()
+    pose[:, 2, direction], pose[:, direction, 2] = turn.sin(), -turn.sin()
+    pose[:, direction, 3] = size * (1 - 0.1 * lift - 0.74 * over - 0.16 * down)
+    pose[:, 2, 3] = 0.18 * size * (lift - down) + height * down
+    return tc.Trajectory(t, pose, (t >= start) & (t < start + time + 0.1))
+
+
 def draw_fold(figure, data) -> None:
     names = [name for name in data if name != "faces"]
     for k, name in enumerate(names):
@@ -193,9 +209,9 @@ def fold_in_half_and_quarter(fast: bool) -> Outcome:
     hold = torch.zeros(len(t), 3)
     motion = {
         "left": path(t, hold, t < 0.6),
-        "right": carry(t, 0.0, 0.5, 0, size, 1.5 * spacing, 0.6),
+        "right": lay_over(t, 0.0, 0, size, 1.5 * spacing, 0.5),
         "front": path(t, hold, (t >= 0.7) & (t < 1.3)),
-        "back": carry(t, 0.7, 1.2, 1, size, 3.0 * spacing, 1.3),
+        "back": lay_over(t, 0.7, 1, size, 3.0 * spacing, 0.5),
     }
     with torch.no_grad():
         out = cloth(cloth.rest_state(), motion, times=[0.0, 0.25, 0.7, 0.95, 1.5])
