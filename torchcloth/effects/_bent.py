@@ -8,10 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .._math import cross, dot
+from .._math import cross, dot, safe_norm
 from ..meshes import Mesh
 from ._curvature import Pattern, Stencils, curvature_stencils, gathered, largest_eigenvalue, local_matrices, mixed_area
 from ._curvature import pattern as pattern_of
+
+FOLDED = 0.5  # a fit whose tangents span less than this has no normal to speak of: its ring lies folded on itself
 
 
 class Bent(NamedTuple):
@@ -20,8 +22,8 @@ class Bent(NamedTuple):
     second: Tensor  # [..., 3, V, 3] 1/m, second derivatives of x along ww, ff, and sqrt 2 times wf
     warp: Tensor  # [..., V, 3] -, tangent
     weft: Tensor  # [..., V, 3] -
-    normal: Tensor  # [..., V, 3] -, unit, on the side from which warp turns to weft counter-clockwise
-    stretch: Tensor  # [..., V, 1] -, area ratio
+    normal: Tensor  # [..., V, 3] -, unit, on the side from which warp turns to weft counter-clockwise; fades if FOLDED
+    stretch: Tensor  # [..., V, 1] -, area ratio, at least FOLDED
 
     @property
     def curvature(self) -> Tensor:
@@ -73,7 +75,7 @@ class BentSheet(nn.Module):
         values = self._derivatives(self.weight, x)
         warp, weft = values[..., 3, :, :], values[..., 4, :, :]
         normal = cross(warp, weft)
-        stretch = dot(normal, normal).sqrt()
+        stretch = safe_norm(normal).clamp(min=FOLDED)
         return Bent(values[..., :3, :, :], warp, weft, normal / stretch, stretch)
 
     def second(self, x: Tensor) -> Tensor:
@@ -84,7 +86,8 @@ class BentSheet(nn.Module):
         """Forces [..., V, 3] N whose virtual work is minus that of ``moment`` [..., V, 3] N on the curvature."""
         couples = moment.mT.unsqueeze(-1)
         pull = (couples * bent.second).sum(-3)
-        turn = (pull - dot(pull, bent.normal) * bent.normal) / bent.stretch  # on the normal
+        along = torch.where(bent.stretch > FOLDED, dot(pull, bent.normal), 0.0)
+        turn = (pull - along * bent.normal) / bent.stretch  # on the normal
         slopes = torch.stack([cross(bent.weft, turn), cross(turn, bent.warp)], dim=-3)
         stress = torch.cat([couples * bent.normal.unsqueeze(-3), slopes], dim=-3)
         return self._transposed(self.weight, stress)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._math import dot
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
@@ -185,11 +186,11 @@ class Bending(AbstractEffect):
     def energy(self, c: Coefficients, x: Tensor) -> Tensor:
         """Bending energy [...] J."""
         bent = self.sheet.see(x)
-        second = bent.second
-        if c.curl is not None:
-            second = second - c.curl.mT.unsqueeze(-1) * bent.normal.unsqueeze(-3)
         plate = self._plate(c.stiffness) if c.plate is None else c.plate
-        return (self.sheet.area * plate.energy(second)).sum((-2, -1))
+        density = plate.energy(bent.second)
+        if c.curl is not None:
+            density = density + dot(c.curl / 2 - bent.curvature, plate.moment(c.curl))
+        return (self.sheet.area * density).sum((-2, -1))
 
     def rates(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
         """B times the largest eigenvalue of Q over the vertices' masses, bounded by that for equal areal density."""
