@@ -7,6 +7,7 @@ filters velocities at every substep, so its damping depends on dt: docs/verifica
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from .dynamics import Impulses, constrain, vertex_forces
 from .model import Model, corners, surface
 from .self_contact import Layers, add_columns, near_layers, per_point, pressure
 from .strain import evolve, membrane_stress
-from .transfer import carried_momentum, lattice, stencil, through
+from .transfer import Grid, carried_momentum, lattice, stencil, through
 from .types import ClothState, Surface
 
 
@@ -24,8 +25,7 @@ def step(
     model: Model, state: ClothState, dt: float, drives: Mapping[str, Drive], substep: int, layers: Layers | None = None
 ) -> tuple[ClothState, Impulses]:
     """Advance one substep; ``memory["apic"]`` [..., V + E, 9] 1/s is the particles' affine velocity."""
-    grid = model.grid
-    assert grid is not None  # Cloth sees to it
+    grid = cast("Grid", model.grid)  # Cloth refuses to be made without
     s = surface(model.geometry, state.x, state.v)
     memory = evolve(model, state, s, dt)
     layers = near_layers(model, grid, state.x) if layers is None else layers
