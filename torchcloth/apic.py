@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .boundaries import Drive
 from .dynamics import Impulses, constrain, vertex_forces
-from .model import Model, corners, surface
+from .model import Model, centroids, surface
 from .self_contact import Layers, add_columns, near_layers, per_point, pressure
 from .strain import evolve, membrane_stress
 from .transfer import Grid, carried_momentum, lattice, stencil, through
@@ -37,9 +37,9 @@ def step(
     v = state.v + dt * outer / model.mass
 
     batch, vertices = state.x.shape[:-2], state.x.shape[-2]
-    x0, x1, x2 = corners(model.geometry, state.x)
-    position = torch.cat([state.x, (x0 + x1 + x2) / 3], dim=-2).reshape(-1, 3)
-    velocity = torch.cat([v, torch.stack(corners(model.geometry, v)).mean(0)], dim=-2).reshape(-1, 3)
+    position, velocity = (
+        torch.cat([field, centroids(model.geometry, field)], dim=-2).reshape(-1, 3) for field in (state.x, v)
+    )
     mass = _masses(model, state, s).reshape(-1, 1)
     each = position.shape[0] // max(1, batch.numel())
     scene = torch.arange(batch.numel(), device=position.device).repeat_interleave(each)

@@ -93,13 +93,11 @@ class Cloth(nn.Module):
     def _store_geometry(self) -> None:
         gradient, area = self.mesh.shape_gradient, self.mesh.area
         dtype = torch.get_default_dtype()
-        share = np.zeros(len(self.mesh.vertices))
-        np.add.at(share, self.mesh.faces.ravel(), np.repeat(area / 3, 3))
         arrays = {
             "_corners": torch.as_tensor(self.mesh.faces.T.ravel().copy()),
             "_gradient": torch.as_tensor(gradient, dtype=dtype),
             "_area": torch.as_tensor(area, dtype=dtype).unsqueeze(-1),
-            "_share": torch.as_tensor(share, dtype=dtype).unsqueeze(-1),
+            "_share": torch.as_tensor(self.mesh.vertex_area, dtype=dtype).unsqueeze(-1),
             "_vertices": torch.as_tensor(self.mesh.vertices, dtype=dtype),
             "_points": torch.zeros(0, 3, dtype=dtype) if self._grid is None else self._grid.points,
             "_apart": None if self._grid is None else self._grid.apart,
@@ -261,6 +259,11 @@ class Cloth(nn.Module):
         found |= {f"effects.{name}": effect.start(x) for name, effect in self._parts()}
         return {name: value for name, value in found.items() if value is not None}
 
+    def _expected(self) -> ClothState:
+        """A state with the right shapes and no physics."""
+        x = self._vertices
+        return ClothState(x, x, x.new_empty(len(self._area) * len(self._points), 3), self._virgin(x))
+
     def _geometry(self) -> functional.Geometry:
         g = self._gradient
         return functional.Geometry(
@@ -282,7 +285,7 @@ class Cloth(nn.Module):
         return triangle.new_zeros(*triangle.shape[:-2], *self._share.shape).index_add(-2, self._corners, corners)
 
     def _start(self, state: ClothState, model: functional.Model, motion: Mapping[str, Trajectory]) -> ClothState:
-        check_state(state, self.rest_state())
+        check_state(state, self._expected())
         state = expand_state(state, model, motion)
         self._check_extent(state.x)
         return state

@@ -49,13 +49,18 @@ def surface(geometry: Geometry, x: Tensor, v: Tensor) -> Surface:
     normal = cross(f1, f2)
     J = dot(normal, normal).sqrt()
     n = normal / J
-    v0, v1, v2 = corners(geometry, v)
-    return Surface(f1, f2, cross(f2, n), cross(n, f1), n, J, geometry.area, (v0 + v1 + v2) / 3)
+    return Surface(f1, f2, cross(f2, n), cross(n, f1), n, J, geometry.area, centroids(geometry, v))
 
 
 def corners(geometry: Geometry, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Values [..., E, K] at the triangles' three corners."""
     return field.index_select(-2, geometry.corners).unflatten(-2, (3, -1)).unbind(-3)  # type: ignore[return-value]
+
+
+def centroids(geometry: Geometry, field: Tensor) -> Tensor:
+    """Mean [..., E, K] of the values at the triangles' corners."""
+    a, b, c = corners(geometry, field)
+    return (a + b + c) / 3
 
 
 def assemble(geometry: Geometry, shares: tuple[Tensor, Tensor, Tensor], like: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ._math import cross, dot
-from .model import Model, corners, surface
+from .model import Model, centroids, corners, surface
 from .transfer import FADING, RANGE, SKIN, TOUCH, Grid, Stencil, push, stencil, velocity_gradient
 from .types import ClothState, Surface
 
@@ -46,8 +46,7 @@ def near_layers(model: Model, grid: Grid, x: Tensor, before: Layers | None = Non
     if before is not None and float((x - before.x).abs().max()) < grid.skin / 2:
         return before
     x = x.detach()
-    a, b, c = corners(model.geometry, x)
-    centre = ((a + b + c) / 3).flatten(0, -3) if x.ndim > 2 else ((a + b + c) / 3).unsqueeze(0)
+    centre = centroids(model.geometry, x.reshape(-1, *x.shape[-2:]))
     if grid.apart is None:
         near = torch.ones(centre.shape[:2], dtype=torch.bool, device=x.device)
     else:
@@ -64,10 +63,9 @@ def first_directors(model: Model, grid: Grid, x: Tensor) -> Tensor:
 
     Layers that start within each other's splines would else have to give way by the whole play from there.
     """
-    s = surface(model.geometry, x, x)
-    d3 = s.n
+    d3 = n = surface(model.geometry, x, x).n
     if grid.apart is not None and grid.play > 0:
-        d3 = (1 - _unpressed(grid, grid.apart, s.v.detach(), s.n.detach())) * s.n
+        d3 = (1 - _unpressed(grid, grid.apart, centroids(model.geometry, x.detach()), n.detach())) * n
     return d3.repeat_interleave(grid.points.shape[0], dim=-2)
 
 
@@ -124,7 +122,7 @@ def repulsion(model: Model, grid: Grid, layers: Layers, p: Pressure, s: Surface,
     """Change of the vertices' velocities [..., V, 3] m/s by contact.
 
     The exact transpose of how vertices carry velocity to the nodes, with the affine part: momentum and its moment are
-    kept to rounding, and contact is as symmetric as elasticity. Without the affine part folds flutter.
+    kept to rounding, and contact is as symmetric as elasticity.
     """
     count = grid.points.shape[0]
     change, moment = push(p.nodes, p.pull, p.d3, grid.spacing, dt)

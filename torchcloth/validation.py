@@ -86,7 +86,7 @@ def check_motions(
 
 
 def check_state(state: ClothState, like: ClothState) -> None:
-    """Refuse a state that was made for another cloth (than ``like``, one of its own), or is not finite."""
+    """Refuse a state that was made for another cloth (than ``like``, one of the right shapes), or is not finite."""
     got, expected = ({name: tuple(t.shape[-2:]) for name, t in _named(s).items()} for s in (state, like))
     if got != expected:
         raise InvalidInput(

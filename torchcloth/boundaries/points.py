@@ -21,8 +21,7 @@ class TrianglePoints(nn.Module):
     def __init__(self, mesh: Mesh, spacing: float) -> None:
         super().__init__()
         index, weight = _lattice(mesh.faces, int(np.ceil(mesh.mean_edge / spacing - 1e-9)))
-        share = np.zeros(len(mesh.vertices))
-        np.add.at(share, mesh.faces.ravel(), np.repeat(mesh.area / 3, 3))
+        share = mesh.vertex_area
         dtype = torch.get_default_dtype()
         self.register_buffer("index", torch.as_tensor(index.T.ravel().copy()), persistent=False)
         self.register_buffer("weight", torch.as_tensor(weight.T[..., None].copy(), dtype=dtype), persistent=False)

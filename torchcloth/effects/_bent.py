@@ -55,7 +55,7 @@ class BentSheet(nn.Module):
     def bind(self, mesh: Mesh, stencils: Stencils | None = None, device: torch.device | None = None) -> BentSheet:
         """Build the stencils of a mesh, or take them if they are there already."""
         near, second, first = curvature_stencils(mesh) if stencils is None else stencils
-        area, share = mixed_area(mesh), thirds(mesh)
+        area, share = mixed_area(mesh), mesh.vertex_area
         bending, slope = (_largest(near, part, area, share) for part in (second, first))
         weight = np.concatenate([second, first], axis=-1).transpose(2, 1, 0)[..., None]
         self.near = torch.as_tensor(near.T.copy(), device=device)
@@ -119,11 +119,6 @@ class BentSheet(nn.Module):
 def differences(field: Tensor, index: Tensor) -> Tensor:
     """Values at each vertex's ``index`` [D, V] less its own [..., D, V, 3]: small numbers, wherever the sheet is."""
     return field.index_select(-2, index.flatten()).unflatten(-2, index.shape) - field.unsqueeze(-3)
-
-
-def thirds(mesh: Mesh) -> np.ndarray:
-    """[V] m^2, a third of each triangle to each corner, as mass is shared."""
-    return np.bincount(mesh.faces.ravel(), np.repeat(mesh.area / 3, 3), minlength=len(mesh.vertices))
 
 
 def _largest(near: np.ndarray, weight: np.ndarray, area: np.ndarray, share: np.ndarray) -> float:

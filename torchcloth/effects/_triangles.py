@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -24,17 +23,16 @@ class Triangles(nn.Module):
     def bind(self, mesh: Mesh, device: torch.device | None = None) -> Triangles:
         """Resolve the mesh."""
         dtype, gradient = torch.get_default_dtype(), mesh.shape_gradient
-        share = np.bincount(mesh.faces.ravel(), np.repeat(mesh.area / 3, 3), minlength=len(mesh.vertices))
         largest = 3 * (gradient**2).sum((1, 2)).max()  # a triangle on its own share of the mass (Irons, Treharne)
         self.corners = torch.as_tensor(mesh.faces.T.ravel().copy(), device=device)
         self.gradient, self.area, self.shear_bound = (
             torch.as_tensor(value, dtype=dtype, device=device).unsqueeze(-1)
-            for value in (gradient.transpose(1, 2, 0).copy(), mesh.area, share * largest)
+            for value in (gradient.transpose(1, 2, 0).copy(), mesh.area, mesh.vertex_area * largest)
         )
         return self
 
     def columns(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Deformation gradient's warp and weft columns [..., E, 3]."""
+        """Deformation gradient's warp and weft columns [..., E, 3]; of velocities, their rates."""
         x0, x1, x2 = x.index_select(-2, self.corners).unflatten(-2, (3, -1)).unbind(-3)
         (a1, b1), (a2, b2) = self.gradient[1], self.gradient[2]
         return a1 * (x1 - x0) + a2 * (x2 - x0), b1 * (x1 - x0) + b2 * (x2 - x0)

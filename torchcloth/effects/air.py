@@ -74,7 +74,7 @@ class AirDrag(AbstractEffect):
     def bind(self, mesh: Mesh) -> AirDrag:
         """Sizes of the triangles, for the bounds on what a wind does."""
         perimeter = np.linalg.norm(np.roll(mesh.rest, -1, axis=1) - mesh.rest, axis=-1).sum(1)
-        sizes = (np.bincount(mesh.faces.ravel(), np.repeat(size, 3)) for size in (mesh.area / 3, perimeter / 2))
+        sizes = (mesh.vertex_area, np.bincount(mesh.faces.ravel(), np.repeat(perimeter / 2, 3)))
         like = {"dtype": torch.get_default_dtype(), "device": self.wind.device}
         self.share, self.rim = (torch.as_tensor(size, **like).unsqueeze(-1) for size in sizes)
         return self

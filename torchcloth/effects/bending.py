@@ -13,7 +13,7 @@ from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from ..types import Moment
-from ._bent import BentSheet, differences, thirds
+from ._bent import BentSheet, differences
 from ._curvature import curvature_stencils, gathered, largest_eigenvalue, local_matrices, mixed_area, pattern
 from ._plate import Operator, Plate
 from .base import AbstractEffect, Amplitude
@@ -108,7 +108,7 @@ class Bending(AbstractEffect):
             got, want = f"shape {tuple(self.stiffness.raw.shape)}", f"a number, [{len(mesh.faces)}] or [B, 1]"
             raise InvalidInput("bending stiffness", got=got, expected=want)
         dtype, device = torch.get_default_dtype(), self.stiffness.raw.device
-        stencils, area, share = curvature_stencils(mesh), mixed_area(mesh), thirds(mesh)
+        stencils, area, share = curvature_stencils(mesh), mixed_area(mesh), mesh.vertex_area
         form = stencils.second @ np.linalg.cholesky(_isotropic(self.poisson)) * np.sqrt(area)[:, None, None]
         local = local_matrices(form)
         shape = pattern(stencils.near, local)

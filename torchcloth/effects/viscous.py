@@ -6,9 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._math import dot
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from ..types import Moment
+from ._triangles import Triangles
 from .base import AbstractEffect, Amplitude
 
 
@@ -35,21 +37,15 @@ class KelvinVoigt(AbstractEffect):
     def __init__(self, viscosity: float | Tensor = 1.0) -> None:
         super().__init__()
         self.viscosity = PhysicalParameter(viscosity, "N s/m", "nonnegative", name="membrane viscosity")
-        for name, like in (("corners", torch.long), ("gradient", None), ("bound", None)):
-            self.register_buffer(name, torch.zeros(0, dtype=like), persistent=False)
-        self.corners: Tensor  # [3 E], all first corners, then all second, then all third
-        self.gradient: Tensor  # [3, 2, E, 1] 1/m, of the corners' shape functions along warp and weft
+        self.triangles = Triangles()
+        self.register_buffer("bound", torch.zeros(0, 1), persistent=False)
         self.bound: Tensor  # [V, 1] m^2 / m^2: a vertex's area times the largest damping of a triangle
 
     def bind(self, mesh: Mesh) -> KelvinVoigt:
-        """Gradients of the shape functions, and the bound on their spectrum."""
+        """Resolve the triangles, and the bound on their spectrum."""
         device, dtype = self.viscosity.raw.device, torch.get_default_dtype()
-        gradient = mesh.shape_gradient
-        share = np.bincount(mesh.faces.ravel(), np.repeat(mesh.area / 3, 3))
-        self.corners = torch.as_tensor(mesh.faces.T.ravel().copy(), device=device)
-        laid = gradient.transpose(1, 2, 0)[..., None].copy()
-        self.gradient = torch.as_tensor(laid, dtype=dtype, device=device)
-        bound = share * 3 * _largest(gradient)
+        self.triangles.bind(mesh, device)
+        bound = mesh.vertex_area * 3 * _largest(mesh.shape_gradient)
         self.bound = torch.as_tensor(bound, dtype=dtype, device=device).unsqueeze(-1)
         return self
 
@@ -60,21 +56,9 @@ class KelvinVoigt(AbstractEffect):
     def force(self, c: Tensor, now: Moment) -> Tensor:
         """-area F S G_a on the corners of each triangle, summed on the vertices."""
         f1, f2 = now.surface.f1, now.surface.f2
-        rate1, rate2 = self._rates_of_deformation(now.v)
-        e11, e22 = (f1 * rate1).sum(-1, keepdim=True), (f2 * rate2).sum(-1, keepdim=True)
-        e12 = 0.5 * ((f1 * rate2).sum(-1, keepdim=True) + (f2 * rate1).sum(-1, keepdim=True))
-        weight = c * now.surface.area
-        p1, p2 = weight * (e11 * f1 + e12 * f2), weight * (e12 * f1 + e22 * f2)
-        second, third = (-(g[0] * p1 + g[1] * p2) for g in self.gradient[1:])
-        stacked = torch.cat([-(second + third), second, third], dim=-2)
-        index = self.corners.unsqueeze(-1).expand(stacked.shape)
-        return torch.zeros_like(now.x).expand(*stacked.shape[:-2], -1, -1).scatter_add(-2, index, stacked)
-
-    def _rates_of_deformation(self, v: Tensor) -> tuple[Tensor, Tensor]:
-        """Columns of F' [..., E, 3] 1/s; differences first, so that a common velocity cancels exactly."""
-        v0, v1, v2 = v.index_select(-2, self.corners).unflatten(-2, (3, -1)).unbind(-3)
-        (a1, a2), (b1, b2) = self.gradient[1], self.gradient[2]
-        return a1 * (v1 - v0) + b1 * (v2 - v0), a2 * (v1 - v0) + b2 * (v2 - v0)
+        rate1, rate2 = self.triangles.columns(now.v)
+        e11, e22, e12 = dot(f1, rate1), dot(f2, rate2), 0.5 * (dot(f1, rate2) + dot(f2, rate1))
+        return self.triangles.force(c * (e11 * f1 + e12 * f2), c * (e12 * f1 + e22 * f2))
 
     def rates(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
         """The largest damping rate of a single triangle on its own share of the vertices' mass (Irons, Treharne)."""

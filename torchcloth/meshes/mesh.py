@@ -95,6 +95,11 @@ class Mesh:
         return signed_area(self.rest)
 
     @property
+    def vertex_area(self) -> np.ndarray:
+        """[V] m^2, rest: a third of each triangle to each corner, as mass is shared."""
+        return np.bincount(self.faces.ravel(), np.repeat(self.area / 3, 3), minlength=len(self.vertices))
+
+    @property
     def shape_gradient(self) -> np.ndarray:
         """[F, 3, 2] 1/m, gradient of each corner's linear shape function in material axes: F = sum_a x_a (x) G_a."""
         edges = np.stack([self.rest[:, 1] - self.rest[:, 0], self.rest[:, 2] - self.rest[:, 0]], axis=-1)
