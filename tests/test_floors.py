@@ -21,7 +21,7 @@ FLOORS = (
     ("model",),
     ("self_contact", "strain", "dynamics"),
     ("apic",),
-    ("functional", "stability", "recordings", "losses"),
+    ("functional", "stability", "recordings", "losses", "engine"),
     ("observe", "intervals", "validation"),
     ("cloth", "robots"),
     ("identification", "diagnosis", "plan", "testing"),

@@ -1,0 +1,109 @@
+// The engine's plain C interface. Programs are built once and run many times; errors come back as text.
+#include <string>
+
+#include "kernels/kernels.h"
+#include "loop.h"
+#include "run.h"
+#include "stencil.h"
+
+namespace {
+
+thread_local std::string message;
+
+template <class F>
+int guarded(F work) {
+    try {
+        work();
+        return 0;
+    } catch (const std::exception& error) {
+        message = error.what();
+        return 1;
+    }
+}
+
+template <class R>
+struct Engine {
+    tc::Program<R> program;
+    std::vector<tc::Kernel<R>> kernels = tc::all_kernels<R>();
+
+    tc::Loop<R>& loop() {
+        auto* last = program.stages.empty() ? nullptr : dynamic_cast<tc::Loop<R>*>(program.stages.back().get());
+        if (last == nullptr) throw std::logic_error("no loop to add to");
+        return *last;
+    }
+};
+
+}  // namespace
+
+#define TC_API extern "C" __attribute__((visibility("default")))
+// Every function exists for float (f) and double (d).
+#define TC_BOTH(R, s)                                                                                                  \
+    TC_API void* tc_new_##s() { return new Engine<R>(); }                                                              \
+    TC_API void tc_free_##s(void* e) { delete static_cast<Engine<R>*>(e); }                                            \
+    TC_API int tc_field_##s(void* e, int kind, int rows, int comps, int raw, const R* data) {                          \
+        auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
+        const int f = p.field(tc::Kind(kind), rows, comps, raw != 0);                                                  \
+        if (data) {                                                                                                    \
+            p.constants[f].reset(p.fields[f].size());                                                                  \
+            for (int r = 0; r < rows; r++)                                                                             \
+                for (int c = 0; c < comps; c++)                                                                        \
+                    p.constants[f].data[raw ? r * comps + c : c * p.fields[f].padded + r] = data[r * comps + c];       \
+        }                                                                                                              \
+        return f;                                                                                                      \
+    }                                                                                                                  \
+    TC_API void tc_pair_##s(void* e, int state, int next) { static_cast<Engine<R>*>(e)->program.next[state] = next; }  \
+    TC_API int tc_table_##s(void* e, const int* data, int count) {                                                     \
+        auto& tables = static_cast<Engine<R>*>(e)->program.tables;                                                     \
+        tables.emplace_back(data, data + count);                                                                       \
+        tables.back().resize(tc::round_up(count, tc::LANES<float>), count ? data[count - 1] : 0);                      \
+        return int(tables.size()) - 1;                                                                                 \
+    }                                                                                                                  \
+    TC_API void tc_loop_##s(void* e, int items) {                                                                      \
+        auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
+        engine.program.stages.push_back(std::make_unique<tc::Loop<R>>(engine.program, engine.kernels.data(), items));  \
+    }                                                                                                                  \
+    TC_API int tc_move_##s(void* e, int code, int field, int table, int reg) {                                         \
+        auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
+        return guarded([&] {                                                                                           \
+            const int comps = engine.program.fields.at(field).comps;                                                   \
+            engine.loop().code.push_back({tc::Instruction::Code(code), field, table, reg, comps, -1, {}, {}});         \
+            engine.program.registers = std::max(engine.program.registers, reg + comps);                                \
+        });                                                                                                            \
+    }                                                                                                                  \
+    TC_API int tc_call_##s(void* e, int kernel, const int* in, const int* out, int feeds) {                            \
+        auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
+        return guarded([&] {                                                                                           \
+            const auto& k = engine.kernels.at(kernel);                                                                 \
+            engine.loop().code.push_back({tc::Instruction::call, -1, -1, -1, 0, kernel, {in, in + k.inputs},           \
+                                          {out, out + k.outputs}, feeds != 0});                                        \
+            for (int o : engine.loop().code.back().out)                                                                \
+                engine.program.registers = std::max(engine.program.registers, (o >= 0 ? o : ~o) + 1);                  \
+        });                                                                                                            \
+    }                                                                                                                  \
+    TC_API void tc_stencil_##s(void* e, int table, int weight, int x, int y, int near, int count, int transposed) {    \
+        auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
+        p.stages.push_back(std::make_unique<tc::Stencil<R>>(p, table, weight, x, y, near, count, transposed != 0));    \
+    }                                                                                                                  \
+    TC_API void tc_again_##s(void* e, int stage) { static_cast<Engine<R>*>(e)->program.stages.at(stage)->again = true; } \
+    TC_API void tc_ready_##s(void* e) { static_cast<Engine<R>*>(e)->program.lay_out(); }                               \
+    TC_API int64_t tc_size_##s(void* e, int full) {                                                                    \
+        auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
+        return int64_t(full ? p.record_size : p.state_size);                                                           \
+    }                                                                                                                  \
+    TC_API int tc_run_##s(void* e, const tc::Call* call, int mode) {                                                   \
+        return guarded([&] {                                                                                           \
+            tc::Run<R> run(static_cast<Engine<R>*>(e)->program, *call);                                                \
+            mode == 0 ? run.forward() : mode == 1 ? run.reverse() : run.tangent();                                     \
+        });                                                                                                            \
+    }
+
+TC_BOTH(float, f)
+TC_BOTH(double, d)
+
+TC_API const char* tc_error() { return message.c_str(); }
+TC_API int tc_kernels() { return int(tc::all_kernels<double>().size()); }
+TC_API const char* tc_kernel_name(int k) { return tc::all_kernels<double>()[k].name; }
+TC_API int tc_kernel_info(int k, int what) {
+    const auto kernel = tc::all_kernels<double>()[k];
+    return what == 0 ? kernel.inputs : what == 1 ? kernel.outputs : kernel.flops;
+}

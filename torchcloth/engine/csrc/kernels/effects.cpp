@@ -1,0 +1,64 @@
+// Forces of effects: torchcloth/effects.
+#include "kernels.h"
+#include "../vec.h"
+
+namespace tc {
+
+// Velocity of the centroid, n, J, area, pressure, friction, wind -> force on the triangle. effects/air.py
+struct AirDrag {
+    static constexpr const char* name = "air_drag";
+    static constexpr int inputs = 13, outputs = 3;
+    static constexpr auto fixed = bits(7, 1);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto v = r.vec(), n = r.vec();
+        const T J = r.number(), area = r.number(), pressure = r.number(), friction = r.number();
+        const auto relative = v - r.vec();
+        const T speed = dot(relative, n);
+        const auto along = relative - speed * n;
+        const T now = area * J;
+        Write<T>{out}.vec(-((pressure * now * abs(speed) * speed) * n) - (friction * now * safe_norm(along)) * along);
+    }
+};
+
+// mass, acceleration -> force. effects/gravity.py
+struct Weight {
+    static constexpr const char* name = "weight";
+    static constexpr int inputs = 4, outputs = 3;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T mass = r.number();
+        Write<T>{out}.vec(mass * r.vec());
+    }
+};
+
+// rate, mass, velocity -> force. effects/damping.py
+struct MassDamping {
+    static constexpr const char* name = "mass_damping";
+    static constexpr int inputs = 5, outputs = 3;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T rate = r.number(), mass = r.number();
+        Write<T>{out}.vec(-((rate * mass) * r.vec()));
+    }
+};
+
+// stiffness, viscosity, x, v -> what the plate matrix acts on. effects/bending.py
+struct Bent {
+    static constexpr const char* name = "bent";
+    static constexpr int inputs = 8, outputs = 3;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T stiffness = r.number(), viscosity = r.number();
+        const auto x = r.vec(), v = r.vec();
+        Write<T>{out}.vec(stiffness * x + viscosity * v);
+    }
+};
+
+TC_KERNELS(effect_kernels, AirDrag, Weight, MassDamping, Bent)
+
+}  // namespace tc

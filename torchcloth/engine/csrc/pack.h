@@ -1,0 +1,93 @@
+// L numbers side by side: the arithmetic of all kernels. GCC and Clang turn it into whatever the processor has.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+namespace tc {
+
+constexpr int WIDTH = 64;  // bytes of a pack, one cache line
+
+template <class R, int L>
+struct Pack {
+    typedef R Lanes __attribute__((vector_size(sizeof(R) * L)));
+    Lanes v;
+
+    Pack() = default;
+    Pack(Lanes lanes) : v(lanes) {}
+    Pack(double c) : v(Lanes{} + R(c)) {}
+    R operator[](int lane) const { return v[lane]; }
+};
+
+template <class R>
+constexpr int LANES = WIDTH / int(sizeof(R));
+template <class R>
+using Wide = Pack<R, LANES<R>>;
+
+#define TC_BINARY(op)                                                                                     \
+    template <class R, int L>                                                                             \
+    inline Pack<R, L> operator op(Pack<R, L> a, Pack<R, L> b) { return Pack<R, L>(a.v op b.v); }          \
+    template <class R, int L>                                                                             \
+    inline Pack<R, L> operator op(Pack<R, L> a, double b) { return Pack<R, L>(a.v op R(b)); }             \
+    template <class R, int L>                                                                             \
+    inline Pack<R, L> operator op(double a, Pack<R, L> b) { return Pack<R, L>(R(a) op b.v); }
+TC_BINARY(+)
+TC_BINARY(-)
+TC_BINARY(*)
+TC_BINARY(/)
+#undef TC_BINARY
+
+template <class R, int L>
+inline Pack<R, L> operator-(Pack<R, L> a) { return Pack<R, L>(-a.v); }
+
+// Comparisons give 1 or 0; `select` takes the first where that is not 0.
+template <class R, int L>
+inline Pack<R, L> less(Pack<R, L> a, Pack<R, L> b) { return Pack<R, L>(a.v < b.v ? Pack<R, L>(1.0).v : Pack<R, L>(0.0).v); }
+template <class R, int L>
+inline Pack<R, L> less(Pack<R, L> a, double b) { return less(a, Pack<R, L>(b)); }
+template <class R, int L>
+inline Pack<R, L> less(double a, Pack<R, L> b) { return less(Pack<R, L>(a), b); }
+template <class R, int L>
+inline Pack<R, L> select(Pack<R, L> c, Pack<R, L> a, Pack<R, L> b) { return Pack<R, L>(c.v != Pack<R, L>(0.0).v ? a.v : b.v); }
+template <class R, int L>
+inline Pack<R, L> select(Pack<R, L> c, Pack<R, L> a, double b) { return select(c, a, Pack<R, L>(b)); }
+template <class R, int L>
+inline Pack<R, L> select(Pack<R, L> c, double a, Pack<R, L> b) { return select(c, Pack<R, L>(a), b); }
+template <class R, int L>
+inline Pack<R, L> at_least(Pack<R, L> a, double c) { return select(less(a, c), Pack<R, L>(c), a); }
+template <class R, int L>
+inline Pack<R, L> at_most(Pack<R, L> a, double c) { return select(less(c, a), Pack<R, L>(c), a); }
+template <class R, int L>
+inline Pack<R, L> abs(Pack<R, L> a) { return select(less(a, 0.0), -a, a); }
+template <class R, int L>
+inline Pack<R, L> detach(Pack<R, L> a) { return a; }
+template <class R, int L>
+inline Pack<R, L> constant(Pack<R, L>, double c) { return Pack<R, L>(c); }
+
+#define TC_EACH(name, call)                                                                               \
+    template <class R, int L>                                                                             \
+    inline Pack<R, L> name(Pack<R, L> a) {                                                                \
+        Pack<R, L> r;                                                                                     \
+        for (int i = 0; i < L; i++) r.v[i] = call(a.v[i]);                                                \
+        return r;                                                                                         \
+    }
+TC_EACH(sqrt, std::sqrt)
+TC_EACH(exp, std::exp)
+TC_EACH(expm1, std::expm1)
+#undef TC_EACH
+
+template <class R, int L>
+inline Pack<R, L> atan2(Pack<R, L> y, Pack<R, L> x) {
+    Pack<R, L> r;
+    for (int i = 0; i < L; i++) r.v[i] = std::atan2(y.v[i], x.v[i]);
+    return r;
+}
+
+template <class R, int L>
+inline R total(Pack<R, L> a) {
+    R sum = 0;
+    for (int i = 0; i < L; i++) sum += a.v[i];
+    return sum;
+}
+
+}  // namespace tc

@@ -1,0 +1,96 @@
+// What a substep is made of: fields, index tables, and the stages that read and write them.
+#pragma once
+
+#include <cstring>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "tape.h"
+
+namespace tc {
+
+// constant: of the mesh. parameter: an input with a derivative. state: at the start of the substep; its `next` at the
+// end. temporary: within a substep; a kept one is recorded, because the reverse sweep reads it. drive: one row per
+// substep. sum: added up over all substeps.
+enum class Kind : int { constant, parameter, state, next, temporary, kept, drive, sum };
+
+struct Field {
+    Kind kind;
+    int rows, comps;
+    int padded;       // rows, rounded up to whole packs
+    int offset = -1;  // of state and kept fields in a record
+    bool raw = false; // as the caller gives it; otherwise component by component
+    size_t size() const { return size_t(raw ? rows : padded) * comps; }
+};
+
+constexpr int round_up(int n, int to) { return (n + to - 1) / to * to; }
+
+template <class R>
+struct Buffer {  // aligned, zero at first
+    R* data = nullptr;
+    size_t size = 0;
+    Buffer() = default;
+    explicit Buffer(size_t n) { reset(n); }
+    Buffer(const Buffer&) = delete;
+    Buffer& operator=(const Buffer&) = delete;
+    Buffer(Buffer&& other) noexcept : data(other.data), size(other.size) { other.data = nullptr; other.size = 0; }
+    Buffer& operator=(Buffer&& other) noexcept { std::swap(data, other.data); std::swap(size, other.size); return *this; }
+    ~Buffer() { std::free(data); }
+    void reset(size_t n) {
+        std::free(data);
+        size = n;
+        const size_t bytes = (n * sizeof(R) + WIDTH - 1) / WIDTH * WIDTH + WIDTH;
+        data = static_cast<R*>(std::aligned_alloc(WIDTH, bytes));
+        if (data == nullptr) throw std::bad_alloc();
+        std::memset(static_cast<void*>(data), 0, bytes);
+    }
+    void clear() { std::memset(static_cast<void*>(data), 0, size * sizeof(R)); }
+};
+
+// One simulated scene, or one scene with some directions: everything that changes.
+template <class R>
+struct Scene {
+    std::vector<R*> value, bar, dot;  // by field; null where there is none
+    Buffer<Wide<R>> regs, bars;
+    Buffer<Along<R>> dots;            // [register][lane]
+};
+
+template <class R>
+struct Stage {
+    virtual ~Stage() = default;
+    virtual void forward(Scene<R>& s) const = 0;
+    virtual void tangent(Scene<R>& s) const = 0;
+    virtual void reverse(Scene<R>& s) const = 0;  // values of all that it reads are there
+    bool again = false;  // what it writes is not recorded: the reverse sweep runs it forward again
+};
+
+template <class R>
+struct Program {
+    std::vector<Field> fields;
+    std::vector<Buffer<R>> constants;  // by field
+    std::vector<int> next;  // by field: of a state, where it goes; else -1
+    std::vector<std::vector<int>> tables;  // padded to whole packs
+    std::vector<std::unique_ptr<Stage<R>>> stages;
+    int registers = 0;
+    size_t state_size = 0, record_size = 0;  // numbers
+
+    int field(Kind kind, int rows, int comps, bool raw) {
+        fields.push_back({kind, rows, comps, round_up(rows, LANES<float>), -1, raw});
+        next.push_back(-1);
+        constants.emplace_back();
+        if (kind == Kind::drive) fields.back().padded = 1;
+        return int(fields.size()) - 1;
+    }
+    void lay_out() {  // states first: the record of a coarse checkpoint is the start of a full one
+        record_size = 0;
+        for (Kind kind : {Kind::state, Kind::kept}) {
+            for (Field& f : fields)
+                if (f.kind == kind) f.offset = int(record_size), record_size += round_up(int(f.size()), LANES<float>);
+            if (kind == Kind::state) state_size = record_size;
+        }
+    }
+};
+
+}  // namespace tc

@@ -1,0 +1,290 @@
+// Many substeps of many scenes: values with records, the reverse sweep from them, and tangents.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <exception>
+#include <mutex>
+#include <thread>
+
+#include "program.h"
+
+namespace tc {
+
+// What the caller hands in and gets back for one field, each [scenes, rows, components] or, for drives,
+// [scenes, substeps, components]; tangents have the directions after the scenes. Null: not given, not wanted.
+struct Port {
+    const void* value;    // of parameters, states, drives
+    int64_t stride;       // numbers between scenes; 0: all share one
+    void* result;         // of nexts and sums
+    const void* seed;     // adjoint of nexts and sums
+    void* gradient;       // of parameters, states, drives
+    const void* dot;      // tangents of parameters, states, drives: [scenes or 1, directions, ...]
+    int64_t dot_stride;   // likewise
+    void* dot_result;     // of nexts and sums
+};
+
+struct Call {
+    const Port* ports;  // by field
+    int64_t scenes, substeps, directions, threads;
+    void* records;      // [scenes, 1 + ceil(substeps / every), record_size, or state_size where every > 1]
+    int64_t every;      // substeps between records; 0: none
+};
+
+template <class R>
+class Run {
+    using D = Along<R>;
+    const Program<R>& program;
+    const Call& call;
+
+    struct Memory {
+        Scene<R> scene;
+        std::vector<Buffer<R>> values, bars, dots;  // by field, owned
+        std::vector<size_t> temporaries;            // fields that start each substep at zero
+        Buffer<R> rows;                             // of a record: what is not recorded
+    };
+
+  public:
+    Run(const Program<R>& p, const Call& c) : program(p), call(c) {}
+
+    void forward() {
+        each(call.scenes, [&](int64_t scene) {
+            Memory m = memory(scene, Mode::value);
+            R* first = call.every ? record(scene, 0) : nullptr;
+            m.rows.reset(2 * program.record_size);
+            R *row = call.every == 1 ? first : m.rows.data, *after = nullptr;
+            start(m, scene, row);
+            for (int64_t k = 0; k < call.substeps; k++) {
+                if (call.every > 1 && k % call.every == 0) save(record(scene, k / call.every), row);
+                after = call.every == 1 ? record(scene, k + 1) : other(m, row);
+                substep(m, scene, k, row, after);
+                row = after;
+            }
+            finish(m, scene, row);
+        });
+    }
+
+    void reverse() {
+        each(call.scenes, [&](int64_t scene) {
+            Memory m = memory(scene, Mode::reverse);
+            seed(m, scene);
+            const int64_t every = call.every;
+            if (every > 1) m.rows.reset((every + 1) * program.record_size);
+            for (int64_t first = (call.substeps - 1) / every * every; first >= 0; first -= every) {
+                const int64_t last = std::min(first + every, call.substeps);
+                auto row = [&](int64_t k) { return every == 1 ? record(scene, k) : m.rows.data + (k - first) * program.record_size; };
+                if (every > 1) {
+                    std::memcpy(row(first), record(scene, first / every), program.state_size * sizeof(R));
+                    for (int64_t k = first; k < last; k++) substep(m, scene, k, row(k), row(k + 1));
+                }
+                for (int64_t k = last - 1; k >= first; k--) back(m, scene, k, row(k), row(k + 1));
+            }
+            gradients(m, scene);
+        });
+    }
+
+    void tangent() {
+        const int64_t chunks = (call.directions + DIRECTIONS - 1) / DIRECTIONS;
+        each(call.scenes * chunks, [&](int64_t task) {
+            const int64_t scene = task / chunks, chunk = task % chunks;
+            Memory m = memory(scene, Mode::tangent);
+            load_dots(m, scene, chunk);
+            m.rows.reset(2 * program.record_size);
+            R *row = m.rows.data, *after = nullptr;
+            start(m, scene, row);
+            for (int64_t k = 0; k < call.substeps; k++) {
+                after = other(m, row);
+                point(m, scene, k, row, after);
+                for (size_t f : m.temporaries) m.dots[f].clear();
+                for (const auto& stage : program.stages) stage->tangent(m.scene);
+                for (size_t f = 0; f < program.fields.size(); f++)
+                    if (program.next[f] >= 0) std::swap(m.scene.dot[f], m.scene.dot[program.next[f]]);
+                row = after;
+            }
+            if (chunk == 0) finish(m, scene, row);
+            save_dots(m, scene, chunk);
+        });
+    }
+
+  private:
+    enum class Mode { value, reverse, tangent };
+
+    template <class F>
+    void each(int64_t tasks, F work) {
+        const int64_t workers = std::max<int64_t>(1, std::min(call.threads, tasks));
+        std::atomic<int64_t> next{0};
+        std::exception_ptr failure;
+        std::mutex guard;
+        auto loop = [&] {
+            try {
+                for (int64_t task; (task = next++) < tasks;) work(task);
+            } catch (...) {
+                std::lock_guard<std::mutex> lock(guard);
+                failure = std::current_exception();
+            }
+        };
+        std::vector<std::thread> threads;
+        for (int64_t i = 1; i < workers; i++) threads.emplace_back(loop);
+        loop();
+        for (auto& thread : threads) thread.join();
+        if (failure) std::rethrow_exception(failure);
+    }
+
+    R* record(int64_t scene, int64_t k) const {
+        const size_t size = call.every == 1 ? program.record_size : program.state_size;
+        const int64_t count = 1 + (call.substeps + call.every - 1) / call.every;
+        return static_cast<R*>(call.records) + (scene * count + k) * size;
+    }
+    R* other(const Memory& m, const R* row) const {
+        return row == m.rows.data ? m.rows.data + program.record_size : m.rows.data;
+    }
+    void save(R* to, const R* row) const { std::memcpy(to, row, program.state_size * sizeof(R)); }
+
+    static bool is_input(Kind kind) { return kind == Kind::parameter || kind == Kind::drive; }
+    static bool is_within(Kind kind) { return kind == Kind::temporary || kind == Kind::kept; }
+    size_t size_of(const Field& f) const { return f.kind == Kind::drive ? size_t(call.substeps) * f.comps : f.size(); }
+
+    Memory memory(int64_t scene, Mode mode) const {
+        Memory m;
+        const size_t count = program.fields.size();
+        m.scene.value.assign(count, nullptr), m.scene.bar.assign(count, nullptr), m.scene.dot.assign(count, nullptr);
+        m.values.resize(count), m.bars.resize(count), m.dots.resize(count);
+        m.scene.regs.reset(program.registers);
+        if (mode == Mode::reverse) m.scene.bars.reset(program.registers);
+        if (mode == Mode::tangent) m.scene.dots.reset(size_t(program.registers) * LANES<R>);
+        for (size_t f = 0; f < count; f++) {
+            const Field& field = program.fields[f];
+            if (field.kind == Kind::constant) { m.scene.value[f] = program.constants[f].data; continue; }
+            if (is_within(field.kind)) m.temporaries.push_back(f);
+            if (field.kind == Kind::temporary || field.kind == Kind::sum || is_input(field.kind)) {
+                m.values[f].reset(size_of(field));
+                m.scene.value[f] = m.values[f].data;
+            }
+            if (is_input(field.kind)) load(m.values[f].data, field, call.ports[f].value, scene * call.ports[f].stride, 1);
+            if (mode == Mode::reverse && (!is_input(field.kind) || call.ports[f].gradient)) {
+                m.bars[f].reset(size_of(field));
+                m.scene.bar[f] = m.bars[f].data;
+            }
+            if (mode == Mode::tangent && (!is_input(field.kind) || call.ports[f].dot)) {
+                m.dots[f].reset(size_of(field) * DIRECTIONS);
+                m.scene.dot[f] = m.dots[f].data;
+            }
+        }
+        return m;
+    }
+
+    // Between the caller's [rows, components] and ours, component by component; `depth` numbers each.
+    void load(R* to, const Field& f, const void* from, int64_t at, int depth, int which = 0) const {
+        if (from == nullptr) return;
+        const R* source = static_cast<const R*>(from) + at;
+        const bool plain = f.raw || f.kind == Kind::drive;
+        const size_t rows = f.kind == Kind::drive ? size_t(call.substeps) : size_t(f.rows);
+        for (size_t r = 0; r < rows; r++)
+            for (int c = 0; c < f.comps; c++)
+                to[(plain ? r * f.comps + c : size_t(c) * f.padded + r) * depth + which] = source[r * f.comps + c];
+    }
+    void unload(void* to, int64_t at, const Field& f, const R* from, int depth, int which = 0) const {
+        if (to == nullptr) return;
+        R* target = static_cast<R*>(to) + at;
+        const bool plain = f.raw || f.kind == Kind::drive;
+        const size_t rows = f.kind == Kind::drive ? size_t(call.substeps) : size_t(f.rows);
+        for (size_t r = 0; r < rows; r++)
+            for (int c = 0; c < f.comps; c++)
+                target[r * f.comps + c] = from[(plain ? r * f.comps + c : size_t(c) * f.padded + r) * depth + which];
+    }
+    size_t outer(const Field& f) const {  // numbers of the caller's array for one scene
+        return size_t(f.kind == Kind::drive ? call.substeps : f.rows) * f.comps;
+    }
+
+    void start(Memory& m, int64_t scene, R* row) const {
+        for (size_t f = 0; f < program.fields.size(); f++) {
+            const Field& field = program.fields[f];
+            if (field.kind == Kind::state) load(row + field.offset, field, call.ports[f].value, scene * call.ports[f].stride, 1);
+        }
+    }
+    void finish(Memory& m, int64_t scene, const R* row) const {
+        for (size_t f = 0; f < program.fields.size(); f++) {
+            const Field& field = program.fields[f];
+            if (program.next[f] >= 0) unload(call.ports[program.next[f]].result, scene * outer(field), field, row + field.offset, 1);
+            if (field.kind == Kind::sum) unload(call.ports[f].result, scene * outer(field), field, m.scene.value[f], 1);
+        }
+    }
+
+    // Let every field point to where it is in substep k.
+    void point(Memory& m, int64_t scene, int64_t k, R* row, R* after) const {
+        for (size_t f = 0; f < program.fields.size(); f++) {
+            const Field& field = program.fields[f];
+            if (field.kind == Kind::state || field.kind == Kind::kept) m.scene.value[f] = row + field.offset;
+            if (program.next[f] >= 0) m.scene.value[program.next[f]] = after + field.offset;
+            if (field.kind == Kind::drive) {
+                m.scene.value[f] = m.values[f].data + k * field.comps;
+                if (m.bars[f].data) m.scene.bar[f] = m.bars[f].data + k * field.comps;
+                if (m.dots[f].data) m.scene.dot[f] = m.dots[f].data + k * field.comps * DIRECTIONS;
+            }
+        }
+        std::memset(row + program.state_size, 0, (program.record_size - program.state_size) * sizeof(R));
+        for (size_t f : m.temporaries) if (m.values[f].data) m.values[f].clear();
+    }
+    void substep(Memory& m, int64_t scene, int64_t k, R* row, R* after) const {
+        point(m, scene, k, row, after);
+        for (const auto& stage : program.stages) stage->forward(m.scene);
+    }
+    void back(Memory& m, int64_t scene, int64_t k, R* row, R* after) const {
+        for (size_t f = 0; f < program.fields.size(); f++) {
+            const Field& field = program.fields[f];
+            if (field.kind == Kind::state || field.kind == Kind::kept) m.scene.value[f] = row + field.offset;
+            if (program.next[f] >= 0) m.scene.value[program.next[f]] = after + field.offset;
+            if (field.kind == Kind::state || is_within(field.kind)) std::memset(m.scene.bar[f], 0, field.size() * sizeof(R));
+            if (field.kind == Kind::temporary) m.values[f].clear();
+            if (field.kind == Kind::drive) {
+                m.scene.value[f] = m.values[f].data + k * field.comps;
+                if (m.bars[f].data) m.scene.bar[f] = m.bars[f].data + k * field.comps;
+            }
+        }
+        for (const auto& stage : program.stages) if (stage->again) stage->forward(m.scene);
+        for (auto stage = program.stages.rbegin(); stage != program.stages.rend(); ++stage) (*stage)->reverse(m.scene);
+        for (size_t f = 0; f < program.fields.size(); f++)
+            if (program.next[f] >= 0) std::swap(m.scene.bar[f], m.scene.bar[program.next[f]]);
+    }
+
+    void seed(Memory& m, int64_t scene) const {
+        for (size_t f = 0; f < program.fields.size(); f++) {
+            const Field& field = program.fields[f];
+            if (field.kind == Kind::next || field.kind == Kind::sum)
+                load(m.scene.bar[f], field, call.ports[f].seed, scene * outer(field), 1);
+        }
+    }
+    void gradients(Memory& m, int64_t scene) const {
+        for (size_t f = 0; f < program.fields.size(); f++) {
+            const Field& field = program.fields[f];
+            void* to = call.ports[f].gradient;
+            if (is_input(field.kind)) unload(to, scene * outer(field), field, m.bars[f].data, 1);
+            if (program.next[f] >= 0) unload(to, scene * outer(field), field, m.scene.bar[program.next[f]], 1);
+        }
+    }
+
+    void load_dots(Memory& m, int64_t scene, int64_t chunk) const {
+        each_dot(chunk, [&](size_t f, int64_t direction, int which) {
+            const Field& field = program.fields[f];
+            const Port& port = call.ports[f];
+            if ((is_input(field.kind) || field.kind == Kind::state) && port.dot)
+                load(m.dots[f].data, field, port.dot, scene * port.dot_stride + direction * outer(field), DIRECTIONS, which);
+        });
+    }
+    void save_dots(Memory& m, int64_t scene, int64_t chunk) const {
+        each_dot(chunk, [&](size_t f, int64_t direction, int which) {
+            const Field& field = program.fields[f];
+            const int64_t at = (scene * call.directions + direction) * outer(field);
+            if (program.next[f] >= 0) unload(call.ports[program.next[f]].dot_result, at, field, m.scene.dot[f], DIRECTIONS, which);
+            if (field.kind == Kind::sum) unload(call.ports[f].dot_result, at, field, m.scene.dot[f], DIRECTIONS, which);
+        });
+    }
+    template <class F>
+    void each_dot(int64_t chunk, F work) const {
+        const int64_t first = chunk * DIRECTIONS, last = std::min(first + DIRECTIONS, call.directions);
+        for (int64_t direction = first; direction < last; direction++)
+            for (size_t f = 0; f < program.fields.size(); f++) work(f, direction, int(direction - first));
+    }
+};
+
+}  // namespace tc

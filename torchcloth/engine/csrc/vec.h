@@ -1,0 +1,81 @@
+// Vectors of three numbers of any kind, and readers that turn a kernel's flat arguments into them.
+#pragma once
+
+#include "tape.h"
+
+namespace tc {
+
+template <class T>
+struct Vec {
+    T x, y, z;
+};
+
+template <class T>
+constexpr Vec<T> operator+(Vec<T> a, Vec<T> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+template <class T>
+constexpr Vec<T> operator-(Vec<T> a, Vec<T> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+template <class T>
+constexpr Vec<T> operator-(Vec<T> a) { return {-a.x, -a.y, -a.z}; }
+template <class T>
+constexpr Vec<T> operator*(T s, Vec<T> a) { return {s * a.x, s * a.y, s * a.z}; }
+template <class T>
+constexpr Vec<T> operator*(double s, Vec<T> a) { return {s * a.x, s * a.y, s * a.z}; }
+template <class T>
+constexpr Vec<T> operator/(Vec<T> a, T s) { return {a.x / s, a.y / s, a.z / s}; }
+template <class T>
+constexpr T dot(Vec<T> a, Vec<T> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+template <class T>
+constexpr Vec<T> cross(Vec<T> a, Vec<T> b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+template <class T>
+constexpr Vec<T> select(T c, Vec<T> a, Vec<T> b) { return {select(c, a.x, b.x), select(c, a.y, b.y), select(c, a.z, b.z)}; }
+
+// Length; value and derivative 0 at 0.
+template <class T>
+constexpr T safe_sqrt(T squared) {
+    const T positive = less(0.0, squared);
+    return select(positive, sqrt(select(positive, squared, 1.0)), 0.0);
+}
+template <class T>
+constexpr T safe_norm(Vec<T> a) { return safe_sqrt(dot(a, a)); }
+
+template <class T>
+struct Mat {  // by rows
+    Vec<T> a, b, c;
+};
+template <class T>
+constexpr Vec<T> operator*(Mat<T> m, Vec<T> v) { return {dot(m.a, v), dot(m.b, v), dot(m.c, v)}; }
+template <class T>
+constexpr Vec<T> transposed(Mat<T> m, Vec<T> v) { return v.x * m.a + v.y * m.b + v.z * m.c; }
+
+template <class T>
+struct Pose {  // p -> R p + t
+    Mat<T> R;
+    Vec<T> t;
+};
+
+template <class T>
+struct Read {
+    const T* at;
+    constexpr T number() { return *at++; }
+    constexpr Vec<T> vec() { const T* p = at; at += 3; return {p[0], p[1], p[2]}; }
+    constexpr Mat<T> mat() { Vec<T> a = vec(), b = vec(), c = vec(); return {a, b, c}; }
+    constexpr Pose<T> pose() {  // the first three rows of a 4 x 4 matrix
+        const T* p = at;
+        at += 12;
+        return {{{p[0], p[1], p[2]}, {p[4], p[5], p[6]}, {p[8], p[9], p[10]}}, {p[3], p[7], p[11]}};
+    }
+};
+
+template <class T>
+struct Write {
+    T* at;
+    constexpr void number(T a) { *at++ = a; }
+    constexpr void vec(Vec<T> a) { *at++ = a.x; *at++ = a.y; *at++ = a.z; }
+};
+
+// Bit mask of inputs that never vary: constants of the mesh, the step. Their derivatives are not computed.
+constexpr unsigned long long bits(int first, int count) { return ((1ull << count) - 1) << first; }
+
+}  // namespace tc

@@ -1,0 +1,1 @@
+"""Which kernels materials, effects and boundaries are."""

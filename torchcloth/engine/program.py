@@ -1,0 +1,214 @@
+"""Programs of the engine: which numbers a substep reads, which kernels it runs, and where results go.
+
+    loop = program.loop(triangles)
+    x0, x1, x2 = (loop.load(x, at=corner) for corner in corners)
+    *f, n, J = loop.call("surface", x0, x1, x2, ...)
+
+A loop's registers are numbered once and for all; a list of them stands for a vector.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from .library import kernels, library
+
+OWN, SHARED = -1, -2
+LOAD, ADD, PUT = 0, 2, 3
+
+
+class Kind(IntEnum):
+    """What a field is; as in csrc/program.h."""
+
+    CONSTANT, PARAMETER, STATE, NEXT, TEMPORARY, KEPT, DRIVE, SUM = range(8)
+
+
+class Field(NamedTuple):
+    """Rows of numbers, by the engine's number."""
+
+    id: int
+    rows: int
+    comps: int
+    kind: Kind
+
+
+class Program:
+    """What one substep does, for cloths of one structure and precision."""
+
+    def __init__(self, dtype: torch.dtype) -> None:
+        self.dtype = dtype
+        self._letter = "d" if dtype == torch.float64 else "f"
+        self._numpy = np.float64 if dtype == torch.float64 else np.float32
+        self._handle = ctypes.c_void_p(self._api("new")())
+        self.fields: list[Field] = []
+        self._constants: dict[bytes, Field] = {}
+        self._tables: dict[bytes, int] = {}
+        self._stages: list[Loop | Stencil] = []
+
+    def __del__(self) -> None:
+        self._api("free")(self._handle)
+
+    # -- fields ---------------------------------------------------------------------------------------------------
+
+    def constant(self, values: np.ndarray | torch.Tensor, raw: bool = False) -> Field:
+        """Numbers [rows, comps] that never change."""
+        values = values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
+        data = np.ascontiguousarray(values, dtype=self._numpy)
+        key = data.tobytes() + bytes([raw]) + str(data.shape).encode()
+        if key not in self._constants:
+            self._constants[key] = self._field(Kind.CONSTANT, *data.shape, raw=raw, data=data)
+        return self._constants[key]
+
+    def parameter(self, rows: int, comps: int, raw: bool = False) -> Field:
+        """An input with a derivative; ``raw``: read by a stencil, as it lies."""
+        return self._field(Kind.PARAMETER, rows, comps, raw)
+
+    def state(self, rows: int, comps: int) -> tuple[Field, Field]:
+        """(what is carried, where it goes at the end of the substep)."""
+        now, after = self._field(Kind.STATE, rows, comps), self._field(Kind.NEXT, rows, comps)
+        self._api("pair")(self._handle, now.id, after.id)
+        return now, after
+
+    def temporary(self, rows: int, comps: int, kept: bool = True) -> Field:
+        """Zero at the start of a substep; ``kept``: loops read it, so the reverse sweep must know it."""
+        return self._field(Kind.KEPT if kept else Kind.TEMPORARY, rows, comps)
+
+    def drive(self, comps: int) -> Field:
+        """An input with one row for every substep."""
+        return self._field(Kind.DRIVE, 1, comps)
+
+    def sum(self, comps: int) -> Field:
+        """Added up over all substeps."""
+        return self._field(Kind.SUM, 1, comps)
+
+    def table(self, index: np.ndarray | torch.Tensor) -> int:
+        """Rows to gather from or scatter to, one per item."""
+        data = np.ascontiguousarray(np.asarray(index), dtype=np.int32).ravel()
+        key = data.tobytes()
+        if key not in self._tables:
+            self._tables[key] = self._api("table")(self._handle, data.ctypes.data, len(data))
+        return self._tables[key]
+
+    def _field(self, kind: Kind, rows: int, comps: int, raw: bool = False, data: np.ndarray | None = None) -> Field:
+        pointer = None if data is None else data.ctypes.data
+        field = Field(self._api("field")(self._handle, int(kind), rows, comps, int(raw), pointer), rows, comps, kind)
+        self.fields.append(field)
+        return field
+
+    # -- stages ---------------------------------------------------------------------------------------------------
+
+    def loop(self, items: int) -> Loop:
+        """Runs after all stages that are there already."""
+        self._stages.append(Loop(items))
+        return self._stages[-1]  # type: ignore[return-value]
+
+    def stencil(self, near: np.ndarray, weight: Field, x: Field, y: Field, transposed: bool = False) -> None:
+        """y += differences of x over ``near`` [N, V] with weights [count, N, V]; transposed: x -= the transpose of y."""
+        self._stages.append(Stencil(self.table(near), weight, x, y, len(near), transposed))
+
+    def ready(self) -> Program:
+        """Hand everything to the engine; returns self."""
+        for stage in self._stages:
+            stage.emit(self._handle, self._api)
+        self._api("ready")(self._handle)
+        return self
+
+    def record_size(self, full: bool) -> int:
+        """Numbers of a record: of the state alone, or of all that the reverse sweep reads."""
+        return self._api("size")(self._handle, int(full))
+
+    def run(self, call, mode: int) -> None:
+        """0: values, 1: adjoint, 2: tangents."""
+        _check(self._api("run")(self._handle, ctypes.byref(call), mode))
+
+    def _api(self, name: str):
+        return getattr(library(), f"tc_{name}_{self._letter}")
+
+
+class Loop:
+    """Instructions on every item."""
+
+    def __init__(self, items: int) -> None:
+        self.items = items
+        self._used = 0
+        self._code: list[tuple] = []
+
+    def load(self, field: Field, at: int | None = None) -> list[int]:
+        """Registers with a row of the field: the item's own, the one in table ``at``, or the only one."""
+        regs = self._new(field.comps)
+        self._code.append(("move", LOAD, field.id, _place(field, at), regs[0]))
+        return regs
+
+    def call(self, kernel: str, *inputs: Sequence[int]) -> list[int]:
+        """Registers with a kernel's results."""
+        number, takes, gives = kernels()[kernel]
+        flat = [reg for group in inputs for reg in group]
+        if len(flat) != takes:
+            raise ValueError(f"kernel {kernel!r} takes {takes} numbers, not {len(flat)}")
+        out = self._new(gives)
+        self._code.append(("call", number, flat, out))
+        return out
+
+    def add(self, regs: Sequence[int], field: Field, at: int | None = None) -> None:
+        """Add registers to a row of the field."""
+        self._move(ADD, regs, field, at)
+
+    def put(self, regs: Sequence[int], field: Field, at: int | None = None) -> None:
+        """Write registers to a row of the field."""
+        self._move(PUT, regs, field, at)
+
+    def _move(self, code: int, regs: Sequence[int], field: Field, at: int | None) -> None:
+        if len(regs) != field.comps or list(regs) != list(range(regs[0], regs[0] + len(regs))):
+            raise ValueError(f"{field} cannot take the registers {regs}")
+        self._code.append(("move", code, field.id, _place(field, at), regs[0]))
+
+    def _new(self, count: int) -> list[int]:
+        self._used += count
+        return list(range(self._used - count, self._used))
+
+    def emit(self, handle, api) -> None:
+        """Hand over the instructions."""
+        read = {reg for kind, *rest in self._code if kind == "call" for reg in rest[1]}
+        api("loop")(handle, self.items)
+        for kind, *rest in self._code:
+            if kind == "move":
+                _check(api("move")(handle, *rest))
+            else:
+                number, takes, gives = rest
+                feeds = int(any(reg in read for reg in gives))
+                _check(api("call")(handle, number, _ints(takes), _ints(gives), feeds))
+
+
+class Stencil(NamedTuple):
+    """See ``Program.stencil``."""
+
+    table: int
+    weight: Field
+    x: Field
+    y: Field
+    near: int
+    transposed: bool
+
+    def emit(self, handle, api) -> None:
+        """Hand it over."""
+        count = self.y.comps // 3
+        api("stencil")(handle, self.table, self.weight.id, self.x.id, self.y.id, self.near, count, int(self.transposed))
+
+
+def _place(field: Field, at: int | None) -> int:
+    return SHARED if field.rows == 1 else OWN if at is None else at
+
+
+def _ints(values: Sequence[int]):
+    return (ctypes.c_int * len(values))(*values)
+
+
+def _check(code: int) -> None:
+    if code:
+        raise RuntimeError(library().tc_error().decode())

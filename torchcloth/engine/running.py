@@ -1,0 +1,100 @@
+"""Running a program on tensors: values, adjoints, tangents."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .library import Call, Port
+from .program import Field, Kind, Program
+
+BUDGET = 256 * 2**20  # bytes of records of one call, above which substeps are recomputed
+
+
+class Job(NamedTuple):
+    """A program with the numbers it runs on; every tensor is [scenes or 1, rows or substeps, comps]."""
+
+    program: Program
+    inputs: Mapping[Field, Tensor]  # parameters, states, drives
+    scenes: int
+    substeps: int
+
+
+def forward(job: Job, every: int = 0) -> tuple[dict[Field, Tensor], Tensor]:
+    """(nexts and sums [scenes, rows, comps], records); ``every``: substeps between records, 0 for none."""
+    like = next(iter(job.inputs.values()))
+    results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in outputs(job.program)}
+    records = like.new_empty(job.scenes, *_records(job, every))
+    ports = _ports(job)
+    for f, tensor in results.items():
+        ports[f.id].result = tensor.data_ptr()
+    _run(job, ports, 0, records, every)
+    return results, records
+
+
+def reverse(
+    job: Job, records: Tensor, every: int, seeds: Mapping[Field, Tensor], wanted: set[Field]
+) -> dict[Field, Tensor]:
+    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums."""
+    like = next(iter(job.inputs.values()))
+    grads = {f: like.new_zeros(job.scenes, *job.inputs[f].shape[1:]) for f in wanted}
+    ports = _ports(job)
+    for f, tensor in seeds.items():
+        ports[f.id].seed = tensor.data_ptr()
+    for f, tensor in grads.items():
+        ports[f.id].gradient = tensor.data_ptr()
+    _run(job, ports, 1, records, every)
+    return grads
+
+
+def tangent(job: Job, dots: Mapping[Field, Tensor], directions: int) -> tuple[dict[Field, Tensor], dict[Field, Tensor]]:
+    """(nexts and sums, their tangents [scenes, directions, rows, comps]) from tangents [scenes or 1, directions, ...]."""
+    like = next(iter(job.inputs.values()))
+    results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in outputs(job.program)}
+    moved = {f: like.new_empty(job.scenes, directions, f.rows, f.comps) for f in results}
+    ports = _ports(job)
+    for f, tensor in results.items():
+        ports[f.id].result, ports[f.id].dot_result = tensor.data_ptr(), moved[f].data_ptr()
+    for f, tensor in dots.items():
+        ports[f.id].dot, ports[f.id].dot_stride = tensor.data_ptr(), tensor[0].numel() if len(tensor) > 1 else 0
+    _run(job, ports, 2, like, 0, directions)
+    return results, moved
+
+
+def spacing(job: Job) -> int:
+    """Substeps between records: every one if they fit into the budget, else about the square root of all."""
+    size = torch.empty(0, dtype=job.program.dtype).element_size()
+    if job.scenes * (job.substeps + 1) * job.program.record_size(True) * size <= BUDGET:
+        return 1
+    states = job.scenes * job.substeps * job.program.record_size(False) * size
+    return max(int(job.substeps**0.5), states // BUDGET, 2)
+
+
+def outputs(program: Program) -> list[Field]:
+    """Nexts and sums, in the order of the program."""
+    return [f for f in program.fields if f.kind in (Kind.NEXT, Kind.SUM)]
+
+
+def _records(job: Job, every: int) -> tuple[int, int]:
+    if every == 0:
+        return 0, 0
+    return 1 + -(-job.substeps // every), job.program.record_size(every == 1)
+
+
+def _ports(job: Job):
+    ports = (Port * len(job.program.fields))()
+    for f, tensor in job.inputs.items():
+        if not tensor.is_contiguous() or tensor.dtype != job.program.dtype:
+            raise ValueError(f"{f}: not contiguous or of another precision")
+        ports[f.id].value, ports[f.id].stride = tensor.data_ptr(), tensor[0].numel() if len(tensor) > 1 else 0
+    return ports
+
+
+def _run(job: Job, ports, mode: int, records: Tensor, every: int, directions: int = 0) -> None:
+    threads = torch.get_num_threads()
+    pointer = ctypes.cast(ports, ctypes.POINTER(Port))
+    job.program.run(Call(pointer, job.scenes, job.substeps, directions, threads, records.data_ptr(), every), mode)
