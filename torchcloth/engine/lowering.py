@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +17,9 @@ from ..boundaries import Drive
 from ..model import Model
 from ..types import ClothState
 from .program import Field, Loop, Program
+
+
+LANES = 16  # of the widest pack, csrc/pack.h
 
 
 class Unfused(Exception):
@@ -46,26 +50,27 @@ class Lowering:
 
     def __init__(self, model: Model, state: ClothState, drives: Mapping[str, Drive]) -> None:
         self.model = model
-        self.program = Program(state.x.dtype)
+        self.vertices, self.faces = state.x.shape[-2], len(model.geometry.area)
+        self.program = Program(state.x.dtype, self.vertices)
         self.inputs: dict[Field, Tensor] = {}
         self._known: dict[int, Field] = {}
-        self.vertices, self.faces = state.x.shape[-2], len(model.geometry.area)
         self.x, self.v = (State(*self.program.state(self.vertices, 3)) for _ in range(2))
         self.memory = {key: State(*self.program.state(*value.shape[-2:])) for key, value in state.memory.items()}
         self.dt = self.program.parameter(1, 1)
         self.mass = self.parameter(model.mass)
         self.force = self.program.temporary(self.vertices, 3)
         self.resistance: Field | None = None
-        self.corners = [self.program.table(c) for c in model.geometry.corners.view(3, -1).cpu()]
-        self.triangles = Triangles(self)
+        order = _scattered(self.faces)
+        self.corners = [self.program.table(c[order]) for c in model.geometry.corners.view(3, -1).cpu().numpy()]
+        self.triangles = Triangles(self, order)
         self.drives = {name: (self.program.drive(16), self.program.drive(16)) for name in drives}
         self.impulses = {name: self.program.sum(6) for name in drives}
         self.closed = {name: drive.closed for name, drive in drives.items()}
 
-    def parameter(self, tensor: Tensor, raw: bool = False) -> Field:
-        """The input field of a coefficient [..., rows, comps]; one tensor has one field."""
+    def parameter(self, tensor: Tensor, near: int = 0) -> Field:
+        """The input field of a coefficient [..., rows, comps]; one tensor has one field. ``near``: of a stencil."""
         if id(tensor) not in self._known:
-            field = self.program.parameter(*tensor.shape[-2:], raw=raw)
+            field = self.program.parameter(*tensor.shape[-2:], near)
             self._known[id(tensor)], self.inputs[field] = field, tensor
         return self._known[id(tensor)]
 
@@ -77,10 +82,10 @@ class Lowering:
 class Triangles:
     """The loop over triangles; what several parts need is computed once."""
 
-    def __init__(self, lowering: Lowering) -> None:
+    def __init__(self, lowering: Lowering, order: np.ndarray) -> None:
         self._lowering = lowering
         g = lowering.model.geometry
-        self.loop = lowering.loop(lowering.faces)
+        self.loop = lowering.program.loop(lowering.faces, order)
         program = lowering.program
         self.shape = self.loop.load(program.constant(torch.cat([*g.warp, *g.weft], dim=-1)))  # a1, a2, b1, b2
         self.area = self.loop.load(program.constant(g.area))
@@ -134,13 +139,20 @@ class Triangles:
             self.loop.add(regs[3 * k : 3 * k + 3], self._lowering.force, corner)
 
     def _corners(self, name: str, field: Field) -> list[list[int]]:
-        flat = self._once(name, lambda: sum((self.loop.load(field, c) for c in self._lowering.corners), []))
+        flat = self._once(name, lambda: [r for c in self._lowering.corners for r in self.loop.load(field, c)])
         return [flat[0:3], flat[3:6], flat[6:9]]
 
     def _once(self, name: str, make) -> list[int]:
         if name not in self._done:
             self._done[name] = make()
         return self._done[name]
+
+
+def _scattered(items: int) -> np.ndarray:
+    """An order whose neighbours are far apart in the mesh: additions to one vertex need not wait for each other."""
+    packs = -(-items // LANES)
+    order = np.arange(packs * LANES).reshape(LANES, packs).T.ravel()
+    return order[order < items]
 
 
 def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lowering:

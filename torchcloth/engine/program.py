@@ -29,6 +29,12 @@ class Kind(IntEnum):
     CONSTANT, PARAMETER, STATE, NEXT, TEMPORARY, KEPT, DRIVE, SUM = range(8)
 
 
+class Shape(IntEnum):
+    """Of a stencil's operator; as in csrc/stencil.h."""
+
+    PLAIN, TRANSPOSED, SYMMETRIC = range(3)
+
+
 class Field(NamedTuple):
     """Rows of numbers, by the engine's number."""
 
@@ -41,8 +47,8 @@ class Field(NamedTuple):
 class Program:
     """What one substep does, for cloths of one structure and precision."""
 
-    def __init__(self, dtype: torch.dtype) -> None:
-        self.dtype = dtype
+    def __init__(self, dtype: torch.dtype, vertices: int) -> None:
+        self.dtype, self.vertices = dtype, vertices
         self._letter = "d" if dtype == torch.float64 else "f"
         self._numpy = np.float64 if dtype == torch.float64 else np.float32
         self._handle = ctypes.c_void_p(self._api("new")())
@@ -56,18 +62,18 @@ class Program:
 
     # -- fields ---------------------------------------------------------------------------------------------------
 
-    def constant(self, values: np.ndarray | torch.Tensor, raw: bool = False) -> Field:
-        """Numbers [rows, comps] that never change."""
+    def constant(self, values: np.ndarray | torch.Tensor, near: int = 0) -> Field:
+        """Numbers [rows, comps] that never change; ``near``: the weights [count near V, 1] of a stencil."""
         values = values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
         data = np.ascontiguousarray(values, dtype=self._numpy)
-        key = data.tobytes() + bytes([raw]) + str(data.shape).encode()
+        key = data.tobytes() + f"{near} {data.shape}".encode()
         if key not in self._constants:
-            self._constants[key] = self._field(Kind.CONSTANT, *data.shape, raw=raw, data=data)
+            self._constants[key] = self._field(Kind.CONSTANT, *data.shape, near, data)
         return self._constants[key]
 
-    def parameter(self, rows: int, comps: int, raw: bool = False) -> Field:
-        """An input with a derivative; ``raw``: read by a stencil, as it lies."""
-        return self._field(Kind.PARAMETER, rows, comps, raw)
+    def parameter(self, rows: int, comps: int, near: int = 0) -> Field:
+        """An input with a derivative; ``near``: as for ``constant``."""
+        return self._field(Kind.PARAMETER, rows, comps, near)
 
     def state(self, rows: int, comps: int) -> tuple[Field, Field]:
         """(what is carried, where it goes at the end of the substep)."""
@@ -95,22 +101,24 @@ class Program:
             self._tables[key] = self._api("table")(self._handle, data.ctypes.data, len(data))
         return self._tables[key]
 
-    def _field(self, kind: Kind, rows: int, comps: int, raw: bool = False, data: np.ndarray | None = None) -> Field:
+    def _field(self, kind: Kind, rows: int, comps: int, near: int = 0, data: np.ndarray | None = None) -> Field:
         pointer = None if data is None else data.ctypes.data
-        field = Field(self._api("field")(self._handle, int(kind), rows, comps, int(raw), pointer), rows, comps, kind)
+        field = Field(
+            self._api("field")(self._handle, int(kind), rows, comps, near, self.vertices, pointer), rows, comps, kind
+        )
         self.fields.append(field)
         return field
 
     # -- stages ---------------------------------------------------------------------------------------------------
 
-    def loop(self, items: int) -> Loop:
-        """Runs after all stages that are there already."""
-        self._stages.append(Loop(items))
+    def loop(self, items: int, order: np.ndarray | None = None) -> Loop:
+        """Runs after all stages that are there already; ``order``: in which the items are gone through."""
+        self._stages.append(Loop(items, OWN if order is None else self.table(order)))
         return self._stages[-1]  # type: ignore[return-value]
 
-    def stencil(self, near: np.ndarray, weight: Field, x: Field, y: Field, transposed: bool = False) -> None:
-        """y += differences of x over ``near`` [N, V] with weights [count, N, V]; transposed: x -= the transpose of y."""
-        self._stages.append(Stencil(self.table(near), weight, x, y, len(near), transposed))
+    def stencil(self, near: np.ndarray, weight: Field, x: Field, y: Field, shape: Shape = Shape.PLAIN) -> None:
+        """y += differences of x over ``near`` [N, V] with weights [count, N, V]; transposed: x -= transpose of y."""
+        self._stages.append(Stencil(self.table(near), weight, x, y, shape))
 
     def ready(self) -> Program:
         """Hand everything to the engine; returns self."""
@@ -134,15 +142,15 @@ class Program:
 class Loop:
     """Instructions on every item."""
 
-    def __init__(self, items: int) -> None:
-        self.items = items
+    def __init__(self, items: int, own: int = OWN) -> None:
+        self.items, self._own = items, own
         self._used = 0
         self._code: list[tuple] = []
 
     def load(self, field: Field, at: int | None = None) -> list[int]:
         """Registers with a row of the field: the item's own, the one in table ``at``, or the only one."""
         regs = self._new(field.comps)
-        self._code.append(("move", LOAD, field.id, _place(field, at), regs[0]))
+        self._code.append(("move", LOAD, field.id, self._place(field, at), regs[0]))
         return regs
 
     def call(self, kernel: str, *inputs: Sequence[int]) -> list[int]:
@@ -166,7 +174,10 @@ class Loop:
     def _move(self, code: int, regs: Sequence[int], field: Field, at: int | None) -> None:
         if len(regs) != field.comps or list(regs) != list(range(regs[0], regs[0] + len(regs))):
             raise ValueError(f"{field} cannot take the registers {regs}")
-        self._code.append(("move", code, field.id, _place(field, at), regs[0]))
+        self._code.append(("move", code, field.id, self._place(field, at), regs[0]))
+
+    def _place(self, field: Field, at: int | None) -> int:
+        return SHARED if field.rows == 1 else self._own if at is None else at
 
     def _new(self, count: int) -> list[int]:
         self._used += count
@@ -192,17 +203,11 @@ class Stencil(NamedTuple):
     weight: Field
     x: Field
     y: Field
-    near: int
-    transposed: bool
+    shape: Shape
 
     def emit(self, handle, api) -> None:
         """Hand it over."""
-        count = self.y.comps // 3
-        api("stencil")(handle, self.table, self.weight.id, self.x.id, self.y.id, self.near, count, int(self.transposed))
-
-
-def _place(field: Field, at: int | None) -> int:
-    return SHARED if field.rows == 1 else OWN if at is None else at
+        api("stencil")(handle, self.table, self.weight.id, self.x.id, self.y.id, int(self.shape))
 
 
 def _ints(values: Sequence[int]):

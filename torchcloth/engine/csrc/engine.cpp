@@ -40,14 +40,14 @@ struct Engine {
 #define TC_BOTH(R, s)                                                                                                  \
     TC_API void* tc_new_##s() { return new Engine<R>(); }                                                              \
     TC_API void tc_free_##s(void* e) { delete static_cast<Engine<R>*>(e); }                                            \
-    TC_API int tc_field_##s(void* e, int kind, int rows, int comps, int raw, const R* data) {                          \
+    TC_API int tc_field_##s(void* e, int kind, int rows, int comps, int near, int vertices, const R* data) {    \
         auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
-        const int f = p.field(tc::Kind(kind), rows, comps, raw != 0);                                                  \
+        const int f = p.field(tc::Kind(kind), rows, comps, near, vertices);                                            \
         if (data) {                                                                                                    \
             p.constants[f].reset(p.fields[f].size());                                                                  \
             for (int r = 0; r < rows; r++)                                                                             \
                 for (int c = 0; c < comps; c++)                                                                        \
-                    p.constants[f].data[raw ? r * comps + c : c * p.fields[f].padded + r] = data[r * comps + c];       \
+                    p.constants[f].data[p.fields[f].place(r) + c] = data[r * comps + c];                              \
         }                                                                                                              \
         return f;                                                                                                      \
     }                                                                                                                  \
@@ -80,9 +80,9 @@ struct Engine {
                 engine.program.registers = std::max(engine.program.registers, (o >= 0 ? o : ~o) + 1);                  \
         });                                                                                                            \
     }                                                                                                                  \
-    TC_API void tc_stencil_##s(void* e, int table, int weight, int x, int y, int near, int count, int transposed) {    \
+    TC_API void tc_stencil_##s(void* e, int table, int weight, int x, int y, int shape) {                              \
         auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
-        p.stages.push_back(std::make_unique<tc::Stencil<R>>(p, table, weight, x, y, near, count, transposed != 0));    \
+        p.stages.push_back(std::make_unique<tc::Stencil<R>>(p, table, weight, x, y, tc::Shape(shape)));                \
     }                                                                                                                  \
     TC_API void tc_again_##s(void* e, int stage) { static_cast<Engine<R>*>(e)->program.stages.at(stage)->again = true; } \
     TC_API void tc_ready_##s(void* e) { static_cast<Engine<R>*>(e)->program.lay_out(); }                               \

@@ -2,12 +2,15 @@
 // and results are scattered. The reverse sweep and the tangents go through the same instructions.
 #pragma once
 
+#include <type_traits>
+
 #include "program.h"
 
 namespace tc {
 
 constexpr int OWN = -1;     // item i reads and writes row i
 constexpr int SHARED = -2;  // all items read, or add to, row 0
+constexpr int MOST = 64;    // components of a field
 
 struct Instruction {
     enum Code { load, call, add, put } code;
@@ -36,39 +39,62 @@ struct Loop : Stage<R> {
         const int k = item < items ? item : items - 1;
         return i.table == OWN ? k : program.tables[i.table][k];
     }
-    size_t stride(const Instruction& i) const { return program.fields[i.field].padded; }
+    size_t pitch(const Instruction& i) const { return program.fields[i.field].pitch; }
+    int count(int first) const { return first + L <= items ? L : items - first; }
+
+    // f(where each lane's row starts, numbers between rows), the frequent cases with constants that the compiler sees.
+    template <class F>
+    TC_INLINE void rows(const Instruction& i, int first, F f) const {
+        const size_t step = pitch(i);
+        if (count(first) < L || i.table == SHARED || step > 4)
+            f([this, &i, first, step](int lane) { return row(i, first + lane) * step; }, step);
+        else if (i.table == OWN) {
+            if (step == 4) f([first](int lane) { return size_t(first + lane) * 4; }, four);
+            else f([first](int lane) { return size_t(first + lane); }, one);
+        } else {
+            const int* index = program.tables[i.table].data() + first;
+            if (step == 4) f([index](int lane) { return size_t(index[lane]) * 4; }, four);
+            else f([index](int lane) { return size_t(index[lane]); }, one);
+        }
+    }
+    static constexpr std::integral_constant<size_t, 1> one{};
+    static constexpr std::integral_constant<size_t, 4> four{};
 
     void gather(const Instruction& i, const R* from, P* to, int first) const {
-        const size_t step = stride(i);
-        const bool whole = first + L <= items;
-        for (int c = 0; c < i.comps; c++) {
-            const R* source = from + c * step;
-            P& target = to[i.reg + c];
-            if (i.table == OWN && whole) target = *reinterpret_cast<const P*>(source + first);
-            else if (i.table >= 0 && whole) {
-                const int* index = program.tables[i.table].data() + first;
-                for (int lane = 0; lane < L; lane++) target.v[lane] = source[index[lane]];
-            } else for (int lane = 0; lane < L; lane++) target.v[lane] = source[row(i, first + lane)];
-        }
+        rows(i, first, [&](auto place, auto step) {
+            if (step == 1)
+                for (int lane = 0; lane < L; lane++) to[i.reg].v[lane] = from[place(lane)];
+            else
+                for (int c = 0; c < i.comps; c += 4) {
+                    P quad[4];
+                    gather_quads([&](int lane) { return from + place(lane) + c; }, quad);
+                    for (int k = 0; k < 4 && c + k < i.comps; k++) to[i.reg + c + k] = quad[k];
+                }
+        });
     }
-    void scatter(const Instruction& i, R* to, const P* from, int first) const {
-        const size_t step = stride(i);
-        const int count = first + L <= items ? L : items - first;
-        for (int c = 0; c < i.comps; c++) {
-            R* target = to + c * step;
-            const P& source = from[i.reg + c];
-            if (i.table == OWN && count == L) *reinterpret_cast<P*>(target + first) = *reinterpret_cast<P*>(target + first) + source;
-            else if (i.table >= 0) {
-                const int* index = program.tables[i.table].data() + first;
-                for (int lane = 0; lane < count; lane++) target[index[lane]] += source.v[lane];
-            } else for (int lane = 0; lane < count; lane++) target[row(i, first + lane)] += source.v[lane];
-        }
+    // change(where a number or four lie, what came from the lane) for all lanes that are items.
+    template <class F>
+    TC_INLINE void scatter(const Instruction& i, R* to, const P* from, int first, F change) const {
+        const int lanes = count(first);
+        rows(i, first, [&](auto place, auto step) {
+            if (step == 1)
+                for (int lane = 0; lane < lanes; lane++) change(to[place(lane)], from[i.reg].v[lane]);
+            else
+                for (int c = 0; c < i.comps; c += 4) {
+                    P quad[4];
+                    for (int k = 0; k < 4; k++) quad[k] = c + k < i.comps ? from[i.reg + c + k] : P(0.0);
+                    const bool whole = lanes == L;
+                    scatter_quads(quad, [&](int lane, Quad<R> numbers) {
+                        if (whole || lane < lanes) change(*reinterpret_cast<Quad<R>*>(to + place(lane) + c), numbers);
+                    });
+                }
+        });
+    }
+    void add(const Instruction& i, R* to, const P* from, int first) const {
+        scatter(i, to, from, first, [](auto& place, auto x) { place = place + x; });
     }
     void store(const Instruction& i, R* to, const P* from, int first) const {
-        const size_t step = stride(i);
-        const int count = first + L <= items ? L : items - first;
-        for (int c = 0; c < i.comps; c++)
-            for (int lane = 0; lane < count; lane++) to[c * step + row(i, first + lane)] = from[i.reg + c].v[lane];
+        scatter(i, to, from, first, [](auto& place, auto x) { place = x; });
     }
     bool is_shared(const Instruction& i) const { return i.code == Instruction::load && i.table == SHARED; }
 
@@ -79,7 +105,7 @@ struct Loop : Stage<R> {
             for (const Instruction& i : code) switch (i.code) {
                 case Instruction::load: if (!is_shared(i)) gather(i, s.value[i.field], regs, first); break;
                 case Instruction::call: kernels[i.kernel].value(regs, i.in.data(), i.out.data()); break;
-                case Instruction::add: scatter(i, s.value[i.field], regs, first); break;
+                case Instruction::add: add(i, s.value[i.field], regs, first); break;
                 case Instruction::put: store(i, s.value[i.field], regs, first); break;
             }
     }
@@ -102,32 +128,39 @@ struct Loop : Stage<R> {
                 case Instruction::add:
                 case Instruction::put: take(*i, s.bar[i->field], bars, first); break;
                 case Instruction::call: kernels[i->kernel].adjoint(regs, bars, i->in.data(), i->out.data()); break;
-                case Instruction::load: if (!is_shared(*i) && s.bar[i->field]) scatter(*i, s.bar[i->field], bars, first); break;
+                case Instruction::load: if (!is_shared(*i) && s.bar[i->field]) add(*i, s.bar[i->field], bars, first); break;
             }
         }
         for (const Instruction& i : code)
             if (is_shared(i) && s.bar[i.field])
-                for (int c = 0; c < i.comps; c++) s.bar[i.field][c * stride(i)] += total(bars[i.reg + c]);
+                for (int c = 0; c < i.comps; c++) s.bar[i.field][c] += total(bars[i.reg + c]);
     }
     // Adjoint of a result; what was overwritten before does not count any more.
     void take(const Instruction& i, R* from, P* bars, int first) const {
-        const size_t step = stride(i);
-        const int count = first + L <= items ? L : items - first;
-        for (int c = 0; c < i.comps; c++) {
-            P seed(0.0);
-            for (int lane = 0; lane < count; lane++) {
-                R& place = from[c * step + row(i, first + lane)];
-                seed.v[lane] = place;
-                if (i.code == Instruction::put) place = 0;
+        const int lanes = count(first);
+        const bool spent = i.code == Instruction::put;
+        rows(i, first, [&](auto place, auto step) {
+            for (int c = 0; c < i.comps; c += 4) {
+                P seeds[4];
+                if (step == 1)
+                    for (int lane = 0; lane < L; lane++) seeds[0].v[lane] = from[place(lane)];
+                else gather_quads([&](int lane) { return from + place(lane) + c; }, seeds);
+                for (int k = 0; k < 4 && c + k < i.comps; k++) {
+                    for (int lane = lanes; lane < L; lane++) seeds[k].v[lane] = 0;
+                    bars[i.reg + c + k] = bars[i.reg + c + k] + seeds[k];
+                }
             }
-            bars[i.reg + c] = bars[i.reg + c] + seed;
-        }
+            for (int lane = 0; spent && lane < lanes; lane++)
+                for (int c = 0; c < i.comps; c++) from[place(lane) + c] = 0;
+        });
     }
 
     void tangent(Scene<R>& s) const override {
         P* regs = s.regs.data;
         D* dots = s.dots.data;
-        s.dots.clear();  // what has no tangent
+        for (const Instruction& i : code)  // what has no tangent
+            if (i.code == Instruction::load && s.dot[i.field] == nullptr)
+                std::memset(static_cast<void*>(dots + size_t(i.reg) * L), 0, size_t(i.comps) * L * sizeof(D));
         for (const Instruction& i : code)
             if (is_shared(i)) {
                 gather(i, s.value[i.field], regs, 0);
@@ -142,7 +175,7 @@ struct Loop : Stage<R> {
                     break;
                 case Instruction::call: kernels[i.kernel].tangent(regs, dots, i.in.data(), i.out.data()); break;
                 case Instruction::add:
-                    scatter(i, s.value[i.field], regs, first);
+                    add(i, s.value[i.field], regs, first);
                     scatter_along(i, s.dot[i.field], dots, first, true);
                     break;
                 case Instruction::put:
@@ -154,21 +187,21 @@ struct Loop : Stage<R> {
     void gather_along(const Instruction& i, const R* from, D* dots, int first) const {
         if (from == nullptr) return;
         const D* source = reinterpret_cast<const D*>(from);
-        const size_t step = stride(i);
+        const size_t step = pitch(i);
         for (int lane = 0; lane < L; lane++) {
-            const int k = row(i, first + lane);
-            for (int c = 0; c < i.comps; c++) dots[(i.reg + c) * L + lane] = source[c * step + k];
+            const size_t k = row(i, first + lane) * step;
+            for (int c = 0; c < i.comps; c++) dots[(i.reg + c) * L + lane] = source[k + c];
         }
     }
     void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds) const {
         D* target = reinterpret_cast<D*>(to);
-        const size_t step = stride(i);
-        const int count = first + L <= items ? L : items - first;
-        for (int lane = 0; lane < count; lane++) {
-            const int k = row(i, first + lane);
+        const size_t step = pitch(i);
+        const int lanes = count(first);
+        for (int lane = 0; lane < lanes; lane++) {
+            const size_t k = row(i, first + lane) * step;
             for (int c = 0; c < i.comps; c++) {
                 const D& x = dots[(i.reg + c) * L + lane];
-                D& place = target[c * step + k];
+                D& place = target[k + c];
                 place = adds ? place + x : x;
             }
         }

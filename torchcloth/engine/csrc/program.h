@@ -7,6 +7,7 @@
 #include <string>
 #include <vector>
 
+#include "rows.h"
 #include "tape.h"
 
 namespace tc {
@@ -19,13 +20,21 @@ enum class Kind : int { constant, parameter, state, next, temporary, kept, drive
 struct Field {
     Kind kind;
     int rows, comps;
-    int padded;       // rows, rounded up to whole packs
-    int offset = -1;  // of state and kept fields in a record
-    bool raw = false; // as the caller gives it; otherwise component by component
-    size_t size() const { return size_t(raw ? rows : padded) * comps; }
-};
+    int padded;        // rows, rounded up to whole packs
+    int pitch;         // numbers between rows, see rows.h
+    int offset = -1;   // of state and kept fields in a record
+    bool raw = false;  // weights of a stencil [count, near, vertices]
+    int near = 0, vertices = 0;
+    size_t size() const { return raw ? size_t(rows) / vertices * groups() * 4 : size_t(padded) * pitch; }
 
-constexpr int round_up(int n, int to) { return (n + to - 1) / to * to; }
+    // Weights lie by groups of four vertices, so that a stencil reads them one after the other.
+    int groups() const { return (vertices + 3) / 4; }
+    size_t place(size_t row) const {
+        if (!raw) return row * pitch;
+        const size_t v = row % vertices, n = row / vertices % near, c = row / vertices / near;
+        return ((c * groups() + v / 4) * near + n) * 4 + v % 4;
+    }
+};
 
 template <class R>
 struct Buffer {  // aligned, zero at first
@@ -76,11 +85,12 @@ struct Program {
     int registers = 0;
     size_t state_size = 0, record_size = 0;  // numbers
 
-    int field(Kind kind, int rows, int comps, bool raw) {
-        fields.push_back({kind, rows, comps, round_up(rows, LANES<float>), -1, raw});
+    int field(Kind kind, int rows, int comps, int near = 0, int vertices = 0) {
+        const bool raw = near > 0, plain = raw || kind == Kind::drive;
+        fields.push_back({kind, rows, comps, plain ? rows : round_up(rows, LANES<float>), plain ? comps : pitch_of(comps), -1,
+                          raw, near, vertices});
         next.push_back(-1);
         constants.emplace_back();
-        if (kind == Kind::drive) fields.back().padded = 1;
         return int(fields.size()) - 1;
     }
     void lay_out() {  // states first: the record of a coarse checkpoint is the start of a full one

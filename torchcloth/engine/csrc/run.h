@@ -173,24 +173,20 @@ class Run {
         return m;
     }
 
-    // Between the caller's [rows, components] and ours, component by component; `depth` numbers each.
+    // Between the caller's [rows, components] and ours, which has pitches; `depth` numbers each.
     void load(R* to, const Field& f, const void* from, int64_t at, int depth, int which = 0) const {
         if (from == nullptr) return;
         const R* source = static_cast<const R*>(from) + at;
-        const bool plain = f.raw || f.kind == Kind::drive;
-        const size_t rows = f.kind == Kind::drive ? size_t(call.substeps) : size_t(f.rows);
+        const size_t rows = outer(f) / f.comps;
         for (size_t r = 0; r < rows; r++)
-            for (int c = 0; c < f.comps; c++)
-                to[(plain ? r * f.comps + c : size_t(c) * f.padded + r) * depth + which] = source[r * f.comps + c];
+            for (int c = 0; c < f.comps; c++) to[(f.place(r) + c) * depth + which] = source[r * f.comps + c];
     }
     void unload(void* to, int64_t at, const Field& f, const R* from, int depth, int which = 0) const {
         if (to == nullptr) return;
         R* target = static_cast<R*>(to) + at;
-        const bool plain = f.raw || f.kind == Kind::drive;
-        const size_t rows = f.kind == Kind::drive ? size_t(call.substeps) : size_t(f.rows);
+        const size_t rows = outer(f) / f.comps;
         for (size_t r = 0; r < rows; r++)
-            for (int c = 0; c < f.comps; c++)
-                target[r * f.comps + c] = from[(plain ? r * f.comps + c : size_t(c) * f.padded + r) * depth + which];
+            for (int c = 0; c < f.comps; c++) target[r * f.comps + c] = from[(f.place(r) + c) * depth + which];
     }
     size_t outer(const Field& f) const {  // numbers of the caller's array for one scene
         return size_t(f.kind == Kind::drive ? call.substeps : f.rows) * f.comps;

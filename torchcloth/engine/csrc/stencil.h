@@ -5,132 +5,182 @@
 
 namespace tc {
 
-// Y_c(v) = sum_n W_c(n, v) (X(near(n, v)) - X(v)), added to Y; transposed: minus its transpose, X from Y.
-// The weights lie as [count, N, V]; a parameter among them gets its derivative.
+enum class Shape : int { plain, transposed, symmetric };
+
+// Y_c(v) = sum_n W_c(n, v) (X(near(n, v)) - X(v)), added to Y; transposed: minus its transpose, from Y to X; symmetric:
+// plain, and its own transpose. The weights lie as [count, N, V]; a parameter among them gets its derivative.
 template <class R>
 struct Stencil : Stage<R> {
+    static constexpr int TOGETHER = LANES<R> / 4;  // vertices in a pack
+    using P = Wide<R>;
     using D = Along<R>;
     const Program<R>& program;
-    int table;   // [N, V]
-    int weight;  // raw field
-    int x, y;    // fields of 3, and 3 count, components
-    int vertices, near, count;
-    bool transposed;
+    std::vector<int> others;  // vertices, laid out like the weights
+    int weight;               // field
+    int x, y;                 // fields of 3, and 3 count, components
+    int vertices, near, groups, count;
+    Shape shape;
 
-    Stencil(const Program<R>& p, int table, int weight, int x, int y, int near, int count, bool transposed)
-        : program(p), table(table), weight(weight), x(x), y(y), vertices(p.fields[x].rows), near(near), count(count),
-          transposed(transposed) {}
+    Stencil(const Program<R>& p, int table, int weight, int x, int y, Shape shape)
+        : program(p), weight(weight), x(x), y(y), vertices(p.fields[weight].vertices), near(p.fields[weight].near),
+          groups(p.fields[weight].groups()), count(p.fields[weight].rows / near / vertices), shape(shape) {
+        others.assign(size_t(groups) * near * 4, 0);
+        for (int n = 0; n < near; n++)
+            for (int v = 0; v < vertices; v++) others[at(0, v, n)] = p.tables[table][size_t(n) * vertices + v];
+    }
 
     void forward(Scene<R>& s) const override {
-        if (transposed) spread<1>(s.value[weight], s.value[y], s.value[x], R(1));
+        if (shape == Shape::transposed) spread<1>(s.value[weight], s.value[y], s.value[x], R(1));
         else differences<1>(s.value[weight], s.value[x], s.value[y], R(1));
     }
     void reverse(Scene<R>& s) const override {
-        if (transposed) {
+        if (shape == Shape::transposed) {
             differences<1>(s.value[weight], s.bar[x], s.bar[y], R(-1));
             if (s.bar[weight]) weigh(s.bar[x], s.value[y], s.bar[weight], R(-1));
         } else {
-            spread<1>(s.value[weight], s.bar[y], s.bar[x], R(-1));
+            if (shape == Shape::symmetric) differences<1>(s.value[weight], s.bar[y], s.bar[x], R(1));
+            else spread<1>(s.value[weight], s.bar[y], s.bar[x], R(-1));
             if (s.bar[weight]) weigh(s.value[x], s.bar[y], s.bar[weight], R(1));
         }
     }
     void tangent(Scene<R>& s) const override {
         forward(s);
-        if (transposed) spread<DIRECTIONS>(s.value[weight], s.dot[y], s.dot[x], R(1));
+        if (shape == Shape::transposed) spread<DIRECTIONS>(s.value[weight], s.dot[y], s.dot[x], R(1));
         else differences<DIRECTIONS>(s.value[weight], s.dot[x], s.dot[y], R(1));
         if (s.dot[weight] == nullptr) return;
-        if (transposed) spread_weights(s);
+        if (shape == Shape::transposed) spread_weights(s);
         else difference_weights(s);
     }
 
   private:
-    const int* neighbours(int n) const { return program.tables[table].data() + size_t(n) * vertices; }
-    size_t stride() const { return program.fields[x].padded; }
-    // Fields lie component by component; here the K numbers of the 3 components of a vertex are wanted together.
+    size_t at(int c, int v, int n) const { return ((size_t(c) * groups + v / 4) * near + n) * 4 + v % 4; }
+    int other(int v, int n) const { return others[at(0, v, n)]; }
+    size_t pitch() const { return program.fields[y].pitch; }  // x has 4
+    // A vector with K numbers for each component, and room for a fourth; as packs that the processor has.
     template <int K>
-    using Row = Pack<R, 4 * K>;
+    using Part = Pack<R, (4 * K < LANES<R> ? 4 * K : LANES<R>)>;
+    template <int K>
+    static constexpr int PACKS = 4 * K * int(sizeof(R)) / int(sizeof(Part<K>));
+    template <int K>
+    struct Row {
+        Part<K> part[PACKS<K>];
+    };
+    template <class V>
+    static V all(R number) { return V(typename V::Lanes{} + number); }
 
     template <int K>
-    Row<K> row(const R* field, int c, int v) const {
-        Row<K> out(0.0);
-        for (int k = 0; k < 3; k++)
-            for (int d = 0; d < K; d++) out.v[k * K + d] = field[((3 * c + k) * stride() + v) * K + d];
+    const Row<K>& vector(const R* field, int v) const { return *reinterpret_cast<const Row<K>*>(field + size_t(v) * 4 * K); }
+    template <int K>
+    Row<K>& vector(R* field, int v) const { return *reinterpret_cast<Row<K>*>(field + size_t(v) * 4 * K); }
+    const Quad<R>& quad(const R* field, int v) const { return *reinterpret_cast<const Quad<R>*>(field + size_t(v) * 4); }
+    template <int K>
+    Row<K> given(const R* field, int c, int v, R sign) const {
+        Row<K> out{};
+        std::memcpy(&out, field + (v * pitch() + 3 * c) * K, 3 * K * sizeof(R));
+        for (Part<K>& part : out.part) part = all<Part<K>>(sign) * part;
         return out;
     }
     template <int K>
-    void add(R* field, int c, int v, const Row<K>& value) const {
-        for (int k = 0; k < 3; k++)
-            for (int d = 0; d < K; d++) field[((3 * c + k) * stride() + v) * K + d] += value.v[k * K + d];
+    void add(R* field, int c, int v, const Row<K>& value, R sign) const {
+        R numbers[4 * K], *to = field + (v * pitch() + 3 * c) * K;
+        std::memcpy(numbers, &value, sizeof(value));
+        for (int k = 0; k < 3 * K; k++) to[k] += sign * numbers[k];
     }
+
     template <int K>
     void differences(const R* w, const R* from, R* to, R sign) const {
-        thread_local std::vector<Row<K>> rows;
-        rows.resize(vertices);
-        for (int v = 0; v < vertices; v++) rows[v] = row<K>(from, 0, v);
-        for (int c = 0; c < count; c++)
-            for (int v = 0; v < vertices; v++) {
-                Row<K> sum(0.0);
-                const Row<K> own = rows[v];
-                const R* part = w + size_t(c) * near * vertices + v;
-                for (int n = 0; n < near; n++)
-                    sum = sum + Row<K>(typename Row<K>::Lanes{} + part[size_t(n) * vertices]) * (rows[neighbours(n)[v]] - own);
-                add<K>(to, c, v, Row<K>(typename Row<K>::Lanes{} + sign) * sum);
+        for (int c = 0; c < count; c++) {
+            int v = 0;
+            if constexpr (K == 1)
+                for (; v + TOGETHER <= vertices; v += TOGETHER) together(w, from, to, sign, c, v);
+            for (; v < vertices; v++) {
+                Row<K> sum, own = vector<K>(from, v);
+                for (int k = 0; k < PACKS<K>; k++) sum.part[k] = Part<K>(0.0);
+                for (int n = 0; n < near; n++) {
+                    const Part<K> weight = all<Part<K>>(w[at(c, v, n)]);
+                    const Row<K>& there = vector<K>(from, other(v, n));
+                    for (int k = 0; k < PACKS<K>; k++) sum.part[k] = sum.part[k] + weight * (there.part[k] - own.part[k]);
+                }
+                add<K>(to, c, v, sum, sign);
             }
+        }
     }
+    // Several vertices side by side: four times fewer operations in float, two in double.
+    void together(const R* w, const R* from, R* to, R sign, int c, int v) const {
+        P own = *reinterpret_cast<const P*>(from + size_t(v) * 4), sum(0.0);
+        const R* weights = w + at(c, v, 0);
+        const int* index = others.data() + at(0, v, 0);
+        for (int n = 0; n < near; n++) sum = sum + each(weights + 4 * n) * (vectors(from, index + 4 * n) - own);
+        Row<1> parts[TOGETHER];
+        std::memcpy(parts, &sum, sizeof(sum));
+        for (int i = 0; i < TOGETHER; i++) add<1>(to, c, v + i, parts[i], sign);
+    }
+    P vectors(const R* from, const int* k) const {
+        if constexpr (TOGETHER == 4) return joined(quad(from, k[0]), quad(from, k[1]), quad(from, k[2]), quad(from, k[3]));
+        else return joined(quad(from, k[0]), quad(from, k[1]));
+    }
+    static P each(const R* w) {  // each weight four times
+        if constexpr (TOGETHER == 4) {
+            Quad<R> q;
+            std::memcpy(&q, w, sizeof(q));
+            const P all = joined(q, q, q, q);  // a widening shuffle would go through memory
+            return P(__builtin_shufflevector(all.v, all.v, 0, 0, 0, 0, 5, 5, 5, 5, 10, 10, 10, 10, 15, 15, 15, 15));
+        } else return joined(all<Quad<R>>(w[0]), all<Quad<R>>(w[1]));
+    }
+
     template <int K>
     void spread(const R* w, const R* from, R* to, R sign) const {
-        thread_local std::vector<Row<K>> rows;
-        rows.assign(vertices, Row<K>(0.0));
         for (int c = 0; c < count; c++)
             for (int v = 0; v < vertices; v++) {
-                const Row<K> given = Row<K>(typename Row<K>::Lanes{} + sign) * row<K>(from, c, v);
-                const R* part = w + size_t(c) * near * vertices + v;
+                const Row<K> moment = given<K>(from, c, v, sign);
+                Row<K> own{};
                 for (int n = 0; n < near; n++) {
-                    const Row<K> share = Row<K>(typename Row<K>::Lanes{} + part[size_t(n) * vertices]) * given;
-                    rows[v] = rows[v] + share;
-                    Row<K>& other = rows[neighbours(n)[v]];
-                    other = other - share;
+                    const Part<K> weight = all<Part<K>>(w[at(c, v, n)]);
+                    Row<K>& there = vector<K>(to, other(v, n));
+                    for (int k = 0; k < PACKS<K>; k++) {
+                        const Part<K> share = weight * moment.part[k];
+                        own.part[k] = own.part[k] + share;
+                        there.part[k] = there.part[k] - share;
+                    }
                 }
+                Row<K>& here = vector<K>(to, v);
+                for (int k = 0; k < PACKS<K>; k++) here.part[k] = here.part[k] + own.part[k];
             }
-        for (int v = 0; v < vertices; v++) add<K>(to, 0, v, rows[v]);
     }
-    // d(weights): differences of X times Y.
-    void weigh(const R* from, const R* times, R* to, R sign) const {
-        for (int c = 0; c < count; c++)
-            for (int n = 0; n < near; n++)
-                for (int v = 0; v < vertices; v++) {
-                    R sum = 0;
-                    for (int k = 0; k < 3; k++)
-                        sum += (from[k * stride() + neighbours(n)[v]] - from[k * stride() + v]) * times[(3 * c + k) * stride() + v];
-                    to[(size_t(c) * near + n) * vertices + v] += sign * sum;
-                }
+
+    // Work that the differences of X do on Y, per unit of each weight.
+    void weigh(const R* from, const R* on, R* to, R sign) const {
+        each_weight([&](size_t at, int c, int v, int other) {
+            const Quad<R> work = (quad(from, other) - quad(from, v)) * given<1>(on, c, v, R(1)).part[0];
+            to[at] += sign * (work.v[0] + work.v[1] + work.v[2]);
+        });
     }
     void difference_weights(Scene<R>& s) const {
-        const D* w = reinterpret_cast<const D*>(s.dot[weight]);
-        D* to = reinterpret_cast<D*>(s.dot[y]);
         const R* from = s.value[x];
-        for (int c = 0; c < count; c++)
-            for (int n = 0; n < near; n++)
-                for (int v = 0; v < vertices; v++)
-                    for (int k = 0; k < 3; k++) {
-                        const R d = from[k * stride() + neighbours(n)[v]] - from[k * stride() + v];
-                        D& place = to[(3 * c + k) * stride() + v];
-                        place = place + w[(size_t(c) * near + n) * vertices + v] * D(typename D::Lanes{} + d);
-                    }
+        each_weight([&](size_t at, int c, int v, int other) {
+            const Quad<R> d = quad(from, other) - quad(from, v);
+            const D& change = *reinterpret_cast<const D*>(s.dot[weight] + at * DIRECTIONS);
+            D* to = reinterpret_cast<D*>(s.dot[y]) + v * pitch() + 3 * c;
+            for (int k = 0; k < 3; k++) to[k] = to[k] + change * all<D>(d.v[k]);
+        });
     }
     void spread_weights(Scene<R>& s) const {
-        const D* w = reinterpret_cast<const D*>(s.dot[weight]);
         D* to = reinterpret_cast<D*>(s.dot[x]);
-        const R* from = s.value[y];
+        each_weight([&](size_t at, int c, int v, int other) {
+            const Quad<R> whole = given<1>(s.value[y], c, v, R(1)).part[0];
+            const D& change = *reinterpret_cast<const D*>(s.dot[weight] + at * DIRECTIONS);
+            for (int k = 0; k < 3; k++) {
+                const D share = change * all<D>(whole.v[k]);
+                to[v * 4 + k] = to[v * 4 + k] + share;
+                to[other * 4 + k] = to[other * 4 + k] - share;
+            }
+        });
+    }
+    template <class F>
+    void each_weight(F work) const {
         for (int c = 0; c < count; c++)
             for (int n = 0; n < near; n++)
-                for (int v = 0; v < vertices; v++)
-                    for (int k = 0; k < 3; k++) {
-                        const D share = w[(size_t(c) * near + n) * vertices + v] * D(typename D::Lanes{} + from[(3 * c + k) * stride() + v]);
-                        D &own = to[k * stride() + v], &other = to[k * stride() + neighbours(n)[v]];
-                        own = own + share;
-                        other = other - share;
-                    }
+                for (int v = 0; v < vertices; v++) work(at(c, v, n), c, v, other(v, n));
     }
 };
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from ...effects import AbstractEffect, AirDrag, Bending, Gravity, LineMass, MassDamping
 from ..lowering import Lowering, Unfused
+from ..program import Shape
 
 
 def lower(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
@@ -41,8 +42,8 @@ def _bending(low: Lowering, name: str, effect: Bending, c: Any) -> None:
     loop = low.loop(low.vertices)
     parts = [low.parameter(c.stiffness), low.parameter(c.viscosity), low.x.now, low.v.now]
     loop.put(loop.call("bent", *(loop.load(field) for field in parts)), bent)
-    weight = low.program.constant(effect.operator.reshape(-1, 1), raw=True)
-    low.program.stencil(effect.columns.cpu().numpy(), weight, bent, low.force)
+    weight = low.program.constant(effect.operator.reshape(-1, 1), near=len(effect.columns))
+    low.program.stencil(effect.columns.cpu().numpy(), weight, bent, low.force, Shape.SYMMETRIC)
 
 
 def _nothing(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
