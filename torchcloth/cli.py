@@ -1,4 +1,4 @@
-"""The command line: ``torchcloth identify | demo | doctor``. Wrong input: one line on stderr, exit code 2."""
+"""The command line: ``torchcloth identify | demo | doctor | bench``. Wrong input: one line on stderr, exit code 2."""
 
 from __future__ import annotations
 
@@ -52,6 +52,13 @@ def _parser() -> argparse.ArgumentParser:
     _add_fit_options(demo)
     doctor = verbs.add_parser("doctor", help="say what is installed and what works")
     doctor.set_defaults(run=_doctor)
+    bench = verbs.add_parser("bench", help="measure speed and memory, also beside other simulators")
+    bench.add_argument("--peers", action="store_true", help="beside Taichi, Warp, Newton, MuJoCo, where installed")
+    bench.add_argument("--json", action="store_true", help="one JSON object on stdout instead of tables")
+    bench.add_argument("--out", type=Path, metavar="DIR", help="folder for bench.json and a plot of cost by size")
+    bench.add_argument("--fast", action="store_true", help="tiny scenes: whether it works, not how fast it is")
+    bench.add_argument("--threads", type=int, metavar="N", help="of each contestant that can use them (all cores)")
+    bench.set_defaults(run=_bench)
     return parser
 
 
@@ -186,6 +193,12 @@ def _report(folder: Path, fit: Identification, cloth: Cloth, recordings: list[Re
     print(f"result:   {path}")
     print("pictures: " + ", ".join(str(p) for p in pictures))
     return 0
+
+
+def _bench(options: argparse.Namespace) -> int:
+    from .benchmarks import command  # pyright: ignore[reportMissingImports] - mapped from benchmarks/ at installation
+
+    return command.run(options)
 
 
 def _doctor(options: argparse.Namespace) -> int:

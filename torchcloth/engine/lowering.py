@@ -120,11 +120,6 @@ class Triangles:
         """Area ratio."""
         return self.surface[15:]
 
-    @property
-    def velocity(self) -> list[int]:
-        """Of the centroid."""
-        return self._once("velocity", lambda: self.loop.call("centroid", *self.v))
-
     def stress(self, columns: list[int]) -> None:
         """Forces of first Piola-Kirchhoff columns (6 registers) on the corners."""
         self.forces(self.loop.call("assemble", columns, self.shape, self.area))

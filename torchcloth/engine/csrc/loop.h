@@ -59,13 +59,15 @@ struct Loop : Stage<R> {
     }
     static constexpr std::integral_constant<size_t, 1> one{};
     static constexpr std::integral_constant<size_t, 4> four{};
+    template <class Step>
+    static int last_quad(Step step, int comps) { return std::is_integral_v<Step> ? (comps - 1) / 4 * 4 : 0; }
 
     void gather(const Instruction& i, const R* from, P* to, int first) const {
         rows(i, first, [&](auto place, auto step) {
             if (step == 1)
                 for (int lane = 0; lane < L; lane++) to[i.reg].v[lane] = from[place(lane)];
             else
-                for (int c = 0; c < i.comps; c += 4) {
+                for (int c = 0, end = last_quad(step, i.comps); c <= end; c += 4) {
                     P quad[4];
                     gather_quads([&](int lane) { return from + place(lane) + c; }, quad);
                     for (int k = 0; k < 4 && c + k < i.comps; k++) to[i.reg + c + k] = quad[k];
@@ -80,7 +82,7 @@ struct Loop : Stage<R> {
             if (step == 1)
                 for (int lane = 0; lane < lanes; lane++) change(to[place(lane)], from[i.reg].v[lane]);
             else
-                for (int c = 0; c < i.comps; c += 4) {
+                for (int c = 0, end = last_quad(step, i.comps); c <= end; c += 4) {
                     P quad[4];
                     for (int k = 0; k < 4; k++) quad[k] = c + k < i.comps ? from[i.reg + c + k] : P(0.0);
                     const bool whole = lanes == L;
@@ -140,7 +142,7 @@ struct Loop : Stage<R> {
         const int lanes = count(first);
         const bool spent = i.code == Instruction::put;
         rows(i, first, [&](auto place, auto step) {
-            for (int c = 0; c < i.comps; c += 4) {
+            for (int c = 0, end = last_quad(step, i.comps); c <= end; c += 4) {
                 P seeds[4];
                 if (step == 1)
                     for (int lane = 0; lane < L; lane++) seeds[0].v[lane] = from[place(lane)];
@@ -187,24 +189,25 @@ struct Loop : Stage<R> {
     void gather_along(const Instruction& i, const R* from, D* dots, int first) const {
         if (from == nullptr) return;
         const D* source = reinterpret_cast<const D*>(from);
-        const size_t step = pitch(i);
-        for (int lane = 0; lane < L; lane++) {
-            const size_t k = row(i, first + lane) * step;
-            for (int c = 0; c < i.comps; c++) dots[(i.reg + c) * L + lane] = source[k + c];
-        }
+        rows(i, first, [&](auto place, auto) {
+            for (int lane = 0; lane < L; lane++) {
+                const D* at = source + place(lane);
+                for (int c = 0; c < i.comps; c++) dots[(i.reg + c) * L + lane] = at[c];
+            }
+        });
     }
     void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds) const {
         D* target = reinterpret_cast<D*>(to);
-        const size_t step = pitch(i);
         const int lanes = count(first);
-        for (int lane = 0; lane < lanes; lane++) {
-            const size_t k = row(i, first + lane) * step;
-            for (int c = 0; c < i.comps; c++) {
-                const D& x = dots[(i.reg + c) * L + lane];
-                D& place = target[k + c];
-                place = adds ? place + x : x;
+        rows(i, first, [&](auto place, auto) {
+            for (int lane = 0; lane < lanes; lane++) {
+                D* at = target + place(lane);
+                for (int c = 0; c < i.comps; c++) {
+                    const D& x = dots[(i.reg + c) * L + lane];
+                    at[c] = adds ? at[c] + x : x;
+                }
             }
-        }
+        });
     }
 };
 

@@ -32,7 +32,7 @@ def _mass_damping(low: Lowering, name: str, effect: MassDamping, c: Any) -> None
 def _air_drag(low: Lowering, name: str, effect: AirDrag, c: Any) -> None:
     t = low.triangles
     coefficients = [t.parameter(value) for value in (c.pressure, c.friction, c.wind)]
-    t.push(t.loop.call("air_drag", t.velocity, t.normal, t.J, t.area, *coefficients))
+    t.forces(t.loop.call("air_drag", *t.x, *t.v, *coefficients))
 
 
 def _bending(low: Lowering, name: str, effect: Bending, c: Any) -> None:

@@ -4,21 +4,25 @@
 
 namespace tc {
 
-// Velocity of the centroid, n, J, area, pressure, friction, wind -> force on the triangle. effects/air.py
+// Positions and velocities of the corners, pressure, friction, wind -> forces on the corners. effects/air.py
 struct AirDrag {
     static constexpr const char* name = "air_drag";
-    static constexpr int inputs = 13, outputs = 3;
-    static constexpr auto fixed = bits(7, 1);
+    static constexpr int inputs = 23, outputs = 9;
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
-        const auto v = r.vec(), n = r.vec();
-        const T J = r.number(), area = r.number(), pressure = r.number(), friction = r.number();
-        const auto relative = v - r.vec();
+        const auto x0 = r.vec(), x1 = r.vec(), x2 = r.vec(), a = r.vec(), b = r.vec(), c = r.vec();
+        const T pressure = r.number(), friction = r.number();
+        const auto relative = (1.0 / 3) * (a + b + c) - r.vec();
+        const auto normal = cross(x1 - x0, x2 - x0);
+        const T twice = sqrt(dot(normal, normal));  // the area
+        const auto n = normal / twice;
         const T speed = dot(relative, n);
         const auto along = relative - speed * n;
-        const T now = area * J;
-        Write<T>{out}.vec(-((pressure * now * abs(speed) * speed) * n) - (friction * now * safe_norm(along)) * along);
+        const T third = (1.0 / 6) * twice;  // of the area: each corner's part
+        const auto part = -((pressure * third * abs(speed) * speed) * n) - (friction * third * safe_norm(along)) * along;
+        Write<T> w{out};
+        w.vec(part), w.vec(part), w.vec(part);
     }
 };
 

@@ -1,68 +1,8 @@
-// Kinematics of the triangles, how their stresses reach the vertices, and the step itself.
+// The step itself, and the parts of a triangle's work, one by one.
 #include "kernels.h"
-#include "../vec.h"
+#include "surface.h"
 
 namespace tc {
-
-// Corners, warp and weft coefficients -> f1, f2, cofactors dJ/df1 and dJ/df2, normal, J.
-struct Surface {
-    static constexpr const char* name = "surface";
-    static constexpr int inputs = 13, outputs = 16;
-    static constexpr auto fixed = bits(9, 4);
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const auto x0 = r.vec(), x1 = r.vec(), x2 = r.vec();
-        const T a1 = r.number(), a2 = r.number(), b1 = r.number(), b2 = r.number();
-        const auto d1 = x1 - x0, d2 = x2 - x0;
-        const auto f1 = a1 * d1 + a2 * d2, f2 = b1 * d1 + b2 * d2;
-        const auto normal = cross(f1, f2);
-        const T J = sqrt(dot(normal, normal));
-        const auto n = normal / J;
-        Write<T> w{out};
-        w.vec(f1), w.vec(f2), w.vec(cross(f2, n)), w.vec(cross(n, f1)), w.vec(n), w.number(J);
-    }
-};
-
-// Mean over the corners.
-struct Centroid {
-    static constexpr const char* name = "centroid";
-    static constexpr int inputs = 9, outputs = 3;
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const auto a = r.vec(), b = r.vec(), c = r.vec();
-        Write<T>{out}.vec((1.0 / 3) * (a + b + c));
-    }
-};
-
-// Stress columns, warp and weft coefficients, area -> forces on the three corners.
-struct Assemble {
-    static constexpr const char* name = "assemble";
-    static constexpr int inputs = 11, outputs = 9;
-    static constexpr auto fixed = bits(6, 5);
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const auto p1 = r.vec(), p2 = r.vec();
-        const T a1 = r.number(), a2 = r.number(), b1 = r.number(), b2 = r.number(), area = r.number();
-        const auto second = (-area) * (a1 * p1 + b1 * p2), third = (-area) * (a2 * p1 + b2 * p2);
-        Write<T> w{out};
-        w.vec(-(second + third)), w.vec(second), w.vec(third);
-    }
-};
-
-// A force on a triangle goes to its corners in equal parts.
-struct Thirds {
-    static constexpr const char* name = "thirds";
-    static constexpr int inputs = 3, outputs = 9;
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        const auto part = (1.0 / 3) * Read<T>{in}.vec();
-        Write<T> w{out};
-        w.vec(part), w.vec(part), w.vec(part);
-    }
-};
 
 // dt, velocity, force, mass -> velocity free of the boundaries.
 struct Kick {
@@ -101,6 +41,6 @@ struct Copy {
     static constexpr void run(const T* in, T* out) { Write<T>{out}.vec(1.0 * Read<T>{in}.vec()); }
 };
 
-TC_KERNELS(surface_kernels, Surface, Centroid, Assemble, Thirds, Kick, Drift, Copy)
+TC_KERNELS(surface_kernels, Surface, Assemble, Thirds, Kick, Drift, Copy)
 
 }  // namespace tc
