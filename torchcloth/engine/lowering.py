@@ -42,6 +42,7 @@ class Lowering:
         x, v: positions and velocities.
         memory: internal variables by key, as in ``ClothState.memory``.
         force: [V, 3], to be added to.
+        resistance: [V, 6] kg, mass of the air that moves along (xx, xy, xz, yy, yz, zz), to be added to; None without.
         triangles: the loop over triangles that comes first; ``Triangles`` has what is computed there already.
         inputs: parameter fields with their tensors [..., rows, comps].
         drives: by boundary, (increment, pose) fields [16] each.
@@ -77,6 +78,19 @@ class Lowering:
     def loop(self, items: int) -> Loop:
         """A loop after all that are there."""
         return self.program.loop(items)
+
+    def resisted(self, loop: Loop, change: list[int], at: int | None = None) -> list[int]:
+        """Registers of a change of velocity in the air that moves along, of all vertices or those of a table."""
+        if self.resistance is None:
+            return change
+        return loop.call("resisted", loop.load(self.resistance, at), loop.load(self.mass, at), change)
+
+    def momentum(self, loop: Loop, change: list[int], at: int | None = None) -> list[int]:
+        """Registers of the momentum that a change of velocity takes, that of the air included."""
+        mass = loop.load(self.mass, at)
+        if self.resistance is None:
+            return loop.call("scaled3", mass, change)
+        return loop.call("loaded", loop.load(self.resistance, at), mass, change)
 
 
 class Triangles:
@@ -178,8 +192,11 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lower
 def _kick(low: Lowering) -> Field:
     free = low.program.temporary(low.vertices, 3)
     loop = low.loop(low.vertices)
-    parts = [loop.load(field) for field in (low.dt, low.v.now, low.force, low.mass)]
-    loop.put(loop.call("kick", *parts), free)
+    dt, v, force, mass = (loop.load(field) for field in (low.dt, low.v.now, low.force, low.mass))
+    if low.resistance is None:
+        loop.put(loop.call("kick", dt, v, force, mass), free)
+    else:
+        loop.put(loop.call("plus3", v, low.resisted(loop, loop.call("push", dt, force, mass))), free)
     return free
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ...effects import AbstractEffect, AirDrag, Bending, Gravity, LineMass, MassDamping
+from ...effects import AbstractEffect, AddedMass, AirDrag, Bending, Gravity, LineMass, MassDamping
 from ..lowering import Lowering, Unfused
 from ..program import Shape
 
@@ -35,6 +35,15 @@ def _air_drag(low: Lowering, name: str, effect: AirDrag, c: Any) -> None:
     t.push(t.loop.call("air_drag", t.velocity, t.normal, t.J, t.area, *coefficients))
 
 
+def _added_mass(low: Lowering, name: str, effect: AddedMass, c: Any) -> None:
+    if low.resistance is None:
+        low.resistance = low.program.temporary(low.vertices, 6)
+    t = low.triangles
+    air = t.loop.call("added_mass", t.parameter(c), t.normal, t.J, t.area)
+    for corner in low.corners:
+        t.loop.add(air, low.resistance, corner)
+
+
 def _bending(low: Lowering, name: str, effect: Bending, c: Any) -> None:
     if c.operator is not None or c.curl is not None:
         raise Unfused(f"effect {name!r} (Bending with fields, ratios or curl)")
@@ -51,6 +60,7 @@ def _nothing(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
 
 
 _EFFECTS: dict[type, Callable[[Lowering, str, Any, Any], None]] = {
+    AddedMass: _added_mass,
     AirDrag: _air_drag,
     Bending: _bending,
     Gravity: _gravity,

@@ -22,6 +22,21 @@ struct AirDrag {
     }
 };
 
+// Mass of the air per area, n, J, area -> a corner's third of it, along the normal only. effects/added_mass.py
+struct AddedMass {
+    static constexpr const char* name = "added_mass";
+    static constexpr int inputs = 6, outputs = 6;
+    static constexpr auto fixed = bits(5, 1);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T air = r.number();
+        const auto n = r.vec();
+        const T J = r.number(), area = r.number();
+        Write<T>{out}.symmetric(outer((1.0 / 3) * (air * (area * J)), n));
+    }
+};
+
 // mass, acceleration -> force. effects/gravity.py
 struct Weight {
     static constexpr const char* name = "weight";
@@ -59,6 +74,6 @@ struct Bent {
     }
 };
 
-TC_KERNELS(effect_kernels, AirDrag, Weight, MassDamping, Bent)
+TC_KERNELS(effect_kernels, AirDrag, AddedMass, Weight, MassDamping, Bent)
 
 }  // namespace tc
