@@ -153,7 +153,7 @@ def moving(cloth: tc.Cloth, scenes: tuple[int, ...] = (), strain: float = 0.03, 
     x = x + strain * edge * noise((*scenes, *x.shape), seed + 1)
     turn = torch.linalg.qr(noise((3, 3), seed + 2))[0]
     turn = turn * torch.linalg.det(turn)
-    return cloth.state((x @ turn.mT).to(rest), 0.5 * noise((*scenes, *x.shape), seed + 3).to(rest))
+    return cloth.state((x @ turn.mT).to(rest), 0.5 * noise(x.shape, seed + 3).to(rest))
 
 
 def held(cloth_time: float, knots: int = 3, scenes: tuple[int, ...] = ()) -> Trajectory:

@@ -161,14 +161,16 @@ struct Drift {
     }
 };
 
-// A vector goes from one field to another.
-struct Copy {
-    static constexpr const char* name = "copy3";
-    static constexpr int inputs = 3, outputs = 3;
+// Numbers go from one place to another, or are added there.
+template <int N>
+struct Copied {
+    static constexpr int inputs = N, outputs = N;
     template <class T>
-    static constexpr void run(const T* in, T* out) { Write<T>{out}.vec(1.0 * Read<T>{in}.vec()); }
+    static constexpr void run(const T* in, T* out) { for (int i = 0; i < N; i++) out[i] = 1.0 * in[i]; }
 };
+struct Copy : Copied<3> { static constexpr const char* name = "copy3"; };
+struct CopyColumns : Copied<6> { static constexpr const char* name = "copy6"; };
 
-TC_KERNELS(surface_kernels, Surface, Centroid, Assemble, Thirds, Kick, Resisted, Loaded, Push, Scaled, Plus, Drift, Copy)
+TC_KERNELS(surface_kernels, Surface, Centroid, Assemble, Thirds, Kick, Resisted, Loaded, Push, Scaled, Plus, Drift, Copy, CopyColumns)
 
 }  // namespace tc
