@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from ..boundaries import Drive
+from ..effects._bent import BentSheet
 from ..model import Model
 from ..types import ClothState
-from .program import Field, Loop, Program
-
+from .program import Field, Loop, Program, Shape
 
 LANES = 16  # of the widest pack, csrc/pack.h
 
@@ -42,7 +42,9 @@ class Lowering:
         x, v: positions and velocities.
         memory: internal variables by key, as in ``ClothState.memory``.
         force: [V, 3], to be added to.
+        resistance: [V, 6] kg, mass of the air that moves along (xx, xy, xz, yy, yz, zz), to be added to; None without.
         triangles: the loop over triangles that comes first; ``Triangles`` has what is computed there already.
+        sheets: how the sheet is bent at its vertices, by the weights of the derivatives.
         inputs: parameter fields with their tensors [..., rows, comps].
         drives: by boundary, (increment, pose) fields [16] each.
         impulses: by boundary, [6].
@@ -63,6 +65,7 @@ class Lowering:
         order = _scattered(self.faces)
         self.corners = [self.program.table(c[order]) for c in model.geometry.corners.view(3, -1).cpu().numpy()]
         self.triangles = Triangles(self, order)
+        self.sheets: dict[Field, Sheet] = {}
         self.drives = {name: (self.program.drive(16), self.program.drive(16)) for name in drives}
         self.impulses = {name: self.program.sum(6) for name in drives}
         self.closed = {name: drive.closed for name, drive in drives.items()}
@@ -74,9 +77,39 @@ class Lowering:
             self._known[id(tensor)], self.inputs[field] = field, tensor
         return self._known[id(tensor)]
 
+    def number(self, value: float) -> Field:
+        """A constant of a part."""
+        return self.program.constant(np.array([[value]]))
+
     def loop(self, items: int) -> Loop:
         """A loop after all that are there."""
         return self.program.loop(items)
+
+    def sheet(self, bent: BentSheet) -> Sheet:
+        """The one of these stencils, for all effects that see the same bending."""
+        weight = self.program.constant(bent.weight.reshape(-1, 1), near=len(bent.near))
+        if weight not in self.sheets:
+            self.sheets[weight] = Sheet(self, bent, weight)
+        return self.sheets[weight]
+
+    def close(self) -> None:
+        """No more forces."""
+        self.triangles.close()
+        for sheet in self.sheets.values():
+            sheet.close()
+
+    def resisted(self, loop: Loop, change: list[int], at: int | None = None) -> list[int]:
+        """Registers of a change of velocity in the air that moves along, of all vertices or those of a table."""
+        if self.resistance is None:
+            return change
+        return loop.call("resisted", loop.load(self.resistance, at), loop.load(self.mass, at), change)
+
+    def momentum(self, loop: Loop, change: list[int], at: int | None = None) -> list[int]:
+        """Registers of the momentum that a change of velocity takes, that of the air included."""
+        mass = loop.load(self.mass, at)
+        if self.resistance is None:
+            return loop.call("scaled3", mass, change)
+        return loop.call("loaded", loop.load(self.resistance, at), mass, change)
 
 
 class Triangles:
@@ -90,6 +123,7 @@ class Triangles:
         self.shape = self.loop.load(program.constant(torch.cat([*g.warp, *g.weft], dim=-1)))  # a1, a2, b1, b2
         self.area = self.loop.load(program.constant(g.area))
         self._done: dict[str, list[int]] = {}
+        self._forces: list[int] | None = None
 
     def parameter(self, tensor: Tensor) -> list[int]:
         """Registers of a coefficient [..., E or 1, comps]."""
@@ -120,18 +154,19 @@ class Triangles:
         """Area ratio."""
         return self.surface[15:]
 
+    def push(self, kernel: str, *inputs: list[int]) -> None:
+        """Forces on the corners (9 numbers) that a kernel gives."""
+        self._forces = self.loop.call(kernel, *inputs, into=self._forces)
+
     def stress(self, columns: list[int]) -> None:
         """Forces of first Piola-Kirchhoff columns (6 registers) on the corners."""
-        self.forces(self.loop.call("assemble", columns, self.shape, self.area))
+        self.push("assemble", columns, self.shape, self.area)
 
-    def push(self, force: list[int]) -> None:
-        """A force on the triangle, in equal parts on its corners."""
-        self.forces(self.loop.call("thirds", force))
-
-    def forces(self, regs: list[int]) -> None:
-        """Forces on the three corners (9 registers)."""
-        for k, corner in enumerate(self._lowering.corners):
-            self.loop.add(regs[3 * k : 3 * k + 3], self._lowering.force, corner)
+    def close(self) -> None:
+        """Give the corners the sum of all that acts: one scatter, however many effects there are."""
+        if self._forces is not None:
+            for k, corner in enumerate(self._lowering.corners):
+                self.loop.add(self._forces[3 * k : 3 * k + 3], self._lowering.force, corner)
 
     def _corners(self, name: str, field: Field) -> list[list[int]]:
         flat = self._once(name, lambda: [r for c in self._lowering.corners for r in self.loop.load(field, c)])
@@ -150,6 +185,33 @@ def _scattered(items: int) -> np.ndarray:
     return order[order < items]
 
 
+class Sheet:
+    """The loop over vertices in which bending is seen, and moments become forces. effects/_bent.py"""
+
+    def __init__(self, lowering: Lowering, bent: BentSheet, weight: Field) -> None:
+        program, near = lowering.program, bent.near.cpu().numpy()
+        seen = program.temporary(lowering.vertices, 15)
+        self._answer = program.temporary(lowering.vertices, 15, kept=False)
+        program.stencil(near, weight, lowering.x.now, seen)
+        self.loop = lowering.loop(lowering.vertices)
+        program.stencil(near, weight, lowering.force, self._answer, Shape.TRANSPOSED)
+        self._seen = self.loop.load(seen)
+        self._area = self.loop.load(program.constant(bent.area))
+        *self._normal, k0, k1, k2 = self.loop.call("bent_sheet", self._seen)
+        self.curvature = [k0, k1, k2]
+        self._moment: list[int] | None = None
+
+    def moment(self, moment: list[int]) -> None:
+        """A bending moment (3 registers) that works on the curvature."""
+        self._moment = moment if self._moment is None else self.loop.call("copy3", moment, into=self._moment)
+
+    def close(self) -> None:
+        """Give the sum of all moments to the stencils."""
+        if self._moment is not None:
+            stress = self.loop.call("bending_stress", self._seen, self._normal, self._area, self._moment)
+            self.loop.put(stress, self._answer)
+
+
 def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lowering:
     """The program of a substep.
 
@@ -162,6 +224,7 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lower
     materials.lower(low)
     for name, (effect, c) in model.effects.items():
         effects.lower(low, name, effect, c)
+    low.close()
     velocity = _kick(low)
     for name, boundary in model.boundaries.items():
         velocity = boundaries.lower(low, name, boundary, velocity)
@@ -173,8 +236,11 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lower
 def _kick(low: Lowering) -> Field:
     free = low.program.temporary(low.vertices, 3)
     loop = low.loop(low.vertices)
-    parts = [loop.load(field) for field in (low.dt, low.v.now, low.force, low.mass)]
-    loop.put(loop.call("kick", *parts), free)
+    dt, v, force, mass = (loop.load(field) for field in (low.dt, low.v.now, low.force, low.mass))
+    if low.resistance is None:
+        loop.put(loop.call("kick", dt, v, force, mass), free)
+    else:
+        loop.put(loop.call("plus3", v, low.resisted(loop, loop.call("push", dt, force, mass))), free)
     return free
 
 

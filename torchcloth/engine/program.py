@@ -153,14 +153,14 @@ class Loop:
         self._code.append(("move", LOAD, field.id, self._place(field, at), regs[0]))
         return regs
 
-    def call(self, kernel: str, *inputs: Sequence[int]) -> list[int]:
-        """Registers with a kernel's results."""
+    def call(self, kernel: str, *inputs: Sequence[int], into: list[int] | None = None) -> list[int]:
+        """Registers with a kernel's results; ``into``: added to these."""
         number, takes, gives = kernels()[kernel]
         flat = [reg for group in inputs for reg in group]
         if len(flat) != takes:
             raise ValueError(f"kernel {kernel!r} takes {takes} numbers, not {len(flat)}")
-        out = self._new(gives)
-        self._code.append(("call", number, flat, out))
+        out = self._new(gives) if into is None else into
+        self._code.append(("call", number, flat, out if into is None else [~reg for reg in out]))
         return out
 
     def add(self, regs: Sequence[int], field: Field, at: int | None = None) -> None:
@@ -192,7 +192,7 @@ class Loop:
                 _check(api("move")(handle, *rest))
             else:
                 number, takes, gives = rest
-                feeds = int(any(reg in read for reg in gives))
+                feeds = int(any(reg in read or ~reg in read for reg in gives))
                 _check(api("call")(handle, number, _ints(takes), _ints(gives), feeds))
 
 

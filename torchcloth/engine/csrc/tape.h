@@ -16,7 +16,7 @@
 #include <cstdint>
 #include <utility>
 
-#include "pack.h"
+#include "functions.h"
 
 namespace tc {
 

@@ -19,6 +19,74 @@ struct Kick {
     }
 };
 
+// Mass of the air that moves along with a vertex, its own mass, a change of velocity -> the change with that air, so
+// written that no air changes nothing, bitwise. dynamics.py
+struct Resisted {
+    static constexpr const char* name = "resisted";
+    static constexpr int inputs = 10, outputs = 3;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto mass = r.symmetric();
+        const auto air = mass / r.number();
+        const auto change = r.vec();
+        const Symmetric<T> all{air.xx + 1.0, air.xy, air.xz, air.yy + 1.0, air.yz, air.zz + 1.0};
+        Write<T>{out}.vec(change - solve(all, air * change));
+    }
+};
+
+// Mass of the air, own mass, change of velocity -> what the two were given. dynamics.py
+struct Loaded {
+    static constexpr const char* name = "loaded";
+    static constexpr int inputs = 10, outputs = 3;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto air = r.symmetric();
+        const T mass = r.number();
+        const auto change = r.vec();
+        Write<T>{out}.vec(mass * change + air * change);
+    }
+};
+
+// dt, force, mass -> change of velocity.
+struct Push {
+    static constexpr const char* name = "push";
+    static constexpr int inputs = 5, outputs = 3;
+    static constexpr auto fixed = bits(0, 1);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T dt = r.number();
+        const auto force = r.vec();
+        Write<T>{out}.vec(dt * (force / r.number()));
+    }
+};
+
+// A vector times a number.
+struct Scaled {
+    static constexpr const char* name = "scaled3";
+    static constexpr int inputs = 4, outputs = 3;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T scale = r.number();
+        Write<T>{out}.vec(scale * r.vec());
+    }
+};
+
+// Sum of two vectors.
+struct Plus {
+    static constexpr const char* name = "plus3";
+    static constexpr int inputs = 6, outputs = 3;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto a = r.vec();
+        Write<T>{out}.vec(a + r.vec());
+    }
+};
+
 // dt, position, velocity -> position.
 struct Drift {
     static constexpr const char* name = "drift";
@@ -33,14 +101,15 @@ struct Drift {
     }
 };
 
-// A vector goes from one field to another.
-struct Copy {
-    static constexpr const char* name = "copy3";
-    static constexpr int inputs = 3, outputs = 3;
+// Numbers go from one place to another, or are added there.
+template <int N>
+struct Copied {
+    static constexpr int inputs = N, outputs = N;
     template <class T>
-    static constexpr void run(const T* in, T* out) { Write<T>{out}.vec(1.0 * Read<T>{in}.vec()); }
+    static constexpr void run(const T* in, T* out) { for (int i = 0; i < N; i++) out[i] = 1.0 * in[i]; }
 };
+struct Copy : Copied<3> { static constexpr const char* name = "copy3"; };
 
-TC_KERNELS(surface_kernels, Surface, Assemble, Thirds, Kick, Drift, Copy)
+TC_KERNELS(surface_kernels, Surface, Assemble, Kick, Resisted, Loaded, Push, Scaled, Plus, Drift, Copy)
 
 }  // namespace tc
