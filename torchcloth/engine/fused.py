@@ -71,8 +71,14 @@ def _fields(low: Lowering) -> list[Field]:
 
 def _inputs(low: Lowering, state: ClothState, dt: float, drives: Mapping[str, Drive]) -> list[Tensor]:
     step = torch.full((1, 1), dt, dtype=state.x.dtype)
-    moves = [pose.flatten(-2) for drive in drives.values() for pose in (drive.increment, drive.pose)]
+    moves = [tensor for drive in drives.values() for tensor in _moves(drive, state.x)]
     return [state.x, state.v, *state.memory.values(), step, *low.inputs.values(), *moves]
+
+
+def _moves(drive: Drive, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows of a drive's fields."""
+    closed = torch.tensor(drive.closed).to(like).unsqueeze(-1)
+    return drive.increment.flatten(-2), drive.pose.flatten(-2), closed
 
 
 def _flat(tensors: list[Tensor], batch: torch.Size) -> list[Tensor]:

@@ -46,7 +46,7 @@ class Lowering:
         triangles: the loop over triangles that comes first; ``Triangles`` has what is computed there already.
         sheets: how the sheet is bent at its vertices, by the weights of the derivatives.
         inputs: parameter fields with their tensors [..., rows, comps].
-        drives: by boundary, (increment, pose) fields [16] each.
+        drives: by boundary, (increment [16], pose [16], closed [1]) fields.
         impulses: by boundary, [6].
     """
 
@@ -66,9 +66,8 @@ class Lowering:
         self.corners = [self.program.table(c[order]) for c in model.geometry.corners.view(3, -1).cpu().numpy()]
         self.triangles = Triangles(self, order)
         self.sheets: dict[Field, Sheet] = {}
-        self.drives = {name: (self.program.drive(16), self.program.drive(16)) for name in drives}
+        self.drives = {name: tuple(self.program.drive(comps) for comps in (16, 16, 1)) for name in drives}
         self.impulses = {name: self.program.sum(6) for name in drives}
-        self.closed = {name: drive.closed for name, drive in drives.items()}
 
     def parameter(self, tensor: Tensor, near: int = 0) -> Field:
         """The input field of a coefficient [..., rows, comps]; one tensor has one field. ``near``: of a stencil."""
@@ -110,6 +109,35 @@ class Lowering:
         if self.resistance is None:
             return loop.call("scaled3", mass, change)
         return loop.call("loaded", loop.load(self.resistance, at), mass, change)
+
+
+class Velocities:
+    """The vertices' velocities on their way from the forces to the drift: registers, as long as one loop will do.
+
+    Attributes:
+        loop: over the vertices, the last of the program.
+        now: registers of the velocities in it.
+        before: registers of what they were before the present boundary.
+    """
+
+    def __init__(self, low: Lowering, loop: Loop, now: list[int]) -> None:
+        self._low, self.loop, self.now, self.before = low, loop, now, now
+
+    def store(self) -> Field:
+        """End the loop; returns the velocities, for what is not done vertex by vertex. ``resume`` when it is done."""
+        field = self._put(self.now)
+        self._stored = field if self.before == self.now else self._put(self.before)
+        return field
+
+    def resume(self, field: Field) -> None:
+        """A new loop, with the velocities of a field."""
+        self.loop = self._low.loop(self._low.vertices)
+        self.now, self.before = self.loop.load(field), self.loop.load(self._stored)
+
+    def _put(self, regs: list[int]) -> Field:
+        field = self._low.program.temporary(self._low.vertices, 3)
+        self.loop.put(regs, field)
+        return field
 
 
 class Triangles:
@@ -227,25 +255,21 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lower
     low.close()
     velocity = _kick(low)
     for name, boundary in model.boundaries.items():
-        velocity = boundaries.lower(low, name, boundary, velocity)
+        boundaries.lower(low, name, boundary, velocity)
     _drift(low, velocity)
     low.program.ready()
     return low
 
 
-def _kick(low: Lowering) -> Field:
-    free = low.program.temporary(low.vertices, 3)
+def _kick(low: Lowering) -> Velocities:
     loop = low.loop(low.vertices)
     dt, v, force, mass = (loop.load(field) for field in (low.dt, low.v.now, low.force, low.mass))
     if low.resistance is None:
-        loop.put(loop.call("kick", dt, v, force, mass), free)
-    else:
-        loop.put(loop.call("plus3", v, low.resisted(loop, loop.call("push", dt, force, mass))), free)
-    return free
+        return Velocities(low, loop, loop.call("kick", dt, v, force, mass))
+    return Velocities(low, loop, loop.call("plus3", v, low.resisted(loop, loop.call("push", dt, force, mass))))
 
 
-def _drift(low: Lowering, velocity: Field) -> None:
-    loop = low.loop(low.vertices)
-    dt, x, v = (loop.load(field) for field in (low.dt, low.x.now, velocity))
-    loop.put(loop.call("copy3", v), low.v.after)
-    loop.put(loop.call("drift", dt, x, v), low.x.after)
+def _drift(low: Lowering, velocity: Velocities) -> None:
+    loop, v = velocity.loop, velocity.now
+    loop.put(v, low.v.after)
+    loop.put(loop.call("drift", loop.load(low.dt), loop.load(low.x.now), v), low.x.after)

@@ -4,6 +4,7 @@
 #include "kernels/kernels.h"
 #include "loop.h"
 #include "run.h"
+#include "sieve.h"
 #include "stencil.h"
 
 namespace {
@@ -58,9 +59,10 @@ struct Engine {
         tables.back().resize(tc::round_up(count, tc::LANES<float>), count ? data[count - 1] : 0);                      \
         return int(tables.size()) - 1;                                                                                 \
     }                                                                                                                  \
-    TC_API void tc_loop_##s(void* e, int items) {                                                                      \
+    TC_API void tc_loop_##s(void* e, int items, int list, int flat) {                                                  \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
-        engine.program.stages.push_back(std::make_unique<tc::Loop<R>>(engine.program, engine.kernels.data(), items));  \
+        engine.program.stages.push_back(                                                                               \
+            std::make_unique<tc::Loop<R>>(engine.program, engine.kernels.data(), items, list, flat != 0));             \
     }                                                                                                                  \
     TC_API int tc_move_##s(void* e, int code, int field, int table, int reg) {                                         \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
@@ -79,6 +81,20 @@ struct Engine {
             for (int o : engine.loop().code.back().out)                                                                \
                 engine.program.registers = std::max(engine.program.registers, (o >= 0 ? o : ~o) + 1);                  \
         });                                                                                                            \
+    }                                                                                                                  \
+    TC_API int tc_lookup_##s(void* e, int field, int x, int y, int z, int in, int out) {                               \
+        auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
+        return guarded([&] {                                                                                           \
+            engine.loop().code.push_back({tc::Instruction::lookup, field, -1, -1, 0, -1, {in, x, y, z}, {out}});       \
+            engine.program.registers = std::max(engine.program.registers, out + tc::CELL);                             \
+        });                                                                                                            \
+    }                                                                                                                  \
+    TC_API void tc_sieve_##s(void* e, int list, int x, int reach, int dt, int corners, int starts, int points,         \
+                             int triangles, double steep) {                                                            \
+        auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
+        p.lists = std::max(p.lists, list + 1);                                                                         \
+        p.stages.push_back(                                                                                            \
+            std::make_unique<tc::Sieve<R>>(p, list, x, reach, dt, corners, starts, points, triangles, steep));         \
     }                                                                                                                  \
     TC_API void tc_stencil_##s(void* e, int table, int weight, int x, int y, int shape) {                              \
         auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \

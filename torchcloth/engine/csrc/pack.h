@@ -76,9 +76,9 @@ TC_EACH(sqrt, std::sqrt)
 
 template <class R, int L>
 inline R total(Pack<R, L> a) {
-    R sum = 0;
-    for (int i = 0; i < L; i++) sum += a.v[i];
-    return sum;
+    for (int half = L / 2; half > 0; half /= 2)
+        for (int i = 0; i < half; i++) a.v[i] += a.v[i + half];
+    return a.v[0];
 }
 
 }  // namespace tc

@@ -13,6 +13,7 @@ from ...effects import (
     BendingFriction,
     CreasingBending,
     Gravity,
+    GripSlip,
     KelvinVoigt,
     LineMass,
     MassDamping,
@@ -72,7 +73,7 @@ def _shear_friction(low: Lowering, name: str, effect: ShearFriction, c: Any) -> 
 
 
 def _nothing(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
-    """It acts through the vertices' mass, or the material's rest shape, alone."""
+    """It acts through the vertices' mass, the material's rest shape, or in a grasp, alone."""
 
 
 _EFFECTS: dict[type, Callable[[Lowering, str, Any, Any], None]] = {
@@ -82,6 +83,7 @@ _EFFECTS: dict[type, Callable[[Lowering, str, Any, Any], None]] = {
     BendingFriction: bending.friction,
     CreasingBending: bending.creasing,
     Gravity: _gravity,
+    GripSlip: _nothing,
     KelvinVoigt: _kelvin_voigt,
     LineMass: _nothing,
     MassDamping: _mass_damping,
