@@ -109,7 +109,8 @@ struct Copied {
     static constexpr void run(const T* in, T* out) { for (int i = 0; i < N; i++) out[i] = 1.0 * in[i]; }
 };
 struct Copy : Copied<3> { static constexpr const char* name = "copy3"; };
+struct CopyStress : Copied<15> { static constexpr const char* name = "copy15"; };
 
-TC_KERNELS(surface_kernels, Surface, Assemble, Kick, Resisted, Loaded, Push, Scaled, Plus, Drift, Copy)
+TC_KERNELS(surface_kernels, Surface, Assemble, Kick, Resisted, Loaded, Push, Scaled, Plus, Drift, Copy, CopyStress)
 
 }  // namespace tc
