@@ -234,6 +234,9 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lower
     """
     from .parts import boundaries, effects, materials
 
+    for key in state.memory:
+        if key not in ("material", "contact") and key.removeprefix("effects.") not in model.effects:
+            raise Unfused(f"memory {key!r} that no part owns")
     low = Lowering(model, state, drives)
     materials.lower(low)
     for name, (effect, c) in model.effects.items():
@@ -254,7 +257,7 @@ def _kick(low: Lowering) -> Field:
     if low.resistance is None:
         loop.put(loop.call("kick", dt, v, force, mass), free)
     else:
-        loop.put(loop.call("plus3", v, low.resisted(loop, loop.call("push", dt, force, mass))), free)
+        loop.put(loop.call("kick_in_air", dt, v, force, mass, loop.load(low.resistance)), free)
     return free
 
 
