@@ -97,6 +97,7 @@ def difference(value: Tensor, reference: Tensor) -> float:
     """The largest of the components' relative errors; a component that is 0 in the reference must be 0."""
     if value.shape != reference.shape or not bool(torch.isfinite(value).all()):
         return float("inf")
+    value, reference = value.detach(), reference.detach()
     error, size = _columns(value - reference).norm(dim=0), _columns(reference).norm(dim=0)
     return float(torch.where(size > 1e-9 * size.max(), error / size, error / size.max().clamp(min=1e-300)).max())
 

@@ -16,4 +16,6 @@ def _engine():
     try:
         library()
     except RuntimeError as error:
-        pytest.skip(f"no fused engine: {error}")
+        if "no C++ compiler" not in str(error):
+            raise
+        pytest.skip(str(error))

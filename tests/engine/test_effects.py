@@ -115,6 +115,19 @@ def test_all_together_in_a_batch():
     agree(cloth, {}, remembering(moving(cloth, (2,))))
 
 
+def test_no_air_that_moves_along_changes_nothing_bitwise():
+    state = moving(sheet({}))
+    with_none, _ = fused.rollout(sheet({"air": E.AddedMass(0.0)}).model(), state, 1e-4, {}, 50)
+    without, _ = fused.rollout(sheet({}).model(), state, 1e-4, {}, 50)
+    assert torch.equal(with_none.x, without.x) and torch.equal(with_none.v, without.v)
+
+
+def test_memory_that_nobody_owns():
+    cloth = sheet({"friction": E.BendingFriction()})
+    with pytest.raises(Unfused, match="friction"):
+        fused.rollout(sheet({}).model(), moving(cloth), 1e-4, {}, 1)
+
+
 def test_still_and_flat_has_finite_gradients():
     effects = {"friction": E.BendingFriction(), "shear": E.ShearFriction(), "crease": E.CreasingBending(1e-4)}
     effects |= {"air": E.AirDrag(1.2, tangential=0.1), "saturating": E.SaturatingBending(), "mass": E.AddedMass()}

@@ -225,19 +225,33 @@ class Sheet:
         program.stencil(near, weight, lowering.force, self._answer, Shape.TRANSPOSED)
         self._seen = self.loop.load(seen)
         self._area = self.loop.load(program.constant(bent.area))
-        *self._normal, k0, k1, k2 = self.loop.call("bent_sheet", self._seen)
-        self.curvature = [k0, k1, k2]
+        self.second = [*self._seen[:9], *self._area]
         self._moment: list[int] | None = None
+        self._stress: list[int] | None = None
+        self._shape: list[int] = []
+
+    @property
+    def curvature(self) -> list[int]:
+        """Along the normal."""
+        if not self._shape:
+            self._shape = self.loop.call("bent_sheet", self._seen)
+        return self._shape[4:]
 
     def moment(self, moment: list[int]) -> None:
         """A bending moment (3 registers) that works on the curvature."""
         self._moment = moment if self._moment is None else self.loop.call("copy3", moment, into=self._moment)
 
+    def stress(self, stress: list[int]) -> None:
+        """What works on the derivatives (15 registers), times the area."""
+        self._stress = stress if self._stress is None else self.loop.call("copy15", stress, into=self._stress)
+
     def close(self) -> None:
-        """Give the sum of all moments to the stencils."""
+        """Give the sum of all to the stencils."""
         if self._moment is not None:
-            stress = self.loop.call("bending_stress", self._seen, self._normal, self._area, self._moment)
-            self.loop.put(stress, self._answer)
+            _ = self.curvature
+            self.stress(self.loop.call("bending_stress", self._seen, self._shape[:4], self._area, self._moment))
+        if self._stress is not None:
+            self.loop.put(self._stress, self._answer)
 
 
 def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lowering:
@@ -248,6 +262,9 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lower
     """
     from .parts import boundaries, effects, materials
 
+    for key in state.memory:
+        if key not in ("material", "contact") and key.removeprefix("effects.") not in model.effects:
+            raise Unfused(f"memory {key!r} that no part owns")
     low = Lowering(model, state, drives)
     materials.lower(low)
     for name, (effect, c) in model.effects.items():
@@ -266,7 +283,7 @@ def _kick(low: Lowering) -> Velocities:
     dt, v, force, mass = (loop.load(field) for field in (low.dt, low.v.now, low.force, low.mass))
     if low.resistance is None:
         return Velocities(low, loop, loop.call("kick", dt, v, force, mass))
-    return Velocities(low, loop, loop.call("plus3", v, low.resisted(loop, loop.call("push", dt, force, mass))))
+    return Velocities(low, loop, loop.call("kick_in_air", dt, v, force, mass, loop.load(low.resistance)))
 
 
 def _drift(low: Lowering, velocity: Velocities) -> None:

@@ -2,6 +2,7 @@
 #include <string>
 
 #include "kernels/kernels.h"
+#include "derivatives.h"
 #include "loop.h"
 #include "run.h"
 #include "sieve.h"
@@ -31,6 +32,20 @@ struct Engine {
         auto* last = program.stages.empty() ? nullptr : dynamic_cast<tc::Loop<R>*>(program.stages.back().get());
         if (last == nullptr) throw std::logic_error("no loop to add to");
         return *last;
+    }
+    void stencil(int table, int weight, int x, int y, tc::Shape shape) {
+        if (!tc::Derivatives<R>::fits(program, weight, y)) {
+            program.stages.push_back(std::make_unique<tc::Stencil<R>>(program, table, weight, x, y, shape));
+            return;
+        }
+        std::shared_ptr<const tc::BothWays<R>> links;
+        for (const auto& stage : program.stages) {
+            const auto* other = dynamic_cast<const tc::Derivatives<R>*>(stage.get());
+            if (other && other->weight == weight) links = other->links;
+        }
+        if (!links) links = std::make_shared<tc::BothWays<R>>(program, table, weight);
+        const bool transposed = shape == tc::Shape::transposed;
+        program.stages.push_back(std::make_unique<tc::Derivatives<R>>(program, links, weight, x, y, transposed));
     }
 };
 
@@ -97,8 +112,7 @@ struct Engine {
             std::make_unique<tc::Sieve<R>>(p, list, x, reach, dt, corners, starts, points, triangles, steep));         \
     }                                                                                                                  \
     TC_API void tc_stencil_##s(void* e, int table, int weight, int x, int y, int shape) {                              \
-        auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
-        p.stages.push_back(std::make_unique<tc::Stencil<R>>(p, table, weight, x, y, tc::Shape(shape)));                \
+        static_cast<Engine<R>*>(e)->stencil(table, weight, x, y, tc::Shape(shape));                                    \
     }                                                                                                                  \
     TC_API void tc_again_##s(void* e, int stage) { static_cast<Engine<R>*>(e)->program.stages.at(stage)->again = true; } \
     TC_API void tc_ready_##s(void* e) { static_cast<Engine<R>*>(e)->program.lay_out(); }                               \

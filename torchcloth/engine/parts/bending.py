@@ -39,14 +39,9 @@ def friction(low: Lowering, name: str, effect: BendingFriction, c) -> None:
 
 def saturating(low: Lowering, name: str, effect: SaturatingBending, c: Saturating) -> None:
     """On the second derivatives alone."""
-    near = effect.sheet.near.cpu().numpy()
-    weight = low.program.constant(effect.sheet.weight[:3].reshape(-1, 1), near=len(near))
-    second, answer = low.program.temporary(low.vertices, 9), low.program.temporary(low.vertices, 9, kept=False)
-    low.program.stencil(near, weight, low.x.now, second)
-    loop = low.loop(low.vertices)
-    fields = (second, low.parameter(c.moment), low.parameter(c.curvature), low.program.constant(effect.sheet.area))
-    loop.put(loop.call("saturating", *(loop.load(field) for field in fields)), answer)
-    low.program.stencil(near, weight, low.force, answer, Shape.TRANSPOSED)
+    sheet = low.sheet(effect.sheet)
+    values = [sheet.loop.load(low.parameter(value)) for value in (c.moment, c.curvature)]
+    sheet.stress(sheet.loop.call("saturating", sheet.second, *values))
 
 
 def _matrix(low: Lowering, effect: Bending, c: Coefficients) -> None:

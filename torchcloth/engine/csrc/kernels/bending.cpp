@@ -87,20 +87,21 @@ struct Crease {
     }
 };
 
-// Second derivatives of x, moment, curvature, area -> what the transposed derivatives pull with. effects/saturating.py
+// Second derivatives of x, area, moment, curvature -> what the transposed derivatives pull with. effects/saturating.py
 struct Saturating {
     static constexpr const char* name = "saturating";
-    static constexpr int inputs = 12, outputs = 9;
-    static constexpr auto fixed = bits(11, 1);
+    static constexpr int inputs = 12, outputs = 15;
+    static constexpr auto fixed = bits(9, 1);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
         const auto ww = r.vec(), ff = r.vec(), wf = r.vec();
-        const T moment = r.number(), curvature = r.number(), area = r.number();
+        const T area = r.number(), moment = r.number(), curvature = r.number();
         const T squared = dot(ww, ww) + dot(ff, ff) + dot(wf, wf) + curvature * curvature;
         const T scale = area * (moment / sqrt(squared));
         Write<T> w{out};
         w.vec(scale * ww), w.vec(scale * ff), w.vec(scale * wf);
+        for (int slope = 0; slope < 6; slope++) w.number(constant(scale, 0.0));
     }
 };
 

@@ -19,19 +19,39 @@ struct Kick {
     }
 };
 
-// Mass of the air that moves along with a vertex, its own mass, a change of velocity -> the change with that air, so
-// written that no air changes nothing, bitwise. dynamics.py
+// What is left of a change of velocity in the air that moves along, so written that no air changes nothing, bitwise.
+// dynamics.py
+template <class T>
+constexpr Vec<T> resisted(Symmetric<T> air, T mass, Vec<T> change) {
+    const auto b = air / mass;
+    return change - solve(Symmetric<T>{b.xx + 1.0, b.xy, b.xz, b.yy + 1.0, b.yz, b.zz + 1.0}, b * change);
+}
+
+// Mass of the air at a vertex, its own mass, a change of velocity -> what is left of it.
 struct Resisted {
     static constexpr const char* name = "resisted";
     static constexpr int inputs = 10, outputs = 3;
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
-        const auto mass = r.symmetric();
-        const auto air = mass / r.number();
-        const auto change = r.vec();
-        const Symmetric<T> all{air.xx + 1.0, air.xy, air.xz, air.yy + 1.0, air.yz, air.zz + 1.0};
-        Write<T>{out}.vec(change - solve(all, air * change));
+        const auto air = r.symmetric();
+        const T mass = r.number();
+        Write<T>{out}.vec(resisted(air, mass, r.vec()));
+    }
+};
+
+// dt, velocity, force, own mass, mass of the air -> velocity free of the boundaries.
+struct KickInAir {
+    static constexpr const char* name = "kick_in_air";
+    static constexpr int inputs = 14, outputs = 3;
+    static constexpr auto fixed = bits(0, 1);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T dt = r.number();
+        const auto v = r.vec(), force = r.vec();
+        const T mass = r.number();
+        Write<T>{out}.vec(v + dt * resisted(r.symmetric(), mass, force / mass));
     }
 };
 
@@ -109,7 +129,8 @@ struct Copied {
     static constexpr void run(const T* in, T* out) { for (int i = 0; i < N; i++) out[i] = 1.0 * in[i]; }
 };
 struct Copy : Copied<3> { static constexpr const char* name = "copy3"; };
+struct CopyStress : Copied<15> { static constexpr const char* name = "copy15"; };
 
-TC_KERNELS(surface_kernels, Surface, Assemble, Kick, Resisted, Loaded, Push, Scaled, Plus, Drift, Copy)
+TC_KERNELS(surface_kernels, Surface, Assemble, Kick, Resisted, KickInAir, Loaded, Push, Scaled, Plus, Drift, Copy, CopyStress)
 
 }  // namespace tc
