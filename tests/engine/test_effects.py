@@ -129,6 +129,15 @@ def test_memory_that_nobody_owns():
         fused.rollout(sheet({}).model(), moving(cloth), 1e-4, {}, 1)
 
 
+def test_friction_that_hardly_moves():
+    """By less than 1e-4 thresholds in a step, where the law is a series."""
+    cloth = sheet({"bending": E.BendingFriction(1e-3, threshold=3.0), "shear": E.ShearFriction(5.0, threshold=0.02)})
+    slow = remembering(cloth.state(cloth.rest_state().x, 1e-5 * moving(cloth).v))
+    for name, value in slow.memory.items():  # not where the law has its kink
+        value[:, : value.shape[-1] // 2] = 1e-6 * noise(value.chunk(2, dim=-1)[0].shape, 50 + len(name))
+    agree(cloth, {}, slow, substeps=10)
+
+
 def test_still_and_flat_has_finite_gradients():
     effects = {"friction": E.BendingFriction(), "shear": E.ShearFriction(), "crease": E.CreasingBending(1e-4)}
     effects |= {"air": E.AirDrag(1.2, tangential=0.1), "saturating": E.SaturatingBending(), "mass": E.AddedMass()}
