@@ -239,27 +239,38 @@ struct Loop : Stage<R> {
                     break;
             }
     }
+    // f(components), with the frequent number as a constant.
+    template <class F>
+    static TC_INLINE void components(const Instruction& i, F f) {
+        if (i.comps == 3) f(std::integral_constant<int, 3>{});
+        else f(i.comps);
+    }
     void gather_along(const Instruction& i, const R* from, D* dots, int first, Span s) const {
         if (from == nullptr) return;
         const D* source = reinterpret_cast<const D*>(from);
+        D* to = dots + size_t(i.reg) * L;
         rows(i, first, s, [&](auto place, auto) {
-            for (int lane = 0; lane < L; lane++) {
-                const D* at = source + place(lane);
-                for (int c = 0; c < i.comps; c++) dots[(i.reg + c) * L + lane] = at[c];
-            }
+            components(i, [&](auto comps) {
+                for (int lane = 0; lane < L; lane++) {
+                    const D* at = source + place(lane);
+                    for (int c = 0; c < comps; c++) to[c * L + lane] = at[c];
+                }
+            });
         });
     }
     void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds, Span s) const {
         D* target = reinterpret_cast<D*>(to);
+        const D* from = dots + size_t(i.reg) * L;
         const int lanes = count(first, s);
         rows(i, first, s, [&](auto place, auto) {
-            for (int lane = 0; lane < lanes; lane++) {
-                D* at = target + place(lane);
-                for (int c = 0; c < i.comps; c++) {
-                    const D& x = dots[(i.reg + c) * L + lane];
-                    at[c] = adds ? at[c] + x : x;
-                }
-            }
+            components(i, [&](auto comps) {
+                if (adds)
+                    for (int lane = 0; lane < lanes; lane++)
+                        for (int c = 0; c < comps; c++) target[place(lane) + c] = target[place(lane) + c] + from[c * L + lane];
+                else
+                    for (int lane = 0; lane < lanes; lane++)
+                        for (int c = 0; c < comps; c++) target[place(lane) + c] = from[c * L + lane];
+            });
         });
     }
 };
