@@ -238,11 +238,10 @@ class Loop:
 
 
 class PointTables(NamedTuple):
-    """Points on triangles: three tables of one length, and the number of triangles."""
+    """Points on triangles, in the order of these."""
 
-    corners: int  # [3, E] vertices
-    starts: int  # [E + 1], where a triangle's points start in the next
-    points: int  # [P]
+    corners: int  # table [3, E] of vertices
+    starts: int  # table [E + 1] of the first points
     triangles: int
 
 

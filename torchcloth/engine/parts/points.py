@@ -85,14 +85,16 @@ def _points(low: Lowering, given: TrianglePoints) -> Points:
     index, weight = given.index.view(3, -1).cpu().numpy(), given.weight[..., 0].cpu().numpy()
     faces = low.model.geometry.corners.view(3, -1).cpu().numpy()
     owner = _owners(index, weight, faces, low.vertices)
+    order = np.argsort(owner, kind="stable")
+    index, weight = index[:, order], weight[:, order]
     mobile = weight * given.mobility[:, 0].cpu().numpy()[index]
-    starts = np.searchsorted(owner, np.arange(faces.shape[1] + 1), sorter=(order := np.argsort(owner, kind="stable")))
+    starts = np.searchsorted(owner[order], np.arange(faces.shape[1] + 1))
     table, constant = low.program.table, low.program.constant
     return Points(
         [table(corner) for corner in index],
         constant(weight.T),
         constant(mobile.T),
-        PointTables(table(faces), table(starts), table(order), faces.shape[1]),
+        PointTables(table(faces), table(starts), faces.shape[1]),
     )
 
 
