@@ -65,7 +65,7 @@ def _job(low: Lowering, substeps: int, values) -> Job:
 
 
 def _fields(low: Lowering) -> list[Field]:
-    drives = [field for pair in low.drives.values() for field in pair]
+    drives = [field for motion in low.drives.values() for field in motion]
     return [low.x.now, low.v.now, *(s.now for s in low.memory.values()), low.dt, *low.inputs, *drives]
 
 
@@ -76,7 +76,7 @@ def _inputs(low: Lowering, state: ClothState, dt: float, drives: Mapping[str, Dr
 
 
 def _moves(drive: Drive, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows of a drive's fields."""
+    """Rows of the fields of a ``lowering.Motion``."""
     closed = torch.tensor(drive.closed).to(like).unsqueeze(-1)
     return drive.increment.flatten(-2), drive.pose.flatten(-2), closed
 

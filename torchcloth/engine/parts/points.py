@@ -6,7 +6,7 @@ remember what they saw at every point.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,16 +15,7 @@ from ...boundaries.collider import PASSES
 from ...boundaries.points import TrianglePoints
 from ..lowering import Lowering, Velocities
 from ..program import Field, Loop, PointTables
-
-
-class Body(Protocol):
-    """What is needed of a collider; see ``colliders``."""
-
-    steep: float
-    limits: Field
-
-    def seen(self, loop: Loop, x: list[int]) -> tuple[list[int], list[int] | None]: ...
-    def change(self, loop: Loop, x: list[int], v: list[int]) -> list[int]: ...
+from .body import Body
 
 
 class Points(NamedTuple):
