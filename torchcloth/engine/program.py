@@ -180,7 +180,10 @@ class Loop:
         self._loaded: dict[tuple[int, int], list[int]] = {}
 
     def load(self, field: Field, at: int | None = None) -> list[int]:
-        """Registers with a row of the field: the item's own, the one in table ``at``, or the only one."""
+        """Registers with a row of the field: the item's own, the one in table ``at``, or the only one.
+
+        The same registers whenever asked again: no loop reads what it writes.
+        """
         place = self._place(field, at)
         if (field.id, place) not in self._loaded:
             regs = self._loaded[field.id, place] = self._new(field.comps)

@@ -7,8 +7,8 @@
 
 namespace tc {
 
-// Points of a triangle are no nearer to the body than its first corner less the longest way there, and none approaches
-// faster than the fastest corner. Writes a list of points; its stage runs again before the reverse sweep.
+// Points of a triangle are no nearer to the body than a corner less the longest way there, and none approaches faster
+// than the fastest corner. Writes a list of points; its stage runs again before the reverse sweep.
 template <class R>
 struct Sieve : Stage<R> {
     const Program<R>& program;
@@ -39,9 +39,14 @@ struct Sieve : Stage<R> {
         found.clear();
         for (int t = 0; t < triangles; t++) {
             const size_t a = corner[t] * pitch, b = corner[t + triangles] * pitch, c = corner[t + 2 * triangles] * pitch;
-            const R way = std::sqrt(std::max(squared(a, b), squared(a, c)));
-            const R slack = steep * way + step * std::max(speed[a], std::max(speed[b], speed[c]));
-            if (distance[a] > R(1.0001) * slack + R(1e-6)) continue;  // more than rounding
+            const R moved = step * std::max(speed[a], std::max(speed[b], speed[c]));
+            auto far = [&](size_t corner, R way) {  // by more than rounding
+                return distance[corner] > R(1.0001) * (steep * std::sqrt(way) + moved) + R(1e-6);
+            };
+            const R ab = squared(a, b), ac = squared(a, c);
+            if (far(a, std::max(ab, ac))) continue;
+            const R bc = squared(b, c);
+            if (far(b, std::max(ab, bc)) || far(c, std::max(ac, bc))) continue;
             for (int point = start[t]; point < start[t + 1]; point++) found.push_back(point);
         }
         scatter(found, s.lists[list]);
