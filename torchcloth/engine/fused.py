@@ -13,7 +13,7 @@ from ..dynamics import Impulses
 from ..model import Model
 from ..types import ClothState
 from . import running
-from .lowering import Lowering, lower
+from .lowering import DIRECTORS, Lowering, lower, remembered
 from .program import Field
 from .running import Job
 
@@ -72,7 +72,7 @@ def _fields(low: Lowering) -> list[Field]:
 def _inputs(low: Lowering, state: ClothState, dt: float, drives: Mapping[str, Drive]) -> list[Tensor]:
     step = torch.full((1, 1), dt, dtype=state.x.dtype)
     moves = [tensor for drive in drives.values() for tensor in _moves(drive, state.x)]
-    return [state.x, state.v, *state.memory.values(), step, *low.inputs.values(), *moves]
+    return [state.x, state.v, *remembered(low.model, state).values(), step, *low.inputs.values(), *moves]
 
 
 def _moves(drive: Drive, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -100,4 +100,5 @@ def _outcome(
     shaped = {f: t.reshape(*batch, *t.shape[-2:]) for f, t in by_field.items()}
     memory = {key: shaped[s.after] for key, s in low.memory.items()}
     impulses = {name: shaped[f].squeeze(-2) for name, f in low.impulses.items()}
-    return ClothState(shaped[low.x.after], shaped[low.v.after], state.d3, memory), impulses
+    d3 = memory.pop(DIRECTORS, state.d3)
+    return ClothState(shaped[low.x.after], shaped[low.v.after], d3, memory), impulses

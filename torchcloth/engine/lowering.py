@@ -22,6 +22,9 @@ from .program import Field, Loop, Program, Shape
 LANES = 16  # of the widest pack, csrc/pack.h
 
 
+DIRECTORS = "d3"  # key of the state's directors among the internal variables, where there is contact
+
+
 class Unfused(Exception):
     """A part that the engine does not know; the text names it."""
 
@@ -65,7 +68,8 @@ class Lowering:
         self.inputs: dict[Field, Tensor] = {}
         self._known: dict[int, Field] = {}
         self.x, self.v = (State(*self.program.state(self.vertices, 3)) for _ in range(2))
-        self.memory = {key: State(*self.program.state(*value.shape[-2:])) for key, value in state.memory.items()}
+        carried = remembered(model, state).items()
+        self.memory = {key: State(*self.program.state(*value.shape[-2:])) for key, value in carried}
         self.dt = self.program.parameter(1, 1)
         self.mass = self.parameter(model.mass)
         self.force = self.program.temporary(self.vertices, 3)
@@ -118,6 +122,11 @@ class Lowering:
         if self.resistance is None:
             return loop.call("scaled3", mass, change)
         return loop.call("loaded", loop.load(self.resistance, at), mass, change)
+
+
+def remembered(model: Model, state: ClothState) -> dict[str, Tensor]:
+    """Internal variables, and the directors where there is contact."""
+    return dict(state.memory) if model.grid is None else {**state.memory, DIRECTORS: state.d3}
 
 
 class Velocities:
@@ -270,6 +279,7 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lower
         Unfused: a part without kernels.
     """
     from .parts import boundaries, effects, materials
+    from .parts.contact import Contact
 
     for key in state.memory:
         if key not in ("material", "contact") and key.removeprefix("effects.") not in model.effects:
@@ -279,10 +289,15 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lower
     for name, (effect, c) in model.effects.items():
         effects.lower(low, name, effect, c)
     low.close()
+    contact = None if model.grid is None else Contact(low, model.grid)
+    if contact is not None:
+        contact.press()
     velocity = _kick(low)
     for name, boundary in model.boundaries.items():
         boundaries.lower(low, name, boundary, velocity)
     _drift(low, velocity)
+    if contact is not None:
+        contact.follow()
     low.program.ready()
     return low
 

@@ -28,7 +28,7 @@ def forward(job: Job, every: int = 0) -> tuple[dict[Field, Tensor], Tensor]:
     """(nexts and sums [scenes, rows, comps], records); ``every``: substeps between records, 0 for none."""
     like = next(iter(job.inputs.values()))
     results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in outputs(job.program)}
-    records = like.new_empty(job.scenes, *_records(job, every))
+    records = like.new_empty(job.scenes, job.program.records_size(job.substeps, every))
     ports = _ports(job)
     for f, tensor in results.items():
         ports[f.id].result = tensor.data_ptr()
@@ -77,12 +77,6 @@ def spacing(job: Job) -> int:
 def outputs(program: Program) -> list[Field]:
     """Nexts and sums, in the order of the program."""
     return [f for f in program.fields if f.kind in (Kind.NEXT, Kind.SUM)]
-
-
-def _records(job: Job, every: int) -> tuple[int, int]:
-    if every == 0:
-        return 0, 0
-    return 1 + -(-job.substeps // every), job.program.record_size(every == 1)
 
 
 def _ports(job: Job):
