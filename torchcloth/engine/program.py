@@ -194,7 +194,8 @@ class Loop:
     def __init__(
         self, items: int, own: int = OWN, among: int = -1, counted: int = -1, flat: bool = False, again: bool = False
     ) -> None:
-        self.items, self._own, self._among, self._counted, self.flat, self.again = items, own, among, counted, flat, again
+        self.items, self._own, self._among, self._counted = items, own, among, counted
+        self.flat, self.again = flat, again
         self._used = 0
         self._code: list[tuple] = []
         self._loaded: dict[tuple[int, int], list[int]] = {}
@@ -306,7 +307,8 @@ class Layers(NamedTuple):
         ids = _ints([field.id for field in self.fields])
         limits = _ints([self.wrap, self.chunk, len(self.starts) - 1])
         lengths = (ctypes.c_double * 3)(*self.lengths)
-        corners, places, *search = (_array(a) for a in (self.corners, self.places, self.order, self.starts, self.meet, self.apart))
+        corners, places = _array(self.corners), _array(self.places)
+        search = (_array(a) for a in (self.order, self.starts, self.meet, self.apart))
         sizes = self.corners.shape[1], len(self.places)
         api("contact")(handle, ids, len(ids), corners, sizes[0], places, sizes[1], lengths, limits, *search)
 

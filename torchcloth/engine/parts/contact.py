@@ -173,7 +173,8 @@ class _Points:
     @property
     def mass(self) -> list[int]:
         """Of the point."""
-        return self.loop.call("point_mass", self.parameter(self._contact.low.model.areal_density), self.area, self.share)
+        density = self.parameter(self._contact.low.model.areal_density)
+        return self.loop.call("point_mass", density, self.area, self.share)
 
     def along_director(self, d3: list[int]) -> list[int]:
         """Weights of the nodes, and d3 times their slopes: 2 bases."""
