@@ -13,9 +13,8 @@ from torch.utils.checkpoint import checkpoint as recompute
 from . import functional
 from .boundaries import Drive, drive
 from .errors import SimulationDiverged
+from .self_contact import CHUNK
 from .types import ClothState, Trajectory
-
-CHUNK = 48  # substeps between checkpoints of a long interval: memory ~ frames + CHUNK, one extra forward pass
 
 
 class Interval(NamedTuple):
