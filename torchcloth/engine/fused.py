@@ -2,96 +2,153 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping
+from itertools import groupby
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint as recompute
 
 from ..boundaries import Drive
 from ..dynamics import Impulses
 from ..model import Model
 from ..types import ClothState
-from . import running
-from .lowering import Lowering, lower
-from .program import Field
-from .running import Job
+from . import binding, running
+from .lowering import Lowering, fitted
+from .operators import Rollout
+from .outside import Outside
+
+CHUNK = 48  # substeps between checkpoints where torch has a part in each of them
+
+
+class Fused:
+    """A model on the engine, for the length of one call of the cloth.
+
+    Attributes:
+        outside: the parts that torch computes in every substep; None: there are none, and the engine runs by itself.
+
+    Raises:
+        Unfused: a part without kernels that torch cannot take over either.
+    """
+
+    def __init__(self, model: Model, state: ClothState, drives: Mapping[str, Drive]) -> None:
+        self.model = model
+        self._left = running.BUDGET  # bytes of records that the adjoint may find ready
+        low, parts = fitted(model, state, cut(drives, 0, 1))
+        self.outside = Outside(model, parts) if parts else None
+        self._known = {_pattern(drives): low}
+
+    def rollout(
+        self,
+        state: ClothState,
+        dt: float,
+        drives: Mapping[str, Drive],
+        substeps: int,
+        first: int = 0,
+        checkpoint: bool = True,
+    ) -> tuple[ClothState, Impulses]:
+        """As ``functional.rollout``. ``checkpoint``: the adjoint keeps to a budget of memory, and recomputes beyond."""
+        total: Impulses = {}
+        for begin, end in spans(drives, first, first + substeps, substeps if self.outside is None else CHUNK):
+            state, impulses = self._span(state, dt, cut(drives, begin, end), end - begin, checkpoint)
+            total = _sum(total, impulses)
+        return state, total
+
+    def lowering(self, state: ClothState, drives: Mapping[str, Drive]) -> Lowering:
+        """The program for these grasps, closed or open, with the numbers of the model."""
+        pattern = _pattern(drives)
+        if pattern not in self._known:
+            self._known[pattern], _ = fitted(self.model, state, cut(drives, 0, 1))
+        return self._known[pattern]
+
+    def _span(self, state: ClothState, dt: float, drives: Mapping[str, Drive], count: int, checkpoint: bool):
+        """Substeps while no grasp opens or closes."""
+        low = self.lowering(state, drives)
+        if self.outside is None:
+            return self._call(low, state, dt, drives, count, checkpoint)
+
+        def run(state: ClothState) -> tuple[ClothState, Impulses]:
+            total: Impulses = {}
+            for k in range(count):
+                state, impulses = self._shared_substep(low, state, dt, cut(drives, k, k + 1))
+                total = _sum(total, impulses)
+            return state, total
+
+        if checkpoint and torch.is_grad_enabled():
+            return recompute(run, state, use_reentrant=False, preserve_rng_state=False)
+        return run(state)
+
+    def _shared_substep(self, low: Lowering, state: ClothState, dt: float, drives: Mapping[str, Drive]):
+        """One substep in which torch has a part."""
+        if self.outside is None or low.given is None:
+            raise ValueError("no part is outside")
+        force, memory = self.outside.force(state, dt)
+        after, impulses = self._call(low, state, dt, drives, 1, False, force)
+        return after._replace(memory=after.memory | memory), impulses
+
+    def _call(
+        self,
+        low: Lowering,
+        state: ClothState,
+        dt: float,
+        drives: Mapping[str, Drive],
+        substeps: int,
+        checkpoint: bool,
+        force: Tensor | None = None,
+    ) -> tuple[ClothState, Impulses]:
+        batch, program = state.x.shape[:-2], low.program
+        found = binding.values(low, state, dt, drives)
+        if low.given is not None and force is not None:
+            found[low.given] = force
+        by_field = binding.flat(low, found, batch)
+        inputs = [by_field[field] for field in program.inputs]
+        every = self._every(low, batch.numel(), substeps, checkpoint) if _needs_gradient(inputs) else 0
+        *results, _ = Rollout.apply(program.number, substeps, every, *inputs)  # type: ignore[misc]
+        return binding.outcome(low, state, dict(zip(program.outputs, results, strict=True)), batch)
+
+    def _every(self, low: Lowering, scenes: int, substeps: int, checkpoint: bool) -> int:
+        """Substeps between records: all while the budget lasts; 0: the adjoint makes its own when it comes here."""
+        if not checkpoint:
+            return 1
+        size = running.full_size(low.program, scenes, substeps)
+        if size > self._left:
+            return 0
+        self._left -= size
+        return 1
 
 
 def rollout(model: Model, state: ClothState, dt: float, drives: Mapping[str, Drive], substeps: int):
-    """As ``functional.rollout``, from substep 0 of the drives; differentiable in reverse mode.
+    """As ``functional.rollout``, from substep 0 of the drives.
 
     Raises:
         Unfused: a part without kernels.
     """
-    low = lower(model, state, drives)
-    batch = state.x.shape[:-2]
-    tensors = _inputs(low, state, dt, drives)
-    results = _Rollout.apply(low, substeps, len(batch), *_flat(tensors, batch))
-    return _outcome(low, state, results, batch)
+    return Fused(model, state, drives).rollout(state, dt, drives, substeps)
 
 
-class _Rollout(torch.autograd.Function):
-    """Inputs [scenes or 1, rows, comps] in the order of ``_inputs``; outputs nexts and sums."""
-
-    @staticmethod
-    def forward(ctx: Any, low: Lowering, substeps: int, dims: int, *values: Tensor):
-        job = _job(low, substeps, values)
-        every = running.spacing(job) if any(ctx.needs_input_grad) else 0
-        results, records = running.forward(job, every)
-        ctx.low, ctx.substeps, ctx.every = low, substeps, every
-        ctx.save_for_backward(*values, records)
-        return tuple(results.values())
-
-    @staticmethod
-    def backward(ctx: Any, *seeds: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        *values, records = ctx.saved_tensors
-        job = _job(ctx.low, ctx.substeps, values)
-        given = dict(zip(running.outputs(job.program), (s.contiguous() for s in seeds), strict=True))
-        wanted = {f for f, needs in zip(job.inputs, ctx.needs_input_grad[3:], strict=True) if needs}
-        found = running.reverse(job, records, ctx.every, given, wanted)
-        grads = [None if f not in wanted else _summed(found[f], job.inputs[f]) for f in job.inputs]
-        return None, None, None, *grads
+def spans(drives: Mapping[str, Drive], first: int, last: int, longest: int) -> Iterator[tuple[int, int]]:
+    """(first, last) of pieces in which no grasp opens or closes, at most ``longest`` substeps each."""
+    for _, group in groupby(range(first, last), lambda k: tuple(drive.closed[k] for drive in drives.values())):
+        steps = list(group)
+        for begin in range(steps[0], steps[-1] + 1, longest):
+            yield begin, min(begin + longest, steps[-1] + 1)
 
 
-def _summed(grad: Tensor, like: Tensor) -> Tensor:
-    return grad if len(like) == len(grad) else grad.sum(0, keepdim=True)
+def cut(drives: Mapping[str, Drive], first: int, last: int) -> dict[str, Drive]:
+    """The drives of some substeps."""
+    return {
+        name: Drive(d.increment[..., first:last, :, :], d.pose[..., first:last, :, :], d.closed[first:last])
+        for name, d in drives.items()
+    }
 
 
-def _job(low: Lowering, substeps: int, values) -> Job:
-    fields = [*_fields(low)]
-    scenes = max(len(value) for value in values)
-    return Job(low.program, dict(zip(fields, values, strict=True)), scenes, substeps)
+def _pattern(drives: Mapping[str, Drive]) -> tuple[bool, ...]:
+    return tuple(drive.closed[0] for drive in drives.values())
 
 
-def _fields(low: Lowering) -> list[Field]:
-    drives = [field for pair in low.drives.values() for field in pair]
-    return [low.x.now, low.v.now, *(s.now for s in low.memory.values()), low.dt, *low.inputs, *drives]
+def _needs_gradient(inputs: list[Tensor]) -> bool:
+    return torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
 
 
-def _inputs(low: Lowering, state: ClothState, dt: float, drives: Mapping[str, Drive]) -> list[Tensor]:
-    step = torch.full((1, 1), dt, dtype=state.x.dtype)
-    moves = [pose.flatten(-2) for drive in drives.values() for pose in (drive.increment, drive.pose)]
-    return [state.x, state.v, *state.memory.values(), step, *low.inputs.values(), *moves]
-
-
-def _flat(tensors: list[Tensor], batch: torch.Size) -> list[Tensor]:
-    """[scenes or 1, rows, comps] each."""
-    out = []
-    for t in tensors:
-        alone = t.ndim == 2 or t.shape[:-2].numel() == 1
-        full = t.reshape(1, *t.shape[-2:]) if alone else t.expand(*batch, *t.shape[-2:]).reshape(-1, *t.shape[-2:])
-        out.append(full.contiguous())
-    if batch.numel() > 1:
-        out[:2] = [t.expand(batch.numel(), -1, -1).contiguous() for t in out[:2]]
-    return out
-
-
-def _outcome(
-    low: Lowering, state: ClothState, results: tuple[Tensor, ...], batch: torch.Size
-) -> tuple[ClothState, Impulses]:
-    by_field = dict(zip(running.outputs(low.program), results, strict=True))
-    shaped = {f: t.reshape(*batch, *t.shape[-2:]) for f, t in by_field.items()}
-    memory = {key: shaped[s.after] for key, s in low.memory.items()}
-    impulses = {name: shaped[f].squeeze(-2) for name, f in low.impulses.items()}
-    return ClothState(shaped[low.x.after], shaped[low.v.after], state.d3, memory), impulses
+def _sum(total: Impulses, more: Impulses) -> Impulses:
+    return {name: total[name] + value if name in total else value for name, value in more.items()}

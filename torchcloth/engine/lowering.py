@@ -1,12 +1,12 @@
 """A model turned into a program of the engine: the page ``functional.step`` in the engine's words.
 
 The parts (materials, effects, boundaries) say in ``parts`` which kernels they are. Only exact types count: a subclass
-may have changed its law.
+may have changed its law. Materials and effects without kernels are left to torch, see ``outside``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -16,14 +16,17 @@ from torch import Tensor
 from ..boundaries import Drive
 from ..model import Model
 from ..types import ClothState
-from .program import Field, Loop, Program
+from .outside import MATERIAL, obstacle
+from .program import Field, Loop, Program, array
 
 
 LANES = 16  # of the widest pack, csrc/pack.h
 
 
 class Unfused(Exception):
-    """A part that the engine does not know; the text names it."""
+    """A part that the engine does not know; the text names it. ``part``: "material" or "effects.NAME"."""
+
+    part: str | None = None
 
 
 class State(NamedTuple):
@@ -44,24 +47,29 @@ class Lowering:
         force: [V, 3], to be added to.
         triangles: the loop over triangles that comes first; ``Triangles`` has what is computed there already.
         inputs: parameter fields with their tensors [..., rows, comps].
+        given: a parameter field without tensor, for the forces of parts that torch computes; None: there are none.
         drives: by boundary, (increment, pose) fields [16] each.
         impulses: by boundary, [6].
     """
 
-    def __init__(self, model: Model, state: ClothState, drives: Mapping[str, Drive]) -> None:
+    def __init__(
+        self, model: Model, state: ClothState, drives: Mapping[str, Drive], outside: Collection[str] = ()
+    ) -> None:
         self.model = model
         self.vertices, self.faces = state.x.shape[-2], len(model.geometry.area)
         self.program = Program(state.x.dtype, self.vertices)
         self.inputs: dict[Field, Tensor] = {}
         self._known: dict[int, Field] = {}
         self.x, self.v = (State(*self.program.state(self.vertices, 3)) for _ in range(2))
-        self.memory = {key: State(*self.program.state(*value.shape[-2:])) for key, value in state.memory.items()}
+        kept = {key: value for key, value in state.memory.items() if key not in outside}
+        self.memory = {key: State(*self.program.state(*value.shape[-2:])) for key, value in kept.items()}
         self.dt = self.program.parameter(1, 1)
         self.mass = self.parameter(model.mass)
         self.force = self.program.temporary(self.vertices, 3)
+        self.given = self._given() if outside else None
         self.resistance: Field | None = None
         order = _scattered(self.faces)
-        self.corners = [self.program.table(c[order]) for c in model.geometry.corners.view(3, -1).cpu().numpy()]
+        self.corners = [self.program.table(c[order]) for c in array(model.geometry.corners).reshape(3, -1)]
         self.triangles = Triangles(self, order)
         self.drives = {name: (self.program.drive(16), self.program.drive(16)) for name in drives}
         self.impulses = {name: self.program.sum(6) for name in drives}
@@ -73,6 +81,18 @@ class Lowering:
             field = self.program.parameter(*tensor.shape[-2:], near)
             self._known[id(tensor)], self.inputs[field] = field, tensor
         return self._known[id(tensor)]
+
+    @property
+    def carried(self) -> dict[str, State]:
+        """All that goes on from substep to substep, by its name in the state."""
+        return {"x": self.x, "v": self.v, **self.memory}
+
+    def _given(self) -> Field:
+        """Forces [V, 3] that torch computes, as an input."""
+        given = self.program.parameter(self.vertices, 3)
+        loop = self.loop(self.vertices)
+        loop.add(loop.call("copy3", loop.load(given)), self.force)
+        return given
 
     def loop(self, items: int) -> Loop:
         """A loop after all that are there."""
@@ -150,24 +170,58 @@ def _scattered(items: int) -> np.ndarray:
     return order[order < items]
 
 
-def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lowering:
-    """The program of a substep.
+def fitted(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> tuple[Lowering, frozenset[str]]:
+    """The program of a substep, and the parts that are left to torch.
+
+    Raises:
+        Unfused: a part without kernels that cannot be left to torch.
+    """
+    outside: set[str] = set()
+    while True:
+        try:
+            return lower(model, state, drives, outside), frozenset(outside)
+        except Unfused as miss:
+            if miss.part is None:
+                raise
+            if reason := obstacle(model, miss.part):
+                raise Unfused(f"{miss}, {reason},") from None
+            outside.add(miss.part)
+
+
+def lower(
+    model: Model, state: ClothState, drives: Mapping[str, Drive], outside: Collection[str] = ()
+) -> Lowering:
+    """The program of a substep without the parts ``outside``; from the drives only names and flags are taken.
 
     Raises:
         Unfused: a part without kernels.
     """
     from .parts import boundaries, effects, materials
 
-    low = Lowering(model, state, drives)
-    materials.lower(low)
+    if model.transfer != "mesh":
+        raise Unfused(f"transfer {model.transfer!r}")
+    if model.grid is not None:
+        raise Unfused("contact between layers")
+    low = Lowering(model, state, drives, outside)
+    if MATERIAL not in outside:
+        _part(MATERIAL, lambda: materials.lower(low))
     for name, (effect, c) in model.effects.items():
-        effects.lower(low, name, effect, c)
+        if f"effects.{name}" not in outside:
+            _part(f"effects.{name}", lambda own=(name, effect, c): effects.lower(low, *own))
     velocity = _kick(low)
     for name, boundary in model.boundaries.items():
         velocity = boundaries.lower(low, name, boundary, velocity)
     _drift(low, velocity)
-    low.program.ready()
+    low.program = low.program.ready()
     return low
+
+
+def _part(name: str, lower: Callable[[], None]) -> None:
+    try:
+        lower()
+    except Unfused as miss:
+        miss.part = name
+        raise
 
 
 def _kick(low: Lowering) -> Field:
