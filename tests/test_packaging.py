@@ -109,7 +109,9 @@ def test_all_modules_are_inside_and_nothing_else(inside):
 def test_data_is_inside(inside):
     urdf = {f"torchcloth/robots/urdf/{file.name}" for file in (ROOT / "robots" / "urdf").glob("*.urdf")}
     assert len(urdf) >= 3
-    assert urdf | {"torchcloth/py.typed", "torchcloth/materials/fabrics.csv"} <= inside
+    engine = {file.relative_to(ROOT).as_posix() for file in (ROOT / "torchcloth/engine/csrc").rglob("*.[ch]*")}
+    assert {"torchcloth/engine/csrc/run.h", "torchcloth/engine/csrc/engine.cpp"} <= engine
+    assert urdf | engine | {"torchcloth/py.typed", "torchcloth/materials/fabrics.csv"} <= inside
     assert any(name.endswith("licenses/LICENSE") for name in inside)
 
 

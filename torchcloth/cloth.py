@@ -14,6 +14,7 @@ from . import functional
 from .boundaries import AbstractBoundary
 from .boundaries.motion import drive, interpolate
 from .effects import AbstractEffect, MassDamping
+from .engine.choice import Choice, Setting, check_setting, choose, standing
 from .errors import InvalidInput
 from .intervals import Interval, advance
 from .materials import AbstractMaterial
@@ -51,6 +52,9 @@ class Cloth(nn.Module):
         transfer: "mesh": elastic forces act on the vertices, the grid carries contact only. "apic": the usual material
             point method, everything through the grid, for comparison; one contact point per triangle, no play, no
             collision damping, no added mass.
+        engine: what computes the substeps. "auto": the fused engine (C++, on the CPU, in float32 or float64) where it
+            knows the parts, else the torch reference; ``print`` of the cloth tells which and why. "fused": an error
+            where it cannot. "reference": always torch. The attribute of the same name may be set at any time.
 
     Raises:
         InvalidInput: a part that does not fit.
@@ -73,8 +77,10 @@ class Cloth(nn.Module):
         boundaries: Mapping[str, AbstractBoundary] | None = None,
         contact: Contact | None = Contact(),  # noqa: B008 - frozen, carries no state
         transfer: Literal["mesh", "apic"] = "mesh",
+        engine: Setting = "auto",
     ) -> None:
         super().__init__()
+        self.engine = engine
         self.transfer: Literal["mesh", "apic"] = transfer
         if transfer != "mesh":
             contact = check_transfer(transfer, contact).usual()
@@ -104,6 +110,15 @@ class Cloth(nn.Module):
         }
         for name, tensor in arrays.items():
             self.register_buffer(name, tensor, persistent=False)
+
+    @property
+    def engine(self) -> Setting:
+        """What computes the substeps: "auto", "reference" or "fused"."""
+        return self._engine
+
+    @engine.setter
+    def engine(self, setting: Setting) -> None:
+        self._engine = check_setting(setting)
 
     # -- states ---------------------------------------------------------------------------------------------------
 
@@ -155,10 +170,11 @@ class Cloth(nn.Module):
         model = self.model()
         limit = check_step(dt, self.stable_step())
         state = self._start(state, model, motion)
+        fused = self._choice(model, state).fused
         states, wrenches = [state], []
         for start, end in pairwise(frames):
             count = max(1, int(np.ceil((end - start) / limit - 1e-9)))
-            state, impulses = advance(Interval(model, motion, start, end, count), state, checkpoint)
+            state, impulses = advance(Interval(model, motion, start, end, count, fused), state, checkpoint)
             self._check_extent(state.x)
             states.append(state)
             wrenches.append({name: -impulse / (end - start) for name, impulse in impulses.items()})
@@ -198,7 +214,8 @@ class Cloth(nn.Module):
         kept = {name: part for name, part in model.effects.items() if part[0].grasp is None}  # grips do not slip yet
         model = model._replace(effects={**kept, "settling": (damping, damping.coefficients().detach())})
         count = int(np.ceil(duration * (1 / self.stable_step() + rate)))
-        settled, _ = advance(Interval(model, held, start, start + duration, count), state, checkpoint=True)
+        interval = Interval(model, held, start, start + duration, count, self._choice(model, state).fused)
+        settled, _ = advance(interval, state, checkpoint=True)
         self._check_extent(settled.x)
         return settled._replace(v=torch.zeros_like(settled.v))
 
@@ -238,6 +255,9 @@ class Cloth(nn.Module):
     def energy(self, state: ClothState) -> dict[str, Tensor]:
         """Energies by name, each [...] J."""
         return functional.energy(self.model(), state)
+
+    def _choice(self, model: functional.Model, state: ClothState) -> Choice:
+        return choose(self.engine, model, state, standing(model))
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
@@ -303,7 +323,9 @@ class Cloth(nn.Module):
             else f"layers rest {1e3 * GAP * self._grid.spacing:.3g} mm apart, unseen within "
             f"{1e3 * TURNED * self._grid.reach:.3g} mm along the cloth; {len(self._points)} point(s) per triangle"
         )
-        return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s"
+        with torch.no_grad():
+            engine = self._choice(self.model(), self._expected())
+        return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s\nengine: {engine}"
 
 
 def _collect(frames: list[float], states: list[ClothState], wrenches: list[dict[str, Tensor]], names: list[str]):

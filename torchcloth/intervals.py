@@ -12,20 +12,23 @@ from torch.utils.checkpoint import checkpoint as recompute
 
 from . import functional
 from .boundaries import Drive, drive
+from .engine.fused import Fused
 from .errors import SimulationDiverged
+from .functional import Impulses
 from .types import ClothState, Trajectory
 
 CHUNK = 48  # substeps between checkpoints of a long interval: memory ~ frames + CHUNK, one extra forward pass
 
 
 class Interval(NamedTuple):
-    """The time between two frames, in ``count`` equal substeps."""
+    """The time between two frames, in ``count`` equal substeps; ``fused``: the engine that runs them, or None."""
 
     model: functional.Model
     motion: Mapping[str, Trajectory]
     start: float  # s
     end: float  # s
     count: int
+    fused: Fused | None = None
 
     @property
     def dt(self) -> float:
@@ -42,30 +45,50 @@ class Interval(NamedTuple):
         return {name: drive(trajectory, times.to(trajectory.pose)) for name, trajectory in self.motion.items()}
 
 
-def advance(interval: Interval, state: ClothState, checkpoint: bool) -> tuple[ClothState, dict[str, Tensor]]:
+def advance(interval: Interval, state: ClothState, checkpoint: bool) -> tuple[ClothState, Impulses]:
     """Simulate one interval; impulses are summed over it.
 
     Raises:
         SimulationDiverged: positions are not finite at its end.
     """
-    before, drives, total = state, interval.drives(), {}
+    before, drives = state, interval.drives()
+    if interval.fused is None:
+        state, total = _by_reference(interval, state, drives, checkpoint)
+    else:
+        state, total = interval.fused.rollout(state, interval.dt, drives, interval.count, checkpoint=checkpoint)
+    check_finite(interval, before, state)
+    return state, total
+
+
+def _by_reference(
+    interval: Interval, state: ClothState, drives: Mapping[str, Drive], checkpoint: bool
+) -> tuple[ClothState, Impulses]:
+    total: Impulses = {}
     for first in range(0, interval.count, CHUNK):
         substeps = min(CHUNK, interval.count - first)
         run = partial(functional.rollout, interval.model, dt=interval.dt, drives=drives, substeps=substeps, first=first)
         store = checkpoint and torch.is_grad_enabled()
         state, impulses = recompute(run, state, use_reentrant=False, preserve_rng_state=False) if store else run(state)
         total = {name: total[name] + value if name in total else value for name, value in impulses.items()}
-    if not bool(torch.isfinite(state.x.detach()).all()):
-        raise _divergence(interval, before)
     return state, total
+
+
+def check_finite(interval: Interval, before: ClothState, after: ClothState) -> None:
+    """Go through an interval again, substep by substep, to name the first vertex that was lost.
+
+    Raises:
+        SimulationDiverged: positions are not finite at its end.
+    """
+    if not bool(torch.isfinite(after.x.detach()).all()):
+        raise _divergence(interval, before)
 
 
 @torch.no_grad()
 def _divergence(interval: Interval, state: ClothState) -> SimulationDiverged:
-    """Go through the interval again, substep by substep, to name the first vertex that was lost."""
     drives, k, vertex = interval.drives(), 0, 0
+    run = partial(functional.rollout, interval.model) if interval.fused is None else interval.fused.rollout
     for k in range(interval.count):
-        state, _ = functional.step(interval.model, state, interval.dt, drives, k)
+        state, _ = run(state, interval.dt, drives, 1, k)
         lost = ~torch.isfinite(state.x).all(-1)
         if bool(lost.any()):
             vertex = int(lost.reshape(-1, lost.shape[-1]).any(0).nonzero()[0])
