@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -12,10 +13,13 @@ from torch.utils.checkpoint import checkpoint as recompute
 
 from . import functional
 from .boundaries import Drive, drive
+from .boundaries.motion import interpolate
+from .engine.choice import Choice
 from .engine.fused import Fused
 from .errors import SimulationDiverged
 from .functional import Impulses
-from .types import ClothState, Trajectory
+from .types import ClothState, Rollout, Trajectory
+from .validation import check_extent
 
 CHUNK = 48  # substeps between checkpoints of a long interval: memory ~ frames + CHUNK, one extra forward pass
 
@@ -43,6 +47,64 @@ class Interval(NamedTuple):
         """The trajectories on the substeps."""
         times = self.times()
         return {name: drive(trajectory, times.to(trajectory.pose)) for name, trajectory in self.motion.items()}
+
+
+class Plan(NamedTuple):
+    """A simulation that has been checked and can begin."""
+
+    model: functional.Model
+    motion: Mapping[str, Trajectory]
+    frames: list[float]  # s
+    counts: list[int]  # substeps between them
+    state: ClothState  # at the first frame, with all batch dimensions
+    choice: Choice
+    longest: float  # m, extent that the contact grid has room for
+
+    def intervals(self) -> Iterator[Interval]:
+        """One after the other."""
+        for (start, end), count in zip(pairwise(self.frames), self.counts, strict=True):
+            yield Interval(self.model, self.motion, start, end, count, self.choice.fused)
+
+    def check(self, state: ClothState) -> None:
+        """Refuse a cloth that has been torn apart."""
+        if self.longest < float("inf"):
+            check_extent(state.x, self.longest)
+
+
+def run(plan: Plan, checkpoint: bool) -> Rollout:
+    """The whole simulation.
+
+    Raises:
+        SimulationDiverged: the state lost finiteness.
+    """
+    state, states, impulses = plan.state, [plan.state], []
+    for interval in plan.intervals():
+        state, given = advance(interval, state, checkpoint)
+        plan.check(state)
+        states.append(state)
+        impulses.append(given)
+    return collect(plan, states, impulses)
+
+
+def collect(plan: Plan, states: Sequence[ClothState], impulses: Sequence[Impulses]) -> Rollout:
+    """States at the frames and impulses between them, as a rollout."""
+    x, v = (torch.stack(part, dim=-3) for part in ([s.x for s in states], [s.v for s in states]))
+    zero, wrench = x.new_zeros(*x.shape[:-3], 6), {}
+    durations = [end - start for start, end in pairwise(plan.frames)]
+    for name in (name for name, boundary in plan.model.boundaries.items() if boundary.driven):
+        found = [-j[name] / d if name in j else zero for j, d in zip(impulses, durations, strict=True)]
+        wrench[name] = torch.stack([zero, *(f.expand_as(zero) for f in found)], dim=-2)
+    return Rollout(torch.tensor(plan.frames, dtype=torch.float64), x, v, wrench, states[-1])
+
+
+def held(motion: Mapping[str, Trajectory], start: float, end: float) -> dict[str, Trajectory]:
+    """Every body stands where it is at ``start``, with the same grasps closed."""
+    found, span = {}, torch.tensor([start, end], dtype=torch.float64)
+    for name, trajectory in motion.items():
+        pose = interpolate(trajectory, span[:1].to(trajectory.pose))
+        closed = drive(trajectory, span[:1].repeat(2).to(trajectory.pose)).closed[0]
+        found[name] = Trajectory(span, pose.expand(*pose.shape[:-3], 2, 4, 4), torch.tensor([closed, closed]))
+    return found
 
 
 def advance(interval: Interval, state: ClothState, checkpoint: bool) -> tuple[ClothState, Impulses]:

@@ -28,7 +28,7 @@ for schema in (
     "rollout_tangent(int program, int substeps, Tensor[] inputs, Tensor[] tangents, int[] moved) -> Tensor[]",
 ):
     torch.library.define(f"torchcloth::{schema.partition('(')[0]}", "(" + schema.partition("(")[2])
-_ops = torch.ops.torchcloth
+ops = torch.ops.torchcloth
 
 
 def _job(program: int, substeps: int, inputs: Sequence[Tensor]) -> Job:
@@ -45,7 +45,7 @@ def _scenes(inputs: Sequence[Tensor]) -> int:
 
 
 @torch.library.impl("torchcloth::rollout", "CPU")
-def rollout(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -> list[Tensor]:
+def _values(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -> list[Tensor]:
     """Results after the substeps [scenes, rows, components], and the records for the adjoint.
 
     ``every``: substeps between records; 0: none, the adjoint goes through the substeps again.
@@ -65,7 +65,7 @@ def _(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -> list
 def _(info: Any, dims: Any, program: int, substeps: int, every: int, inputs: Sequence[Tensor]):
     scenes = _inner_scenes(inputs, dims[3])
     flat = [_folded(t, d, info.batch_size, scenes) for t, d in zip(inputs, dims[3], strict=True)]
-    results = _ops.rollout(program, substeps, every, flat)
+    results = ops.rollout(program, substeps, every, flat)
     return [_unfolded(t, info.batch_size) for t in results], [0] * len(results)
 
 
@@ -73,7 +73,7 @@ def _(info: Any, dims: Any, program: int, substeps: int, every: int, inputs: Seq
 
 
 @torch.library.impl("torchcloth::rollout_backward", "CPU")
-def rollout_backward(
+def _adjoints(
     program: int,
     substeps: int,
     every: int,
@@ -106,7 +106,7 @@ def _(info: Any, dims: Any, program, substeps, every, inputs, records, seeds, wa
     own = [_folded(t, d, size, scenes, i in wanted) for i, (t, d) in enumerate(zip(inputs, dims[3], strict=True))]
     kept = _folded(records, dims[4], size, scenes, True)
     given = [_folded(t, d, size, scenes, True) for t, d in zip(seeds, dims[5], strict=True)]
-    grads = [_unfolded(g, size) for g in _ops.rollout_backward(program, substeps, every, own, kept, given, wanted)]
+    grads = [_unfolded(g, size) for g in ops.rollout_backward(program, substeps, every, own, kept, given, wanted)]
     shared = [scenes > 1 and inputs[i].shape[_first(dims[3][i])] == 1 for i in wanted]
     return [g.sum(1, keepdim=True) if s else g for g, s in zip(grads, shared, strict=True)], [0] * len(grads)
 
@@ -115,7 +115,7 @@ def _(info: Any, dims: Any, program, substeps, every, inputs, records, seeds, wa
 
 
 @torch.library.impl("torchcloth::rollout_tangent", "CPU")
-def rollout_tangent(
+def _tangents(
     program: int, substeps: int, inputs: Sequence[Tensor], tangents: Sequence[Tensor], moved: Sequence[int]
 ) -> list[Tensor]:
     """Results, and then their tangents [scenes, directions, rows, components].
@@ -144,13 +144,13 @@ def _(info: Any, dims: Any, program, substeps, inputs, tangents, moved):
     scenes = _inner_scenes(inputs, dims[2])
     own = [_folded(t, d, size, scenes) for t, d in zip(inputs, dims[2], strict=True)]
     dots = [_folded(t, d, size, scenes) for t, d in zip(tangents, dims[3], strict=True)]
-    results = _ops.rollout_tangent(program, substeps, own, dots, moved)
+    results = ops.rollout_tangent(program, substeps, own, dots, moved)
     return [_unfolded(t, size) for t in results], [0] * len(results)
 
 
 def _many_directions(size: int, dims: Batch, program: int, substeps: int, inputs, tangents, moved):
     first = [t.expand(size, *t.shape) if d is None else t.movedim(d, 0) for t, d in zip(tangents, dims, strict=True)]
-    results = _ops.rollout_tangent(program, substeps, inputs, [t.movedim(0, 1).flatten(1, 2) for t in first], moved)
+    results = ops.rollout_tangent(program, substeps, inputs, [t.movedim(0, 1).flatten(1, 2) for t in first], moved)
     half = len(results) // 2
     values = [t.expand(size, *t.shape) for t in results[:half]]
     return [*values, *(t.unflatten(1, (size, -1)).movedim(1, 0) for t in results[half:])], [0] * len(results)
@@ -196,7 +196,7 @@ def _adjoint(ctx: Any, seeds: Sequence[Tensor | None], needs: Sequence[bool]) ->
     given = [
         like.new_zeros(scenes, f.rows, f.comps) if s is None else s for f, s in zip(fields, seeds[:-1], strict=True)
     ]
-    found = _ops.rollout_backward(ctx.number, ctx.substeps, ctx.every, inputs, records, given, wanted)
+    found = ops.rollout_backward(ctx.number, ctx.substeps, ctx.every, inputs, records, given, wanted)
     grads: list[Tensor | None] = [None] * len(inputs)
     for i, grad in zip(wanted, found, strict=True):
         grads[i] = grad
@@ -229,7 +229,7 @@ class Rollout(torch.autograd.Function):
     @staticmethod
     def forward(program: int, substeps: int, every: int, *inputs: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore
         """See ``rollout``."""
-        return tuple(_ops.rollout(program, substeps, every, inputs))
+        return tuple(ops.rollout(program, substeps, every, inputs))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -251,5 +251,5 @@ class Rollout(torch.autograd.Function):
         *inputs, _ = ctx.saved_tensors
         moved = [i for i, t in enumerate(tangents[3:]) if t is not None]
         dots = [t.unsqueeze(1) for t in tangents[3:] if t is not None]
-        results = _ops.rollout_tangent(ctx.number, ctx.substeps, inputs, dots, moved)
+        results = ops.rollout_tangent(ctx.number, ctx.substeps, inputs, dots, moved)
         return *(t.squeeze(1) for t in results[len(results) // 2 :]), None
