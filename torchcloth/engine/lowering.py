@@ -7,6 +7,7 @@ may have changed its law. Materials and effects without kernels are left to torc
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from contextlib import nullcontext
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,8 @@ from ..boundaries import Drive
 from ..model import Model
 from ..types import ClothState
 from .outside import MATERIAL, obstacle
-from .program import Field, Loop, Program, array
+from .program import Field, Loop, Program
+from .wrapped import array, is_wrapped, numbers_of_wrapped
 
 
 LANES = 16  # of the widest pack, csrc/pack.h
@@ -177,9 +179,11 @@ def fitted(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> tupl
         Unfused: a part without kernels that cannot be left to torch.
     """
     outside: set[str] = set()
+    readable = numbers_of_wrapped() if is_wrapped(model.mass) else nullcontext()
     while True:
         try:
-            return lower(model, state, drives, outside), frozenset(outside)
+            with readable:
+                return lower(model, state, drives, outside), frozenset(outside)
         except Unfused as miss:
             if miss.part is None:
                 raise

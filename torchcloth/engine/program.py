@@ -26,6 +26,7 @@ import numpy as np
 import torch
 
 from .library import kernels, library
+from .wrapped import array
 
 OWN, SHARED = -1, -2
 LOAD, ADD, PUT = 0, 2, 3
@@ -277,17 +278,6 @@ class Stencil(NamedTuple):
     def emit(self, handle, api) -> None:
         """Write it down."""
         api("stencil")(handle, self.table, self.weight.id, self.x.id, self.y.id, int(self.shape))
-
-
-def array(values: np.ndarray | torch.Tensor) -> np.ndarray:
-    """The numbers, also where one of torch.func's transforms has wrapped them."""
-    if not isinstance(values, torch.Tensor):
-        return np.asarray(values)
-    values = values.detach().cpu()
-    try:
-        return values.numpy()
-    except RuntimeError:
-        return np.asarray(values.tolist()).reshape(values.shape)
 
 
 def _ints(values: Sequence[int]):
