@@ -40,8 +40,8 @@ def start(cloth, batch=()):
     """Not at rest, not flat."""
     generator = torch.Generator().manual_seed(0)
     x = cloth.rest_state().x.expand(*batch, -1, -1)
-    x = x + 1e-3 * torch.randn(x.shape, generator=generator, dtype=x.dtype)
-    v = 0.3 * torch.randn(x.shape, generator=generator, dtype=x.dtype)
+    x = x + 1e-3 * torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x)
+    v = 0.3 * torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x)
     return cloth.state(x, v)
 
 

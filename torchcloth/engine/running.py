@@ -70,7 +70,7 @@ def spacing(job: Job) -> int:
     if full_size(job.program, job.scenes, job.substeps) <= BUDGET:
         return 1
     states = job.scenes * job.substeps * job.program.record_size(False) * job.program.dtype.itemsize
-    return max(int(job.substeps**0.5), states // BUDGET, 2)
+    return max(int(job.substeps**0.5), min(states // max(BUDGET, 1), job.substeps), 2)
 
 
 def full_size(program: Program, scenes: int, substeps: int) -> int:
