@@ -28,7 +28,7 @@ CLANG = "-fbracket-depth=16384 -fconstexpr-steps=200000000"  # its limits are lo
 SPEED = 500.0  # bytes of kernels that one core compiles in a second, measured with g++ 12
 
 
-class Unbuilt(Exception):
+class Unbuilt(RuntimeError):
     """There is no library, and why; ``remedy``: what to do."""
 
     def __init__(self, reason: str, remedy: str) -> None:
