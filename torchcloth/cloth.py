@@ -117,7 +117,7 @@ class Cloth(nn.Module):
 
     @engine.setter
     def engine(self, setting: Setting) -> None:
-        self._engine = check_setting(setting)
+        self._engine: Setting = check_setting(setting)
 
     # -- states ---------------------------------------------------------------------------------------------------
 

@@ -92,6 +92,7 @@ class _Walk:
             }
             return functional_call(_Built(self.cloth, self.build, work), entries, ())
 
+
 class _Built(nn.Module):
     """Work on a model within ``functional_call``, so that parts read the dual parameters wherever they do."""
 

@@ -101,6 +101,7 @@ def test_memory_budget_changes_nothing(budget, monkeypatch):
     """No records at all, some, all: the same gradients to the last digit but the order of sums."""
     expected = outcome("fused", times=(0.0, 0.003, 0.006, END))[1]
     monkeypatch.setattr(running, "BUDGET", budget)
+    monkeypatch.setattr(running, "ANEW", budget)
     found = outcome("fused", times=(0.0, 0.003, 0.006, END))[1]
     for name, grad in found.items():
         if grad is not None:
@@ -204,7 +205,10 @@ def test_print_says_which_engine_runs_and_why():
 def test_other_precisions_and_devices_are_left_to_the_reference():
     cloth = sheet()
     model, state = cloth.model(), cloth.rest_state()
-    for other, why in ((state.map(lambda t: t.half()), "float16"), (state.map(lambda t: t.to("meta")), "tensors on meta")):
+    for other, why in (
+        (state.map(lambda t: t.half()), "float16"),
+        (state.map(lambda t: t.to("meta")), "tensors on meta"),
+    ):
         assert str(choose("auto", model, other, standing(model))) == f"reference ({why})"
 
 
@@ -220,9 +224,9 @@ def test_fused_refuses_what_it_cannot():
     message = r"""engine; got "fused"; expected .*boundary 'floor' \(Floor\) has no kernels; use engine="auto\""""
     with pytest.raises(InvalidInput, match=message):
         cloth(start(cloth), times=TIMES)
+    apic = sheet("fused", contact=tc.Contact(), transfer="apic", boundaries={})
     with pytest.raises(InvalidInput, match=r"transfer 'apic' has no kernels"):
-        fine = sheet("fused", contact=tc.Contact(), transfer="apic", boundaries={})
-        fine(fine.rest_state(), times=(0.0, 1e-3))
+        apic(apic.rest_state(), times=(0.0, 1e-3))
 
 
 def test_divergence_names_time_and_vertex():
@@ -233,7 +237,9 @@ def test_divergence_names_time_and_vertex():
         state = cloth.rest_state()
         v = state.v.clone()
         v[7] = 1e200
-        with pytest.raises(SimulationDiverged, match=r"t = .*; got vertex \d+ not finite after substep \d+ of") as caught:
+        with pytest.raises(
+            SimulationDiverged, match=r"t = .*; got vertex \d+ not finite after substep \d+ of"
+        ) as caught:
             cloth(state._replace(v=v), opening(END, "nobody"), (0.0, END))
         messages.append(str(caught.value))
     assert messages[0] == messages[1]

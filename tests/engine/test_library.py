@@ -61,7 +61,9 @@ def test_without_a_compiler(nowhere):
 def test_doctor_without_a_compiler(nowhere):
     done = run(["-m", "torchcloth.cli", "doctor"], **nowhere)
     assert done.returncode == 0, done.stderr
-    assert re.search(r"^engine +not available, the torch reference serves: no C\+\+ compiler; install", done.stdout, re.M)
+    assert re.search(
+        r"^engine +not available, the torch reference serves: no C\+\+ compiler; install", done.stdout, re.M
+    )
 
 
 def test_doctor_before_and_after_the_first_use(nowhere, tmp_path):

@@ -161,7 +161,9 @@ def simulation(cloth, motion):
 
     def run(x=state.x, pose=motion["left"].pose, **moved):
         driven = {**motion, "left": motion["left"]._replace(pose=pose)}
-        out = functional_call(cloth, {**values, **moved}, (state._replace(x=x), driven, (0.0, 0.004, END)), {"dt": 4e-4})
+        out = functional_call(
+            cloth, {**values, **moved}, (state._replace(x=x), driven, (0.0, 0.004, END)), {"dt": 4e-4}
+        )
         return torch.cat([out.x[1:].flatten(), 0.1 * out.v[1:].flatten(), out.wrench["left"].flatten()])
 
     return run, state

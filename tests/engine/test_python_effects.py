@@ -1,4 +1,4 @@
-"""A user's effects and materials in Python, beside the engine: exact values, gradients in both modes, bounded memory."""
+"""A user's effects and materials in Python, beside the engine: exact values, gradients in both modes, memory."""
 
 import pytest
 import torch
@@ -166,6 +166,7 @@ def test_settling_and_a_grip_effect():
 
 def test_memory_is_bounded_by_checkpoints(monkeypatch):
     """Tensors that the graph keeps: about one state for every 48 substeps instead of all of each."""
+
     def kept(checkpoint):
         cloth = cloth_with("fused", Pull)
         total = 0

@@ -90,7 +90,10 @@ def test_fields_and_boundary_free_cloth():
     ("along", "message"),
     [
         (Directions(), "along; got no direction"),
-        (Directions({"stiffness": torch.ones(1)}), r"along\.parameters; got 'stiffness'; expected one of areal_density"),
+        (
+            Directions({"stiffness": torch.ones(1)}),
+            r"along\.parameters; got 'stiffness'; expected one of areal_density",
+        ),
         (Directions({"areal_density.raw": torch.ones(1, 2)}), r"got shape \(1, 2\); expected \[K, \]"),
         (Directions(motion={"foot": torch.ones(1)}), r"along\.motion; got 'foot'"),
         (Directions({"areal_density.raw": torch.ones(2), "material.cone.raw": torch.ones(3)}), "same K"),

@@ -1,4 +1,4 @@
-"""Building the engine's library. Nothing but Python's own modules: ``setup.py`` runs this file before anything is there.
+"""Building the engine's library, with nothing but Python's own modules: ``setup.py`` runs this file by itself.
 
 A library is named by its sources and by the processor and flags it was built for, so a wrong one is never taken.
 """

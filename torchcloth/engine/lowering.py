@@ -21,7 +21,6 @@ from .outside import MATERIAL, obstacle
 from .program import Field, Loop, Program
 from .wrapped import array, is_wrapped, numbers_of_wrapped
 
-
 LANES = 16  # of the widest pack, csrc/pack.h
 
 
@@ -80,7 +79,7 @@ class Lowering:
     def parameter(self, tensor: Tensor, near: int = 0) -> Field:
         """The input field of a coefficient [..., rows, comps]; one tensor has one field. ``near``: of a stencil."""
         if id(tensor) not in self._known:
-            field = self.program.parameter(*tensor.shape[-2:], near)
+            field = self.program.parameter(tensor.shape[-2], tensor.shape[-1], near)
             self._known[id(tensor)], self.inputs[field] = field, tensor
         return self._known[id(tensor)]
 
@@ -192,9 +191,7 @@ def fitted(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> tupl
             outside.add(miss.part)
 
 
-def lower(
-    model: Model, state: ClothState, drives: Mapping[str, Drive], outside: Collection[str] = ()
-) -> Lowering:
+def lower(model: Model, state: ClothState, drives: Mapping[str, Drive], outside: Collection[str] = ()) -> Lowering:
     """The program of a substep without the parts ``outside``; from the drives only names and flags are taken.
 
     Raises:

@@ -7,8 +7,9 @@ exact in both modes and under ``vmap``; second ones are refused.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NoReturn
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NoReturn, cast
 
 import torch
 from torch import Tensor
@@ -29,6 +30,8 @@ for schema in (
 ):
     torch.library.define(f"torchcloth::{schema.partition('(')[0]}", "(" + schema.partition("(")[2])
 ops = torch.ops.torchcloth
+_on_cpu = cast("Callable[[str], Callable]", partial(torch.library.impl, types="CPU"))
+_mapped = cast("Callable[[str], Callable]", torch.library.register_vmap)
 
 
 def _job(program: int, substeps: int, inputs: Sequence[Tensor]) -> Job:
@@ -44,7 +47,7 @@ def _scenes(inputs: Sequence[Tensor]) -> int:
 # -- values -----------------------------------------------------------------------------------------------------------
 
 
-@torch.library.impl("torchcloth::rollout", "CPU")
+@_on_cpu("torchcloth::rollout")
 def _values(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -> list[Tensor]:
     """Results after the substeps [scenes, rows, components], and the records for the adjoint.
 
@@ -61,7 +64,7 @@ def _(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -> list
     return [*results, inputs[0].new_empty(scenes, *running.record_shape(known, substeps, every))]
 
 
-@torch.library.register_vmap("torchcloth::rollout")
+@_mapped("torchcloth::rollout")
 def _(info: Any, dims: Any, program: int, substeps: int, every: int, inputs: Sequence[Tensor]):
     scenes = _inner_scenes(inputs, dims[3])
     flat = [_folded(t, d, info.batch_size, scenes) for t, d in zip(inputs, dims[3], strict=True)]
@@ -72,7 +75,7 @@ def _(info: Any, dims: Any, program: int, substeps: int, every: int, inputs: Seq
 # -- reverse mode -----------------------------------------------------------------------------------------------------
 
 
-@torch.library.impl("torchcloth::rollout_backward", "CPU")
+@_on_cpu("torchcloth::rollout_backward")
 def _adjoints(
     program: int,
     substeps: int,
@@ -99,7 +102,7 @@ def _(program, substeps, every, inputs, records, seeds, wanted) -> list[Tensor]:
     return [torch.empty_like(inputs[i], memory_format=torch.contiguous_format) for i in wanted]
 
 
-@torch.library.register_vmap("torchcloth::rollout_backward")
+@_mapped("torchcloth::rollout_backward")
 def _(info: Any, dims: Any, program, substeps, every, inputs, records, seeds, wanted):
     size, scenes = info.batch_size, _inner_scenes(inputs, dims[3])
     # an input that many scenes share gets a copy for each, so that their adjoints stay apart
@@ -114,7 +117,7 @@ def _(info: Any, dims: Any, program, substeps, every, inputs, records, seeds, wa
 # -- forward mode -----------------------------------------------------------------------------------------------------
 
 
-@torch.library.impl("torchcloth::rollout_tangent", "CPU")
+@_on_cpu("torchcloth::rollout_tangent")
 def _tangents(
     program: int, substeps: int, inputs: Sequence[Tensor], tangents: Sequence[Tensor], moved: Sequence[int]
 ) -> list[Tensor]:
@@ -136,7 +139,7 @@ def _(program: int, substeps: int, inputs: Sequence[Tensor], tangents: Sequence[
     return [*results, *(like.new_empty(scenes, tangents[0].shape[1], f.rows, f.comps) for f in fields)]
 
 
-@torch.library.register_vmap("torchcloth::rollout_tangent")
+@_mapped("torchcloth::rollout_tangent")
 def _(info: Any, dims: Any, program, substeps, inputs, tangents, moved):
     size = info.batch_size
     if all(d is None for d in dims[2]):  # many tangents at one place: directions

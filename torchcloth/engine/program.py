@@ -79,7 +79,7 @@ class Program:
         data = np.ascontiguousarray(array(values), dtype=self._numpy)
         key = data.tobytes() + f"{near} {data.shape}".encode()
         if key not in self._constants:
-            self._constants[key] = self._field(Kind.CONSTANT, *data.shape, near, data)
+            self._constants[key] = self._field(Kind.CONSTANT, data.shape[0], data.shape[1], near, data)
         return self._constants[key]
 
     def parameter(self, rows: int, comps: int, near: int = 0) -> Field:

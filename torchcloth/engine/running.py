@@ -12,7 +12,8 @@ from torch import Tensor
 from .library import Call, Port
 from .program import Field, Program
 
-BUDGET = 128 * 2**20  # bytes of records of one call, above which substeps are recomputed
+BUDGET = 192 * 2**20  # bytes of records that a simulation keeps for its adjoint
+ANEW = 96 * 2**20  # bytes of records that the adjoint makes at a time, of substeps that it goes through again
 
 
 class Job(NamedTuple):
@@ -52,7 +53,7 @@ def reverse(
 
 
 def tangent(job: Job, dots: Mapping[Field, Tensor], directions: int) -> tuple[dict[Field, Tensor], dict[Field, Tensor]]:
-    """(nexts and sums, their tangents [scenes, directions, rows, comps]) from tangents [scenes or 1, directions, ...]."""
+    """(nexts and sums, their tangents [scenes, directions, rows, comps]) of inputs [scenes or 1, directions, ...]."""
     like = next(iter(job.inputs.values()))
     results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in job.program.outputs}
     moved = {f: like.new_empty(job.scenes, directions, f.rows, f.comps) for f in results}
@@ -66,11 +67,11 @@ def tangent(job: Job, dots: Mapping[Field, Tensor], directions: int) -> tuple[di
 
 
 def spacing(job: Job) -> int:
-    """Substeps between records: every one if they fit into the budget, else about the square root of all."""
-    if full_size(job.program, job.scenes, job.substeps) <= BUDGET:
+    """Substeps between records made anew: every one if they fit, else about the square root of all."""
+    if full_size(job.program, job.scenes, job.substeps) <= ANEW:
         return 1
     states = job.scenes * job.substeps * job.program.record_size(False) * job.program.dtype.itemsize
-    return max(int(job.substeps**0.5), min(states // max(BUDGET, 1), job.substeps), 2)
+    return max(int(job.substeps**0.5), min(states // max(ANEW, 1), job.substeps), 2)
 
 
 def full_size(program: Program, scenes: int, substeps: int) -> int:

@@ -78,13 +78,14 @@ class Sensing:
         number = low.program.number
         if number not in self._known:
 
-            def tangents(model: Model) -> Coefficients:
+            def found_in(model: Model) -> Coefficients:
                 found = lower(model, state, cut(drives, 0, 1)).inputs
                 return {f: forward_ad.unpack_dual(t).tangent for f, t in found.items()}
 
-            every = [self.within(k, tangents) for k in range(self.count)]
+            every = [self.within(k, found_in) for k in range(self.count)]
             moved = [f for f in low.inputs if any(found[f] is not None for found in every)]
-            self._known[number] = {f: torch.stack([_or_zero(found[f], low.inputs[f]) for found in every]) for f in moved}
+            full = {f: [_or_zero(found[f], low.inputs[f]) for found in every] for f in moved}
+            self._known[number] = {f: torch.stack(tangents) for f, tangents in full.items()}
         return self._known[number]
 
 
