@@ -30,8 +30,10 @@ def program(dtype, batch=()):
     model = cloth.model()
     drives = {name: d._replace(increment=d.increment.repeat(STEPS, 1, 1), pose=d.pose.repeat(STEPS, 1, 1),
                                closed=(True,) * STEPS) for name, d in standing(model).items()}  # fmt: skip
-    low = Fused(model, state, drives).lowering(state, drives)
-    values = binding.flat(low, binding.values(low, state, 1e-4, drives), state.x.shape[:-2])
+    fused, shape = Fused(model, state, drives), state.x.shape[:-2]
+    low = fused.lowering(state, drives)
+    values = binding.flat(low, binding.states(low, state) | binding.moves(low, drives), shape)
+    values |= fused.coefficients(low, 1e-4, shape)
     return low.program, [values[field].detach() for field in low.program.inputs]
 
 

@@ -33,12 +33,6 @@ def moves(low: Lowering, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
     return found
 
 
-def values(low: Lowering, state: ClothState, dt: float, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
-    """All inputs but what ``outside`` gives, by field, each [..., rows, components]."""
-    step = torch.full((1, 1), dt, dtype=state.x.dtype)
-    return {**states(low, state), low.dt: step, **low.inputs, **moves(low, drives)}
-
-
 def flat(low: Lowering, found: Mapping[Field, Tensor], batch: torch.Size, behind: int = 2) -> dict[Field, Tensor]:
     """Contiguous tensors of the program's precision; ``batch``: the scenes' shape, before the last ``behind`` axes."""
     out = {}

@@ -17,6 +17,7 @@ from . import binding, running
 from .lowering import Lowering, fitted
 from .operators import Rollout
 from .outside import Outside
+from .program import Field
 
 CHUNK = 48  # substeps between checkpoints where torch has a part in each of them
 
@@ -37,6 +38,7 @@ class Fused:
         low, parts = fitted(model, state, cut(drives, 0, 1))
         self.outside = Outside(model, parts) if parts else None
         self._known = {_pattern(drives): low}
+        self._coefficients: dict[int, dict[Field, Tensor]] = {}  # by the program's number
 
     def rollout(
         self,
@@ -61,16 +63,28 @@ class Fused:
             self._known[pattern], _ = fitted(self.model, state, cut(drives, 0, 1))
         return self._known[pattern]
 
+    def coefficients(self, low: Lowering, dt: float, batch: torch.Size) -> dict[Field, Tensor]:
+        """Inputs that stay the same over the substeps of a call."""
+        number, step = low.program.number, torch.full((1, 1, 1), dt, dtype=low.program.dtype)
+        if number not in self._coefficients:
+            self._coefficients[number] = binding.flat(low, low.inputs, batch)
+        return self._coefficients[number] | {low.dt: step}
+
     def _span(self, state: ClothState, dt: float, drives: Mapping[str, Drive], count: int, checkpoint: bool):
         """Substeps while no grasp opens or closes."""
-        low = self.lowering(state, drives)
-        if self.outside is None:
-            return self._call(low, state, dt, drives, count, checkpoint)
+        low, batch = self.lowering(state, drives), state.x.shape[:-2]
+        fixed, moves = self.coefficients(low, dt, batch), binding.flat(low, binding.moves(low, drives), batch)
+        outside = self.outside
+        if outside is None:
+            return self._call(low, state, fixed | moves, count, checkpoint)
 
         def run(state: ClothState) -> tuple[ClothState, Impulses]:
             total: Impulses = {}
             for k in range(count):
-                state, impulses = self._shared_substep(low, state, dt, cut(drives, k, k + 1))
+                force, memory = outside.force(state, dt)
+                now = {field: rows[:, k : k + 1] for field, rows in moves.items()}
+                state, impulses = self._call(low, state, fixed | now, 1, False, force)
+                state = state._replace(memory=state.memory | memory)
                 total = _sum(total, impulses)
             return state, total
 
@@ -78,29 +92,20 @@ class Fused:
             return recompute(run, state, use_reentrant=False, preserve_rng_state=False)
         return run(state)
 
-    def _shared_substep(self, low: Lowering, state: ClothState, dt: float, drives: Mapping[str, Drive]):
-        """One substep in which torch has a part."""
-        if self.outside is None or low.given is None:
-            raise ValueError("no part is outside")
-        force, memory = self.outside.force(state, dt)
-        after, impulses = self._call(low, state, dt, drives, 1, False, force)
-        return after._replace(memory=after.memory | memory), impulses
-
     def _call(
         self,
         low: Lowering,
         state: ClothState,
-        dt: float,
-        drives: Mapping[str, Drive],
+        others: dict[Field, Tensor],
         substeps: int,
         checkpoint: bool,
         force: Tensor | None = None,
     ) -> tuple[ClothState, Impulses]:
         batch, program = state.x.shape[:-2], low.program
-        found = binding.values(low, state, dt, drives)
+        begin = binding.states(low, state)
         if low.given is not None and force is not None:
-            found[low.given] = force
-        by_field = binding.flat(low, found, batch)
+            begin[low.given] = force
+        by_field = binding.flat(low, begin, batch) | others
         inputs = [by_field[field] for field in program.inputs]
         every = self._every(low, batch.numel(), substeps, checkpoint) if _needs_gradient(inputs) else 0
         *results, _ = Rollout.apply(program.number, substeps, every, *inputs)  # type: ignore[misc]

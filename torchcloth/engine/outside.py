@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ..dynamics import vertex_forces
 from ..effects import AbstractEffect
-from ..model import Model, surface
+from ..model import Model, assemble, surface
 from ..strain import evolve, membrane_stress
-from ..types import ClothState, Memory
+from ..types import ClothState, Memory, Moment
 
 MATERIAL = "material"
 
@@ -40,7 +40,14 @@ class Outside:
         own = {key: value for key, value in state.memory.items() if key in self.parts}
         memory = evolve(self.model, state._replace(memory=own), s, dt)
         if MATERIAL in self.parts:
-            columns = membrane_stress(self.model, s, memory)
-        else:
-            columns = (torch.zeros_like(s.f1), torch.zeros_like(s.f1))
-        return vertex_forces(self.model, state, s, memory, columns), memory
+            return vertex_forces(self.model, state, s, memory, membrane_stress(self.model, s, memory)), memory
+        total, shares = torch.zeros_like(state.x), None
+        for name, (effect, c) in self.model.effects.items():
+            force = effect.force(c, Moment(state.x, state.v, s, self.model.mass, memory.get(f"effects.{name}")))
+            if force is not None and effect.acts_on == "triangles":
+                shares = force / 3 if shares is None else shares + force / 3
+            elif force is not None:
+                total = total + force
+        if shares is not None:
+            total = total + assemble(self.model.geometry, (shares, shares, shares), state.x)
+        return total, memory

@@ -57,7 +57,8 @@ class Sensing:
     def _span(self, state, moved, dt, drives, driven, substeps):
         low = self.fused.lowering(state, drives)
         program, batch = low.program, state.x.shape[:-2]
-        values = binding.flat(low, binding.values(low, state, dt, drives), batch)
+        values = binding.flat(low, binding.states(low, state) | binding.moves(low, drives), batch)
+        values |= self.fused.coefficients(low, dt, batch)
         dots = {**binding.states(low, moved), **self._inputs(low, state, drives)}
         if driven:
             dots |= binding.moves(low, driven)
