@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from torchcloth.engine.library import Unbuilt, library
+from torchcloth.engine.library import library
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -15,6 +15,8 @@ def _engine(request):
     """Build it once."""
     try:
         library()
-    except Unbuilt as miss:
+    except RuntimeError as error:
+        if "no C++ compiler" not in str(error):
+            raise
         if request.path.name != "test_library.py":  # that file asks what happens then
-            pytest.skip(f"no fused engine: {miss}")
+            pytest.skip(str(error))

@@ -114,7 +114,7 @@ def test_records_are_kept_while_the_budget_lasts(monkeypatch):
     model, state = cloth.model(), start(cloth)
     drives = {name: d._replace(increment=d.increment.repeat(9, 1, 1), pose=d.pose.repeat(9, 1, 1), closed=(True,) * 9)
               for name, d in standing(model).items()}  # fmt: skip
-    size = running.full_size(Fused(model, state, drives).lowering(state, drives).program, 1, 9)
+    size = running.full_size(Fused(model, state, drives).low.program, 1, 9)
     monkeypatch.setattr(running, "BUDGET", int(1.5 * size))
     fused, forward = Fused(model, state, drives), running.forward
     monkeypatch.setattr(running, "forward", lambda job, every=0: kept.append(every) or forward(job, every))

@@ -7,7 +7,6 @@ from clothes import close, opening, sheet, start
 from torch.func import functional_call, jacfwd, jvp, vjp, vmap
 
 import torchcloth as tc
-from torchcloth.engine import binding
 from torchcloth.engine.choice import standing
 from torchcloth.engine.fused import Fused
 from torchcloth.engine.operators import Rollout, ops
@@ -30,11 +29,8 @@ def program(dtype, batch=()):
     model = cloth.model()
     drives = {name: d._replace(increment=d.increment.repeat(STEPS, 1, 1), pose=d.pose.repeat(STEPS, 1, 1),
                                closed=(True,) * STEPS) for name, d in standing(model).items()}  # fmt: skip
-    fused, shape = Fused(model, state, drives), state.x.shape[:-2]
-    low = fused.lowering(state, drives)
-    values = binding.flat(low, binding.states(low, state) | binding.moves(low, drives), shape)
-    values |= fused.coefficients(low, 1e-4, shape)
-    return low.program, [values[field].detach() for field in low.program.inputs]
+    job = Fused(model, state, drives).job(state, 1e-4, drives, STEPS)
+    return job.program, [tensor.detach() for tensor in job.inputs.values()]
 
 
 def leaves(inputs):
@@ -218,11 +214,11 @@ def test_jvp_of_a_number_of_steps_in_one_program():
     numbers = set()
     for cloth in (first, second, first):
         model, state = cloth.model(), cloth.rest_state()
-        numbers.add(Fused(model, state, standing(model)).lowering(state, standing(model)).program.number)
+        numbers.add(Fused(model, state, standing(model)).low.program.number)
     assert len(numbers) == 1
     second.boundaries["left"].index = torch.tensor([2])  # a constant of a part
     model = second.model()
-    numbers.add(Fused(model, state, standing(model)).lowering(state, standing(model)).program.number)
+    numbers.add(Fused(model, state, standing(model)).low.program.number)
     assert len(numbers) == 2
 
 

@@ -6,8 +6,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .._math import dot
 from ..meshes import Mesh
 from ..meshes.topology import edges
+
+# Changes of velocity below it [m/s] are no contact. What a pass has stopped is left with rounding, of either sign; if
+# that counted, a point's neighbours would get their full share of the mass or not by chance.
+TOUCH = 1e-6
 
 
 class TrianglePoints(nn.Module):
@@ -42,10 +47,10 @@ class TrianglePoints(nn.Module):
         corners by weight, which keeps linear and angular momentum; no vertex is pushed twice for one cause.
         """
         with torch.no_grad():
-            touches = (change != 0).any(-1, keepdim=True).to(change)
+            touches = (dot(change, change) > TOUCH**2).to(change)
             load = self._corners(self.mobility * self._gathered(self.weight * touches.unsqueeze(-3)))
             mobility = (self.weight * load).sum(-3)  # of a point that has its corners' parts of mass m b / sum(b)
-        impulse = change / torch.where(touches > 0, mobility, 1.0)
+        impulse = torch.where(touches > 0, change / torch.where(touches > 0, mobility, 1.0), 0.0)
         return self.mobility * self._gathered(self.weight * impulse.unsqueeze(-3))
 
     def _corners(self, field: Tensor) -> Tensor:

@@ -26,10 +26,12 @@ def states(low: Lowering, state: ClothState) -> dict[Field, Tensor]:
 
 
 def moves(low: Lowering, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
-    """The drives' tensors [..., substeps, 16], by field."""
+    """The drives' tensors [..., substeps, comps], by field."""
     found = {}
-    for name, (increment, pose) in low.drives.items():
-        found[increment], found[pose] = drives[name].increment.flatten(-2), drives[name].pose.flatten(-2)
+    for name, (increment, pose, closed) in low.drives.items():
+        drive = drives[name]
+        found[increment], found[pose] = drive.increment.flatten(-2), drive.pose.flatten(-2)
+        found[closed] = torch.tensor(drive.closed, dtype=low.program.dtype).unsqueeze(-1)
     return found
 
 

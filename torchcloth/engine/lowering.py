@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 
 from ..boundaries import Drive
+from ..effects._bent import BentSheet
 from ..model import Model
 from ..types import ClothState
 from .outside import MATERIAL, obstacle
-from .program import Field, Loop, Program
+from .program import Field, Loop, Program, Shape
 from .wrapped import array, is_wrapped, numbers_of_wrapped
 
 LANES = 16  # of the widest pack, csrc/pack.h
@@ -46,10 +47,12 @@ class Lowering:
         x, v: positions and velocities.
         memory: internal variables by key, as in ``ClothState.memory``.
         force: [V, 3], to be added to.
+        resistance: [V, 6] kg, mass of the air that moves along (xx, xy, xz, yy, yz, zz), to be added to; None without.
         triangles: the loop over triangles that comes first; ``Triangles`` has what is computed there already.
+        sheets: how the sheet is bent at its vertices, by the weights of the derivatives.
         inputs: parameter fields with their tensors [..., rows, comps].
         given: a parameter field without tensor, for the forces of parts that torch computes; None: there are none.
-        drives: by boundary, (increment, pose) fields [16] each.
+        drives: by boundary, (increment [16], pose [16], closed [1]) fields.
         impulses: by boundary, [6].
     """
 
@@ -72,9 +75,9 @@ class Lowering:
         order = _scattered(self.faces)
         self.corners = [self.program.table(c[order]) for c in array(model.geometry.corners).reshape(3, -1)]
         self.triangles = Triangles(self, order)
-        self.drives = {name: (self.program.drive(16), self.program.drive(16)) for name in drives}
+        self.sheets: dict[Field, Sheet] = {}
+        self.drives = {name: tuple(self.program.drive(comps) for comps in (16, 16, 1)) for name in drives}
         self.impulses = {name: self.program.sum(6) for name in drives}
-        self.closed = {name: drive.closed for name, drive in drives.items()}
 
     def parameter(self, tensor: Tensor, near: int = 0) -> Field:
         """The input field of a coefficient [..., rows, comps]; one tensor has one field. ``near``: of a stencil."""
@@ -95,9 +98,68 @@ class Lowering:
         loop.add(loop.call("copy3", loop.load(given)), self.force)
         return given
 
+    def number(self, value: float) -> Field:
+        """A constant of a part."""
+        return self.program.constant(np.array([[value]]))
+
     def loop(self, items: int) -> Loop:
         """A loop after all that are there."""
         return self.program.loop(items)
+
+    def sheet(self, bent: BentSheet) -> Sheet:
+        """The one of these stencils, for all effects that see the same bending."""
+        weight = self.program.constant(bent.weight.reshape(-1, 1), near=len(bent.near))
+        if weight not in self.sheets:
+            self.sheets[weight] = Sheet(self, bent, weight)
+        return self.sheets[weight]
+
+    def close(self) -> None:
+        """No more forces."""
+        self.triangles.close()
+        for sheet in self.sheets.values():
+            sheet.close()
+
+    def resisted(self, loop: Loop, change: list[int], at: int | None = None) -> list[int]:
+        """Registers of a change of velocity in the air that moves along, of all vertices or those of a table."""
+        if self.resistance is None:
+            return change
+        return loop.call("resisted", loop.load(self.resistance, at), loop.load(self.mass, at), change)
+
+    def momentum(self, loop: Loop, change: list[int], at: int | None = None) -> list[int]:
+        """Registers of the momentum that a change of velocity takes, that of the air included."""
+        mass = loop.load(self.mass, at)
+        if self.resistance is None:
+            return loop.call("scaled3", mass, change)
+        return loop.call("loaded", loop.load(self.resistance, at), mass, change)
+
+
+class Velocities:
+    """The vertices' velocities on their way from the forces to the drift: registers, as long as one loop will do.
+
+    Attributes:
+        loop: over the vertices, the last of the program.
+        now: registers of the velocities in it.
+        before: registers of what they were before the present boundary.
+    """
+
+    def __init__(self, low: Lowering, loop: Loop, now: list[int]) -> None:
+        self._low, self.loop, self.now, self.before = low, loop, now, now
+
+    def store(self) -> Field:
+        """End the loop; returns the velocities, for what is not done vertex by vertex. ``resume`` when it is done."""
+        field = self._put(self.now)
+        self._stored = field if self.before == self.now else self._put(self.before)
+        return field
+
+    def resume(self, field: Field) -> None:
+        """A new loop, with the velocities of a field."""
+        self.loop = self._low.loop(self._low.vertices)
+        self.now, self.before = self.loop.load(field), self.loop.load(self._stored)
+
+    def _put(self, regs: list[int]) -> Field:
+        field = self._low.program.temporary(self._low.vertices, 3)
+        self.loop.put(regs, field)
+        return field
 
 
 class Triangles:
@@ -111,6 +173,7 @@ class Triangles:
         self.shape = self.loop.load(program.constant(torch.cat([*g.warp, *g.weft], dim=-1)))  # a1, a2, b1, b2
         self.area = self.loop.load(program.constant(g.area))
         self._done: dict[str, list[int]] = {}
+        self._forces: list[int] | None = None
 
     def parameter(self, tensor: Tensor) -> list[int]:
         """Registers of a coefficient [..., E or 1, comps]."""
@@ -141,18 +204,19 @@ class Triangles:
         """Area ratio."""
         return self.surface[15:]
 
+    def push(self, kernel: str, *inputs: list[int]) -> None:
+        """Forces on the corners (9 numbers) that a kernel gives."""
+        self._forces = self.loop.call(kernel, *inputs, into=self._forces)
+
     def stress(self, columns: list[int]) -> None:
         """Forces of first Piola-Kirchhoff columns (6 registers) on the corners."""
-        self.forces(self.loop.call("assemble", columns, self.shape, self.area))
+        self.push("assemble", columns, self.shape, self.area)
 
-    def push(self, force: list[int]) -> None:
-        """A force on the triangle, in equal parts on its corners."""
-        self.forces(self.loop.call("thirds", force))
-
-    def forces(self, regs: list[int]) -> None:
-        """Forces on the three corners (9 registers)."""
-        for k, corner in enumerate(self._lowering.corners):
-            self.loop.add(regs[3 * k : 3 * k + 3], self._lowering.force, corner)
+    def close(self) -> None:
+        """Give the corners the sum of all that acts: one scatter, however many effects there are."""
+        if self._forces is not None:
+            for k, corner in enumerate(self._lowering.corners):
+                self.loop.add(self._forces[3 * k : 3 * k + 3], self._lowering.force, corner)
 
     def _corners(self, name: str, field: Field) -> list[list[int]]:
         flat = self._once(name, lambda: [r for c in self._lowering.corners for r in self.loop.load(field, c)])
@@ -169,6 +233,47 @@ def _scattered(items: int) -> np.ndarray:
     packs = -(-items // LANES)
     order = np.arange(packs * LANES).reshape(LANES, packs).T.ravel()
     return order[order < items]
+
+
+class Sheet:
+    """The loop over vertices in which bending is seen, and moments become forces. effects/_bent.py"""
+
+    def __init__(self, lowering: Lowering, bent: BentSheet, weight: Field) -> None:
+        program, near = lowering.program, bent.near.cpu().numpy()
+        seen = program.temporary(lowering.vertices, 15)
+        self._answer = program.temporary(lowering.vertices, 15, kept=False)
+        program.stencil(near, weight, lowering.x.now, seen)
+        self.loop = lowering.loop(lowering.vertices)
+        program.stencil(near, weight, lowering.force, self._answer, Shape.TRANSPOSED)
+        self._seen = self.loop.load(seen)
+        self._area = self.loop.load(program.constant(bent.area))
+        self.second = [*self._seen[:9], *self._area]
+        self._moment: list[int] | None = None
+        self._stress: list[int] | None = None
+        self._shape: list[int] = []
+
+    @property
+    def curvature(self) -> list[int]:
+        """Along the normal."""
+        if not self._shape:
+            self._shape = self.loop.call("bent_sheet", self._seen)
+        return self._shape[4:]
+
+    def moment(self, moment: list[int]) -> None:
+        """A bending moment (3 registers) that works on the curvature."""
+        self._moment = moment if self._moment is None else self.loop.call("copy3", moment, into=self._moment)
+
+    def stress(self, stress: list[int]) -> None:
+        """What works on the derivatives (15 registers), times the area."""
+        self._stress = stress if self._stress is None else self.loop.call("copy15", stress, into=self._stress)
+
+    def close(self) -> None:
+        """Give the sum of all to the stencils."""
+        if self._moment is not None:
+            _ = self.curvature
+            self.stress(self.loop.call("bending_stress", self._seen, self._shape[:4], self._area, self._moment))
+        if self._stress is not None:
+            self.loop.put(self._stress, self._answer)
 
 
 def fitted(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> tuple[Lowering, frozenset[str]]:
@@ -203,15 +308,19 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive], outside:
         raise Unfused(f"transfer {model.transfer!r}")
     if model.grid is not None:
         raise Unfused("contact between layers")
+    for key in state.memory:
+        if key not in ("material", "contact") and key.removeprefix("effects.") not in model.effects:
+            raise Unfused(f"memory {key!r} that no part owns")
     low = Lowering(model, state, drives, outside)
     if MATERIAL not in outside:
         _part(MATERIAL, lambda: materials.lower(low))
     for name, (effect, c) in model.effects.items():
         if f"effects.{name}" not in outside:
             _part(f"effects.{name}", lambda own=(name, effect, c): effects.lower(low, *own))
+    low.close()
     velocity = _kick(low)
     for name, boundary in model.boundaries.items():
-        velocity = boundaries.lower(low, name, boundary, velocity)
+        boundaries.lower(low, name, boundary, velocity)
     _drift(low, velocity)
     low.program = low.program.ready()
     return low
@@ -225,16 +334,15 @@ def _part(name: str, lower: Callable[[], None]) -> None:
         raise
 
 
-def _kick(low: Lowering) -> Field:
-    free = low.program.temporary(low.vertices, 3)
+def _kick(low: Lowering) -> Velocities:
     loop = low.loop(low.vertices)
-    parts = [loop.load(field) for field in (low.dt, low.v.now, low.force, low.mass)]
-    loop.put(loop.call("kick", *parts), free)
-    return free
+    dt, v, force, mass = (loop.load(field) for field in (low.dt, low.v.now, low.force, low.mass))
+    if low.resistance is None:
+        return Velocities(low, loop, loop.call("kick", dt, v, force, mass))
+    return Velocities(low, loop, loop.call("kick_in_air", dt, v, force, mass, loop.load(low.resistance)))
 
 
-def _drift(low: Lowering, velocity: Field) -> None:
-    loop = low.loop(low.vertices)
-    dt, x, v = (loop.load(field) for field in (low.dt, low.x.now, velocity))
-    loop.put(loop.call("copy3", v), low.v.after)
-    loop.put(loop.call("drift", dt, x, v), low.x.after)
+def _drift(low: Lowering, velocity: Velocities) -> None:
+    loop, v = velocity.loop, velocity.now
+    loop.put(v, low.v.after)
+    loop.put(loop.call("drift", loop.load(low.dt), loop.load(low.x.now), v), low.x.after)

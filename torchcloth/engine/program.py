@@ -65,7 +65,8 @@ class Program:
         self.fields: list[Field] = []
         self._constants: dict[bytes, Field] = {}
         self._tables: dict[bytes, int] = {}
-        self._stages: list[Loop | Stencil] = []
+        self._stages: list[Loop | Stencil | Sieve] = []
+        self._lists = 0
         self._written: list[tuple[str, tuple]] = []
 
     def __del__(self) -> None:
@@ -121,10 +122,40 @@ class Program:
 
     # -- stages ---------------------------------------------------------------------------------------------------
 
-    def loop(self, items: int, order: np.ndarray | None = None) -> Loop:
-        """Runs after all stages that are there already; ``order``: in which the items are gone through."""
-        self._stages.append(Loop(items, OWN if order is None else self.table(order)))
+    def loop(self, items: int, order: np.ndarray | None = None, flat: bool = False) -> Loop:
+        """Runs after all stages that are there already.
+
+        Args:
+            items: rows.
+            order: in which they are gone through.
+            flat: what it gives has no derivative.
+        """
+        self._stages.append(Loop(items, OWN if order is None else self.table(order), flat=flat))
         return self._stages[-1]  # type: ignore[return-value]
+
+    def first(self) -> Loop:
+        """Runs before all stages that are there already, once."""
+        self._stages.insert(0, Loop(1))
+        return self._stages[0]  # type: ignore[return-value]
+
+    def among(self, near: int, flat: bool = False) -> Loop:
+        """On those points alone that a sieve has found; ``flat`` as for ``loop``."""
+        self._stages.append(Loop(0, among=near, flat=flat))
+        return self._stages[-1]  # type: ignore[return-value]
+
+    def sieve(self, x: Field, reach: Field, dt: Field, points: PointTables, steep: float) -> int:
+        """A list of the points on triangles that may touch a body in this substep; see ``csrc/sieve.h``.
+
+        Args:
+            x: [V, 3] positions.
+            reach: [V, 2] distances of the vertices to the body and speeds relative to it.
+            dt: substep.
+            points: of the triangles.
+            steep: how much the distance may change along a way of length 1.
+        """
+        self._lists += 1
+        self._stages.append(Sieve(self._lists - 1, x, reach, dt, points, steep))
+        return self._lists - 1
 
     def stencil(self, near: np.ndarray, weight: Field, x: Field, y: Field, shape: Shape = Shape.PLAIN) -> None:
         """y += differences of x over ``near`` [N, V] with weights [count, N, V]; transposed: x -= transpose of y."""
@@ -212,26 +243,35 @@ def program_of(number: int) -> Program:
 class Loop:
     """Instructions on every item."""
 
-    def __init__(self, items: int, own: int = OWN) -> None:
-        self.items, self._own = items, own
+    def __init__(self, items: int, own: int = OWN, among: int = -1, flat: bool = False) -> None:
+        self.items, self._own, self._among, self.flat = items, own, among, flat
         self._used = 0
         self._code: list[tuple] = []
+        self._loaded: dict[tuple[int, int], list[int]] = {}
 
     def load(self, field: Field, at: int | None = None) -> list[int]:
         """Registers with a row of the field: the item's own, the one in table ``at``, or the only one."""
-        regs = self._new(field.comps)
-        self._code.append(("move", LOAD, field.id, self._place(field, at), regs[0]))
-        return regs
+        place = self._place(field, at)
+        if (field.id, place) not in self._loaded:
+            regs = self._loaded[field.id, place] = self._new(field.comps)
+            self._code.append(("move", LOAD, field.id, place, regs[0]))
+        return self._loaded[field.id, place]
 
-    def call(self, kernel: str, *inputs: Sequence[int]) -> list[int]:
-        """Registers with a kernel's results."""
+    def call(self, kernel: str, *inputs: Sequence[int], into: list[int] | None = None) -> list[int]:
+        """Registers with a kernel's results; ``into``: added to these."""
         number, takes, gives = kernels()[kernel]
         flat = [reg for group in inputs for reg in group]
         if len(flat) != takes:
             raise ValueError(f"kernel {kernel!r} takes {takes} numbers, not {len(flat)}")
-        out = self._new(gives)
-        self._code.append(("call", number, flat, out))
+        out = self._new(gives) if into is None else into
+        self._code.append(("call", number, flat, out if into is None else [~reg for reg in out]))
         return out
+
+    def lookup(self, table: Field, nodes: Sequence[int], place: Sequence[int]) -> tuple[list[int], list[int]]:
+        """(fractions of the cell, values at its 8 corners) of a place on a grid [x, y, z] in cells."""
+        regs = self._new(11)
+        self._code.append(("lookup", table.id, *nodes, place[0], regs[0]))
+        return regs[:3], regs[3:]
 
     def add(self, regs: Sequence[int], field: Field, at: int | None = None) -> None:
         """Add registers to a row of the field."""
@@ -256,14 +296,40 @@ class Loop:
     def emit(self, handle, api) -> None:
         """Write down the instructions."""
         read = {reg for kind, *rest in self._code if kind == "call" for reg in rest[1]}
-        api("loop")(handle, self.items)
+        read |= {reg for kind, *rest in self._code if kind == "lookup" for reg in range(rest[4], rest[4] + 3)}
+        api("loop")(handle, self.items, self._among, int(self.flat))
         for kind, *rest in self._code:
-            if kind == "move":
-                api("move")(handle, *rest)
+            if kind in ("move", "lookup"):
+                api(kind)(handle, *rest)
             else:
                 number, takes, gives = rest
-                feeds = int(any(reg in read for reg in gives))
+                feeds = int(any(reg in read or ~reg in read for reg in gives))
                 api("call")(handle, number, _ints(takes), _ints(gives), feeds)
+
+
+class PointTables(NamedTuple):
+    """Points on triangles: three tables of one length, and the number of triangles."""
+
+    corners: int  # [3, E] vertices
+    starts: int  # [E + 1], where a triangle's points start in the next
+    points: int  # [P]
+    triangles: int
+
+
+class Sieve(NamedTuple):
+    """See ``Program.sieve``."""
+
+    number: int
+    x: Field
+    reach: Field
+    dt: Field
+    points: PointTables
+    steep: float
+
+    def emit(self, handle, api) -> None:
+        """Write it down."""
+        fields = (self.x.id, self.reach.id, self.dt.id)
+        api("sieve")(handle, self.number, *fields, *self.points, self.steep)
 
 
 class Stencil(NamedTuple):

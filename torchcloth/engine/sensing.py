@@ -13,8 +13,8 @@ from ..dynamics import Impulses
 from ..model import Model
 from ..types import ClothState
 from . import binding
-from .fused import Fused, cut, spans
-from .lowering import Lowering, lower
+from .fused import Fused
+from .lowering import lower
 from .operators import ops
 from .program import Field
 
@@ -33,7 +33,7 @@ class Sensing:
 
     def __init__(self, fused: Fused, within: Within, count: int) -> None:
         self.fused, self.within, self.count = fused, within, count
-        self._known: dict[int, dict[Field, Tensor]] = {}
+        self._known: dict[Field, Tensor] | None = None
 
     def rollout(
         self,
@@ -45,23 +45,12 @@ class Sensing:
         substeps: int,
     ) -> tuple[ClothState, ClothState, Impulses, Impulses]:
         """(state, its tangents [K, ...], impulses, their tangents) after the substeps; ``driven``: drives' tangents."""
-        total: Impulses = {}
-        shifts: Impulses = {}
-        for begin, end in spans(drives, 0, substeps, substeps):
-            pieces = cut(drives, begin, end), cut(driven, begin, end)
-            state, moved, impulses, shift = self._span(state, moved, dt, *pieces, end - begin)
-            total = {name: total[name] + j if name in total else j for name, j in impulses.items()}
-            shifts = {name: shifts[name] + j if name in shifts else j for name, j in shift.items()}
-        return state, moved, total, shifts
-
-    def _span(self, state, moved, dt, drives, driven, substeps):
-        low = self.fused.lowering(state, drives)
-        program, batch = low.program, state.x.shape[:-2]
-        values = binding.flat(low, binding.states(low, state) | binding.moves(low, drives), batch)
-        values |= self.fused.coefficients(low, dt, batch)
-        dots = {**binding.states(low, moved), **self._inputs(low, state, drives)}
+        low, batch = self.fused.low, state.x.shape[:-2]
+        program = low.program
+        values = self.fused.job(state, dt, drives, substeps).inputs
+        dots = binding.states(low, moved) | self._inputs(state, drives)
         if driven:
-            dots |= binding.moves(low, driven)
+            dots |= {f: t for f, t in binding.moves(low, driven).items() if f.comps > 1}  # not the flags
         behind = binding.flat(low, {f: t.movedim(0, -3) for f, t in dots.items()}, batch, behind=3)
         fields = [f for f in program.inputs if f in behind]
         places = [program.inputs.index(f) for f in fields]
@@ -74,20 +63,20 @@ class Sensing:
         moved, shift = binding.outcome(low, moved, {f: t.flatten(0, 1) for f, t in along.items()}, shape)
         return after, moved, impulses, shift
 
-    def _inputs(self, low: Lowering, state: ClothState, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
+    def _inputs(self, state: ClothState, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
         """Tangents [K, ..., rows, comps] of the coefficients that have any."""
-        number = low.program.number
-        if number not in self._known:
+        if self._known is None:
+            inputs = self.fused.low.inputs
 
             def found_in(model: Model) -> Coefficients:
-                found = lower(model, state, cut(drives, 0, 1)).inputs
+                found = lower(model, state, drives).inputs
                 return {f: forward_ad.unpack_dual(t).tangent for f, t in found.items()}
 
             every = [self.within(k, found_in) for k in range(self.count)]
-            moved = [f for f in low.inputs if any(found[f] is not None for found in every)]
-            full = {f: [_or_zero(found[f], low.inputs[f]) for found in every] for f in moved}
-            self._known[number] = {f: torch.stack(tangents) for f, tangents in full.items()}
-        return self._known[number]
+            moved = [f for f in inputs if any(found[f] is not None for found in every)]
+            full = {f: [_or_zero(found[f], inputs[f]) for found in every] for f in moved}
+            self._known = {f: torch.stack(tangents) for f, tangents in full.items()}
+        return self._known
 
 
 def _or_zero(tangent: Tensor | None, like: Tensor) -> Tensor:

@@ -2,8 +2,10 @@
 #include <string>
 
 #include "kernels/kernels.h"
+#include "derivatives.h"
 #include "loop.h"
 #include "run.h"
+#include "sieve.h"
 #include "stencil.h"
 
 namespace {
@@ -30,6 +32,20 @@ struct Engine {
         auto* last = program.stages.empty() ? nullptr : dynamic_cast<tc::Loop<R>*>(program.stages.back().get());
         if (last == nullptr) throw std::logic_error("no loop to add to");
         return *last;
+    }
+    void stencil(int table, int weight, int x, int y, tc::Shape shape) {
+        if (!tc::Derivatives<R>::fits(program, weight, y)) {
+            program.stages.push_back(std::make_unique<tc::Stencil<R>>(program, table, weight, x, y, shape));
+            return;
+        }
+        std::shared_ptr<const tc::BothWays<R>> links;
+        for (const auto& stage : program.stages) {
+            const auto* other = dynamic_cast<const tc::Derivatives<R>*>(stage.get());
+            if (other && other->weight == weight) links = other->links;
+        }
+        if (!links) links = std::make_shared<tc::BothWays<R>>(program, table, weight);
+        const bool transposed = shape == tc::Shape::transposed;
+        program.stages.push_back(std::make_unique<tc::Derivatives<R>>(program, links, weight, x, y, transposed));
     }
 };
 
@@ -58,9 +74,10 @@ struct Engine {
         tables.back().resize(tc::round_up(count, tc::LANES<float>), count ? data[count - 1] : 0);                      \
         return int(tables.size()) - 1;                                                                                 \
     }                                                                                                                  \
-    TC_API void tc_loop_##s(void* e, int items) {                                                                      \
+    TC_API void tc_loop_##s(void* e, int items, int list, int flat) {                                                  \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
-        engine.program.stages.push_back(std::make_unique<tc::Loop<R>>(engine.program, engine.kernels.data(), items));  \
+        engine.program.stages.push_back(                                                                               \
+            std::make_unique<tc::Loop<R>>(engine.program, engine.kernels.data(), items, list, flat != 0));             \
     }                                                                                                                  \
     TC_API int tc_move_##s(void* e, int code, int field, int table, int reg) {                                         \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
@@ -80,9 +97,22 @@ struct Engine {
                 engine.program.registers = std::max(engine.program.registers, (o >= 0 ? o : ~o) + 1);                  \
         });                                                                                                            \
     }                                                                                                                  \
-    TC_API void tc_stencil_##s(void* e, int table, int weight, int x, int y, int shape) {                              \
+    TC_API int tc_lookup_##s(void* e, int field, int x, int y, int z, int in, int out) {                               \
+        auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
+        return guarded([&] {                                                                                           \
+            engine.loop().code.push_back({tc::Instruction::lookup, field, -1, -1, 0, -1, {in, x, y, z}, {out}});       \
+            engine.program.registers = std::max(engine.program.registers, out + tc::CELL);                             \
+        });                                                                                                            \
+    }                                                                                                                  \
+    TC_API void tc_sieve_##s(void* e, int list, int x, int reach, int dt, int corners, int starts, int points,         \
+                             int triangles, double steep) {                                                            \
         auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
-        p.stages.push_back(std::make_unique<tc::Stencil<R>>(p, table, weight, x, y, tc::Shape(shape)));                \
+        p.lists = std::max(p.lists, list + 1);                                                                         \
+        p.stages.push_back(                                                                                            \
+            std::make_unique<tc::Sieve<R>>(p, list, x, reach, dt, corners, starts, points, triangles, steep));         \
+    }                                                                                                                  \
+    TC_API void tc_stencil_##s(void* e, int table, int weight, int x, int y, int shape) {                              \
+        static_cast<Engine<R>*>(e)->stencil(table, weight, x, y, tc::Shape(shape));                                    \
     }                                                                                                                  \
     TC_API void tc_again_##s(void* e, int stage) { static_cast<Engine<R>*>(e)->program.stages.at(stage)->again = true; } \
     TC_API void tc_ready_##s(void* e) { static_cast<Engine<R>*>(e)->program.lay_out(); }                               \

@@ -2,6 +2,7 @@
 // and results are scattered. The reverse sweep and the tangents go through the same instructions.
 #pragma once
 
+#include <algorithm>
 #include <type_traits>
 
 #include "program.h"
@@ -11,13 +12,22 @@ namespace tc {
 constexpr int OWN = -1;     // item i reads and writes row i
 constexpr int SHARED = -2;  // all items read, or add to, row 0
 constexpr int MOST = 64;    // components of a field
+constexpr int CELL = 11;    // registers that a lookup gives
 
+// lookup: three registers, a place on a grid in cells, give the fractions of its cell and the values at its corners.
 struct Instruction {
-    enum Code { load, call, add, put } code;
+    enum Code { load, call, add, put, lookup } code;
     int field, table, reg, comps;
     int kernel;
-    std::vector<int> in, out;
-    bool feeds = false;  // another call reads what this one gives
+    std::vector<int> in, out;  // of a lookup: {first register, nodes along x, y, z} and {first register}
+    bool feeds = false;        // another call reads what this one gives
+};
+
+// The items of one run: all, or those of a list.
+struct Span {
+    const int* list;
+    int items;
+    int at(int k) const { return list ? list[k] : k; }
 };
 
 template <class R>
@@ -28,26 +38,37 @@ struct Loop : Stage<R> {
 
     const Program<R>& program;
     const Kernel<R>* kernels;
-    int items;
+    int items, list;  // list: of a sieve; -1: all items
+    bool flat;        // what it gives has no derivative
     std::vector<Instruction> code;
 
-    Loop(const Program<R>& p, const Kernel<R>* k, int n) : program(p), kernels(k), items(n) {}
+    Loop(const Program<R>& p, const Kernel<R>* k, int n, int list, bool flat)
+        : program(p), kernels(k), items(n), list(list), flat(flat) {}
 
+    Span span(const Scene<R>& s) const {
+        if (list < 0) return {nullptr, items};
+        return {s.lists[list].data(), int(s.lists[list].size())};
+    }
     // Row of an item; items beyond the last count as the last.
-    int row(const Instruction& i, int item) const {
+    int row(const Instruction& i, int item, Span s) const {
         if (i.table == SHARED) return 0;
-        const int k = item < items ? item : items - 1;
+        const int k = s.at(item < s.items ? item : s.items - 1);
         return i.table == OWN ? k : program.tables[i.table][k];
     }
     size_t pitch(const Instruction& i) const { return program.fields[i.field].pitch; }
-    int count(int first) const { return first + L <= items ? L : items - first; }
+    int count(int first, Span s) const { return std::min(L, s.items - first); }
 
     // f(where each lane's row starts, numbers between rows), the frequent cases with constants that the compiler sees.
     template <class F>
-    TC_INLINE void rows(const Instruction& i, int first, F f) const {
+    TC_INLINE void rows(const Instruction& i, int first, Span s, F f) const {
         const size_t step = pitch(i);
-        if (count(first) < L || i.table == SHARED || step > 4)
-            f([this, &i, first, step](int lane) { return row(i, first + lane) * step; }, step);
+        if (s.list && i.table != SHARED && step <= 4) {
+            size_t places[L];
+            for (int lane = 0; lane < L; lane++) places[lane] = row(i, first + lane, s) * step;
+            if (step == 4) f([&](int lane) { return places[lane]; }, four);
+            else f([&](int lane) { return places[lane]; }, one);
+        } else if (count(first, s) < L || i.table == SHARED || step > 4)
+            f([this, &i, first, step, s](int lane) { return row(i, first + lane, s) * step; }, step);
         else if (i.table == OWN) {
             if (step == 4) f([first](int lane) { return size_t(first + lane) * 4; }, four);
             else f([first](int lane) { return size_t(first + lane); }, one);
@@ -62,8 +83,8 @@ struct Loop : Stage<R> {
     template <class Step>
     static int last_quad(Step step, int comps) { return std::is_integral_v<Step> ? (comps - 1) / 4 * 4 : 0; }
 
-    void gather(const Instruction& i, const R* from, P* to, int first) const {
-        rows(i, first, [&](auto place, auto step) {
+    void gather(const Instruction& i, const R* from, P* to, int first, Span s) const {
+        rows(i, first, s, [&](auto place, auto step) {
             if (step == 1)
                 for (int lane = 0; lane < L; lane++) to[i.reg].v[lane] = from[place(lane)];
             else
@@ -76,9 +97,9 @@ struct Loop : Stage<R> {
     }
     // change(where a number or four lie, what came from the lane) for all lanes that are items.
     template <class F>
-    TC_INLINE void scatter(const Instruction& i, R* to, const P* from, int first, F change) const {
-        const int lanes = count(first);
-        rows(i, first, [&](auto place, auto step) {
+    TC_INLINE void scatter(const Instruction& i, R* to, const P* from, int first, Span s, F change) const {
+        const int lanes = count(first, s);
+        rows(i, first, s, [&](auto place, auto step) {
             if (step == 1)
                 for (int lane = 0; lane < lanes; lane++) change(to[place(lane)], from[i.reg].v[lane]);
             else
@@ -92,45 +113,71 @@ struct Loop : Stage<R> {
                 }
         });
     }
-    void add(const Instruction& i, R* to, const P* from, int first) const {
-        scatter(i, to, from, first, [](auto& place, auto x) { place = place + x; });
+    void add(const Instruction& i, R* to, const P* from, int first, Span s) const {
+        if (i.table == SHARED && count(first, s) == L)
+            for (int c = 0; c < i.comps; c++) to[c] += total(from[i.reg + c]);
+        else scatter(i, to, from, first, s, [](auto& place, auto x) { place = place + x; });
     }
-    void store(const Instruction& i, R* to, const P* from, int first) const {
-        scatter(i, to, from, first, [](auto& place, auto x) { place = x; });
+    void store(const Instruction& i, R* to, const P* from, int first, Span s) const {
+        scatter(i, to, from, first, s, [](auto& place, auto x) { place = x; });
+    }
+    void look(const Instruction& i, const R* table, P* regs) const {
+        const int *in = i.in.data(), out = i.out[0];
+        for (int lane = 0; lane < L; lane++) {
+            int cell[3];
+            for (int k = 0; k < 3; k++) {
+                const R place = regs[in[0] + k].v[lane];
+                cell[k] = place > 0 ? int(std::min(place, R(in[k + 1] - 2))) : 0;  // also where it is not finite
+                regs[out + k].v[lane] = place - cell[k];
+            }
+            const R* at = table + (size_t(cell[0]) * in[2] + cell[1]) * in[3] + cell[2];
+            for (int corner = 0; corner < 8; corner++)
+                regs[out + 3 + corner].v[lane] = at[(size_t(corner >> 2) * in[2] + (corner >> 1 & 1)) * in[3] + (corner & 1)];
+        }
     }
     bool is_shared(const Instruction& i) const { return i.code == Instruction::load && i.table == SHARED; }
 
     void forward(Scene<R>& s) const override {
         P* regs = s.regs.data;
-        for (const Instruction& i : code) if (is_shared(i)) gather(i, s.value[i.field], regs, 0);
-        for (int first = 0; first < items; first += L)
+        const Span all = span(s);
+        for (const Instruction& i : code) if (is_shared(i)) gather(i, s.value[i.field], regs, 0, all);
+        for (int first = 0; first < all.items; first += L)
             for (const Instruction& i : code) switch (i.code) {
-                case Instruction::load: if (!is_shared(i)) gather(i, s.value[i.field], regs, first); break;
+                case Instruction::load: if (!is_shared(i)) gather(i, s.value[i.field], regs, first, all); break;
                 case Instruction::call: kernels[i.kernel].value(regs, i.in.data(), i.out.data()); break;
-                case Instruction::add: add(i, s.value[i.field], regs, first); break;
-                case Instruction::put: store(i, s.value[i.field], regs, first); break;
+                case Instruction::add: add(i, s.value[i.field], regs, first, all); break;
+                case Instruction::put: store(i, s.value[i.field], regs, first, all); break;
+                case Instruction::lookup: look(i, s.value[i.field], regs); break;
             }
     }
 
     void reverse(Scene<R>& s) const override {
+        if (flat) return;
         P *regs = s.regs.data, *bars = s.bars.data;
+        const Span all = span(s);
         s.bars.clear();
-        for (const Instruction& i : code) if (is_shared(i)) gather(i, s.value[i.field], regs, 0);
-        for (int first = 0; first < items; first += L) {
+        for (const Instruction& i : code) if (is_shared(i)) gather(i, s.value[i.field], regs, 0, all);
+        for (int first = 0; first < all.items; first += L) {
             for (const Instruction& i : code) {
                 if (i.code == Instruction::load && !is_shared(i)) {
-                    gather(i, s.value[i.field], regs, first);
+                    gather(i, s.value[i.field], regs, first, all);
                     for (int c = 0; c < i.comps; c++) bars[i.reg + c] = P(0.0);
                 } else if (i.code == Instruction::call) {
                     if (i.feeds) kernels[i.kernel].value(regs, i.in.data(), i.out.data());
                     for (int o : i.out) if (o >= 0) bars[o] = P(0.0);
+                } else if (i.code == Instruction::lookup) {
+                    look(i, s.value[i.field], regs);
+                    for (int c = 0; c < CELL; c++) bars[i.out[0] + c] = P(0.0);
                 }
             }
             for (auto i = code.rbegin(); i != code.rend(); ++i) switch (i->code) {
                 case Instruction::add:
-                case Instruction::put: take(*i, s.bar[i->field], bars, first); break;
+                case Instruction::put: take(*i, s.bar[i->field], bars, first, all); break;
                 case Instruction::call: kernels[i->kernel].adjoint(regs, bars, i->in.data(), i->out.data()); break;
-                case Instruction::load: if (!is_shared(*i) && s.bar[i->field]) add(*i, s.bar[i->field], bars, first); break;
+                case Instruction::load: if (!is_shared(*i) && s.bar[i->field]) add(*i, s.bar[i->field], bars, first, all); break;
+                case Instruction::lookup:
+                    for (int k = 0; k < 3; k++) bars[i->in[0] + k] = bars[i->in[0] + k] + bars[i->out[0] + k];
+                    break;
             }
         }
         for (const Instruction& i : code)
@@ -138,10 +185,10 @@ struct Loop : Stage<R> {
                 for (int c = 0; c < i.comps; c++) s.bar[i.field][c] += total(bars[i.reg + c]);
     }
     // Adjoint of a result; what was overwritten before does not count any more.
-    void take(const Instruction& i, R* from, P* bars, int first) const {
-        const int lanes = count(first);
+    void take(const Instruction& i, R* from, P* bars, int first, Span s) const {
+        const int lanes = count(first, s);
         const bool spent = i.code == Instruction::put;
-        rows(i, first, [&](auto place, auto step) {
+        rows(i, first, s, [&](auto place, auto step) {
             for (int c = 0, end = last_quad(step, i.comps); c <= end; c += 4) {
                 P seeds[4];
                 if (step == 1)
@@ -158,48 +205,54 @@ struct Loop : Stage<R> {
     }
 
     void tangent(Scene<R>& s) const override {
+        if (flat) return forward(s);
         P* regs = s.regs.data;
         D* dots = s.dots.data;
+        const Span all = span(s);
         for (const Instruction& i : code)  // what has no tangent
             if (i.code == Instruction::load && s.dot[i.field] == nullptr)
                 std::memset(static_cast<void*>(dots + size_t(i.reg) * L), 0, size_t(i.comps) * L * sizeof(D));
         for (const Instruction& i : code)
             if (is_shared(i)) {
-                gather(i, s.value[i.field], regs, 0);
-                gather_along(i, s.dot[i.field], dots, 0);
+                gather(i, s.value[i.field], regs, 0, all);
+                gather_along(i, s.dot[i.field], dots, 0, all);
             }
-        for (int first = 0; first < items; first += L)
+        for (int first = 0; first < all.items; first += L)
             for (const Instruction& i : code) switch (i.code) {
                 case Instruction::load:
                     if (is_shared(i)) break;
-                    gather(i, s.value[i.field], regs, first);
-                    gather_along(i, s.dot[i.field], dots, first);
+                    gather(i, s.value[i.field], regs, first, all);
+                    gather_along(i, s.dot[i.field], dots, first, all);
                     break;
                 case Instruction::call: kernels[i.kernel].tangent(regs, dots, i.in.data(), i.out.data()); break;
                 case Instruction::add:
-                    add(i, s.value[i.field], regs, first);
-                    scatter_along(i, s.dot[i.field], dots, first, true);
+                    add(i, s.value[i.field], regs, first, all);
+                    scatter_along(i, s.dot[i.field], dots, first, true, all);
                     break;
                 case Instruction::put:
-                    store(i, s.value[i.field], regs, first);
-                    scatter_along(i, s.dot[i.field], dots, first, false);
+                    store(i, s.value[i.field], regs, first, all);
+                    scatter_along(i, s.dot[i.field], dots, first, false, all);
+                    break;
+                case Instruction::lookup:
+                    look(i, s.value[i.field], regs);
+                    for (int k = 0; k < CELL * L; k++) dots[i.out[0] * L + k] = k < 3 * L ? dots[i.in[0] * L + k] : D(0.0);
                     break;
             }
     }
-    void gather_along(const Instruction& i, const R* from, D* dots, int first) const {
+    void gather_along(const Instruction& i, const R* from, D* dots, int first, Span s) const {
         if (from == nullptr) return;
         const D* source = reinterpret_cast<const D*>(from);
-        rows(i, first, [&](auto place, auto) {
+        rows(i, first, s, [&](auto place, auto) {
             for (int lane = 0; lane < L; lane++) {
                 const D* at = source + place(lane);
                 for (int c = 0; c < i.comps; c++) dots[(i.reg + c) * L + lane] = at[c];
             }
         });
     }
-    void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds) const {
+    void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds, Span s) const {
         D* target = reinterpret_cast<D*>(to);
-        const int lanes = count(first);
-        rows(i, first, [&](auto place, auto) {
+        const int lanes = count(first, s);
+        rows(i, first, s, [&](auto place, auto) {
             for (int lane = 0; lane < lanes; lane++) {
                 D* at = target + place(lane);
                 for (int c = 0; c < i.comps; c++) {

@@ -72,22 +72,13 @@ inline Pack<R, L> constant(Pack<R, L>, double c) { return Pack<R, L>(c); }
         return r;                                                                                         \
     }
 TC_EACH(sqrt, std::sqrt)
-TC_EACH(exp, std::exp)
-TC_EACH(expm1, std::expm1)
 #undef TC_EACH
 
 template <class R, int L>
-inline Pack<R, L> atan2(Pack<R, L> y, Pack<R, L> x) {
-    Pack<R, L> r;
-    for (int i = 0; i < L; i++) r.v[i] = std::atan2(y.v[i], x.v[i]);
-    return r;
-}
-
-template <class R, int L>
 inline R total(Pack<R, L> a) {
-    R sum = 0;
-    for (int i = 0; i < L; i++) sum += a.v[i];
-    return sum;
+    for (int half = L / 2; half > 0; half /= 2)
+        for (int i = 0; i < half; i++) a.v[i] += a.v[i + half];
+    return a.v[0];
 }
 
 }  // namespace tc

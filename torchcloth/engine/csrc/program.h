@@ -64,6 +64,7 @@ struct Scene {
     std::vector<R*> value, bar, dot;  // by field; null where there is none
     Buffer<Wide<R>> regs, bars;
     Buffer<Along<R>> dots;            // [register][lane]
+    std::vector<std::vector<int>> lists;  // items that sieves have found
 };
 
 template <class R>
@@ -82,7 +83,7 @@ struct Program {
     std::vector<int> next;  // by field: of a state, where it goes; else -1
     std::vector<std::vector<int>> tables;  // padded to whole packs
     std::vector<std::unique_ptr<Stage<R>>> stages;
-    int registers = 0;
+    int registers = 0, lists = 0;
     size_t state_size = 0, record_size = 0;  // numbers
 
     int field(Kind kind, int rows, int comps, int near = 0, int vertices = 0) {

@@ -158,7 +158,7 @@ class Run {
         const size_t count = program.fields.size();
         m.scene.value.assign(count, nullptr), m.scene.bar.assign(count, nullptr), m.scene.dot.assign(count, nullptr);
         m.values.resize(count), m.bars.resize(count), m.dots.resize(count);
-        m.scene.regs.reset(program.registers);
+        m.scene.regs.reset(program.registers), m.scene.lists.resize(program.lists);
         if (mode == Mode::reverse) m.scene.bars.reset(program.registers);
         if (mode == Mode::tangent) m.scene.dots.reset(size_t(program.registers) * LANES<R>);
         for (size_t f = 0; f < count; f++) {

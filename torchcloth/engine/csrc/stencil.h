@@ -1,6 +1,8 @@
 // Linear operators whose rows are stencils of vertices: derivatives on the mesh, and the plate matrix.
 #pragma once
 
+#include <algorithm>
+
 #include "program.h"
 
 namespace tc {
@@ -148,12 +150,28 @@ struct Stencil : Stage<R> {
             }
     }
 
-    // Work that the differences of X do on Y, per unit of each weight.
+    // Work that the differences of X do on Y, per unit of each weight; the weights of a group lie side by side.
     void weigh(const R* from, const R* on, R* to, R sign) const {
-        each_weight([&](size_t at, int c, int v, int other) {
-            const Quad<R> work = (quad(from, other) - quad(from, v)) * given<1>(on, c, v, R(1)).part[0];
-            to[at] += sign * (work.v[0] + work.v[1] + work.v[2]);
-        });
+        for (int c = 0; c < count; c++)
+            for (int v = 0; v < vertices; v += 4) {
+                Quad<R> own[4], moment[4];
+                for (int i = 0; i < 4; i++) {
+                    own[i] = quad(from, std::min(v + i, vertices - 1));
+                    moment[i] = v + i < vertices ? given<1>(on, c, v + i, sign).part[0] : Quad<R>(0.0);
+                }
+                for (int n = 0; n < near; n++) {
+                    const int* index = others.data() + at(0, v, n);
+                    Quad<R> work[4];
+                    for (int i = 0; i < 4; i++) work[i] = (quad(from, index[i]) - own[i]) * moment[i];
+                    Quad<R>& place = *reinterpret_cast<Quad<R>*>(to + at(c, v, n));
+                    place = place + sums(work);
+                }
+            }
+    }
+    static Quad<R> sums(const Quad<R>* a) {  // of each quad's numbers
+        const auto ab = __builtin_shufflevector(a[0].v, a[1].v, 0, 4, 2, 6) + __builtin_shufflevector(a[0].v, a[1].v, 1, 5, 3, 7);
+        const auto cd = __builtin_shufflevector(a[2].v, a[3].v, 0, 4, 2, 6) + __builtin_shufflevector(a[2].v, a[3].v, 1, 5, 3, 7);
+        return Quad<R>(__builtin_shufflevector(ab, cd, 0, 1, 4, 5) + __builtin_shufflevector(ab, cd, 2, 3, 6, 7));
     }
     void difference_weights(Scene<R>& s) const {
         const R* from = s.value[x];

@@ -16,7 +16,7 @@
 #include <cstdint>
 #include <utility>
 
-#include "pack.h"
+#include "functions.h"
 
 namespace tc {
 
@@ -81,7 +81,7 @@ constexpr Sym select(Sym c, double a, Sym b) { return select(c, constant(b, a), 
 struct Trace {
     Tape tape{};
     int out[256]{};         // node of each output
-    int last[LONGEST]{};    // last operation that uses a node; -1: none
+    int last[LONGEST]{};    // last operation that gives a node an adjoint; -1: none
     bool seeded[LONGEST]{}; // is an output
     bool varies[LONGEST]{}; // depends on an input that is not fixed
     int flops = 0;
@@ -106,9 +106,13 @@ constexpr Trace trace() {
         if (n.op == Op::input) { t.varies[i] = !is_fixed<K>(i); continue; }
         if (n.op == Op::constant) continue;
         t.flops++;
-        for (int operand : {n.a, n.b, n.c}) if (operand >= 0) t.last[operand] = i;
         const bool flat = n.op == Op::detach || n.op == Op::less || n.op == Op::lessc || n.op == Op::cless;
         t.varies[i] = !flat && (t.varies[n.a] || (n.b >= 0 && t.varies[n.b]));
+    }
+    for (int i = t.tape.size - 1; i >= 0; i--) {  // only those that hand an adjoint on count as users
+        const Node& n = t.tape.node[i];
+        if (n.op == Op::input || !t.varies[i] || !(t.seeded[i] || t.last[i] >= 0)) continue;
+        for (int operand : {n.a, n.b}) if (operand >= 0 && t.last[operand] < 0) t.last[operand] = i;
     }
     return t;
 }

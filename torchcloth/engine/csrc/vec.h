@@ -50,6 +50,31 @@ template <class T>
 constexpr Vec<T> transposed(Mat<T> m, Vec<T> v) { return v.x * m.a + v.y * m.b + v.z * m.c; }
 
 template <class T>
+struct Symmetric {
+    T xx, xy, xz, yy, yz, zz;
+};
+template <class T>
+constexpr Symmetric<T> operator/(Symmetric<T> m, T s) {
+    const T r = 1.0 / s;
+    return {r * m.xx, r * m.xy, r * m.xz, r * m.yy, r * m.yz, r * m.zz};
+}
+template <class T>
+constexpr Symmetric<T> outer(T s, Vec<T> a) {
+    const auto b = s * a;
+    return {b.x * a.x, b.x * a.y, b.x * a.z, b.y * a.y, b.y * a.z, b.z * a.z};
+}
+template <class T>
+constexpr Vec<T> operator*(Symmetric<T> m, Vec<T> v) {
+    return {m.xx * v.x + m.xy * v.y + m.xz * v.z, m.xy * v.x + m.yy * v.y + m.yz * v.z, m.xz * v.x + m.yz * v.y + m.zz * v.z};
+}
+template <class T>
+constexpr Vec<T> solve(Symmetric<T> m, Vec<T> y) {
+    const T xx = m.yy * m.zz - m.yz * m.yz, xy = m.xz * m.yz - m.xy * m.zz, xz = m.xy * m.yz - m.xz * m.yy;
+    const T yy = m.xx * m.zz - m.xz * m.xz, yz = m.xy * m.xz - m.xx * m.yz, zz = m.xx * m.yy - m.xy * m.xy;
+    return (Symmetric<T>{xx, xy, xz, yy, yz, zz} * y) / (m.xx * xx + m.xy * xy + m.xz * xz);
+}
+
+template <class T>
 struct Pose {  // p -> R p + t
     Mat<T> R;
     Vec<T> t;
@@ -61,6 +86,7 @@ struct Read {
     constexpr T number() { return *at++; }
     constexpr Vec<T> vec() { const T* p = at; at += 3; return {p[0], p[1], p[2]}; }
     constexpr Mat<T> mat() { Vec<T> a = vec(), b = vec(), c = vec(); return {a, b, c}; }
+    constexpr Symmetric<T> symmetric() { const T* p = at; at += 6; return {p[0], p[1], p[2], p[3], p[4], p[5]}; }
     constexpr Pose<T> pose() {  // the first three rows of a 4 x 4 matrix
         const T* p = at;
         at += 12;
@@ -73,6 +99,7 @@ struct Write {
     T* at;
     constexpr void number(T a) { *at++ = a; }
     constexpr void vec(Vec<T> a) { *at++ = a.x; *at++ = a.y; *at++ = a.z; }
+    constexpr void symmetric(Symmetric<T> m) { for (T a : {m.xx, m.xy, m.xz, m.yy, m.yz, m.zz}) *at++ = a; }
 };
 
 // Bit mask of inputs that never vary: constants of the mesh, the step. Their derivatives are not computed.

@@ -1,45 +1,71 @@
-"""Boundaries: each takes the velocities that it finds and gives those that obey it."""
+"""Boundaries: each takes the velocities that it finds and leaves those that obey it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
-from ...boundaries import AbstractBoundary, Grasp
-from ..lowering import Lowering, Unfused
+import torch
+from torch import Tensor
+
+from ...boundaries import AbstractBoundary, Box, Capsule, Cylinder, Grasp, MeshSolid, Plane, Sphere
+from ...effects import GripSlip
+from ..lowering import Lowering, Unfused, Velocities
 from ..program import Field
+from .colliders import collide
 
 
-def lower(low: Lowering, name: str, boundary: AbstractBoundary, before: Field) -> Field:
-    """Add a boundary to the program; returns the velocities after it."""
+def lower(low: Lowering, name: str, boundary: AbstractBoundary, velocity: Velocities) -> None:
+    """Add a boundary to the program, and what it gives if it is driven. dynamics.py, ``constrain``"""
     part = _BOUNDARIES.get(type(boundary))
     if part is None:
         raise Unfused(f"boundary {name!r} ({type(boundary).__name__})")
-    return part(low, name, boundary, before)
+    velocity.before = velocity.now
+    part(low, name, boundary, velocity)
+    if name in low.drives:
+        _slip(low, name, boundary, velocity)
+        _report(low, name, velocity)
 
 
-def copied(low: Lowering, before: Field) -> Field:
-    """A field of its own with the same velocities."""
-    after = low.program.temporary(low.vertices, 3)
-    loop = low.loop(low.vertices)
-    loop.put(loop.call("copy3", loop.load(before)), after)
-    return after
+def _grasp(low: Lowering, name: str, grasp: Grasp, velocity: Velocities) -> None:
+    if name not in low.drives:
+        return
+    loop, (increment, _, closed) = velocity.loop, low.drives[name]
+    numbers = (increment, low.dt, _held(low, grasp.index), closed, low.x.now)
+    velocity.now = loop.call("grasp", *(loop.load(field) for field in numbers), velocity.now)
 
 
-def _grasp(low: Lowering, name: str, grasp: Grasp, before: Field) -> Field:
-    if name not in low.drives or not any(low.closed[name]):
-        return before
-    if not all(low.closed[name]):
-        raise Unfused(f"boundary {name!r} (a grasp that opens within an interval)")
-    after = copied(low, before)
-    index = low.program.table(grasp.index.cpu())
-    loop = low.loop(len(grasp.index))
-    x, increment, pose = loop.load(low.x.now, index), *(loop.load(field) for field in low.drives[name])
-    held = loop.call("grasp", increment, loop.load(low.dt), x)
-    loop.put(held, after, index)
-    mass, free = loop.load(low.mass, index), loop.load(before, index)
-    loop.add(loop.call("impulse", mass, free, held, x, increment, pose), low.impulses[name])
-    return after
+def _held(low: Lowering, index: Tensor) -> Field:
+    """1 for the vertices of a patch, 0 for the others: on all of them a loop need not be interrupted."""
+    held = torch.zeros(low.vertices, 1)
+    held[index.cpu()] = 1
+    return low.program.constant(held)
 
 
-_BOUNDARIES: dict[type, Callable[[Lowering, str, Any, Field], Field]] = {Grasp: _grasp}
+def _slip(low: Lowering, name: str, boundary: AbstractBoundary, velocity: Velocities) -> None:
+    for key, (effect, c) in low.model.effects.items():
+        if effect.grasp != name:
+            continue
+        if type(effect) is not GripSlip:
+            raise Unfused(f"effect {key!r} ({type(effect).__name__})")
+        held, pull = _held(low, cast("Tensor", boundary.index)), low.program.temporary(1, 4)
+        loop = velocity.loop
+        parts = (loop.load(held), loop.load(low.mass), velocity.before, velocity.now)
+        loop.add(loop.call("pull", *parts), pull)
+        velocity.resume(velocity.store())
+        loop, fields = velocity.loop, (pull, low.parameter(c.mobility), low.parameter(c.hold), low.dt)
+        velocity.now = loop.call("creep", loop.load(held), velocity.now, *(loop.load(field) for field in fields))
+
+
+def _report(low: Lowering, name: str, velocity: Velocities) -> None:
+    """Impulse and its moment about the body."""
+    loop, (increment, pose, _) = velocity.loop, low.drives[name]
+    momentum = low.momentum(loop, loop.call("change", velocity.now, velocity.before))
+    place = [loop.load(field) for field in (low.x.now, increment, pose)]
+    loop.add(loop.call("impulse", momentum, *place), low.impulses[name])
+
+
+_BOUNDARIES: dict[type, Callable[[Lowering, str, Any, Velocities], None]] = {
+    Grasp: _grasp,
+    **dict.fromkeys((Box, Capsule, Cylinder, MeshSolid, Plane, Sphere), collide),
+}

@@ -5,9 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ...effects import AbstractEffect, AirDrag, Bending, Gravity, LineMass, MassDamping
+from ...effects import (
+    AbstractEffect,
+    AddedMass,
+    AirDrag,
+    Bending,
+    BendingFriction,
+    CreasingBending,
+    Gravity,
+    GripSlip,
+    KelvinVoigt,
+    LineMass,
+    MassDamping,
+    RestShape,
+    SaturatingBending,
+    ShearFriction,
+)
 from ..lowering import Lowering, Unfused
-from ..program import Shape
+from . import bending
 
 
 def lower(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
@@ -32,28 +47,47 @@ def _mass_damping(low: Lowering, name: str, effect: MassDamping, c: Any) -> None
 def _air_drag(low: Lowering, name: str, effect: AirDrag, c: Any) -> None:
     t = low.triangles
     coefficients = [t.parameter(value) for value in (c.pressure, c.friction, c.wind)]
-    t.forces(t.loop.call("air_drag", *t.x, *t.v, *coefficients))
+    t.push("air_drag", *t.x, *t.v, *coefficients)
 
 
-def _bending(low: Lowering, name: str, effect: Bending, c: Any) -> None:
-    if c.operator is not None or c.curl is not None:
-        raise Unfused(f"effect {name!r} (Bending with fields, ratios or curl)")
-    bent = low.program.temporary(low.vertices, 3, kept=False)  # the operator is constant: no need to know on what
-    loop = low.loop(low.vertices)
-    parts = [low.parameter(c.stiffness), low.parameter(c.viscosity), low.x.now, low.v.now]
-    loop.put(loop.call("bent", *(loop.load(field) for field in parts)), bent)
-    weight = low.program.constant(effect.operator.reshape(-1, 1), near=len(effect.columns))
-    low.program.stencil(effect.columns.cpu().numpy(), weight, bent, low.force, Shape.SYMMETRIC)
+def _added_mass(low: Lowering, name: str, effect: AddedMass, c: Any) -> None:
+    if low.resistance is None:
+        low.resistance = low.program.temporary(low.vertices, 6)
+    t = low.triangles
+    air = t.loop.call("added_mass", t.parameter(c), t.normal, t.J, t.area)
+    for corner in low.corners:
+        t.loop.add(air, low.resistance, corner)
+
+
+def _kelvin_voigt(low: Lowering, name: str, effect: KelvinVoigt, c: Any) -> None:
+    t = low.triangles
+    t.stress(t.loop.call("kelvin_voigt", t.surface[:6], *t.v, t.shape, t.parameter(c)))
+
+
+def _shear_friction(low: Lowering, name: str, effect: ShearFriction, c: Any) -> None:
+    t, memory = low.triangles, low.memory[f"effects.{name}"]
+    threshold = t.loop.load(low.number(effect.threshold))
+    after = t.loop.call("shear_friction", t.surface, t.loop.load(memory.now), threshold, t.parameter(c))
+    t.loop.put(after[:2], memory.after)
+    t.stress(after[2:])
 
 
 def _nothing(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
-    """It acts through the vertices' mass alone."""
+    """It acts through the vertices' mass, the material's rest shape, or in a grasp, alone."""
 
 
 _EFFECTS: dict[type, Callable[[Lowering, str, Any, Any], None]] = {
+    AddedMass: _added_mass,
     AirDrag: _air_drag,
-    Bending: _bending,
+    Bending: bending.plate,
+    BendingFriction: bending.friction,
+    CreasingBending: bending.creasing,
     Gravity: _gravity,
+    GripSlip: _nothing,
+    KelvinVoigt: _kelvin_voigt,
     LineMass: _nothing,
     MassDamping: _mass_damping,
+    RestShape: _nothing,
+    SaturatingBending: bending.saturating,
+    ShearFriction: _shear_friction,
 }

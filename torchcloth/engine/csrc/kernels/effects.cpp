@@ -26,6 +26,21 @@ struct AirDrag {
     }
 };
 
+// Mass of the air per area, n, J, area -> a corner's third of it, along the normal only. effects/added_mass.py
+struct AddedMass {
+    static constexpr const char* name = "added_mass";
+    static constexpr int inputs = 6, outputs = 6;
+    static constexpr auto fixed = bits(5, 1);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T air = r.number();
+        const auto n = r.vec();
+        const T J = r.number(), area = r.number();
+        Write<T>{out}.symmetric(outer((1.0 / 3) * (air * (area * J)), n));
+    }
+};
+
 // mass, acceleration -> force. effects/gravity.py
 struct Weight {
     static constexpr const char* name = "weight";
@@ -50,19 +65,25 @@ struct MassDamping {
     }
 };
 
-// stiffness, viscosity, x, v -> what the plate matrix acts on. effects/bending.py
-struct Bent {
-    static constexpr const char* name = "bent";
-    static constexpr int inputs = 8, outputs = 3;
+// f1, f2, corners' velocities, warp and weft coefficients, viscosity -> stress columns. effects/viscous.py
+struct KelvinVoigt {
+    static constexpr const char* name = "kelvin_voigt";
+    static constexpr int inputs = 20, outputs = 6;
+    static constexpr auto fixed = bits(15, 4);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
-        const T stiffness = r.number(), viscosity = r.number();
-        const auto x = r.vec(), v = r.vec();
-        Write<T>{out}.vec(stiffness * x + viscosity * v);
+        const auto f1 = r.vec(), f2 = r.vec(), v0 = r.vec(), v1 = r.vec(), v2 = r.vec();
+        const T a1 = r.number(), a2 = r.number(), b1 = r.number(), b2 = r.number(), viscosity = r.number();
+        const auto d1 = v1 - v0, d2 = v2 - v0;
+        const auto rate1 = a1 * d1 + a2 * d2, rate2 = b1 * d1 + b2 * d2;
+        const T e11 = viscosity * dot(f1, rate1), e22 = viscosity * dot(f2, rate2);
+        const T e12 = viscosity * (0.5 * (dot(f1, rate2) + dot(f2, rate1)));
+        Write<T> w{out};
+        w.vec(e11 * f1 + e12 * f2), w.vec(e12 * f1 + e22 * f2);
     }
 };
 
-TC_KERNELS(effect_kernels, AirDrag, Weight, MassDamping, Bent)
+TC_KERNELS(effect_kernels, AirDrag, AddedMass, Weight, MassDamping, KelvinVoigt)
 
 }  // namespace tc

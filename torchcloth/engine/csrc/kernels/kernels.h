@@ -10,12 +10,19 @@ namespace tc {
 template <class R> std::vector<Kernel<R>> surface_kernels();
 template <class R> std::vector<Kernel<R>> material_kernels();
 template <class R> std::vector<Kernel<R>> effect_kernels();
+template <class R> std::vector<Kernel<R>> bending_kernels();
+template <class R> std::vector<Kernel<R>> friction_kernels();
 template <class R> std::vector<Kernel<R>> boundary_kernels();
+template <class R> std::vector<Kernel<R>> collider_kernels();
+template <class R> std::vector<Kernel<R>> shape_kernels();
+template <class R> std::vector<Kernel<R>> point_kernels();
 
 template <class R>
 std::vector<Kernel<R>> all_kernels() {
     std::vector<Kernel<R>> all;
-    for (auto part : {surface_kernels<R>(), material_kernels<R>(), effect_kernels<R>(), boundary_kernels<R>()})
+    for (auto part : {surface_kernels<R>(), material_kernels<R>(), effect_kernels<R>(), bending_kernels<R>(),
+                      friction_kernels<R>(), boundary_kernels<R>(), collider_kernels<R>(), shape_kernels<R>(),
+                      point_kernels<R>()})
         all.insert(all.end(), part.begin(), part.end());
     return all;
 }

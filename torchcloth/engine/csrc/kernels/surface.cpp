@@ -19,6 +19,94 @@ struct Kick {
     }
 };
 
+// What is left of a change of velocity in the air that moves along, so written that no air changes nothing, bitwise.
+// dynamics.py
+template <class T>
+constexpr Vec<T> resisted(Symmetric<T> air, T mass, Vec<T> change) {
+    const auto b = air / mass;
+    return change - solve(Symmetric<T>{b.xx + 1.0, b.xy, b.xz, b.yy + 1.0, b.yz, b.zz + 1.0}, b * change);
+}
+
+// Mass of the air at a vertex, its own mass, a change of velocity -> what is left of it.
+struct Resisted {
+    static constexpr const char* name = "resisted";
+    static constexpr int inputs = 10, outputs = 3;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto air = r.symmetric();
+        const T mass = r.number();
+        Write<T>{out}.vec(resisted(air, mass, r.vec()));
+    }
+};
+
+// dt, velocity, force, own mass, mass of the air -> velocity free of the boundaries.
+struct KickInAir {
+    static constexpr const char* name = "kick_in_air";
+    static constexpr int inputs = 14, outputs = 3;
+    static constexpr auto fixed = bits(0, 1);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T dt = r.number();
+        const auto v = r.vec(), force = r.vec();
+        const T mass = r.number();
+        Write<T>{out}.vec(v + dt * resisted(r.symmetric(), mass, force / mass));
+    }
+};
+
+// Mass of the air, own mass, change of velocity -> what the two were given. dynamics.py
+struct Loaded {
+    static constexpr const char* name = "loaded";
+    static constexpr int inputs = 10, outputs = 3;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto air = r.symmetric();
+        const T mass = r.number();
+        const auto change = r.vec();
+        Write<T>{out}.vec(mass * change + air * change);
+    }
+};
+
+// dt, force, mass -> change of velocity.
+struct Push {
+    static constexpr const char* name = "push";
+    static constexpr int inputs = 5, outputs = 3;
+    static constexpr auto fixed = bits(0, 1);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T dt = r.number();
+        const auto force = r.vec();
+        Write<T>{out}.vec(dt * (force / r.number()));
+    }
+};
+
+// A vector times a number.
+struct Scaled {
+    static constexpr const char* name = "scaled3";
+    static constexpr int inputs = 4, outputs = 3;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T scale = r.number();
+        Write<T>{out}.vec(scale * r.vec());
+    }
+};
+
+// Sum of two vectors.
+struct Plus {
+    static constexpr const char* name = "plus3";
+    static constexpr int inputs = 6, outputs = 3;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto a = r.vec();
+        Write<T>{out}.vec(a + r.vec());
+    }
+};
+
 // dt, position, velocity -> position.
 struct Drift {
     static constexpr const char* name = "drift";
@@ -33,14 +121,16 @@ struct Drift {
     }
 };
 
-// A vector goes from one field to another.
-struct Copy {
-    static constexpr const char* name = "copy3";
-    static constexpr int inputs = 3, outputs = 3;
+// Numbers go from one place to another, or are added there.
+template <int N>
+struct Copied {
+    static constexpr int inputs = N, outputs = N;
     template <class T>
-    static constexpr void run(const T* in, T* out) { Write<T>{out}.vec(1.0 * Read<T>{in}.vec()); }
+    static constexpr void run(const T* in, T* out) { for (int i = 0; i < N; i++) out[i] = 1.0 * in[i]; }
 };
+struct Copy : Copied<3> { static constexpr const char* name = "copy3"; };
+struct CopyStress : Copied<15> { static constexpr const char* name = "copy15"; };
 
-TC_KERNELS(surface_kernels, Surface, Assemble, Thirds, Kick, Drift, Copy)
+TC_KERNELS(surface_kernels, Surface, Assemble, Kick, Resisted, KickInAir, Loaded, Push, Scaled, Plus, Drift, Copy, CopyStress)
 
 }  // namespace tc

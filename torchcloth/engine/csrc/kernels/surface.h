@@ -41,18 +41,6 @@ struct Assemble {
     }
 };
 
-// A force on a triangle goes to its corners in equal parts.
-struct Thirds {
-    static constexpr const char* name = "thirds";
-    static constexpr int inputs = 3, outputs = 9;
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        const auto part = (1.0 / 3) * Read<T>{in}.vec();
-        Write<T> w{out};
-        w.vec(part), w.vec(part), w.vec(part);
-    }
-};
-
 // What an in-plane law sees of F: g = F^T F, and J = sqrt(det g). Frame-indifferent by construction.
 template <class T>
 struct Metric {

@@ -1,0 +1,176 @@
+"""Effects in the fused engine, one by one and together."""
+
+import pytest
+import torch
+from agreement import agree, difference, held, moving, noise, outcome
+
+import torchcloth as tc
+from torchcloth import functional
+from torchcloth.engine import fused
+from torchcloth.engine.lowering import Unfused, lower
+
+E = tc.effects
+TRIANGLES = 30
+
+
+def sheet(effects, boundaries=None):
+    """Its triangles all differ."""
+    mesh = tc.meshes.rectangle(0.3, 0.2, triangles=TRIANGLES)
+    return tc.Cloth(mesh, tc.materials.AEP(6e3, 0.3), 0.15, effects, boundaries, contact=None)
+
+
+def field(low, high):
+    return torch.linspace(low, high, TRIANGLES)
+
+
+def remembering(state):
+    """Internal variables as after a long life: all different, none in its first state."""
+
+    def aged(seed: int, value: torch.Tensor) -> torch.Tensor:
+        if value.shape[-1] == 3:  # creases
+            return 5 * noise(value.shape, 40 + seed)
+        shift, share = noise(value.shape, 40 + seed).chunk(2, dim=-1)
+        return torch.cat([value.chunk(2, dim=-1)[0] * (1 + 0.1 * shift), (0.5 * share).clamp(-0.9, 0.9)], dim=-1)
+
+    return state._replace(memory={name: aged(k, value) for k, (name, value) in enumerate(state.memory.items())})
+
+
+def standard():
+    """What most cloths have."""
+    return {
+        "gravity": E.Gravity(tilt=(0.1, -0.2)),
+        "air": E.AirDrag(1.2, tangential=0.02, wind=(0.3, 0.1, 0)),
+        "damping": E.MassDamping(0.4),
+        "bending": E.Bending(1e-5, 0.01, poisson=0.2),
+        "hem": E.LineMass(4e-3),
+    }
+
+
+EFFECTS = {
+    "drag with fields": lambda: E.AirDrag(field(0.5, 1.5), tangential=field(0.02, 0.01)),
+    "bending without damping": lambda: E.Bending(1e-5),
+    "bending field": lambda: E.Bending(field(1e-5, 1e-3), 0.02),
+    "woven bending": lambda: E.Bending(1e-4, poisson=0.3, weft_ratio=0.5, twist_ratio=1.3),
+    "curl": lambda: E.Bending(1e-4, 0.02, curl_warp=3.0),
+    "curl of a woven sheet": lambda: E.Bending(
+        field(1e-5, 1e-3), poisson=0.2, weft_ratio=0.4, curl_warp=3.0, curl_weft=-2.0
+    ),
+    "saturating": lambda: E.SaturatingBending(1e-3, 3.0),
+    "bending friction": lambda: E.BendingFriction(1e-3, threshold=3.0),
+    "shear friction": lambda: E.ShearFriction(5.0, threshold=0.02),
+    "kelvin voigt": lambda: E.KelvinVoigt(field(0.1, 0.3)),
+    "added mass": lambda: E.AddedMass(field(0.1, 0.3)),
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_alone(name):
+    cloth = sheet({"it": EFFECTS[name]()})
+    agree(cloth, {}, remembering(moving(cloth)))
+
+
+def test_standard_in_a_hand():
+    cloth = sheet(standard(), {"hand": tc.boundaries.Grasp.corner("upper-left")})
+    agree(cloth, {"hand": held(0.01)}, moving(cloth))
+
+
+@pytest.mark.parametrize("options", [{}, {"weft_ratio": 0.5, "curl_weft": 3.0}])
+def test_creases_where_it_is_bent_far(options):
+    cloth = sheet({"crease": E.CreasingBending(1e-4, 30.0, yield_curvature=12.0, **options)})
+    state = remembering(moving(cloth))
+    with torch.no_grad():
+        after, _ = functional.rollout(cloth.model(), state, 1e-4, {}, 1)
+    flowed = (after.memory["effects.crease"] != state.memory["effects.crease"]).any(-1).float().mean()
+    assert 0.2 < flowed < 0.9
+    agree(cloth, {}, state)
+
+
+def test_bending_of_a_sheet_that_lies_folded():
+    effects = {"curl": E.Bending(1e-4, curl_warp=3.0), "friction": E.BendingFriction()}
+    cloth = sheet(effects)
+    state = moving(cloth)
+    flat = cloth.rest_state().x
+    folded = flat * torch.tensor([1.0, 0.1, 1.0]) + 0.02 * flat.flip(-1)  # seen from far off its plane
+    folded[:, 1] = torch.where(flat[:, 0] > flat[:, 0].mean(), flat[:, 1], folded[:, 1])
+    state = cloth.state(folded + 1e-4 * noise(folded.shape, 9), state.v)
+    stretch = effects["curl"].sheet.see(state.x).stretch
+    assert 0 < int((stretch == 0.5).sum()) < len(stretch)
+    agree(cloth, {}, state, substeps=20)
+
+
+def test_all_together_in_a_batch():
+    batch = torch.tensor([[1.0], [1.5]])
+    effects = {
+        **standard(),
+        "curl": E.Bending(1e-4 * batch, 0.01, weft_ratio=0.6 * batch, curl_warp=2.0),
+        "crease": E.CreasingBending(1e-4, 30.0 * batch, yield_curvature=12.0),
+        "friction": E.BendingFriction(1e-3 * batch, threshold=3.0),
+        "saturating": E.SaturatingBending(1e-3 * batch, 3.0),
+        "shear": E.ShearFriction(5.0 * batch, threshold=0.02),
+        "viscous": E.KelvinVoigt(0.1 * batch),
+        "air mass": E.AddedMass(0.1 * batch),
+        "shrunk": E.RestShape(0.02 * batch),
+    }
+    cloth = sheet(effects)
+    agree(cloth, {}, remembering(moving(cloth, (2,))))
+
+
+def test_no_air_that_moves_along_changes_nothing_bitwise():
+    state = moving(sheet({}))
+    with_none, _ = fused.rollout(sheet({"air": E.AddedMass(0.0)}).model(), state, 1e-4, {}, 50)
+    without, _ = fused.rollout(sheet({}).model(), state, 1e-4, {}, 50)
+    assert torch.equal(with_none.x, without.x) and torch.equal(with_none.v, without.v)
+
+
+def test_memory_that_nobody_owns():
+    cloth = sheet({"friction": E.BendingFriction()})
+    with pytest.raises(Unfused, match="friction"):
+        fused.rollout(sheet({}).model(), moving(cloth), 1e-4, {}, 1)
+
+
+def test_still_and_flat_has_finite_gradients():
+    effects = {"friction": E.BendingFriction(), "shear": E.ShearFriction(), "crease": E.CreasingBending(1e-4)}
+    effects |= {"air": E.AirDrag(1.2, tangential=0.1), "saturating": E.SaturatingBending(), "mass": E.AddedMass()}
+    cloth = sheet(effects)
+    found = outcome(fused.rollout, cloth, {}, cloth.rest_state(), 3, 1e-4)
+    assert all(bool(torch.isfinite(grad).all()) for grad in found.gradients.values() if grad is not None)
+
+
+@pytest.mark.parametrize("name", ["bending friction", "standard"])
+def test_float32_gradients_over_a_thousand_steps(name):
+    def made():
+        return sheet(standard() if name == "standard" else {**standard(), "it": EFFECTS[name]()})
+
+    cloth = made()
+    state = moving(cloth, strain=0.01)
+    state = state.map(lambda t: t.float().double())
+    exact = outcome(functional.rollout, cloth, {}, state, 1000, 5e-5)
+    torch.set_default_dtype(torch.float32)
+    rough = made()
+    found = outcome(fused.rollout, rough, {}, state.map(torch.Tensor.float), 1000, 5e-5)
+    for key, want in exact.gradients.items():
+        if want is not None:
+            got = found.gradients[key].double()
+            assert float((got - want).norm() / want.norm()) < 1e-3, key
+            assert float(torch.cosine_similarity(got.flatten(), want.double().flatten(), 0)) > 0.9999, key
+
+
+def test_an_effect_of_ones_own_is_not_taken_for_the_built_in():
+    class Heavier(E.Gravity):
+        def force(self, c, now):
+            return 2 * super().force(c, now)
+
+    cloth = sheet({"g": Heavier()})
+    with pytest.raises(Unfused, match="'g' \\(Heavier\\)"):
+        lower(cloth.model(), moving(cloth), {})
+
+
+def test_settling():
+    cloth = sheet(standard(), {"hand": tc.boundaries.Grasp.corner("upper-left")})
+    model = cloth.model()
+    settling = E.MassDamping(30.0)
+    model = model._replace(effects={**model.effects, "settling": (settling, settling.coefficients().detach())})
+    state = moving(cloth)
+    one, _ = functional.rollout(model, state, 1e-4, {}, 20)
+    other, _ = fused.rollout(model, state, 1e-4, {}, 20)
+    assert difference(other.x - state.x, one.x - state.x) < 1e-10

@@ -1,0 +1,160 @@
+// The five derivatives of a field of vectors at every vertex, and what forces on them do to the vertices: a Stencil with
+// constant weights, five at a time. Both directions gather, so that nothing waits for what was just written.
+#pragma once
+
+#include <array>
+#include <utility>
+
+#include "stencil.h"
+
+namespace tc {
+
+// The vertices that each vertex sees, one vertex after the other, with eight numbers each: five weights, three zeros.
+template <class R>
+struct Links {
+    std::vector<int> first, other;
+    Buffer<R> weight;
+
+    using Rows = std::vector<std::vector<std::pair<int, std::array<double, 5>>>>;
+
+    explicit Links(const Rows& rows) : first{0} {
+        for (const auto& row : rows) {
+            for (const auto& link : row) other.push_back(link.first);
+            first.push_back(int(other.size()));
+        }
+        weight.reset(8 * other.size());
+        size_t at = 0;
+        for (const auto& row : rows)
+            for (const auto& link : row) {
+                for (int c = 0; c < 5; c++) weight.data[at + c] = R(link.second[c]);
+                at += 8;
+            }
+    }
+};
+
+template <class R>
+struct BothWays {
+    std::unique_ptr<Links<R>> seeing, seen;
+
+    BothWays(const Program<R>& p, int table, int weight) {
+        const Field& f = p.fields[weight];
+        typename Links<R>::Rows to(f.vertices), from(f.vertices);
+        for (int v = 0; v < f.vertices; v++) {
+            std::array<double, 5> sum{};
+            for (int n = 0; n < f.near; n++) {
+                const int other = p.tables[table][size_t(n) * f.vertices + v];
+                if (other == v) continue;  // rows are filled up with the vertex itself
+                std::array<double, 5> w, minus;
+                for (int c = 0; c < 5; c++) {
+                    w[c] = p.constants[weight].data[f.place((size_t(c) * f.near + n) * f.vertices + v)];
+                    sum[c] += w[c], minus[c] = -w[c];
+                }
+                to[v].push_back({other, w}), from[other].push_back({v, minus});
+            }
+            from[v].push_back({v, sum});
+        }
+        seeing = std::make_unique<Links<R>>(to), seen = std::make_unique<Links<R>>(from);
+    }
+};
+
+template <class R>
+struct Derivatives : Stage<R> {
+    using D = Along<R>;
+    using Row = Pack<R, 16>;  // five vectors and a zero
+    const Program<R>& program;
+    std::shared_ptr<const BothWays<R>> links;
+    int weight, x, y;  // y has 15 components
+    bool transposed;
+
+    Derivatives(const Program<R>& p, std::shared_ptr<const BothWays<R>> links, int weight, int x, int y, bool transposed)
+        : program(p), links(std::move(links)), weight(weight), x(x), y(y), transposed(transposed) {}
+
+    static bool fits(const Program<R>& p, int weight, int y) {
+        return p.fields[weight].kind == Kind::constant && p.fields[y].comps == 15;
+    }
+
+    void forward(Scene<R>& s) const override {
+        if (transposed) answer(s.value[y], s.value[x], R(1));
+        else see(s.value[x], s.value[y], R(1));
+    }
+    void reverse(Scene<R>& s) const override {
+        if (transposed) see(s.bar[x], s.bar[y], R(-1));
+        else answer(s.bar[y], s.bar[x], R(-1));
+    }
+    void tangent(Scene<R>& s) const override {
+        forward(s);
+        if (transposed) answer_along(s.dot[y], s.dot[x]);
+        else see_along(s.dot[x], s.dot[y]);
+    }
+
+  private:
+    int vertices() const { return program.fields[x].rows; }
+    const Quad<R>& vector(const R* field, int v) const { return *reinterpret_cast<const Quad<R>*>(field + size_t(v) * 4); }
+    Quad<R>& vector(R* field, int v) const { return *reinterpret_cast<Quad<R>*>(field + size_t(v) * 4); }
+    const Row& row(const R* field, int v) const { return *reinterpret_cast<const Row*>(field + size_t(v) * 16); }
+    Row& row(R* field, int v) const { return *reinterpret_cast<Row*>(field + size_t(v) * 16); }
+    static Row five_times(Quad<R> a) {  // in two steps: a widening shuffle would go through memory
+        const auto b = __builtin_shufflevector(a.v, a.v, 0, 1, 2, 3, 4, 5, 6, 7);
+        const auto c = __builtin_shufflevector(b, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+        return Row(__builtin_shufflevector(c, c, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 3));
+    }
+    static Row weights(const R* w) {
+        const auto a = reinterpret_cast<const Pack<R, 8>*>(w)->v;
+        const auto b = __builtin_shufflevector(a, a, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+        return Row(__builtin_shufflevector(b, b, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5));
+    }
+    static Quad<R> summed(Row a) {  // of the five vectors
+        const auto b = a.v + __builtin_shufflevector(a.v, a.v, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2);
+        const auto c = b + __builtin_shufflevector(b, b, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5);
+        const auto d = c + __builtin_shufflevector(a.v, a.v, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11);
+        const typename Quad<R>::Lanes none{};
+        return Quad<R>(__builtin_shufflevector(__builtin_shufflevector(d, d, 0, 1, 2, 3), none, 0, 1, 2, 4));
+    }
+
+    // Y(v) += sign sum_u w(u) (X(u) - X(v)): differences, which are small wherever the sheet is.
+    void see(const R* from, R* to, R sign) const {
+        const Links<R>& l = *links->seeing;
+        for (int v = 0; v < vertices(); v++) {
+            const Quad<R> own = vector(from, v);
+            Row sum(0.0);
+            for (int k = l.first[v]; k < l.first[v + 1]; k++)
+                sum = sum + weights(l.weight.data + 8 * size_t(k)) * five_times(vector(from, l.other[k]) - own);
+            row(to, v) = row(to, v) + Row(typename Row::Lanes{} + sign) * sum;
+        }
+    }
+    // X(v) -= sign times the transpose of that.
+    void answer(const R* from, R* to, R sign) const {
+        const Links<R>& l = *links->seen;
+        for (int v = 0; v < vertices(); v++) {
+            Row sum(0.0);
+            for (int k = l.first[v]; k < l.first[v + 1]; k++)
+                sum = sum + weights(l.weight.data + 8 * size_t(k)) * row(from, l.other[k]);
+            vector(to, v) = vector(to, v) + Quad<R>(typename Quad<R>::Lanes{} + sign) * summed(sum);
+        }
+    }
+    void see_along(const R* from, R* to) const {
+        const Links<R>& l = *links->seeing;
+        const D* in = reinterpret_cast<const D*>(from);
+        for (int v = 0; v < vertices(); v++) {
+            D* sum = reinterpret_cast<D*>(to) + size_t(v) * 16;
+            for (int k = l.first[v]; k < l.first[v + 1]; k++)
+                for (int i = 0; i < 3; i++) {
+                    const D d = in[l.other[k] * 4 + i] - in[v * 4 + i];
+                    for (int c = 0; c < 5; c++) sum[3 * c + i] = sum[3 * c + i] + l.weight.data[8 * size_t(k) + c] * d;
+                }
+        }
+    }
+    void answer_along(const R* from, R* to) const {
+        const Links<R>& l = *links->seen;
+        const D* in = reinterpret_cast<const D*>(from);
+        for (int v = 0; v < vertices(); v++) {
+            D* sum = reinterpret_cast<D*>(to) + size_t(v) * 4;
+            for (int k = l.first[v]; k < l.first[v + 1]; k++)
+                for (int c = 0; c < 5; c++)
+                    for (int i = 0; i < 3; i++)
+                        sum[i] = sum[i] + l.weight.data[8 * size_t(k) + c] * in[l.other[k] * 16 + 3 * c + i];
+        }
+    }
+};
+
+}  // namespace tc

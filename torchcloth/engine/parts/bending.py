@@ -1,0 +1,66 @@
+"""Effects that bend the sheet."""
+
+from __future__ import annotations
+
+from ...effects import Bending, BendingFriction, CreasingBending, SaturatingBending
+from ...effects.bending import Coefficients
+from ...effects.saturating import Coefficients as Saturating
+from ..lowering import Lowering
+from ..program import Shape
+
+
+def plate(low: Lowering, name: str, effect: Bending, c: Coefficients) -> None:
+    """Elastic and viscous, by one matrix; and what rest curvature adds."""
+    _matrix(low, effect, c)
+    if c.curl is not None:
+        sheet = low.sheet(effect.sheet)
+        _rest_moment(low, effect, c, sheet.loop.load(low.parameter(c.curl)))
+
+
+def creasing(low: Lowering, name: str, effect: CreasingBending, c: Coefficients) -> None:
+    """The same with a rest curvature that flows."""
+    _matrix(low, effect, c)
+    sheet, memory = low.sheet(effect.sheet), low.memory[f"effects.{name}"]
+    load = sheet.loop.load
+    fields = (low.parameter(c.curl), memory.now, low.parameter(c.mobility), low.dt, low.number(effect.yield_curvature))
+    after = sheet.loop.call("crease", sheet.curvature, *(load(field) for field in fields))
+    sheet.loop.put(after[:3], memory.after)
+    _rest_moment(low, effect, c, after[3:])
+
+
+def friction(low: Lowering, name: str, effect: BendingFriction, c) -> None:
+    """Moment that opposes changes of curvature."""
+    sheet, memory = low.sheet(effect.sheet), low.memory[f"effects.{name}"]
+    fields = (memory.now, low.number(effect.threshold), low.parameter(c))
+    after = sheet.loop.call("bending_friction", sheet.curvature, *(sheet.loop.load(field) for field in fields))
+    sheet.loop.put(after[:6], memory.after)
+    sheet.moment(after[6:])
+
+
+def saturating(low: Lowering, name: str, effect: SaturatingBending, c: Saturating) -> None:
+    """On the second derivatives alone."""
+    sheet = low.sheet(effect.sheet)
+    values = [sheet.loop.load(low.parameter(value)) for value in (c.moment, c.curvature)]
+    sheet.stress(sheet.loop.call("saturating", sheet.second, *values))
+
+
+def _matrix(low: Lowering, effect: Bending, c: Coefficients) -> None:
+    """-Q (stiffness x + viscosity v); weights that are parameters need to know what they weighed."""
+    if c.operator is None:
+        columns = effect.columns.cpu().numpy()
+        weight = low.program.constant(effect.operator.reshape(-1, 1), near=len(columns))
+    else:
+        columns = effect.woven.columns.cpu().numpy()
+        weight = low.parameter(c.operator, near=len(columns))
+    bent = low.program.temporary(low.vertices, 3, kept=c.operator is not None)
+    loop = low.loop(low.vertices)
+    parts = [low.parameter(c.stiffness), low.parameter(c.viscosity), low.x.now, low.v.now]
+    loop.put(loop.call("bent", *(loop.load(field) for field in parts)), bent)
+    low.program.stencil(columns, weight, bent, low.force, Shape.SYMMETRIC)
+
+
+def _rest_moment(low: Lowering, effect: Bending, c: Coefficients, rest: list[int]) -> None:
+    sheet = low.sheet(effect.sheet)
+    assert c.plate is not None
+    plate = [sheet.loop.load(low.parameter(part)) for part in c.plate]
+    sheet.moment(sheet.loop.call("rest_moment", *plate, rest))
