@@ -1,7 +1,8 @@
 """Every file imports from its own room or from a floor below; rooms on one floor do not know each other.
 
-A room is a module or package directly under ``torchcloth`` (robots/ and training/ are rooms too, "" is the package
-itself). Imports inside functions and under TYPE_CHECKING count: a cycle is a cycle when it runs, and to a reader.
+A room is a module or package directly under ``torchcloth`` (benchmarks/, robots/, training/ are rooms too, "" is the
+package itself). Imports inside functions and under TYPE_CHECKING count: a cycle is a cycle when it runs, and to a
+reader.
 """
 
 import ast
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-COMPANIONS = ("robots", "training")  # folders of their own, installed as torchcloth.robots, torchcloth.training
+COMPANIONS = ("benchmarks", "robots", "training")  # folders of their own, installed as torchcloth.robots, ...
 
 FLOORS = (
     ("errors", "_math", "forward_mode"),
@@ -28,7 +29,7 @@ FLOORS = (
     ("cloth", "robots"),
     ("identification", "diagnosis", "plan", "testing"),
     ("",),  # torchcloth/__init__.py: the names a user sees
-    ("training", "demo"),
+    ("training", "benchmarks", "demo"),
     ("cli",),
     ("__main__",),
 )

@@ -15,7 +15,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = {"torchcloth": "torchcloth", "torchcloth.robots": "robots", "torchcloth.training": "training"}
+FOLDERS = {
+    "torchcloth": "torchcloth",
+    "torchcloth.benchmarks": "benchmarks",
+    "torchcloth.robots": "robots",
+    "torchcloth.training": "training",
+}
 EXAMPLES = ROOT / "torchcloth" / "examples"
 
 
@@ -103,7 +108,7 @@ def test_all_modules_are_inside_and_nothing_else(inside):
         expected |= {f"{package.replace('.', '/')}/{file.name}" for file in folder.glob("*.py")}
     assert {name for name in inside if name.endswith(".py")} == expected
     folders = {part for name in inside for part in name.split("/")[:-1]}
-    assert not folders & {"tests", "notebooks", "benchmarks", "docs", "build"}
+    assert not folders & {"tests", "notebooks", "docs", "build"}
 
 
 def test_data_is_inside(inside):
@@ -134,8 +139,8 @@ def test_command_is_inside(wheel, inside):
 USE = """
 import importlib.resources as resources
 import sys
-import torchcloth, torchcloth.robots, torchcloth.recordings, torchcloth.training
-for module in (torchcloth, torchcloth.robots, torchcloth.training):
+import torchcloth, torchcloth.benchmarks, torchcloth.robots, torchcloth.recordings, torchcloth.training
+for module in (torchcloth, torchcloth.benchmarks, torchcloth.robots, torchcloth.training):
     print(module.__file__)
 assert resources.files("torchcloth.robots").joinpath("urdf", "rizon4.urdf").is_file()
 arm = torchcloth.robots.load("rizon4")
@@ -153,12 +158,12 @@ def test_it_works_from_the_wheel(wheel, tmp_path):
         archive.extractall(unpacked)
     out = call(sys.executable, "-c", USE, cwd=elsewhere, env={**os.environ, "PYTHONPATH": str(unpacked)})
     places = [Path(line).parent.relative_to(unpacked).as_posix() for line in out.splitlines()]
-    assert places == ["torchcloth", "torchcloth/robots", "torchcloth/training"]
+    assert places == ["torchcloth", "torchcloth/benchmarks", "torchcloth/robots", "torchcloth/training"]
 
 
 def test_companions_refuse_another_name():
     """``import robots`` in a checkout is a mistake that would load a second copy."""
-    for folder in ("robots", "training"):
+    for folder in ("benchmarks", "robots", "training"):
         done = subprocess.run([sys.executable, "-c", f"import {folder}"], cwd=ROOT, capture_output=True, text=True)
         assert done.returncode != 0
         assert f"import this package as torchcloth.{folder}" in done.stderr

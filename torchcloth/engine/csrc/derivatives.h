@@ -136,23 +136,32 @@ struct Derivatives : Stage<R> {
         const Links<R>& l = *links->seeing;
         const D* in = reinterpret_cast<const D*>(from);
         for (int v = 0; v < vertices(); v++) {
-            D* sum = reinterpret_cast<D*>(to) + size_t(v) * 16;
-            for (int k = l.first[v]; k < l.first[v + 1]; k++)
+            D sum[15];  // in registers until the vertex is done
+            for (D& part : sum) part = D(0.0);
+            for (int k = l.first[v]; k < l.first[v + 1]; k++) {
+                const R* w = l.weight.data + 8 * size_t(k);
                 for (int i = 0; i < 3; i++) {
                     const D d = in[l.other[k] * 4 + i] - in[v * 4 + i];
-                    for (int c = 0; c < 5; c++) sum[3 * c + i] = sum[3 * c + i] + l.weight.data[8 * size_t(k) + c] * d;
+                    for (int c = 0; c < 5; c++) sum[3 * c + i] = sum[3 * c + i] + d * w[c];
                 }
+            }
+            D* target = reinterpret_cast<D*>(to) + size_t(v) * 16;
+            for (int c = 0; c < 15; c++) target[c] = target[c] + sum[c];
         }
     }
     void answer_along(const R* from, R* to) const {
         const Links<R>& l = *links->seen;
         const D* in = reinterpret_cast<const D*>(from);
         for (int v = 0; v < vertices(); v++) {
-            D* sum = reinterpret_cast<D*>(to) + size_t(v) * 4;
-            for (int k = l.first[v]; k < l.first[v + 1]; k++)
+            D sum[3] = {D(0.0), D(0.0), D(0.0)};
+            for (int k = l.first[v]; k < l.first[v + 1]; k++) {
+                const R* w = l.weight.data + 8 * size_t(k);
+                const D* given = in + size_t(l.other[k]) * 16;
                 for (int c = 0; c < 5; c++)
-                    for (int i = 0; i < 3; i++)
-                        sum[i] = sum[i] + l.weight.data[8 * size_t(k) + c] * in[l.other[k] * 16 + 3 * c + i];
+                    for (int i = 0; i < 3; i++) sum[i] = sum[i] + given[3 * c + i] * w[c];
+            }
+            D* target = reinterpret_cast<D*>(to) + size_t(v) * 4;
+            for (int i = 0; i < 3; i++) target[i] = target[i] + sum[i];
         }
     }
 };

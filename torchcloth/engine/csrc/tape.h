@@ -271,7 +271,7 @@ TC_INLINE void along(const P* v, const P* p, const P* q, int lane, D* t) {
         auto number = [&](const P& pack) { return D(typename D::Lanes{} + pack.v[lane]); };
         if constexpr (n.op == Op::select) {
             const D a = k.varies[n.a] ? t[n.a] : D(0.0), b = k.varies[n.b] ? t[n.b] : D(0.0);
-            t[I] = v[n.c].v[lane] != 0 ? a : b;
+            t[I] = select(number(v[n.c]), a, b);
         } else if constexpr (n.op == Op::mulc) t[I] = t[n.a] * n.value;
         else if constexpr (n.op == Op::rsubc || n.op == Op::neg) t[I] = -t[n.a];
         else if constexpr (n.op == Op::addc) t[I] = t[n.a];

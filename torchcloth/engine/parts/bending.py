@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import cast
+
+from torch import Tensor
+
 from ...effects import Bending, BendingFriction, CreasingBending, SaturatingBending
+from ...effects._plate import Plate
 from ...effects.bending import Coefficients
 from ...effects.saturating import Coefficients as Saturating
-from ..lowering import Lowering
+from ..lowering import Lowering, Sheet
 from ..program import Shape
 
 
@@ -14,21 +19,21 @@ def plate(low: Lowering, name: str, effect: Bending, c: Coefficients) -> None:
     _matrix(low, effect, c)
     if c.curl is not None:
         sheet = low.sheet(effect.sheet)
-        _rest_moment(low, effect, c, sheet.loop.load(low.parameter(c.curl)))
+        _rest_moment(sheet, low, c, sheet.loop.load(low.parameter(c.curl)))
 
 
 def creasing(low: Lowering, name: str, effect: CreasingBending, c: Coefficients) -> None:
     """The same with a rest curvature that flows."""
     _matrix(low, effect, c)
     sheet, memory = low.sheet(effect.sheet), low.memory[f"effects.{name}"]
-    load = sheet.loop.load
-    fields = (low.parameter(c.curl), memory.now, low.parameter(c.mobility), low.dt, low.number(effect.yield_curvature))
-    after = sheet.loop.call("crease", sheet.curvature, *(load(field) for field in fields))
+    curl, mobility = (low.parameter(cast("Tensor", part)) for part in (c.curl, c.mobility))
+    fields = (curl, memory.now, mobility, low.dt, low.number(effect.yield_curvature))
+    after = sheet.loop.call("crease", sheet.curvature, *(sheet.loop.load(field) for field in fields))
     sheet.loop.put(after[:3], memory.after)
-    _rest_moment(low, effect, c, after[3:])
+    _rest_moment(sheet, low, c, after[3:])
 
 
-def friction(low: Lowering, name: str, effect: BendingFriction, c) -> None:
+def friction(low: Lowering, name: str, effect: BendingFriction, c: Tensor) -> None:
     """Moment that opposes changes of curvature."""
     sheet, memory = low.sheet(effect.sheet), low.memory[f"effects.{name}"]
     fields = (memory.now, low.number(effect.threshold), low.parameter(c))
@@ -59,8 +64,6 @@ def _matrix(low: Lowering, effect: Bending, c: Coefficients) -> None:
     low.program.stencil(columns, weight, bent, low.force, Shape.SYMMETRIC)
 
 
-def _rest_moment(low: Lowering, effect: Bending, c: Coefficients, rest: list[int]) -> None:
-    sheet = low.sheet(effect.sheet)
-    assert c.plate is not None
-    plate = [sheet.loop.load(low.parameter(part)) for part in c.plate]
+def _rest_moment(sheet: Sheet, low: Lowering, c: Coefficients, rest: list[int]) -> None:
+    plate = [sheet.loop.load(low.parameter(part)) for part in cast("Plate", c.plate)]
     sheet.moment(sheet.loop.call("rest_moment", *plate, rest))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 from ...materials import AEP, NormYield, OrthotropicAEP
 from ..lowering import Lowering, Unfused
@@ -52,7 +53,8 @@ def _isotropic(low: Lowering) -> tuple[str, list[list[int]]]:
 def _orthotropic(low: Lowering) -> tuple[str, list[list[int]]]:
     t, c = low.triangles, low.model.coefficients
     numbers = [t.parameter(v) for v in (c.mu, c.lam, c.balance, c.warp, c.weft, c.warp_toe, c.weft_toe)]
-    return "orthotropic", [*numbers, t.loop.load(low.number(low.model.material.stiffening_reach))]
+    reach = cast("OrthotropicAEP", low.model.material).stiffening_reach
+    return "orthotropic", [*numbers, t.loop.load(low.number(reach))]
 
 
 _LAWS: dict[type, Callable[[Lowering], tuple[str, list[list[int]]]]] = {AEP: _isotropic, OrthotropicAEP: _orthotropic}

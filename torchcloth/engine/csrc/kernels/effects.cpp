@@ -14,13 +14,13 @@ struct AirDrag {
         const auto x0 = r.vec(), x1 = r.vec(), x2 = r.vec(), a = r.vec(), b = r.vec(), c = r.vec();
         const T pressure = r.number(), friction = r.number();
         const auto relative = (1.0 / 3) * (a + b + c) - r.vec();
-        const auto normal = cross(x1 - x0, x2 - x0);
-        const T twice = sqrt(dot(normal, normal));  // the area
-        const auto n = normal / twice;
-        const T speed = dot(relative, n);
-        const auto along = relative - speed * n;
-        const T third = (1.0 / 6) * twice;  // of the area: each corner's part
-        const auto part = -((pressure * third * abs(speed) * speed) * n) - (friction * third * safe_norm(along)) * along;
+        const auto normal = cross(x1 - x0, x2 - x0);  // twice the area long
+        const T squared = dot(normal, normal), flow = dot(relative, normal);
+        const T share = flow / squared;
+        const auto along = relative - share * normal;
+        const T across = (1.0 / 6) * pressure * abs(flow) * share;  // a third of the area for each corner
+        const T slide = (1.0 / 6) * friction * sqrt(squared) * safe_norm(along);
+        const auto part = -(across * normal + slide * along);
         Write<T> w{out};
         w.vec(part), w.vec(part), w.vec(part);
     }

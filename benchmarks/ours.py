@@ -1,0 +1,105 @@
+"""torchcloth itself, with one of its engines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import cast
+
+import torch
+import torch.autograd.forward_ad as forward_ad
+from torch import Tensor
+from torch.func import functional_call
+
+import torchcloth as tc
+from torchcloth.forward_mode import real_tangents
+
+from .cases import DT, Scene, stage
+from .contestant import DIRECTIONS, Contestant, Outcome, Task
+
+LIMIT = DT * (1 + 1e-6)  # frame times are rounded
+
+
+class Ours(Contestant):
+    """A cloth layer in float32."""
+
+    def __init__(self, engine: str, threads: int) -> None:
+        self.engine = engine
+        self.threads = 1 if engine == "reference" else threads  # small torch operations: a second thread only waits
+        torch.set_num_threads(self.threads)
+
+    def prepare(self, task: Task) -> Callable[[], Outcome]:
+        """Build the layer; the frames are those of a user who asks for 25 a second."""
+        scene = stage(task.scene(), self.engine, task.substeps, task.batch)
+        return {"forward": _forward, "gradient": _gradient, "tangents8": _tangents}[task.quantity](scene)
+
+
+def _forward(scene: Scene) -> Callable[[], Outcome]:
+    def run() -> Outcome:
+        with torch.no_grad():
+            return _outcome(_end(scene, scene.x, scene.motion))
+
+    return run
+
+
+def _gradient(scene: Scene) -> Callable[[], Outcome]:
+    def run() -> Outcome:
+        x = scene.x.clone().requires_grad_()
+        poses = {name: path.pose.clone().requires_grad_() for name, path in scene.motion.items()}
+        motion = {name: path._replace(pose=poses[name]) for name, path in scene.motion.items()}
+        youngs = cast("tc.PhysicalParameter", scene.cloth.material.youngs_modulus)
+        end = _end(scene, x, motion)
+        loss = (end**2).mean()
+        by_x, by_raw, *by_pose = torch.autograd.grad(loss, [x, youngs.raw, *poses.values()])
+        by_youngs = float(by_raw / youngs.value.detach())  # raw is the logarithm
+        extra = tuple(g.numpy() for g in by_pose)
+        return _outcome(end.detach())._replace(
+            loss=float(loss.detach()), by_x=_first(by_x), by_youngs=by_youngs, extra=extra
+        )
+
+    return run
+
+
+def _tangents(scene: Scene) -> Callable[[], Outcome]:
+    raws = {name: raw for name, raw in scene.cloth.named_parameters() if _counts(scene.cloth, name, raw)}
+    mixing = torch.randn(DIRECTIONS, len(raws), generator=torch.Generator().manual_seed(0), dtype=scene.x.dtype)
+
+    def run() -> Outcome:
+        x, tangent = tangents(scene, raws, mixing)
+        return _outcome(x)._replace(extra=(tangent.numpy(),))
+
+    return run
+
+
+def tangents(scene: Scene, raws: Mapping[str, Tensor], directions: Tensor) -> tuple[Tensor, Tensor]:
+    """End [V, 3] m, and the frames' derivatives [K, T, V, 3] along ``directions`` [K, parameters], unconstrained ones.
+
+    The K directions run as a batch of dual numbers.
+    """
+    count = len(directions)
+    state = scene.cloth.state(scene.x.expand(count, *scene.x.shape))
+    with torch.no_grad(), forward_ad.dual_level(), real_tangents():
+        entries = {
+            name: forward_ad.make_dual(raw.detach().expand(count).contiguous(), column.contiguous()).unsqueeze(-1)
+            for (name, raw), column in zip(raws.items(), directions.T, strict=True)
+        }
+        rollout = functional_call(scene.cloth, entries, (state, scene.motion, scene.times), {"dt": LIMIT})
+        primal, tangent = forward_ad.unpack_dual(rollout.x)
+        return primal[0, -1].clone(), cast("Tensor", tangent).clone()
+
+
+def _counts(cloth: tc.Cloth, name: str, raw: Tensor) -> bool:
+    """Scalar parameters that the model feels."""
+    director = name.split(".")[1:2] in (["contact_stiffness"], ["shear_stiffness"], ["cone"])
+    return raw.ndim == 0 and not (director and cloth.contact is None)
+
+
+def _end(scene: Scene, x: Tensor, motion: dict[str, tc.Trajectory]) -> Tensor:
+    return scene.cloth(scene.cloth.state(x), motion, scene.times, dt=LIMIT).x.select(-3, -1)
+
+
+def _outcome(end: Tensor) -> Outcome:
+    return Outcome(_first(end))
+
+
+def _first(field: Tensor):
+    return field.reshape(-1, *field.shape[-2:])[0].numpy()

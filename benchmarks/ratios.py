@@ -1,0 +1,78 @@
+"""Ratios between records."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from .suite import Record
+
+CONVENTIONS = {
+    "seconds": "median over samples of one whole run; contestants took turns within this one call",
+    "substeps": "of 1.6e-4 s; ms_per_substep is seconds by substeps, of all scenes of a batch together",
+    "ratios *_vs_taichi, *_vs_warp, *_vs_newton, *_vs_mujoco, *_vs_eager": "time of the other over torchcloth's: above "
+    "1, torchcloth is faster",
+    "ratios tangents8_vs_forward, gradient_vs_forward, batch8_vs_batch1, batch32_vs_batch1": "costs: time over that of "
+    "one forward run of the same substeps; a gradient is forward and backward",
+    "ratios linear_*": "time per triangle (per substep) at the largest over that at 800 triangles (250 substeps)",
+    "forward_vs_taichi, forward_vs_warp, gradient_vs_*": "standard-everywhere: every triangle uses the grid, the same "
+    "grid work as theirs; ours takes 800 contact points through it, theirs 441 vertices and 800 elements",
+    "*_default_*": "the same peers against torchcloth's default contact (case standard), where a sheet far from "
+    "other layers needs no grid",
+    "newton, mujoco": "sheet-800, without contact, like theirs; Newton's contact is on in case standard",
+    "gradient": "of the mean squared end position by initial positions, Young's modulus and (torchcloth) the poses",
+    "prepare_seconds": "building, compiling and a first run; Taichi and Warp keep compiled code between calls",
+    "limits": "flops and bytes that the standard case needs at least, in torchcloth's scheme, against this machine's "
+    "rates with the threads asked for",
+    "threads": "the reference runs with one thread, which is faster for small tensors; Warp has one on the CPU",
+    "memory": "MiB (2^20 bytes) above the process after a brief run of the same scene",
+}
+
+
+def ratios(records: Mapping[str, Record], engine: str) -> dict[str, float]:
+    """All ratios that the records allow; ``engine`` is torchcloth's best."""
+    found = {}
+    for name, (above, below, scale) in _pairs(engine).items():
+        if above in records and below in records:
+            found[name] = scale * records[above]["seconds"] / records[below]["seconds"]
+    growth = _growth(records, engine)
+    return {name: float(f"{value:.4g}") for name, value in (found | growth).items()}
+
+
+def _pairs(engine: str) -> dict[str, tuple[str, str, float]]:
+    """Name -> (key above, key below, factor)."""
+    equal, default, lone = "standard-everywhere", "standard", "sheet-800"
+    pairs = {}
+    for quantity in ("forward", "gradient"):
+        for peer in ("taichi", "warp"):
+            pairs[f"{quantity}_vs_{peer}"] = (f"{quantity}.{equal}.{peer}", f"{quantity}.{equal}.{engine}")
+            pairs[f"{quantity}_default_vs_{peer}"] = (f"{quantity}.{equal}.{peer}", f"{quantity}.{default}.{engine}")
+        for peer in ("newton", "mujoco"):
+            pairs[f"{quantity}_vs_{peer}"] = (f"{quantity}.{lone}.{peer}", f"{quantity}.{lone}.{engine}")
+    pairs["forward_default_vs_newton"] = (f"forward.{default}.newton", f"forward.{default}.{engine}")
+    for quantity in ("forward", "gradient", "tangents8"):
+        name = "forward_vs_eager" if quantity == "forward" else f"{quantity}_vs_eager"
+        pairs[name] = (f"{quantity}.{equal}.reference", f"{quantity}.{equal}.{engine}")
+        pairs[f"{quantity}_garment_vs_eager"] = (f"{quantity}.garment.reference", f"{quantity}.garment.{engine}")
+    for case, suffix in ((equal, "_everywhere"), (default, ""), ("standard-usual", "_usual"), ("garment", "_garment")):
+        for quantity in ("tangents8", "gradient"):
+            pairs[f"{quantity}_vs_forward{suffix}"] = (f"{quantity}.{case}.{engine}", f"forward.{case}.{engine}")
+    one = f"forward.{default}.batch-1.{engine}"
+    for size in (8, 32):
+        pairs[f"batch{size}_vs_batch1"] = (f"forward.{default}.batch-{size}.{engine}", one)
+    return {name: (*pair, 1.0) for name, pair in pairs.items()}
+
+
+def _growth(records: Mapping[str, Record], engine: str) -> dict[str, float]:
+    """How far cost is from proportional to triangles and to substeps, and tangents' memory from constant."""
+    found = {}
+    sizes = [r for key, r in records.items() if key.startswith("forward.sheet-") and key.endswith(f".size.{engine}")]
+    if len(sizes) > 1:
+        middle = min(sizes, key=lambda r: abs(r["triangles"] - 800))
+        largest = max(sizes, key=lambda r: r["triangles"])
+        each = [r["seconds"] / r["triangles"] for r in (largest, middle)]
+        found["linear_in_triangles"] = each[0] / each[1]
+    lengths = [r for key, r in records.items() if ".steps-" in key and key.endswith(engine)]
+    steps = sorted((r["substeps"], r["seconds"]) for r in lengths)
+    if len(steps) > 1:
+        found["linear_in_substeps"] = steps[-1][1] / steps[-1][0] / (steps[0][1] / steps[0][0])
+    return found

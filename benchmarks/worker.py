@@ -1,0 +1,150 @@
+"""A contestant in a process of its own: compiled code, thread pools and memory do not meet.
+
+One JSON object a line each way: {"prepare": task, "run": flag}, {"sample": shortest seconds} and {"result": {}} are
+answered in turn.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict
+from typing import IO, Any
+
+import numpy as np
+
+from . import measure
+from .contestant import Outcome, Task, Unsupported
+
+
+class Failed(Exception):
+    """A contestant could not do what it was asked."""
+
+
+class Worker:
+    """The near end; use as a context."""
+
+    def __init__(self, name: str, threads: int) -> None:
+        self.name = name
+        start = time.perf_counter()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
+        environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "MKL_NUM_THREADS": str(threads)}
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", __spec__.name, name, str(threads)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            text=True,
+            env=environment,
+        )
+        self.threads = self._answer()["threads"]
+        self.ready = time.perf_counter() - start  # s
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def prepare(self, task: Task) -> float:
+        """Build, compile and run once; seconds of that."""
+        return self._ask({"prepare": asdict(task), "run": True})["seconds"]
+
+    def build(self, task: Task) -> float:
+        """Without the run; memory of the process after it [MiB]."""
+        return self._ask({"prepare": asdict(task), "run": False})["mebibytes"]
+
+    def sample(self, shortest: float = measure.SHORTEST) -> float:
+        """Seconds per run."""
+        return self._ask({"sample": shortest})["seconds"]
+
+    def result(self) -> tuple[Outcome, float]:
+        """What the last run computed, and this process's peak memory [MiB]."""
+        answer = self._ask({"result": {}})
+        fields = {name: _array(value) for name, value in answer["outcome"].items()}
+        return Outcome(**fields), answer["mebibytes"]
+
+    def close(self) -> None:
+        """End the process."""
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()  # type: ignore[union-attr]
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._errors.close()
+
+    def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        try:
+            self._process.stdin.write(json.dumps(request) + "\n")  # type: ignore[union-attr]
+            self._process.stdin.flush()  # type: ignore[union-attr]
+        except OSError:
+            pass  # it died: the answer says why
+        return self._answer()
+
+    def _answer(self) -> dict[str, Any]:
+        line = self._process.stdout.readline()  # type: ignore[union-attr]
+        if not line:
+            self._errors.seek(0)
+            last = self._errors.read().decode(errors="replace").strip().splitlines()[-1:]
+            raise Failed(f"{self.name} ended: {' '.join(last) or 'no message'}")
+        answer = json.loads(line)
+        if "unsupported" in answer:
+            raise Unsupported(answer["unsupported"])
+        if "error" in answer:
+            raise Failed(f"{self.name}: {answer['error']}")
+        return answer
+
+
+def _serve(name: str, threads: int) -> None:
+    """The far end."""
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # what simulators print must not mix with the answers
+    from .contestants import build
+
+    contestant = build(name, threads)
+    _say(answers, {"threads": contestant.threads})
+    run, outcome = None, None
+    for line in sys.stdin:
+        request = json.loads(line)
+        try:
+            if "prepare" in request:
+                start = time.perf_counter()
+                run = contestant.prepare(Task(**request["prepare"]))
+                outcome = run() if request["run"] else None
+                _say(answers, {"seconds": time.perf_counter() - start, "mebibytes": measure.resident()})
+            elif "sample" in request and run is not None:
+                seconds, outcome = measure.sample(run, request["sample"])
+                _say(answers, {"seconds": seconds})
+            elif outcome is not None:
+                fields = {key: _plain(value) for key, value in outcome._asdict().items()}
+                _say(answers, {"outcome": fields, "mebibytes": measure.peak()})
+        except Unsupported as error:
+            _say(answers, {"unsupported": str(error)})
+        except Exception as error:
+            _say(answers, {"error": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"})
+
+
+def _say(answers: IO[str], answer: dict[str, Any]) -> None:
+    answers.write(json.dumps(answer) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    """For JSON; of the other derivatives only what the checks need."""
+    if isinstance(value, tuple):
+        return [[float(np.abs(part).max()) if np.isfinite(part).all() else float("nan")] for part in value]
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _array(value: Any) -> Any:
+    return np.array(value) if isinstance(value, list) else value
+
+
+if __name__ == "__main__":
+    _serve(sys.argv[1], int(sys.argv[2]))

@@ -1,0 +1,66 @@
+"""The peers simulate what torchcloth does: each in a process of its own, where it is installed."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchcloth.benchmarks import contestants, guards
+from torchcloth.benchmarks.contestant import Task, Unsupported
+from torchcloth.benchmarks.ours import Ours
+from torchcloth.benchmarks.worker import Failed, Worker
+
+STEPS = 60
+
+
+def worker(name):
+    if name in contestants.absent():
+        pytest.skip(f"{name} is not installed")
+    return Worker(name, 1)
+
+
+def compare(name, task, truth_case, limit):
+    truth = Ours("reference", 1).prepare(replace(task, case=truth_case))()  # float64
+    with worker(name) as far:
+        far.prepare(task)
+        found = far.result()[0]
+    case = task.scene()
+    assert guards.problems(case, task.substeps, found.x) == []
+    assert guards.disagreement(case, truth, found, limit) == []
+
+
+SLOW = pytest.mark.slow  # Taichi compiles for seconds, its gradient for minutes
+
+
+@pytest.mark.parametrize("name", ["warp", pytest.param("taichi", marks=SLOW)])
+def test_mpm_moves_as_our_own(name):
+    """Position by position as ``transfer="apic"``: the same scheme, written three times."""
+    compare(name, Task("standard-everywhere", "forward", STEPS, small=True), "standard-apic", guards.SAME)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["warp", pytest.param("taichi", marks=pytest.mark.slow)],  # Taichi compiles its gradient for minutes
+)
+def test_mpm_gradients_are_our_own(name):
+    compare(name, Task("standard-everywhere", "gradient", STEPS, small=True), "standard-apic", guards.SAME)
+
+
+@pytest.mark.parametrize("name", ["newton", "mujoco"])
+def test_mesh_simulators_move_alike(name):
+    """Other laws of stretch, the same linear elasticity."""
+    compare(name, Task("sheet-200", "forward", STEPS), "sheet-200", guards.OTHER)
+
+
+@pytest.mark.parametrize("name", contestants.PEERS)
+def test_what_is_not_offered_is_said(name):
+    with worker(name) as far, pytest.raises(Unsupported):
+        far.prepare(Task("sheet-200", "tangents8", 10))
+
+
+def test_a_contestant_that_fails_says_why():
+    with Worker("reference", 1) as far, pytest.raises(Failed, match="one of"):
+        far.prepare(Task("no such case", "forward", 1))
+    with pytest.raises(Failed, match="ended"):
+        Worker("nobody", 1)
+    assert torch.get_default_dtype() == torch.float64

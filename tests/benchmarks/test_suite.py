@@ -1,0 +1,147 @@
+"""Ratios, counts and the command."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from torchcloth.benchmarks import contestants, limits, report
+from torchcloth.benchmarks.cases import engines, make
+from torchcloth.benchmarks.measure import Timing, peak, resident, sample
+from torchcloth.benchmarks.ratios import CONVENTIONS, ratios
+from torchcloth.benchmarks.suite import Plan, entries
+
+ISSUE = (
+    "forward_vs_taichi",
+    "forward_vs_warp",
+    "forward_vs_eager",
+    "gradient_vs_taichi",
+    "gradient_vs_warp",
+    "tangents8_vs_forward",
+    "gradient_vs_forward",
+    "batch8_vs_batch1",
+)
+
+
+@pytest.fixture
+def made_up():
+    """A record for every entry of the full plan: so many seconds as the contestant's name has letters."""
+    plan = Plan(("fused", "reference"), tuple(contestants.PEERS))
+    found = {}
+    for entry in entries(plan):
+        for name in entry.names:
+            task = entry.task
+            size = {"substeps": task.substeps, "triangles": task.scene().triangles, "batch": task.batch}
+            found[entry.key(name)] = size | {"seconds": float(len(name)), "ms_per_substep": 1.0}
+    return found
+
+
+def test_ratios_come_from_the_cases(made_up):
+    made_up["tangents8.standard.fused"]["seconds"] = 15.0
+    made_up["forward.standard.batch-8.fused"]["seconds"] = 20.0
+    found = ratios(made_up, "fused")
+    assert set(ISSUE) <= set(found)
+    assert found["forward_vs_taichi"] == 6 / 5
+    assert found["gradient_vs_warp"] == 4 / 5
+    assert found["forward_vs_eager"] == 9 / 5
+    assert found["tangents8_vs_forward"] == 3.0
+    assert found["batch8_vs_batch1"] == 4.0
+    assert found["linear_in_triangles"] == pytest.approx(800 / 20_000, rel=1e-3)
+    assert found["linear_in_substeps"] == pytest.approx(0.1)
+
+
+def test_without_peers_their_ratios_are_left_out(made_up):
+    found = ratios({key: r for key, r in made_up.items() if not key.endswith("warp")}, "fused")
+    assert not any("warp" in name for name in found)
+    assert "forward_vs_taichi" in found
+
+
+def test_conventions_speak_of_ratios_that_exist(made_up):
+    found = ratios(made_up, "fused")
+    for name in ("tangents8_vs_forward", "gradient_vs_forward", "batch8_vs_batch1"):
+        assert name in found
+        assert any(name in convention for convention in CONVENTIONS)
+
+
+def test_entries_have_keys_of_their_own():
+    for fast in (False, True):
+        plan = Plan(("fused", "reference"), tuple(contestants.PEERS), fast=fast)
+        keys = [entry.key(name) for entry in entries(plan) for name in entry.names]
+        assert len(keys) == len(set(keys))
+
+
+def test_samples_are_seconds_of_one_run():
+    runs = []
+    seconds, last = sample(lambda: runs.append(len(runs)) or len(runs), shortest=0.01)
+    assert len(runs) > 1
+    assert seconds * len(runs) >= 0.01 * (1 - 1e-9)
+    assert last == len(runs)
+    assert Timing.of([3.0, 1.0, 2.0]) == Timing(2.0, 1.0, 3)
+
+
+def test_memory_is_seen():
+    before = resident()
+    block = bytearray(64 * 2**20)
+    block[::4096] = b"x" * len(block[::4096])
+    assert resident() - before == pytest.approx(64, abs=8)
+    assert peak() >= resident() - 1
+
+
+def test_limits_of_this_machine():
+    found = limits.measure(1)
+    assert 1e9 < found.bytes_per_second < 1e12
+    assert 1e9 < found.flops_per_second < 1e12
+    case = make("standard-everywhere")
+    counts, alone = limits.counts(case, 800), limits.counts(case, 0)
+    assert counts.flops > 5 * alone.flops
+    distance = found.distance(counts, 1e-3)
+    assert distance["times_the_limit"] == pytest.approx(1.0 / max(distance["arithmetic_ms"], distance["memory_ms"]))
+
+
+def test_the_plot(made_up, tmp_path):
+    path = report.plot({"cases": made_up}, tmp_path / "new")
+    assert path is not None
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert report.plot({"cases": {}}, tmp_path) is None
+
+
+def call(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "torchcloth.cli", "bench", *map(str, arguments)], capture_output=True, text=True
+    )
+
+
+def test_the_command_says_one_object(tmp_path):
+    done = call("--fast", "--json", "--threads", 1, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    (line,) = done.stdout.splitlines()
+    result = json.loads(line)
+    assert {"machine", "cases", "ratios", "conventions", "limits", "notes", "absent"} == set(result)
+    assert result["notes"] == {}
+    best = engines()[0]
+    for quantity in ("forward", "gradient", "tangents8"):
+        record = result["cases"][f"{quantity}.standard-everywhere.{best}"]
+        assert {"seconds", "substeps", "triangles", "ms_per_substep"} <= set(record)
+        assert record["ms_per_substep"] == pytest.approx(1e3 * record["seconds"] / record["substeps"])
+    assert {"forward_vs_eager", "tangents8_vs_forward", "gradient_vs_forward", "batch8_vs_batch1"} <= set(
+        result["ratios"]
+    )
+    assert result["cases"][f"startup.gradient.{best}"]["seconds"] > 0
+    assert result["cases"][f"memory.gradient.garment.{best}"]["peak_mebibytes"] > 0
+    assert json.loads((tmp_path / "out" / "bench.json").read_text()) == result
+
+
+def test_wrong_arguments_are_one_line(tmp_path):
+    (tmp_path / "file").touch()
+    for arguments in (("--threads", 0), ("--out", tmp_path / "file")):
+        done = call("--fast", *arguments)
+        assert done.returncode == 2
+        assert done.stderr.startswith("torchcloth: ")
+        assert done.stderr.count("\n") == 1
+
+
+def test_a_missing_peer_is_named_with_its_remedy(monkeypatch):
+    monkeypatch.setattr(contestants, "find_spec", lambda name: None)
+    assert set(contestants.absent()) == set(contestants.PEERS)
+    assert "pip install warp-lang" in contestants.absent()["warp"]
