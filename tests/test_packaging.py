@@ -161,6 +161,23 @@ def test_it_works_from_the_wheel(wheel, tmp_path):
     assert places == ["torchcloth", "torchcloth/benchmarks", "torchcloth/robots", "torchcloth/training"]
 
 
+def test_the_engine_came_along(wheel, inside, tmp_path):
+    """Where there is a compiler, the wheel holds the library for this processor, and takes that one."""
+    from torchcloth.engine import building
+
+    try:
+        building.compiler()
+    except building.Unbuilt as miss:
+        pytest.skip(str(miss))
+    built = f"torchcloth/engine/built/{building.file_name()}"
+    assert {name for name in inside if name.startswith("torchcloth/engine/built/")} == {built}
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path)
+    use = "from torchcloth.engine import library; library.library(); print(library.standing())"
+    said = call(sys.executable, "-c", use, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(tmp_path)})
+    assert said.strip() == f"built: {tmp_path / built}"
+
+
 def test_companions_refuse_another_name():
     """``import robots`` in a checkout is a mistake that would load a second copy."""
     for folder in ("benchmarks", "robots", "training"):

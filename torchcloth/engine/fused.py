@@ -55,10 +55,10 @@ class Fused:
         if self.outside is None:
             return self._call(state, fixed | _cut(moves, first, first + substeps), substeps, checkpoint)
         total: Impulses = {}
-        for begin in range(first, first + substeps, CHUNK):
-            run = partial(
-                self._shared, self.outside, dt, fixed, moves, range(begin, min(begin + CHUNK, first + substeps))
-            )
+        last = first + substeps
+        for begin in range(first, last, CHUNK):
+            chunk = range(begin, min(begin + CHUNK, last))
+            run = partial(self._shared, self.outside, dt, fixed, moves, chunk)
             again = checkpoint and torch.is_grad_enabled()
             state, impulses = (
                 recompute(run, state, use_reentrant=False, preserve_rng_state=False) if again else run(state)

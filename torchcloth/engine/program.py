@@ -24,6 +24,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from .library import kernels, library
 from .wrapped import array
@@ -75,7 +76,7 @@ class Program:
 
     # -- fields ---------------------------------------------------------------------------------------------------
 
-    def constant(self, values: np.ndarray | torch.Tensor, near: int = 0) -> Field:
+    def constant(self, values: ArrayLike | torch.Tensor, near: int = 0) -> Field:
         """Numbers [rows, comps] that never change; ``near``: the weights [count near V, 1] of a stencil."""
         data = np.ascontiguousarray(array(values), dtype=self._numpy)
         key = data.tobytes() + f"{near} {data.shape}".encode()

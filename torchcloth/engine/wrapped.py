@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
@@ -17,7 +18,7 @@ def is_wrapped(tensor: Tensor) -> bool:
     return False
 
 
-def array(values: np.ndarray | Tensor) -> np.ndarray:
+def array(values: ArrayLike | Tensor) -> np.ndarray:
     """The numbers, wrapped or not."""
     if not isinstance(values, Tensor):
         return np.asarray(values)

@@ -23,8 +23,13 @@ class Body(Protocol):
     steep: float
     limits: Field
 
-    def seen(self, loop: Loop, x: list[int]) -> tuple[list[int], list[int] | None]: ...
-    def change(self, loop: Loop, x: list[int], v: list[int]) -> list[int]: ...
+    def seen(self, loop: Loop, x: list[int]) -> tuple[list[int], list[int] | None]:
+        """What it is near a place."""
+        ...
+
+    def change(self, loop: Loop, x: list[int], v: list[int]) -> list[int]:
+        """Of a velocity there."""
+        ...
 
 
 class Points(NamedTuple):
