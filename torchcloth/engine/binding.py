@@ -16,7 +16,7 @@ from .program import Field
 
 def named(state: ClothState) -> dict[str, Tensor]:
     """What a program may carry, by the names of ``Lowering.carried``."""
-    return {"x": state.x, "v": state.v, **state.memory}
+    return {"x": state.x, "v": state.v, "d3": state.d3, **state.memory}
 
 
 def states(low: Lowering, state: ClothState) -> dict[Field, Tensor]:
@@ -53,7 +53,8 @@ def outcome(
     shaped = {f: t.reshape(*batch, *t.shape[1:]) for f, t in results.items()}
     after = {name: shaped[carried.after] for name, carried in low.carried.items()}
     impulses = {name: shaped[f].squeeze(-2) for name, f in low.impulses.items()}
-    return ClothState(after.pop("x"), after.pop("v"), before.d3, before.memory | after), impulses
+    x, v, d3 = after.pop("x"), after.pop("v"), after.pop("d3", before.d3)
+    return ClothState(x, v, d3, before.memory | after), impulses
 
 
 def _states(low: Lowering) -> set[Field]:

@@ -112,7 +112,7 @@ def _declare(lib: ctypes.CDLL, letter: str) -> None:
         "move": (number, [pointer, number, number, number, number]),
         "call": (number, [pointer, number, pointer, pointer, number]),
         "lookup": (number, [pointer] + [number] * 6),
-        "sieve": (None, [pointer] + [number] * 8 + [ctypes.c_double]),
+        "sieve": (None, [pointer] + [number] * 7 + [ctypes.c_double]),
         "stencil": (None, [pointer] + [number] * 5),
         "again": (None, [pointer, number]),
         "ready": (None, [pointer]),

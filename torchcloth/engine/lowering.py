@@ -38,6 +38,14 @@ class State(NamedTuple):
     after: Field
 
 
+class Motion(NamedTuple):
+    """Fields of a drive, one row for every substep."""
+
+    increment: Field  # [16]
+    pose: Field  # [16]
+    closed: Field  # [1], 0 or 1
+
+
 class Lowering:
     """A program under construction, and the tensors that it will be run on.
 
@@ -52,7 +60,7 @@ class Lowering:
         sheets: how the sheet is bent at its vertices, by the weights of the derivatives.
         inputs: parameter fields with their tensors [..., rows, comps].
         given: a parameter field without tensor, for the forces of parts that torch computes; None: there are none.
-        drives: by boundary, (increment [16], pose [16], closed [1]) fields.
+        drives: by boundary.
         impulses: by boundary, [6].
     """
 
@@ -76,7 +84,8 @@ class Lowering:
         self.corners = [self.program.table(c[order]) for c in array(model.geometry.corners).reshape(3, -1)]
         self.triangles = Triangles(self, order)
         self.sheets: dict[Field, Sheet] = {}
-        self.drives = {name: tuple(self.program.drive(comps) for comps in (16, 16, 1)) for name in drives}
+        drive = self.program.drive
+        self.drives = {name: Motion(drive(16), drive(16), drive(1)) for name in drives}
         self.impulses = {name: self.program.sum(6) for name in drives}
 
     def parameter(self, tensor: Tensor, near: int = 0) -> Field:

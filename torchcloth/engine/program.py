@@ -251,7 +251,10 @@ class Loop:
         self._loaded: dict[tuple[int, int], list[int]] = {}
 
     def load(self, field: Field, at: int | None = None) -> list[int]:
-        """Registers with a row of the field: the item's own, the one in table ``at``, or the only one."""
+        """Registers with a row of the field: the item's own, the one in table ``at``, or the only one.
+
+        The same registers whenever asked again: no loop reads what it writes.
+        """
         place = self._place(field, at)
         if (field.id, place) not in self._loaded:
             regs = self._loaded[field.id, place] = self._new(field.comps)
@@ -309,11 +312,10 @@ class Loop:
 
 
 class PointTables(NamedTuple):
-    """Points on triangles: three tables of one length, and the number of triangles."""
+    """Points on triangles, in the order of these."""
 
-    corners: int  # [3, E] vertices
-    starts: int  # [E + 1], where a triangle's points start in the next
-    points: int  # [P]
+    corners: int  # table [3, E] of vertices
+    starts: int  # table [E + 1] of the first points
     triangles: int
 
 

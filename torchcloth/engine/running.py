@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
+from math import prod
 from typing import NamedTuple
 
 import torch
@@ -76,11 +77,11 @@ def spacing(job: Job) -> int:
 
 def full_size(program: Program, scenes: int, substeps: int) -> int:
     """Bytes of the records of all substeps."""
-    return scenes * (substeps + 1) * program.record_size(True) * program.dtype.itemsize
+    return scenes * prod(record_shape(program, substeps, 1)) * program.dtype.itemsize
 
 
-def record_shape(program: Program, substeps: int, every: int) -> tuple[int, int]:
-    """(records, numbers of each) of one scene."""
+def record_shape(program: Program, substeps: int, every: int) -> tuple[int, ...]:
+    """Of the records of one scene."""
     return (0, 0) if every == 0 else (1 + -(-substeps // every), program.record_size(every == 1))
 
 

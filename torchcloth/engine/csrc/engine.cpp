@@ -83,7 +83,9 @@ struct Engine {
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
         return guarded([&] {                                                                                           \
             const int comps = engine.program.fields.at(field).comps;                                                   \
-            engine.loop().code.push_back({tc::Instruction::Code(code), field, table, reg, comps, -1, {}, {}});         \
+            auto& loop = engine.loop();                                                                                \
+            loop.code.push_back(                                                                                       \
+                {tc::Instruction::Code(code), field, table, reg, comps, -1, {}, {}, false, loop.slot(table)});         \
             engine.program.registers = std::max(engine.program.registers, reg + comps);                                \
         });                                                                                                            \
     }                                                                                                                  \
@@ -104,12 +106,12 @@ struct Engine {
             engine.program.registers = std::max(engine.program.registers, out + tc::CELL);                             \
         });                                                                                                            \
     }                                                                                                                  \
-    TC_API void tc_sieve_##s(void* e, int list, int x, int reach, int dt, int corners, int starts, int points,         \
-                             int triangles, double steep) {                                                            \
+    TC_API void tc_sieve_##s(void* e, int list, int x, int reach, int dt, int corners, int starts, int triangles,      \
+                             double steep) {                                                                           \
         auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
         p.lists = std::max(p.lists, list + 1);                                                                         \
         p.stages.push_back(                                                                                            \
-            std::make_unique<tc::Sieve<R>>(p, list, x, reach, dt, corners, starts, points, triangles, steep));         \
+            std::make_unique<tc::Sieve<R>>(p, list, x, reach, dt, corners, starts, triangles, steep));                 \
     }                                                                                                                  \
     TC_API void tc_stencil_##s(void* e, int table, int weight, int x, int y, int shape) {                              \
         static_cast<Engine<R>*>(e)->stencil(table, weight, x, y, tc::Shape(shape));                                    \

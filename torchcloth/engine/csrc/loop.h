@@ -21,12 +21,14 @@ struct Instruction {
     int kernel;
     std::vector<int> in, out;  // of a lookup: {first register, nodes along x, y, z} and {first register}
     bool feeds = false;        // another call reads what this one gives
+    int slot = 0;              // of its table among those of the loop
 };
 
 // The items of one run: all, or those of a list.
 struct Span {
     const int* list;
     int items;
+    const int* picked;  // rows of a list's items in this pack, by slot
     int at(int k) const { return list ? list[k] : k; }
 };
 
@@ -41,13 +43,34 @@ struct Loop : Stage<R> {
     int items, list;  // list: of a sieve; -1: all items
     bool flat;        // what it gives has no derivative
     std::vector<Instruction> code;
+    std::vector<int> tables;  // that it uses
 
     Loop(const Program<R>& p, const Kernel<R>* k, int n, int list, bool flat)
         : program(p), kernels(k), items(n), list(list), flat(flat) {}
 
-    Span span(const Scene<R>& s) const {
-        if (list < 0) return {nullptr, items};
-        return {s.lists[list].data(), int(s.lists[list].size())};
+    int slot(int table) {
+        const auto found = std::find(tables.begin(), tables.end(), table);
+        if (found != tables.end()) return int(found - tables.begin());
+        tables.push_back(table);
+        return int(tables.size()) - 1;
+    }
+    Span span(Scene<R>& s) const {
+        if (list < 0) return {nullptr, items, nullptr};
+        if (s.picked.size() < tables.size() * L) s.picked.resize(tables.size() * L);
+        return {s.lists[list].items.data(), s.lists[list].count, s.picked.data()};
+    }
+    // Look up once what all instructions on this pack need.
+    void pick(Scene<R>& s, int first) const {
+        if (list < 0) return;
+        const int* item = s.lists[list].items.data() + first;
+        for (size_t k = 0; k < tables.size(); k++) {
+            int* to = s.picked.data() + k * L;
+            if (tables[k] == OWN) std::copy(item, item + L, to);
+            else if (tables[k] >= 0) {
+                const int* index = program.tables[tables[k]].data();
+                for (int lane = 0; lane < L; lane++) to[lane] = index[item[lane]];
+            }
+        }
     }
     // Row of an item; items beyond the last count as the last.
     int row(const Instruction& i, int item, Span s) const {
@@ -63,10 +86,9 @@ struct Loop : Stage<R> {
     TC_INLINE void rows(const Instruction& i, int first, Span s, F f) const {
         const size_t step = pitch(i);
         if (s.list && i.table != SHARED && step <= 4) {
-            size_t places[L];
-            for (int lane = 0; lane < L; lane++) places[lane] = row(i, first + lane, s) * step;
-            if (step == 4) f([&](int lane) { return places[lane]; }, four);
-            else f([&](int lane) { return places[lane]; }, one);
+            const int* index = s.picked + i.slot * L;
+            if (step == 4) f([index](int lane) { return size_t(index[lane]) * 4; }, four);
+            else f([index](int lane) { return size_t(index[lane]); }, one);
         } else if (count(first, s) < L || i.table == SHARED || step > 4)
             f([this, &i, first, step, s](int lane) { return row(i, first + lane, s) * step; }, step);
         else if (i.table == OWN) {
@@ -141,7 +163,8 @@ struct Loop : Stage<R> {
         P* regs = s.regs.data;
         const Span all = span(s);
         for (const Instruction& i : code) if (is_shared(i)) gather(i, s.value[i.field], regs, 0, all);
-        for (int first = 0; first < all.items; first += L)
+        for (int first = 0; first < all.items; first += L) {
+            pick(s, first);
             for (const Instruction& i : code) switch (i.code) {
                 case Instruction::load: if (!is_shared(i)) gather(i, s.value[i.field], regs, first, all); break;
                 case Instruction::call: kernels[i.kernel].value(regs, i.in.data(), i.out.data()); break;
@@ -149,6 +172,7 @@ struct Loop : Stage<R> {
                 case Instruction::put: store(i, s.value[i.field], regs, first, all); break;
                 case Instruction::lookup: look(i, s.value[i.field], regs); break;
             }
+        }
     }
 
     void reverse(Scene<R>& s) const override {
@@ -158,6 +182,7 @@ struct Loop : Stage<R> {
         s.bars.clear();
         for (const Instruction& i : code) if (is_shared(i)) gather(i, s.value[i.field], regs, 0, all);
         for (int first = 0; first < all.items; first += L) {
+            pick(s, first);
             for (const Instruction& i : code) {
                 if (i.code == Instruction::load && !is_shared(i)) {
                     gather(i, s.value[i.field], regs, first, all);
@@ -217,7 +242,8 @@ struct Loop : Stage<R> {
                 gather(i, s.value[i.field], regs, 0, all);
                 gather_along(i, s.dot[i.field], dots, 0, all);
             }
-        for (int first = 0; first < all.items; first += L)
+        for (int first = 0; first < all.items; first += L) {
+            pick(s, first);
             for (const Instruction& i : code) switch (i.code) {
                 case Instruction::load:
                     if (is_shared(i)) break;
@@ -238,28 +264,40 @@ struct Loop : Stage<R> {
                     for (int k = 0; k < CELL * L; k++) dots[i.out[0] * L + k] = k < 3 * L ? dots[i.in[0] * L + k] : D(0.0);
                     break;
             }
+        }
+    }
+    // f(components), with the frequent number as a constant.
+    template <class F>
+    static TC_INLINE void components(const Instruction& i, F f) {
+        if (i.comps == 3) f(std::integral_constant<int, 3>{});
+        else f(i.comps);
     }
     void gather_along(const Instruction& i, const R* from, D* dots, int first, Span s) const {
         if (from == nullptr) return;
         const D* source = reinterpret_cast<const D*>(from);
+        D* to = dots + size_t(i.reg) * L;
         rows(i, first, s, [&](auto place, auto) {
-            for (int lane = 0; lane < L; lane++) {
-                const D* at = source + place(lane);
-                for (int c = 0; c < i.comps; c++) dots[(i.reg + c) * L + lane] = at[c];
-            }
+            components(i, [&](auto comps) {
+                for (int lane = 0; lane < L; lane++) {
+                    const D* at = source + place(lane);
+                    for (int c = 0; c < comps; c++) to[c * L + lane] = at[c];
+                }
+            });
         });
     }
     void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds, Span s) const {
         D* target = reinterpret_cast<D*>(to);
+        const D* from = dots + size_t(i.reg) * L;
         const int lanes = count(first, s);
         rows(i, first, s, [&](auto place, auto) {
-            for (int lane = 0; lane < lanes; lane++) {
-                D* at = target + place(lane);
-                for (int c = 0; c < i.comps; c++) {
-                    const D& x = dots[(i.reg + c) * L + lane];
-                    at[c] = adds ? at[c] + x : x;
-                }
-            }
+            components(i, [&](auto comps) {
+                if (adds)
+                    for (int lane = 0; lane < lanes; lane++)
+                        for (int c = 0; c < comps; c++) target[place(lane) + c] = target[place(lane) + c] + from[c * L + lane];
+                else
+                    for (int lane = 0; lane < lanes; lane++)
+                        for (int c = 0; c < comps; c++) target[place(lane) + c] = from[c * L + lane];
+            });
         });
     }
 };

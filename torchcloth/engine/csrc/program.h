@@ -58,13 +58,20 @@ struct Buffer {  // aligned, zero at first
     void clear() { std::memset(static_cast<void*>(data), 0, size * sizeof(R)); }
 };
 
+// Items that a sieve has found, padded to whole packs.
+struct List {
+    std::vector<int> items;
+    int count = 0;
+};
+
 // One simulated scene, or one scene with some directions: everything that changes.
 template <class R>
 struct Scene {
     std::vector<R*> value, bar, dot;  // by field; null where there is none
     Buffer<Wide<R>> regs, bars;
     Buffer<Along<R>> dots;            // [register][lane]
-    std::vector<std::vector<int>> lists;  // items that sieves have found
+    std::vector<List> lists;          // by sieve
+    std::vector<int> picked;          // rows of the items of a pack, by table of the loop
 };
 
 template <class R>

@@ -14,6 +14,7 @@
 #pragma once
 
 #include <cstdint>
+#include <type_traits>
 #include <utility>
 
 #include "functions.h"
@@ -249,11 +250,30 @@ void adjoint(const Wide<R>* regs, Wide<R>* bar, const int* in, const int* out) {
 
 // ---- forward tangents ----------------------------------------------------------------------------------------------
 
-constexpr int DIRECTIONS = 8;  // at once
+constexpr int DIRECTIONS = 4;  // at once
 template <class R>
 using Along = Pack<R, DIRECTIONS>;
 
-// Partials of all lanes at once; then each lane goes through the operations with its directions side by side.
+// So many items have their directions side by side in a pack.
+template <class R>
+constexpr int BESIDE = LANES<R> / DIRECTIONS;
+
+// Each direction gets the number of its item: lanes `first`, first + 1, ... of a pack.
+template <class R>
+struct Spread {
+    typedef std::conditional_t<sizeof(R) == 4, int32_t, int64_t> Index;
+    typedef Index Indices __attribute__((vector_size(WIDTH)));
+    Indices index;
+    explicit Spread(int first) {
+        for (int i = 0; i < LANES<R>; i++) index[i] = first + i / DIRECTIONS;
+    }
+    Wide<R> operator()(const Wide<R>& pack) const {
+        if constexpr (BESIDE<R> == 1) return Wide<R>(typename Wide<R>::Lanes{} + pack.v[index[0]]);
+        else return Wide<R>(__builtin_shuffle(pack.v, index));
+    }
+};
+
+// Partials of all lanes at once; then the lanes go through the operations with their directions side by side.
 template <class K, int I, class P>
 TC_INLINE void partials(const P* v, P* p, P* q) {
     constexpr Node n = traced<K>.tape.node[I];
@@ -263,14 +283,13 @@ TC_INLINE void partials(const P* v, P* p, P* q) {
     }
 }
 
-template <class K, int I, class P, class D>
-TC_INLINE void along(const P* v, const P* p, const P* q, int lane, D* t) {
+template <class K, int I, class P, class Number>
+TC_INLINE void along(const P* v, const P* p, const P* q, Number number, P* t) {
     constexpr Node n = traced<K>.tape.node[I];
     constexpr const Trace& k = traced<K>;
     if constexpr (k.varies[I] && n.op != Op::input) {
-        auto number = [&](const P& pack) { return D(typename D::Lanes{} + pack.v[lane]); };
         if constexpr (n.op == Op::select) {
-            const D a = k.varies[n.a] ? t[n.a] : D(0.0), b = k.varies[n.b] ? t[n.b] : D(0.0);
+            const P a = k.varies[n.a] ? t[n.a] : P(0.0), b = k.varies[n.b] ? t[n.b] : P(0.0);
             t[I] = select(number(v[n.c]), a, b);
         } else if constexpr (n.op == Op::mulc) t[I] = t[n.a] * n.value;
         else if constexpr (n.op == Op::rsubc || n.op == Op::neg) t[I] = -t[n.a];
@@ -295,29 +314,29 @@ TC_INLINE void along(const P* v, const P* p, const P* q, int lane, D* t) {
 
 template <class K, class P, int... I>
 TC_INLINE void all_partials(const P* v, P* p, P* q, std::integer_sequence<int, I...>) { (partials<K, I>(v, p, q), ...); }
-template <class K, class P, class D, int... I>
-TC_INLINE void all_along(const P* v, const P* p, const P* q, int lane, D* t, std::integer_sequence<int, I...>) {
-    (along<K, I>(v, p, q, lane, t), ...);
+template <class K, class P, class Number, int... I>
+TC_INLINE void all_along(const P* v, const P* p, const P* q, Number number, P* t, std::integer_sequence<int, I...>) {
+    (along<K, I>(v, p, q, number, t), ...);
 }
 
 template <class K, class R>
 void tangent(Wide<R>* regs, Along<R>* dots, const int* in, const int* out) {
     using P = Wide<R>;
-    using D = Along<R>;
     constexpr const Trace& k = traced<K>;
     constexpr int L = LANES<R>;
     P v[k.tape.size], p[k.tape.size], q[k.tape.size];
     for (int i = 0; i < K::inputs; i++) v[i] = regs[in[i]];
     all_forward<K>(v, Operations<K>{});
     all_partials<K>(v, p, q, Operations<K>{});
-    for (int lane = 0; lane < L; lane++) {
-        D t[k.tape.size];
-        for (int i = 0; i < K::inputs; i++) if (k.varies[i]) t[i] = dots[in[i] * L + lane];
-        all_along<K>(v, p, q, lane, t, Operations<K>{});
+    auto place = [&](int reg, int lane) -> P& { return *reinterpret_cast<P*>(dots + reg * L + lane); };
+    for (int lane = 0; lane < L; lane += BESIDE<R>) {
+        P t[k.tape.size];
+        for (int i = 0; i < K::inputs; i++) if (k.varies[i]) t[i] = place(in[i], lane);
+        all_along<K>(v, p, q, Spread<R>(lane), t, Operations<K>{});
         for (int i = 0; i < K::outputs; i++) {
-            const D result = k.varies[k.out[i]] ? t[k.out[i]] : D(0.0);
-            D& place = dots[(out[i] >= 0 ? out[i] : ~out[i]) * L + lane];
-            place = out[i] >= 0 ? result : place + result;
+            const P result = k.varies[k.out[i]] ? t[k.out[i]] : P(0.0);
+            P& there = place(out[i] >= 0 ? out[i] : ~out[i], lane);
+            there = out[i] >= 0 ? result : there + result;
         }
     }
     for (int i = 0; i < K::outputs; i++)

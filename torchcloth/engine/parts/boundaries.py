@@ -8,11 +8,12 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from ...boundaries import AbstractBoundary, Box, Capsule, Cylinder, Grasp, MeshSolid, Plane, Sphere
+from ...boundaries import AbstractBoundary, AbstractCollider, Box, Capsule, Cylinder, Grasp, MeshSolid, Plane, Sphere
 from ...effects import GripSlip
 from ..lowering import Lowering, Unfused, Velocities
 from ..program import Field
-from .colliders import collide
+from . import points
+from .body import Body
 
 
 def lower(low: Lowering, name: str, boundary: AbstractBoundary, velocity: Velocities) -> None:
@@ -33,6 +34,14 @@ def _grasp(low: Lowering, name: str, grasp: Grasp, velocity: Velocities) -> None
     loop, (increment, _, closed) = velocity.loop, low.drives[name]
     numbers = (increment, low.dt, _held(low, grasp.index), closed, low.x.now)
     velocity.now = loop.call("grasp", *(loop.load(field) for field in numbers), velocity.now)
+
+
+def _collide(low: Lowering, name: str, solid: AbstractCollider, velocity: Velocities) -> None:
+    body = Body(low, name, solid)
+    if solid.points is not None:
+        points.collide(low, solid.points, body, velocity)
+    loop = velocity.loop
+    velocity.now = loop.call("plus3", velocity.now, body.change(loop, loop.load(low.x.now), velocity.now))
 
 
 def _held(low: Lowering, index: Tensor) -> Field:
@@ -67,5 +76,5 @@ def _report(low: Lowering, name: str, velocity: Velocities) -> None:
 
 _BOUNDARIES: dict[type, Callable[[Lowering, str, Any, Velocities], None]] = {
     Grasp: _grasp,
-    **dict.fromkeys((Box, Capsule, Cylinder, MeshSolid, Plane, Sphere), collide),
+    **dict.fromkeys((Box, Capsule, Cylinder, MeshSolid, Plane, Sphere), _collide),
 }

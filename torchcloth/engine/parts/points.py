@@ -6,7 +6,7 @@ remember what they saw at every point.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,21 +15,7 @@ from ...boundaries.collider import PASSES
 from ...boundaries.points import TrianglePoints
 from ..lowering import Lowering, Velocities
 from ..program import Field, Loop, PointTables
-
-
-class Body(Protocol):
-    """What is needed of a collider; see ``colliders``."""
-
-    steep: float
-    limits: Field
-
-    def seen(self, loop: Loop, x: list[int]) -> tuple[list[int], list[int] | None]:
-        """What it is near a place."""
-        ...
-
-    def change(self, loop: Loop, x: list[int], v: list[int]) -> list[int]:
-        """Of a velocity there."""
-        ...
+from .body import Body
 
 
 class Points(NamedTuple):
@@ -90,14 +76,16 @@ def _points(low: Lowering, given: TrianglePoints) -> Points:
     index, weight = given.index.view(3, -1).cpu().numpy(), given.weight[..., 0].cpu().numpy()
     faces = low.model.geometry.corners.view(3, -1).cpu().numpy()
     owner = _owners(index, weight, faces, low.vertices)
+    order = np.argsort(owner, kind="stable")
+    index, weight = index[:, order], weight[:, order]
     mobile = weight * given.mobility[:, 0].cpu().numpy()[index]
-    starts = np.searchsorted(owner, np.arange(faces.shape[1] + 1), sorter=(order := np.argsort(owner, kind="stable")))
+    starts = np.searchsorted(owner[order], np.arange(faces.shape[1] + 1))
     table, constant = low.program.table, low.program.constant
     return Points(
         [table(corner) for corner in index],
         constant(weight.T),
         constant(mobile.T),
-        PointTables(table(faces), table(starts), table(order), faces.shape[1]),
+        PointTables(table(faces), table(starts), faces.shape[1]),
     )
 
 

@@ -1,4 +1,4 @@
-"""Solid bodies: the response of ``boundaries/collider.py``, at the vertices and at points on the triangles."""
+"""Solid bodies: the response of ``boundaries/collider.py`` to what touches them."""
 
 from __future__ import annotations
 
@@ -8,18 +8,9 @@ from typing import Any
 import torch
 
 from ...boundaries import AbstractCollider, Coulomb, Elliptic, Stribeck
-from ..lowering import Lowering, Unfused, Velocities
+from ..lowering import Lowering, Unfused
 from ..program import Field, Loop
-from . import points, solids
-
-
-def collide(low: Lowering, name: str, solid: AbstractCollider, velocity: Velocities) -> None:
-    """Stop what approaches."""
-    body = Body(low, name, solid)
-    if solid.points is not None:
-        points.collide(low, solid.points, body, velocity)
-    loop = velocity.loop
-    velocity.now = loop.call("plus3", velocity.now, body.change(loop, loop.load(low.x.now), velocity.now))
+from . import solids
 
 
 class Body:
@@ -36,7 +27,7 @@ class Body:
             raise Unfused(f"boundary {name!r} (friction {type(solid.friction).__name__})")
         self._low, self._distance, self.steep = low, solids.distance(low, solid), solids.steepness(solid)
         self._law, *self._numbers = law(low, solid.friction)
-        self.limits = low.program.constant([[solid.offset, solid.recovery]])
+        self.limits = low.program.constant(torch.tensor([[solid.offset, solid.recovery]], dtype=low.program.dtype))
         self._place = _place(low, name, solid)
 
     def seen(self, loop: Loop, x: list[int]) -> tuple[list[int], list[int] | None]:
