@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from inspect import signature
 from typing import NamedTuple
 
 import numpy as np
@@ -104,7 +103,7 @@ def make(name: str, small: bool = False) -> Case:
 
 def engines() -> list[str]:
     """Engines of the installed torchcloth, the best first."""
-    return ["fused", "reference"] if "engine" in signature(tc.Cloth).parameters else ["reference"]
+    return ["fused", "reference"]
 
 
 def make_cloth(case: Case, engine: str) -> tc.Cloth:
@@ -116,7 +115,6 @@ def make_cloth(case: Case, engine: str) -> tc.Cloth:
     if engine not in engines():
         raise InvalidInput("engine", got=repr(engine), expected=f"one of {', '.join(engines())}")
     grasps = {name: tc.boundaries.Grasp(vertices) for name, vertices in case.held.items()}
-    choice = {} if engines() == ["reference"] else {"engine": engine}
     return tc.Cloth(
         case.mesh,
         tc.materials.AEP(**MATERIAL),  # type: ignore[arg-type]
@@ -125,7 +123,7 @@ def make_cloth(case: Case, engine: str) -> tc.Cloth:
         {**case.boundaries(), **grasps},
         case.contact,
         case.transfer,  # type: ignore[arg-type]
-        **choice,
+        engine,  # type: ignore[arg-type]
     )
 
 

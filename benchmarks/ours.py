@@ -6,12 +6,10 @@ from collections.abc import Callable, Mapping
 from typing import cast
 
 import torch
-import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
-from torch.func import functional_call
 
 import torchcloth as tc
-from torchcloth.forward_mode import real_tangents
+from torchcloth.sensitivities import Directions
 
 from .cases import DT, Scene, stage
 from .contestant import DIRECTIONS, Contestant, Outcome, Task
@@ -71,20 +69,11 @@ def _tangents(scene: Scene) -> Callable[[], Outcome]:
 
 
 def tangents(scene: Scene, raws: Mapping[str, Tensor], directions: Tensor) -> tuple[Tensor, Tensor]:
-    """End [V, 3] m, and the frames' derivatives [K, T, V, 3] along ``directions`` [K, parameters], unconstrained ones.
-
-    The K directions run as a batch of dual numbers.
-    """
-    count = len(directions)
-    state = scene.cloth.state(scene.x.expand(count, *scene.x.shape))
-    with torch.no_grad(), forward_ad.dual_level(), real_tangents():
-        entries = {
-            name: forward_ad.make_dual(raw.detach().expand(count).contiguous(), column.contiguous()).unsqueeze(-1)
-            for (name, raw), column in zip(raws.items(), directions.T, strict=True)
-        }
-        rollout = functional_call(scene.cloth, entries, (state, scene.motion, scene.times), {"dt": LIMIT})
-        primal, tangent = forward_ad.unpack_dual(rollout.x)
-        return primal[0, -1].clone(), cast("Tensor", tangent).clone()
+    """End [V, 3] m, and the frames' derivatives [K, T, V, 3] along ``directions`` [K, unconstrained parameters]."""
+    along = Directions({name: column.contiguous() for name, column in zip(raws, directions.T, strict=True)})
+    state = scene.cloth.state(scene.x)
+    rollout, moved = scene.cloth.sensitivities(state, scene.motion, scene.times, along=along, dt=LIMIT)
+    return rollout.x[-1].clone(), moved.x
 
 
 def _counts(cloth: tc.Cloth, name: str, raw: Tensor) -> bool:

@@ -180,6 +180,7 @@ def test_doctor_says_what_is_installed(capsys):
     assert main(["doctor"]) == 0
     said = capsys.readouterr().out
     assert f"torchcloth {metadata.version('torchcloth')}" in said
+    assert re.search(r"^engine +(built|will be built|not available)", said, re.MULTILINE)
     assert re.search(r"^trimesh +installed$", said, re.MULTILINE)
 
 

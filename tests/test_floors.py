@@ -23,7 +23,9 @@ FLOORS = (
     ("self_contact", "strain", "dynamics"),
     ("apic",),
     ("functional", "stability", "recordings", "losses", "engine"),
-    ("observe", "intervals", "validation"),
+    ("observe", "validation"),
+    ("intervals",),
+    ("sensitivities",),
     ("cloth", "robots"),
     ("identification", "diagnosis", "plan", "testing"),
     ("",),  # torchcloth/__init__.py: the names a user sees

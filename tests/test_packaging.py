@@ -114,7 +114,9 @@ def test_all_modules_are_inside_and_nothing_else(inside):
 def test_data_is_inside(inside):
     urdf = {f"torchcloth/robots/urdf/{file.name}" for file in (ROOT / "robots" / "urdf").glob("*.urdf")}
     assert len(urdf) >= 3
-    assert urdf | {"torchcloth/py.typed", "torchcloth/materials/fabrics.csv"} <= inside
+    engine = {file.relative_to(ROOT).as_posix() for file in (ROOT / "torchcloth/engine/csrc").rglob("*.[ch]*")}
+    assert {"torchcloth/engine/csrc/run.h", "torchcloth/engine/csrc/engine.cpp"} <= engine
+    assert urdf | engine | {"torchcloth/py.typed", "torchcloth/materials/fabrics.csv"} <= inside
     assert any(name.endswith("licenses/LICENSE") for name in inside)
 
 
@@ -157,6 +159,23 @@ def test_it_works_from_the_wheel(wheel, tmp_path):
     out = call(sys.executable, "-c", USE, cwd=elsewhere, env={**os.environ, "PYTHONPATH": str(unpacked)})
     places = [Path(line).parent.relative_to(unpacked).as_posix() for line in out.splitlines()]
     assert places == ["torchcloth", "torchcloth/benchmarks", "torchcloth/robots", "torchcloth/training"]
+
+
+def test_the_engine_came_along(wheel, inside, tmp_path):
+    """Where there is a compiler, the wheel holds the library for this processor, and takes that one."""
+    from torchcloth.engine import building
+
+    try:
+        building.compiler()
+    except building.Unbuilt as miss:
+        pytest.skip(str(miss))
+    built = f"torchcloth/engine/built/{building.file_name()}"
+    assert {name for name in inside if name.startswith("torchcloth/engine/built/")} == {built}
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path)
+    use = "from torchcloth.engine import library; library.library(); print(library.standing())"
+    said = call(sys.executable, "-c", use, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(tmp_path)})
+    assert said.strip() == f"built: {tmp_path / built}"
 
 
 def test_companions_refuse_another_name():

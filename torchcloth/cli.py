@@ -206,7 +206,10 @@ def _doctor(options: argparse.Namespace) -> int:
 
     import torch
 
+    from .engine import library
+
     print(f"torchcloth {metadata.version('torchcloth')}, torch {torch.__version__}, CUDA {torch.cuda.is_available()}")
+    print(f"{'engine':20s} {library.standing()}")
     packages = {
         "pytorch_kinematics": "robots",
         "yourdfpy": "robots",

@@ -12,20 +12,20 @@ from torch import Tensor, nn
 
 from . import functional
 from .boundaries import AbstractBoundary
-from .boundaries.motion import drive, interpolate
 from .effects import AbstractEffect, MassDamping
+from .engine.choice import Choice, Setting, check_setting, choose, standing
 from .errors import InvalidInput
-from .intervals import Interval, advance
+from .intervals import Plan, held, run
 from .materials import AbstractMaterial
 from .meshes import Mesh
 from .parameters import PhysicalParameter
 from .self_contact import first_directors
+from .sensitivities import Directions, sensitivities
 from .stability import stable_step
 from .strain import grown_gradient, inverse_growth
 from .transfer import GAP, TURNED, Contact, Grid
 from .types import ClothState, Memory, Rollout, Trajectory
 from .validation import (
-    check_extent,
     check_field,
     check_grasps,
     check_motions,
@@ -51,6 +51,9 @@ class Cloth(nn.Module):
         transfer: "mesh": elastic forces act on the vertices, the grid carries contact only. "apic": the usual material
             point method, everything through the grid, for comparison; one contact point per triangle, no play, no
             collision damping, no added mass.
+        engine: what computes the substeps. "auto": the fused engine (C++, on the CPU, in float32 or float64) where it
+            knows the parts, else the torch reference; ``print`` of the cloth tells which and why. "fused": an error
+            where it cannot. "reference": always torch. The attribute of the same name may be set at any time.
 
     Raises:
         InvalidInput: a part that does not fit.
@@ -73,8 +76,10 @@ class Cloth(nn.Module):
         boundaries: Mapping[str, AbstractBoundary] | None = None,
         contact: Contact | None = Contact(),  # noqa: B008 - frozen, carries no state
         transfer: Literal["mesh", "apic"] = "mesh",
+        engine: Setting = "auto",
     ) -> None:
         super().__init__()
+        self.engine = engine
         self.transfer: Literal["mesh", "apic"] = transfer
         if transfer != "mesh":
             contact = check_transfer(transfer, contact).usual()
@@ -104,6 +109,15 @@ class Cloth(nn.Module):
         }
         for name, tensor in arrays.items():
             self.register_buffer(name, tensor, persistent=False)
+
+    @property
+    def engine(self) -> Setting:
+        """What computes the substeps: "auto", "reference" or "fused"."""
+        return self._engine
+
+    @engine.setter
+    def engine(self, setting: Setting) -> None:
+        self._engine: Setting = check_setting(setting)
 
     # -- states ---------------------------------------------------------------------------------------------------
 
@@ -150,19 +164,7 @@ class Cloth(nn.Module):
             UnstableStep: ``dt`` beyond the stability limit.
             SimulationDiverged: the state lost finiteness.
         """
-        frames = check_times(times)
-        motion = check_motions(motion or {}, self.boundaries, frames, self._area)
-        model = self.model()
-        limit = check_step(dt, self.stable_step())
-        state = self._start(state, model, motion)
-        states, wrenches = [state], []
-        for start, end in pairwise(frames):
-            count = max(1, int(np.ceil((end - start) / limit - 1e-9)))
-            state, impulses = advance(Interval(model, motion, start, end, count), state, checkpoint)
-            self._check_extent(state.x)
-            states.append(state)
-            wrenches.append({name: -impulse / (end - start) for name, impulse in impulses.items()})
-        return _collect(frames, states, wrenches, [name for name, b in self.boundaries.items() if b.driven])
+        return run(self.plan(state, motion or {}, times, dt), checkpoint)
 
     def settle(
         self,
@@ -184,23 +186,38 @@ class Cloth(nn.Module):
             duration: simulated time [s].
             rate: of the mass damping that is added meanwhile [1/s].
         """
-        frames = [start, start + duration]
-        held = {}
-        for name, trajectory in (motion or {}).items():
-            pose = interpolate(trajectory, torch.tensor([start], dtype=torch.float64).to(trajectory.pose))
-            closed = drive(trajectory, torch.tensor([start, start], dtype=trajectory.pose.dtype)).closed[0]
-            pose = pose.expand(*pose.shape[:-3], 2, 4, 4)
-            held[name] = Trajectory(torch.tensor(frames, dtype=torch.float64), pose, torch.tensor([closed, closed]))
-        held = check_motions(held, self.boundaries, frames, self._area)
-        damping = MassDamping(rate).to(self._area)
-        model = self.model()
-        state = self._start(state, model, held)
-        kept = {name: part for name, part in model.effects.items() if part[0].grasp is None}  # grips do not slip yet
-        model = model._replace(effects={**kept, "settling": (damping, damping.coefficients().detach())})
-        count = int(np.ceil(duration * (1 / self.stable_step() + rate)))
-        settled, _ = advance(Interval(model, held, start, start + duration, count), state, checkpoint=True)
-        self._check_extent(settled.x)
+        settled = run(self.settling(state, motion or {}, start, duration, rate), checkpoint=True).state
         return settled._replace(v=torch.zeros_like(settled.v))
+
+    def sensitivities(
+        self,
+        state: ClothState,
+        motion: Mapping[str, Trajectory] | None = None,
+        times: Tensor | Sequence[float] = (0.0, 1.0),
+        *,
+        along: Directions,
+        dt: float | None = None,
+        settle: float = 0.0,
+    ) -> tuple[Rollout, Rollout]:
+        """Simulate, and differentiate in K directions at once, by forward mode: exact, for the price of a few runs.
+
+        Memory does not grow with the number of substeps. Neither result is part of an autograd graph.
+
+        Args:
+            state: as for ``forward``, like motion, times and dt.
+            motion: likewise.
+            times: likewise.
+            dt: likewise.
+            along: the directions.
+            settle: first let the cloth come to rest for so long [s], as ``settle`` does; 0: not.
+
+        Returns:
+            The rollout, and its derivatives, which have K in front of every shape but that of ``t``.
+
+        Raises:
+            InvalidInput: directions that do not fit, and as ``forward``.
+        """
+        return sensitivities(self, state, motion or {}, times, along, dt, settle)
 
     def stable_step(self) -> float:
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
@@ -238,6 +255,31 @@ class Cloth(nn.Module):
     def energy(self, state: ClothState) -> dict[str, Tensor]:
         """Energies by name, each [...] J."""
         return functional.energy(self.model(), state)
+
+    def plan(
+        self, state: ClothState, motion: Mapping[str, Trajectory], times: Tensor | Sequence[float], dt: float | None
+    ) -> Plan:
+        """What ``forward`` does, checked."""
+        frames = check_times(times)
+        motion = check_motions(motion, self.boundaries, frames, self._area)
+        limit = check_step(dt, self.stable_step())
+        counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
+        return self._ready(self.model(), state, motion, frames, counts)
+
+    def settling(
+        self, state: ClothState, motion: Mapping[str, Trajectory], start: float, duration: float, rate: float
+    ) -> Plan:
+        """What ``settle`` does, checked."""
+        frames = [start, start + duration]
+        motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
+        count = int(np.ceil(duration * (1 / self.stable_step() + rate)))
+        return self._ready(self.settling_model(rate), state, motion, frames, [count])
+
+    def settling_model(self, rate: float) -> functional.Model:
+        """As ``model``, damped; grips do not slip yet."""
+        model, damping = self.model(), MassDamping(rate).to(self._area)
+        kept = {name: part for name, part in model.effects.items() if part[0].grasp is None}
+        return model._replace(effects={**kept, "settling": (damping, damping.coefficients().detach())})
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
@@ -284,15 +326,26 @@ class Cloth(nn.Module):
         corners = torch.cat([triangle] * 3, dim=-2)
         return triangle.new_zeros(*triangle.shape[:-2], *self._share.shape).index_add(-2, self._corners, corners)
 
-    def _start(self, state: ClothState, model: functional.Model, motion: Mapping[str, Trajectory]) -> ClothState:
+    def _ready(
+        self,
+        model: functional.Model,
+        state: ClothState,
+        motion: Mapping[str, Trajectory],
+        frames: list[float],
+        counts: list[int],
+    ) -> Plan:
         check_state(state, self._expected())
         state = expand_state(state, model, motion)
-        self._check_extent(state.x)
-        return state
+        plan = Plan(model, motion, frames, counts, state, self._choice(model, state), self._longest())
+        plan.check(state)
+        return plan
 
-    def _check_extent(self, x: Tensor) -> None:
-        if self._grid is not None:
-            check_extent(x, (self._grid.nodes - 4) * self._grid.spacing)
+    def _choice(self, model: functional.Model, state: ClothState) -> Choice:
+        return choose(self.engine, model, state, standing(model))
+
+    def _longest(self) -> float:
+        """Extent [m] that the contact grid has room for."""
+        return float("inf") if self._grid is None else (self._grid.nodes - 4) * self._grid.spacing
 
     def extra_repr(self) -> str:
         """Data sheet: size, contact, step."""
@@ -303,14 +356,6 @@ class Cloth(nn.Module):
             else f"layers rest {1e3 * GAP * self._grid.spacing:.3g} mm apart, unseen within "
             f"{1e3 * TURNED * self._grid.reach:.3g} mm along the cloth; {len(self._points)} point(s) per triangle"
         )
-        return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s"
-
-
-def _collect(frames: list[float], states: list[ClothState], wrenches: list[dict[str, Tensor]], names: list[str]):
-    x = torch.stack([s.x for s in states], dim=-3)
-    zero = x.new_zeros(*x.shape[:-3], 6)
-    wrench = {
-        name: torch.stack([zero, *(w.get(name, zero).expand_as(zero) for w in wrenches)], dim=-2) for name in names
-    }
-    v = torch.stack([s.v for s in states], dim=-3)
-    return Rollout(torch.tensor(frames, dtype=torch.float64), x, v, wrench, states[-1])
+        with torch.no_grad():
+            engine = self._choice(self.model(), self._expected())
+        return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s\nengine: {engine}"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -12,19 +13,25 @@ from torch.utils.checkpoint import checkpoint as recompute
 
 from . import functional
 from .boundaries import Drive, drive
+from .boundaries.motion import interpolate
+from .engine.choice import Choice
+from .engine.fused import Fused
 from .errors import SimulationDiverged
+from .functional import Impulses
 from .self_contact import CHUNK
-from .types import ClothState, Trajectory
+from .types import ClothState, Rollout, Trajectory
+from .validation import check_extent
 
 
 class Interval(NamedTuple):
-    """The time between two frames, in ``count`` equal substeps."""
+    """The time between two frames, in ``count`` equal substeps; ``fused``: the engine that runs them, or None."""
 
     model: functional.Model
     motion: Mapping[str, Trajectory]
     start: float  # s
     end: float  # s
     count: int
+    fused: Fused | None = None
 
     @property
     def dt(self) -> float:
@@ -41,30 +48,108 @@ class Interval(NamedTuple):
         return {name: drive(trajectory, times.to(trajectory.pose)) for name, trajectory in self.motion.items()}
 
 
-def advance(interval: Interval, state: ClothState, checkpoint: bool) -> tuple[ClothState, dict[str, Tensor]]:
+class Plan(NamedTuple):
+    """A simulation that has been checked and can begin."""
+
+    model: functional.Model
+    motion: Mapping[str, Trajectory]
+    frames: list[float]  # s
+    counts: list[int]  # substeps between them
+    state: ClothState  # at the first frame, with all batch dimensions
+    choice: Choice
+    longest: float  # m, extent that the contact grid has room for
+
+    def intervals(self) -> Iterator[Interval]:
+        """One after the other."""
+        for (start, end), count in zip(pairwise(self.frames), self.counts, strict=True):
+            yield Interval(self.model, self.motion, start, end, count, self.choice.fused)
+
+    def check(self, state: ClothState) -> None:
+        """Refuse a cloth that has been torn apart."""
+        if self.longest < float("inf"):
+            check_extent(state.x, self.longest)
+
+
+def run(plan: Plan, checkpoint: bool) -> Rollout:
+    """The whole simulation.
+
+    Raises:
+        SimulationDiverged: the state lost finiteness.
+    """
+    state, states, impulses = plan.state, [plan.state], []
+    for interval in plan.intervals():
+        state, given = advance(interval, state, checkpoint)
+        plan.check(state)
+        states.append(state)
+        impulses.append(given)
+    return collect(plan, states, impulses)
+
+
+def collect(plan: Plan, states: Sequence[ClothState], impulses: Sequence[Impulses]) -> Rollout:
+    """States at the frames and impulses between them, as a rollout."""
+    x, v = (torch.stack(part, dim=-3) for part in ([s.x for s in states], [s.v for s in states]))
+    zero, wrench = x.new_zeros(*x.shape[:-3], 6), {}
+    durations = [end - start for start, end in pairwise(plan.frames)]
+    for name in (name for name, boundary in plan.model.boundaries.items() if boundary.driven):
+        found = [-j[name] / d if name in j else zero for j, d in zip(impulses, durations, strict=True)]
+        wrench[name] = torch.stack([zero, *(f.expand_as(zero) for f in found)], dim=-2)
+    return Rollout(torch.tensor(plan.frames, dtype=torch.float64), x, v, wrench, states[-1])
+
+
+def held(motion: Mapping[str, Trajectory], start: float, end: float) -> dict[str, Trajectory]:
+    """Every body stands where it is at ``start``, with the same grasps closed."""
+    found, span = {}, torch.tensor([start, end], dtype=torch.float64)
+    for name, trajectory in motion.items():
+        pose = interpolate(trajectory, span[:1].to(trajectory.pose))
+        closed = drive(trajectory, span[:1].repeat(2).to(trajectory.pose)).closed[0]
+        found[name] = Trajectory(span, pose.expand(*pose.shape[:-3], 2, 4, 4), torch.tensor([closed, closed]))
+    return found
+
+
+def advance(interval: Interval, state: ClothState, checkpoint: bool) -> tuple[ClothState, Impulses]:
     """Simulate one interval; impulses are summed over it.
 
     Raises:
         SimulationDiverged: positions are not finite at its end.
     """
-    before, drives, total = state, interval.drives(), {}
+    before, drives = state, interval.drives()
+    if interval.fused is None:
+        state, total = _by_reference(interval, state, drives, checkpoint)
+    else:
+        state, total = interval.fused.rollout(state, interval.dt, drives, interval.count, checkpoint=checkpoint)
+    check_finite(interval, before, state)
+    return state, total
+
+
+def _by_reference(
+    interval: Interval, state: ClothState, drives: Mapping[str, Drive], checkpoint: bool
+) -> tuple[ClothState, Impulses]:
+    total: Impulses = {}
     for first in range(0, interval.count, CHUNK):
         substeps = min(CHUNK, interval.count - first)
         run = partial(functional.rollout, interval.model, dt=interval.dt, drives=drives, substeps=substeps, first=first)
         store = checkpoint and torch.is_grad_enabled()
         state, impulses = recompute(run, state, use_reentrant=False, preserve_rng_state=False) if store else run(state)
         total = {name: total[name] + value if name in total else value for name, value in impulses.items()}
-    if not bool(torch.isfinite(state.x.detach()).all()):
-        raise _divergence(interval, before)
     return state, total
+
+
+def check_finite(interval: Interval, before: ClothState, after: ClothState) -> None:
+    """Go through an interval again, substep by substep, to name the first vertex that was lost.
+
+    Raises:
+        SimulationDiverged: positions are not finite at its end.
+    """
+    if not bool(torch.isfinite(after.x.detach()).all()):
+        raise _divergence(interval, before)
 
 
 @torch.no_grad()
 def _divergence(interval: Interval, state: ClothState) -> SimulationDiverged:
-    """Go through the interval again, substep by substep, to name the first vertex that was lost."""
     drives, k, vertex = interval.drives(), 0, 0
+    run = partial(functional.rollout, interval.model) if interval.fused is None else interval.fused.rollout
     for k in range(interval.count):
-        state, _ = functional.step(interval.model, state, interval.dt, drives, k)
+        state, _ = run(state, interval.dt, drives, 1, k)
         lost = ~torch.isfinite(state.x).all(-1)
         if bool(lost.any()):
             vertex = int(lost.reshape(-1, lost.shape[-1]).any(0).nonzero()[0])

@@ -121,12 +121,10 @@ def tangents_transpose(cloth, motion, state: ClothState, substeps: int, dt: floa
     """Relative error of <seed, J dot> = <J^T seed, dot> of the engine, for random dots of all inputs."""
     with torch.no_grad():
         drives = drives_of(motion, substeps, dt, {name: t.pose for name, t in motion.items()})
-        model = cloth.model()
-        low = fused.lower(model, state, drives)
-        batch = state.x.shape[:-2]
-        values = fused._flat(fused._inputs(low, state, dt, drives), batch)
-        job = fused._job(low, substeps, values)
-        varied = {field for field in job.inputs if field is not low.dt}  # the step itself is not differentiated
+        engine = fused.Fused(cloth.model(), state, drives)
+        assert engine.outside is None, f"not on the engine: {engine.outside.parts}"
+        job = engine.job(state, dt, drives, substeps)
+        varied = {field for field in job.inputs if field != engine.low.dt}  # the step itself is not differentiated
         results, records = running.forward(job, 1)
         seeds = {f: scaled(noise(t.shape, k, t.dtype), t) for k, (f, t) in enumerate(results.items())}
         gradients = running.reverse(job, records, 1, seeds, varied)

@@ -154,8 +154,8 @@ def test_batch():
 def test_recomputed_substeps_are_bitwise_the_recorded_ones():
     cloth, state = folded(tc.Contact(spacing=SPACING))
     with torch.no_grad():
-        low = fused.lower(cloth.model(), state, {})
-        job = fused._job(low, 120, fused._flat(fused._inputs(low, state, 5e-5, {}), state.x.shape[:-2]))
+        engine = fused.Fused(cloth.model(), state, {})
+        job = engine.job(state, 5e-5, {}, 120)
     found = []
     for every in (1, 7, 120):
         results, records = running.forward(job, every)

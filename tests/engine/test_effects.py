@@ -7,7 +7,7 @@ from agreement import agree, difference, held, moving, noise, outcome
 import torchcloth as tc
 from torchcloth import functional
 from torchcloth.engine import fused
-from torchcloth.engine.lowering import Unfused
+from torchcloth.engine.lowering import Unfused, lower
 
 E = tc.effects
 TRIANGLES = 30
@@ -172,7 +172,7 @@ def test_an_effect_of_ones_own_is_not_taken_for_the_built_in():
 
     cloth = sheet({"g": Heavier()})
     with pytest.raises(Unfused, match="'g' \\(Heavier\\)"):
-        fused.rollout(cloth.model(), moving(cloth), 1e-4, {}, 1)
+        lower(cloth.model(), moving(cloth), {})
 
 
 def test_settling():

@@ -5,8 +5,7 @@ import torch
 from agreement import agree, moving, noise
 
 import torchcloth as tc
-from torchcloth.engine import fused
-from torchcloth.engine.lowering import Unfused
+from torchcloth.engine.lowering import Unfused, lower
 
 REACH = 0.04  # strain beyond which the weave no longer stiffens
 
@@ -91,4 +90,4 @@ def test_a_law_of_ones_own_is_not_taken_for_the_built_in():
     for material in (Own(6e4), tc.materials.AEP(6e4, plastic=OwnYield(0.1))):
         cloth = sheet(material)
         with pytest.raises(Unfused, match="Own"):
-            fused.rollout(cloth.model(), moving(cloth), 1e-4, {}, 1)
+            lower(cloth.model(), moving(cloth), {})

@@ -3,102 +3,149 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from functools import partial
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint as recompute
 
 from ..boundaries import Drive
 from ..dynamics import Impulses
 from ..model import Model
+from ..self_contact import CHUNK
 from ..types import ClothState
-from . import running
-from .lowering import DIRECTORS, Lowering, lower, remembered
+from . import binding, running
+from .lowering import fitted
+from .operators import Rollout
+from .outside import Outside
 from .program import Field
 from .running import Job
 
 
+class Fused:
+    """A model on the engine, for the length of one call of the cloth.
+
+    Attributes:
+        low: the program, with the numbers of the model.
+        outside: the parts that torch computes in every substep; None: there are none, and the engine runs by itself.
+
+    Raises:
+        Unfused: a part without kernels that torch cannot take over either.
+    """
+
+    def __init__(self, model: Model, state: ClothState, drives: Mapping[str, Drive]) -> None:
+        self.model = model
+        self._left = running.BUDGET  # bytes of records that the adjoint may find ready
+        self.low, parts = fitted(model, state, drives)
+        self.outside = Outside(model, parts) if parts else None
+        self._coefficients: dict[Field, Tensor] = {}
+
+    def rollout(
+        self,
+        state: ClothState,
+        dt: float,
+        drives: Mapping[str, Drive],
+        substeps: int,
+        first: int = 0,
+        checkpoint: bool = True,
+    ) -> tuple[ClothState, Impulses]:
+        """As ``functional.rollout``. ``checkpoint``: the adjoint keeps to a budget of memory, and recomputes beyond."""
+        fixed, moves = self.coefficients(dt, state.x.shape[:-2]), self.moves(state, drives)
+        if self.outside is None:
+            return self._call(state, fixed | _cut(moves, first, first + substeps), substeps, checkpoint)
+        total: Impulses = {}
+        last = first + substeps
+        for begin in range(first, last, CHUNK):
+            chunk = range(begin, min(begin + CHUNK, last))
+            run = partial(self._shared, self.outside, dt, fixed, moves, chunk)
+            again = checkpoint and torch.is_grad_enabled()
+            state, impulses = (
+                recompute(run, state, use_reentrant=False, preserve_rng_state=False) if again else run(state)
+            )
+            total = _sum(total, impulses)
+        return state, total
+
+    def job(self, state: ClothState, dt: float, drives: Mapping[str, Drive], substeps: int) -> Job:
+        """What the engine is given, as plain numbers; without parts outside."""
+        batch, program = state.x.shape[:-2], self.low.program
+        found = binding.flat(self.low, binding.states(self.low, state), batch) | self.moves(state, drives)
+        found |= self.coefficients(dt, batch)
+        return Job(program, {field: found[field] for field in program.inputs}, batch.numel(), substeps)
+
+    def coefficients(self, dt: float, batch: torch.Size) -> dict[Field, Tensor]:
+        """Inputs that stay the same over the substeps of a call."""
+        if not self._coefficients:
+            self._coefficients = binding.flat(self.low, self.low.inputs, batch)
+        return self._coefficients | {self.low.dt: torch.full((1, 1, 1), dt, dtype=self.low.program.dtype)}
+
+    def moves(self, state: ClothState, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
+        """Inputs with a row for every substep."""
+        return binding.flat(self.low, binding.moves(self.low, drives), state.x.shape[:-2])
+
+    def _shared(
+        self,
+        outside: Outside,
+        dt: float,
+        fixed: dict[Field, Tensor],
+        moves: dict[Field, Tensor],
+        substeps: range,
+        state: ClothState,
+    ) -> tuple[ClothState, Impulses]:
+        """Substeps in which torch has a part."""
+        total: Impulses = {}
+        for k in substeps:
+            force, memory = outside.force(state, dt)
+            state, impulses = self._call(state, fixed | _cut(moves, k, k + 1), 1, False, force)
+            state = state._replace(memory=state.memory | memory)
+            total = _sum(total, impulses)
+        return state, total
+
+    def _call(
+        self,
+        state: ClothState,
+        others: dict[Field, Tensor],
+        substeps: int,
+        checkpoint: bool,
+        force: Tensor | None = None,
+    ) -> tuple[ClothState, Impulses]:
+        low, program, batch = self.low, self.low.program, state.x.shape[:-2]
+        begin = binding.states(low, state)
+        if low.given is not None and force is not None:
+            begin[low.given] = force
+        by_field = binding.flat(low, begin, batch) | others
+        inputs = [by_field[field] for field in program.inputs]
+        every = self._every(batch.numel(), substeps, checkpoint) if _needs_gradient(inputs) else 0
+        *results, _ = Rollout.apply(program.number, substeps, every, *inputs)  # type: ignore[misc]
+        return binding.outcome(low, state, dict(zip(program.outputs, results, strict=True)), batch)
+
+    def _every(self, scenes: int, substeps: int, checkpoint: bool) -> int:
+        """Substeps between records: all while the budget lasts; 0: the adjoint makes its own when it comes here."""
+        if not checkpoint:
+            return 1
+        size = running.full_size(self.low.program, scenes, substeps)
+        if size > self._left:
+            return 0
+        self._left -= size
+        return 1
+
+
 def rollout(model: Model, state: ClothState, dt: float, drives: Mapping[str, Drive], substeps: int):
-    """As ``functional.rollout``, from substep 0 of the drives; differentiable in reverse mode.
+    """As ``functional.rollout``, from substep 0 of the drives.
 
     Raises:
         Unfused: a part without kernels.
     """
-    low = lower(model, state, drives)
-    batch = state.x.shape[:-2]
-    tensors = _inputs(low, state, dt, drives)
-    results = _Rollout.apply(low, substeps, len(batch), *_flat(tensors, batch))
-    return _outcome(low, state, results, batch)
+    return Fused(model, state, drives).rollout(state, dt, drives, substeps)
 
 
-class _Rollout(torch.autograd.Function):
-    """Inputs [scenes or 1, rows, comps] in the order of ``_inputs``; outputs nexts and sums."""
-
-    @staticmethod
-    def forward(ctx: Any, low: Lowering, substeps: int, dims: int, *values: Tensor):
-        job = _job(low, substeps, values)
-        every = running.spacing(job) if any(ctx.needs_input_grad) else 0
-        results, records = running.forward(job, every)
-        ctx.low, ctx.substeps, ctx.every = low, substeps, every
-        ctx.save_for_backward(*values, records)
-        return tuple(results.values())
-
-    @staticmethod
-    def backward(ctx: Any, *seeds: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        *values, records = ctx.saved_tensors
-        job = _job(ctx.low, ctx.substeps, values)
-        given = dict(zip(running.outputs(job.program), (s.contiguous() for s in seeds), strict=True))
-        wanted = {f for f, needs in zip(job.inputs, ctx.needs_input_grad[3:], strict=True) if needs}
-        found = running.reverse(job, records, ctx.every, given, wanted)
-        grads = [None if f not in wanted else _summed(found[f], job.inputs[f]) for f in job.inputs]
-        return None, None, None, *grads
+def _cut(moves: Mapping[Field, Tensor], first: int, last: int) -> dict[Field, Tensor]:
+    """The rows of some substeps."""
+    return {field: rows[:, first:last] for field, rows in moves.items()}
 
 
-def _summed(grad: Tensor, like: Tensor) -> Tensor:
-    return grad if len(like) == len(grad) else grad.sum(0, keepdim=True)
+def _needs_gradient(inputs: list[Tensor]) -> bool:
+    return torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
 
 
-def _job(low: Lowering, substeps: int, values) -> Job:
-    fields = [*_fields(low)]
-    scenes = max(len(value) for value in values)
-    return Job(low.program, dict(zip(fields, values, strict=True)), scenes, substeps)
-
-
-def _fields(low: Lowering) -> list[Field]:
-    drives = [field for motion in low.drives.values() for field in motion]
-    return [low.x.now, low.v.now, *(s.now for s in low.memory.values()), low.dt, *low.inputs, *drives]
-
-
-def _inputs(low: Lowering, state: ClothState, dt: float, drives: Mapping[str, Drive]) -> list[Tensor]:
-    step = torch.full((1, 1), dt, dtype=state.x.dtype)
-    moves = [tensor for drive in drives.values() for tensor in _moves(drive, state.x)]
-    return [state.x, state.v, *remembered(low.model, state).values(), step, *low.inputs.values(), *moves]
-
-
-def _moves(drive: Drive, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows of the fields of a ``lowering.Motion``."""
-    closed = torch.tensor(drive.closed).to(like).unsqueeze(-1)
-    return drive.increment.flatten(-2), drive.pose.flatten(-2), closed
-
-
-def _flat(tensors: list[Tensor], batch: torch.Size) -> list[Tensor]:
-    """[scenes or 1, rows, comps] each."""
-    out = []
-    for t in tensors:
-        alone = t.ndim == 2 or t.shape[:-2].numel() == 1
-        full = t.reshape(1, *t.shape[-2:]) if alone else t.expand(*batch, *t.shape[-2:]).reshape(-1, *t.shape[-2:])
-        out.append(full.contiguous())
-    if batch.numel() > 1:
-        out[:2] = [t.expand(batch.numel(), -1, -1).contiguous() for t in out[:2]]
-    return out
-
-
-def _outcome(
-    low: Lowering, state: ClothState, results: tuple[Tensor, ...], batch: torch.Size
-) -> tuple[ClothState, Impulses]:
-    by_field = dict(zip(running.outputs(low.program), results, strict=True))
-    shaped = {f: t.reshape(*batch, *t.shape[-2:]) for f, t in by_field.items()}
-    memory = {key: shaped[s.after] for key, s in low.memory.items()}
-    impulses = {name: shaped[f].squeeze(-2) for name, f in low.impulses.items()}
-    d3 = memory.pop(DIRECTORS, state.d3)
-    return ClothState(shaped[low.x.after], shaped[low.v.after], d3, memory), impulses
+def _sum(total: Impulses, more: Impulses) -> Impulses:
+    return {name: total[name] + value if name in total else value for name, value in more.items()}

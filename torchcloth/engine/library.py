@@ -1,20 +1,21 @@
-"""The engine's shared library: found, built when it is not there, and loaded."""
+"""The engine's shared library: found, built when it is not there, and loaded.
+
+One that came with the package (``pip install`` builds it where there is a compiler) serves if it is right for this
+processor; otherwise it is built once into the cache: ``$TORCHCLOTH_CACHE``, or ``~/.cache/torchcloth``, or a temporary
+folder where those cannot be written to.
+"""
 
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import os
-import shutil
-import subprocess
-import tempfile
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-SOURCES = Path(__file__).parent / "csrc"
-FLAGS = "-std=c++20 -O3 -march=native -fPIC -fno-math-errno -fno-trapping-math -fno-signed-zeros -fvisibility=hidden"
-QUIET = "-Wno-psabi"
+from . import building
+from .building import Unbuilt
+
+PACKAGED = Path(__file__).parent / "built"
 
 
 class Port(ctypes.Structure):
@@ -46,19 +47,16 @@ class Call(ctypes.Structure):
     ]
 
 
-@cache
 def library() -> ctypes.CDLL:
     """The loaded library, built if need be.
 
     Raises:
-        RuntimeError: no compiler, or it failed.
+        Unbuilt: no compiler, or it failed.
     """
-    lib = ctypes.CDLL(str(_built()))
-    for letter in "fd":
-        _declare(lib, letter)
-    lib.tc_error.restype = ctypes.c_char_p
-    lib.tc_kernel_name.restype = ctypes.c_char_p
-    return lib
+    found = _found()
+    if isinstance(found, Unbuilt):
+        raise Unbuilt(str(found), found.remedy)
+    return found
 
 
 @cache
@@ -67,6 +65,39 @@ def kernels() -> dict[str, tuple[int, int, int]]:
     lib = library()
     found = range(lib.tc_kernels())
     return {lib.tc_kernel_name(k).decode(): (k, lib.tc_kernel_info(k, 0), lib.tc_kernel_info(k, 1)) for k in found}
+
+
+def standing() -> str:
+    """Whether it is built, or can be, in a line; builds nothing."""
+    for folder in (PACKAGED / building.file_name(), building.cached()):
+        if folder is not None and folder.exists():
+            return f"built: {folder}"
+    try:
+        return f"will be built at first use, with {building.version(building.compiler())}"
+    except Unbuilt as miss:
+        return f"not available, the torch reference serves: {miss}; {miss.remedy}"
+
+
+@cache
+def _found() -> ctypes.CDLL | Unbuilt:
+    """Once per process, also where it failed."""
+    with suppress(OSError):  # none for this processor, or its C++ runtime is not here
+        return _loaded(PACKAGED / building.file_name())
+    try:
+        return _loaded(building.cached() or building.build())
+    except Unbuilt as miss:
+        return miss
+    except OSError as error:
+        return Unbuilt(f"the engine's library does not load: {error}", "delete it, or set TORCHCLOTH_CACHE elsewhere")
+
+
+def _loaded(file: Path) -> ctypes.CDLL:
+    lib = ctypes.CDLL(str(file))
+    for letter in "fd":
+        _declare(lib, letter)
+    lib.tc_error.restype = ctypes.c_char_p
+    lib.tc_kernel_name.restype = ctypes.c_char_p
+    return lib
 
 
 def _declare(lib: ctypes.CDLL, letter: str) -> None:
@@ -93,37 +124,3 @@ def _declare(lib: ctypes.CDLL, letter: str) -> None:
     for name, (result, arguments) in signatures.items():
         function = getattr(lib, f"tc_{name}_{letter}")
         function.restype, function.argtypes = result, arguments
-
-
-def _built() -> Path:
-    files = sorted(p for p in SOURCES.rglob("*") if p.suffix in (".h", ".cpp"))
-    key = hashlib.sha256(b"".join(p.read_bytes() for p in files) + FLAGS.encode()).hexdigest()[:16]
-    folder = Path(os.environ.get("TORCHCLOTH_CACHE", Path.home() / ".cache" / "torchcloth"))
-    target = folder / f"engine-{key}.so"
-    if not target.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        _build([p for p in files if p.suffix == ".cpp"], target)
-    return target
-
-
-def _build(sources: list[Path], target: Path) -> None:
-    compiler = shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++")
-    if compiler is None:
-        raise RuntimeError("no C++ compiler")
-    with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-        objects = [Path(scratch) / f"{number}.o" for number in range(len(sources))]
-
-        def compile(pair: tuple[Path, Path]) -> None:
-            _run([compiler, *FLAGS.split(), QUIET, "-c", str(pair[0]), "-o", str(pair[1])])
-
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(compile, zip(sources, objects, strict=True)))
-        made = Path(scratch) / "engine.so"
-        _run([compiler, "-shared", *map(str, objects), "-o", str(made), "-pthread"])
-        os.replace(made, target)
-
-
-def _run(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(f"{' '.join(command[:1])} failed: {done.stderr[-2000:]}")

@@ -1,12 +1,13 @@
 """A model turned into a program of the engine: the page ``functional.step`` in the engine's words.
 
 The parts (materials, effects, boundaries) say in ``parts`` which kernels they are. Only exact types count: a subclass
-may have changed its law.
+may have changed its law. Materials and effects without kernels are left to torch, see ``outside``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
+from contextlib import nullcontext
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,9 @@ from ..boundaries import Drive
 from ..effects._bent import BentSheet
 from ..model import Model
 from ..types import ClothState
+from .outside import MATERIAL, obstacle
 from .program import Field, Loop, Program, Shape
+from .wrapped import array, is_wrapped, numbers_of_wrapped
 
 LANES = 16  # of the widest pack, csrc/pack.h
 
@@ -26,7 +29,9 @@ DIRECTORS = "d3"  # key of the state's directors among the internal variables, w
 
 
 class Unfused(Exception):
-    """A part that the engine does not know; the text names it."""
+    """A part that the engine does not know; the text names it. ``part``: "material" or "effects.NAME"."""
+
+    part: str | None = None
 
 
 class State(NamedTuple):
@@ -57,25 +62,29 @@ class Lowering:
         triangles: the loop over triangles that comes first; ``Triangles`` has what is computed there already.
         sheets: how the sheet is bent at its vertices, by the weights of the derivatives.
         inputs: parameter fields with their tensors [..., rows, comps].
+        given: a parameter field without tensor, for the forces of parts that torch computes; None: there are none.
         drives: by boundary.
         impulses: by boundary, [6].
     """
 
-    def __init__(self, model: Model, state: ClothState, drives: Mapping[str, Drive]) -> None:
+    def __init__(
+        self, model: Model, state: ClothState, drives: Mapping[str, Drive], outside: Collection[str] = ()
+    ) -> None:
         self.model = model
         self.vertices, self.faces = state.x.shape[-2], len(model.geometry.area)
         self.program = Program(state.x.dtype, self.vertices)
         self.inputs: dict[Field, Tensor] = {}
         self._known: dict[int, Field] = {}
         self.x, self.v = (State(*self.program.state(self.vertices, 3)) for _ in range(2))
-        carried = remembered(model, state).items()
-        self.memory = {key: State(*self.program.state(*value.shape[-2:])) for key, value in carried}
+        kept = {key: value for key, value in remembered(model, state).items() if key not in outside}
+        self.memory = {key: State(*self.program.state(*value.shape[-2:])) for key, value in kept.items()}
         self.dt = self.program.parameter(1, 1)
         self.mass = self.parameter(model.mass)
         self.force = self.program.temporary(self.vertices, 3)
+        self.given = self._given() if outside else None
         self.resistance: Field | None = None
         order = _scattered(self.faces)
-        self.corners = [self.program.table(c[order]) for c in model.geometry.corners.view(3, -1).cpu().numpy()]
+        self.corners = [self.program.table(c[order]) for c in array(model.geometry.corners).reshape(3, -1)]
         self.triangles = Triangles(self, order)
         self.sheets: dict[Field, Sheet] = {}
         drive = self.program.drive
@@ -85,9 +94,21 @@ class Lowering:
     def parameter(self, tensor: Tensor, near: int = 0) -> Field:
         """The input field of a coefficient [..., rows, comps]; one tensor has one field. ``near``: of a stencil."""
         if id(tensor) not in self._known:
-            field = self.program.parameter(*tensor.shape[-2:], near)
+            field = self.program.parameter(tensor.shape[-2], tensor.shape[-1], near)
             self._known[id(tensor)], self.inputs[field] = field, tensor
         return self._known[id(tensor)]
+
+    @property
+    def carried(self) -> dict[str, State]:
+        """All that goes on from substep to substep, by its name in the state."""
+        return {"x": self.x, "v": self.v, **self.memory}
+
+    def _given(self) -> Field:
+        """Forces [V, 3] that torch computes, as an input."""
+        given = self.program.parameter(self.vertices, 3)
+        loop = self.loop(self.vertices)
+        loop.add(loop.call("copy3", loop.load(given)), self.force)
+        return given
 
     def number(self, value: float) -> Field:
         """A constant of a part."""
@@ -272,8 +293,28 @@ class Sheet:
             self.loop.put(self._stress, self._answer)
 
 
-def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lowering:
-    """The program of a substep.
+def fitted(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> tuple[Lowering, frozenset[str]]:
+    """The program of a substep, and the parts that are left to torch.
+
+    Raises:
+        Unfused: a part without kernels that cannot be left to torch.
+    """
+    outside: set[str] = set()
+    readable = numbers_of_wrapped() if is_wrapped(model.mass) else nullcontext()
+    while True:
+        try:
+            with readable:
+                return lower(model, state, drives, outside), frozenset(outside)
+        except Unfused as miss:
+            if miss.part is None:
+                raise
+            if reason := obstacle(model, miss.part):
+                raise Unfused(f"{miss}, {reason},") from None
+            outside.add(miss.part)
+
+
+def lower(model: Model, state: ClothState, drives: Mapping[str, Drive], outside: Collection[str] = ()) -> Lowering:
+    """The program of a substep without the parts ``outside``; from the drives only names and flags are taken.
 
     Raises:
         Unfused: a part without kernels.
@@ -281,13 +322,17 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lower
     from .parts import boundaries, effects, materials
     from .parts.contact import Contact
 
+    if model.transfer != "mesh":
+        raise Unfused(f"transfer {model.transfer!r}")
     for key in state.memory:
         if key not in ("material", "contact") and key.removeprefix("effects.") not in model.effects:
             raise Unfused(f"memory {key!r} that no part owns")
-    low = Lowering(model, state, drives)
-    materials.lower(low)
+    low = Lowering(model, state, drives, outside)
+    if MATERIAL not in outside:
+        _part(MATERIAL, lambda: materials.lower(low))
     for name, (effect, c) in model.effects.items():
-        effects.lower(low, name, effect, c)
+        if f"effects.{name}" not in outside:
+            _part(f"effects.{name}", lambda own=(name, effect, c): effects.lower(low, *own))
     low.close()
     contact = None if model.grid is None else Contact(low, model.grid)
     if contact is not None:
@@ -298,8 +343,16 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Lower
     _drift(low, velocity)
     if contact is not None:
         contact.follow()
-    low.program.ready()
+    low.program = low.program.ready()
     return low
+
+
+def _part(name: str, lower: Callable[[], None]) -> None:
+    try:
+        lower()
+    except Unfused as miss:
+        miss.part = name
+        raise
 
 
 def _kick(low: Lowering) -> Velocities:

@@ -5,19 +5,29 @@
     *f, n, J = loop.call("surface", x0, x1, x2, ...)
 
 A loop's registers are numbered once and for all; a list of them stands for a vector.
+
+A program is written down first and handed to the engine by ``ready``, unless the engine has the same one already: the
+programs of two calls are the same where every constant, index and instruction is, so nothing that a user changes in
+the parts can be missed, and nothing is built twice.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from itertools import count
+from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from .library import kernels, library
+from .wrapped import array
 
 OWN, SHARED, VARYING = -1, -2, -3
 LOAD, ADD, PUT, SPREAD, COLLECT = 0, 2, 3, 5, 6
@@ -50,27 +60,29 @@ class Program:
 
     def __init__(self, dtype: torch.dtype, vertices: int) -> None:
         self.dtype, self.vertices = dtype, vertices
+        self.number = -1  # by which the operators know it; there is none before it is ready
         self._letter = "d" if dtype == torch.float64 else "f"
         self._numpy = np.float64 if dtype == torch.float64 else np.float32
-        self._handle = ctypes.c_void_p(self._api("new")())
+        self._handle: ctypes.c_void_p | None = None
         self.fields: list[Field] = []
         self._constants: dict[bytes, Field] = {}
         self._tables: dict[bytes, int] = {}
         self._stages: list[Loop | Stencil | Sieve | Layers] = []
         self._lists = 0
+        self._written: list[tuple[str, tuple]] = []
 
     def __del__(self) -> None:
-        self._api("free")(self._handle)
+        if self._handle is not None:
+            self._call("free")
 
     # -- fields ---------------------------------------------------------------------------------------------------
 
-    def constant(self, values: np.ndarray | torch.Tensor, near: int = 0) -> Field:
+    def constant(self, values: ArrayLike | torch.Tensor, near: int = 0) -> Field:
         """Numbers [rows, comps] that never change; ``near``: the weights [count near V, 1] of a stencil."""
-        values = values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
-        data = np.ascontiguousarray(values, dtype=self._numpy)
+        data = np.ascontiguousarray(array(values), dtype=self._numpy)
         key = data.tobytes() + f"{near} {data.shape}".encode()
         if key not in self._constants:
-            self._constants[key] = self._field(Kind.CONSTANT, *data.shape, near, data)
+            self._constants[key] = self._field(Kind.CONSTANT, data.shape[0], data.shape[1], near, data)
         return self._constants[key]
 
     def parameter(self, rows: int, comps: int, near: int = 0) -> Field:
@@ -101,17 +113,16 @@ class Program:
 
     def table(self, index: np.ndarray | torch.Tensor) -> int:
         """Rows to gather from or scatter to, one per item."""
-        data = np.ascontiguousarray(np.asarray(index), dtype=np.int32).ravel()
+        data = np.ascontiguousarray(array(index), dtype=np.int32).ravel()
         key = data.tobytes()
         if key not in self._tables:
-            self._tables[key] = self._api("table")(self._handle, data.ctypes.data, len(data))
+            self._tables[key] = len(self._tables)
+            self._api("table")(self._handle, data, len(data))
         return self._tables[key]
 
     def _field(self, kind: Kind, rows: int, comps: int, near: int = 0, data: np.ndarray | None = None) -> Field:
-        pointer = None if data is None else data.ctypes.data
-        field = Field(
-            self._api("field")(self._handle, int(kind), rows, comps, near, self.vertices, pointer), rows, comps, kind
-        )
+        field = Field(len(self.fields), rows, comps, kind)
+        self._api("field")(self._handle, int(kind), rows, comps, near, self.vertices, data)
         self.fields.append(field)
         return field
 
@@ -166,26 +177,86 @@ class Program:
         self._stages.append(Stencil(self.table(near), weight, x, y, shape))
 
     def ready(self) -> Program:
-        """Hand everything to the engine; returns self."""
+        """The program to run: an earlier one where there is the same, else this one, handed to the engine."""
         for stage in self._stages:
             stage.emit(self._handle, self._api)
-        self._api("ready")(self._handle)
-        return self
+        key = self._key()
+        known = _KEPT.setdefault(key, self)
+        _KEPT.move_to_end(key)
+        if known is self:
+            self._hand_over()
+            while len(_KEPT) > MOST_KEPT:
+                _KEPT.popitem(last=False)
+        self._written.clear()
+        return known
+
+    @property
+    def inputs(self) -> list[Field]:
+        """States, parameters and drives, in the order in which the operators take them."""
+        return [f for f in self.fields if f.kind in (Kind.STATE, Kind.PARAMETER, Kind.DRIVE)]
+
+    @property
+    def outputs(self) -> list[Field]:
+        """Nexts and sums, in the order in which the operators give them."""
+        return [f for f in self.fields if f.kind in (Kind.NEXT, Kind.SUM)]
 
     def record_size(self, full: bool) -> int:
         """Numbers of a record: of the state alone, or of all that the reverse sweep reads."""
-        return self._api("size")(self._handle, int(full))
+        return self._call("size", int(full))
 
     def records_size(self, substeps: int, every: int) -> int:
         """Numbers of all records of a scene, with what contact notes."""
-        return self._api("records")(self._handle, substeps, every)
+        return self._call("records", substeps, every)
 
     def run(self, call, mode: int) -> None:
         """0: values, 1: adjoint, 2: tangents."""
-        _check(self._api("run")(self._handle, ctypes.byref(call), mode))
+        _check(self._call("run", ctypes.byref(call), mode))
 
-    def _api(self, name: str):
-        return getattr(library(), f"tc_{name}_{self._letter}")
+    def _api(self, name: str) -> Callable[..., int]:
+        """Stands for a function of the library: what it is called with (numbers and arrays) is written down."""
+
+        def write(handle: Any, *arguments) -> int:
+            self._written.append((name, arguments))
+            return 0
+
+        return write
+
+    def _key(self) -> bytes:
+        known = hashlib.sha256(self._letter.encode())
+        for name, arguments in self._written:
+            known.update(name.encode())
+            for value in arguments:
+                known.update(bytes(value) if isinstance(value, (np.ndarray, ctypes.Array)) else repr(value).encode())
+                known.update(b",")
+        return known.digest()
+
+    def _hand_over(self) -> None:
+        self._handle = ctypes.c_void_p(getattr(library(), f"tc_new_{self._letter}")())
+        for name, arguments in self._written:
+            done = self._call(name, *(a.ctypes.data if isinstance(a, np.ndarray) else a for a in arguments))
+            if name not in ("field", "table"):  # they give a number
+                _check(done or 0)
+        self._call("ready")
+        self.number = next(_NUMBERS)
+        _KNOWN[self.number] = self
+
+    def _call(self, name: str, *arguments) -> Any:
+        return getattr(library(), f"tc_{name}_{self._letter}")(self._handle, *arguments)
+
+
+MOST_KEPT = 64  # programs that wait for the next call, besides those that are in use
+_KEPT: OrderedDict[bytes, Program] = OrderedDict()
+_KNOWN: WeakValueDictionary[int, Program] = WeakValueDictionary()
+_NUMBERS = count()
+
+
+def program_of(number: int) -> Program:
+    """The program that an operator was given by its number.
+
+    Raises:
+        KeyError: nobody holds it any more.
+    """
+    return _KNOWN[number]
 
 
 class Loop:
@@ -259,19 +330,19 @@ class Loop:
         return list(range(self._used - count, self._used))
 
     def emit(self, handle, api) -> None:
-        """Hand over the instructions."""
+        """Write down the instructions."""
         read = self._read()
         api("loop")(handle, self.items, self._among, self._counted, int(self.flat), int(self.again))
         for kind, *rest in self._code:
             if kind in ("move", "lookup"):
-                _check(api(kind)(handle, *rest))
+                api(kind)(handle, *rest)
             elif kind == "transfer":
                 share, count = rest[4], rest[5] * ON_NODE
-                _check(api("transfer")(handle, *rest, int(bool(read & set(range(share, share + count))))))
+                api("transfer")(handle, *rest, int(bool(read & set(range(share, share + count)))))
             else:
                 number, takes, gives = rest
                 feeds = int(any(reg in read or ~reg in read for reg in gives))
-                _check(api("call")(handle, number, _ints(takes), _ints(gives), feeds))
+                api("call")(handle, number, _ints(takes), _ints(gives), feeds)
 
     def _read(self) -> set[int]:
         """Registers whose values the reverse sweep needs."""
@@ -332,7 +403,7 @@ class Sieve(NamedTuple):
     steep: float
 
     def emit(self, handle, api) -> None:
-        """Hand it over."""
+        """Write it down."""
         fields = (self.x.id, self.reach.id, self.dt.id)
         api("sieve")(handle, self.number, *fields, *self.points, self.steep)
 
@@ -347,7 +418,7 @@ class Stencil(NamedTuple):
     shape: Shape
 
     def emit(self, handle, api) -> None:
-        """Hand it over."""
+        """Write it down."""
         api("stencil")(handle, self.table, self.weight.id, self.x.id, self.y.id, int(self.shape))
 
 

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from .library import Call, Port
-from .program import Field, Kind, Program
+from .program import Field, Program
 
-BUDGET = 256 * 2**20  # bytes of records of one call, above which substeps are recomputed
+BUDGET = 192 * 2**20  # bytes of records that a simulation keeps for its adjoint
+ANEW = 96 * 2**20  # bytes of records that the adjoint makes at a time, of substeps that it goes through again
 
 
 class Job(NamedTuple):
@@ -27,8 +28,8 @@ class Job(NamedTuple):
 def forward(job: Job, every: int = 0) -> tuple[dict[Field, Tensor], Tensor]:
     """(nexts and sums [scenes, rows, comps], records); ``every``: substeps between records, 0 for none."""
     like = next(iter(job.inputs.values()))
-    results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in outputs(job.program)}
-    records = like.new_empty(job.scenes, job.program.records_size(job.substeps, every))
+    results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in job.program.outputs}
+    records = like.new_empty(job.scenes, record_size(job.program, job.substeps, every))
     ports = _ports(job)
     for f, tensor in results.items():
         ports[f.id].result = tensor.data_ptr()
@@ -52,9 +53,9 @@ def reverse(
 
 
 def tangent(job: Job, dots: Mapping[Field, Tensor], directions: int) -> tuple[dict[Field, Tensor], dict[Field, Tensor]]:
-    """(nexts and sums, their tangents [scenes, directions, rows, comps]) from tangents [scenes or 1, directions, ...]."""
+    """(nexts and sums, their tangents [scenes, directions, rows, comps]) of inputs [scenes or 1, directions, ...]."""
     like = next(iter(job.inputs.values()))
-    results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in outputs(job.program)}
+    results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in job.program.outputs}
     moved = {f: like.new_empty(job.scenes, directions, f.rows, f.comps) for f in results}
     ports = _ports(job)
     for f, tensor in results.items():
@@ -66,17 +67,21 @@ def tangent(job: Job, dots: Mapping[Field, Tensor], directions: int) -> tuple[di
 
 
 def spacing(job: Job) -> int:
-    """Substeps between records: every one if they fit into the budget, else about the square root of all."""
-    size = torch.empty(0, dtype=job.program.dtype).element_size()
-    if job.scenes * (job.substeps + 1) * job.program.record_size(True) * size <= BUDGET:
+    """Substeps between records made anew: every one if they fit, else about the square root of all."""
+    if full_size(job.program, job.scenes, job.substeps) <= ANEW:
         return 1
-    states = job.scenes * job.substeps * job.program.record_size(False) * size
-    return max(int(job.substeps**0.5), states // BUDGET, 2)
+    states = job.scenes * job.substeps * job.program.record_size(False) * job.program.dtype.itemsize
+    return max(int(job.substeps**0.5), min(states // max(ANEW, 1), job.substeps), 2)
 
 
-def outputs(program: Program) -> list[Field]:
-    """Nexts and sums, in the order of the program."""
-    return [f for f in program.fields if f.kind in (Kind.NEXT, Kind.SUM)]
+def full_size(program: Program, scenes: int, substeps: int) -> int:
+    """Bytes of the records of all substeps."""
+    return scenes * record_size(program, substeps, 1) * program.dtype.itemsize
+
+
+def record_size(program: Program, substeps: int, every: int) -> int:
+    """Numbers of the records of one scene."""
+    return 0 if every == 0 else program.records_size(substeps, every)
 
 
 def _ports(job: Job):

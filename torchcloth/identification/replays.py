@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 from torch.func import functional_call
 
 from ..cloth import Cloth
-from ..forward_mode import real_tangents
+from ..sensitivities import Directions
+from ..types import Rollout
 from .episodes import Episode
 from .unknowns import Unknown, overrides
+
+SETTLING = 0.3  # s, in which the noise of measured positions is damped out
 
 
 class Replay(nn.Module):
@@ -22,13 +24,11 @@ class Replay(nn.Module):
         super().__init__()
         self.cloth = cloth
 
-    def forward(self, episode: Episode, dt: float | None = None, copies: int = 0) -> Tensor:
-        """Vertices at the frame times [T, V, 3] m, or [copies, T, V, 3]."""
+    def forward(self, episode: Episode, dt: float | None = None) -> Tensor:
+        """Vertices at the frame times [T, V, 3] m."""
         state = self.cloth.state(episode.initial)
-        if copies:
-            state = state.map(lambda field: field.expand(copies, *field.shape))
         if episode.settles:
-            state = self.cloth.settle(state, episode.motion, start=float(episode.times[0]))
+            state = self.cloth.settle(state, episode.motion, start=float(episode.times[0]), duration=SETTLING)
         return self.cloth(state, episode.motion, episode.times, dt=dt).x
 
 
@@ -45,13 +45,24 @@ def tangents(
 ) -> tuple[Tensor, Tensor]:
     """Frames [T, V, 3] m and their derivatives [K, T, V, 3] by the unknowns, exact, in one forward pass.
 
-    The K directions run as a batch; memory does not grow with the number of substeps.
+    Memory does not grow with the number of substeps.
     """
     count = len(unknowns)
-    value = raw.detach().to(episode.initial).expand(count, count).contiguous()
-    with torch.no_grad(), forward_ad.dual_level(), real_tangents():
-        dual = forward_ad.make_dual(value, torch.eye(count, dtype=value.dtype))
-        entries = {f"cloth.{key}": v.unsqueeze(-1) for key, v in overrides(unknowns, dual).items()}
-        frames = functional_call(Replay(cloth), entries, (episode, dt, count))
-        primal, tangent = forward_ad.unpack_dual(frames)
-        return primal[0].clone(), torch.zeros_like(primal) if tangent is None else tangent.clone()
+    value, eye = raw.detach().to(episode.initial), torch.eye(count, dtype=episode.initial.dtype)
+    entries = {f"cloth.{key}": v for key, v in overrides(unknowns, value).items()}
+    along = Directions({key: v for key, v in overrides(unknowns, eye).items()})
+    out, moved = functional_call(_Tangents(cloth), entries, (episode, along, dt))
+    return out.x, moved.x
+
+
+class _Tangents(nn.Module):
+    """As ``Replay``, with derivatives."""
+
+    def __init__(self, cloth: Cloth) -> None:
+        super().__init__()
+        self.cloth = cloth
+
+    def forward(self, episode: Episode, along: Directions, dt: float | None) -> tuple[Rollout, Rollout]:
+        """The rollout and its tangents."""
+        state, settle = self.cloth.state(episode.initial), SETTLING if episode.settles else 0.0
+        return self.cloth.sensitivities(state, episode.motion, episode.times, along=along, dt=dt, settle=settle)

@@ -60,6 +60,7 @@ class Run {
         each(call.scenes, [&](int64_t scene) {
             Memory m = memory(scene, Mode::value);
             R* first = call.every ? record(scene, 0) : nullptr;
+            if (call.every) clear(scene);
             m.rows.reset(2 * program.record_size);
             R *row = call.every == 1 ? first : m.rows.data, *after = nullptr;
             start(m, scene, row);
@@ -142,6 +143,14 @@ class Run {
     R* record(int64_t scene, int64_t k) const {
         const size_t size = call.every == 1 ? program.record_size : program.state_size;
         return static_cast<R*>(call.records) + scene * records_size(program, call.substeps, call.every) + k * size;
+    }
+    // What no substep writes: lanes beyond the last row, and the end of the last record. Results are then reproducible.
+    void clear(int64_t scene) const {
+        const int64_t last = (call.substeps + call.every - 1) / call.every;
+        for (int64_t k = 0; k <= last; k++) {
+            const size_t size = k == last && call.every == 1 ? program.record_size : program.state_size;
+            std::memset(static_cast<void*>(record(scene, k)), 0, size * sizeof(R));
+        }
     }
     R* other(const Memory& m, const R* row) const {
         return row == m.rows.data ? m.rows.data + program.record_size : m.rows.data;

@@ -1,0 +1,114 @@
+"""What each path through the engine costs: ``python -m torchcloth.benchmarks.paths``.
+
+The same cloth and motion on the fused engine, on the fused engine with one effect in Python, and on the torch
+reference. All three must agree, or nothing is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+import torch
+
+import torchcloth as tc
+from torchcloth.effects import AbstractEffect, Amplitude
+from torchcloth.engine.choice import Setting
+from torchcloth.sensitivities import Directions
+
+T = TypeVar("T")
+PATHS: dict[str, tuple[Setting, bool]] = {
+    "fused": ("fused", False),
+    "fused, one effect in Python": ("fused", True),
+    "reference": ("reference", False),
+}
+FABRIC = ("material.youngs_modulus.raw", "material.poisson_ratio.raw", "areal_density.raw", "effects.air.normal.raw")
+
+
+class Pull(AbstractEffect):
+    """A user's force: a breath on every vertex, so weak that all paths lead to the same place."""
+
+    amplitudes = {"strength": Amplitude("N", 1e-12, 1e-13)}
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.strength = tc.PhysicalParameter(1e-12, "N", "nonnegative", name="pull")
+
+    def coefficients(self):
+        """Its strength."""
+        return self.strength.field
+
+    def force(self, c, now):
+        """Away from the origin."""
+        return c * now.x
+
+
+def sheet(engine: Setting, python: bool) -> tc.Cloth:
+    """0.5 m, 441 vertices, 800 triangles, without contact."""
+    effects = {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(1.2), "bending": tc.effects.Bending(1e-5)}
+    if python:
+        effects["pull"] = Pull()
+    mesh = tc.meshes.rectangle(0.5, 0.5, resolution=(21, 21))
+    hands = {"hand": tc.boundaries.Grasp.corner("upper-left")}
+    return tc.Cloth(mesh, tc.materials.AEP(6e4, 0.3), 0.15, effects, hands, contact=None, engine=engine)
+
+
+def motion(end: float) -> dict[str, tc.Trajectory]:
+    """A hand that rises."""
+    pose = torch.eye(4).repeat(9, 1, 1)
+    pose[:, 2, 3] = torch.linspace(0.0, 0.2, 9) ** 2
+    return {"hand": tc.Trajectory(torch.linspace(0.0, end, 9), pose, torch.ones(9, dtype=torch.bool))}
+
+
+def seconds(work: Callable[[], T], repeats: int) -> tuple[float, T]:
+    """(the best of some runs, the result)."""
+    taken = []
+    while True:
+        begin = time.perf_counter()
+        out = work()
+        taken.append(time.perf_counter() - begin)
+        if len(taken) == repeats:
+            return min(taken), out
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=6, help="at 30 Hz")
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args()
+    times = [k / 30 for k in range(options.frames + 1)]
+    rows, ends = [], []
+    for name, (engine, python) in PATHS.items():
+        cloth = sheet(engine, python)
+        state, driven = cloth.rest_state(), motion(times[-1])
+        along = Directions({n: row.clone() for n, row in zip(FABRIC, torch.eye(len(FABRIC)), strict=True)})
+
+        def forward(cloth=cloth, state=state, driven=driven):
+            with torch.no_grad():
+                return cloth(state, driven, times)
+
+        def gradient(cloth=cloth, state=state, driven=driven):
+            cloth.zero_grad()
+            cloth(state, driven, times).x.pow(2).sum().backward()
+
+        def tangents(cloth=cloth, state=state, driven=driven, along=along):
+            return cloth.sensitivities(state, driven, times, along=along)
+
+        repeats = 1 if engine == "reference" else options.repeats
+        best, out = seconds(forward, repeats)
+        ends.append(out.x)
+        rows.append((name, best, seconds(gradient, repeats)[0], seconds(tangents, repeats)[0]))
+        substeps = sum(cloth.plan(state, driven, times, None).counts)
+    for x in ends[1:]:
+        torch.testing.assert_close(x, ends[0], rtol=0, atol=1e-4)
+    print(f"{substeps} substeps of 800 triangles, {torch.get_num_threads()} thread(s), {torch.get_default_dtype()}\n")
+    print(f"| path | forward | gradient | {len(FABRIC)} tangents | per substep |\n|---|---|---|---|---|")
+    for name, value, slope, moves in rows:
+        print(f"| {name} | {value:.3f} s | {slope:.3f} s | {moves:.3f} s | {1e6 * value / substeps:.0f} us |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,255 @@
+"""A user's cloth on the engine: the same results as the reference, the same errors, and word of what runs."""
+
+import warnings
+
+import pytest
+import torch
+from clothes import close, opening, sheet, start
+
+import torchcloth as tc
+from torchcloth.boundaries import AbstractBoundary
+from torchcloth.engine import running
+from torchcloth.engine.choice import choose, standing
+from torchcloth.engine.fused import Fused
+from torchcloth.errors import InvalidInput, SimulationDiverged
+
+END = 0.012
+TIMES = (0.0, 0.4 * END, END)
+
+
+class Floor(AbstractBoundary):
+    """A user's own."""
+
+    def bind(self, mesh):
+        return self
+
+    def apply(self, x, v, dt, drive, substep):
+        low = x[..., 2:] + dt * v[..., 2:] < -0.02
+        return torch.where(low, -v, v)
+
+
+def outcome(engine, batch=(), settle=False, checkpoint=True, times=TIMES, **options):
+    """All that comes out of a simulation, and all gradients."""
+    cloth = sheet(engine, **options)
+    motion = opening(END)
+    leaves = {name: t.pose.clone().requires_grad_() for name, t in motion.items()}
+    motion = {name: t._replace(pose=leaves[name]) for name, t in motion.items()}
+    state = start(cloth, batch)
+    x, v = state.x.clone().requires_grad_(), state.v.clone().requires_grad_()
+    state = state._replace(x=x, v=v)
+    if settle:
+        state = cloth.settle(state, motion, duration=0.02)
+    out = cloth(state, motion, times, checkpoint=checkpoint)
+    parts = {"x": out.x, "v": out.v, **out.wrench, "end": out.state.v}
+    generator = torch.Generator().manual_seed(0)
+    loss = sum((torch.randn(p.shape, generator=generator, dtype=torch.float64).to(p) * p).sum() for p in parts.values())
+    parameters = {name: p for name, p in cloth.named_parameters()}
+    inputs = {"x0": x, **({} if settle else {"v0": v}), **leaves, **parameters}
+    grads = torch.autograd.grad(loss, list(inputs.values()), allow_unused=True)
+    return parts, dict(zip(inputs, grads, strict=True))
+
+
+CASES = {
+    "plain": {},
+    "settled": {"settle": True},
+    "batch": {"batch": (2, 3)},
+    "no checkpoints": {"checkpoint": False},
+    "one interval": {"times": (0.0, END)},
+    "fields": {"material": lambda: tc.materials.AEP(torch.linspace(0.8e5, 1.2e5, 32), 0.3)},
+    "batch of fabrics": {"batch": (2,), "material": lambda: tc.materials.AEP(torch.tensor([[0.8e5], [1.2e5]]), 0.3)},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_fused_equals_reference(case):
+    def options():
+        return {key: value() if callable(value) else value for key, value in CASES[case].items()}
+
+    parts, grads = outcome("fused", **options())
+    expected, slopes = outcome("reference", **options())
+    for name, value in parts.items():
+        close(value, expected[name], 1e-10, name)
+    assert [n for n, g in grads.items() if g is None] == [n for n, g in slopes.items() if g is None]
+    for name, grad in grads.items():
+        if grad is not None:
+            assert grad.shape == slopes[name].shape
+            close(grad, slopes[name], 1e-8, f"gradient of {name}")
+
+
+def test_auto_is_fused_where_it_can_be():
+    """Bitwise: it is the same program."""
+    auto, fused = (outcome(engine) for engine in ("auto", "fused"))
+    for name in auto[0]:
+        assert torch.equal(auto[0][name], fused[0][name])
+
+
+def test_float32():
+    """Values 1e-4, gradients 1e-3 in the norm, against float64."""
+    exact, fine = outcome("fused")
+    torch.set_default_dtype(torch.float32)
+    parts, grads = outcome("fused")
+    for name, value in parts.items():
+        assert value.dtype == torch.float32
+        close(value.double(), exact[name], 1e-4, name)
+    for name, grad in grads.items():
+        if grad is not None:
+            close(grad.double(), fine[name], 1e-3, name)
+
+
+@pytest.mark.parametrize("budget", [0, 40_000, 10**9])
+def test_memory_budget_changes_nothing(budget, monkeypatch):
+    """No records at all, some, all: the same gradients to the last digit but the order of sums."""
+    expected = outcome("fused", times=(0.0, 0.003, 0.006, END))[1]
+    monkeypatch.setattr(running, "BUDGET", budget)
+    monkeypatch.setattr(running, "ANEW", budget)
+    found = outcome("fused", times=(0.0, 0.003, 0.006, END))[1]
+    for name, grad in found.items():
+        if grad is not None:
+            close(grad, expected[name], 1e-12, name)
+
+
+def test_records_are_kept_while_the_budget_lasts(monkeypatch):
+    """Three intervals, room for the records of one and a half: the first keeps, the others go through it again."""
+    cloth, kept = sheet("fused"), []
+    model, state = cloth.model(), start(cloth)
+    drives = {name: d._replace(increment=d.increment.repeat(9, 1, 1), pose=d.pose.repeat(9, 1, 1), closed=(True,) * 9)
+              for name, d in standing(model).items()}  # fmt: skip
+    size = running.full_size(Fused(model, state, drives).low.program, 1, 9)
+    monkeypatch.setattr(running, "BUDGET", int(1.5 * size))
+    fused, forward = Fused(model, state, drives), running.forward
+    monkeypatch.setattr(running, "forward", lambda job, every=0: kept.append(every) or forward(job, every))
+    for _ in range(3):
+        state, _ = fused.rollout(state, 1e-4, drives, 9)
+    assert kept == [1, 0, 0]
+    state.x.sum().backward()
+    assert kept == [1, 0, 0, 1, 1]
+
+
+def test_a_loop_without_gradients_keeps_no_records(monkeypatch):
+    kept, forward = [], running.forward
+    monkeypatch.setattr(running, "forward", lambda job, every=0: kept.append(every) or forward(job, every))
+    cloth = sheet("fused")
+    with torch.no_grad():
+        cloth(start(cloth), opening(END), TIMES)
+    assert set(kept) == {0}
+
+
+# -- changes between calls --------------------------------------------------------------------------------------------
+
+
+def changes():
+    """What a user may do to a cloth between two calls."""
+
+    def young(cloth):
+        cloth.material.youngs_modulus.set(2e5)
+
+    def density(cloth):
+        cloth.effects["air"].density = 1.5
+
+    def index(cloth):
+        cloth.boundaries["right"].index = torch.tensor([20])
+
+    def wind(cloth):
+        with torch.no_grad():
+            cloth.effects["air"].wind += 0.5
+
+    def buffer(cloth):
+        cloth.effects["bending"].operator.mul_(3.0)
+
+    def effect(cloth):
+        del cloth.effects["damping"]
+
+    def geometry(cloth):
+        cloth._gradient.div_(1.1)
+        cloth._area.mul_(1.1**2)
+
+    return [young, density, index, wind, buffer, effect, geometry]
+
+
+@pytest.mark.parametrize("change", changes(), ids=lambda f: f.__name__)
+def test_changes_between_calls_are_seen(change):
+    """Programs are kept between calls, but never one that is no longer right."""
+    found = {}
+    for engine in ("fused", "reference"):
+        cloth = sheet(engine)
+        before = cloth(start(cloth), opening(END), TIMES).x.detach()
+        change(cloth)
+        found[engine] = cloth(start(cloth), opening(END), TIMES).x.detach()
+        assert not torch.equal(before, found[engine])
+    close(found["fused"], found["reference"], 1e-10, change.__name__)
+
+
+def test_the_engine_may_be_set_at_any_time():
+    cloth = sheet("fused")
+    first = cloth(start(cloth), opening(END), TIMES).x
+    cloth.engine = "reference"
+    second = cloth(start(cloth), opening(END), TIMES).x
+    assert not torch.equal(first, second)
+    close(first, second, 1e-10, "x")
+    with pytest.raises(InvalidInput, match='engine; got \'fast\'; expected "auto", "reference" or "fused"'):
+        cloth.engine = "fast"
+    assert cloth.engine == "reference"
+    with pytest.raises(InvalidInput, match="engine"):
+        sheet("CUDA")
+
+
+# -- words ------------------------------------------------------------------------------------------------------------
+
+
+def test_print_says_which_engine_runs_and_why():
+    assert "\n  engine: fused\n" in str(sheet())
+    assert "engine: reference (as asked for)" in str(sheet("reference"))
+    assert "engine: reference (boundary 'floor' (Floor) has no kernels)" in str(sheet(boundaries={"floor": Floor()}))
+
+
+def test_other_precisions_and_devices_are_left_to_the_reference():
+    cloth = sheet()
+    model, state = cloth.model(), cloth.rest_state()
+    for other, why in (
+        (state.map(lambda t: t.half()), "float16"),
+        (state.map(lambda t: t.to("meta")), "tensors on meta"),
+    ):
+        assert str(choose("auto", model, other, standing(model))) == f"reference ({why})"
+
+
+def test_unknown_boundary_runs_on_the_reference_without_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        auto, reference = (sheet(engine, boundaries={"floor": Floor()}) for engine in ("auto", "reference"))
+        assert torch.equal(auto(start(auto), times=TIMES).x, reference(start(reference), times=TIMES).x)
+
+
+def test_fused_refuses_what_it_cannot():
+    cloth = sheet("fused", boundaries={"floor": Floor()})
+    message = r"""engine; got "fused"; expected .*boundary 'floor' \(Floor\) has no kernels; use engine="auto\""""
+    with pytest.raises(InvalidInput, match=message):
+        cloth(start(cloth), times=TIMES)
+    apic = sheet("fused", contact=tc.Contact(), transfer="apic", boundaries={})
+    with pytest.raises(InvalidInput, match=r"transfer 'apic' has no kernels"):
+        apic(apic.rest_state(), times=(0.0, 1e-3))
+
+
+def test_divergence_names_time_and_vertex():
+    """A pose that jumps tears the cloth; the engine goes through the interval again to say where."""
+    messages = []
+    for engine in ("fused", "reference"):
+        cloth = sheet(engine, effects={})
+        state = cloth.rest_state()
+        v = state.v.clone()
+        v[7] = 1e200
+        with pytest.raises(
+            SimulationDiverged, match=r"t = .*; got vertex \d+ not finite after substep \d+ of"
+        ) as caught:
+            cloth(state._replace(v=v), opening(END, "nobody"), (0.0, END))
+        messages.append(str(caught.value))
+    assert messages[0] == messages[1]
+
+
+def test_a_state_dict_and_a_copy_keep_working():
+    import copy
+
+    cloth = sheet("fused")
+    twin = copy.deepcopy(cloth)
+    twin.load_state_dict(cloth.state_dict())
+    assert twin.engine == "fused"
+    assert torch.equal(twin(start(twin), opening(END), TIMES).x, cloth(start(cloth), opening(END), TIMES).x)

@@ -1,0 +1,184 @@
+"""A user's effects and materials in Python, beside the engine: exact values, gradients in both modes, memory."""
+
+import pytest
+import torch
+import torch.autograd.forward_ad as forward_ad
+from clothes import close, opening, sheet, start
+
+import torchcloth as tc
+from torchcloth.effects import AbstractEffect, Amplitude
+from torchcloth.sensitivities import Directions
+
+END = 0.012
+TIMES = (0.0, 0.4 * END, END)
+
+
+class Pull(AbstractEffect):
+    """On vertices, and it is felt in proportion to the speed."""
+
+    amplitudes = {"strength": Amplitude("N", 1e-3, 1e-4)}
+
+    def __init__(self, strength=1e-3):
+        super().__init__()
+        self.strength = tc.PhysicalParameter(strength, "N", "nonnegative", name="pull")
+
+    def coefficients(self):
+        return self.strength.field
+
+    def force(self, c, now):
+        return c * torch.stack([now.v[..., 1], torch.sin(now.x[..., 2]), -now.v[..., 0]], dim=-1)
+
+
+class Blow(Pull):
+    """On triangles."""
+
+    acts_on = "triangles"
+
+    def force(self, c, now):
+        return c * now.surface.n * now.surface.J
+
+
+class Fading(Pull):
+    """With a memory."""
+
+    def start(self, x):
+        return torch.zeros_like(x)
+
+    def evolve(self, c, now):
+        return now.memory + now.dt * (now.v - 10 * now.memory)
+
+    def force(self, c, now):
+        return -100 * c * now.memory
+
+
+class Ballast(Pull):
+    """With a mass."""
+
+    def mass(self, c):
+        return c * torch.ones(25, 1, dtype=c.dtype)
+
+
+class Heavy(Pull):
+    """Its inertia goes through the velocities: not from outside."""
+
+    def inertia(self, c, surface):
+        return c * surface.area
+
+
+class Slippery(Pull):
+    """It loosens a grasp: not from outside."""
+
+    grasp = "left"
+
+    def loosen(self, c, index, free, held, mass, dt):
+        return held + c * (free - held)
+
+
+class Softening(tc.materials.AEP):
+    """A subclass has a law of its own, whatever it does."""
+
+    def membrane_stress(self, c, surface):
+        p1, p2 = super().membrane_stress(c, surface)
+        soft = 1 / (1 + (surface.J - 1) ** 2)
+        return soft * p1, soft * p2
+
+
+def cloth_with(engine, part):
+    effects = {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(1.2), "bending": tc.effects.Bending(1e-4)}
+    if part == "material":
+        return sheet(engine, effects=effects, material=Softening(1e5, 0.3))
+    if part == "both":
+        return sheet(engine, effects={**effects, "own": Fading(0.02)}, material=Softening(1e5, 0.3))
+    return sheet(engine, effects={**effects, "own": part(0.02)})
+
+
+def outcome(engine, part, batch=(), checkpoint=True):
+    cloth = cloth_with(engine, part)
+    motion = opening(END)
+    state = start(cloth, batch)
+    pose = motion["left"].pose.clone().requires_grad_()
+    x = state.x.clone().requires_grad_()
+    motion["left"] = motion["left"]._replace(pose=pose)
+    out = cloth(state._replace(x=x), motion, TIMES, checkpoint=checkpoint)
+    parts = {"x": out.x, "v": out.v, **out.wrench, **out.state.memory}
+    generator = torch.Generator().manual_seed(0)
+    loss = sum((torch.randn(p.shape, generator=generator, dtype=p.dtype) * p).sum() for p in parts.values())
+    inputs = {"x0": x, "pose": pose, **dict(cloth.named_parameters())}
+    grads = torch.autograd.grad(loss, list(inputs.values()), allow_unused=True)
+    return parts, dict(zip(inputs, grads, strict=True))
+
+
+@pytest.mark.parametrize("options", [{}, {"batch": (2,)}, {"checkpoint": False}], ids=str)
+@pytest.mark.parametrize("part", [Pull, Blow, Fading, Ballast, "material", "both"])
+def test_values_and_gradients_equal_the_reference(part, options):
+    parts, grads = outcome("fused", part, **options)
+    expected, slopes = outcome("reference", part, **options)
+    assert parts.keys() == expected.keys()
+    for name, value in parts.items():
+        close(value, expected[name], 1e-10, name)
+    for name, grad in grads.items():
+        assert (grad is None) == (slopes[name] is None), name
+        if grad is not None:
+            close(grad, slopes[name], 1e-8, name)
+
+
+@pytest.mark.parametrize("part", [Fading, "both"])
+def test_forward_mode(part):
+    """One direction by forward_ad, and several by ``sensitivities``."""
+    found = []
+    for engine in ("fused", "reference"):
+        cloth = cloth_with(engine, part)
+        state = start(cloth)
+        torch.manual_seed(0)
+        dx = 1e-3 * torch.randn(2, *state.x.shape)
+        with torch.no_grad(), forward_ad.dual_level():
+            out = cloth(state._replace(x=forward_ad.make_dual(state.x, dx[0])), opening(END), TIMES)
+            one = forward_ad.unpack_dual(out.x).tangent.clone()
+        moved = tc.ClothState(dx, torch.zeros_like(dx), dx[..., :0, :],
+                              {name: torch.zeros(2, *m.shape) for name, m in state.memory.items()})  # fmt: skip
+        along = Directions({"effects.bending.stiffness.raw": torch.tensor([0.0, 1.0])}, moved)
+        _, many = cloth.sensitivities(state, opening(END), TIMES, along=along)
+        close(many.x[0], one, 1e-9, "the same direction")
+        found.append((one, many.x, many.wrench["left"]))
+    for a, b in zip(*found, strict=True):
+        close(a, b, 1e-8, "tangent")
+
+
+def test_print_names_what_torch_computes():
+    assert "engine: fused, with effects.own in torch" in str(cloth_with("auto", Pull))
+    assert "engine: fused, with effects.own, material in torch" in str(cloth_with("auto", "both"))
+    heavy, slippery = (str(cloth_with("auto", part)) for part in (Heavy, Slippery))
+    assert "engine: reference (effect 'own' (Heavy), which adds inertia, has no kernels)" in heavy
+    assert "engine: reference (effect 'own' (Slippery), which loosens a grasp, has no kernels)" in slippery
+
+
+@pytest.mark.parametrize("part", [Heavy, Slippery])
+def test_hooks_that_reach_into_the_substep_are_left_to_the_reference(part):
+    assert torch.equal(outcome("auto", part)[0]["x"], outcome("reference", part)[0]["x"])
+
+
+def test_settling_and_a_grip_effect():
+    """While it settles, grips do not slip: that part can then run on the engine."""
+    auto, reference = (cloth_with(engine, Slippery) for engine in ("auto", "reference"))
+    a, b = (c.settle(start(c), opening(END), duration=0.01) for c in (auto, reference))
+    close(a.x, b.x, 1e-10, "x")
+
+
+def test_memory_is_bounded_by_checkpoints(monkeypatch):
+    """Tensors that the graph keeps: about one state for every 48 substeps instead of all of each."""
+
+    def kept(checkpoint):
+        cloth = cloth_with("fused", Pull)
+        total = 0
+
+        def pack(tensor):
+            nonlocal total
+            total += tensor.numel()
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
+            state = start(cloth)
+            cloth(state._replace(x=state.x.requires_grad_()), opening(0.1), (0.0, 0.1), checkpoint=checkpoint)
+        return total
+
+    assert kept(True) < kept(False) / 20

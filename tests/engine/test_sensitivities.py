@@ -1,0 +1,113 @@
+"""Derivatives along many directions at once: against the reference's copies, against reverse mode, and their memory."""
+
+import pytest
+import torch
+from clothes import close, opening, sheet, start
+
+import torchcloth as tc
+from torchcloth.errors import InvalidInput
+from torchcloth.sensitivities import Directions
+
+END = 0.012
+
+
+def directions(cloth, state, motion, count=3):
+    generator = torch.Generator().manual_seed(1)
+
+    def random(like):
+        return torch.randn(count, *like.shape, generator=generator, dtype=like.dtype)
+
+    only_in_contact = ("contact_stiffness", "shear_stiffness", "cone")
+    named = {n: p for n, p in cloth.named_parameters() if not any(key in n for key in only_in_contact)}
+    moves = {}
+    for name, trajectory in motion.items():
+        moves[name] = torch.zeros(count, *trajectory.pose.shape)
+        moves[name][..., :3, 3] = 1e-2 * random(trajectory.pose[..., :3, 3])
+    memory = {name: random(value) for name, value in state.memory.items()}
+    changed = tc.ClothState(1e-3 * random(state.x), random(state.v), random(state.d3), memory)
+    return Directions({n: 0.1 * random(p.detach()) for n, p in named.items()}, changed, moves)
+
+
+def parts(out):
+    return {"x": out.x, "v": out.v, **out.wrench, "last": out.state.x}
+
+
+def both(settle=0.0, batch=(), times=(0.0, 0.4 * END, END), count=3):
+    found = []
+    for engine in ("fused", "reference"):
+        cloth = sheet(engine)
+        state, motion = start(cloth, batch), opening(END)
+        along = directions(cloth, state, motion, count)
+        found.append(cloth.sensitivities(state, motion, times, along=along, settle=settle))
+    return found
+
+
+@pytest.mark.parametrize("case", [{}, {"settle": 0.01}, {"batch": (2,)}, {"count": 11, "times": (0.0, 0.003)}], ids=str)
+def test_equal_the_reference(case):
+    (value, moved), (expected, slopes) = both(**case)
+    for name in parts(value):
+        close(parts(value)[name], parts(expected)[name], 1e-10, name)
+        close(parts(moved)[name], parts(slopes)[name], 1e-8, f"tangent of {name}")
+    count = case.get("count", 3)
+    assert moved.x.shape == (count, *value.x.shape)
+
+
+def test_equal_reverse_mode():
+    """Every direction against the same projection of a gradient."""
+    cloth = sheet("fused")
+    state, motion, times = start(cloth), opening(END), (0.0, 0.005, END)
+    along = directions(cloth, state, motion)
+    _, moved = cloth.sensitivities(state, motion, times, along=along)
+    leaves = {name: t.pose.clone().requires_grad_() for name, t in motion.items()}
+    x, v = state.x.clone().requires_grad_(), state.v.clone().requires_grad_()
+    driven = {name: t._replace(pose=leaves[name]) for name, t in motion.items()}
+    out = cloth(state._replace(x=x, v=v), driven, times)
+    weights = {name: torch.randn_like(value) for name, value in parts(out).items()}
+    sum((weights[name] * value).sum() for name, value in parts(out).items()).backward()
+    for k in range(3):
+        forward = sum((weights[name] * value[k]).sum() for name, value in parts(moved).items())
+        pairs = [(along.state.x[k], x.grad), (along.state.v[k], v.grad)]
+        pairs += [(along.motion[name][k], leaves[name].grad) for name in motion]
+        pairs += [(t[k], cloth.get_parameter(name).grad) for name, t in along.parameters.items()]
+        reverse = sum((a * b).sum() for a, b in pairs)
+        assert abs(float(forward - reverse)) < 1e-8 * abs(float(reverse))
+
+
+def test_fields_and_boundary_free_cloth():
+    """A field per triangle; no motion at all."""
+    found = []
+    for engine in ("fused", "reference"):
+        field = torch.linspace(0.9e5, 1.1e5, 32)
+        cloth = sheet(engine, material=tc.materials.AEP(field, 0.3), boundaries={})
+        raw = torch.randn(2, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        along = Directions({"material.youngs_modulus.raw": raw})
+        found.append(cloth.sensitivities(start(cloth), None, (0.0, 0.01), along=along)[1].x)
+    close(*found, 1e-8, "tangent")
+    assert float(found[0][:, 1].abs().max()) > 0
+
+
+@pytest.mark.parametrize(
+    ("along", "message"),
+    [
+        (Directions(), "along; got no direction"),
+        (
+            Directions({"stiffness": torch.ones(1)}),
+            r"along\.parameters; got 'stiffness'; expected one of areal_density",
+        ),
+        (Directions({"areal_density.raw": torch.ones(1, 2)}), r"got shape \(1, 2\); expected \[K, \]"),
+        (Directions(motion={"foot": torch.ones(1)}), r"along\.motion; got 'foot'"),
+        (Directions({"areal_density.raw": torch.ones(2), "material.cone.raw": torch.ones(3)}), "same K"),
+    ],
+)
+def test_refusals(along, message):
+    cloth = sheet()
+    with pytest.raises(InvalidInput, match=message):
+        cloth.sensitivities(cloth.rest_state(), opening(END), along=along)
+
+
+def test_without_gradients_and_graph():
+    cloth = sheet("fused")
+    along = Directions({"areal_density.raw": torch.ones(1)})
+    value, moved = cloth.sensitivities(start(cloth), opening(END), (0.0, 0.005), along=along)
+    assert not value.x.requires_grad
+    assert not moved.x.requires_grad

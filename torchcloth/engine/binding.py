@@ -1,0 +1,61 @@
+"""Between a cloth's tensors and those of a program: [scenes or 1, rows, components] each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from ..boundaries import Drive
+from ..dynamics import Impulses
+from ..types import ClothState
+from .lowering import Lowering
+from .program import Field
+
+
+def named(state: ClothState) -> dict[str, Tensor]:
+    """What a program may carry, by the names of ``Lowering.carried``."""
+    return {"x": state.x, "v": state.v, "d3": state.d3, **state.memory}
+
+
+def states(low: Lowering, state: ClothState) -> dict[Field, Tensor]:
+    """The state's tensors, by field."""
+    values = named(state)
+    return {carried.now: values[name] for name, carried in low.carried.items()}
+
+
+def moves(low: Lowering, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
+    """The drives' tensors [..., substeps, comps], by field."""
+    found = {}
+    for name, (increment, pose, closed) in low.drives.items():
+        drive = drives[name]
+        found[increment], found[pose] = drive.increment.flatten(-2), drive.pose.flatten(-2)
+        found[closed] = torch.tensor(drive.closed, dtype=low.program.dtype).unsqueeze(-1)
+    return found
+
+
+def flat(low: Lowering, found: Mapping[Field, Tensor], batch: torch.Size, behind: int = 2) -> dict[Field, Tensor]:
+    """Contiguous tensors of the program's precision; ``batch``: the scenes' shape, before the last ``behind`` axes."""
+    out = {}
+    for field, t in found.items():
+        own, rest = t.shape[:-behind], t.shape[-behind:]
+        many = own.numel() > 1 or (field in _states(low) and batch.numel() > 1)
+        full = t.expand(*batch, *rest).reshape(-1, *rest) if many else t.reshape(1, *rest)
+        out[field] = full.to(low.program.dtype).contiguous()
+    return out
+
+
+def outcome(
+    low: Lowering, before: ClothState, results: Mapping[Field, Tensor], batch: torch.Size
+) -> tuple[ClothState, Impulses]:
+    """The state after the substeps, and the impulses, from [scenes, rows, components]."""
+    shaped = {f: t.reshape(*batch, *t.shape[1:]) for f, t in results.items()}
+    after = {name: shaped[carried.after] for name, carried in low.carried.items()}
+    impulses = {name: shaped[f].squeeze(-2) for name, f in low.impulses.items()}
+    x, v, d3 = after.pop("x"), after.pop("v"), after.pop("d3", before.d3)
+    return ClothState(x, v, d3, before.memory | after), impulses
+
+
+def _states(low: Lowering) -> set[Field]:
+    return {carried.now for carried in low.carried.values()}

@@ -1,0 +1,165 @@
+"""Building the engine's library, with nothing but Python's own modules: ``setup.py`` runs this file by itself.
+
+A library is named by its sources and by the processor and flags it was built for, so a wrong one is never taken.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+
+SOURCES = Path(__file__).parent / "csrc"
+FLAGS = (
+    "-std=c++20 -O3 -march=native -fPIC -fno-math-errno -fno-trapping-math -fno-signed-zeros -fvisibility=hidden "
+    "-Wno-psabi -pthread"
+)
+CLANG = "-fbracket-depth=16384 -fconstexpr-steps=200000000"  # its limits are lower than a kernel's trace
+SPEED = 500.0  # bytes of kernels that one core compiles in a second, measured with g++ 12
+
+
+class Unbuilt(RuntimeError):
+    """There is no library, and why; ``remedy``: what to do."""
+
+    def __init__(self, reason: str, remedy: str) -> None:
+        super().__init__(reason)
+        self.remedy = remedy
+
+
+def file_name() -> str:
+    """Of the library for these sources on this processor."""
+    known = hashlib.sha256(f"{FLAGS} {platform.machine()} {_processor()}".encode())
+    for file in _sources():
+        known.update(file.relative_to(SOURCES).as_posix().encode() + file.read_bytes())
+    return f"engine-{known.hexdigest()[:20]}.so"
+
+
+def compiler() -> list[str]:
+    """The command: $CXX, g++ or clang++.
+
+    Raises:
+        Unbuilt: there is none.
+    """
+    for command in (os.environ.get("CXX", ""), "g++", "clang++", "c++"):
+        parts = shlex.split(command)
+        if parts and shutil.which(parts[0]):
+            return parts
+    raise Unbuilt("no C++ compiler", "install one (Debian, Ubuntu: apt-get install g++) or name it in CXX")
+
+
+def version(command: list[str]) -> str:
+    """First line of what the compiler says of itself."""
+    with suppress(OSError):
+        done = subprocess.run([*command, "--version"], capture_output=True, text=True)
+        return (done.stdout or done.stderr).partition("\n")[0]
+    return command[0]
+
+
+def folders() -> list[Path]:
+    """Where a library may be kept, best first."""
+    own = os.environ.get("TORCHCLOTH_CACHE")
+    found = [Path(own)] if own else []
+    with suppress(RuntimeError):  # nobody's home
+        found.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchcloth")
+    return [*found, Path(tempfile.gettempdir()) / f"torchcloth-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"]
+
+
+def cached() -> Path | None:
+    """The library in the cache; None: not there."""
+    return next((folder / file_name() for folder in folders() if _is_safe(folder / file_name())), None)
+
+
+def build() -> Path:
+    """The library in the cache, built there unless it is there.
+
+    Raises:
+        Unbuilt: no compiler, it failed, or there is no folder to write to.
+    """
+    command = compiler()
+    for folder in folders():
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if not _is_safe(folder):
+                continue
+            target = folder / file_name()
+            with _alone(folder):  # another process may be building the same
+                if not _is_safe(target):
+                    _compile(command, target)
+            return target
+    places = ", ".join(str(f) for f in folders())
+    raise Unbuilt(f"no folder for the engine's library can be written to ({places})", "name one in TORCHCLOTH_CACHE")
+
+
+def _sources() -> list[Path]:
+    return sorted(p for p in SOURCES.rglob("*") if p.suffix in (".h", ".cpp"))
+
+
+@cache
+def _processor() -> str:
+    """Instructions that the processor knows: what -march=native depends on."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() in ("flags", "Features"):
+                return " ".join(sorted(value.split()))
+    return platform.processor()
+
+
+def _is_safe(path: Path) -> bool:
+    """Is there, and was not put there by somebody else where everybody can write."""
+    try:
+        own = not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()
+    except OSError:
+        return False
+    return own or not path.is_relative_to(tempfile.gettempdir())
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    with open(folder / "building.lock", "w", encoding="utf-8") as lock:
+        with suppress(ImportError, OSError):  # without locks two processes build twice, and the last one wins
+            import fcntl
+
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _compile(command: list[str], target: Path) -> None:
+    files = [p for p in _sources() if p.suffix == ".cpp"]
+    cores = min(os.cpu_count() or 1, len(files))
+    seconds = sum(p.stat().st_size for p in files if p.parent.name == "kernels") / SPEED / cores
+    print(f"torchcloth: building the engine once with {command[0]}, about {seconds:.0f} s", file=sys.stderr, flush=True)
+    flags = FLAGS.split() + (CLANG.split() if "clang" in version(command) else [])
+    with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
+        made = Path(scratch) / "engine.so"
+
+        def one(pair: tuple[int, Path]) -> str:
+            out = str(Path(scratch) / f"{pair[0]}.o")
+            _run([*command, *flags, "-c", str(pair[1]), "-o", out])
+            return out
+
+        with ThreadPoolExecutor(cores) as pool:
+            objects = list(pool.map(one, enumerate(files)))
+        _run([*command, "-shared", "-pthread", *objects, "-o", str(made)])
+        os.replace(made, target)
+
+
+def _run(command: list[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        lines = (done.stderr or done.stdout).splitlines()
+        first = next((line.strip() for line in lines if "error" in line), lines[-1] if lines else "no message")
+        raise Unbuilt(
+            f"{command[0]} failed (exit code {done.returncode}): {first}",
+            "name a compiler for C++20 in CXX (g++ 11 or clang++ 15 and later)",
+        )

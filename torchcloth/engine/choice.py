@@ -1,0 +1,95 @@
+"""Which engine runs a cloth, and why."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from functools import cache
+from typing import Literal, NamedTuple, get_args
+
+import torch
+
+from ..boundaries import Drive
+from ..errors import InvalidInput
+from ..model import Model
+from ..types import ClothState
+from .fused import Fused
+from .library import Unbuilt, library
+from .lowering import Unfused
+
+Setting = Literal["auto", "reference", "fused"]
+
+
+class Choice(NamedTuple):
+    """The fused engine, or None for the reference; and the reason in words."""
+
+    fused: Fused | None
+    reason: str
+
+    def __str__(self) -> str:
+        if self.fused is None:
+            return f"reference ({self.reason})"
+        parts = () if self.fused.outside is None else sorted(self.fused.outside.parts)
+        return f"fused, with {', '.join(parts)} in torch" if parts else "fused"
+
+
+def check_setting(setting: str) -> Setting:
+    """One of "auto", "reference", "fused".
+
+    Raises:
+        InvalidInput: anything else.
+    """
+    if setting not in get_args(Setting):
+        raise InvalidInput("engine", got=repr(setting), expected='"auto", "reference" or "fused"')
+    return setting  # type: ignore[return-value]
+
+
+def choose(setting: Setting, model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Choice:
+    """The engine for one call; warns once per process where only a compiler is missing.
+
+    Raises:
+        InvalidInput: ``setting`` is "fused" and it cannot be.
+    """
+    if setting == "reference":
+        return Choice(None, "as asked for")
+    remedy = 'use engine="auto", which falls back to the reference'
+    try:
+        return Choice(_fused(model, state, drives), "")
+    except Unfused as miss:
+        reason = f"{miss} has no kernels"
+    except _Elsewhere as miss:
+        reason = str(miss)
+    except Unbuilt as miss:
+        reason = str(miss)
+        remedy = f'{miss.remedy}, or use engine="auto"'
+        if setting == "auto":
+            _warn(f"{reason}: simulations run on the torch reference, tens of times slower; {miss.remedy}")
+    if setting == "fused":
+        raise InvalidInput(
+            "engine", got='"fused"', expected=f"a cloth that the engine can run: {reason}", remedy=remedy
+        )
+    return Choice(None, reason)
+
+
+def standing(model: Model) -> dict[str, Drive]:
+    """Drives of one substep in which every driven boundary is closed and stands still, to try an engine on."""
+    still = torch.eye(4, dtype=model.mass.dtype, device=model.mass.device).unsqueeze(0)
+    return {name: Drive(still, still, (True,)) for name, boundary in model.boundaries.items() if boundary.driven}
+
+
+class _Elsewhere(Exception):
+    """Tensors that the engine does not take."""
+
+
+def _fused(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Fused:
+    if state.x.device.type != "cpu":
+        raise _Elsewhere(f"tensors on {state.x.device.type}")
+    if state.x.dtype not in (torch.float32, torch.float64):
+        raise _Elsewhere(str(state.x.dtype).removeprefix("torch."))
+    library()
+    return Fused(model, state, drives)
+
+
+@cache
+def _warn(text: str) -> None:
+    warnings.warn(text, stacklevel=6)

@@ -1,0 +1,258 @@
+"""The engine as operators of torch: ``torchcloth::rollout``, its adjoint and its tangents.
+
+A program is known by its number (``Program.number``); whoever calls must hold it. Inputs are [scenes or 1, rows or
+substeps, components] in the order of ``Program.inputs``, results in that of ``Program.outputs``. First derivatives are
+exact in both modes and under ``vmap``; second ones are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NoReturn, cast
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInput
+from . import running
+from .program import program_of
+from .running import Job
+
+Batch = list[int | None]  # vmap's axis of every tensor
+
+# torch.library.custom_op would do the same, but imports a second's worth of compiler at the first call
+for schema in (
+    "rollout(int program, int substeps, int every, Tensor[] inputs) -> Tensor[]",
+    "rollout_backward(int program, int substeps, int every, Tensor[] inputs, Tensor records, Tensor[] seeds, "
+    "int[] wanted) -> Tensor[]",
+    "rollout_tangent(int program, int substeps, Tensor[] inputs, Tensor[] tangents, int[] moved) -> Tensor[]",
+):
+    torch.library.define(f"torchcloth::{schema.partition('(')[0]}", "(" + schema.partition("(")[2])
+ops = torch.ops.torchcloth
+_on_cpu = cast("Callable[[str], Callable]", partial(torch.library.impl, types="CPU"))
+_mapped = cast("Callable[[str], Callable]", torch.library.register_vmap)
+
+
+def _job(program: int, substeps: int, inputs: Sequence[Tensor]) -> Job:
+    known = program_of(program)
+    values = dict(zip(known.inputs, (t.contiguous() for t in inputs), strict=True))
+    return Job(known, values, _scenes(inputs), substeps)
+
+
+def _scenes(inputs: Sequence[Tensor]) -> int:
+    return max(len(t) for t in inputs)
+
+
+# -- values -----------------------------------------------------------------------------------------------------------
+
+
+@_on_cpu("torchcloth::rollout")
+def _values(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -> list[Tensor]:
+    """Results after the substeps [scenes, rows, components], and the records for the adjoint.
+
+    ``every``: substeps between records; 0: none, the adjoint goes through the substeps again.
+    """
+    results, records = running.forward(_job(program, substeps, inputs), every)
+    return [*results.values(), records]
+
+
+@torch.library.register_fake("torchcloth::rollout")
+def _(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -> list[Tensor]:
+    known, scenes = program_of(program), _scenes(inputs)
+    results = [inputs[0].new_empty(scenes, f.rows, f.comps) for f in known.outputs]
+    return [*results, inputs[0].new_empty(scenes, running.record_size(known, substeps, every))]
+
+
+@_mapped("torchcloth::rollout")
+def _(info: Any, dims: Any, program: int, substeps: int, every: int, inputs: Sequence[Tensor]):
+    scenes = _inner_scenes(inputs, dims[3])
+    flat = [_folded(t, d, info.batch_size, scenes) for t, d in zip(inputs, dims[3], strict=True)]
+    results = ops.rollout(program, substeps, every, flat)
+    return [_unfolded(t, info.batch_size) for t in results], [0] * len(results)
+
+
+# -- reverse mode -----------------------------------------------------------------------------------------------------
+
+
+@_on_cpu("torchcloth::rollout_backward")
+def _adjoints(
+    program: int,
+    substeps: int,
+    every: int,
+    inputs: Sequence[Tensor],
+    records: Tensor,
+    seeds: Sequence[Tensor],
+    wanted: Sequence[int],
+) -> list[Tensor]:
+    """Adjoints of the ``wanted`` inputs, each in its input's shape, from the seeds of all results."""
+    job = _job(program, substeps, inputs)
+    if every == 0:
+        every = running.spacing(job)
+        records = running.forward(job, every)[1]
+    fields = job.program.inputs
+    given = dict(zip(job.program.outputs, (s.contiguous() for s in seeds), strict=True))
+    found = running.reverse(job, records.contiguous(), every, given, {fields[i] for i in wanted})
+    grads = [found[fields[i]] for i in wanted]
+    return [g.sum(0, keepdim=True) if len(inputs[i]) < len(g) else g for i, g in zip(wanted, grads, strict=True)]
+
+
+@torch.library.register_fake("torchcloth::rollout_backward")
+def _(program, substeps, every, inputs, records, seeds, wanted) -> list[Tensor]:
+    return [torch.empty_like(inputs[i], memory_format=torch.contiguous_format) for i in wanted]
+
+
+@_mapped("torchcloth::rollout_backward")
+def _(info: Any, dims: Any, program, substeps, every, inputs, records, seeds, wanted):
+    size, scenes = info.batch_size, _inner_scenes(inputs, dims[3])
+    # an input that many scenes share gets a copy for each, so that their adjoints stay apart
+    own = [_folded(t, d, size, scenes, i in wanted) for i, (t, d) in enumerate(zip(inputs, dims[3], strict=True))]
+    kept = _folded(records, dims[4], size, scenes, True)
+    given = [_folded(t, d, size, scenes, True) for t, d in zip(seeds, dims[5], strict=True)]
+    grads = [_unfolded(g, size) for g in ops.rollout_backward(program, substeps, every, own, kept, given, wanted)]
+    shared = [scenes > 1 and inputs[i].shape[_first(dims[3][i])] == 1 for i in wanted]
+    return [g.sum(1, keepdim=True) if s else g for g, s in zip(grads, shared, strict=True)], [0] * len(grads)
+
+
+# -- forward mode -----------------------------------------------------------------------------------------------------
+
+
+@_on_cpu("torchcloth::rollout_tangent")
+def _tangents(
+    program: int, substeps: int, inputs: Sequence[Tensor], tangents: Sequence[Tensor], moved: Sequence[int]
+) -> list[Tensor]:
+    """Results, and then their tangents [scenes, directions, rows, components].
+
+    ``tangents``: of the inputs ``moved``, [scenes or 1, directions, rows or substeps, components] each.
+    """
+    job = _job(program, substeps, inputs)
+    fields = job.program.inputs
+    dots = {fields[i]: t.contiguous() for i, t in zip(moved, tangents, strict=True)}
+    results, moves = running.tangent(job, dots, tangents[0].shape[1])
+    return [*results.values(), *moves.values()]
+
+
+@torch.library.register_fake("torchcloth::rollout_tangent")
+def _(program: int, substeps: int, inputs: Sequence[Tensor], tangents: Sequence[Tensor], moved: Sequence[int]):
+    fields, like, scenes = program_of(program).outputs, inputs[0], _scenes(inputs)
+    results = [like.new_empty(scenes, f.rows, f.comps) for f in fields]
+    return [*results, *(like.new_empty(scenes, tangents[0].shape[1], f.rows, f.comps) for f in fields)]
+
+
+@_mapped("torchcloth::rollout_tangent")
+def _(info: Any, dims: Any, program, substeps, inputs, tangents, moved):
+    size = info.batch_size
+    if all(d is None for d in dims[2]):  # many tangents at one place: directions
+        return _many_directions(size, dims[3], program, substeps, inputs, tangents, moved)
+    scenes = _inner_scenes(inputs, dims[2])
+    own = [_folded(t, d, size, scenes) for t, d in zip(inputs, dims[2], strict=True)]
+    dots = [_folded(t, d, size, scenes) for t, d in zip(tangents, dims[3], strict=True)]
+    results = ops.rollout_tangent(program, substeps, own, dots, moved)
+    return [_unfolded(t, size) for t in results], [0] * len(results)
+
+
+def _many_directions(size: int, dims: Batch, program: int, substeps: int, inputs, tangents, moved):
+    first = [t.expand(size, *t.shape) if d is None else t.movedim(d, 0) for t, d in zip(tangents, dims, strict=True)]
+    results = ops.rollout_tangent(program, substeps, inputs, [t.movedim(0, 1).flatten(1, 2) for t in first], moved)
+    half = len(results) // 2
+    values = [t.expand(size, *t.shape) for t in results[:half]]
+    return [*values, *(t.unflatten(1, (size, -1)).movedim(1, 0) for t in results[half:])], [0] * len(results)
+
+
+# -- what the above share ---------------------------------------------------------------------------------------------
+
+
+def _first(dim: int | None) -> int:
+    """Axis of the scenes, beside vmap's."""
+    return 1 if dim == 0 else 0
+
+
+def _inner_scenes(inputs: Sequence[Tensor], dims: Batch) -> int:
+    return max(t.shape[_first(d)] for t, d in zip(inputs, dims, strict=True))
+
+
+def _folded(t: Tensor, dim: int | None, size: int, scenes: int, always: bool = False) -> Tensor:
+    """vmap's axis becomes scenes; what all scenes share stays alone, unless ``always``."""
+    if dim is None:
+        if len(t) == 1 and not always:
+            return t
+        t, dim = t.expand(size, *t.shape), 0
+    t = t.movedim(dim, 0)
+    return t.expand(size, scenes, *t.shape[2:]).flatten(0, 1)
+
+
+def _unfolded(t: Tensor, size: int) -> Tensor:
+    return t.unflatten(0, (size, -1))
+
+
+def _remember(ctx: Any, inputs: tuple[Any, ...], output: Sequence[Tensor]) -> None:
+    ctx.number, ctx.substeps, ctx.every, tensors = inputs
+    ctx.program, ctx.count = program_of(ctx.number), len(tensors)  # held as long as the graph is
+    ctx.save_for_backward(*tensors, output[-1])
+
+
+def _adjoint(ctx: Any, seeds: Sequence[Tensor | None], needs: Sequence[bool]) -> list[Tensor | None]:
+    *inputs, records = ctx.saved_tensors
+    scenes, wanted = _scenes(inputs), [i for i, need in enumerate(needs) if need]
+    fields = ctx.program.outputs
+    like = inputs[0]
+    given = [
+        like.new_zeros(scenes, f.rows, f.comps) if s is None else s for f, s in zip(fields, seeds[:-1], strict=True)
+    ]
+    found = ops.rollout_backward(ctx.number, ctx.substeps, ctx.every, inputs, records, given, wanted)
+    grads: list[Tensor | None] = [None] * len(inputs)
+    for i, grad in zip(wanted, found, strict=True):
+        grads[i] = grad
+    return grads
+
+
+def _op_backward(ctx: Any, seeds: Sequence[Tensor | None]):
+    return None, None, None, _adjoint(ctx, seeds, [t.requires_grad for t in ctx.saved_tensors[:-1]])
+
+
+def _refuse(ctx: Any, *seeds: Any) -> NoReturn:
+    raise InvalidInput(
+        "second derivatives",
+        got="a derivative of the fused engine's gradient or tangent",
+        expected="first derivatives",
+        remedy='use tc.Cloth(..., engine="reference")',
+    )
+
+
+torch.library.register_autograd("torchcloth::rollout", _op_backward, setup_context=_remember)
+torch.library.register_autograd("torchcloth::rollout_backward", _refuse)
+torch.library.register_autograd("torchcloth::rollout_tangent", _refuse)
+
+
+class Rollout(torch.autograd.Function):
+    """The operator with forward mode, which torch.library has no place for."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(program: int, substeps: int, every: int, *inputs: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore
+        """See ``rollout``."""
+        return tuple(ops.rollout(program, substeps, every, inputs))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        """What both modes need."""
+        program, substeps, every, *tensors = inputs
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(output[-1])
+        _remember(ctx, (program, substeps, every, tensors), output)
+        ctx.save_for_forward(*tensors, output[-1])
+
+    @staticmethod
+    def backward(ctx: Any, *seeds: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Adjoints."""
+        return None, None, None, *_adjoint(ctx, seeds, ctx.needs_input_grad[3:])
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Tangents."""
+        *inputs, _ = ctx.saved_tensors
+        moved = [i for i, t in enumerate(tangents[3:]) if t is not None]
+        dots = [t.unsqueeze(1) for t in tangents[3:] if t is not None]
+        results = ops.rollout_tangent(ctx.number, ctx.substeps, inputs, dots, moved)
+        return *(t.squeeze(1) for t in results[len(results) // 2 :]), None

@@ -1,0 +1,53 @@
+"""Forces that only torch knows: a user's effects and materials. They come from outside into every substep."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import torch
+from torch import Tensor
+
+from ..dynamics import vertex_forces
+from ..effects import AbstractEffect
+from ..model import Model, assemble, surface
+from ..strain import evolve, membrane_stress
+from ..types import ClothState, Memory, Moment
+
+MATERIAL = "material"
+
+
+def obstacle(model: Model, part: str) -> str | None:
+    """Why torch cannot compute a part beside the engine; None where it can."""
+    if part == MATERIAL:
+        return None if model.grid is None else "whose directors meet other layers"
+    effect = type(model.effects[part.removeprefix("effects.")][0])
+    for hook, what in (("inertia", "adds inertia"), ("loosen", "loosens a grasp")):
+        if getattr(effect, hook) is not getattr(AbstractEffect, hook):
+            return f"which {what}"
+    return None
+
+
+class Outside:
+    """The parts of a model that torch computes, by name: "material", "effects.NAME"."""
+
+    def __init__(self, model: Model, parts: Collection[str]) -> None:
+        effects = {name: part for name, part in model.effects.items() if f"effects.{name}" in parts}
+        self.model, self.parts = model._replace(effects=effects), frozenset(parts)
+
+    def force(self, state: ClothState, dt: float) -> tuple[Tensor, Memory]:
+        """(force on the vertices [..., V, 3] N, internal variables of these parts) at the start of a substep."""
+        s = surface(self.model.geometry, state.x, state.v)
+        own = {key: value for key, value in state.memory.items() if key in self.parts}
+        memory = evolve(self.model, state._replace(memory=own), s, dt)
+        if MATERIAL in self.parts:
+            return vertex_forces(self.model, state, s, memory, membrane_stress(self.model, s, memory)), memory
+        total, shares = torch.zeros_like(state.x), None
+        for name, (effect, c) in self.model.effects.items():
+            force = effect.force(c, Moment(state.x, state.v, s, self.model.mass, memory.get(f"effects.{name}")))
+            if force is not None and effect.acts_on == "triangles":
+                shares = force / 3 if shares is None else shares + force / 3
+            elif force is not None:
+                total = total + force
+        if shares is not None:
+            total = total + assemble(self.model.geometry, (shares, shares, shares), state.x)
+        return total, memory

@@ -1,0 +1,83 @@
+"""The engine's tangents: derivatives in many directions at once, carried beside the values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import torch
+import torch.autograd.forward_ad as forward_ad
+from torch import Tensor
+
+from ..boundaries import Drive
+from ..dynamics import Impulses
+from ..model import Model
+from ..types import ClothState
+from . import binding
+from .fused import Fused
+from .lowering import lower
+from .operators import ops
+from .program import Field
+
+Coefficients = dict[Field, Tensor | None]
+Within = Callable[[int, Callable[[Model], Coefficients]], Coefficients]  # work on the model that is dual along k
+
+
+class Sensing:
+    """A model on the engine, with its derivatives along K directions.
+
+    Args:
+        fused: without parts outside.
+        within: calls a function with the model that is dual along direction k, in a level of forward mode.
+        count: K.
+    """
+
+    def __init__(self, fused: Fused, within: Within, count: int) -> None:
+        self.fused, self.within, self.count = fused, within, count
+        self._known: dict[Field, Tensor] | None = None
+
+    def rollout(
+        self,
+        state: ClothState,
+        moved: ClothState,
+        dt: float,
+        drives: Mapping[str, Drive],
+        driven: Mapping[str, Drive],
+        substeps: int,
+    ) -> tuple[ClothState, ClothState, Impulses, Impulses]:
+        """(state, its tangents [K, ...], impulses, their tangents) after the substeps; ``driven``: drives' tangents."""
+        low, batch = self.fused.low, state.x.shape[:-2]
+        program = low.program
+        values = self.fused.job(state, dt, drives, substeps).inputs
+        dots = binding.states(low, moved) | self._inputs(state, drives)
+        if driven:
+            dots |= {f: t for f, t in binding.moves(low, driven).items() if f.comps > 1}  # not the flags
+        behind = binding.flat(low, {f: t.movedim(0, -3) for f, t in dots.items()}, batch, behind=3)
+        fields = [f for f in program.inputs if f in behind]
+        places = [program.inputs.index(f) for f in fields]
+        inputs, tangents = [values[f] for f in program.inputs], [behind[f] for f in fields]
+        results = ops.rollout_tangent(program.number, substeps, inputs, tangents, places)
+        half = len(program.outputs)
+        after, impulses = binding.outcome(low, state, dict(zip(program.outputs, results[:half], strict=True)), batch)
+        along = {f: t.movedim(1, 0) for f, t in zip(program.outputs, results[half:], strict=True)}
+        shape = torch.Size((self.count, *batch))
+        moved, shift = binding.outcome(low, moved, {f: t.flatten(0, 1) for f, t in along.items()}, shape)
+        return after, moved, impulses, shift
+
+    def _inputs(self, state: ClothState, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
+        """Tangents [K, ..., rows, comps] of the coefficients that have any."""
+        if self._known is None:
+            inputs = self.fused.low.inputs
+
+            def found_in(model: Model) -> Coefficients:
+                found = lower(model, state, drives).inputs
+                return {f: forward_ad.unpack_dual(t).tangent for f, t in found.items()}
+
+            every = [self.within(k, found_in) for k in range(self.count)]
+            moved = [f for f in inputs if any(found[f] is not None for found in every)]
+            full = {f: [_or_zero(found[f], inputs[f]) for found in every] for f in moved}
+            self._known = {f: torch.stack(tangents) for f, tangents in full.items()}
+        return self._known
+
+
+def _or_zero(tangent: Tensor | None, like: Tensor) -> Tensor:
+    return torch.zeros_like(like) if tangent is None else tangent.detach()

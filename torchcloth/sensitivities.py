@@ -1,0 +1,248 @@
+"""A simulation with its derivatives along K directions, by forward mode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+import torch.autograd.forward_ad as forward_ad
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from .boundaries import Drive
+from .engine.sensing import Sensing
+from .errors import InvalidInput
+from .forward_mode import real_tangents
+from .intervals import Interval, Plan, check_finite, collect, held
+from .model import Model
+from .types import ClothState, Rollout, Trajectory
+
+RATE = 30.0  # 1/s, of the damping while the cloth settles
+
+
+class Directions(NamedTuple):
+    """K directions, each a change of some of these together; K is in front of the shape of what changes."""
+
+    parameters: Mapping[str, Tensor] = {}  # by the names of ``Cloth.named_parameters``, of the raw values
+    state: ClothState | None = None
+    motion: Mapping[str, Tensor] = {}  # of the poses [K, ..., knots, 4, 4] of a boundary's trajectory
+
+
+@torch.no_grad()
+def sensitivities(
+    cloth: Any,
+    state: ClothState,
+    motion: Mapping[str, Trajectory],
+    times: Tensor | Sequence[float],
+    along: Directions,
+    dt: float | None,
+    settle: float,
+) -> tuple[Rollout, Rollout]:  # a cloth is Any here: the layer stands above this file
+    """See ``Cloth.sensitivities``."""
+    count = _check(along, cloth, state, motion)
+    plan = cloth.plan(state, motion, times, dt)
+    fused = plan.choice.fused
+    if fused is None or fused.outside is not None:
+        return _by_copies(cloth, plan, motion, along, count, dt, settle)
+    state, moved = plan.state, _tangent_of(plan.state, along, count)
+    if settle:
+        start = plan.frames[0]
+        rest = cloth.settling(state, motion, start, settle, RATE)
+        walk = _Walk(cloth, rest, lambda: cloth.settling_model(RATE), along, count)
+        poses = _Poses(motion, along, count, lambda m: held(m, *rest.frames))
+        (states, _), (shifts, _) = walk.run(state, moved, poses)
+        state, moved = (s[-1]._replace(v=torch.zeros_like(s[-1].v)) for s in (states, shifts))
+    found = _Walk(cloth, plan, cloth.model, along, count).run(state, moved, _Poses(motion, along, count))
+    values, tangents = (collect(plan, states, impulses) for states, impulses in found)
+    return values, tangents
+
+
+class _Walk:
+    """A plan, interval by interval, with tangents beside the values."""
+
+    def __init__(self, cloth: nn.Module, plan: Plan, build: Callable[[], Model], along: Directions, count: int) -> None:
+        self.cloth, self.plan, self.build, self.along, self.count = cloth, plan, build, along, count
+
+    def run(self, state: ClothState, moved: ClothState, poses: _Poses):
+        """((states, impulses), (their tangents))."""
+        fused = self.plan.choice.fused
+        if fused is None:
+            raise ValueError("the reference has no such tangents")
+        sensing = Sensing(fused, self._within, self.count)
+        values, tangents = ([state], []), ([moved], [])
+        for interval in self.plan.intervals():
+            before, drives = state, interval.drives()
+            driven = poses.tangents(interval, state.x.ndim - 2)
+            state, moved, given, shift = sensing.rollout(state, moved, interval.dt, drives, driven, interval.count)
+            check_finite(interval, before, state)
+            self.plan.check(state)
+            for (states, impulses), s, j in ((values, state, given), (tangents, moved, shift)):
+                states.append(s)
+                impulses.append(j)
+        return values, tangents
+
+    def _within(self, k: int, work: Callable[[Model], Any]) -> Any:
+        """``work`` on the model, dual along direction k of the parameters."""
+        values = dict(self.cloth.named_parameters())
+        with forward_ad.dual_level(), real_tangents():
+            entries = {
+                f"cloth.{name}": forward_ad.make_dual(values[name].detach(), tangent[k].to(values[name]).contiguous())
+                for name, tangent in self.along.parameters.items()
+            }
+            return functional_call(_Built(self.cloth, self.build, work), entries, ())
+
+
+class _Built(nn.Module):
+    """Work on a model within ``functional_call``, so that parts read the dual parameters wherever they do."""
+
+    def __init__(self, cloth: nn.Module, build: Callable[[], Model], work: Callable[[Model], Any]) -> None:
+        super().__init__()
+        self.cloth, self.build, self.work = cloth, build, work
+
+    def forward(self) -> Any:
+        """The result of the work."""
+        return self.work(self.build())
+
+
+class _Poses(NamedTuple):
+    """Motion as the user gave it; ``becomes``: what the simulation follows instead."""
+
+    motion: Mapping[str, Trajectory]
+    along: Directions
+    count: int
+    becomes: Callable[[Mapping[str, Trajectory]], Mapping[str, Trajectory]] = dict
+
+    def tangents(self, interval: Interval, batch: int) -> dict[str, Drive]:
+        """Of the drives of an interval [K, ...]; nothing where no pose changes."""
+        if not self.along.motion:
+            return {}
+        with forward_ad.dual_level():
+            motion = self.becomes(_dual_motion(self.motion, self.along, self.count, batch))
+            like = interval.motion
+            motion = {name: m._replace(pose=m.pose.to(like[name].pose)) for name, m in motion.items()}
+            drives = interval._replace(motion=motion).drives()
+            return {
+                name: d._replace(increment=_tangent(d.increment), pose=_tangent(d.pose)) for name, d in drives.items()
+            }
+
+
+def _by_copies(
+    cloth: Any,
+    plan: Plan,
+    motion: Mapping[str, Trajectory],
+    along: Directions,
+    count: int,
+    dt: float | None,
+    settle: float,
+) -> tuple[Rollout, Rollout]:
+    """K dual copies side by side: what every engine can do."""
+    state, batch, values = plan.state, plan.state.x.ndim - 2, dict(cloth.named_parameters())
+    with forward_ad.dual_level(), real_tangents():
+        entries = {
+            f"cloth.{name}": forward_ad.make_dual(*_copies(values[name], tangent, count, batch))
+            for name, tangent in along.parameters.items()
+        }
+        many = state.map(lambda field: field.expand(count, *field.shape).contiguous())
+        if along.state is not None:
+            many = _both(many, _tangent_of(state, along, count), forward_ad.make_dual)
+        moved = _dual_motion(motion, along, count, batch)
+        out = functional_call(_Replay(cloth), entries, (many, moved, plan.frames, dt, settle))
+        primal = _each(out, lambda t: forward_ad.unpack_dual(t).primal[0].clone())
+        return primal, _each(out, _tangent)
+
+
+class _Replay(nn.Module):
+    """A cloth that comes to rest, and then moves."""
+
+    def __init__(self, cloth: nn.Module) -> None:
+        super().__init__()
+        self.cloth: Any = cloth
+
+    def forward(self, state: ClothState, motion: Any, frames: list[float], dt: float | None, settle: float) -> Rollout:
+        """The rollout."""
+        if settle:
+            state = self.cloth.settle(state, motion, start=frames[0], duration=settle, rate=RATE)
+        return self.cloth(state, motion, frames, dt=dt)
+
+
+def _copies(value: Tensor, tangent: Tensor, count: int, batch: int) -> tuple[Tensor, Tensor]:
+    """K copies of a parameter as a batch in front of ``batch`` others, and their tangents."""
+    own = value.shape if value.ndim else torch.Size((1,))  # a number would be taken for a field
+    ones = (1,) * max(0, batch + 1 - len(own))
+    full = value.detach().reshape(1, *ones, *own).expand(count, *ones, *own).contiguous()
+    return full, tangent.to(full).reshape(full.shape).contiguous()
+
+
+def _dual_motion(motion: Mapping[str, Trajectory], along: Directions, count: int, batch: int) -> dict[str, Trajectory]:
+    """Trajectories with K copies of their poses, dual where a direction changes them."""
+    out = dict(motion)
+    for name, tangent in along.motion.items():
+        pose = motion[name].pose.detach()
+        ones = (1,) * max(0, batch + 3 - pose.ndim)
+        many = pose.reshape(1, *ones, *pose.shape).expand(count, *ones, *pose.shape).contiguous()
+        out[name] = motion[name]._replace(
+            pose=forward_ad.make_dual(many, tangent.to(many).reshape(many.shape).contiguous())
+        )
+    return out
+
+
+def _tangent_of(state: ClothState, along: Directions, count: int) -> ClothState:
+    """Tangents [K, ...] of the state with all its batch dimensions."""
+    zero = state.map(lambda field: field.new_zeros(count, *field.shape))
+    if along.state is None:
+        return zero
+    return _both(zero, along.state, lambda like, t: _spread(t.to(like), like))
+
+
+def _spread(tangent: Tensor, like: Tensor) -> Tensor:
+    ones = (1,) * (like.ndim - tangent.ndim)
+    return tangent.reshape(tangent.shape[0], *ones, *tangent.shape[1:]).expand_as(like).contiguous()
+
+
+def _both(a: ClothState, b: ClothState, function: Callable[[Tensor, Tensor], Tensor]) -> ClothState:
+    memory = {name: function(value, b.memory[name]) for name, value in a.memory.items()}
+    return ClothState(function(a.x, b.x), function(a.v, b.v), function(a.d3, b.d3), memory)
+
+
+def _each(out: Rollout, function: Callable[[Tensor], Tensor]) -> Rollout:
+    wrench = {name: function(w) for name, w in out.wrench.items()}
+    return Rollout(out.t, function(out.x), function(out.v), wrench, out.state.map(function))
+
+
+def _tangent(t: Tensor) -> Tensor:
+    tangent = forward_ad.unpack_dual(t).tangent
+    return torch.zeros_like(t) if tangent is None else tangent.clone()
+
+
+def _check(along: Directions, cloth: nn.Module, state: ClothState, motion: Mapping[str, Trajectory]) -> int:
+    """K, the same everywhere.
+
+    Raises:
+        InvalidInput: names or shapes that do not fit.
+    """
+    known = {
+        "parameters": dict(cloth.named_parameters()),
+        "motion": {name: trajectory.pose for name, trajectory in motion.items()},
+    }
+    pairs = []
+    for kind, given in (("parameters", along.parameters), ("motion", along.motion)):
+        for name, tangent in given.items():
+            if name not in known[kind]:
+                expected = f"one of {', '.join(sorted(known[kind]))}"
+                raise InvalidInput(f"along.{kind}", got=repr(name), expected=expected)
+            pairs.append((f"along.{kind}[{name!r}]", tangent, known[kind][name]))
+    if along.state is not None:
+        if along.state.memory.keys() != state.memory.keys():
+            got, expected = (str(sorted(s.memory)) for s in (along.state, state))
+            raise InvalidInput("along.state.memory", got=got, expected=expected)
+        pairs += [(f"along.state.{n}", getattr(along.state, n), getattr(state, n)) for n in ("x", "v", "d3")]
+        pairs += [(f"along.state.memory[{n!r}]", along.state.memory[n], state.memory[n]) for n in state.memory]
+    counts = {len(tangent) for _, tangent, _ in pairs if tangent.ndim}
+    for what, tangent, value in pairs:
+        if len(counts) != 1 or tangent.shape != (next(iter(counts)), *value.shape):
+            expected = f"[K, {', '.join(map(str, value.shape))}] with the same K everywhere"
+            raise InvalidInput(what, got=f"shape {tuple(tangent.shape)}", expected=expected)
+    if not counts or 0 in counts:
+        raise InvalidInput("along", got="no direction", expected="at least one")
+    return counts.pop()
