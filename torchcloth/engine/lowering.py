@@ -25,6 +25,9 @@ from .wrapped import array, is_wrapped, numbers_of_wrapped
 LANES = 16  # of the widest pack, csrc/pack.h
 
 
+DIRECTORS = "d3"  # key of the state's directors among the internal variables, where there is contact
+
+
 class Unfused(Exception):
     """A part that the engine does not know; the text names it. ``part``: "material" or "effects.NAME"."""
 
@@ -73,7 +76,7 @@ class Lowering:
         self.inputs: dict[Field, Tensor] = {}
         self._known: dict[int, Field] = {}
         self.x, self.v = (State(*self.program.state(self.vertices, 3)) for _ in range(2))
-        kept = {key: value for key, value in state.memory.items() if key not in outside}
+        kept = {key: value for key, value in remembered(model, state).items() if key not in outside}
         self.memory = {key: State(*self.program.state(*value.shape[-2:])) for key, value in kept.items()}
         self.dt = self.program.parameter(1, 1)
         self.mass = self.parameter(model.mass)
@@ -140,6 +143,11 @@ class Lowering:
         if self.resistance is None:
             return loop.call("scaled3", mass, change)
         return loop.call("loaded", loop.load(self.resistance, at), mass, change)
+
+
+def remembered(model: Model, state: ClothState) -> dict[str, Tensor]:
+    """Internal variables, and the directors where there is contact."""
+    return dict(state.memory) if model.grid is None else {**state.memory, DIRECTORS: state.d3}
 
 
 class Velocities:
@@ -312,11 +320,10 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive], outside:
         Unfused: a part without kernels.
     """
     from .parts import boundaries, effects, materials
+    from .parts.contact import Contact
 
     if model.transfer != "mesh":
         raise Unfused(f"transfer {model.transfer!r}")
-    if model.grid is not None:
-        raise Unfused("contact between layers")
     for key in state.memory:
         if key not in ("material", "contact") and key.removeprefix("effects.") not in model.effects:
             raise Unfused(f"memory {key!r} that no part owns")
@@ -327,10 +334,15 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive], outside:
         if f"effects.{name}" not in outside:
             _part(f"effects.{name}", lambda own=(name, effect, c): effects.lower(low, *own))
     low.close()
+    contact = None if model.grid is None else Contact(low, model.grid)
+    if contact is not None:
+        contact.press()
     velocity = _kick(low)
     for name, boundary in model.boundaries.items():
         boundaries.lower(low, name, boundary, velocity)
     _drift(low, velocity)
+    if contact is not None:
+        contact.follow()
     low.program = low.program.ready()
     return low
 

@@ -29,14 +29,15 @@ from numpy.typing import ArrayLike
 from .library import kernels, library
 from .wrapped import array
 
-OWN, SHARED = -1, -2
-LOAD, ADD, PUT = 0, 2, 3
+OWN, SHARED, VARYING = -1, -2, -3
+LOAD, ADD, PUT, SPREAD, COLLECT = 0, 2, 3, 5, 6
+AROUND, ON_NODE = 27, 4  # nodes of a point, numbers of a node
 
 
 class Kind(IntEnum):
     """What a field is; as in csrc/program.h."""
 
-    CONSTANT, PARAMETER, STATE, NEXT, TEMPORARY, KEPT, DRIVE, SUM = range(8)
+    CONSTANT, PARAMETER, STATE, NEXT, TEMPORARY, KEPT, DRIVE, SUM, NODES = range(9)
 
 
 class Shape(IntEnum):
@@ -66,7 +67,7 @@ class Program:
         self.fields: list[Field] = []
         self._constants: dict[bytes, Field] = {}
         self._tables: dict[bytes, int] = {}
-        self._stages: list[Loop | Stencil | Sieve] = []
+        self._stages: list[Loop | Stencil | Sieve | Layers] = []
         self._lists = 0
         self._written: list[tuple[str, tuple]] = []
 
@@ -106,6 +107,10 @@ class Program:
         """Added up over all substeps."""
         return self._field(Kind.SUM, 1, comps)
 
+    def nodes(self, comps: int) -> Field:
+        """Of contact, which sees to its memory: numbers of the nodes that are touched, or of the points."""
+        return self._field(Kind.NODES, 0, comps)
+
     def table(self, index: np.ndarray | torch.Tensor) -> int:
         """Rows to gather from or scatter to, one per item."""
         data = np.ascontiguousarray(array(index), dtype=np.int32).ravel()
@@ -143,6 +148,15 @@ class Program:
         """On those points alone that a sieve has found; ``flat`` as for ``loop``."""
         self._stages.append(Loop(0, among=near, flat=flat))
         return self._stages[-1]  # type: ignore[return-value]
+
+    def varying(self, count: int, again: bool = False) -> Loop:
+        """A loop over what contact finds, number ``count``; ``again``: it writes what is not recorded, and is read."""
+        self._stages.append(Loop(0, counted=count, again=again))
+        return self._stages[-1]  # type: ignore[return-value]
+
+    def contact(self, layers: Layers) -> None:
+        """Find at every substep what the varying loops run over."""
+        self._stages.append(layers)
 
     def sieve(self, x: Field, reach: Field, dt: Field, points: PointTables, steep: float) -> int:
         """A list of the points on triangles that may touch a body in this substep; see ``csrc/sieve.h``.
@@ -189,6 +203,10 @@ class Program:
     def record_size(self, full: bool) -> int:
         """Numbers of a record: of the state alone, or of all that the reverse sweep reads."""
         return self._call("size", int(full))
+
+    def records_size(self, substeps: int, every: int) -> int:
+        """Numbers of all records of a scene, with what contact notes."""
+        return self._call("records", substeps, every)
 
     def run(self, call, mode: int) -> None:
         """0: values, 1: adjoint, 2: tangents."""
@@ -244,8 +262,11 @@ def program_of(number: int) -> Program:
 class Loop:
     """Instructions on every item."""
 
-    def __init__(self, items: int, own: int = OWN, among: int = -1, flat: bool = False) -> None:
-        self.items, self._own, self._among, self.flat = items, own, among, flat
+    def __init__(
+        self, items: int, own: int = OWN, among: int = -1, counted: int = -1, flat: bool = False, again: bool = False
+    ) -> None:
+        self.items, self._own, self._among, self._counted = items, own, among, counted
+        self.flat, self.again = flat, again
         self._used = 0
         self._code: list[tuple] = []
         self._loaded: dict[tuple[int, int], list[int]] = {}
@@ -285,6 +306,17 @@ class Loop:
         """Write registers to a row of the field."""
         self._move(PUT, regs, field, at)
 
+    def spread(self, basis: Sequence[int], share: Sequence[int], field: Field, at: int) -> None:
+        """Add to the 27 nodes of each point (table ``at``) its shares [bases, 4] with bases [bases, 27]."""
+        self._code.append(("transfer", SPREAD, field.id, at, basis[0], share[0], len(basis) // AROUND))
+
+    def collect(self, basis: Sequence[int], field: Field, at: int) -> list[int]:
+        """Registers [bases, 4] with the sums over the 27 nodes of each point."""
+        bases = len(basis) // AROUND
+        share = self._new(bases * ON_NODE)
+        self._code.append(("transfer", COLLECT, field.id, at, basis[0], share[0], bases))
+        return share
+
     def _move(self, code: int, regs: Sequence[int], field: Field, at: int | None) -> None:
         if len(regs) != field.comps or list(regs) != list(range(regs[0], regs[0] + len(regs))):
             raise ValueError(f"{field} cannot take the registers {regs}")
@@ -299,16 +331,57 @@ class Loop:
 
     def emit(self, handle, api) -> None:
         """Write down the instructions."""
-        read = {reg for kind, *rest in self._code if kind == "call" for reg in rest[1]}
-        read |= {reg for kind, *rest in self._code if kind == "lookup" for reg in range(rest[4], rest[4] + 3)}
-        api("loop")(handle, self.items, self._among, int(self.flat))
+        read = self._read()
+        api("loop")(handle, self.items, self._among, self._counted, int(self.flat), int(self.again))
         for kind, *rest in self._code:
             if kind in ("move", "lookup"):
                 api(kind)(handle, *rest)
+            elif kind == "transfer":
+                share, count = rest[4], rest[5] * ON_NODE
+                api("transfer")(handle, *rest, int(bool(read & set(range(share, share + count)))))
             else:
                 number, takes, gives = rest
                 feeds = int(any(reg in read or ~reg in read for reg in gives))
                 api("call")(handle, number, _ints(takes), _ints(gives), feeds)
+
+    def _read(self) -> set[int]:
+        """Registers whose values the reverse sweep needs."""
+        read: set[int] = set()
+        for kind, *rest in self._code:
+            if kind == "call":
+                read.update(rest[1])
+            elif kind == "lookup":
+                read.update(range(rest[4], rest[4] + 3))
+            elif kind == "transfer":
+                code, _, _, basis, share, bases = rest
+                read.update(range(basis, basis + bases * AROUND))
+                read.update(range(share, share + bases * ON_NODE) if code == SPREAD else ())
+        return read
+
+
+class Layers(NamedTuple):
+    """Contact between layers: which triangles may take part, and the grid; see csrc/contact.h."""
+
+    fields: Sequence[Field]  # positions, lowest node of each point, fields of the nodes
+    corners: np.ndarray  # [3, E] int32
+    places: np.ndarray  # [S, 3] float64, barycentric
+    lengths: tuple[float, float, float]  # spacing, skin, reach [m]
+    wrap: int
+    chunk: int
+    order: np.ndarray  # [E] int32, patch by patch
+    starts: np.ndarray  # [patches + 1] int32; [1]: all triangles take part always
+    meet: np.ndarray  # [patches, patches] uint8
+    apart: np.ndarray  # [E, bytes] uint8, a bit for each triangle
+
+    def emit(self, handle, api) -> None:
+        """Write it down."""
+        ids = _ints([field.id for field in self.fields])
+        limits = _ints([self.wrap, self.chunk, len(self.starts) - 1])
+        lengths = (ctypes.c_double * 3)(*self.lengths)
+        corners, places = _array(self.corners), _array(self.places)
+        search = (_array(a) for a in (self.order, self.starts, self.meet, self.apart))
+        sizes = self.corners.shape[1], len(self.places)
+        api("contact")(handle, ids, len(ids), corners, sizes[0], places, sizes[1], lengths, limits, *search)
 
 
 class PointTables(NamedTuple):
@@ -351,6 +424,10 @@ class Stencil(NamedTuple):
 
 def _ints(values: Sequence[int]):
     return (ctypes.c_int * len(values))(*values)
+
+
+def _array(values: np.ndarray):
+    return np.ctypeslib.as_ctypes(np.ascontiguousarray(values).reshape(-1))
 
 
 def _check(code: int) -> None:

@@ -82,7 +82,7 @@ def full_size(program: Program, scenes: int, substeps: int) -> int:
 
 def record_shape(program: Program, substeps: int, every: int) -> tuple[int, ...]:
     """Of the records of one scene."""
-    return (0, 0) if every == 0 else (1 + -(-substeps // every), program.record_size(every == 1))
+    return (program.records_size(substeps, every) if every else 0,)
 
 
 def _ports(job: Job):

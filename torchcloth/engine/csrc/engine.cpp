@@ -1,6 +1,7 @@
 // The engine's plain C interface. Programs are built once and run many times; errors come back as text.
 #include <string>
 
+#include "contact.h"
 #include "kernels/kernels.h"
 #include "derivatives.h"
 #include "loop.h"
@@ -74,10 +75,33 @@ struct Engine {
         tables.back().resize(tc::round_up(count, tc::LANES<float>), count ? data[count - 1] : 0);                      \
         return int(tables.size()) - 1;                                                                                 \
     }                                                                                                                  \
-    TC_API void tc_loop_##s(void* e, int items, int list, int flat) {                                                  \
+    TC_API void tc_loop_##s(void* e, int items, int list, int counted, int flat, int again) {                          \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
-        engine.program.stages.push_back(                                                                               \
-            std::make_unique<tc::Loop<R>>(engine.program, engine.kernels.data(), items, list, flat != 0));             \
+        auto& p = engine.program;                                                                                      \
+        p.stages.push_back(                                                                                            \
+            std::make_unique<tc::Loop<R>>(p, engine.kernels.data(), items, list, counted, flat != 0));                 \
+        p.stages.back()->again = again != 0;                                                                           \
+    }                                                                                                                  \
+    TC_API int tc_transfer_##s(void* e, int code, int field, int table, int basis, int share, int bases, int feeds) {  \
+        auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
+        return guarded([&] {                                                                                           \
+            engine.loop().code.push_back({tc::Instruction::Code(code), field, table, -1, tc::ON_NODE, -1,              \
+                                          {basis, share, bases}, {}, feeds != 0});                                     \
+            engine.program.registers = std::max(engine.program.registers, share + bases * tc::ON_NODE);                \
+        });                                                                                                            \
+    }                                                                                                                  \
+    TC_API void tc_contact_##s(void* e, const int* fields, int count, const int* corners, int triangles,               \
+                               const double* places, int each, const double* lengths, const int* limits,               \
+                               const int* order, const int* starts, const uint8_t* meet, const uint8_t* apart) {       \
+        auto& program = static_cast<Engine<R>*>(e)->program;                                                           \
+        auto contact = std::make_unique<tc::Contact<R>>(program);                                                      \
+        contact->x = fields[0], contact->base = fields[1], contact->grid.assign(fields + 2, fields + count);           \
+        contact->spacing = R(lengths[0]), contact->skin = R(lengths[1]);                                               \
+        contact->wrap = limits[0], contact->chunk = limits[1];                                                         \
+        contact->place.assign(places, places + 3 * each);                                                              \
+        contact->search.fill(corners, triangles, R(lengths[2]), limits[2], order, starts, meet, apart);                \
+        program.words = (triangles + 31) / 32, program.rows = tc::LISTS, program.counts = tc::COUNTS;                  \
+        program.stages.push_back(std::move(contact));                                                                  \
     }                                                                                                                  \
     TC_API int tc_move_##s(void* e, int code, int field, int table, int reg) {                                         \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
@@ -116,11 +140,13 @@ struct Engine {
     TC_API void tc_stencil_##s(void* e, int table, int weight, int x, int y, int shape) {                              \
         static_cast<Engine<R>*>(e)->stencil(table, weight, x, y, tc::Shape(shape));                                    \
     }                                                                                                                  \
-    TC_API void tc_again_##s(void* e, int stage) { static_cast<Engine<R>*>(e)->program.stages.at(stage)->again = true; } \
     TC_API void tc_ready_##s(void* e) { static_cast<Engine<R>*>(e)->program.lay_out(); }                               \
     TC_API int64_t tc_size_##s(void* e, int full) {                                                                    \
         auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
         return int64_t(full ? p.record_size : p.state_size);                                                           \
+    }                                                                                                                  \
+    TC_API int64_t tc_records_##s(void* e, int64_t substeps, int64_t every) {                                          \
+        return int64_t(tc::records_size(static_cast<Engine<R>*>(e)->program, substeps, every));                        \
     }                                                                                                                  \
     TC_API int tc_run_##s(void* e, const tc::Call* call, int mode) {                                                   \
         return guarded([&] {                                                                                           \

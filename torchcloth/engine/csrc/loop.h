@@ -6,17 +6,20 @@
 #include <type_traits>
 
 #include "program.h"
+#include "transfer.h"
 
 namespace tc {
 
 constexpr int OWN = -1;     // item i reads and writes row i
 constexpr int SHARED = -2;  // all items read, or add to, row 0
+constexpr int VARYING = -3; // and below: rows that contact finds at every substep
 constexpr int MOST = 64;    // components of a field
 constexpr int CELL = 11;    // registers that a lookup gives
 
 // lookup: three registers, a place on a grid in cells, give the fractions of its cell and the values at its corners.
+// spread and collect: between registers and the nodes of the grid, `in` = (first basis, first share, count).
 struct Instruction {
-    enum Code { load, call, add, put, lookup } code;
+    enum Code { load, call, add, put, lookup, spread, collect } code;
     int field, table, reg, comps;
     int kernel;
     std::vector<int> in, out;  // of a lookup: {first register, nodes along x, y, z} and {first register}
@@ -24,11 +27,12 @@ struct Instruction {
     int slot = 0;              // of its table among those of the loop
 };
 
-// The items of one run: all, or those of a list.
+// The items of one run: all, those of a list, or as many as contact counts.
 struct Span {
     const int* list;
     int items;
-    const int* picked;  // rows of a list's items in this pack, by slot
+    const int* picked;          // rows of a list's items in this pack, by slot
+    const int* const* varying;  // rows that contact has found
     int at(int k) const { return list ? list[k] : k; }
 };
 
@@ -41,12 +45,13 @@ struct Loop : Stage<R> {
     const Program<R>& program;
     const Kernel<R>* kernels;
     int items, list;  // list: of a sieve; -1: all items
+    int counted;      // which of the scene's counts says how many items there are; -1: none does
     bool flat;        // what it gives has no derivative
     std::vector<Instruction> code;
     std::vector<int> tables;  // that it uses
 
-    Loop(const Program<R>& p, const Kernel<R>* k, int n, int list, bool flat)
-        : program(p), kernels(k), items(n), list(list), flat(flat) {}
+    Loop(const Program<R>& p, const Kernel<R>* k, int n, int list, int counted, bool flat)
+        : program(p), kernels(k), items(n), list(list), counted(counted), flat(flat) {}
 
     int slot(int table) {
         const auto found = std::find(tables.begin(), tables.end(), table);
@@ -55,9 +60,9 @@ struct Loop : Stage<R> {
         return int(tables.size()) - 1;
     }
     Span span(Scene<R>& s) const {
-        if (list < 0) return {nullptr, items, nullptr};
+        if (list < 0) return {nullptr, counted < 0 ? items : s.counts[counted], nullptr, s.rows.data()};
         if (s.picked.size() < tables.size() * L) s.picked.resize(tables.size() * L);
-        return {s.lists[list].items.data(), s.lists[list].count, s.picked.data()};
+        return {s.lists[list].items.data(), s.lists[list].count, s.picked.data(), nullptr};
     }
     // Look up once what all instructions on this pack need.
     void pick(Scene<R>& s, int first) const {
@@ -76,7 +81,10 @@ struct Loop : Stage<R> {
     int row(const Instruction& i, int item, Span s) const {
         if (i.table == SHARED) return 0;
         const int k = s.at(item < s.items ? item : s.items - 1);
-        return i.table == OWN ? k : program.tables[i.table][k];
+        return i.table == OWN ? k : index(i, s)[k];
+    }
+    const int* index(const Instruction& i, Span s) const {
+        return i.table <= VARYING ? s.varying[VARYING - i.table] : program.tables[i.table].data();
     }
     size_t pitch(const Instruction& i) const { return program.fields[i.field].pitch; }
     int count(int first, Span s) const { return std::min(L, s.items - first); }
@@ -95,9 +103,9 @@ struct Loop : Stage<R> {
             if (step == 4) f([first](int lane) { return size_t(first + lane) * 4; }, four);
             else f([first](int lane) { return size_t(first + lane); }, one);
         } else {
-            const int* index = program.tables[i.table].data() + first;
-            if (step == 4) f([index](int lane) { return size_t(index[lane]) * 4; }, four);
-            else f([index](int lane) { return size_t(index[lane]); }, one);
+            const int* at = index(i, s) + first;
+            if (step == 4) f([at](int lane) { return size_t(at[lane]) * 4; }, four);
+            else f([at](int lane) { return size_t(at[lane]); }, one);
         }
     }
     static constexpr std::integral_constant<size_t, 1> one{};
@@ -159,55 +167,102 @@ struct Loop : Stage<R> {
     }
     bool is_shared(const Instruction& i) const { return i.code == Instruction::load && i.table == SHARED; }
 
-    void forward(Scene<R>& s) const override {
+    // f(transfer) for the points of a pack.
+    template <class F>
+    TC_INLINE void transfer(const Instruction& i, int first, Span s, F f) const {
+        const int *nodes = index(i, s) + size_t(first) * AROUND, lanes = count(first, s);
+        if (i.in[2] == 1) f(Transfer<R, 1>{nodes, lanes});
+        else if (i.in[2] == 2) f(Transfer<R, 2>{nodes, lanes});
+        else f(Transfer<R, 4>{nodes, lanes});
+    }
+    static R* numbers(P* packs, int reg) { return reinterpret_cast<R*>(packs + reg); }
+    static void zero(P* registers, int first, int count) {
+        for (int r = 0; r < count; r++) registers[first + r] = P(0.0);
+    }
+
+    void forward(Scene<R>& s) const override { values(s, false); }
+    void replay(Scene<R>& s) const override { values(s, true); }
+    void values(Scene<R>& s, bool again) const {
         P* regs = s.regs.data;
         const Span all = span(s);
+        if (all.items == 0) return;
         for (const Instruction& i : code) if (is_shared(i)) gather(i, s.value[i.field], regs, 0, all);
         for (int first = 0; first < all.items; first += L) {
             pick(s, first);
-            for (const Instruction& i : code) switch (i.code) {
-                case Instruction::load: if (!is_shared(i)) gather(i, s.value[i.field], regs, first, all); break;
-                case Instruction::call: kernels[i.kernel].value(regs, i.in.data(), i.out.data()); break;
-                case Instruction::add: add(i, s.value[i.field], regs, first, all); break;
-                case Instruction::put: store(i, s.value[i.field], regs, first, all); break;
-                case Instruction::lookup: look(i, s.value[i.field], regs); break;
-            }
+            for (const Instruction& i : code)
+                if (!again || !is_recorded(i)) compute(s, i, first, all, regs);
+        }
+    }
+    bool is_recorded(const Instruction& i) const {
+        if (i.code != Instruction::add && i.code != Instruction::put) return false;
+        const Kind kind = program.fields[i.field].kind;
+        return kind != Kind::temporary && kind != Kind::nodes;
+    }
+    void compute(Scene<R>& s, const Instruction& i, int first, Span all, P* regs) const {
+        R* field = i.field >= 0 ? s.value[i.field] : nullptr;
+        switch (i.code) {
+            case Instruction::load: if (!is_shared(i)) gather(i, field, regs, first, all); break;
+            case Instruction::call: kernels[i.kernel].value(regs, i.in.data(), i.out.data()); break;
+            case Instruction::add: add(i, field, regs, first, all); break;
+            case Instruction::put: store(i, field, regs, first, all); break;
+            case Instruction::lookup: look(i, field, regs); break;
+            case Instruction::spread:
+                transfer(i, first, all, [&](auto t) { t.spread(regs + i.in[0], regs + i.in[1], field); });
+                break;
+            case Instruction::collect:
+                zero(regs, i.in[1], i.in[2] * ON_NODE);
+                transfer(i, first, all, [&](auto t) { t.collect(regs + i.in[0], regs + i.in[1], field); });
+                break;
         }
     }
 
     void reverse(Scene<R>& s) const override {
-        if (flat) return;
         P *regs = s.regs.data, *bars = s.bars.data;
         const Span all = span(s);
-        s.bars.clear();
-        for (const Instruction& i : code) if (is_shared(i)) gather(i, s.value[i.field], regs, 0, all);
+        if (flat || all.items == 0) return;
+        for (const Instruction& i : code)
+            if (is_shared(i)) {
+                gather(i, s.value[i.field], regs, 0, all);
+                zero(bars, i.reg, i.comps);
+            }
         for (int first = 0; first < all.items; first += L) {
             pick(s, first);
             for (const Instruction& i : code) {
-                if (i.code == Instruction::load && !is_shared(i)) {
-                    gather(i, s.value[i.field], regs, first, all);
-                    for (int c = 0; c < i.comps; c++) bars[i.reg + c] = P(0.0);
-                } else if (i.code == Instruction::call) {
-                    if (i.feeds) kernels[i.kernel].value(regs, i.in.data(), i.out.data());
-                    for (int o : i.out) if (o >= 0) bars[o] = P(0.0);
-                } else if (i.code == Instruction::lookup) {
-                    look(i, s.value[i.field], regs);
-                    for (int c = 0; c < CELL; c++) bars[i.out[0] + c] = P(0.0);
-                }
+                const bool gives = i.code == Instruction::call || i.code == Instruction::collect;
+                if (gives ? i.feeds : i.code == Instruction::load || i.code == Instruction::lookup) compute(s, i, first, all, regs);
+                if (i.code == Instruction::load && !is_shared(i)) zero(bars, i.reg, i.comps);
+                else if (i.code == Instruction::lookup) zero(bars, i.out[0], CELL);
+                else if (i.code == Instruction::collect) zero(bars, i.in[1], i.in[2] * ON_NODE);
+                else if (i.code == Instruction::call) for (int o : i.out) if (o >= 0) bars[o] = P(0.0);
             }
-            for (auto i = code.rbegin(); i != code.rend(); ++i) switch (i->code) {
-                case Instruction::add:
-                case Instruction::put: take(*i, s.bar[i->field], bars, first, all); break;
-                case Instruction::call: kernels[i->kernel].adjoint(regs, bars, i->in.data(), i->out.data()); break;
-                case Instruction::load: if (!is_shared(*i) && s.bar[i->field]) add(*i, s.bar[i->field], bars, first, all); break;
-                case Instruction::lookup:
-                    for (int k = 0; k < 3; k++) bars[i->in[0] + k] = bars[i->in[0] + k] + bars[i->out[0] + k];
-                    break;
-            }
+            for (auto i = code.rbegin(); i != code.rend(); ++i) back(s, *i, first, all, regs, bars);
         }
         for (const Instruction& i : code)
             if (is_shared(i) && s.bar[i.field])
                 for (int c = 0; c < i.comps; c++) s.bar[i.field][c] += total(bars[i.reg + c]);
+    }
+    void back(Scene<R>& s, const Instruction& i, int first, Span all, P* regs, P* bars) const {
+        R* bar = i.field >= 0 ? s.bar[i.field] : nullptr;
+        switch (i.code) {
+            case Instruction::add:
+            case Instruction::put: take(i, bar, bars, first, all); break;
+            case Instruction::call: kernels[i.kernel].adjoint(regs, bars, i.in.data(), i.out.data()); break;
+            case Instruction::load: if (!is_shared(i) && bar) add(i, bar, bars, first, all); break;
+            case Instruction::lookup:
+                for (int k = 0; k < 3; k++) bars[i.in[0] + k] = bars[i.in[0] + k] + bars[i.out[0] + k];
+                break;
+            case Instruction::spread:
+                transfer(i, first, all, [&](auto t) {
+                    t.collect_and_weigh(regs + i.in[0], bars + i.in[0], regs + i.in[1], bars + i.in[1], bar);
+                });
+                break;
+            case Instruction::collect:
+                transfer(i, first, all, [&](auto t) {
+                    t.spread(regs + i.in[0], bars + i.in[1], bar);
+                    t.weigh(bars + i.in[0], bars + i.in[1], s.value[i.field]);
+                });
+                break;
+        }
     }
     // Adjoint of a result; what was overwritten before does not count any more.
     void take(const Instruction& i, R* from, P* bars, int first, Span s) const {
@@ -234,6 +289,7 @@ struct Loop : Stage<R> {
         P* regs = s.regs.data;
         D* dots = s.dots.data;
         const Span all = span(s);
+        if (all.items == 0) return;
         for (const Instruction& i : code)  // what has no tangent
             if (i.code == Instruction::load && s.dot[i.field] == nullptr)
                 std::memset(static_cast<void*>(dots + size_t(i.reg) * L), 0, size_t(i.comps) * L * sizeof(D));
@@ -244,26 +300,33 @@ struct Loop : Stage<R> {
             }
         for (int first = 0; first < all.items; first += L) {
             pick(s, first);
-            for (const Instruction& i : code) switch (i.code) {
-                case Instruction::load:
-                    if (is_shared(i)) break;
-                    gather(i, s.value[i.field], regs, first, all);
-                    gather_along(i, s.dot[i.field], dots, first, all);
-                    break;
-                case Instruction::call: kernels[i.kernel].tangent(regs, dots, i.in.data(), i.out.data()); break;
-                case Instruction::add:
-                    add(i, s.value[i.field], regs, first, all);
-                    scatter_along(i, s.dot[i.field], dots, first, true, all);
-                    break;
-                case Instruction::put:
-                    store(i, s.value[i.field], regs, first, all);
-                    scatter_along(i, s.dot[i.field], dots, first, false, all);
-                    break;
-                case Instruction::lookup:
-                    look(i, s.value[i.field], regs);
-                    for (int k = 0; k < CELL * L; k++) dots[i.out[0] * L + k] = k < 3 * L ? dots[i.in[0] * L + k] : D(0.0);
-                    break;
-            }
+            for (const Instruction& i : code)
+                if (i.code == Instruction::call) kernels[i.kernel].tangent(regs, dots, i.in.data(), i.out.data());
+                else compute(s, i, first, all, regs), compute_along(s, i, first, all, regs, dots);
+        }
+    }
+    void compute_along(Scene<R>& s, const Instruction& i, int first, Span all, P* regs, D* dots) const {
+        R* along = s.dot[i.field];
+        const bool moves = i.code == Instruction::spread || i.code == Instruction::collect;
+        D *basis = moves ? dots + i.in[0] * L : nullptr, *share = moves ? dots + i.in[1] * L : nullptr;
+        switch (i.code) {
+            case Instruction::load: if (!is_shared(i)) gather_along(i, along, dots, first, all); break;
+            case Instruction::add: scatter_along(i, along, dots, first, true, all); break;
+            case Instruction::put: scatter_along(i, along, dots, first, false, all); break;
+            case Instruction::lookup:
+                for (int k = 0; k < CELL * L; k++) dots[i.out[0] * L + k] = k < 3 * L ? dots[i.in[0] * L + k] : D(0.0);
+                break;
+            case Instruction::spread:
+                transfer(i, first, all, [&](auto t) {
+                    t.spread_along(numbers(regs, i.in[0]), basis, numbers(regs, i.in[1]), share, reinterpret_cast<D*>(along));
+                });
+                break;
+            case Instruction::collect:
+                transfer(i, first, all, [&](auto t) {
+                    t.collect_along(numbers(regs, i.in[0]), basis, share, s.value[i.field], reinterpret_cast<D*>(along));
+                });
+                break;
+            case Instruction::call: break;
         }
     }
     // f(components), with the frequent number as a constant.

@@ -14,8 +14,8 @@ namespace tc {
 
 // constant: of the mesh. parameter: an input with a derivative. state: at the start of the substep; its `next` at the
 // end. temporary: within a substep; a kept one is recorded, because the reverse sweep reads it. drive: one row per
-// substep. sum: added up over all substeps.
-enum class Kind : int { constant, parameter, state, next, temporary, kept, drive, sum };
+// substep. sum: added up over all substeps. nodes: of the grid of contact, which sees to their memory.
+enum class Kind : int { constant, parameter, state, next, temporary, kept, drive, sum, nodes };
 
 struct Field {
     Kind kind;
@@ -64,6 +64,9 @@ struct List {
     int count = 0;
 };
 
+template <class R>
+struct Layers;  // contact.h
+
 // One simulated scene, or one scene with some directions: everything that changes.
 template <class R>
 struct Scene {
@@ -72,6 +75,13 @@ struct Scene {
     Buffer<Along<R>> dots;            // [register][lane]
     std::vector<List> lists;          // by sieve
     std::vector<int> picked;          // rows of the items of a pack, by table of the loop
+    // What contact between layers decides anew at every substep: how many items some loops have, and which rows.
+    std::vector<int> counts;
+    std::vector<const int*> rows;
+    std::shared_ptr<Layers<R>> layers;
+    int64_t substep = 0, substeps = 0;
+    int32_t* masks = nullptr;  // triangles that take part, a bit each: [substeps, words]
+    bool knows = false;        // masks are there already
 };
 
 template <class R>
@@ -80,7 +90,8 @@ struct Stage {
     virtual void forward(Scene<R>& s) const = 0;
     virtual void tangent(Scene<R>& s) const = 0;
     virtual void reverse(Scene<R>& s) const = 0;  // values of all that it reads are there
-    bool again = false;  // what it writes is not recorded: the reverse sweep runs it forward again
+    virtual void replay(Scene<R>& s) const { forward(s); }  // writes only what is not recorded
+    bool again = false;  // something that it writes is not recorded: the reverse sweep replays it
 };
 
 template <class R>
@@ -91,6 +102,7 @@ struct Program {
     std::vector<std::vector<int>> tables;  // padded to whole packs
     std::vector<std::unique_ptr<Stage<R>>> stages;
     int registers = 0, lists = 0;
+    int counts = 0, rows = 0, words = 0;  // sizes of what Scene has for contact
     size_t state_size = 0, record_size = 0;  // numbers
 
     int field(Kind kind, int rows, int comps, int near = 0, int vertices = 0) {

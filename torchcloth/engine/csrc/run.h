@@ -27,9 +27,18 @@ struct Port {
 struct Call {
     const Port* ports;  // by field
     int64_t scenes, substeps, directions, threads;
-    void* records;      // [scenes, 1 + ceil(substeps / every), record_size, or state_size where every > 1]
+    void* records;      // [scenes, records_size]
     int64_t every;      // substeps between records; 0: none
 };
+
+// Numbers for one scene: [1 + ceil(substeps / every), record_size, or state_size where every > 1], then the triangles
+// in contact, as integers [substeps, words].
+template <class R>
+size_t records_size(const Program<R>& p, int64_t substeps, int64_t every) {
+    if (every == 0) return 0;
+    const size_t masks = (size_t(substeps) * p.words * sizeof(int32_t) + sizeof(R) - 1) / sizeof(R);
+    return size_t(1 + (substeps + every - 1) / every) * (every == 1 ? p.record_size : p.state_size) + masks;
+}
 
 template <class R>
 class Run {
@@ -133,8 +142,7 @@ class Run {
 
     R* record(int64_t scene, int64_t k) const {
         const size_t size = call.every == 1 ? program.record_size : program.state_size;
-        const int64_t count = 1 + (call.substeps + call.every - 1) / call.every;
-        return static_cast<R*>(call.records) + (scene * count + k) * size;
+        return static_cast<R*>(call.records) + scene * records_size(program, call.substeps, call.every) + k * size;
     }
     // What no substep writes: lanes beyond the last row, and the end of the last record. Results are then reproducible.
     void clear(int64_t scene) const {
@@ -158,12 +166,16 @@ class Run {
         const size_t count = program.fields.size();
         m.scene.value.assign(count, nullptr), m.scene.bar.assign(count, nullptr), m.scene.dot.assign(count, nullptr);
         m.values.resize(count), m.bars.resize(count), m.dots.resize(count);
+        m.scene.counts.assign(program.counts, 0), m.scene.rows.assign(program.rows, nullptr);
+        m.scene.substeps = call.substeps, m.scene.knows = mode == Mode::reverse;
+        m.scene.masks = call.every ? reinterpret_cast<int32_t*>(record(scene, 1 + (call.substeps + call.every - 1) / call.every)) : nullptr;
         m.scene.regs.reset(program.registers), m.scene.lists.resize(program.lists);
         if (mode == Mode::reverse) m.scene.bars.reset(program.registers);
         if (mode == Mode::tangent) m.scene.dots.reset(size_t(program.registers) * LANES<R>);
         for (size_t f = 0; f < count; f++) {
             const Field& field = program.fields[f];
             if (field.kind == Kind::constant) { m.scene.value[f] = program.constants[f].data; continue; }
+            if (field.kind == Kind::nodes) continue;
             if (is_within(field.kind)) m.temporaries.push_back(f);
             if (field.kind == Kind::temporary || field.kind == Kind::sum || is_input(field.kind)) {
                 m.values[f].reset(size_of(field));
@@ -217,6 +229,7 @@ class Run {
 
     // Let every field point to where it is in substep k.
     void point(Memory& m, int64_t scene, int64_t k, R* row, R* after) const {
+        m.scene.substep = k;
         for (size_t f = 0; f < program.fields.size(); f++) {
             const Field& field = program.fields[f];
             if (field.kind == Kind::state || field.kind == Kind::kept) m.scene.value[f] = row + field.offset;
@@ -235,6 +248,7 @@ class Run {
         for (const auto& stage : program.stages) stage->forward(m.scene);
     }
     void back(Memory& m, int64_t scene, int64_t k, R* row, R* after) const {
+        m.scene.substep = k;
         for (size_t f = 0; f < program.fields.size(); f++) {
             const Field& field = program.fields[f];
             if (field.kind == Kind::state || field.kind == Kind::kept) m.scene.value[f] = row + field.offset;
@@ -246,7 +260,7 @@ class Run {
                 if (m.bars[f].data) m.scene.bar[f] = m.bars[f].data + k * field.comps;
             }
         }
-        for (const auto& stage : program.stages) if (stage->again) stage->forward(m.scene);
+        for (const auto& stage : program.stages) if (stage->again) stage->replay(m.scene);
         for (auto stage = program.stages.rbegin(); stage != program.stages.rend(); ++stage) (*stage)->reverse(m.scene);
         for (size_t f = 0; f < program.fields.size(); f++)
             if (program.next[f] >= 0) std::swap(m.scene.bar[f], m.scene.bar[program.next[f]]);

@@ -13,6 +13,7 @@ template <class R> std::vector<Kernel<R>> effect_kernels();
 template <class R> std::vector<Kernel<R>> bending_kernels();
 template <class R> std::vector<Kernel<R>> friction_kernels();
 template <class R> std::vector<Kernel<R>> boundary_kernels();
+template <class R> std::vector<Kernel<R>> contact_kernels();
 template <class R> std::vector<Kernel<R>> collider_kernels();
 template <class R> std::vector<Kernel<R>> shape_kernels();
 template <class R> std::vector<Kernel<R>> point_kernels();
@@ -22,7 +23,7 @@ std::vector<Kernel<R>> all_kernels() {
     std::vector<Kernel<R>> all;
     for (auto part : {surface_kernels<R>(), material_kernels<R>(), effect_kernels<R>(), bending_kernels<R>(),
                       friction_kernels<R>(), boundary_kernels<R>(), collider_kernels<R>(), shape_kernels<R>(),
-                      point_kernels<R>()})
+                      point_kernels<R>(), contact_kernels<R>()})
         all.insert(all.end(), part.begin(), part.end());
     return all;
 }

@@ -1,0 +1,190 @@
+"""Contact between layers in the fused engine: agreement with the reference where layers press, slide, part and meet."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from agreement import agree, difference, held, noise, outcome
+
+import torchcloth as tc
+from torchcloth import functional, self_contact
+from torchcloth.engine import fused, running
+
+SPACING, PLAY = 0.012, 0.25
+
+
+def layers(contact: tc.Contact, *, effects=None, boundaries=None, woven=False):
+    """(a sheet above another as one cloth, its lower vertices): parameters differ from triangle to triangle."""
+    below, above = (tc.meshes.rectangle(a, a, resolution=(n, n)) for a, n in ((0.1, 8), (0.08, 7)))
+    count, angle = len(below.vertices), 0.3
+    c, s = math.cos(angle), math.sin(angle)
+    upper = above.vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + np.array([0.03, 0.01, 1.7 * SPACING])
+    mesh = tc.meshes.Mesh.build(
+        np.concatenate([below.vertices, upper]),
+        np.concatenate([below.faces, above.faces + count]),
+        np.concatenate([below.uv, above.uv + np.array([1.0, 0.0])]),
+    )
+    around = 1 + 0.2 * noise((len(mesh.faces),), 5).clamp(-2, 2).to(torch.get_default_dtype())
+    law = {"contact_stiffness": 5e4 * around, "shear_stiffness": 3e3, "cone": 0.6 * around.flip(0)}
+    material = tc.materials.OrthotropicAEP(6e4, 4e4, 2e4, **law) if woven else tc.materials.AEP(6e4, **law)
+    effects = effects or {"gravity": tc.effects.Gravity()}
+    return tc.Cloth(mesh, material, 0.15 * around.roll(9), effects, boundaries or {}, contact), count
+
+
+def pressed(cloth, count, scenes=(), sideways=1.0, down=-1.0, steps=60):
+    """A state of layers that have come together, some points slipping on each other and some not."""
+    rest = cloth.rest_state().x
+    x = rest + 2e-4 * noise((*scenes, *rest.shape), 1).to(rest)
+    v = 0.2 * noise((*scenes, *rest.shape), 2).to(rest)
+    v[..., count:, 2] += down
+    v[..., count:, 0] += sideways * (rest[count:, 1] > 0.05)
+    with torch.no_grad():
+        state, _ = functional.rollout(cloth.model(), cloth.state(x, v), 1e-4, {}, steps)
+    memory = {"contact": state.memory["contact"] + noise(state.memory["contact"].shape, 3).to(rest)}
+    return state._replace(d3=state.d3 * (1 + 0.05 * noise((*state.d3.shape[:-1], 1), 6).to(rest)), memory=memory)
+
+
+def branches(cloth, state) -> dict[str, int]:
+    """How many points are in which branch of the law."""
+    model = cloth.model()
+    n = functional.surface(model.geometry, state.x, state.v).n.repeat_interleave(len(model.grid.points), -2)
+    c = cloth.material.coefficients()
+    each, faces = len(model.grid.points), len(model.geometry.area)
+    k, shear, cone = (f.expand(faces, 1).repeat_interleave(each, 0) for f in (c.contact, c.shear, c.cone))
+    height = (n * state.d3).sum(-1, keepdim=True)
+    slip = shear * (state.d3 - height * n).norm(dim=-1, keepdim=True)
+    limit = cone * k * (1 - height - PLAY).clamp(min=0) ** 2
+    press = height < 1 - PLAY - 1e-9
+    at_limit = press & (slip > (1 - 1e-9) * limit)
+    return {
+        "slip": int(at_limit.sum()),
+        "stick": int((press & ~at_limit).sum()),
+        "free": int((~press & (height < 1)).sum()),
+        "parted": int((height >= 1).sum()),
+    }
+
+
+@pytest.mark.parametrize("subdivisions", [1, 2])
+def test_pressed_and_sliding(subdivisions):
+    cloth, count = layers(tc.Contact(spacing=SPACING, subdivisions=subdivisions))
+    state = pressed(cloth, count)
+    found = branches(cloth, state)
+    assert min(found.values()) > 3, found
+    print(found, agree(cloth, {}, state))
+
+
+def test_with_air_hand_and_woven_cloth():
+    """Contact between the other parts: the air resists what it does, the hand takes part of it."""
+    cloth, count = layers(
+        tc.Contact(spacing=SPACING),
+        effects={
+            "gravity": tc.effects.Gravity(),
+            "air": tc.effects.AddedMass(0.02),
+            "drag": tc.effects.AirDrag(),
+            "bending": tc.effects.Bending(1e-5, 0.01),
+        },
+        boundaries={"hand": tc.boundaries.Grasp([9, 10, 30])},
+        woven=True,
+    )
+    print(agree(cloth, {"hand": held(0.01)}, pressed(cloth, count)))
+
+
+def test_everywhere():
+    cloth, count = layers(tc.Contact(spacing=SPACING, everywhere=True, play=0.0, damping=0.0))
+    print(agree(cloth, {}, pressed(cloth, count, steps=40), substeps=60))
+
+
+def folded(contact):
+    """(a strip folded on itself whose upper half rolls along at a speed, its state)"""
+    mesh = tc.meshes.rectangle(0.4, 0.05, resolution=(41, 6))
+    cloth = tc.Cloth(mesh, tc.materials.AEP(6e4, 0.3, 5e4, 3e4), 0.15, {"gravity": tc.effects.Gravity()}, {}, contact)
+    x = torch.as_tensor(mesh.vertices).clone()
+    over = x[:, 0] > 0.2
+    x[over, 0], x[over, 2] = 0.4 - x[over, 0], 1.3 * SPACING
+    v = torch.zeros_like(x)
+    v[over, 0] = -9.0
+    v[:, 2] = 0.1 * noise((len(x),), 4)
+    return cloth, cloth.state(x, v)
+
+
+def test_triangles_come_and_go():
+    """Searches in between wake some triangles and put others to sleep, at the start of a chunk and within one."""
+    cloth, state = folded(tc.Contact(spacing=SPACING))
+    model, now, known, seen = cloth.model(), state, None, []
+    with torch.no_grad():
+        for _ in range(60):
+            before, known = known, self_contact.near_layers(model, model.grid, now.x, known)
+            if before is not known:
+                seen.append(set(known.active.tolist()))
+            now, _ = functional.step(model, now, 5e-5, {}, 0, known)
+    assert len(seen) > 3
+    assert any(b - a for a, b in pairwise(seen))
+    assert any(a - b for a, b in pairwise(seen))
+    print([len(s) for s in seen], agree(cloth, {}, state, substeps=120, dt=5e-5))
+
+
+@torch.no_grad()
+def test_a_sheet_alone_is_bitwise_one_without_contact():
+    mesh = tc.meshes.rectangle(0.3, 0.2, triangles=200)
+    runs = []
+    for contact in (None, tc.Contact(spacing=0.02)):
+        cloth = tc.Cloth(mesh, tc.materials.AEP(6e4), 0.15, {"gravity": tc.effects.Gravity()}, {}, contact)
+        x = torch.as_tensor(mesh.vertices).clone()
+        x[:, 2] = 0.02 * torch.sin(20 * x[:, 0])
+        runs.append(fused.rollout(cloth.model(), cloth.state(x), 1e-4, {}, 100)[0])
+    assert torch.equal(runs[0].x, runs[1].x)
+    assert torch.equal(runs[0].v, runs[1].v)
+    normals = functional.surface(cloth.model().geometry, runs[1].x, runs[1].v).n
+    assert difference(runs[1].d3, normals.repeat_interleave(cloth.grid().points.shape[0], 0)) < 1e-12
+
+
+def test_batch():
+    """Scenes that differ in state and stiffness do not meet."""
+    cloth, count = layers(tc.Contact(spacing=SPACING))
+    faces = len(cloth.mesh.faces)
+    cloth.material.contact_stiffness = tc.PhysicalParameter(
+        torch.tensor([[3e4], [5e4], [8e4]]).expand(3, faces).clone(), "Pa"
+    )
+    cloth.material.shear_stiffness = tc.PhysicalParameter(torch.tensor([[3e4], [2e4], [4e4]]), "Pa")
+    print(agree(cloth, {}, pressed(cloth, count, (3,)), substeps=40))
+
+
+def test_recomputed_substeps_are_bitwise_the_recorded_ones():
+    cloth, state = folded(tc.Contact(spacing=SPACING))
+    with torch.no_grad():
+        job = fused.Fused(cloth.model(), state, {}).job(state, 5e-5, {}, 120)
+    found = []
+    for every in (1, 7, 120):
+        results, records = running.forward(job, every)
+        seeds = {f: noise(t.shape, k, t.dtype) for k, (f, t) in enumerate(results.items())}
+        found.append(running.reverse(job, records, every, seeds, set(job.inputs)))
+    for other in found[1:]:
+        assert all(torch.equal(value, other[f]) for f, value in found[0].items())
+
+
+@pytest.fixture
+def _restored():
+    before = torch.get_default_dtype()
+    yield
+    torch.set_default_dtype(before)
+
+
+@pytest.mark.usefixtures("_restored")
+def test_single_precision():
+    """Gradients of 1000 substeps of layers that slide on each other, in float32 and in float64."""
+    found = []
+    for dtype in (torch.float64, torch.float32):
+        torch.set_default_dtype(dtype)
+        cloth, count = layers(tc.Contact(spacing=SPACING))
+        start = pressed(cloth, count, sideways=0.3, down=-0.2) if not found else found[0][1].map(lambda t: t.float())
+        gradients = outcome(fused.rollout, cloth, {}, start, 1000, 2e-5).gradients
+        found.append(({k: g.double() for k, g in gradients.items() if g is not None}, start))
+    for name, exact in found[0][0].items():
+        rough = found[1][0][name]
+        error = float((rough - exact).norm() / exact.norm())
+        cosine = float((rough * exact).sum() / rough.norm() / exact.norm())
+        print(name, error, 1 - cosine)
+        assert error < 1e-3, name
+        assert cosine > 0.9999, name

@@ -1,0 +1,188 @@
+"""Contact between layers of cloth: ``self_contact`` in the engine's words.
+
+The stage ``Layers`` finds the triangles that take part and the nodes around their points. Loops over those points then
+press (before the velocities) and let the directors follow (at the end). What the nodes do to the velocities is written
+as a force: added mass resists it as it does all forces.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+from ...intervals import CHUNK
+from ...materials import AEP, OrthotropicAEP
+from ...transfer import FADING, Grid
+from ..lowering import DIRECTORS, Lowering, Unfused
+from ..program import AROUND, VARYING, Field, Layers, Loop
+from .patches import patches
+
+_LAWS = (AEP, OrthotropicAEP)  # whose law across the sheet is that of DirectorMaterial
+
+
+class Rows(IntEnum):
+    """What ``Layers`` lists, as in csrc/contact.h."""
+
+    CORNERS, TRIANGLE, OWN, PLACE, NODES = 0, 3, 4, 5, 6
+    WOKEN, ASLEEP = 7, 13  # where those of other points begin
+
+    def table(self, offset: int = 0) -> int:
+        """How an instruction names it."""
+        return VARYING - self - offset
+
+
+class Count(IntEnum):
+    """And how many."""
+
+    POINTS, WOKEN, ASLEEP, NODES = range(4)
+
+
+class Contact:
+    """Contact of a program under construction."""
+
+    def __init__(self, low: Lowering, grid: Grid) -> None:
+        model = low.model
+        if model.transfer != "mesh":
+            raise Unfused(f"transfer {model.transfer!r}")
+        if type(model.material) not in _LAWS:
+            raise Unfused(f"contact of the material {type(model.material).__name__}")
+        self.low, self.grid = low, grid
+        self.d3, self.closing = low.memory[DIRECTORS], low.memory["contact"]
+        program = low.program
+        self.mass, self.momentum, self.change, self.velocity = self.nodes = [program.nodes(4) for _ in range(4)]
+        self.lowest = program.nodes(3)
+        self.lengths = program.constant(torch.tensor([[grid.spacing, 1 / grid.spacing]], dtype=torch.float64))
+        self.share = low.number(1 / len(grid.points))
+        self.least = low.number(torch.finfo(program.dtype).tiny ** 0.5)
+        self.play = low.number(grid.play)
+        slowing = 2 * grid.damping / (FADING * grid.spacing) ** 2
+        self.losses = program.constant(torch.tensor([[grid.damping, slowing]], dtype=torch.float64))
+        self.places = program.constant(grid.points)
+        self.area = program.constant(model.geometry.area)
+        self.shape = program.constant(torch.cat([*model.geometry.warp, *model.geometry.weft], dim=-1))
+
+    def press(self) -> None:
+        """Forces of the directors: on the corners, and on the nodes."""
+        self.low.program.contact(self._layers())
+        self._alone(Count.WOKEN, Rows.WOKEN, self.low.x.now, self.d3.now, self.closing.now)
+        p = _Points(self, again=True)
+        contact, shear, _ = self._law(p)
+        d3, closing = p.own(self.d3.now), p.own(self.closing.now)
+        f1, f2, n, J = p.surface[0:3], p.surface[3:6], p.surface[12:15], p.surface[15:]
+        density = p.parameter(self.low.model.areal_density)
+        constants = [p.loop.load(field) for field in (self.low.dt, self.play, self.losses)]
+        given = p.loop.call("pressure", n, J, f1, f2, d3, closing, density, contact, shear, p.area, p.share, *constants)
+        forces = p.loop.call("assemble", given[:6], p.shape, p.area)
+        p.to_corners(forces, self.low.force)
+        shares = p.loop.call("force_shares", p.mass, given[6:])
+        p.loop.spread(p.along_director(d3), shares, self.mass, Rows.NODES.table())
+        loop = self.low.program.varying(Count.NODES, again=True)
+        loop.put(loop.call("node_change", loop.load(self.least), loop.load(self.mass)), self.change)
+        self._repel()
+
+    def _repel(self) -> None:
+        p = _Points(self)
+        change = p.loop.collect(p.along_arms(), self.change, Rows.NODES.table())
+        p.to_corners(p.loop.call("corner_forces", p.surface, p.mass, change, p.place, p.shape), self.low.force)
+
+    def follow(self) -> None:
+        """Directors after the substep."""
+        p = _Points(self, again=True)
+        carried = p.loop.call("carried", p.surface, *p.corners(self.low.v.after), p.mass, p.place, p.shape)
+        p.loop.spread(p.along_arms(), carried, self.momentum, Rows.NODES.table())
+        loop = self.low.program.varying(Count.NODES, again=True)
+        parts = (loop.load(field) for field in (self.least, self.mass, self.momentum))
+        loop.put(loop.call("node_velocity", *parts), self.velocity)
+        self._turn()
+        after = self.low.x.after, self.d3.after, self.closing.after
+        self._alone(Count.ASLEEP, Rows.ASLEEP, *after)
+
+    def _turn(self) -> None:
+        p = _Points(self)
+        d3 = p.own(self.d3.now)
+        rate = p.loop.collect(p.along_director(d3)[AROUND:], self.velocity, Rows.NODES.table())
+        now = p.loop.call("surface", *p.corners(self.low.x.after), p.shape)[12:15]
+        constants = p.loop.load(self.low.dt), p.loop.load(self.play)
+        out = p.loop.call("follow", p.surface[12:15], now, d3, rate, *self._law(p), *constants)
+        p.loop.put(out[:3], self.d3.after, Rows.OWN.table())
+        p.loop.put(out[3:], self.closing.after, Rows.OWN.table())
+
+    def _law(self, p: _Points) -> list[list[int]]:
+        """Registers of k h, gamma h and c_F."""
+        c = self.low.model.coefficients
+        return [p.parameter(value) for value in (c.contact, c.shear, c.cone)]
+
+    def _alone(self, count: Count, rows: Rows, x: Field, d3: Field, closing: Field) -> None:
+        """Directors far from other layers are the normals."""
+        loop = self.low.program.varying(count)
+        corners = [loop.load(x, rows.table(Rows.CORNERS + k)) for k in range(3)]
+        surface = loop.call("surface", *corners, loop.load(self.shape, rows.table(Rows.TRIANGLE)))
+        out = loop.call("alone", surface[12:15])
+        loop.put(out[:3], d3, rows.table(Rows.OWN))
+        loop.put(out[3:], closing, rows.table(Rows.OWN))
+
+    def _layers(self) -> Layers:
+        grid, corners = self.grid, self.low.model.geometry.corners.view(3, -1)
+        found = patches(grid, corners)
+        return Layers(
+            fields=[self.low.x.now, self.lowest, *self.nodes],
+            corners=corners.cpu().numpy().astype("int32"),
+            places=grid.points.cpu().double().numpy(),
+            lengths=(grid.spacing, grid.skin, grid.reach),
+            wrap=grid.nodes,
+            chunk=CHUNK,
+            order=found.order,
+            starts=found.starts,
+            meet=found.meet,
+            apart=found.apart,
+        )
+
+
+class _Points:
+    """A loop over the points that take part; what several kernels need is computed once."""
+
+    def __init__(self, contact: Contact, again: bool = False) -> None:
+        self._contact, low = contact, contact.low
+        self.loop: Loop = low.program.varying(Count.POINTS, again)
+        self.shape = self.loop.load(contact.shape, Rows.TRIANGLE.table())
+        self.place = self.loop.load(contact.places, Rows.PLACE.table())
+        self.area, self.share = self.loop.load(contact.area, Rows.TRIANGLE.table()), self.loop.load(contact.share)
+        corners = self.corners(low.x.now)
+        self.surface = self.loop.call("surface", *corners, self.shape)
+        self._x = self.loop.call("at_point", *corners, self.place)
+
+    def corners(self, field: Field) -> list[list[int]]:
+        """Registers of a vertex field at the triangle's corners."""
+        return [self.loop.load(field, Rows.CORNERS.table(k)) for k in range(3)]
+
+    def to_corners(self, shares: list[int], field: Field) -> None:
+        """Add nine numbers to a vertex field at the corners."""
+        for k in range(3):
+            self.loop.add(shares[3 * k : 3 * k + 3], field, Rows.CORNERS.table(k))
+
+    def own(self, field: Field) -> list[int]:
+        """Registers of a field of all points."""
+        return self.loop.load(field, Rows.OWN.table())
+
+    def parameter(self, tensor: Tensor) -> list[int]:
+        """Registers of a coefficient [..., 1 or E, 1]."""
+        return self.loop.load(self._contact.low.parameter(tensor), Rows.TRIANGLE.table())
+
+    @property
+    def mass(self) -> list[int]:
+        """Of the point."""
+        density = self.parameter(self._contact.low.model.areal_density)
+        return self.loop.call("point_mass", density, self.area, self.share)
+
+    def along_director(self, d3: list[int]) -> list[int]:
+        """Weights of the nodes, and d3 times their slopes: 2 bases."""
+        return self.loop.call("along_director", *self._spline(), d3)
+
+    def along_arms(self) -> list[int]:
+        """Weights of the nodes, and times the arms to them: 4 bases."""
+        return self.loop.call("along_arms", *self._spline())
+
+    def _spline(self) -> list[list[int]]:
+        return [self.loop.load(self._contact.lengths), self.loop.load(self._contact.lowest), self._x]
