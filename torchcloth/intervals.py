@@ -18,10 +18,9 @@ from .engine.choice import Choice
 from .engine.fused import Fused
 from .errors import SimulationDiverged
 from .functional import Impulses
+from .self_contact import CHUNK
 from .types import ClothState, Rollout, Trajectory
 from .validation import check_extent
-
-CHUNK = 48  # substeps between checkpoints of a long interval: memory ~ frames + CHUNK, one extra forward pass
 
 
 class Interval(NamedTuple):

@@ -15,6 +15,10 @@ from .model import Model, centroids, corners, surface
 from .transfer import FADING, RANGE, SKIN, TOUCH, Grid, Stencil, push, stencil, velocity_gradient
 from .types import ClothState, Surface
 
+# Substeps between checkpoints of a long interval: memory ~ frames + CHUNK, one extra forward pass. Near layers are
+# searched again at each, as substeps that are computed anew start there.
+CHUNK = 48
+
 
 class Layers(NamedTuple):
     """Triangles near another layer, over all scenes of the batch, while no vertex has moved far from ``x``."""

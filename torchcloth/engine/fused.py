@@ -12,6 +12,7 @@ from torch.utils.checkpoint import checkpoint as recompute
 from ..boundaries import Drive
 from ..dynamics import Impulses
 from ..model import Model
+from ..self_contact import CHUNK
 from ..types import ClothState
 from . import binding, running
 from .lowering import fitted
@@ -19,8 +20,6 @@ from .operators import Rollout
 from .outside import Outside
 from .program import Field
 from .running import Job
-
-CHUNK = 48  # substeps between checkpoints where torch has a part in each of them
 
 
 class Fused:

@@ -12,8 +12,8 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
-from ...intervals import CHUNK
 from ...materials import AEP, OrthotropicAEP
+from ...self_contact import CHUNK
 from ...transfer import FADING, Grid
 from ..lowering import DIRECTORS, Lowering, Unfused
 from ..program import AROUND, VARYING, Field, Layers, Loop
