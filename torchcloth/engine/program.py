@@ -374,7 +374,7 @@ class Layers(NamedTuple):
     apart: np.ndarray  # [E, bytes] uint8, a bit for each triangle
 
     def emit(self, handle, api) -> None:
-        """Hand it over."""
+        """Write it down."""
         ids = _ints([field.id for field in self.fields])
         limits = _ints([self.wrap, self.chunk, len(self.starts) - 1])
         lengths = (ctypes.c_double * 3)(*self.lengths)
