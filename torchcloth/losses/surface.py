@@ -23,8 +23,8 @@ class Hits(NamedTuple):
         return (self.weights.unsqueeze(-1) * picked).sum(-2)
 
 
-def closest(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 400_000) -> Hits:
-    """Exact closest points on a triangle mesh, by brute force in chunks.
+def closest(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 4_000_000) -> Hits:
+    """Exact closest points on a triangle mesh: all triangles that may be nearest by their bounding spheres are tried.
 
     Args:
         points: [N, 3] m.
@@ -69,38 +69,54 @@ def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tenso
 
 
 def _closest(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
-    """(nearest triangle [N], barycentric coordinates [N, 3]) of points [N, 3] on triangles [F, 3, 3]."""
+    """(nearest triangle [N], the first of several; barycentric coordinates [N, 3]) on triangles [F, 3, 3]."""
+    point, triangle = _near(points, corners)
+    offset, x = points[point], corners[triangle]
+    weights, squared = _on_triangles(offset, x)
+    least = squared.new_full((len(points),), torch.inf).scatter_reduce(0, point, squared, "amin")
+    pair = torch.arange(len(point), device=points.device)
+    pair = torch.where(squared == least[point], pair, len(pair))
+    first = pair.new_full((len(points),), len(pair)).scatter_reduce(0, point, pair, "amin")
+    return triangle[first], weights[first]
+
+
+def _near(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
+    """Pairs (point [M], triangle [M]), by points, that leave out only triangles beyond another's farthest place."""
+    centre = corners.mean(1)
+    radius = (corners - centre[:, None]).norm(dim=-1).amax(1)
+    distance = torch.cdist(points, centre, compute_mode="donot_use_mm_for_euclid_dist")
+    slack = 1 + 16 * torch.finfo(points.dtype).eps
+    reach = slack * (distance + radius).amin(1, keepdim=True)
+    point, triangle = (distance - radius <= reach).nonzero(as_tuple=True)
+    return point, triangle
+
+
+def _on_triangles(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
+    """(barycentric coordinates [M, 3], squared distance [M]) of the closest places on one triangle [M, 3, 3] each."""
+    candidates = [_project_inside(points, corners), *(_project_edge(points, corners, i) for i in range(3))]
+    weights = torch.stack(candidates)  # [4, M, 3]
+    on = (weights.unsqueeze(-1) * corners).sum(-2)
+    squared, kind = (points - on).square().sum(-1).min(0)
+    return weights[kind, torch.arange(len(points), device=points.device)], squared
+
+
+def _project_inside(points: Tensor, corners: Tensor) -> Tensor:
+    """Barycentric coordinates [M, 3] of the plane projection; the first corner where that falls outside."""
     a, b, c = corners.unbind(1)
-    inside = _project_inside(points, a, b, c)
-    candidates = [inside, *(_project_edge(points, corners, i) for i in range(3))]
-    weights = torch.stack(candidates)  # [4, N, F, 3]
-    on = torch.einsum("knfc,fcd->knfd", weights, corners)
-    distance = (points[:, None] - on).pow(2).sum(-1)
-    best, kind = distance.min(0)
-    face = best.argmin(-1)
-    row = torch.arange(len(points), device=points.device)
-    return face, weights[kind[row, face], row, face]
-
-
-def _project_inside(points: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Barycentric coordinates [N, F, 3] of the plane projection; the first corner where that falls outside."""
-    e1, e2 = b - a, c - a
+    e1, e2, offset = b - a, c - a, points - a
     normal = cross(e1, e2)
-    scale = 1.0 / dot(normal, normal)
-    offset = points[:, None] - a
-    v = (cross(offset, e2.expand_as(offset)) * (normal * scale)).sum(-1)
-    w = (cross(e1.expand_as(offset), offset) * (normal * scale)).sum(-1)
-    weights = torch.stack([1 - v - w, v, w], dim=-1)
+    scale = normal / dot(normal, normal)
+    v, w = dot(cross(offset, e2), scale), dot(cross(e1, offset), scale)
+    weights = torch.cat([1 - v - w, v, w], dim=-1)
     outside = (weights < 0).any(-1, keepdim=True)
     return torch.where(outside, torch.eye(3, dtype=a.dtype, device=a.device)[0], weights)
 
 
 def _project_edge(points: Tensor, corners: Tensor, start: int) -> Tensor:
-    """Barycentric coordinates [N, F, 3] of the closest point on the edge from corner ``start`` to the next."""
+    """Barycentric coordinates [M, 3] of the closest point on the edge from corner ``start`` to the next."""
     end = (start + 1) % 3
     a, edge = corners[:, start], corners[:, end] - corners[:, start]
-    t = ((points[:, None] - a) * edge).sum(-1) / dot(edge, edge).squeeze(-1)
-    t = t.clamp(0.0, 1.0)
+    t = (dot(points - a, edge) / dot(edge, edge)).squeeze(-1).clamp(0.0, 1.0)
     weights = t.new_zeros(*t.shape, 3)
     weights[..., start], weights[..., end] = 1 - t, t
     return weights
@@ -109,6 +125,7 @@ def _project_edge(points: Tensor, corners: Tensor, start: int) -> Tensor:
 def _on_boundary(faces: Tensor, face: Tensor, weights: Tensor) -> Tensor:
     """[N] bool, whether the closest point lies on an edge that only one triangle has."""
     edges = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], dim=1).sort(-1).values
-    _, inverse, count = edges.reshape(-1, 2).unique(dim=0, return_inverse=True, return_counts=True)
+    number = edges[..., 0] * (faces.max() + 1) + edges[..., 1]  # one number for each edge: sorts far faster than rows
+    _, inverse, count = number.flatten().unique(return_inverse=True, return_counts=True)
     open_edge = (count[inverse] == 1).reshape(-1, 3)  # the edge opposite to each corner
     return ((weights <= 0) & open_edge[face]).any(-1)
