@@ -4,7 +4,6 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth.sensitivities import Directions
 
 SCENES, TIMES = 3, [0.0, 0.01, 0.02]
 
@@ -51,6 +50,6 @@ def test_values_and_gradients(cloth, run):
 @pytest.mark.usefixtures("threads")
 def test_tangents(cloth):
     eye = torch.eye(9, 2, dtype=cloth.rest_state().x.dtype)  # three chunks
-    along = Directions({"material.youngs_modulus.raw": eye[:, 0].clone(), "areal_density.raw": eye[:, 1].clone()})
+    along = tc.Directions({"material.youngs_modulus.raw": eye[:, 0].clone(), "areal_density.raw": eye[:, 1].clone()})
     rollout, moved = cloth.sensitivities(cloth.rest_state(), times=TIMES, along=along)
     same("forward", [rollout.x, moved.x])
