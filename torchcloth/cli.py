@@ -213,7 +213,7 @@ def _doctor(options: argparse.Namespace) -> int:
     from .engine import library
 
     print(f"torchcloth {metadata.version('torchcloth')}, torch {torch.__version__}, CUDA {torch.cuda.is_available()}")
-    print(f"{'engine':20s} {library.standing()}")
+    print(f"{'engine':20s} {library.status()}")
     packages = {
         "pytorch_kinematics": "robots",
         "yourdfpy": "robots",

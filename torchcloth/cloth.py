@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from . import functional
 from .boundaries import AbstractBoundary
 from .effects import AbstractEffect, MassDamping
-from .engine.choice import Choice, Setting, check_setting, choose, standing
+from .engine.choice import Choice, Setting, check_setting, choose, still_drives
 from .errors import InvalidInput
 from .intervals import Plan, held, run
 from .materials import AbstractMaterial
@@ -341,7 +341,7 @@ class Cloth(nn.Module):
         return plan
 
     def _choice(self, model: functional.Model, state: ClothState) -> Choice:
-        return choose(self.engine, model, state, standing(model))
+        return choose(self.engine, model, state, still_drives(model))
 
     def _longest(self) -> float:
         """Extent [m] that the contact grid has room for."""

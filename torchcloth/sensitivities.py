@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from .boundaries import Drive
-from .engine.sensing import Sensing
+from .engine.tangents import FusedTangents
 from .errors import InvalidInput
 from .forward_mode import real_tangents
 from .intervals import Interval, Plan, check_finite, collect, held
@@ -43,7 +43,7 @@ def sensitivities(
     count = _check(along, cloth, state, motion)
     plan = cloth.plan(state, motion, times, dt)
     fused = plan.choice.fused
-    if fused is None or fused.outside is not None:
+    if fused is None or fused.torch_parts is not None:
         return _by_copies(cloth, plan, motion, along, count, dt, settle)
     state, moved = plan.state, _tangent_of(plan.state, along, count)
     if settle:
@@ -69,7 +69,7 @@ class _Walk:
         fused = self.plan.choice.fused
         if fused is None:
             raise ValueError("the reference has no such tangents")
-        sensing = Sensing(fused, self._within, self.count)
+        sensing = FusedTangents(fused, self._within, self.count)
         values, tangents = ([state], []), ([moved], [])
         for interval in self.plan.intervals():
             before, drives = state, interval.drives()
