@@ -22,7 +22,7 @@ FLOORS = (
     ("model",),
     ("self_contact", "strain", "dynamics"),
     ("apic",),
-    ("functional", "stability", "recordings", "losses", "engine"),
+    ("functional", "stability", "recordings", "losses", "engine", "initial"),
     ("observe", "validation"),
     ("intervals",),
     ("sensitivities",),

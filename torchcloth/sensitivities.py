@@ -14,7 +14,8 @@ from .boundaries import Drive
 from .engine.tangents import FusedTangents
 from .errors import InvalidInput
 from .forward_mode import real_tangents
-from .intervals import Interval, Plan, check_finite, collect, held
+from .initial import damped, held
+from .intervals import Interval, Plan, check_finite, collect
 from .model import Model
 from .types import ClothState, Rollout, Trajectory
 
@@ -49,7 +50,7 @@ def sensitivities(
     if settle:
         start = plan.frames[0]
         rest = cloth.settling(state, motion, start, settle, RATE)
-        walk = _Walk(cloth, rest, lambda: cloth.settling_model(RATE), along, count)
+        walk = _Walk(cloth, rest, lambda: damped(cloth.model(), RATE), along, count)
         poses = _Poses(motion, along, count, lambda m: held(m, *rest.frames))
         (states, _), (shifts, _) = walk.run(state, moved, poses)
         state, moved = (s[-1]._replace(v=torch.zeros_like(s[-1].v)) for s in (states, shifts))

@@ -6,8 +6,20 @@ import torch
 from torch import Tensor
 
 from .materials import Stiffness
+from .model import Model
+from .strain import grown_gradient
 
 SAFETY = 0.7  # of the linear limit: leaves room for tangents that double beyond what the material states
+
+
+def stable_step_of(model: Model, gradient: Tensor) -> float:
+    """``stable_step`` of a cloth with all its parts; ``gradient``: of the shape functions of the pattern."""
+    spacing = None if model.grid is None else model.grid.spacing
+    extra = [effect.rates(c, model.mass) for effect, c in model.effects.values()]
+    elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
+    gradient = gradient if model.rest is None else grown_gradient(gradient, model.rest)
+    stiffness = model.material.stiffness(model.coefficients)
+    return stable_step(gradient, model.areal_density, stiffness, spacing, elastic, damping)
 
 
 def stable_step(

@@ -85,6 +85,16 @@ def check_motions(
     return {name: Trajectory(m.t, m.pose.to(like), m.closed) for name, m in motion.items()}
 
 
+def check_positions(x: Tensor, v: Tensor, like: Tensor) -> None:
+    """Refuse positions [..., V, 3] and velocities for another number of vertices than ``like``, or not finite."""
+    if x.shape[-2:] != like.shape:
+        raise InvalidInput("x", got=f"shape {tuple(x.shape)}", expected=f"[..., {len(like)}, 3] in metres")
+    if v.shape != x.shape:
+        raise InvalidInput("v", got=f"shape {tuple(v.shape)}", expected=f"x's, {tuple(x.shape)}")
+    if not bool(torch.isfinite(x.detach()).all()):
+        raise InvalidInput("x", got="NaN or infinite entries", expected="finite positions in metres")
+
+
 def check_state(state: ClothState, like: ClothState) -> None:
     """Refuse a state that was made for another cloth (than ``like``, one of the right shapes), or is not finite."""
     got, expected = ({name: tuple(t.shape[-2:]) for name, t in _named(s).items()} for s in (state, like))
