@@ -29,7 +29,6 @@ from .validation import (
     check_field,
     check_grasps,
     check_motions,
-    check_positions,
     check_state,
     check_step,
     check_times,
@@ -130,7 +129,6 @@ class Cloth(nn.Module):
         """A state from vertex positions [..., V, 3] m and velocities (None: at rest), directors along the normals."""
         x = torch.as_tensor(x, dtype=self._area.dtype, device=self._area.device)
         v = torch.zeros_like(x) if v is None else torch.as_tensor(v, dtype=x.dtype, device=x.device)
-        check_positions(x, v, self._vertices)
         return first_state(self.model(), x, v)
 
     # -- simulation -----------------------------------------------------------------------------------------------

@@ -8,15 +8,21 @@ import torch
 from torch import Tensor
 
 from .boundaries import drive
-from .boundaries.motion import interpolate
+from .boundaries.motion import check, interpolate
 from .effects import MassDamping
 from .model import Model
 from .self_contact import first_directors
 from .types import ClothState, Memory, Trajectory
+from .validation import check_duration, check_mapping, check_positions
 
 
 def first_state(model: Model, x: Tensor, v: Tensor) -> ClothState:
-    """Vertices at x [..., V, 3] with velocities v; directors along the normals, nothing remembered."""
+    """Vertices at x [..., V, 3] with velocities v; directors along the normals, nothing remembered.
+
+    Raises:
+        InvalidInput: shapes that do not fit, or positions that are not finite.
+    """
+    check_positions(x, v, model.mass.shape[-2])
     d3 = x[..., :0, :] if model.grid is None else first_directors(model, model.grid, x)
     return ClothState(x, v, d3, _virgin(model, x))
 
@@ -35,9 +41,16 @@ def damped(model: Model, rate: float) -> Model:
 
 
 def held(motion: Mapping[str, Trajectory], start: float, end: float) -> dict[str, Trajectory]:
-    """Every body stands where it is at ``start``, with the same grasps closed."""
+    """Every body stands where it is at ``start``, with the same grasps closed.
+
+    Raises:
+        InvalidInput: a trajectory that cannot be followed, or no time to stand still.
+    """
+    check_duration(end - start)
+    check_mapping(motion)
     found, span = {}, torch.tensor([start, end], dtype=torch.float64)
     for name, trajectory in motion.items():
+        check(trajectory, name)
         pose = interpolate(trajectory, span[:1].to(trajectory.pose))
         closed = drive(trajectory, span[:1].repeat(2).to(trajectory.pose)).closed[0]
         found[name] = Trajectory(span, pose.expand(*pose.shape[:-3], 2, 4, 4), torch.tensor([closed, closed]))

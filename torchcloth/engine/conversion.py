@@ -28,8 +28,8 @@ def state_inputs(low: Lowering, state: ClothState) -> dict[Field, Tensor]:
 def drive_inputs(low: Lowering, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
     """The drives' tensors [..., substeps, comps], by field."""
     found = {}
-    for name, (increment, pose, closed) in low.drives.items():
-        drive = drives[name]
+    for name, drive in drives.items():
+        increment, pose, closed = low.drives[name]
         found[increment], found[pose] = drive.increment.flatten(-2), drive.pose.flatten(-2)
         found[closed] = torch.tensor(drive.closed, dtype=low.program.dtype).unsqueeze(-1)
     return found
