@@ -71,12 +71,12 @@ class _Walk:
         fused = self.plan.choice.fused
         if fused is None:
             raise ValueError("the reference has no such tangents")
-        sensing = FusedTangents(fused, self._within, self.count)
+        engine = FusedTangents(fused, self._within, self.count)
         values, tangents = ([state], []), ([moved], [])
         for interval in self.plan.intervals():
             before, drives = state, interval.drives()
             driven = poses.tangents(interval, state.x.ndim - 2)
-            state, moved, given, shift = sensing.rollout(state, moved, interval.dt, drives, driven, interval.count)
+            state, moved, given, shift = engine.rollout(state, moved, interval.dt, drives, driven, interval.count)
             check_finite(interval, before, state)
             self.plan.check(state)
             for (states, impulses), s, j in ((values, state, given), (tangents, moved, shift)):
@@ -228,7 +228,7 @@ def _check(along: Directions, cloth: nn.Module, state: ClothState, motion: Mappi
     """
     if not isinstance(along, Directions) or not isinstance(along.state, ClothState | None):
         got = type(along if not isinstance(along, Directions) else along.state).__name__
-        raise InvalidInput("along", got=got, expected="torchcloth.sensitivities.Directions(parameters, state, motion)")
+        raise InvalidInput("along", got=got, expected="tc.Directions(parameters, state, motion)")
     known = {
         "parameters": dict(cloth.named_parameters()),
         "motion": {name: trajectory.pose for name, trajectory in motion.items()},
