@@ -17,7 +17,7 @@ constexpr int MOST = 64;    // components of a field
 constexpr int CELL = 11;    // registers that a lookup gives
 
 // lookup: three registers, a place on a grid in cells, give the fractions of its cell and the values at its corners.
-// spread and collect: between registers and the nodes of the grid, `in` = (first basis, first share, count).
+// spread and collect: between registers and the nodes of the grid, `in` = (first offset, first share, By).
 struct Instruction {
     enum Code { load, call, add, put, lookup, spread, collect } code;
     int field, table, reg, comps;
@@ -168,14 +168,12 @@ struct Loop : Stage<R> {
     bool is_shared(const Instruction& i) const { return i.code == Instruction::load && i.table == SHARED; }
 
     // f(transfer) for the points of a pack.
-    template <class F>
+    template <template <class, By> class Of, class F>
     TC_INLINE void transfer(const Instruction& i, int first, Span s, F f) const {
         const int *nodes = index(i, s) + size_t(first) * AROUND, lanes = count(first, s);
-        if (i.in[2] == 1) f(Transfer<R, 1>{nodes, lanes});
-        else if (i.in[2] == 2) f(Transfer<R, 2>{nodes, lanes});
-        else f(Transfer<R, 4>{nodes, lanes});
+        if (By(i.in[2]) == By::slopes) f(Of<R, By::slopes>{nodes, lanes});
+        else f(Of<R, By::arms>{nodes, lanes});
     }
-    static R* numbers(P* packs, int reg) { return reinterpret_cast<R*>(packs + reg); }
     static void zero(P* registers, int first, int count) {
         for (int r = 0; r < count; r++) registers[first + r] = P(0.0);
     }
@@ -207,11 +205,10 @@ struct Loop : Stage<R> {
             case Instruction::put: store(i, field, regs, first, all); break;
             case Instruction::lookup: look(i, field, regs); break;
             case Instruction::spread:
-                transfer(i, first, all, [&](auto t) { t.spread(regs + i.in[0], regs + i.in[1], field); });
+                transfer<Transfer>(i, first, all, [&](auto t) { t.spread(regs + i.in[0], regs + i.in[1], field); });
                 break;
             case Instruction::collect:
-                zero(regs, i.in[1], i.in[2] * ON_NODE);
-                transfer(i, first, all, [&](auto t) { t.collect(regs + i.in[0], regs + i.in[1], field); });
+                transfer<Transfer>(i, first, all, [&](auto t) { t.collect(regs + i.in[0], regs + i.in[1], field); });
                 break;
         }
     }
@@ -232,7 +229,7 @@ struct Loop : Stage<R> {
                 if (gives ? i.feeds : i.code == Instruction::load || i.code == Instruction::lookup) compute(s, i, first, all, regs);
                 if (i.code == Instruction::load && !is_shared(i)) zero(bars, i.reg, i.comps);
                 else if (i.code == Instruction::lookup) zero(bars, i.out[0], CELL);
-                else if (i.code == Instruction::collect) zero(bars, i.in[1], i.in[2] * ON_NODE);
+                else if (i.code == Instruction::collect) zero(bars, i.in[1], SHARES);
                 else if (i.code == Instruction::call) for (int o : i.out) if (o >= 0) bars[o] = P(0.0);
             }
             for (auto i = code.rbegin(); i != code.rend(); ++i) back(s, *i, first, all, regs, bars);
@@ -252,14 +249,15 @@ struct Loop : Stage<R> {
                 for (int k = 0; k < 3; k++) bars[i.in[0] + k] = bars[i.in[0] + k] + bars[i.out[0] + k];
                 break;
             case Instruction::spread:
-                transfer(i, first, all, [&](auto t) {
-                    t.collect_and_weigh(regs + i.in[0], bars + i.in[0], regs + i.in[1], bars + i.in[1], bar);
+                transfer<Transfer>(i, first, all, [&](auto t) {
+                    t.collect_and_weigh(regs + i.in[0], regs + i.in[1], bar, bars + i.in[1], bars + i.in[0]);
                 });
                 break;
             case Instruction::collect:
-                transfer(i, first, all, [&](auto t) {
+                transfer<Transfer>(i, first, all, [&](auto t) {
                     t.spread(regs + i.in[0], bars + i.in[1], bar);
-                    t.weigh(bars + i.in[0], bars + i.in[1], s.value[i.field]);
+                    P again[SHARES];
+                    t.collect_and_weigh(regs + i.in[0], bars + i.in[1], s.value[i.field], again, bars + i.in[0]);
                 });
                 break;
         }
@@ -308,7 +306,7 @@ struct Loop : Stage<R> {
     void compute_along(Scene<R>& s, const Instruction& i, int first, Span all, P* regs, D* dots) const {
         R* along = s.dot[i.field];
         const bool moves = i.code == Instruction::spread || i.code == Instruction::collect;
-        D *basis = moves ? dots + i.in[0] * L : nullptr, *share = moves ? dots + i.in[1] * L : nullptr;
+        D *offset = moves ? dots + i.in[0] * L : nullptr, *share = moves ? dots + i.in[1] * L : nullptr;
         switch (i.code) {
             case Instruction::load: if (!is_shared(i)) gather_along(i, along, dots, first, all); break;
             case Instruction::add: scatter_along(i, along, dots, first, true, all); break;
@@ -317,14 +315,10 @@ struct Loop : Stage<R> {
                 for (int k = 0; k < CELL * L; k++) dots[i.out[0] * L + k] = k < 3 * L ? dots[i.in[0] * L + k] : D(0.0);
                 break;
             case Instruction::spread:
-                transfer(i, first, all, [&](auto t) {
-                    t.spread_along(numbers(regs, i.in[0]), basis, numbers(regs, i.in[1]), share, reinterpret_cast<D*>(along));
-                });
+                transfer<TransferAlong>(i, first, all, [&](auto t) { t.spread(regs + i.in[0], offset, regs + i.in[1], share, along); });
                 break;
             case Instruction::collect:
-                transfer(i, first, all, [&](auto t) {
-                    t.collect_along(numbers(regs, i.in[0]), basis, share, s.value[i.field], reinterpret_cast<D*>(along));
-                });
+                transfer<TransferAlong>(i, first, all, [&](auto t) { t.collect(regs + i.in[0], offset, share, s.value[i.field], along); });
                 break;
             case Instruction::call: break;
         }

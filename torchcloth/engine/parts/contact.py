@@ -16,7 +16,7 @@ from ...materials import AEP, OrthotropicAEP
 from ...self_contact import CHUNK
 from ...transfer import FADING, Grid
 from ..lowering import DIRECTORS, Lowering, Unfused
-from ..program import AROUND, VARYING, Field, Layers, Loop
+from ..program import VARYING, By, Field, Layers, Loop
 from .patches import patches
 
 _LAWS = (AEP, OrthotropicAEP)  # whose law across the sheet is that of DirectorMaterial
@@ -76,22 +76,24 @@ class Contact:
         given = p.loop.call("pressure", n, J, f1, f2, d3, closing, density, contact, shear, p.area, p.share, *constants)
         forces = p.loop.call("assemble", given[:6], p.shape, p.area)
         p.to_corners(forces, self.low.force)
-        shares = p.loop.call("force_shares", p.mass, given[6:])
-        p.loop.spread(p.along_director(d3), shares, self.mass, Rows.NODES.table())
+        shares = p.loop.call("force_shares", p.lengths, d3, p.mass, given[6:])
+        p.loop.spread(p.offset, shares, self.mass, Rows.NODES.table(), By.SLOPES)
         loop = self.low.program.varying(Count.NODES, again=True)
         loop.put(loop.call("node_change", loop.load(self.least), loop.load(self.mass)), self.change)
         self._repel()
 
     def _repel(self) -> None:
         p = _Points(self)
-        change = p.loop.collect(p.along_arms(), self.change, Rows.NODES.table())
-        p.to_corners(p.loop.call("corner_forces", p.surface, p.mass, change, p.place, p.shape), self.low.force)
+        change = p.loop.collect(p.offset, self.change, Rows.NODES.table(), By.ARMS)
+        forces = p.loop.call("corner_forces", p.surface, p.mass, change, p.place, p.shape, p.lengths)
+        p.to_corners(forces, self.low.force)
 
     def follow(self) -> None:
         """Directors after the substep."""
         p = _Points(self, again=True)
-        carried = p.loop.call("carried", p.surface, *p.corners(self.low.v.after), p.mass, p.place, p.shape)
-        p.loop.spread(p.along_arms(), carried, self.momentum, Rows.NODES.table())
+        v = p.corners(self.low.v.after)
+        carried = p.loop.call("carried", p.surface, *v, p.mass, p.place, p.shape, p.lengths)
+        p.loop.spread(p.offset, carried, self.momentum, Rows.NODES.table(), By.ARMS)
         loop = self.low.program.varying(Count.NODES, again=True)
         parts = (loop.load(field) for field in (self.least, self.mass, self.momentum))
         loop.put(loop.call("node_velocity", *parts), self.velocity)
@@ -102,10 +104,10 @@ class Contact:
     def _turn(self) -> None:
         p = _Points(self)
         d3 = p.own(self.d3.now)
-        rate = p.loop.collect(p.along_director(d3)[AROUND:], self.velocity, Rows.NODES.table())
+        around = p.loop.collect(p.offset, self.velocity, Rows.NODES.table(), By.SLOPES)
         now = p.loop.call("surface", *p.corners(self.low.x.after), p.shape)[12:15]
         constants = p.loop.load(self.low.dt), p.loop.load(self.play)
-        out = p.loop.call("follow", p.surface[12:15], now, d3, rate, *self._law(p), *constants)
+        out = p.loop.call("follow", p.surface[12:15], now, d3, around, p.lengths, *self._law(p), *constants)
         p.loop.put(out[:3], self.d3.after, Rows.OWN.table())
         p.loop.put(out[3:], self.closing.after, Rows.OWN.table())
 
@@ -151,7 +153,8 @@ class _Points:
         self.area, self.share = self.loop.load(contact.area, Rows.TRIANGLE.table()), self.loop.load(contact.share)
         corners = self.corners(low.x.now)
         self.surface = self.loop.call("surface", *corners, self.shape)
-        self._x = self.loop.call("at_point", *corners, self.place)
+        self.lengths = self.loop.load(contact.lengths)
+        self.offset = self.loop.call("offset", self.lengths, self.loop.load(contact.lowest), self.place, *corners)
 
     def corners(self, field: Field) -> list[list[int]]:
         """Registers of a vertex field at the triangle's corners."""
@@ -175,14 +178,3 @@ class _Points:
         """Of the point."""
         density = self.parameter(self._contact.low.model.areal_density)
         return self.loop.call("point_mass", density, self.area, self.share)
-
-    def along_director(self, d3: list[int]) -> list[int]:
-        """Weights of the nodes, and d3 times their slopes: 2 bases."""
-        return self.loop.call("along_director", *self._spline(), d3)
-
-    def along_arms(self) -> list[int]:
-        """Weights of the nodes, and times the arms to them: 4 bases."""
-        return self.loop.call("along_arms", *self._spline())
-
-    def _spline(self) -> list[list[int]]:
-        return [self.loop.load(self._contact.lengths), self.loop.load(self._contact.lowest), self._x]
