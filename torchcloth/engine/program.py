@@ -37,7 +37,7 @@ SHARES = 16  # numbers of a point, see csrc/transfer.h
 class Kind(IntEnum):
     """What a field is; as in csrc/program.h."""
 
-    CONSTANT, PARAMETER, STATE, NEXT, TEMPORARY, KEPT, DRIVE, SUM, NODES = range(9)
+    CONSTANT, PARAMETER, STATE, NEXT, TEMPORARY, KEPT, DRIVE, SUM, NODES, POINTS = range(10)
 
 
 class Shape(IntEnum):
@@ -116,6 +116,10 @@ class Program:
     def nodes(self, comps: int) -> Field:
         """Of contact, which sees to its memory: numbers of the nodes that are touched, or of the points."""
         return self._field(Kind.NODES, 0, comps)
+
+    def points(self, comps: int) -> Field:
+        """What varying loops over points tell each other; put once in a substep."""
+        return self._field(Kind.POINTS, 0, comps)
 
     def table(self, index: np.ndarray | torch.Tensor) -> int:
         """Rows to gather from or scatter to, one per item."""

@@ -109,7 +109,8 @@ struct Engine {
             const int comps = engine.program.fields.at(field).comps;                                                   \
             auto& loop = engine.loop();                                                                                \
             loop.code.push_back(                                                                                       \
-                {tc::Instruction::Code(code), field, table, reg, comps, -1, {}, {}, false, loop.slot(table)});         \
+                {tc::Instruction::Code(code), field, table, reg, comps, -1, {}, {}, false, loop.slot(table),           \
+                 engine.program.fields[field].kind == tc::Kind::points});                                              \
             engine.program.registers = std::max(engine.program.registers, reg + comps);                                \
         });                                                                                                            \
     }                                                                                                                  \

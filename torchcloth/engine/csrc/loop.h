@@ -25,6 +25,7 @@ struct Instruction {
     std::vector<int> in, out;  // of a lookup: {first register, nodes along x, y, z} and {first register}
     bool feeds = false;        // another call reads what this one gives
     int slot = 0;              // of its table among those of the loop
+    bool packed = false;       // the field's kind is points
 };
 
 // The items of one run: all, those of a list, or as many as contact counts.
@@ -113,7 +114,11 @@ struct Loop : Stage<R> {
     template <class Step>
     static int last_quad(Step step, int comps) { return std::is_integral_v<Step> ? (comps - 1) / 4 * 4 : 0; }
 
-    void gather(const Instruction& i, const R* from, P* to, int first, Span s) const {
+    // Where the numbers of a pack begin, in a field of points: [packs, comps, L].
+    static size_t packed(const Instruction& i, int first) { return size_t(first) * i.comps; }
+
+    TC_APART void gather(const Instruction& i, const R* from, P* to, int first, Span s) const {
+        if (i.packed) return void(std::memcpy(static_cast<void*>(to + i.reg), from + packed(i, first), i.comps * sizeof(P)));
         rows(i, first, s, [&](auto place, auto step) {
             if (step == 1)
                 for (int lane = 0; lane < L; lane++) to[i.reg].v[lane] = from[place(lane)];
@@ -143,15 +148,21 @@ struct Loop : Stage<R> {
                 }
         });
     }
-    void add(const Instruction& i, R* to, const P* from, int first, Span s) const {
-        if (i.table == SHARED && count(first, s) == L)
+    TC_APART void add(const Instruction& i, R* to, const P* from, int first, Span s) const {
+        if (i.packed)
+            for (int c = 0; c < i.comps; c++) {
+                P& there = reinterpret_cast<P*>(to + packed(i, first))[c];
+                there = there + from[i.reg + c];
+            }
+        else if (i.table == SHARED && count(first, s) == L)
             for (int c = 0; c < i.comps; c++) to[c] += total(from[i.reg + c]);
         else scatter(i, to, from, first, s, [](auto& place, auto x) { place = place + x; });
     }
-    void store(const Instruction& i, R* to, const P* from, int first, Span s) const {
-        scatter(i, to, from, first, s, [](auto& place, auto x) { place = x; });
+    TC_APART void store(const Instruction& i, R* to, const P* from, int first, Span s) const {
+        if (i.packed) std::memcpy(static_cast<void*>(to + packed(i, first)), from + i.reg, i.comps * sizeof(P));
+        else scatter(i, to, from, first, s, [](auto& place, auto x) { place = x; });
     }
-    void look(const Instruction& i, const R* table, P* regs) const {
+    TC_APART void look(const Instruction& i, const R* table, P* regs) const {
         const int *in = i.in.data(), out = i.out[0];
         for (int lane = 0; lane < L; lane++) {
             int cell[3];
@@ -194,9 +205,9 @@ struct Loop : Stage<R> {
     bool is_recorded(const Instruction& i) const {
         if (i.code != Instruction::add && i.code != Instruction::put) return false;
         const Kind kind = program.fields[i.field].kind;
-        return kind != Kind::temporary && kind != Kind::nodes;
+        return kind != Kind::temporary && kind != Kind::nodes && kind != Kind::points;
     }
-    void compute(Scene<R>& s, const Instruction& i, int first, Span all, P* regs) const {
+    TC_INLINE void compute(Scene<R>& s, const Instruction& i, int first, Span all, P* regs) const {
         R* field = i.field >= 0 ? s.value[i.field] : nullptr;
         switch (i.code) {
             case Instruction::load: if (!is_shared(i)) gather(i, field, regs, first, all); break;
@@ -238,7 +249,7 @@ struct Loop : Stage<R> {
             if (is_shared(i) && s.bar[i.field])
                 for (int c = 0; c < i.comps; c++) s.bar[i.field][c] += total(bars[i.reg + c]);
     }
-    void back(Scene<R>& s, const Instruction& i, int first, Span all, P* regs, P* bars) const {
+    TC_INLINE void back(Scene<R>& s, const Instruction& i, int first, Span all, P* regs, P* bars) const {
         R* bar = i.field >= 0 ? s.bar[i.field] : nullptr;
         switch (i.code) {
             case Instruction::add:
@@ -256,14 +267,17 @@ struct Loop : Stage<R> {
             case Instruction::collect:
                 transfer<Transfer>(i, first, all, [&](auto t) {
                     t.spread(regs + i.in[0], bars + i.in[1], bar);
-                    P again[SHARES];
-                    t.collect_and_weigh(regs + i.in[0], bars + i.in[1], s.value[i.field], again, bars + i.in[0]);
+                    t.weigh(regs + i.in[0], bars + i.in[1], s.value[i.field], bars + i.in[0]);
                 });
                 break;
         }
     }
     // Adjoint of a result; what was overwritten before does not count any more.
-    void take(const Instruction& i, R* from, P* bars, int first, Span s) const {
+    TC_APART void take(const Instruction& i, R* from, P* bars, int first, Span s) const {
+        if (i.packed) {
+            for (int c = 0; c < i.comps; c++) bars[i.reg + c] = bars[i.reg + c] + reinterpret_cast<P*>(from + packed(i, first))[c];
+            return;
+        }
         const int lanes = count(first, s);
         const bool spent = i.code == Instruction::put;
         rows(i, first, s, [&](auto place, auto step) {
@@ -303,7 +317,7 @@ struct Loop : Stage<R> {
                 else compute(s, i, first, all, regs), compute_along(s, i, first, all, regs, dots);
         }
     }
-    void compute_along(Scene<R>& s, const Instruction& i, int first, Span all, P* regs, D* dots) const {
+    TC_INLINE void compute_along(Scene<R>& s, const Instruction& i, int first, Span all, P* regs, D* dots) const {
         R* along = s.dot[i.field];
         const bool moves = i.code == Instruction::spread || i.code == Instruction::collect;
         D *offset = moves ? dots + i.in[0] * L : nullptr, *share = moves ? dots + i.in[1] * L : nullptr;
@@ -329,10 +343,11 @@ struct Loop : Stage<R> {
         if (i.comps == 3) f(std::integral_constant<int, 3>{});
         else f(i.comps);
     }
-    void gather_along(const Instruction& i, const R* from, D* dots, int first, Span s) const {
+    TC_APART void gather_along(const Instruction& i, const R* from, D* dots, int first, Span s) const {
         if (from == nullptr) return;
         const D* source = reinterpret_cast<const D*>(from);
         D* to = dots + size_t(i.reg) * L;
+        if (i.packed) return void(std::memcpy(static_cast<void*>(to), source + packed(i, first), i.comps * L * sizeof(D)));
         rows(i, first, s, [&](auto place, auto) {
             components(i, [&](auto comps) {
                 for (int lane = 0; lane < L; lane++) {
@@ -342,9 +357,10 @@ struct Loop : Stage<R> {
             });
         });
     }
-    void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds, Span s) const {
+    TC_APART void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds, Span s) const {
         D* target = reinterpret_cast<D*>(to);
         const D* from = dots + size_t(i.reg) * L;
+        if (i.packed) return void(std::memcpy(static_cast<void*>(target + packed(i, first)), from, i.comps * L * sizeof(D)));
         const int lanes = count(first, s);
         rows(i, first, s, [&](auto place, auto) {
             components(i, [&](auto comps) {

@@ -99,6 +99,11 @@ struct Transfer {
         }
     }
 
+    // The derivatives of that sum, for the adjoint of what was collected.
+    void weigh(const P* offset, const P* share, const R* grid, P* offset_bar) const {
+        P collected[SHARES]{};
+        collect_and_weigh(offset, share, grid, collected, offset_bar);
+    }
     // What collect gives, added to `collected`; and the derivatives by the offset of the sum over nodes of what the
     // shares spread, times the grid.
     void collect_and_weigh(const P* offset, const P* share, const R* grid, P* collected, P* offset_bar) const {

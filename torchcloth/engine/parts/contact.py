@@ -53,6 +53,7 @@ class Contact:
         program = low.program
         self.mass, self.momentum, self.change, self.velocity = self.nodes = [program.nodes(4) for _ in range(4)]
         self.lowest = program.nodes(3)
+        self.points = [program.points(comps) for comps in (16, 3, 1)]  # surface, offset, mass
         self.lengths = program.constant(torch.tensor([[grid.spacing, 1 / grid.spacing]], dtype=torch.float64))
         self.share = low.number(1 / len(grid.points))
         self.least = low.number(torch.finfo(program.dtype).tiny ** 0.5)
@@ -67,14 +68,15 @@ class Contact:
         """Forces of the directors: on the corners, and on the nodes."""
         self.low.program.contact(self._layers())
         self._alone(Count.WOKEN, Rows.WOKEN, self.low.x.now, self.d3.now, self.closing.now)
-        p = _Points(self, again=True)
+        p = _Points(self, again=True, first=True)
         contact, shear, _ = self._law(p)
         d3, closing = p.own(self.d3.now), p.own(self.closing.now)
         f1, f2, n, J = p.surface[0:3], p.surface[3:6], p.surface[12:15], p.surface[15:]
         density = p.parameter(self.low.model.areal_density)
         constants = [p.loop.load(field) for field in (self.low.dt, self.play, self.losses)]
-        given = p.loop.call("pressure", n, J, f1, f2, d3, closing, density, contact, shear, p.area, p.share, *constants)
-        forces = p.loop.call("assemble", given[:6], p.shape, p.area)
+        area, share = p.area, p.share
+        given = p.loop.call("pressure", n, J, f1, f2, d3, closing, density, contact, shear, area, share, *constants)
+        forces = p.loop.call("assemble", given[:6], p.shape, area)
         p.to_corners(forces, self.low.force)
         shares = p.loop.call("force_shares", p.lengths, d3, p.mass, given[6:])
         p.loop.spread(p.offset, shares, self.mass, Rows.NODES.table(), By.SLOPES)
@@ -129,7 +131,7 @@ class Contact:
         grid, corners = self.grid, self.low.model.geometry.corners.view(3, -1)
         found = patches(grid, corners)
         return Layers(
-            fields=[self.low.x.now, self.lowest, *self.nodes],
+            fields=[self.low.x.now, self.lowest, *self.nodes, *self.points],
             corners=corners.cpu().numpy().astype("int32"),
             places=grid.points.cpu().double().numpy(),
             lengths=(grid.spacing, grid.skin, grid.reach),
@@ -143,18 +145,52 @@ class Contact:
 
 
 class _Points:
-    """A loop over the points that take part; what several kernels need is computed once."""
+    """A loop over the points that take part; the first finds what they all need."""
 
-    def __init__(self, contact: Contact, again: bool = False) -> None:
-        self._contact, low = contact, contact.low
-        self.loop: Loop = low.program.varying(Count.POINTS, again)
-        self.shape = self.loop.load(contact.shape, Rows.TRIANGLE.table())
-        self.place = self.loop.load(contact.places, Rows.PLACE.table())
-        self.area, self.share = self.loop.load(contact.area, Rows.TRIANGLE.table()), self.loop.load(contact.share)
-        corners = self.corners(low.x.now)
-        self.surface = self.loop.call("surface", *corners, self.shape)
-        self.lengths = self.loop.load(contact.lengths)
-        self.offset = self.loop.call("offset", self.lengths, self.loop.load(contact.lowest), self.place, *corners)
+    def __init__(self, contact: Contact, again: bool = False, first: bool = False) -> None:
+        self._contact, self.loop = contact, contact.low.program.varying(Count.POINTS, again)
+        find = self._find if first else self._look
+        self.surface, self.offset, self.mass = find()
+
+    def _look(self) -> list[list[int]]:
+        return [self.loop.load(field) for field in self._contact.points]
+
+    def _find(self) -> list[list[int]]:
+        corners = self.corners(self._contact.low.x.now)
+        density = self.parameter(self._contact.low.model.areal_density)
+        found = [
+            self.loop.call("surface", *corners, self.shape),
+            self.loop.call("offset", self.lengths, self.loop.load(self._contact.lowest), self.place, *corners),
+            self.loop.call("point_mass", density, self.area, self.share),
+        ]
+        for regs, field in zip(found, self._contact.points, strict=True):
+            self.loop.put(regs, field)
+        return found
+
+    @property
+    def shape(self) -> list[int]:
+        """Of the triangle at rest."""
+        return self.loop.load(self._contact.shape, Rows.TRIANGLE.table())
+
+    @property
+    def area(self) -> list[int]:
+        """Of the triangle at rest."""
+        return self.loop.load(self._contact.area, Rows.TRIANGLE.table())
+
+    @property
+    def share(self) -> list[int]:
+        """Of the triangle that belongs to the point."""
+        return self.loop.load(self._contact.share)
+
+    @property
+    def place(self) -> list[int]:
+        """Barycentric."""
+        return self.loop.load(self._contact.places, Rows.PLACE.table())
+
+    @property
+    def lengths(self) -> list[int]:
+        """Spacing of the grid and one over it."""
+        return self.loop.load(self._contact.lengths)
 
     def corners(self, field: Field) -> list[list[int]]:
         """Registers of a vertex field at the triangle's corners."""
@@ -172,9 +208,3 @@ class _Points:
     def parameter(self, tensor: Tensor) -> list[int]:
         """Registers of a coefficient [..., 1 or E, 1]."""
         return self.loop.load(self._contact.low.parameter(tensor), Rows.TRIANGLE.table())
-
-    @property
-    def mass(self) -> list[int]:
-        """Of the point."""
-        density = self.parameter(self._contact.low.model.areal_density)
-        return self.loop.call("point_mass", density, self.area, self.share)
