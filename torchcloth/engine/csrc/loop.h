@@ -79,27 +79,27 @@ struct Loop : Stage<R> {
         }
     }
     // Row of an item; items beyond the last count as the last.
-    int row(const Instruction& i, int item, Span s) const {
+    int row(const Instruction& i, int item, const Span& s) const {
         if (i.table == SHARED) return 0;
         const int k = s.at(item < s.items ? item : s.items - 1);
         return i.table == OWN ? k : index(i, s)[k];
     }
-    const int* index(const Instruction& i, Span s) const {
+    const int* index(const Instruction& i, const Span& s) const {
         return i.table <= VARYING ? s.varying[VARYING - i.table] : program.tables[i.table].data();
     }
     size_t pitch(const Instruction& i) const { return program.fields[i.field].pitch; }
-    int count(int first, Span s) const { return std::min(L, s.items - first); }
+    int count(int first, const Span& s) const { return std::min(L, s.items - first); }
 
     // f(where each lane's row starts, numbers between rows), the frequent cases with constants that the compiler sees.
     template <class F>
-    TC_INLINE void rows(const Instruction& i, int first, Span s, F f) const {
+    TC_INLINE void rows(const Instruction& i, int first, const Span& s, F f) const {
         const size_t step = pitch(i);
         if (s.list && i.table != SHARED && step <= 4) {
             const int* index = s.picked + i.slot * L;
             if (step == 4) f([index](int lane) { return size_t(index[lane]) * 4; }, four);
             else f([index](int lane) { return size_t(index[lane]); }, one);
         } else if (count(first, s) < L || i.table == SHARED || step > 4)
-            f([this, &i, first, step, s](int lane) { return row(i, first + lane, s) * step; }, step);
+            f([this, &i, first, step, &s](int lane) { return row(i, first + lane, s) * step; }, step);
         else if (i.table == OWN) {
             if (step == 4) f([first](int lane) { return size_t(first + lane) * 4; }, four);
             else f([first](int lane) { return size_t(first + lane); }, one);
@@ -117,7 +117,7 @@ struct Loop : Stage<R> {
     // Where the numbers of a pack begin, in a field of points: [packs, comps, L].
     static size_t packed(const Instruction& i, int first) { return size_t(first) * i.comps; }
 
-    TC_APART void gather(const Instruction& i, const R* from, P* to, int first, Span s) const {
+    TC_APART void gather(const Instruction& i, const R* from, P* to, int first, const Span& s) const {
         if (i.packed) return void(std::memcpy(static_cast<void*>(to + i.reg), from + packed(i, first), i.comps * sizeof(P)));
         rows(i, first, s, [&](auto place, auto step) {
             if (step == 1)
@@ -132,7 +132,7 @@ struct Loop : Stage<R> {
     }
     // change(where a number or four lie, what came from the lane) for all lanes that are items.
     template <class F>
-    TC_INLINE void scatter(const Instruction& i, R* to, const P* from, int first, Span s, F change) const {
+    TC_INLINE void scatter(const Instruction& i, R* to, const P* from, int first, const Span& s, F change) const {
         const int lanes = count(first, s);
         rows(i, first, s, [&](auto place, auto step) {
             if (step == 1)
@@ -148,7 +148,7 @@ struct Loop : Stage<R> {
                 }
         });
     }
-    TC_APART void add(const Instruction& i, R* to, const P* from, int first, Span s) const {
+    TC_APART void add(const Instruction& i, R* to, const P* from, int first, const Span& s) const {
         if (i.packed)
             for (int c = 0; c < i.comps; c++) {
                 P& there = reinterpret_cast<P*>(to + packed(i, first))[c];
@@ -158,7 +158,7 @@ struct Loop : Stage<R> {
             for (int c = 0; c < i.comps; c++) to[c] += total(from[i.reg + c]);
         else scatter(i, to, from, first, s, [](auto& place, auto x) { place = place + x; });
     }
-    TC_APART void store(const Instruction& i, R* to, const P* from, int first, Span s) const {
+    TC_APART void store(const Instruction& i, R* to, const P* from, int first, const Span& s) const {
         if (i.packed) std::memcpy(static_cast<void*>(to + packed(i, first)), from + i.reg, i.comps * sizeof(P));
         else scatter(i, to, from, first, s, [](auto& place, auto x) { place = x; });
     }
@@ -180,7 +180,7 @@ struct Loop : Stage<R> {
 
     // f(transfer) for the points of a pack.
     template <template <class, By> class Of, class F>
-    TC_INLINE void transfer(const Instruction& i, int first, Span s, F f) const {
+    TC_INLINE void transfer(const Instruction& i, int first, const Span& s, F f) const {
         const int *nodes = index(i, s) + size_t(first) * AROUND, lanes = count(first, s);
         if (By(i.in[2]) == By::slopes) f(Of<R, By::slopes>{nodes, lanes});
         else f(Of<R, By::arms>{nodes, lanes});
@@ -207,7 +207,7 @@ struct Loop : Stage<R> {
         const Kind kind = program.fields[i.field].kind;
         return kind != Kind::temporary && kind != Kind::nodes && kind != Kind::points;
     }
-    TC_INLINE void compute(Scene<R>& s, const Instruction& i, int first, Span all, P* regs) const {
+    TC_INLINE void compute(Scene<R>& s, const Instruction& i, int first, const Span& all, P* regs) const {
         R* field = i.field >= 0 ? s.value[i.field] : nullptr;
         switch (i.code) {
             case Instruction::load: if (!is_shared(i)) gather(i, field, regs, first, all); break;
@@ -249,7 +249,7 @@ struct Loop : Stage<R> {
             if (is_shared(i) && s.bar[i.field])
                 for (int c = 0; c < i.comps; c++) s.bar[i.field][c] += total(bars[i.reg + c]);
     }
-    TC_INLINE void back(Scene<R>& s, const Instruction& i, int first, Span all, P* regs, P* bars) const {
+    TC_INLINE void back(Scene<R>& s, const Instruction& i, int first, const Span& all, P* regs, P* bars) const {
         R* bar = i.field >= 0 ? s.bar[i.field] : nullptr;
         switch (i.code) {
             case Instruction::add:
@@ -273,7 +273,7 @@ struct Loop : Stage<R> {
         }
     }
     // Adjoint of a result; what was overwritten before does not count any more.
-    TC_APART void take(const Instruction& i, R* from, P* bars, int first, Span s) const {
+    TC_APART void take(const Instruction& i, R* from, P* bars, int first, const Span& s) const {
         if (i.packed) {
             for (int c = 0; c < i.comps; c++) bars[i.reg + c] = bars[i.reg + c] + reinterpret_cast<P*>(from + packed(i, first))[c];
             return;
@@ -317,7 +317,7 @@ struct Loop : Stage<R> {
                 else compute(s, i, first, all, regs), compute_along(s, i, first, all, regs, dots);
         }
     }
-    TC_INLINE void compute_along(Scene<R>& s, const Instruction& i, int first, Span all, P* regs, D* dots) const {
+    TC_INLINE void compute_along(Scene<R>& s, const Instruction& i, int first, const Span& all, P* regs, D* dots) const {
         R* along = s.dot[i.field];
         const bool moves = i.code == Instruction::spread || i.code == Instruction::collect;
         D *offset = moves ? dots + i.in[0] * L : nullptr, *share = moves ? dots + i.in[1] * L : nullptr;
@@ -343,7 +343,7 @@ struct Loop : Stage<R> {
         if (i.comps == 3) f(std::integral_constant<int, 3>{});
         else f(i.comps);
     }
-    TC_APART void gather_along(const Instruction& i, const R* from, D* dots, int first, Span s) const {
+    TC_APART void gather_along(const Instruction& i, const R* from, D* dots, int first, const Span& s) const {
         if (from == nullptr) return;
         const D* source = reinterpret_cast<const D*>(from);
         D* to = dots + size_t(i.reg) * L;
@@ -357,7 +357,7 @@ struct Loop : Stage<R> {
             });
         });
     }
-    TC_APART void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds, Span s) const {
+    TC_APART void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds, const Span& s) const {
         D* target = reinterpret_cast<D*>(to);
         const D* from = dots + size_t(i.reg) * L;
         if (i.packed) return void(std::memcpy(static_cast<void*>(target + packed(i, first)), from, i.comps * L * sizeof(D)));
