@@ -5,6 +5,7 @@
 #pragma once
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
 #include <cstdint>
 #include <numeric>
@@ -27,7 +28,7 @@ struct Search {
     R reach = 0;
     bool everywhere = false;
     std::vector<int> order, starts;    // triangles patch by patch, and where patches begin, [patches + 1]
-    std::vector<uint8_t> meet, apart;  // [patches, patches]; [triangles, bytes] a bit for each triangle, lowest first
+    std::vector<uint8_t> meet, apart;  // [patches, patches]; [in order, patches] a bit for each triangle of the patch
 
     void fill(const int* corners, int count, R distance, int patches, const int* sorted, const int* begins,
               const uint8_t* meeting, const uint8_t* distant) {
@@ -36,7 +37,7 @@ struct Search {
         if (everywhere) return;
         order.assign(sorted, sorted + count), starts.assign(begins, begins + patches + 1);
         meet.assign(meeting, meeting + size_t(patches) * patches);
-        apart.assign(distant, distant + size_t(count) * ((count + 7) / 8));
+        apart.assign(distant, distant + size_t(count) * patches);
     }
 
     void look(const R* x, Mask& mask) const {
@@ -66,7 +67,10 @@ struct Search {
                 }
             }
             for (int j = i; j < end; j++)
-                if (gap[j] < reach * reach && meet[size_t(sorted[i]) * patches + sorted[j]]) compare(centre, sorted[i], sorted[j], mask);
+                if (gap[j] < reach * reach && meet[size_t(sorted[i]) * patches + sorted[j]]) {
+                    compare(centre, sorted[i], sorted[j], mask);
+                    compare(centre, sorted[j], sorted[i], mask);
+                }
         }
     }
 
@@ -90,17 +94,21 @@ struct Search {
                 low[d].push_back(*least), high[d].push_back(*most);
             }
     }
-    bool far(int t, int u) const { return apart[size_t(t) * ((triangles + 7) / 8) + u / 8] >> (u % 8) & 1; }
+    // Marks the triangles of patch a that are near one of patch b, but far along the cloth.
     void compare(const std::vector<R>* centre, int a, int b, Mask& mask) const {
         const R *x = centre[0].data(), *y = centre[1].data(), *z = centre[2].data();
-        for (int k = starts[a]; k < starts[a + 1]; k++)
-            for (int l = starts[b]; l < starts[b + 1]; l++) {
+        const size_t patches = starts.size() - 1;
+        for (int k = starts[a]; k < starts[a + 1]; k++) {
+            unsigned far = apart[k * patches + b];
+            if (far == 0 || has(mask, order[k])) continue;
+            for (; far != 0; far &= far - 1) {
+                const int l = starts[b] + std::countr_zero(far);
                 const R dx = x[k] - x[l], dy = y[k] - y[l], dz = z[k] - z[l];
                 if (!(dx * dx + dy * dy + dz * dz < reach * reach)) continue;
-                const int t = order[k], u = order[l];
-                if (far(t, u)) set(mask, t);
-                if (far(u, t)) set(mask, u);
+                set(mask, order[k]);
+                break;
             }
+        }
     }
 };
 
