@@ -56,6 +56,7 @@ struct Search {
         for (int p = 0; p < patches; p++) first[p] = *std::min_element(&centre[0][starts[p]], &centre[0][starts[p + 1]]);
         std::sort(sorted.begin(), sorted.end(), [&](int a, int b) { return first[a] < first[b]; });
         boxes(centre, sorted, low, high);
+        const std::vector<Together> together = side_by_side(centre);
         for (int i = 0; i < patches; i++) {
             const int end = int(std::upper_bound(low[0].begin() + i, low[0].end(), high[0][i] + reach) - low[0].begin());
             std::fill(gap.begin() + i, gap.begin() + end, R(0));
@@ -67,7 +68,7 @@ struct Search {
                 }
             }
             for (int j = i; j < end; j++)
-                if (gap[j] < reach * reach && meet[size_t(sorted[i]) * patches + sorted[j]]) {
+                if (gap[j] < reach * reach && meet[size_t(sorted[i]) * patches + sorted[j]] && near(together, sorted[i], sorted[j])) {
                     compare(centre, sorted[i], sorted[j], mask);
                     compare(centre, sorted[j], sorted[i], mask);
                 }
@@ -75,6 +76,32 @@ struct Search {
     }
 
   private:
+    static constexpr int MOST = 8;  // triangles of a patch: parts/patches.py
+    using Eight = Pack<R, MOST>;
+    struct Together {
+        Eight at[3];
+    };
+    std::vector<Together> side_by_side(const std::vector<R>* centre) const {  // smaller patches are filled up with their first
+        std::vector<Together> out(starts.size() - 1);
+        for (size_t p = 0; p < out.size(); p++)
+            for (int d = 0; d < 3; d++)
+                for (int k = 0; k < MOST; k++) out[p].at[d].v[k] = centre[d][starts[p] + k < starts[p + 1] ? starts[p] + k : starts[p]];
+        return out;
+    }
+    // Whether there are triangles nearer than the reach, or not quite.
+    bool near(const std::vector<Together>& patch, int a, int b) const {
+        const Together &own = patch[a], &other = patch[b];
+        Eight found(0.0);
+        for (int k = 0; k < MOST; k++) {
+            Eight sum(0.0);
+            for (int d = 0; d < 3; d++) {
+                const Eight way = other.at[d] - double(own.at[d][k]);
+                sum = sum + way * way;
+            }
+            found = found + less(sum, 1.0001 * reach * reach);
+        }
+        return total(found) > 0;
+    }
     bool centres(const R* x, std::vector<R>* centre) const {
         R sum = 0;
         for (int d = 0; d < 3; d++) {

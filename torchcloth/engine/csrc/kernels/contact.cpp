@@ -3,6 +3,7 @@
 #include "../vec.h"
 
 namespace tc {
+namespace {
 
 // Barycentric coordinates, values at the corners -> value at the point.
 template <class T>
@@ -232,6 +233,8 @@ struct Alone {
         w.vec(1.0 * Read<T>{in}.vec()), w.number(constant(in[0], 0.0));
     }
 };
+
+}  // namespace
 
 TC_KERNELS(contact_kernels, PointMass, Pressure, Offset, ForceShares, NodeChange, NodeVelocity,
            CornerForces, Carried, Follow, Alone)
