@@ -16,7 +16,7 @@ from ...materials import AEP, OrthotropicAEP
 from ...self_contact import CHUNK
 from ...transfer import FADING, Grid
 from ..lowering import DIRECTORS, Lowering, Unfused
-from ..program import VARYING, By, Field, Layers, Loop
+from ..program import VARYING, By, Field, Layers
 from .patches import patches
 
 _LAWS = (AEP, OrthotropicAEP)  # whose law across the sheet is that of DirectorMaterial

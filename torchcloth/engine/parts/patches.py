@@ -10,7 +10,9 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from ...transfer import Grid
 
-SIZE = 8  # triangles of a patch, as in csrc/search.h: a bit of a byte for each, and small against the way along the cloth from which on layers are seen
+# Triangles of a patch, as in csrc/search.h: a bit of a byte for each, and small against the way along the cloth from
+# which on layers are seen.
+SIZE = 8
 
 
 class Patches(NamedTuple):
