@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 import torchcloth as tc
-from torchcloth.sensitivities import Directions
 
 from .cases import DT, Scene, stage
 from .contestant import DIRECTIONS, Contestant, Outcome, Task
@@ -70,7 +69,7 @@ def _tangents(scene: Scene) -> Callable[[], Outcome]:
 
 def tangents(scene: Scene, raws: Mapping[str, Tensor], directions: Tensor) -> tuple[Tensor, Tensor]:
     """End [V, 3] m, and the frames' derivatives [K, T, V, 3] along ``directions`` [K, unconstrained parameters]."""
-    along = Directions({name: column.contiguous() for name, column in zip(raws, directions.T, strict=True)})
+    along = tc.Directions({name: column.contiguous() for name, column in zip(raws, directions.T, strict=True)})
     state = scene.cloth.state(scene.x)
     rollout, moved = scene.cloth.sensitivities(state, scene.motion, scene.times, along=along, dt=LIMIT)
     return rollout.x[-1].clone(), moved.x

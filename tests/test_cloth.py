@@ -54,6 +54,10 @@ def held():
         ({"hand": trajectory()._replace(closed=torch.tensor(True))}, r"closed \[K\]"),
         ({"hand": trajectory(pose=torch.full((2, 4, 4), math.nan))}, "NaN"),
         ({"hand": turning(1.0, math.radians(95), 2)}, "over 90 degrees between knots; .*more knots"),
+        ([trajectory()], "motion; got list; expected a dict"),
+        ({"hand": torch.eye(4)}, r"motion\['hand'\]; got Tensor; expected a Trajectory"),
+        ({"hand": trajectory()._replace(closed=[True, True])}, r"motion\['hand'\]; got Tensor, Tensor, list"),
+        ({"hand": trajectory(pose=torch.eye(4).long().repeat(2, 1, 1))}, r"pose; got torch\.int64"),
     ],
 )
 def test_refuses_motion(held, motion, message):
@@ -146,6 +150,60 @@ def test_divergence_names_the_vertex_and_the_time():
     around = sorted({int(k) for face in cloth.mesh.faces if 6 in face for k in face})
     with pytest.raises(SimulationDiverged, match=rf"t = {2 * dt:.6g} s; got vertex {around[0]} .* substep 2 of 40"):
         cloth(state._replace(v=v), times=[0.0, 40 * dt], dt=dt)
+
+
+@pytest.mark.parametrize("engine", ["auto", "reference"])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s.x, "state; got Tensor; expected a ClothState; make states with"),
+        (lambda s: s._replace(v=s.v.numpy()), r"state\.v; got ndarray; expected a tensor"),
+        (lambda s: s._replace(v=s.v.long()), r"state\.v; got int64"),
+        (
+            lambda s: s.map(lambda t: t.float()),
+            r"state\.x; got float32 on cpu; expected float64 on cpu",
+        ),
+        (
+            lambda s: s._replace(x=s.x.expand(2, -1, -1), v=s.v.expand(3, -1, -1)),
+            r"batch dimensions; .*\(2,\).*\(3,\)",
+        ),
+        (lambda s: s.map(lambda t: t.expand(0, -1, -1)), r"batch dimensions; got .*\(0,\).*at least one scene"),
+    ],
+)
+def test_refuses_states(engine, change, message):
+    cloth = sheet()
+    cloth.engine = engine
+    with pytest.raises(InvalidInput, match=message):
+        cloth(change(cloth.rest_state()), times=(0.0, 1e-3))
+
+
+def test_refuses_a_batch_of_states_beside_another_of_fabrics():
+    cloth = tc.Cloth(tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3)), tc.materials.AEP(1e5, 0.3), torch.ones(2, 1))
+    with pytest.raises(InvalidInput, match=r"batch dimensions; got .*\(3,\).*parameters \[\(2,\)\]"):
+        cloth(cloth.state(cloth.rest_state().x.expand(3, -1, -1)), times=(0.0, 1e-3))
+
+
+def test_velocities_alone_may_be_batched():
+    cloth = sheet()
+    state = cloth.rest_state()
+    v = torch.stack([state.v, state.v + 0.1])
+    both = cloth(state._replace(v=v), times=(0.0, 0.01)).x
+    for k in range(2):
+        assert torch.equal(both[k], cloth(state._replace(v=v[k]), times=(0.0, 0.01)).x)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_refused(dtype):
+    cloth = sheet().to(dtype)
+    with pytest.raises(InvalidInput, match=r"precision of the cloth; got .*float16; expected float32 or float64"):
+        cloth(cloth.rest_state(), times=(0.0, 1e-3))
+
+
+@pytest.mark.parametrize("duration", [0.0, -1.0, math.nan])
+def test_refuses_to_settle_for_no_time(duration):
+    cloth = sheet()
+    with pytest.raises(InvalidInput, match=r"duration of settling; got .* s; expected a time > 0"):
+        cloth.settle(cloth.rest_state(), duration=duration)
 
 
 def test_a_state_with_nan_is_refused():

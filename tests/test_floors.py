@@ -24,7 +24,7 @@ FLOORS = (
     ("apic",),
     ("functional", "stability", "recordings", "losses", "engine"),
     ("observe", "validation"),
-    ("intervals",),
+    ("initial", "intervals"),
     ("sensitivities",),
     ("cloth", "robots"),
     ("identification", "diagnosis", "plan", "testing"),

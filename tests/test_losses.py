@@ -34,6 +34,18 @@ def test_closest_points_against_trimesh(vertices, points):
     torch.testing.assert_close((points - hits.on(vertices)).norm(dim=-1), distance, rtol=1e-10, atol=1e-12)
 
 
+def test_closest_points_on_triangles_of_all_sizes(points):
+    """Triangles are left out by their bounding spheres, so large ones, whose centres are far away, must stay in."""
+    triangles = pytest.importorskip("trimesh").triangles
+    torch.manual_seed(1)
+    size = 10.0 ** (-3 + 3 * torch.rand(200, 1, 1))
+    corners = torch.rand(200, 1, 3) * 0.5 + size * torch.randn(200, 3, 3)
+    every = [triangles.closest_point(corners.numpy(), p.expand(200, 3).numpy()) for p in points]
+    distance = torch.stack([(torch.as_tensor(on) - p).norm(dim=-1).min() for on, p in zip(every, points, strict=True)])
+    hits = closest(points, corners.flatten(0, 1), torch.arange(600).view(200, 3))
+    torch.testing.assert_close((points - hits.on(corners.flatten(0, 1))).norm(dim=-1), distance, rtol=1e-9, atol=1e-12)
+
+
 def test_closest_points_against_dense_sampling(vertices, points):
     """Upper bound by 66 samples a triangle; they miss by at most a tenth of an edge."""
     k = torch.arange(11)

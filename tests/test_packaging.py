@@ -173,7 +173,7 @@ def test_the_engine_came_along(wheel, inside, tmp_path):
     assert {name for name in inside if name.startswith("torchcloth/engine/built/")} == {built}
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path)
-    use = "from torchcloth.engine import library; library.library(); print(library.standing())"
+    use = "from torchcloth.engine import library; library.library(); print(library.status())"
     said = call(sys.executable, "-c", use, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(tmp_path)})
     assert said.strip() == f"built: {tmp_path / built}"
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from . import boundaries, effects, errors, functional, losses, materials, meshes
 from .cloth import Cloth
 from .parameters import PhysicalParameter
+from .sensitivities import Directions
 from .transfer import Contact
 from .types import ClothState, Rollout, Trajectory
 
@@ -24,6 +25,7 @@ __all__ = [
     "Cloth",
     "ClothState",
     "Contact",
+    "Directions",
     "PhysicalParameter",
     "Rollout",
     "Trajectory",

@@ -85,6 +85,9 @@ def _add_fit_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--contact", type=float, metavar="SPACING", help="contact grid [m]; left out: no contact")
     parser.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
+    parser.add_argument(
+        "--engine", choices=["auto", "reference", "fused"], default="auto", help="default auto: fused where it can be"
+    )
     parser.add_argument("--resume", action="store_true", help="continue from DIR/progress.json")
 
 
@@ -118,6 +121,7 @@ def _cloth(options: argparse.Namespace, recording: Recording) -> Cloth:
     from .transfer import Contact
 
     cloth = cloth_from(recording, contact=None if options.contact is None else Contact(options.contact))
+    cloth.engine = options.engine
     names = available(cloth)
     for name, value in _assignments(options.start).items():
         if name not in names:
@@ -209,7 +213,7 @@ def _doctor(options: argparse.Namespace) -> int:
     from .engine import library
 
     print(f"torchcloth {metadata.version('torchcloth')}, torch {torch.__version__}, CUDA {torch.cuda.is_available()}")
-    print(f"{'engine':20s} {library.standing()}")
+    print(f"{'engine':20s} {library.status()}")
     packages = {
         "pytorch_kinematics": "robots",
         "yourdfpy": "robots",

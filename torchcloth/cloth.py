@@ -12,19 +12,19 @@ from torch import Tensor, nn
 
 from . import functional
 from .boundaries import AbstractBoundary
-from .effects import AbstractEffect, MassDamping
-from .engine.choice import Choice, Setting, check_setting, choose, standing
-from .errors import InvalidInput
-from .intervals import Plan, held, run
+from .effects import AbstractEffect
+from .engine.choice import Choice, Setting, check_setting, choose, still_drives
+from .initial import damped, first_state, held, likeness
+from .intervals import Plan, run
 from .materials import AbstractMaterial
 from .meshes import Mesh
+from .model import Geometry, Model, vertex_mass
 from .parameters import PhysicalParameter
-from .self_contact import first_directors
 from .sensitivities import Directions, sensitivities
-from .stability import stable_step
-from .strain import grown_gradient, inverse_growth
-from .transfer import GAP, TURNED, Contact, Grid
-from .types import ClothState, Memory, Rollout, Trajectory
+from .stability import stable_step_of
+from .strain import inverse_growth
+from .transfer import Contact, Grid
+from .types import ClothState, Rollout, Trajectory
 from .validation import (
     check_field,
     check_grasps,
@@ -128,16 +128,8 @@ class Cloth(nn.Module):
     def state(self, x: Tensor, v: Tensor | None = None) -> ClothState:
         """A state from vertex positions [..., V, 3] m and velocities (None: at rest), directors along the normals."""
         x = torch.as_tensor(x, dtype=self._area.dtype, device=self._area.device)
-        if x.shape[-2:] != self._vertices.shape:
-            raise InvalidInput(
-                "x", got=f"shape {tuple(x.shape)}", expected=f"[..., {len(self._vertices)}, 3] in metres"
-            )
         v = torch.zeros_like(x) if v is None else torch.as_tensor(v, dtype=x.dtype, device=x.device)
-        if v.shape != x.shape:
-            raise InvalidInput("v", got=f"shape {tuple(v.shape)}", expected=f"x's, {tuple(x.shape)}")
-        if not bool(torch.isfinite(x.detach()).all()):
-            raise InvalidInput("x", got="NaN or infinite entries", expected="finite positions in metres")
-        return ClothState(x, v, self._directors(x), self._virgin(x))
+        return first_state(self.model(), x, v)
 
     # -- simulation -----------------------------------------------------------------------------------------------
 
@@ -222,25 +214,18 @@ class Cloth(nn.Module):
     def stable_step(self) -> float:
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
         with torch.no_grad():
-            c = self.material.coefficients()
-            density = self.areal_density.field
-            spacing = None if self._grid is None else self._grid.spacing
-            model = self.model()
-            extra = [effect.rates(k, model.mass) for effect, k in model.effects.values()]
-            elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
-            gradient = self._gradient if model.rest is None else grown_gradient(self._gradient, model.rest)
-            return stable_step(gradient, density, self.material.stiffness(c), spacing, elastic, damping)
+            return stable_step_of(self.model(), self._gradient)
 
-    def model(self) -> functional.Model:
+    def model(self) -> Model:
         """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
-        density = self.areal_density.value
-        mass = self._vertex_mass(density)
+        geometry = Geometry.of(self._corners, self._gradient, self._area)
+        mass = vertex_mass(geometry, self.areal_density.value, self._share)
         effects = {name: (effect, effect.coefficients()) for name, effect in self._parts()}
         for effect, c in effects.values():
             extra = effect.mass(c)
             mass = mass if extra is None else mass + extra
-        return functional.Model(
-            geometry=self._geometry(),
+        return Model(
+            geometry=geometry,
             mass=mass,
             areal_density=self.areal_density.field,
             material=self.material,
@@ -264,7 +249,7 @@ class Cloth(nn.Module):
         motion = check_motions(motion, self.boundaries, frames, self._area)
         limit = check_step(dt, self.stable_step())
         counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
-        return self._ready(self.model(), state, motion, frames, counts)
+        return self._ready(state, motion, frames, counts)
 
     def settling(
         self, state: ClothState, motion: Mapping[str, Trajectory], start: float, duration: float, rate: float
@@ -273,89 +258,43 @@ class Cloth(nn.Module):
         frames = [start, start + duration]
         motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
         count = int(np.ceil(duration * (1 / self.stable_step() + rate)))
-        return self._ready(self.settling_model(rate), state, motion, frames, [count])
-
-    def settling_model(self, rate: float) -> functional.Model:
-        """As ``model``, damped; grips do not slip yet."""
-        model, damping = self.model(), MassDamping(rate).to(self._area)
-        kept = {name: part for name, part in model.effects.items() if part[0].grasp is None}
-        return model._replace(effects={**kept, "settling": (damping, damping.coefficients().detach())})
+        return self._ready(state, motion, frames, [count], rate)
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
     def _parts(self) -> Iterable[tuple[str, AbstractEffect]]:
         return cast("Iterable[tuple[str, AbstractEffect]]", self.effects.items())
 
-    def _directors(self, x: Tensor) -> Tensor:
-        grid = self.grid()
-        return x[..., :0, :] if grid is None else first_directors(self.model(), grid, x)
-
-    def _virgin(self, x: Tensor) -> Memory:
-        """Internal variables of a cloth that has never been strained."""
-        own = self.material.start(len(self._area))
-        found = {"material": None if own is None else own.to(x).expand(*x.shape[:-2], -1, -1)}
-        if self.contact is not None:
-            found["contact"] = x.new_zeros(*x.shape[:-2], len(self._area) * len(self._points), 1)
-        if self.transfer == "apic":
-            found["apic"] = x.new_zeros(*x.shape[:-2], x.shape[-2] + len(self._area), 9)
-        found |= {f"effects.{name}": effect.start(x) for name, effect in self._parts()}
-        return {name: value for name, value in found.items() if value is not None}
-
-    def _expected(self) -> ClothState:
-        """A state with the right shapes and no physics."""
-        x = self._vertices
-        return ClothState(x, x, x.new_empty(len(self._area) * len(self._points), 3), self._virgin(x))
-
-    def _geometry(self) -> functional.Geometry:
-        g = self._gradient
-        return functional.Geometry(
-            corners=self._corners,
-            warp=(g[:, 1, 0:1], g[:, 2, 0:1]),
-            weft=(g[:, 1, 1:2], g[:, 2, 1:2]),
-            area=self._area,
-        )
-
     def grid(self) -> Grid | None:
         """The contact grid; None without contact."""
         return None if self._grid is None else self._grid._replace(points=self._points, apart=self._apart)
 
-    def _vertex_mass(self, density: Tensor) -> Tensor:
-        if density.ndim == 0:
-            return density * self._share
-        triangle = density.unsqueeze(-1) * self._area / 3
-        corners = torch.cat([triangle] * 3, dim=-2)
-        return triangle.new_zeros(*triangle.shape[:-2], *self._share.shape).index_add(-2, self._corners, corners)
-
     def _ready(
         self,
-        model: functional.Model,
         state: ClothState,
         motion: Mapping[str, Trajectory],
         frames: list[float],
         counts: list[int],
+        settling: float | None = None,
     ) -> Plan:
-        check_state(state, self._expected())
+        model = self.model()
+        check_state(state, likeness(model, self._vertices))
+        if settling is not None:
+            model = damped(model, settling)
         state = expand_state(state, model, motion)
-        plan = Plan(model, motion, frames, counts, state, self._choice(model, state), self._longest())
+        longest = float("inf") if self._grid is None else self._grid.longest
+        plan = Plan(model, motion, frames, counts, state, self._choice(model, state), longest)
         plan.check(state)
         return plan
 
-    def _choice(self, model: functional.Model, state: ClothState) -> Choice:
-        return choose(self.engine, model, state, standing(model))
-
-    def _longest(self) -> float:
-        """Extent [m] that the contact grid has room for."""
-        return float("inf") if self._grid is None else (self._grid.nodes - 4) * self._grid.spacing
+    def _choice(self, model: Model, state: ClothState) -> Choice:
+        return choose(self.engine, model, state, still_drives(model))
 
     def extra_repr(self) -> str:
         """Data sheet: size, contact, step."""
         size = f"{len(self.mesh.vertices)} vertices, {len(self.mesh.faces)} triangles, {self.mesh.area.sum():.4g} m^2"
-        grid = (
-            "none"
-            if self._grid is None
-            else f"layers rest {1e3 * GAP * self._grid.spacing:.3g} mm apart, unseen within "
-            f"{1e3 * TURNED * self._grid.reach:.3g} mm along the cloth; {len(self._points)} point(s) per triangle"
-        )
+        grid = "none" if self._grid is None else self._grid.words
         with torch.no_grad():
-            engine = self._choice(self.model(), self._expected())
+            model = self.model()
+            engine = self._choice(model, likeness(model, self._vertices))
         return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s\nengine: {engine}"

@@ -13,7 +13,6 @@ from torch.utils.checkpoint import checkpoint as recompute
 
 from . import functional
 from .boundaries import Drive, drive
-from .boundaries.motion import interpolate
 from .engine.choice import Choice
 from .engine.fused import Fused
 from .errors import SimulationDiverged
@@ -94,16 +93,6 @@ def collect(plan: Plan, states: Sequence[ClothState], impulses: Sequence[Impulse
         found = [-j[name] / d if name in j else zero for j, d in zip(impulses, durations, strict=True)]
         wrench[name] = torch.stack([zero, *(f.expand_as(zero) for f in found)], dim=-2)
     return Rollout(torch.tensor(plan.frames, dtype=torch.float64), x, v, wrench, states[-1])
-
-
-def held(motion: Mapping[str, Trajectory], start: float, end: float) -> dict[str, Trajectory]:
-    """Every body stands where it is at ``start``, with the same grasps closed."""
-    found, span = {}, torch.tensor([start, end], dtype=torch.float64)
-    for name, trajectory in motion.items():
-        pose = interpolate(trajectory, span[:1].to(trajectory.pose))
-        closed = drive(trajectory, span[:1].repeat(2).to(trajectory.pose)).closed[0]
-        found[name] = Trajectory(span, pose.expand(*pose.shape[:-3], 2, 4, 4), torch.tensor([closed, closed]))
-    return found
 
 
 def advance(interval: Interval, state: ClothState, checkpoint: bool) -> tuple[ClothState, Impulses]:

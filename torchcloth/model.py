@@ -24,6 +24,12 @@ class Geometry(NamedTuple):
     weft: tuple[Tensor, Tensor]  # likewise f2
     area: Tensor  # [E, 1] m^2, rest
 
+    @classmethod
+    def of(cls, corners: Tensor, gradient: Tensor, area: Tensor) -> Geometry:
+        """From the gradients of the shape functions [E, 3, 2] 1/m."""
+        g = gradient
+        return cls(corners, (g[:, 1, 0:1], g[:, 2, 0:1]), (g[:, 1, 1:2], g[:, 2, 1:2]), area)
+
 
 class Model(NamedTuple):
     """Everything a substep needs, with all parameters resolved to tensors."""
@@ -38,6 +44,15 @@ class Model(NamedTuple):
     grid: Grid | None = None  # of the contact between layers; None without contact
     transfer: Literal["mesh", "apic"] = "mesh"  # where elastic forces act: on the vertices, or through the grid
     rest: Tensor | None = None  # [..., E or 1, 4]: F_E = F A for a rest shape that differs from the pattern
+
+
+def vertex_mass(geometry: Geometry, density: Tensor, share: Tensor) -> Tensor:
+    """Lumped masses [..., V, 1] kg, from kg/m^2 [...] or [..., E] and the vertices' areas ``share`` [V, 1]."""
+    if density.ndim == 0:
+        return density * share
+    triangle = density.unsqueeze(-1) * geometry.area / 3
+    corners = torch.cat([triangle] * 3, dim=-2)
+    return triangle.new_zeros(*triangle.shape[:-2], *share.shape).index_add(-2, geometry.corners, corners)
 
 
 def surface(geometry: Geometry, x: Tensor, v: Tensor) -> Surface:

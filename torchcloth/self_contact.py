@@ -76,12 +76,15 @@ def first_directors(model: Model, grid: Grid, x: Tensor) -> Tensor:
 def _unpressed(grid: Grid, apart: Tensor, centre: Tensor, n: Tensor) -> Tensor:
     """Compression [..., E, 1] at which layers that are as near as the triangles with these centres do not yet press."""
     side = (grid.reach - (RANGE + SKIN) * grid.spacing) / 2
+    farthest = TOUCH * grid.spacing + side  # pairs beyond do not press, whatever their direction
     found = []
     for points, normals in zip(centre.reshape(-1, *n.shape[-2:]), n.reshape(-1, *n.shape[-2:]), strict=True):
-        height = (points @ normals.mT - (points * normals).sum(-1)).abs()  # [E, E], of the row over the column
-        beside = (torch.cdist(points, points) ** 2 - height**2).clamp(min=0).sqrt() > side
-        distance = height.masked_fill(beside | ~apart, float("inf")).amin(-1, keepdim=True)
-        found.append(((TOUCH - distance / grid.spacing) / FADING).clamp(0, grid.play))
+        over, under = ((torch.cdist(points, points) <= farthest) & apart).nonzero(as_tuple=True)
+        between = points[over] - points[under]
+        height = dot(between, normals[under]).abs()
+        beside = (dot(between, between) - height**2).clamp(min=0).sqrt() > side
+        close = ((TOUCH - height / grid.spacing) / FADING).masked_fill(beside, 0.0).clamp(0, grid.play)
+        found.append(points.new_zeros(len(points), 1).scatter_reduce(0, over.unsqueeze(-1), close, "amax"))
     return torch.stack(found).view(*n.shape[:-1], 1)
 
 

@@ -11,12 +11,14 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from .boundaries import Drive
-from .engine.sensing import Sensing
+from .engine.tangents import FusedTangents
 from .errors import InvalidInput
 from .forward_mode import real_tangents
-from .intervals import Interval, Plan, check_finite, collect, held
+from .initial import damped, held
+from .intervals import Interval, Plan, check_finite, collect
 from .model import Model
 from .types import ClothState, Rollout, Trajectory
+from .validation import check_numbers
 
 RATE = 30.0  # 1/s, of the damping while the cloth settles
 
@@ -43,13 +45,13 @@ def sensitivities(
     count = _check(along, cloth, state, motion)
     plan = cloth.plan(state, motion, times, dt)
     fused = plan.choice.fused
-    if fused is None or fused.outside is not None:
+    if fused is None or fused.torch_parts is not None:
         return _by_copies(cloth, plan, motion, along, count, dt, settle)
     state, moved = plan.state, _tangent_of(plan.state, along, count)
     if settle:
         start = plan.frames[0]
         rest = cloth.settling(state, motion, start, settle, RATE)
-        walk = _Walk(cloth, rest, lambda: cloth.settling_model(RATE), along, count)
+        walk = _Walk(cloth, rest, lambda: damped(cloth.model(), RATE), along, count)
         poses = _Poses(motion, along, count, lambda m: held(m, *rest.frames))
         (states, _), (shifts, _) = walk.run(state, moved, poses)
         state, moved = (s[-1]._replace(v=torch.zeros_like(s[-1].v)) for s in (states, shifts))
@@ -69,7 +71,7 @@ class _Walk:
         fused = self.plan.choice.fused
         if fused is None:
             raise ValueError("the reference has no such tangents")
-        sensing = Sensing(fused, self._within, self.count)
+        sensing = FusedTangents(fused, self._within, self.count)
         values, tangents = ([state], []), ([moved], [])
         for interval in self.plan.intervals():
             before, drives = state, interval.drives()
@@ -123,7 +125,10 @@ class _Poses(NamedTuple):
             motion = {name: m._replace(pose=m.pose.to(like[name].pose)) for name, m in motion.items()}
             drives = interval._replace(motion=motion).drives()
             return {
-                name: d._replace(increment=_tangent(d.increment), pose=_tangent(d.pose)) for name, d in drives.items()
+                name: drives[name]._replace(
+                    increment=_tangent(drives[name].increment), pose=_tangent(drives[name].pose)
+                )
+                for name in self.along.motion
             }
 
 
@@ -221,6 +226,9 @@ def _check(along: Directions, cloth: nn.Module, state: ClothState, motion: Mappi
     Raises:
         InvalidInput: names or shapes that do not fit.
     """
+    if not isinstance(along, Directions) or not isinstance(along.state, ClothState | None):
+        got = type(along if not isinstance(along, Directions) else along.state).__name__
+        raise InvalidInput("along", got=got, expected="torchcloth.sensitivities.Directions(parameters, state, motion)")
     known = {
         "parameters": dict(cloth.named_parameters()),
         "motion": {name: trajectory.pose for name, trajectory in motion.items()},
@@ -238,10 +246,12 @@ def _check(along: Directions, cloth: nn.Module, state: ClothState, motion: Mappi
             raise InvalidInput("along.state.memory", got=got, expected=expected)
         pairs += [(f"along.state.{n}", getattr(along.state, n), getattr(state, n)) for n in ("x", "v", "d3")]
         pairs += [(f"along.state.memory[{n!r}]", along.state.memory[n], state.memory[n]) for n in state.memory]
+    for what, tangent, _ in pairs:
+        check_numbers(what, tangent)
     counts = {len(tangent) for _, tangent, _ in pairs if tangent.ndim}
     for what, tangent, value in pairs:
         if len(counts) != 1 or tangent.shape != (next(iter(counts)), *value.shape):
-            expected = f"[K, {', '.join(map(str, value.shape))}] with the same K everywhere"
+            expected = f"[{', '.join(('K', *map(str, value.shape)))}] with the same K everywhere"
             raise InvalidInput(what, got=f"shape {tuple(tangent.shape)}", expected=expected)
     if not counts or 0 in counts:
         raise InvalidInput("along", got="no direction", expected="at least one")

@@ -5,9 +5,29 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .errors import InvalidInput
 from .materials import Stiffness
+from .model import Model
+from .strain import grown_gradient
 
 SAFETY = 0.7  # of the linear limit: leaves room for tangents that double beyond what the material states
+
+
+def stable_step_of(model: Model, gradient: Tensor) -> float:
+    """``stable_step`` of a cloth with all its parts; ``gradient``: of the shape functions of the pattern.
+
+    Raises:
+        InvalidInput: a precision in which a substep is lost in rounding.
+    """
+    if gradient.dtype not in (torch.float32, torch.float64):
+        got = str(gradient.dtype).removeprefix("torch.")
+        raise InvalidInput("precision of the cloth", got=got, expected="float32 or float64", remedy="use cloth.float()")
+    spacing = None if model.grid is None else model.grid.spacing
+    extra = [effect.rates(c, model.mass) for effect, c in model.effects.values()]
+    elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
+    gradient = gradient if model.rest is None else grown_gradient(gradient, model.rest)
+    stiffness = model.material.stiffness(model.coefficients)
+    return stable_step(gradient, model.areal_density, stiffness, spacing, elastic, damping)
 
 
 def stable_step(

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from .boundaries import Grasp
 from .boundaries.motion import check as check_motion
+from .boundaries.motion import check_cover
 from .effects import AbstractEffect
 from .errors import InvalidInput, SimulationDiverged, UnstableStep
 from .model import Model
@@ -22,6 +23,21 @@ def check_field(name: str, raw: Tensor, triangles: int) -> None:
     if raw.ndim and raw.shape[-1] not in (1, triangles):
         expected = f"a scalar, [{triangles}] (one per triangle) or [B, 1]"
         raise InvalidInput(name, got=f"shape {tuple(raw.shape)}", expected=expected)
+
+
+def check_numbers(what: str, values: object) -> None:
+    """Refuse what is not a tensor of finite real numbers."""
+    if not isinstance(values, Tensor) or not values.is_floating_point():
+        got = values.dtype if isinstance(values, Tensor) else type(values).__name__
+        raise InvalidInput(what, got=str(got).removeprefix("torch."), expected="a tensor of real numbers")
+    if not bool(torch.isfinite(values.detach()).all()):
+        raise InvalidInput(what, got="NaN or infinite entries", expected="finite numbers")
+
+
+def check_duration(seconds: float) -> None:
+    """Time to settle in."""
+    if not 0 < seconds < float("inf"):
+        raise InvalidInput("duration of settling", got=f"{seconds:g} s", expected="a time > 0")
 
 
 def check_times(times: Tensor | Sequence[float]) -> list[float]:
@@ -71,32 +87,51 @@ def check_grasps(effects: Mapping[str, AbstractEffect], boundaries: nn.ModuleDic
             )
 
 
+def check_mapping(motion: object) -> None:
+    """Trajectories have names."""
+    if not isinstance(motion, Mapping):
+        raise InvalidInput("motion", got=type(motion).__name__, expected="a dict of trajectories by boundary")
+
+
 def check_motions(
     motion: Mapping[str, Trajectory], boundaries: nn.ModuleDict, frames: list[float], like: Tensor
 ) -> dict[str, Trajectory]:
     """One usable trajectory for every driven boundary, in the precision and on the device of ``like``."""
     driven = {name for name, boundary in boundaries.items() if boundary.driven}
+    check_mapping(motion)
     if set(motion) != driven:
         raise InvalidInput(
             "motion", got=f"trajectories for {sorted(motion)}", expected=f"one for each of {sorted(driven)}"
         )
     for name, trajectory in motion.items():
-        check_motion(trajectory, name, frames[0], frames[-1])
+        check_motion(trajectory, name)
+        check_cover(trajectory, name, frames[0], frames[-1])
     return {name: Trajectory(m.t, m.pose.to(like), m.closed) for name, m in motion.items()}
+
+
+def check_positions(x: Tensor, v: Tensor, vertices: int) -> None:
+    """Refuse positions [..., V, 3] and velocities for another number of vertices, or not finite."""
+    if x.shape[-2:] != (vertices, 3):
+        raise InvalidInput("x", got=f"shape {tuple(x.shape)}", expected=f"[..., {vertices}, 3] in metres")
+    if v.shape != x.shape:
+        raise InvalidInput("v", got=f"shape {tuple(v.shape)}", expected=f"x's, {tuple(x.shape)}")
+    if not bool(torch.isfinite(x.detach()).all()):
+        raise InvalidInput("x", got="NaN or infinite entries", expected="finite positions in metres")
 
 
 def check_state(state: ClothState, like: ClothState) -> None:
     """Refuse a state that was made for another cloth (than ``like``, one of the right shapes), or is not finite."""
+    remedy = "make states with this cloth's rest_state() or state()"
+    if not isinstance(state, ClothState):
+        raise InvalidInput("state", got=type(state).__name__, expected="a ClothState", remedy=remedy)
+    for name, field in _named(state).items():
+        check_numbers(f"state.{name}", field)
+        if field.dtype != like.x.dtype or field.device != like.x.device:
+            got, expected = (f"{t.dtype} on {t.device}".removeprefix("torch.") for t in (field, like.x))
+            raise InvalidInput(f"state.{name}", got=got, expected=f"{expected}, as the cloth's", remedy=remedy)
     got, expected = ({name: tuple(t.shape[-2:]) for name, t in _named(s).items()} for s in (state, like))
     if got != expected:
-        raise InvalidInput(
-            "state",
-            got=f"{got}",
-            expected=f"{expected}",
-            remedy="make states with this cloth's rest_state() or state()",
-        )
-    if not all(bool(torch.isfinite(field).all()) for field in _named(state).values()):
-        raise InvalidInput("state", got="NaN or infinite entries", expected="finite x, v, d3 and memory")
+        raise InvalidInput("state", got=f"{got}", expected=f"{expected}", remedy=remedy)
 
 
 def _named(state: ClothState) -> dict[str, Tensor]:
@@ -104,11 +139,26 @@ def _named(state: ClothState) -> dict[str, Tensor]:
 
 
 def expand_state(state: ClothState, model: Model, motion: Mapping[str, Trajectory]) -> ClothState:
-    """The state with the batch dimensions of parameters and motion, so that one state serves many of them."""
+    """The state with the batch dimensions of parameters and motion, so that one state serves many of them.
+
+    Raises:
+        InvalidInput: batch dimensions that do not go together, or none is left.
+    """
     coefficients = [model.coefficients, (model.areal_density, model.mass), *(c for _, c in model.effects.values())]
     tensors = [t for c in coefficients for t in (c if isinstance(c, tuple) else (c,)) if isinstance(t, Tensor)]
-    batches = [t.shape[:-2] for t in tensors if t.ndim > 2] + [m.pose.shape[:-3] for m in motion.values()]
-    batch = torch.broadcast_shapes(state.x.shape[:-2], *batches)
+    found = {
+        **{f"state.{name}": field.shape[:-2] for name, field in _named(state).items()},
+        **{f"motion[{name!r}].pose": trajectory.pose.shape[:-3] for name, trajectory in motion.items()},
+    }
+    parameters = [t.shape[:-2] for t in tensors if t.ndim > 2]
+    try:
+        batch = torch.broadcast_shapes(*found.values(), *parameters)
+    except RuntimeError:
+        batch = None
+    if batch is None or batch.numel() == 0:
+        several = {name: tuple(shape) for name, shape in found.items() if shape}
+        got = f"{several}, parameters {sorted({tuple(shape) for shape in parameters})}"
+        raise InvalidInput("batch dimensions", got=got, expected="shapes that broadcast, to at least one scene")
     return state.map(lambda field: field.expand(*batch, *field.shape[-2:]))
 
 

@@ -122,7 +122,7 @@ def tangents_transpose(cloth, motion, state: ClothState, substeps: int, dt: floa
     with torch.no_grad():
         drives = drives_of(motion, substeps, dt, {name: t.pose for name, t in motion.items()})
         engine = fused.Fused(cloth.model(), state, drives)
-        assert engine.outside is None, f"not on the engine: {engine.outside.parts}"
+        assert engine.torch_parts is None, f"not on the engine: {engine.torch_parts.parts}"
         job = engine.job(state, dt, drives, substeps)
         varied = {field for field in job.inputs if field != engine.low.dt}  # the step itself is not differentiated
         results, records = running.forward(job, 1)

@@ -9,7 +9,7 @@ from clothes import close, opening, sheet, start
 import torchcloth as tc
 from torchcloth.boundaries import AbstractBoundary
 from torchcloth.engine import running
-from torchcloth.engine.choice import choose, standing
+from torchcloth.engine.choice import choose, still_drives
 from torchcloth.engine.fused import Fused
 from torchcloth.errors import InvalidInput, SimulationDiverged
 
@@ -113,7 +113,7 @@ def test_records_are_kept_while_the_budget_lasts(monkeypatch):
     cloth, kept = sheet("fused"), []
     model, state = cloth.model(), start(cloth)
     drives = {name: d._replace(increment=d.increment.repeat(9, 1, 1), pose=d.pose.repeat(9, 1, 1), closed=(True,) * 9)
-              for name, d in standing(model).items()}  # fmt: skip
+              for name, d in still_drives(model).items()}  # fmt: skip
     size = running.full_size(Fused(model, state, drives).low.program, 1, 9)
     monkeypatch.setattr(running, "BUDGET", int(1.5 * size))
     fused, forward = Fused(model, state, drives), running.forward
@@ -209,7 +209,7 @@ def test_other_precisions_and_devices_are_left_to_the_reference():
         (state.map(lambda t: t.half()), "float16"),
         (state.map(lambda t: t.to("meta")), "tensors on meta"),
     ):
-        assert str(choose("auto", model, other, standing(model))) == f"reference ({why})"
+        assert str(choose("auto", model, other, still_drives(model))) == f"reference ({why})"
 
 
 def test_unknown_boundary_runs_on_the_reference_without_a_warning():

@@ -178,6 +178,6 @@ def test_one_that_came_with_the_package_is_preferred(monkeypatch, tmp_path):
     """And one for another processor is not taken."""
     monkeypatch.setattr(library, "PACKAGED", tmp_path)
     (tmp_path / "engine-0123456789.so").write_text("for another")
-    assert str(tmp_path) not in library.standing()
+    assert str(tmp_path) not in library.status()
     (tmp_path / building.file_name()).write_bytes(b"")
-    assert library.standing() == f"built: {tmp_path / building.file_name()}"
+    assert library.status() == f"built: {tmp_path / building.file_name()}"

@@ -7,7 +7,7 @@ from clothes import close, opening, sheet, start
 from torch.func import functional_call, jacfwd, jvp, vjp, vmap
 
 import torchcloth as tc
-from torchcloth.engine.choice import standing
+from torchcloth.engine.choice import still_drives
 from torchcloth.engine.fused import Fused
 from torchcloth.engine.operators import Rollout, ops
 from torchcloth.errors import InvalidInput
@@ -28,7 +28,7 @@ def program(dtype, batch=()):
     state = start(cloth, batch)
     model = cloth.model()
     drives = {name: d._replace(increment=d.increment.repeat(STEPS, 1, 1), pose=d.pose.repeat(STEPS, 1, 1),
-                               closed=(True,) * STEPS) for name, d in standing(model).items()}  # fmt: skip
+                               closed=(True,) * STEPS) for name, d in still_drives(model).items()}  # fmt: skip
     job = Fused(model, state, drives).job(state, 1e-4, drives, STEPS)
     return job.program, [tensor.detach() for tensor in job.inputs.values()]
 
@@ -214,11 +214,11 @@ def test_jvp_of_a_number_of_steps_in_one_program():
     numbers = set()
     for cloth in (first, second, first):
         model, state = cloth.model(), cloth.rest_state()
-        numbers.add(Fused(model, state, standing(model)).low.program.number)
+        numbers.add(Fused(model, state, still_drives(model)).low.program.number)
     assert len(numbers) == 1
     second.boundaries["left"].index = torch.tensor([2])  # a constant of a part
     model = second.model()
-    numbers.add(Fused(model, state, standing(model)).low.program.number)
+    numbers.add(Fused(model, state, still_drives(model)).low.program.number)
     assert len(numbers) == 2
 
 

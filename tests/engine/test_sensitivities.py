@@ -1,5 +1,7 @@
 """Derivatives along many directions at once: against the reference's copies, against reverse mode, and their memory."""
 
+import math
+
 import pytest
 import torch
 from clothes import close, opening, sheet, start
@@ -86,6 +88,18 @@ def test_fields_and_boundary_free_cloth():
     assert float(found[0][:, 1].abs().max()) > 0
 
 
+def test_one_hand_of_two():
+    """The other's poses stay as they are."""
+    found = []
+    for engine in ("fused", "reference"):
+        cloth = sheet(engine)
+        pose = directions(cloth, start(cloth), opening(END)).motion["right"]
+        along = Directions(motion={"right": pose})
+        found.append(cloth.sensitivities(start(cloth), opening(END), (0.0, END), along=along)[1].x)
+    close(*found, 1e-8, "tangent")
+
+
+@pytest.mark.parametrize("engine", ["auto", "reference"])
 @pytest.mark.parametrize(
     ("along", "message"),
     [
@@ -94,13 +108,27 @@ def test_fields_and_boundary_free_cloth():
             Directions({"stiffness": torch.ones(1)}),
             r"along\.parameters; got 'stiffness'; expected one of areal_density",
         ),
-        (Directions({"areal_density.raw": torch.ones(1, 2)}), r"got shape \(1, 2\); expected \[K, \]"),
+        (Directions({"areal_density.raw": torch.ones(1, 2)}), r"got shape \(1, 2\); expected \[K\]"),
         (Directions(motion={"foot": torch.ones(1)}), r"along\.motion; got 'foot'"),
         (Directions({"areal_density.raw": torch.ones(2), "material.cone.raw": torch.ones(3)}), "same K"),
+        (None, "along; got NoneType; expected .*Directions"),
+        ({"areal_density.raw": torch.ones(1)}, "along; got dict; expected .*Directions"),
+        (Directions(state=torch.ones(1)), "along; got Tensor"),
+        (
+            Directions({"areal_density.raw": [1.0]}),
+            r"\['areal_density\.raw'\]; got list; expected a tensor",
+        ),
+        (
+            Directions({"areal_density.raw": torch.ones(1, dtype=torch.int64)}),
+            "got int64; expected a tensor",
+        ),
+        (Directions({"areal_density.raw": torch.tensor([math.nan])}), r"\['areal_density\.raw'\]; got NaN"),
+        (Directions(motion={"left": torch.full((1, 7, 4, 4), math.nan)}), r"along\.motion\['left'\]; got NaN"),
+        (Directions({"areal_density.raw": torch.ones(0)}), "along; got no direction"),
     ],
 )
-def test_refusals(along, message):
-    cloth = sheet()
+def test_refusals(engine, along, message):
+    cloth = sheet(engine)
     with pytest.raises(InvalidInput, match=message):
         cloth.sensitivities(cloth.rest_state(), opening(END), along=along)
 

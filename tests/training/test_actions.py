@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchcloth.boundaries.motion import check, interpolate
+from torchcloth.boundaries.motion import check, check_cover, interpolate
 from torchcloth.errors import InvalidInput
 from torchcloth.training.actions import PERIOD, Limits, cover, drag, fling, minimum_jerk
 
@@ -33,7 +33,8 @@ def fine(action, name="left"):
 
 def test_the_layer_accepts_it(action):
     for name, trajectory in action.motion.items():
-        check(trajectory, name, 0.0, action.duration)
+        check(trajectory, name)
+        check_cover(trajectory, name, 0.0, action.duration)
     assert float(action.motion["left"].t.diff().max()) <= max(PERIOD, 0.5 * (action.duration - action.release)) + 1e-9
 
 

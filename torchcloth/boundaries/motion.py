@@ -11,14 +11,18 @@ from ..types import Trajectory
 from .base import Drive
 
 
-def check(trajectory: Trajectory, name: str, start: float, end: float) -> None:
-    """Refuse a trajectory that cannot be followed over [start, end] s.
+def check(trajectory: Trajectory, name: str) -> None:
+    """Refuse a trajectory that cannot be followed.
 
     Raises:
-        InvalidInput: shapes, time order, coverage, non-finite poses, or turns over 90 degrees between knots.
+        InvalidInput: shapes, time order, non-finite poses, or turns over 90 degrees between knots.
     """
-    t, pose, closed = trajectory
     where = f"motion[{name!r}]"
+    if not isinstance(trajectory, Trajectory) or not all(isinstance(part, Tensor) for part in trajectory):
+        parts = trajectory if isinstance(trajectory, Trajectory) else (trajectory,)
+        got = ", ".join(type(part).__name__ for part in parts)
+        raise InvalidInput(where, got=got, expected="a Trajectory of tensors t, pose and closed")
+    t, pose, closed = trajectory
     if t.ndim != 1 or len(t) < 2 or pose.shape[-3:] != (len(t), 4, 4) or closed.shape != t.shape:
         raise InvalidInput(
             where,
@@ -27,15 +31,9 @@ def check(trajectory: Trajectory, name: str, start: float, end: float) -> None:
         )
     if not bool((t[1:] > t[:-1]).all()):
         raise InvalidInput(f"{where}.t", got="times that do not increase", expected="strictly increasing seconds")
-    slack = 1e-6 * max(1.0, abs(end))
-    if float(t[0]) > start + slack or float(t[-1]) < end - slack:
-        raise InvalidInput(
-            f"{where}.t",
-            got=f"[{float(t[0]):g}, {float(t[-1]):g}] s",
-            expected=f"to cover the frame times [{start:g}, {end:g}] s",
-        )
-    if not bool(torch.isfinite(pose).all()):
-        raise InvalidInput(f"{where}.pose", got="NaN or infinite entries", expected="finite poses")
+    if not pose.is_floating_point() or not bool(torch.isfinite(pose).all()):
+        got = "NaN or infinite entries" if pose.is_floating_point() else str(pose.dtype)
+        raise InvalidInput(f"{where}.pose", got=got, expected="finite poses")
     rotation = pose.detach()[..., :3, :3]
     error = (rotation @ rotation.mT - torch.eye(3).to(rotation)).abs().amax()
     if float(error) > 1e-2 or bool((torch.linalg.det(rotation) < 0).any()):
@@ -47,6 +45,21 @@ def check(trajectory: Trajectory, name: str, start: float, end: float) -> None:
             got="a turn of over 90 degrees between knots",
             expected="smaller steps",
             remedy="give the trajectory at more knots",
+        )
+
+
+def check_cover(trajectory: Trajectory, name: str, start: float, end: float) -> None:
+    """Refuse a trajectory that does not cover [start, end] s.
+
+    Raises:
+        InvalidInput: it begins later or ends earlier.
+    """
+    t, slack = trajectory.t, 1e-6 * max(1.0, abs(end))
+    if float(t[0]) > start + slack or float(t[-1]) < end - slack:
+        raise InvalidInput(
+            f"motion[{name!r}].t",
+            got=f"[{float(t[0]):g}, {float(t[-1]):g}] s",
+            expected=f"to cover the frame times [{start:g}, {end:g}] s",
         )
 
 

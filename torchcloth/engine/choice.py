@@ -29,7 +29,7 @@ class Choice(NamedTuple):
     def __str__(self) -> str:
         if self.fused is None:
             return f"reference ({self.reason})"
-        parts = () if self.fused.outside is None else sorted(self.fused.outside.parts)
+        parts = () if self.fused.torch_parts is None else sorted(self.fused.torch_parts.parts)
         return f"fused, with {', '.join(parts)} in torch" if parts else "fused"
 
 
@@ -71,7 +71,7 @@ def choose(setting: Setting, model: Model, state: ClothState, drives: Mapping[st
     return Choice(None, reason)
 
 
-def standing(model: Model) -> dict[str, Drive]:
+def still_drives(model: Model) -> dict[str, Drive]:
     """Drives of one substep in which every driven boundary is closed and stands still, to try an engine on."""
     still = torch.eye(4, dtype=model.mass.dtype, device=model.mass.device).unsqueeze(0)
     return {name: Drive(still, still, (True,)) for name, boundary in model.boundaries.items() if boundary.driven}

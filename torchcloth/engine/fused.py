@@ -14,12 +14,11 @@ from ..dynamics import Impulses
 from ..model import Model
 from ..self_contact import CHUNK
 from ..types import ClothState
-from . import binding, running
-from .lowering import fitted
+from . import conversion, running
+from .fields import Field
 from .operators import Rollout
-from .outside import Outside
-from .program import Field
 from .running import Job
+from .torch_parts import TorchParts, divide
 
 
 class Fused:
@@ -27,7 +26,7 @@ class Fused:
 
     Attributes:
         low: the program, with the numbers of the model.
-        outside: the parts that torch computes in every substep; None: there are none, and the engine runs by itself.
+        torch_parts: what torch computes in every substep; None: nothing, the engine runs by itself.
 
     Raises:
         Unfused: a part without kernels that torch cannot take over either.
@@ -36,8 +35,8 @@ class Fused:
     def __init__(self, model: Model, state: ClothState, drives: Mapping[str, Drive]) -> None:
         self.model = model
         self._left = running.BUDGET  # bytes of records that the adjoint may find ready
-        self.low, parts = fitted(model, state, drives)
-        self.outside = Outside(model, parts) if parts else None
+        self.low, parts = divide(model, state, drives)
+        self.torch_parts = TorchParts(model, parts) if parts else None
         self._coefficients: dict[Field, Tensor] = {}
 
     def rollout(
@@ -51,13 +50,13 @@ class Fused:
     ) -> tuple[ClothState, Impulses]:
         """As ``functional.rollout``. ``checkpoint``: the adjoint keeps to a budget of memory, and recomputes beyond."""
         fixed, moves = self.coefficients(dt, state.x.shape[:-2]), self.moves(state, drives)
-        if self.outside is None:
+        if self.torch_parts is None:
             return self._call(state, fixed | _cut(moves, first, first + substeps), substeps, checkpoint)
         total: Impulses = {}
         last = first + substeps
         for begin in range(first, last, CHUNK):
             chunk = range(begin, min(begin + CHUNK, last))
-            run = partial(self._shared, self.outside, dt, fixed, moves, chunk)
+            run = partial(self._shared, self.torch_parts, dt, fixed, moves, chunk)
             again = checkpoint and torch.is_grad_enabled()
             state, impulses = (
                 recompute(run, state, use_reentrant=False, preserve_rng_state=False) if again else run(state)
@@ -66,25 +65,25 @@ class Fused:
         return state, total
 
     def job(self, state: ClothState, dt: float, drives: Mapping[str, Drive], substeps: int) -> Job:
-        """What the engine is given, as plain numbers; without parts outside."""
+        """What the engine is given, as plain numbers; without parts in torch."""
         batch, program = state.x.shape[:-2], self.low.program
-        found = binding.flat(self.low, binding.states(self.low, state), batch) | self.moves(state, drives)
+        found = conversion.flat(self.low, conversion.state_inputs(self.low, state), batch) | self.moves(state, drives)
         found |= self.coefficients(dt, batch)
         return Job(program, {field: found[field] for field in program.inputs}, batch.numel(), substeps)
 
     def coefficients(self, dt: float, batch: torch.Size) -> dict[Field, Tensor]:
         """Inputs that stay the same over the substeps of a call."""
         if not self._coefficients:
-            self._coefficients = binding.flat(self.low, self.low.inputs, batch)
+            self._coefficients = conversion.flat(self.low, self.low.inputs, batch)
         return self._coefficients | {self.low.dt: torch.full((1, 1, 1), dt, dtype=self.low.program.dtype)}
 
     def moves(self, state: ClothState, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
         """Inputs with a row for every substep."""
-        return binding.flat(self.low, binding.moves(self.low, drives), state.x.shape[:-2])
+        return conversion.flat(self.low, conversion.drive_inputs(self.low, drives), state.x.shape[:-2])
 
     def _shared(
         self,
-        outside: Outside,
+        parts: TorchParts,
         dt: float,
         fixed: dict[Field, Tensor],
         moves: dict[Field, Tensor],
@@ -94,7 +93,7 @@ class Fused:
         """Substeps in which torch has a part."""
         total: Impulses = {}
         for k in substeps:
-            force, memory = outside.force(state, dt)
+            force, memory = parts.force(state, dt)
             state, impulses = self._call(state, fixed | _cut(moves, k, k + 1), 1, False, force)
             state = state._replace(memory=state.memory | memory)
             total = _sum(total, impulses)
@@ -109,14 +108,14 @@ class Fused:
         force: Tensor | None = None,
     ) -> tuple[ClothState, Impulses]:
         low, program, batch = self.low, self.low.program, state.x.shape[:-2]
-        begin = binding.states(low, state)
-        if low.given is not None and force is not None:
-            begin[low.given] = force
-        by_field = binding.flat(low, begin, batch) | others
+        begin = conversion.state_inputs(low, state)
+        if low.torch_force is not None and force is not None:
+            begin[low.torch_force] = force
+        by_field = conversion.flat(low, begin, batch) | others
         inputs = [by_field[field] for field in program.inputs]
         every = self._every(batch.numel(), substeps, checkpoint) if _needs_gradient(inputs) else 0
         *results, _ = Rollout.apply(program.number, substeps, every, *inputs)  # type: ignore[misc]
-        return binding.outcome(low, state, dict(zip(program.outputs, results, strict=True)), batch)
+        return conversion.outcome(low, state, dict(zip(program.outputs, results, strict=True)), batch)
 
     def _every(self, scenes: int, substeps: int, checkpoint: bool) -> int:
         """Substeps between records: all while the budget lasts; 0: the adjoint makes its own when it comes here."""

@@ -69,7 +69,7 @@ def kernels() -> dict[str, tuple[int, int, int]]:
     return {name: (k, lib.tc_kernel_info(k, 0), lib.tc_kernel_info(k, 1)) for k, name in enumerate(names)}
 
 
-def standing() -> str:
+def status() -> str:
     """Whether it is built, or can be, in a line; builds nothing."""
     for folder in (PACKAGED / building.file_name(), building.cached()):
         if folder is not None and folder.exists():

@@ -1,10 +1,4 @@
-"""Programs of the engine: which numbers a substep reads, which kernels it runs, and where results go.
-
-    loop = program.loop(triangles)
-    x0, x1, x2 = (loop.load(x, at=corner) for corner in corners)
-    *f, n, J = loop.call("surface", x0, x1, x2, ...)
-
-A loop's registers are numbered once and for all; a list of them stands for a vector.
+"""Programs of the engine: what one substep does, as stages that run one after the other on fields of numbers.
 
 A program is written down first and handed to the engine by ``ready``, unless the engine has the same one already: the
 programs of two calls are the same where every constant, index and instruction is, so nothing that a user changes in
@@ -16,49 +10,20 @@ from __future__ import annotations
 import ctypes
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from enum import IntEnum
+from collections.abc import Callable
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from .library import kernels, library
-from .wrapped import array
-
-OWN, SHARED, VARYING = -1, -2, -3
-LOAD, ADD, PUT, SPREAD, COLLECT = 0, 2, 3, 5, 6
-SHARES = 16  # numbers of a point, see csrc/transfer.h
-
-
-class Kind(IntEnum):
-    """What a field is; as in csrc/program.h."""
-
-    CONSTANT, PARAMETER, STATE, NEXT, TEMPORARY, KEPT, DRIVE, SUM, NODES, POINTS = range(10)
-
-
-class Shape(IntEnum):
-    """Of a stencil's operator; as in csrc/stencil.h."""
-
-    PLAIN, TRANSPOSED, SYMMETRIC = range(3)
-
-
-class By(IntEnum):
-    """What nodes get from points, and points from nodes, besides by weight; as in csrc/transfer.h."""
-
-    SLOPES, ARMS = range(2)
-
-
-class Field(NamedTuple):
-    """Rows of numbers, by the engine's number."""
-
-    id: int
-    rows: int
-    comps: int
-    kind: Kind
+from .constants import array
+from .fields import Field, Kind
+from .library import library
+from .loops import OWN, Loop
+from .stages import Layers, PointTables, Shape, Sieve, Stencil
 
 
 class Program:
@@ -267,176 +232,6 @@ def program_of(number: int) -> Program:
         KeyError: nobody holds it any more.
     """
     return _KNOWN[number]
-
-
-class Loop:
-    """Instructions on every item."""
-
-    def __init__(
-        self, items: int, own: int = OWN, among: int = -1, counted: int = -1, flat: bool = False, again: bool = False
-    ) -> None:
-        self.items, self._own, self._among, self._counted = items, own, among, counted
-        self.flat, self.again = flat, again
-        self._used = 0
-        self._code: list[tuple] = []
-        self._loaded: dict[tuple[int, int], list[int]] = {}
-
-    def load(self, field: Field, at: int | None = None) -> list[int]:
-        """Registers with a row of the field: the item's own, the one in table ``at``, or the only one.
-
-        The same registers whenever asked again: no loop reads what it writes.
-        """
-        place = self._place(field, at)
-        if (field.id, place) not in self._loaded:
-            regs = self._loaded[field.id, place] = self._new(field.comps)
-            self._code.append(("move", LOAD, field.id, place, regs[0]))
-        return self._loaded[field.id, place]
-
-    def call(self, kernel: str, *inputs: Sequence[int], into: list[int] | None = None) -> list[int]:
-        """Registers with a kernel's results; ``into``: added to these."""
-        number, takes, gives = kernels()[kernel]
-        flat = [reg for group in inputs for reg in group]
-        if len(flat) != takes:
-            raise ValueError(f"kernel {kernel!r} takes {takes} numbers, not {len(flat)}")
-        out = self._new(gives) if into is None else into
-        self._code.append(("call", number, flat, out if into is None else [~reg for reg in out]))
-        return out
-
-    def lookup(self, table: Field, nodes: Sequence[int], place: Sequence[int]) -> tuple[list[int], list[int]]:
-        """(fractions of the cell, values at its 8 corners) of a place on a grid [x, y, z] in cells."""
-        regs = self._new(11)
-        self._code.append(("lookup", table.id, *nodes, place[0], regs[0]))
-        return regs[:3], regs[3:]
-
-    def add(self, regs: Sequence[int], field: Field, at: int | None = None) -> None:
-        """Add registers to a row of the field."""
-        self._move(ADD, regs, field, at)
-
-    def put(self, regs: Sequence[int], field: Field, at: int | None = None) -> None:
-        """Write registers to a row of the field."""
-        self._move(PUT, regs, field, at)
-
-    def spread(self, offset: Sequence[int], share: Sequence[int], field: Field, at: int, by: By) -> None:
-        """Add a point's shares to the 27 nodes around it (table ``at``), by its offset from the lowest of them."""
-        self._code.append(("transfer", SPREAD, field.id, at, offset[0], share[0], int(by)))
-
-    def collect(self, offset: Sequence[int], field: Field, at: int, by: By) -> list[int]:
-        """Shares of a point that are the sums over its nodes."""
-        share = self._new(SHARES)
-        self._code.append(("transfer", COLLECT, field.id, at, offset[0], share[0], int(by)))
-        return share
-
-    def _move(self, code: int, regs: Sequence[int], field: Field, at: int | None) -> None:
-        if len(regs) != field.comps or list(regs) != list(range(regs[0], regs[0] + len(regs))):
-            raise ValueError(f"{field} cannot take the registers {regs}")
-        self._code.append(("move", code, field.id, self._place(field, at), regs[0]))
-
-    def _place(self, field: Field, at: int | None) -> int:
-        return SHARED if field.rows == 1 else self._own if at is None else at
-
-    def _new(self, count: int) -> list[int]:
-        self._used += count
-        return list(range(self._used - count, self._used))
-
-    def emit(self, handle, api) -> None:
-        """Write down the instructions."""
-        read = self._read()
-        api("loop")(handle, self.items, self._among, self._counted, int(self.flat), int(self.again))
-        for kind, *rest in self._code:
-            if kind in ("move", "lookup"):
-                api(kind)(handle, *rest)
-            elif kind == "transfer":
-                share = rest[4]
-                api("transfer")(handle, *rest, int(bool(read & set(range(share, share + SHARES)))))
-            else:
-                number, takes, gives = rest
-                feeds = int(any(reg in read or ~reg in read for reg in gives))
-                api("call")(handle, number, _ints(takes), _ints(gives), feeds)
-
-    def _read(self) -> set[int]:
-        """Registers whose values the reverse sweep needs."""
-        read: set[int] = set()
-        for kind, *rest in self._code:
-            if kind == "call":
-                read.update(rest[1])
-            elif kind == "lookup":
-                read.update(range(rest[4], rest[4] + 3))
-            elif kind == "transfer":
-                code, _, _, offset, share, _ = rest
-                read.update(range(offset, offset + 3))
-                read.update(range(share, share + SHARES) if code == SPREAD else ())
-        return read
-
-
-class Layers(NamedTuple):
-    """Contact between layers: which triangles may take part, and the grid; see csrc/contact.h."""
-
-    fields: Sequence[Field]  # positions, lowest node of each point, fields of the nodes
-    corners: np.ndarray  # [3, E] int32
-    places: np.ndarray  # [S, 3] float64, barycentric
-    lengths: tuple[float, float, float]  # spacing, skin, reach [m]
-    wrap: int
-    chunk: int
-    order: np.ndarray  # [E] int32, patch by patch
-    starts: np.ndarray  # [patches + 1] int32; [1]: all triangles take part always
-    meet: np.ndarray  # [patches, patches] uint8
-    apart: np.ndarray  # [E, patches] uint8, a bit for each triangle of a patch
-
-    def emit(self, handle, api) -> None:
-        """Write it down."""
-        ids = _ints([field.id for field in self.fields])
-        limits = _ints([self.wrap, self.chunk, len(self.starts) - 1])
-        lengths = (ctypes.c_double * 3)(*self.lengths)
-        corners, places = _array(self.corners), _array(self.places)
-        search = (_array(a) for a in (self.order, self.starts, self.meet, self.apart))
-        sizes = self.corners.shape[1], len(self.places)
-        api("contact")(handle, ids, len(ids), corners, sizes[0], places, sizes[1], lengths, limits, *search)
-
-
-class PointTables(NamedTuple):
-    """Points on triangles, in the order of these."""
-
-    corners: int  # table [3, E] of vertices
-    starts: int  # table [E + 1] of the first points
-    triangles: int
-
-
-class Sieve(NamedTuple):
-    """See ``Program.sieve``."""
-
-    number: int
-    x: Field
-    reach: Field
-    dt: Field
-    points: PointTables
-    steep: float
-
-    def emit(self, handle, api) -> None:
-        """Write it down."""
-        fields = (self.x.id, self.reach.id, self.dt.id)
-        api("sieve")(handle, self.number, *fields, *self.points, self.steep)
-
-
-class Stencil(NamedTuple):
-    """See ``Program.stencil``."""
-
-    table: int
-    weight: Field
-    x: Field
-    y: Field
-    shape: Shape
-
-    def emit(self, handle, api) -> None:
-        """Write it down."""
-        api("stencil")(handle, self.table, self.weight.id, self.x.id, self.y.id, int(self.shape))
-
-
-def _ints(values: Sequence[int]):
-    return (ctypes.c_int * len(values))(*values)
-
-
-def _array(values: np.ndarray):
-    return np.ctypeslib.as_ctypes(np.ascontiguousarray(values).reshape(-1))
 
 
 def _check(code: int) -> None:

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .fields import Field
 from .library import Call, Port
-from .program import Field, Program
+from .program import Program
 
 BUDGET = 192 * 2**20  # bytes of records that a simulation keeps for its adjoint
 ANEW = 96 * 2**20  # bytes of records that the adjoint makes at a time, of substeps that it goes through again

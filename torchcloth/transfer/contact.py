@@ -35,6 +35,20 @@ class Grid(NamedTuple):
     damping: float  # s
     apart: Tensor | None  # [E, E] bool, not neighbours along the cloth; None: every triangle always takes part
 
+    @property
+    def longest(self) -> float:
+        """Extent [m] of a cloth for which there is room before the grid wraps."""
+        return (self.nodes - 4) * self.spacing
+
+    @property
+    def words(self) -> str:
+        """For the data sheet of a cloth."""
+        gap, unseen = 1e3 * GAP * self.spacing, 1e3 * TURNED * self.reach
+        return (
+            f"layers rest {gap:.3g} mm apart, unseen within {unseen:.3g} mm along the cloth; "
+            f"{len(self.points)} point(s) per triangle"
+        )
+
 
 @dataclass(frozen=True)
 class Contact:

@@ -37,7 +37,8 @@ template <class R>
 size_t records_size(const Program<R>& p, int64_t substeps, int64_t every) {
     if (every == 0) return 0;
     const size_t masks = (size_t(substeps) * p.words * sizeof(int32_t) + sizeof(R) - 1) / sizeof(R);
-    return size_t(1 + (substeps + every - 1) / every) * (every == 1 ? p.record_size : p.state_size) + masks;
+    const size_t rows = size_t(1 + (substeps + every - 1) / every) * (every == 1 ? p.record_size : p.state_size);
+    return (rows + masks + LANES<R> - 1) / LANES<R> * LANES<R>;  // the next scene's begin on a cache line
 }
 
 template <class R>

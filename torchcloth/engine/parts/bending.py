@@ -10,8 +10,9 @@ from ...effects import Bending, BendingFriction, CreasingBending, SaturatingBend
 from ...effects._plate import Plate
 from ...effects.bending import Coefficients
 from ...effects.saturating import Coefficients as Saturating
-from ..lowering import Lowering, Sheet
-from ..program import Shape
+from ..lowering import Lowering
+from ..shared_loops import Sheet
+from ..stages import Shape
 
 
 def plate(low: Lowering, name: str, effect: Bending, c: Coefficients) -> None:

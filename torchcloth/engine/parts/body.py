@@ -8,8 +8,9 @@ from typing import Any
 import torch
 
 from ...boundaries import AbstractCollider, Coulomb, Elliptic, Stribeck
+from ..fields import Field
+from ..loops import Loop
 from ..lowering import Lowering, Unfused
-from ..program import Field, Loop
 from . import solids
 
 

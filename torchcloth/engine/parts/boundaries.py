@@ -10,8 +10,9 @@ from torch import Tensor
 
 from ...boundaries import AbstractBoundary, AbstractCollider, Box, Capsule, Cylinder, Grasp, MeshSolid, Plane, Sphere
 from ...effects import GripSlip
-from ..lowering import Lowering, Unfused, Velocities
-from ..program import Field
+from ..fields import Field
+from ..lowering import Lowering, Unfused
+from ..shared_loops import Velocities
 from . import points
 from .body import Body
 

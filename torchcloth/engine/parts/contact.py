@@ -15,8 +15,10 @@ from torch import Tensor
 from ...materials import AEP, OrthotropicAEP
 from ...self_contact import CHUNK
 from ...transfer import FADING, Grid
+from ..fields import Field
+from ..loops import VARYING, By
 from ..lowering import DIRECTORS, Lowering, Unfused
-from ..program import VARYING, By, Field, Layers
+from ..stages import Layers
 from .patches import patches
 
 _LAWS = (AEP, OrthotropicAEP)  # whose law across the sheet is that of DirectorMaterial

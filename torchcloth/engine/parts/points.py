@@ -13,8 +13,11 @@ import torch
 
 from ...boundaries.collider import PASSES
 from ...boundaries.points import TrianglePoints
-from ..lowering import Lowering, Velocities
-from ..program import Field, Loop, PointTables
+from ..fields import Field
+from ..loops import Loop
+from ..lowering import Lowering
+from ..shared_loops import Velocities
+from ..stages import PointTables
 from .body import Body
 
 

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from ...boundaries import AbstractCollider, Box, Capsule, Cylinder, MeshSolid, Plane, Sphere
+from ..fields import Field
+from ..loops import Loop
 from ..lowering import Lowering
-from ..program import Field, Loop
 
 Distance = Callable[[Loop, list[int]], list[int]]  # registers of a place -> of the distance and the normal
 

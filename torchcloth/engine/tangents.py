@@ -12,21 +12,21 @@ from ..boundaries import Drive
 from ..dynamics import Impulses
 from ..model import Model
 from ..types import ClothState
-from . import binding
+from . import conversion
+from .fields import Field
 from .fused import Fused
 from .lowering import lower
 from .operators import ops
-from .program import Field
 
 Coefficients = dict[Field, Tensor | None]
 Within = Callable[[int, Callable[[Model], Coefficients]], Coefficients]  # work on the model that is dual along k
 
 
-class Sensing:
+class FusedTangents:
     """A model on the engine, with its derivatives along K directions.
 
     Args:
-        fused: without parts outside.
+        fused: without parts in torch.
         within: calls a function with the model that is dual along direction k, in a level of forward mode.
         count: K.
     """
@@ -48,19 +48,19 @@ class Sensing:
         low, batch = self.fused.low, state.x.shape[:-2]
         program = low.program
         values = self.fused.job(state, dt, drives, substeps).inputs
-        dots = binding.states(low, moved) | self._inputs(state, drives)
+        dots = conversion.state_inputs(low, moved) | self._inputs(state, drives)
         if driven:
-            dots |= {f: t for f, t in binding.moves(low, driven).items() if f.comps > 1}  # not the flags
-        behind = binding.flat(low, {f: t.movedim(0, -3) for f, t in dots.items()}, batch, behind=3)
+            dots |= {f: t for f, t in conversion.drive_inputs(low, driven).items() if f.comps > 1}  # not the flags
+        behind = conversion.flat(low, {f: t.movedim(0, -3) for f, t in dots.items()}, batch, behind=3)
         fields = [f for f in program.inputs if f in behind]
         places = [program.inputs.index(f) for f in fields]
         inputs, tangents = [values[f] for f in program.inputs], [behind[f] for f in fields]
         results = ops.rollout_tangent(program.number, substeps, inputs, tangents, places)
         half = len(program.outputs)
-        after, impulses = binding.outcome(low, state, dict(zip(program.outputs, results[:half], strict=True)), batch)
+        after, impulses = conversion.outcome(low, state, dict(zip(program.outputs, results[:half], strict=True)), batch)
         along = {f: t.movedim(1, 0) for f, t in zip(program.outputs, results[half:], strict=True)}
         shape = torch.Size((self.count, *batch))
-        moved, shift = binding.outcome(low, moved, {f: t.flatten(0, 1) for f, t in along.items()}, shape)
+        moved, shift = conversion.outcome(low, moved, {f: t.flatten(0, 1) for f, t in along.items()}, shape)
         return after, moved, impulses, shift
 
     def _inputs(self, state: ClothState, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:

@@ -1,33 +1,44 @@
-"""Forces that only torch knows: a user's effects and materials. They come from outside into every substep."""
+"""Parts that only torch knows, a user's effects and materials: which they are, and their forces in every substep."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from contextlib import nullcontext
 
 import torch
 from torch import Tensor
 
+from ..boundaries import Drive
 from ..dynamics import vertex_forces
 from ..effects import AbstractEffect
 from ..model import Model, assemble, surface
 from ..strain import evolve, membrane_stress
 from ..types import ClothState, Memory, Moment
-
-MATERIAL = "material"
-
-
-def obstacle(model: Model, part: str) -> str | None:
-    """Why torch cannot compute a part beside the engine; None where it can."""
-    if part == MATERIAL:
-        return None if model.grid is None else "whose directors meet other layers"
-    effect = type(model.effects[part.removeprefix("effects.")][0])
-    for hook, what in (("inertia", "adds inertia"), ("loosen", "loosens a grasp")):
-        if getattr(effect, hook) is not getattr(AbstractEffect, hook):
-            return f"which {what}"
-    return None
+from .constants import is_wrapped, readable
+from .lowering import MATERIAL, Lowering, Unfused, lower
 
 
-class Outside:
+def divide(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> tuple[Lowering, frozenset[str]]:
+    """The program of a substep, and the parts that are left to torch.
+
+    Raises:
+        Unfused: a part without kernels that cannot be left to torch.
+    """
+    in_torch: set[str] = set()
+    context = readable() if is_wrapped(model.mass) else nullcontext()
+    while True:
+        try:
+            with context:
+                return lower(model, state, drives, in_torch), frozenset(in_torch)
+        except Unfused as miss:
+            if miss.part is None:
+                raise
+            if reason := _obstacle(model, miss.part):
+                raise Unfused(f"{miss}, {reason},") from None
+            in_torch.add(miss.part)
+
+
+class TorchParts:
     """The parts of a model that torch computes, by name: "material", "effects.NAME"."""
 
     def __init__(self, model: Model, parts: Collection[str]) -> None:
@@ -51,3 +62,14 @@ class Outside:
         if shares is not None:
             total = total + assemble(self.model.geometry, (shares, shares, shares), state.x)
         return total, memory
+
+
+def _obstacle(model: Model, part: str) -> str | None:
+    """Why torch cannot compute a part beside the engine; None where it can."""
+    if part == MATERIAL:
+        return None if model.grid is None else "whose directors meet other layers"
+    effect = type(model.effects[part.removeprefix("effects.")][0])
+    for hook, what in (("inertia", "adds inertia"), ("loosen", "loosens a grasp")):
+        if getattr(effect, hook) is not getattr(AbstractEffect, hook):
+            return f"which {what}"
+    return None

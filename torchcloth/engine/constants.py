@@ -1,4 +1,4 @@
-"""Constants within torch.func's transforms, which wrap the result of every operation, of a mesh's indices too."""
+"""Constants as numpy arrays, also within torch.func's transforms, which wrap the result of every operation."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def array(values: ArrayLike | Tensor) -> np.ndarray:
     return np.asarray(values.tolist()).reshape(values.shape) if is_wrapped(values) else values.numpy()
 
 
-class numbers_of_wrapped(TorchFunctionMode):
+class readable(TorchFunctionMode):
     """Context in which ``numpy()`` of a wrapped tensor gives its numbers."""
 
     def __torch_function__(self, func, types, args=(), kwargs=None):

@@ -10,8 +10,8 @@ from torch import Tensor
 from ..boundaries import Drive
 from ..dynamics import Impulses
 from ..types import ClothState
+from .fields import Field
 from .lowering import Lowering
-from .program import Field
 
 
 def named(state: ClothState) -> dict[str, Tensor]:
@@ -19,17 +19,17 @@ def named(state: ClothState) -> dict[str, Tensor]:
     return {"x": state.x, "v": state.v, "d3": state.d3, **state.memory}
 
 
-def states(low: Lowering, state: ClothState) -> dict[Field, Tensor]:
+def state_inputs(low: Lowering, state: ClothState) -> dict[Field, Tensor]:
     """The state's tensors, by field."""
     values = named(state)
     return {carried.now: values[name] for name, carried in low.carried.items()}
 
 
-def moves(low: Lowering, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
+def drive_inputs(low: Lowering, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
     """The drives' tensors [..., substeps, comps], by field."""
     found = {}
-    for name, (increment, pose, closed) in low.drives.items():
-        drive = drives[name]
+    for name, drive in drives.items():
+        increment, pose, closed = low.drives[name]
         found[increment], found[pose] = drive.increment.flatten(-2), drive.pose.flatten(-2)
         found[closed] = torch.tensor(drive.closed, dtype=low.program.dtype).unsqueeze(-1)
     return found

@@ -1,0 +1,69 @@
+"""Where a simulation begins: states of a cloth that has never been strained, and what lets it come to rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from .boundaries import drive
+from .boundaries.motion import check, interpolate
+from .effects import MassDamping
+from .model import Model
+from .self_contact import first_directors
+from .types import ClothState, Memory, Trajectory
+from .validation import check_duration, check_mapping, check_positions
+
+
+def first_state(model: Model, x: Tensor, v: Tensor) -> ClothState:
+    """Vertices at x [..., V, 3] with velocities v; directors along the normals, nothing remembered.
+
+    Raises:
+        InvalidInput: shapes that do not fit, or positions that are not finite.
+    """
+    check_positions(x, v, model.mass.shape[-2])
+    d3 = x[..., :0, :] if model.grid is None else first_directors(model, model.grid, x)
+    return ClothState(x, v, d3, _virgin(model, x))
+
+
+def likeness(model: Model, x: Tensor) -> ClothState:
+    """A state with the right shapes and no physics."""
+    points = 0 if model.grid is None else len(model.geometry.area) * len(model.grid.points)
+    return ClothState(x, x, x.new_empty(points, 3), _virgin(model, x))
+
+
+def damped(model: Model, rate: float) -> Model:
+    """With mass damping of ``rate`` [1/s] beside all; grips do not slip yet."""
+    damping = MassDamping(rate).to(model.geometry.area)
+    kept = {name: part for name, part in model.effects.items() if part[0].grasp is None}
+    return model._replace(effects={**kept, "settling": (damping, damping.coefficients().detach())})
+
+
+def held(motion: Mapping[str, Trajectory], start: float, end: float) -> dict[str, Trajectory]:
+    """Every body stands where it is at ``start``, with the same grasps closed.
+
+    Raises:
+        InvalidInput: a trajectory that cannot be followed, or no time to stand still.
+    """
+    check_duration(end - start)
+    check_mapping(motion)
+    found, span = {}, torch.tensor([start, end], dtype=torch.float64)
+    for name, trajectory in motion.items():
+        check(trajectory, name)
+        pose = interpolate(trajectory, span[:1].to(trajectory.pose))
+        closed = drive(trajectory, span[:1].repeat(2).to(trajectory.pose)).closed[0]
+        found[name] = Trajectory(span, pose.expand(*pose.shape[:-3], 2, 4, 4), torch.tensor([closed, closed]))
+    return found
+
+
+def _virgin(model: Model, x: Tensor) -> Memory:
+    triangles = len(model.geometry.area)
+    own = model.material.start(triangles)
+    found = {"material": None if own is None else own.to(x).expand(*x.shape[:-2], -1, -1)}
+    if model.grid is not None:
+        found["contact"] = x.new_zeros(*x.shape[:-2], triangles * len(model.grid.points), 1)
+    if model.transfer == "apic":
+        found["apic"] = x.new_zeros(*x.shape[:-2], x.shape[-2] + triangles, 9)
+    found |= {f"effects.{name}": effect.start(x) for name, (effect, _) in model.effects.items()}
+    return {name: value for name, value in found.items() if value is not None}
