@@ -9,7 +9,7 @@ from typing import NamedTuple
 class Kind(IntEnum):
     """What a field is; as in csrc/program.h."""
 
-    CONSTANT, PARAMETER, STATE, NEXT, TEMPORARY, KEPT, DRIVE, SUM, NODES = range(9)
+    CONSTANT, PARAMETER, STATE, NEXT, TEMPORARY, KEPT, DRIVE, SUM, NODES, POINTS = range(10)
 
 
 class Field(NamedTuple):

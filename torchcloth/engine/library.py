@@ -63,8 +63,10 @@ def library() -> ctypes.CDLL:
 def kernels() -> dict[str, tuple[int, int, int]]:
     """By name: (number, inputs, outputs)."""
     lib = library()
-    found = range(lib.tc_kernels())
-    return {lib.tc_kernel_name(k).decode(): (k, lib.tc_kernel_info(k, 0), lib.tc_kernel_info(k, 1)) for k in found}
+    names = [lib.tc_kernel_name(k).decode() for k in range(lib.tc_kernels())]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise RuntimeError(f"kernels of one name in csrc/kernels: {twice}")
+    return {name: (k, lib.tc_kernel_info(k, 0), lib.tc_kernel_info(k, 1)) for k, name in enumerate(names)}
 
 
 def status() -> str:

@@ -11,6 +11,7 @@ A loop's registers are numbered once and for all; a list of them stands for a ve
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import IntEnum
 
 from .fields import Field
 from .library import kernels
@@ -18,7 +19,13 @@ from .stages import ints
 
 OWN, SHARED, VARYING = -1, -2, -3
 LOAD, ADD, PUT, SPREAD, COLLECT = 0, 2, 3, 5, 6
-AROUND, ON_NODE = 27, 4  # nodes of a point, numbers of a node
+SHARES = 16  # numbers of a point, see csrc/transfer.h
+
+
+class By(IntEnum):
+    """What nodes get from points, and points from nodes, besides by weight; as in csrc/transfer.h."""
+
+    SLOPES, ARMS = range(2)
 
 
 class Loop:
@@ -68,15 +75,14 @@ class Loop:
         """Write registers to a row of the field."""
         self._move(PUT, regs, field, at)
 
-    def spread(self, basis: Sequence[int], share: Sequence[int], field: Field, at: int) -> None:
-        """Add to the 27 nodes of each point (table ``at``) its shares [bases, 4] with bases [bases, 27]."""
-        self._code.append(("transfer", SPREAD, field.id, at, basis[0], share[0], len(basis) // AROUND))
+    def spread(self, offset: Sequence[int], share: Sequence[int], field: Field, at: int, by: By) -> None:
+        """Add a point's shares to the 27 nodes around it (table ``at``), by its offset from the lowest of them."""
+        self._code.append(("transfer", SPREAD, field.id, at, offset[0], share[0], int(by)))
 
-    def collect(self, basis: Sequence[int], field: Field, at: int) -> list[int]:
-        """Registers [bases, 4] with the sums over the 27 nodes of each point."""
-        bases = len(basis) // AROUND
-        share = self._new(bases * ON_NODE)
-        self._code.append(("transfer", COLLECT, field.id, at, basis[0], share[0], bases))
+    def collect(self, offset: Sequence[int], field: Field, at: int, by: By) -> list[int]:
+        """Shares of a point that are the sums over its nodes."""
+        share = self._new(SHARES)
+        self._code.append(("transfer", COLLECT, field.id, at, offset[0], share[0], int(by)))
         return share
 
     def _move(self, code: int, regs: Sequence[int], field: Field, at: int | None) -> None:
@@ -99,8 +105,8 @@ class Loop:
             if kind in ("move", "lookup"):
                 api(kind)(handle, *rest)
             elif kind == "transfer":
-                share, count = rest[4], rest[5] * ON_NODE
-                api("transfer")(handle, *rest, int(bool(read & set(range(share, share + count)))))
+                share = rest[4]
+                api("transfer")(handle, *rest, int(bool(read & set(range(share, share + SHARES)))))
             else:
                 number, takes, gives = rest
                 feeds = int(any(reg in read or ~reg in read for reg in gives))
@@ -115,7 +121,7 @@ class Loop:
             elif kind == "lookup":
                 read.update(range(rest[4], rest[4] + 3))
             elif kind == "transfer":
-                code, _, _, basis, share, bases = rest
-                read.update(range(basis, basis + bases * AROUND))
-                read.update(range(share, share + bases * ON_NODE) if code == SPREAD else ())
+                code, _, _, offset, share, _ = rest
+                read.update(range(offset, offset + 3))
+                read.update(range(share, share + SHARES) if code == SPREAD else ())
         return read

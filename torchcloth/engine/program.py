@@ -82,6 +82,10 @@ class Program:
         """Of contact, which sees to its memory: numbers of the nodes that are touched, or of the points."""
         return self._field(Kind.NODES, 0, comps)
 
+    def points(self, comps: int) -> Field:
+        """What varying loops over points tell each other; put once in a substep."""
+        return self._field(Kind.POINTS, 0, comps)
+
     def table(self, index: np.ndarray | torch.Tensor) -> int:
         """Rows to gather from or scatter to, one per item."""
         data = np.ascontiguousarray(array(index), dtype=np.int32).ravel()

@@ -30,7 +30,7 @@ class Layers(NamedTuple):
     order: np.ndarray  # [E] int32, patch by patch
     starts: np.ndarray  # [patches + 1] int32; [1]: all triangles take part always
     meet: np.ndarray  # [patches, patches] uint8
-    apart: np.ndarray  # [E, bytes] uint8, a bit for each triangle
+    apart: np.ndarray  # [E, patches] uint8, a bit for each triangle of a patch
 
     def emit(self, handle, api) -> None:
         """Write it down."""

@@ -32,7 +32,7 @@ struct Contact : Stage<R> {
     const Program<R>& program;
     Search<R> search;
     int x, base;               // fields: positions, lowest node of each point
-    std::vector<int> grid;     // fields of the nodes, first the two that are added to
+    std::vector<int> grid;     // fields of the nodes, first the two that are added to, and of the points
     std::vector<R> place;      // [points of a triangle, 3] barycentric
     int chunk;                 // substeps after which the search is repeated anyway: intervals.py
     R spacing, skin;
@@ -118,8 +118,10 @@ struct Contact : Stage<R> {
     }
 
     void make_room(Scene<R>& s, Layers<R>& near) const {
-        const size_t count = size_t(near.nodes.count) * ON_NODE;
+        const size_t packed = round_up(near.points.size(), LANES<R>);
         for (size_t i = 0; i < grid.size(); i++) {
+            const Field& f = program.fields[grid[i]];
+            const size_t count = f.kind == Kind::points ? packed * f.comps : size_t(near.nodes.count) * ON_NODE;
             const bool adds = i < 2;
             s.value[grid[i]] = room(near.value[i], count, adds);
             if (s.bars.size) s.bar[grid[i]] = room(near.bar[i], count, true);

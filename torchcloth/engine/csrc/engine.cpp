@@ -82,12 +82,12 @@ struct Engine {
             std::make_unique<tc::Loop<R>>(p, engine.kernels.data(), items, list, counted, flat != 0));                 \
         p.stages.back()->again = again != 0;                                                                           \
     }                                                                                                                  \
-    TC_API int tc_transfer_##s(void* e, int code, int field, int table, int basis, int share, int bases, int feeds) {  \
+    TC_API int tc_transfer_##s(void* e, int code, int field, int table, int offset, int share, int by, int feeds) {    \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
         return guarded([&] {                                                                                           \
             engine.loop().code.push_back({tc::Instruction::Code(code), field, table, -1, tc::ON_NODE, -1,              \
-                                          {basis, share, bases}, {}, feeds != 0});                                     \
-            engine.program.registers = std::max(engine.program.registers, share + bases * tc::ON_NODE);                \
+                                          {offset, share, by}, {}, feeds != 0});                                       \
+            engine.program.registers = std::max(engine.program.registers, share + tc::SHARES);                         \
         });                                                                                                            \
     }                                                                                                                  \
     TC_API void tc_contact_##s(void* e, const int* fields, int count, const int* corners, int triangles,               \
@@ -109,7 +109,8 @@ struct Engine {
             const int comps = engine.program.fields.at(field).comps;                                                   \
             auto& loop = engine.loop();                                                                                \
             loop.code.push_back(                                                                                       \
-                {tc::Instruction::Code(code), field, table, reg, comps, -1, {}, {}, false, loop.slot(table)});         \
+                {tc::Instruction::Code(code), field, table, reg, comps, -1, {}, {}, false, loop.slot(table),           \
+                 engine.program.fields[field].kind == tc::Kind::points});                                              \
             engine.program.registers = std::max(engine.program.registers, reg + comps);                                \
         });                                                                                                            \
     }                                                                                                                  \

@@ -17,7 +17,7 @@ constexpr int MOST = 64;    // components of a field
 constexpr int CELL = 11;    // registers that a lookup gives
 
 // lookup: three registers, a place on a grid in cells, give the fractions of its cell and the values at its corners.
-// spread and collect: between registers and the nodes of the grid, `in` = (first basis, first share, count).
+// spread and collect: between registers and the nodes of the grid, `in` = (first offset, first share, By).
 struct Instruction {
     enum Code { load, call, add, put, lookup, spread, collect } code;
     int field, table, reg, comps;
@@ -25,6 +25,7 @@ struct Instruction {
     std::vector<int> in, out;  // of a lookup: {first register, nodes along x, y, z} and {first register}
     bool feeds = false;        // another call reads what this one gives
     int slot = 0;              // of its table among those of the loop
+    bool packed = false;       // the field's kind is points
 };
 
 // The items of one run: all, those of a list, or as many as contact counts.
@@ -78,27 +79,27 @@ struct Loop : Stage<R> {
         }
     }
     // Row of an item; items beyond the last count as the last.
-    int row(const Instruction& i, int item, Span s) const {
+    int row(const Instruction& i, int item, const Span& s) const {
         if (i.table == SHARED) return 0;
         const int k = s.at(item < s.items ? item : s.items - 1);
         return i.table == OWN ? k : index(i, s)[k];
     }
-    const int* index(const Instruction& i, Span s) const {
+    const int* index(const Instruction& i, const Span& s) const {
         return i.table <= VARYING ? s.varying[VARYING - i.table] : program.tables[i.table].data();
     }
     size_t pitch(const Instruction& i) const { return program.fields[i.field].pitch; }
-    int count(int first, Span s) const { return std::min(L, s.items - first); }
+    int count(int first, const Span& s) const { return std::min(L, s.items - first); }
 
     // f(where each lane's row starts, numbers between rows), the frequent cases with constants that the compiler sees.
     template <class F>
-    TC_INLINE void rows(const Instruction& i, int first, Span s, F f) const {
+    TC_INLINE void rows(const Instruction& i, int first, const Span& s, F f) const {
         const size_t step = pitch(i);
         if (s.list && i.table != SHARED && step <= 4) {
             const int* index = s.picked + i.slot * L;
             if (step == 4) f([index](int lane) { return size_t(index[lane]) * 4; }, four);
             else f([index](int lane) { return size_t(index[lane]); }, one);
         } else if (count(first, s) < L || i.table == SHARED || step > 4)
-            f([this, &i, first, step, s](int lane) { return row(i, first + lane, s) * step; }, step);
+            f([this, &i, first, step, &s](int lane) { return row(i, first + lane, s) * step; }, step);
         else if (i.table == OWN) {
             if (step == 4) f([first](int lane) { return size_t(first + lane) * 4; }, four);
             else f([first](int lane) { return size_t(first + lane); }, one);
@@ -113,7 +114,11 @@ struct Loop : Stage<R> {
     template <class Step>
     static int last_quad(Step step, int comps) { return std::is_integral_v<Step> ? (comps - 1) / 4 * 4 : 0; }
 
-    void gather(const Instruction& i, const R* from, P* to, int first, Span s) const {
+    // Where the numbers of a pack begin, in a field of points: [packs, comps, L].
+    static size_t packed(const Instruction& i, int first) { return size_t(first) * i.comps; }
+
+    TC_APART void gather(const Instruction& i, const R* from, P* to, int first, const Span& s) const {
+        if (i.packed) return void(std::memcpy(static_cast<void*>(to + i.reg), from + packed(i, first), i.comps * sizeof(P)));
         rows(i, first, s, [&](auto place, auto step) {
             if (step == 1)
                 for (int lane = 0; lane < L; lane++) to[i.reg].v[lane] = from[place(lane)];
@@ -127,7 +132,7 @@ struct Loop : Stage<R> {
     }
     // change(where a number or four lie, what came from the lane) for all lanes that are items.
     template <class F>
-    TC_INLINE void scatter(const Instruction& i, R* to, const P* from, int first, Span s, F change) const {
+    TC_INLINE void scatter(const Instruction& i, R* to, const P* from, int first, const Span& s, F change) const {
         const int lanes = count(first, s);
         rows(i, first, s, [&](auto place, auto step) {
             if (step == 1)
@@ -143,15 +148,21 @@ struct Loop : Stage<R> {
                 }
         });
     }
-    void add(const Instruction& i, R* to, const P* from, int first, Span s) const {
-        if (i.table == SHARED && count(first, s) == L)
+    TC_APART void add(const Instruction& i, R* to, const P* from, int first, const Span& s) const {
+        if (i.packed)
+            for (int c = 0; c < i.comps; c++) {
+                P& there = reinterpret_cast<P*>(to + packed(i, first))[c];
+                there = there + from[i.reg + c];
+            }
+        else if (i.table == SHARED && count(first, s) == L)
             for (int c = 0; c < i.comps; c++) to[c] += total(from[i.reg + c]);
         else scatter(i, to, from, first, s, [](auto& place, auto x) { place = place + x; });
     }
-    void store(const Instruction& i, R* to, const P* from, int first, Span s) const {
-        scatter(i, to, from, first, s, [](auto& place, auto x) { place = x; });
+    TC_APART void store(const Instruction& i, R* to, const P* from, int first, const Span& s) const {
+        if (i.packed) std::memcpy(static_cast<void*>(to + packed(i, first)), from + i.reg, i.comps * sizeof(P));
+        else scatter(i, to, from, first, s, [](auto& place, auto x) { place = x; });
     }
-    void look(const Instruction& i, const R* table, P* regs) const {
+    TC_APART void look(const Instruction& i, const R* table, P* regs) const {
         const int *in = i.in.data(), out = i.out[0];
         for (int lane = 0; lane < L; lane++) {
             int cell[3];
@@ -168,14 +179,12 @@ struct Loop : Stage<R> {
     bool is_shared(const Instruction& i) const { return i.code == Instruction::load && i.table == SHARED; }
 
     // f(transfer) for the points of a pack.
-    template <class F>
-    TC_INLINE void transfer(const Instruction& i, int first, Span s, F f) const {
+    template <template <class, By> class Of, class F>
+    TC_INLINE void transfer(const Instruction& i, int first, const Span& s, F f) const {
         const int *nodes = index(i, s) + size_t(first) * AROUND, lanes = count(first, s);
-        if (i.in[2] == 1) f(Transfer<R, 1>{nodes, lanes});
-        else if (i.in[2] == 2) f(Transfer<R, 2>{nodes, lanes});
-        else f(Transfer<R, 4>{nodes, lanes});
+        if (By(i.in[2]) == By::slopes) f(Of<R, By::slopes>{nodes, lanes});
+        else f(Of<R, By::arms>{nodes, lanes});
     }
-    static R* numbers(P* packs, int reg) { return reinterpret_cast<R*>(packs + reg); }
     static void zero(P* registers, int first, int count) {
         for (int r = 0; r < count; r++) registers[first + r] = P(0.0);
     }
@@ -196,9 +205,9 @@ struct Loop : Stage<R> {
     bool is_recorded(const Instruction& i) const {
         if (i.code != Instruction::add && i.code != Instruction::put) return false;
         const Kind kind = program.fields[i.field].kind;
-        return kind != Kind::temporary && kind != Kind::nodes;
+        return kind != Kind::temporary && kind != Kind::nodes && kind != Kind::points;
     }
-    void compute(Scene<R>& s, const Instruction& i, int first, Span all, P* regs) const {
+    TC_INLINE void compute(Scene<R>& s, const Instruction& i, int first, const Span& all, P* regs) const {
         R* field = i.field >= 0 ? s.value[i.field] : nullptr;
         switch (i.code) {
             case Instruction::load: if (!is_shared(i)) gather(i, field, regs, first, all); break;
@@ -207,11 +216,10 @@ struct Loop : Stage<R> {
             case Instruction::put: store(i, field, regs, first, all); break;
             case Instruction::lookup: look(i, field, regs); break;
             case Instruction::spread:
-                transfer(i, first, all, [&](auto t) { t.spread(regs + i.in[0], regs + i.in[1], field); });
+                transfer<Transfer>(i, first, all, [&](auto t) { t.spread(regs + i.in[0], regs + i.in[1], field); });
                 break;
             case Instruction::collect:
-                zero(regs, i.in[1], i.in[2] * ON_NODE);
-                transfer(i, first, all, [&](auto t) { t.collect(regs + i.in[0], regs + i.in[1], field); });
+                transfer<Transfer>(i, first, all, [&](auto t) { t.collect(regs + i.in[0], regs + i.in[1], field); });
                 break;
         }
     }
@@ -232,7 +240,7 @@ struct Loop : Stage<R> {
                 if (gives ? i.feeds : i.code == Instruction::load || i.code == Instruction::lookup) compute(s, i, first, all, regs);
                 if (i.code == Instruction::load && !is_shared(i)) zero(bars, i.reg, i.comps);
                 else if (i.code == Instruction::lookup) zero(bars, i.out[0], CELL);
-                else if (i.code == Instruction::collect) zero(bars, i.in[1], i.in[2] * ON_NODE);
+                else if (i.code == Instruction::collect) zero(bars, i.in[1], SHARES);
                 else if (i.code == Instruction::call) for (int o : i.out) if (o >= 0) bars[o] = P(0.0);
             }
             for (auto i = code.rbegin(); i != code.rend(); ++i) back(s, *i, first, all, regs, bars);
@@ -241,7 +249,7 @@ struct Loop : Stage<R> {
             if (is_shared(i) && s.bar[i.field])
                 for (int c = 0; c < i.comps; c++) s.bar[i.field][c] += total(bars[i.reg + c]);
     }
-    void back(Scene<R>& s, const Instruction& i, int first, Span all, P* regs, P* bars) const {
+    TC_INLINE void back(Scene<R>& s, const Instruction& i, int first, const Span& all, P* regs, P* bars) const {
         R* bar = i.field >= 0 ? s.bar[i.field] : nullptr;
         switch (i.code) {
             case Instruction::add:
@@ -252,20 +260,24 @@ struct Loop : Stage<R> {
                 for (int k = 0; k < 3; k++) bars[i.in[0] + k] = bars[i.in[0] + k] + bars[i.out[0] + k];
                 break;
             case Instruction::spread:
-                transfer(i, first, all, [&](auto t) {
-                    t.collect_and_weigh(regs + i.in[0], bars + i.in[0], regs + i.in[1], bars + i.in[1], bar);
+                transfer<Transfer>(i, first, all, [&](auto t) {
+                    t.collect_and_weigh(regs + i.in[0], regs + i.in[1], bar, bars + i.in[1], bars + i.in[0]);
                 });
                 break;
             case Instruction::collect:
-                transfer(i, first, all, [&](auto t) {
+                transfer<Transfer>(i, first, all, [&](auto t) {
                     t.spread(regs + i.in[0], bars + i.in[1], bar);
-                    t.weigh(bars + i.in[0], bars + i.in[1], s.value[i.field]);
+                    t.weigh(regs + i.in[0], bars + i.in[1], s.value[i.field], bars + i.in[0]);
                 });
                 break;
         }
     }
     // Adjoint of a result; what was overwritten before does not count any more.
-    void take(const Instruction& i, R* from, P* bars, int first, Span s) const {
+    TC_APART void take(const Instruction& i, R* from, P* bars, int first, const Span& s) const {
+        if (i.packed) {
+            for (int c = 0; c < i.comps; c++) bars[i.reg + c] = bars[i.reg + c] + reinterpret_cast<P*>(from + packed(i, first))[c];
+            return;
+        }
         const int lanes = count(first, s);
         const bool spent = i.code == Instruction::put;
         rows(i, first, s, [&](auto place, auto step) {
@@ -305,10 +317,10 @@ struct Loop : Stage<R> {
                 else compute(s, i, first, all, regs), compute_along(s, i, first, all, regs, dots);
         }
     }
-    void compute_along(Scene<R>& s, const Instruction& i, int first, Span all, P* regs, D* dots) const {
+    TC_INLINE void compute_along(Scene<R>& s, const Instruction& i, int first, const Span& all, P* regs, D* dots) const {
         R* along = s.dot[i.field];
         const bool moves = i.code == Instruction::spread || i.code == Instruction::collect;
-        D *basis = moves ? dots + i.in[0] * L : nullptr, *share = moves ? dots + i.in[1] * L : nullptr;
+        D *offset = moves ? dots + i.in[0] * L : nullptr, *share = moves ? dots + i.in[1] * L : nullptr;
         switch (i.code) {
             case Instruction::load: if (!is_shared(i)) gather_along(i, along, dots, first, all); break;
             case Instruction::add: scatter_along(i, along, dots, first, true, all); break;
@@ -317,14 +329,10 @@ struct Loop : Stage<R> {
                 for (int k = 0; k < CELL * L; k++) dots[i.out[0] * L + k] = k < 3 * L ? dots[i.in[0] * L + k] : D(0.0);
                 break;
             case Instruction::spread:
-                transfer(i, first, all, [&](auto t) {
-                    t.spread_along(numbers(regs, i.in[0]), basis, numbers(regs, i.in[1]), share, reinterpret_cast<D*>(along));
-                });
+                transfer<TransferAlong>(i, first, all, [&](auto t) { t.spread(regs + i.in[0], offset, regs + i.in[1], share, along); });
                 break;
             case Instruction::collect:
-                transfer(i, first, all, [&](auto t) {
-                    t.collect_along(numbers(regs, i.in[0]), basis, share, s.value[i.field], reinterpret_cast<D*>(along));
-                });
+                transfer<TransferAlong>(i, first, all, [&](auto t) { t.collect(regs + i.in[0], offset, share, s.value[i.field], along); });
                 break;
             case Instruction::call: break;
         }
@@ -335,10 +343,11 @@ struct Loop : Stage<R> {
         if (i.comps == 3) f(std::integral_constant<int, 3>{});
         else f(i.comps);
     }
-    void gather_along(const Instruction& i, const R* from, D* dots, int first, Span s) const {
+    TC_APART void gather_along(const Instruction& i, const R* from, D* dots, int first, const Span& s) const {
         if (from == nullptr) return;
         const D* source = reinterpret_cast<const D*>(from);
         D* to = dots + size_t(i.reg) * L;
+        if (i.packed) return void(std::memcpy(static_cast<void*>(to), source + packed(i, first), i.comps * L * sizeof(D)));
         rows(i, first, s, [&](auto place, auto) {
             components(i, [&](auto comps) {
                 for (int lane = 0; lane < L; lane++) {
@@ -348,9 +357,10 @@ struct Loop : Stage<R> {
             });
         });
     }
-    void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds, Span s) const {
+    TC_APART void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds, const Span& s) const {
         D* target = reinterpret_cast<D*>(to);
         const D* from = dots + size_t(i.reg) * L;
+        if (i.packed) return void(std::memcpy(static_cast<void*>(target + packed(i, first)), from, i.comps * L * sizeof(D)));
         const int lanes = count(first, s);
         rows(i, first, s, [&](auto place, auto) {
             components(i, [&](auto comps) {

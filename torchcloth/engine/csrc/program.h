@@ -14,8 +14,9 @@ namespace tc {
 
 // constant: of the mesh. parameter: an input with a derivative. state: at the start of the substep; its `next` at the
 // end. temporary: within a substep; a kept one is recorded, because the reverse sweep reads it. drive: one row per
-// substep. sum: added up over all substeps. nodes: of the grid of contact, which sees to their memory.
-enum class Kind : int { constant, parameter, state, next, temporary, kept, drive, sum, nodes };
+// substep. sum: added up over all substeps. nodes, points: of contact, which sees to their memory; what loops over points
+// tell each other lies there as in registers, pack by pack.
+enum class Kind : int { constant, parameter, state, next, temporary, kept, drive, sum, nodes, points };
 
 struct Field {
     Kind kind;

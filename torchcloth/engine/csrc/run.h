@@ -176,7 +176,7 @@ class Run {
         for (size_t f = 0; f < count; f++) {
             const Field& field = program.fields[f];
             if (field.kind == Kind::constant) { m.scene.value[f] = program.constants[f].data; continue; }
-            if (field.kind == Kind::nodes) continue;
+            if (field.kind == Kind::nodes || field.kind == Kind::points) continue;
             if (is_within(field.kind)) m.temporaries.push_back(f);
             if (field.kind == Kind::temporary || field.kind == Kind::sum || is_input(field.kind)) {
                 m.values[f].reset(size_of(field));

@@ -5,6 +5,7 @@
 #pragma once
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
 #include <cstdint>
 #include <numeric>
@@ -27,7 +28,7 @@ struct Search {
     R reach = 0;
     bool everywhere = false;
     std::vector<int> order, starts;    // triangles patch by patch, and where patches begin, [patches + 1]
-    std::vector<uint8_t> meet, apart;  // [patches, patches]; [triangles, bytes] a bit for each triangle, lowest first
+    std::vector<uint8_t> meet, apart;  // [patches, patches]; [in order, patches] a bit for each triangle of the patch
 
     void fill(const int* corners, int count, R distance, int patches, const int* sorted, const int* begins,
               const uint8_t* meeting, const uint8_t* distant) {
@@ -36,7 +37,7 @@ struct Search {
         if (everywhere) return;
         order.assign(sorted, sorted + count), starts.assign(begins, begins + patches + 1);
         meet.assign(meeting, meeting + size_t(patches) * patches);
-        apart.assign(distant, distant + size_t(count) * ((count + 7) / 8));
+        apart.assign(distant, distant + size_t(count) * patches);
     }
 
     void look(const R* x, Mask& mask) const {
@@ -55,6 +56,7 @@ struct Search {
         for (int p = 0; p < patches; p++) first[p] = *std::min_element(&centre[0][starts[p]], &centre[0][starts[p + 1]]);
         std::sort(sorted.begin(), sorted.end(), [&](int a, int b) { return first[a] < first[b]; });
         boxes(centre, sorted, low, high);
+        const std::vector<Together> together = side_by_side(centre);
         for (int i = 0; i < patches; i++) {
             const int end = int(std::upper_bound(low[0].begin() + i, low[0].end(), high[0][i] + reach) - low[0].begin());
             std::fill(gap.begin() + i, gap.begin() + end, R(0));
@@ -66,11 +68,40 @@ struct Search {
                 }
             }
             for (int j = i; j < end; j++)
-                if (gap[j] < reach * reach && meet[size_t(sorted[i]) * patches + sorted[j]]) compare(centre, sorted[i], sorted[j], mask);
+                if (gap[j] < reach * reach && meet[size_t(sorted[i]) * patches + sorted[j]] && near(together, sorted[i], sorted[j])) {
+                    compare(centre, sorted[i], sorted[j], mask);
+                    compare(centre, sorted[j], sorted[i], mask);
+                }
         }
     }
 
   private:
+    static constexpr int MOST = 8;  // triangles of a patch: parts/patches.py
+    using Eight = Pack<R, MOST>;
+    struct Together {
+        Eight at[3];
+    };
+    std::vector<Together> side_by_side(const std::vector<R>* centre) const {  // smaller patches are filled up with their first
+        std::vector<Together> out(starts.size() - 1);
+        for (size_t p = 0; p < out.size(); p++)
+            for (int d = 0; d < 3; d++)
+                for (int k = 0; k < MOST; k++) out[p].at[d].v[k] = centre[d][starts[p] + k < starts[p + 1] ? starts[p] + k : starts[p]];
+        return out;
+    }
+    // Whether there are triangles nearer than the reach, or not quite.
+    bool near(const std::vector<Together>& patch, int a, int b) const {
+        const Together &own = patch[a], &other = patch[b];
+        Eight found(0.0);
+        for (int k = 0; k < MOST; k++) {
+            Eight sum(0.0);
+            for (int d = 0; d < 3; d++) {
+                const Eight way = other.at[d] - double(own.at[d][k]);
+                sum = sum + way * way;
+            }
+            found = found + less(sum, 1.0001 * reach * reach);
+        }
+        return total(found) > 0;
+    }
     bool centres(const R* x, std::vector<R>* centre) const {
         R sum = 0;
         for (int d = 0; d < 3; d++) {
@@ -90,17 +121,21 @@ struct Search {
                 low[d].push_back(*least), high[d].push_back(*most);
             }
     }
-    bool far(int t, int u) const { return apart[size_t(t) * ((triangles + 7) / 8) + u / 8] >> (u % 8) & 1; }
+    // Marks the triangles of patch a that are near one of patch b, but far along the cloth.
     void compare(const std::vector<R>* centre, int a, int b, Mask& mask) const {
         const R *x = centre[0].data(), *y = centre[1].data(), *z = centre[2].data();
-        for (int k = starts[a]; k < starts[a + 1]; k++)
-            for (int l = starts[b]; l < starts[b + 1]; l++) {
+        const size_t patches = starts.size() - 1;
+        for (int k = starts[a]; k < starts[a + 1]; k++) {
+            unsigned far = apart[k * patches + b];
+            if (far == 0 || has(mask, order[k])) continue;
+            for (; far != 0; far &= far - 1) {
+                const int l = starts[b] + std::countr_zero(far);
                 const R dx = x[k] - x[l], dy = y[k] - y[l], dz = z[k] - z[l];
                 if (!(dx * dx + dy * dy + dz * dz < reach * reach)) continue;
-                const int t = order[k], u = order[l];
-                if (far(t, u)) set(mask, t);
-                if (far(u, t)) set(mask, u);
+                set(mask, order[k]);
+                break;
             }
+        }
     }
 };
 

@@ -122,6 +122,7 @@ template <class K>
 inline constexpr Trace traced = trace<K>();
 
 #define TC_INLINE inline __attribute__((always_inline))
+#define TC_APART __attribute__((noinline))  // its frame is not needed by what is small around it
 
 template <class K, int I, class P>
 TC_INLINE void forward(P* v) {

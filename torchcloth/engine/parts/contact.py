@@ -16,7 +16,7 @@ from ...materials import AEP, OrthotropicAEP
 from ...self_contact import CHUNK
 from ...transfer import FADING, Grid
 from ..fields import Field
-from ..loops import AROUND, VARYING, Loop
+from ..loops import VARYING, By
 from ..lowering import DIRECTORS, Lowering, Unfused
 from ..stages import Layers
 from .patches import patches
@@ -55,6 +55,7 @@ class Contact:
         program = low.program
         self.mass, self.momentum, self.change, self.velocity = self.nodes = [program.nodes(4) for _ in range(4)]
         self.lowest = program.nodes(3)
+        self.points = [program.points(comps) for comps in (16, 3, 1)]  # surface, offset, mass
         self.lengths = program.constant(torch.tensor([[grid.spacing, 1 / grid.spacing]], dtype=torch.float64))
         self.share = low.number(1 / len(grid.points))
         self.least = low.number(torch.finfo(program.dtype).tiny ** 0.5)
@@ -69,31 +70,34 @@ class Contact:
         """Forces of the directors: on the corners, and on the nodes."""
         self.low.program.contact(self._layers())
         self._alone(Count.WOKEN, Rows.WOKEN, self.low.x.now, self.d3.now, self.closing.now)
-        p = _Points(self, again=True)
+        p = _Points(self, again=True, first=True)
         contact, shear, _ = self._law(p)
         d3, closing = p.own(self.d3.now), p.own(self.closing.now)
         f1, f2, n, J = p.surface[0:3], p.surface[3:6], p.surface[12:15], p.surface[15:]
         density = p.parameter(self.low.model.areal_density)
         constants = [p.loop.load(field) for field in (self.low.dt, self.play, self.losses)]
-        given = p.loop.call("pressure", n, J, f1, f2, d3, closing, density, contact, shear, p.area, p.share, *constants)
-        forces = p.loop.call("assemble", given[:6], p.shape, p.area)
+        area, share = p.area, p.share
+        given = p.loop.call("pressure", n, J, f1, f2, d3, closing, density, contact, shear, area, share, *constants)
+        forces = p.loop.call("assemble", given[:6], p.shape, area)
         p.to_corners(forces, self.low.force)
-        shares = p.loop.call("force_shares", p.mass, given[6:])
-        p.loop.spread(p.along_director(d3), shares, self.mass, Rows.NODES.table())
+        shares = p.loop.call("force_shares", p.lengths, d3, p.mass, given[6:])
+        p.loop.spread(p.offset, shares, self.mass, Rows.NODES.table(), By.SLOPES)
         loop = self.low.program.varying(Count.NODES, again=True)
         loop.put(loop.call("node_change", loop.load(self.least), loop.load(self.mass)), self.change)
         self._repel()
 
     def _repel(self) -> None:
         p = _Points(self)
-        change = p.loop.collect(p.along_arms(), self.change, Rows.NODES.table())
-        p.to_corners(p.loop.call("corner_forces", p.surface, p.mass, change, p.place, p.shape), self.low.force)
+        change = p.loop.collect(p.offset, self.change, Rows.NODES.table(), By.ARMS)
+        forces = p.loop.call("corner_forces", p.surface, p.mass, change, p.place, p.shape, p.lengths)
+        p.to_corners(forces, self.low.force)
 
     def follow(self) -> None:
         """Directors after the substep."""
         p = _Points(self, again=True)
-        carried = p.loop.call("carried", p.surface, *p.corners(self.low.v.after), p.mass, p.place, p.shape)
-        p.loop.spread(p.along_arms(), carried, self.momentum, Rows.NODES.table())
+        v = p.corners(self.low.v.after)
+        carried = p.loop.call("carried", p.surface, *v, p.mass, p.place, p.shape, p.lengths)
+        p.loop.spread(p.offset, carried, self.momentum, Rows.NODES.table(), By.ARMS)
         loop = self.low.program.varying(Count.NODES, again=True)
         parts = (loop.load(field) for field in (self.least, self.mass, self.momentum))
         loop.put(loop.call("node_velocity", *parts), self.velocity)
@@ -104,10 +108,10 @@ class Contact:
     def _turn(self) -> None:
         p = _Points(self)
         d3 = p.own(self.d3.now)
-        rate = p.loop.collect(p.along_director(d3)[AROUND:], self.velocity, Rows.NODES.table())
+        around = p.loop.collect(p.offset, self.velocity, Rows.NODES.table(), By.SLOPES)
         now = p.loop.call("surface", *p.corners(self.low.x.after), p.shape)[12:15]
         constants = p.loop.load(self.low.dt), p.loop.load(self.play)
-        out = p.loop.call("follow", p.surface[12:15], now, d3, rate, *self._law(p), *constants)
+        out = p.loop.call("follow", p.surface[12:15], now, d3, around, p.lengths, *self._law(p), *constants)
         p.loop.put(out[:3], self.d3.after, Rows.OWN.table())
         p.loop.put(out[3:], self.closing.after, Rows.OWN.table())
 
@@ -129,7 +133,7 @@ class Contact:
         grid, corners = self.grid, self.low.model.geometry.corners.view(3, -1)
         found = patches(grid, corners)
         return Layers(
-            fields=[self.low.x.now, self.lowest, *self.nodes],
+            fields=[self.low.x.now, self.lowest, *self.nodes, *self.points],
             corners=corners.cpu().numpy().astype("int32"),
             places=grid.points.cpu().double().numpy(),
             lengths=(grid.spacing, grid.skin, grid.reach),
@@ -143,17 +147,52 @@ class Contact:
 
 
 class _Points:
-    """A loop over the points that take part; what several kernels need is computed once."""
+    """A loop over the points that take part; the first finds what they all need."""
 
-    def __init__(self, contact: Contact, again: bool = False) -> None:
-        self._contact, low = contact, contact.low
-        self.loop: Loop = low.program.varying(Count.POINTS, again)
-        self.shape = self.loop.load(contact.shape, Rows.TRIANGLE.table())
-        self.place = self.loop.load(contact.places, Rows.PLACE.table())
-        self.area, self.share = self.loop.load(contact.area, Rows.TRIANGLE.table()), self.loop.load(contact.share)
-        corners = self.corners(low.x.now)
-        self.surface = self.loop.call("surface", *corners, self.shape)
-        self._x = self.loop.call("at_point", *corners, self.place)
+    def __init__(self, contact: Contact, again: bool = False, first: bool = False) -> None:
+        self._contact, self.loop = contact, contact.low.program.varying(Count.POINTS, again)
+        find = self._find if first else self._look
+        self.surface, self.offset, self.mass = find()
+
+    def _look(self) -> list[list[int]]:
+        return [self.loop.load(field) for field in self._contact.points]
+
+    def _find(self) -> list[list[int]]:
+        corners = self.corners(self._contact.low.x.now)
+        density = self.parameter(self._contact.low.model.areal_density)
+        found = [
+            self.loop.call("surface", *corners, self.shape),
+            self.loop.call("offset", self.lengths, self.loop.load(self._contact.lowest), self.place, *corners),
+            self.loop.call("point_mass", density, self.area, self.share),
+        ]
+        for regs, field in zip(found, self._contact.points, strict=True):
+            self.loop.put(regs, field)
+        return found
+
+    @property
+    def shape(self) -> list[int]:
+        """Of the triangle at rest."""
+        return self.loop.load(self._contact.shape, Rows.TRIANGLE.table())
+
+    @property
+    def area(self) -> list[int]:
+        """Of the triangle at rest."""
+        return self.loop.load(self._contact.area, Rows.TRIANGLE.table())
+
+    @property
+    def share(self) -> list[int]:
+        """Of the triangle that belongs to the point."""
+        return self.loop.load(self._contact.share)
+
+    @property
+    def place(self) -> list[int]:
+        """Barycentric."""
+        return self.loop.load(self._contact.places, Rows.PLACE.table())
+
+    @property
+    def lengths(self) -> list[int]:
+        """Spacing of the grid and one over it."""
+        return self.loop.load(self._contact.lengths)
 
     def corners(self, field: Field) -> list[list[int]]:
         """Registers of a vertex field at the triangle's corners."""
@@ -171,20 +210,3 @@ class _Points:
     def parameter(self, tensor: Tensor) -> list[int]:
         """Registers of a coefficient [..., 1 or E, 1]."""
         return self.loop.load(self._contact.low.parameter(tensor), Rows.TRIANGLE.table())
-
-    @property
-    def mass(self) -> list[int]:
-        """Of the point."""
-        density = self.parameter(self._contact.low.model.areal_density)
-        return self.loop.call("point_mass", density, self.area, self.share)
-
-    def along_director(self, d3: list[int]) -> list[int]:
-        """Weights of the nodes, and d3 times their slopes: 2 bases."""
-        return self.loop.call("along_director", *self._spline(), d3)
-
-    def along_arms(self) -> list[int]:
-        """Weights of the nodes, and times the arms to them: 4 bases."""
-        return self.loop.call("along_arms", *self._spline())
-
-    def _spline(self) -> list[list[int]]:
-        return [self.loop.load(self._contact.lengths), self.loop.load(self._contact.lowest), self._x]

@@ -10,7 +10,9 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from ...transfer import Grid
 
-SIZE = 8  # triangles of a patch: small against the way along the cloth from which on layers are seen
+# Triangles of a patch, as in csrc/search.h: a bit of a byte for each, and small against the way along the cloth from
+# which on layers are seen.
+SIZE = 8
 
 
 class Patches(NamedTuple):
@@ -19,7 +21,7 @@ class Patches(NamedTuple):
     order: np.ndarray  # [E] int32, patch by patch
     starts: np.ndarray  # [patches + 1] int32
     meet: np.ndarray  # [patches, patches] uint8: have triangles that are far from each other along the cloth
-    apart: np.ndarray  # [E, bytes] uint8, ``Grid.apart`` with a bit for each triangle
+    apart: np.ndarray  # [E, patches] uint8, ``Grid.apart`` in this order with a bit for each triangle of a patch
 
 
 _KNOWN: WeakTensorKeyDictionary = WeakTensorKeyDictionary()  # by ``Grid.apart``, which belongs to one mesh
@@ -36,9 +38,9 @@ def patches(grid: Grid, corners: Tensor) -> Patches:
 
 def _found(apart: np.ndarray, corners: np.ndarray) -> Patches:
     order, starts = _grown(corners)
-    rows = np.logical_or.reduceat(apart[order], starts[:-1], axis=0)
-    meet = np.logical_or.reduceat(rows[:, order], starts[:-1], axis=1)
-    bits = np.packbits(apart, axis=1, bitorder="little")
+    bit = (1 << np.arange(len(order)) - np.repeat(starts[:-1], np.diff(starts))).astype(np.uint8)
+    bits = np.add.reduceat(apart[np.ix_(order, order)] * bit, starts[:-1], axis=1, dtype=np.uint8)
+    meet = np.logical_or.reduceat(bits != 0, starts[:-1], axis=0)
     return Patches(order, starts, (meet | meet.T).astype(np.uint8), bits)
 
 

@@ -3,6 +3,7 @@
 #include "../vec.h"
 
 namespace tc {
+namespace {
 
 constexpr double FOLDED = 0.5;  // of effects/_bent.py
 
@@ -104,6 +105,8 @@ struct Saturating {
         for (int slope = 0; slope < 6; slope++) w.number(constant(scale, 0.0));
     }
 };
+
+}  // namespace
 
 TC_KERNELS(bending_kernels, Bent, BentSheet, BendingStress, RestMoment, Crease, Saturating)
 

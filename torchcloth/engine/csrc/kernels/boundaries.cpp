@@ -3,6 +3,7 @@
 #include "../vec.h"
 
 namespace tc {
+namespace {
 
 // increment [4, 4], dt, whether this vertex is held, whether the gripper is closed, position, velocity -> velocity.
 // boundaries/grasp.py
@@ -85,6 +86,8 @@ struct Creep {
         Write<T>{out}.vec(v - (held * (mobility * excess / (dt + mobility * mass))) * pull);
     }
 };
+
+}  // namespace
 
 TC_KERNELS(boundary_kernels, Grasp, Change, Impulse, Pull, Creep)
 

@@ -4,6 +4,7 @@
 #include "../vec.h"
 
 namespace tc {
+namespace {
 
 // Pose of a body, pose of the shape in it -> pose of the shape.
 struct Compose {
@@ -124,6 +125,8 @@ struct Response {
         Write<T>{out}.vec(push * normal - taken * slip);
     }
 };
+
+}  // namespace
 
 TC_KERNELS(collider_kernels, Compose, Place, Inwards, Outwards, Response<CoulombLaw>, Response<StribeckLaw>,
            Response<EllipticLaw>)

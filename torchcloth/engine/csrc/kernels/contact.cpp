@@ -3,6 +3,7 @@
 #include "../vec.h"
 
 namespace tc {
+namespace {
 
 // Barycentric coordinates, values at the corners -> value at the point.
 template <class T>
@@ -49,90 +50,37 @@ struct Pressure {
     }
 };
 
-// One over the spacing, position, lowest node -> weights and slopes of the quadratic spline along each axis.
-template <class T>
-struct Splines {
-    T weight[3][3]{}, slope[3][3]{}, offset[3]{};
-    constexpr Splines(T inverse, Vec<T> x, Vec<T> lowest) {
-        const T position[3] = {x.x, x.y, x.z}, low[3] = {lowest.x, lowest.y, lowest.z};
-        for (int d = 0; d < 3; d++) {
-            const T o = position[d] * inverse - low[d];
-            offset[d] = o;
-            const T before = 1.5 - o, middle = o - 1.0, after = o - 0.5;
-            weight[d][0] = 0.5 * (before * before);
-            weight[d][1] = 0.75 - middle * middle;
-            weight[d][2] = 0.5 * (after * after);
-            slope[d][0] = -before * inverse;
-            slope[d][1] = (-2.0 * middle) * inverse;
-            slope[d][2] = after * inverse;
-        }
-    }
-};
-
-// Spacing and one over it, lowest node, position, d3 -> 27 weights, 27 times d3 . slope.
-struct AlongDirector {
-    static constexpr const char* name = "along_director";
-    static constexpr int inputs = 11, outputs = 54;
-    static constexpr auto fixed = bits(0, 5);
+// Spacing and one over it, lowest node, place, corners -> where the point is among its nodes, in spacings.
+struct Offset {
+    static constexpr const char* name = "offset";
+    static constexpr int inputs = 17, outputs = 3;
+    static constexpr auto fixed = bits(0, 8);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
         r.number();
         const T inverse = r.number();
-        const auto lowest = r.vec(), x = r.vec(), d3 = r.vec();
-        const Splines<T> s(inverse, x, lowest);
-        for (int i = 0; i < 3; i++)
-            for (int j = 0; j < 3; j++) {
-                const T both = s.weight[0][i] * s.weight[1][j];
-                const T turned = (d3.x * s.slope[0][i]) * s.weight[1][j] + s.weight[0][i] * (d3.y * s.slope[1][j]);
-                for (int k = 0; k < 3; k++) {
-                    const int n = (i * 3 + j) * 3 + k;
-                    out[n] = both * s.weight[2][k];
-                    out[27 + n] = turned * s.weight[2][k] + both * (d3.z * s.slope[2][k]);
-                }
-            }
+        const auto lowest = r.vec(), place = r.vec(), a = r.vec(), b = r.vec(), c = r.vec();
+        Write<T>{out}.vec(inverse * at_point(place, a, b, c) - lowest);
     }
 };
 
-// Spacing and one over it, lowest node, position -> 27 weights, and times each component of the arm to the node.
-struct AlongArms {
-    static constexpr const char* name = "along_arms";
-    static constexpr int inputs = 8, outputs = 108;
-    static constexpr auto fixed = bits(0, 5);
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const T spacing = r.number(), inverse = r.number();
-        const auto lowest = r.vec(), x = r.vec();
-        const Splines<T> s(inverse, x, lowest);
-        T arm[3][3]{};
-        for (int d = 0; d < 3; d++)
-            for (int i = 0; i < 3; i++) arm[d][i] = (double(i) - s.offset[d]) * spacing * s.weight[d][i];
-        for (int i = 0; i < 3; i++)
-            for (int j = 0; j < 3; j++) {
-                const T both = s.weight[0][i] * s.weight[1][j];
-                const T first = arm[0][i] * s.weight[1][j], second = s.weight[0][i] * arm[1][j];
-                for (int k = 0; k < 3; k++) {
-                    const int n = (i * 3 + j) * 3 + k;
-                    out[n] = both * s.weight[2][k];
-                    out[27 + n] = first * s.weight[2][k];
-                    out[54 + n] = second * s.weight[2][k];
-                    out[81 + n] = both * arm[2][k];
-                }
-            }
-    }
-};
-
-// Mass, pull -> shares of the weights (mass) and of d3 . slope (force).
+// Spacing and one over it, d3, mass, pull -> shares of the weights (mass) and of their slopes (force along d3 . slope).
 struct ForceShares {
     static constexpr const char* name = "force_shares";
-    static constexpr int inputs = 4, outputs = 8;
+    static constexpr int inputs = 9, outputs = 16;
+    static constexpr auto fixed = bits(0, 2);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
+        r.number();
+        const T inverse = r.number();
+        const auto d3 = inverse * r.vec();
         const T mass = r.number(), nothing = constant(mass, 0.0);
+        const auto force = -r.vec();
         Write<T> w{out};
-        w.number(mass), w.number(nothing), w.number(nothing), w.number(nothing), w.number(nothing), w.vec(-r.vec());
+        w.number(mass), w.vec({nothing, nothing, nothing});
+        for (T d : {d3.x, d3.y, d3.z}) w.number(nothing), w.vec(d * force);
     }
 };
 
@@ -169,12 +117,13 @@ struct NodeVelocity {
     }
 };
 
-// Surface, mass, what was collected of the nodes' accelerations, place, shape -> forces on the corners.
+// Surface, mass, what was collected of the nodes' accelerations, place, shape, spacing and one over it -> forces on the
+// corners.
 // self_contact.repulsion
 struct CornerForces {
     static constexpr const char* name = "corner_forces";
-    static constexpr int inputs = 40, outputs = 9;
-    static constexpr auto fixed = bits(33, 7);
+    static constexpr int inputs = 42, outputs = 9;
+    static constexpr auto fixed = bits(33, 9);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
@@ -184,13 +133,15 @@ struct CornerForces {
         r.number();
         const auto momentum = mass * r.vec();
         r.number();
-        const auto x = mass * r.vec();  // columns of the moment
+        const auto first_arm = r.vec();
         r.number();
-        const auto y = mass * r.vec();
+        const auto second_arm = r.vec();
         r.number();
-        const auto z = mass * r.vec();
+        const auto third_arm = r.vec();
         const auto place = r.vec();
         const T a1 = r.number(), a2 = r.number(), b1 = r.number(), b2 = r.number();
+        const T scale = mass * r.number();
+        const auto x = scale * first_arm, y = scale * second_arm, z = scale * third_arm;  // columns of the moment
         const auto times = [&](Vec<T> u) { return u.x * x + u.y * y + u.z * z; };
         const auto dual1 = c1 / J, dual2 = c2 / J, normal = times(n);
         const auto first = times(dual1) - dot(normal, dual1) * n, second = times(dual2) - dot(normal, dual2) * n;
@@ -200,12 +151,13 @@ struct CornerForces {
     }
 };
 
-// Surface, corners' velocities, mass, place, shape -> shares of the weights and of the arms in the momentum.
+// Surface, corners' velocities, mass, place, shape, spacing and one over it -> shares of the weights and of the arms in
+// the momentum.
 // transfer.carried_momentum of self_contact._mesh_gradient
 struct Carried {
     static constexpr const char* name = "carried";
-    static constexpr int inputs = 33, outputs = 16;
-    static constexpr auto fixed = bits(26, 7);
+    static constexpr int inputs = 35, outputs = 16;
+    static constexpr auto fixed = bits(26, 9);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
@@ -216,11 +168,12 @@ struct Carried {
         const T mass = r.number();
         const auto place = r.vec();
         const T a1 = r.number(), a2 = r.number(), b1 = r.number(), b2 = r.number();
+        const T scale = mass * r.number();
         const auto d1 = v1 - v0, d2 = v2 - v0;
         const auto rate1 = a1 * d1 + a2 * d2, rate2 = b1 * d1 + b2 * d2;
         const auto dual1 = c1 / J, dual2 = c2 / J;
         const auto spin = -(dot(rate1, n) * dual1 + dot(rate2, n) * dual2);
-        const auto column = [&](T x, T y, T z) { return mass * (x * rate1 + y * rate2 + z * spin); };
+        const auto column = [&](T x, T y, T z) { return scale * (x * rate1 + y * rate2 + z * spin); };
         const T nothing = constant(mass, 0.0);
         Write<T> w{out};
         w.number(nothing), w.vec(mass * at_point(place, v0, v1, v2));
@@ -242,17 +195,24 @@ constexpr Vec<T> return_map(T contact, T shear, T cone, Vec<T> n, Vec<T> d) {
     return select(less(1.0, height), n, keep * r + height * n);
 }
 
-// Normal before and after, d3, its rate as collected, contact, shear, cone, dt, play -> d3, closing. self_contact.follow
+// Normal before and after, d3, what was collected of the nodes' velocities, spacing and one over it, contact, shear, cone,
+// dt, play -> d3, closing. self_contact.follow
 struct Follow {
     static constexpr const char* name = "follow";
-    static constexpr int inputs = 18, outputs = 4;
-    static constexpr auto fixed = bits(16, 2);
+    static constexpr int inputs = 32, outputs = 4;
+    static constexpr auto fixed = bits(25, 2) | bits(30, 2);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
         const auto old = r.vec(), n = r.vec(), d3 = r.vec();
+        r.number(), r.vec(), r.number();
+        const auto along_x = r.vec();
         r.number();
-        const auto rate = r.vec();
+        const auto along_y = r.vec();
+        r.number();
+        const auto along_z = r.vec();
+        r.number();
+        const auto rate = r.number() * (d3.x * along_x + d3.y * along_y + d3.z * along_z);
         const T contact = r.number(), shear = r.number(), cone = r.number(), dt = r.number(), play = r.number();
         const auto moved = d3 + dt * rate;
         const T height = dot(moved, n);
@@ -274,7 +234,9 @@ struct Alone {
     }
 };
 
-TC_KERNELS(contact_kernels, PointMass, Pressure, AlongDirector, AlongArms, ForceShares, NodeChange, NodeVelocity,
+}  // namespace
+
+TC_KERNELS(contact_kernels, PointMass, Pressure, Offset, ForceShares, NodeChange, NodeVelocity,
            CornerForces, Carried, Follow, Alone)
 
 }  // namespace tc

@@ -3,6 +3,7 @@
 #include "../vec.h"
 
 namespace tc {
+namespace {
 
 // Positions and velocities of the corners, pressure, friction, wind -> forces on the corners. effects/air.py
 struct AirDrag {
@@ -83,6 +84,8 @@ struct KelvinVoigt {
         w.vec(e11 * f1 + e12 * f2), w.vec(e12 * f1 + e22 * f2);
     }
 };
+
+}  // namespace
 
 TC_KERNELS(effect_kernels, AirDrag, AddedMass, Weight, MassDamping, KelvinVoigt)
 

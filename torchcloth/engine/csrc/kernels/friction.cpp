@@ -3,6 +3,7 @@
 #include "../vec.h"
 
 namespace tc {
+namespace {
 
 // Share z / Z after the strain has gone by path = change / threshold: share exp(-|path|) + path (1 - exp(-|path|)) / |path|.
 template <class T>
@@ -55,6 +56,8 @@ struct ShearFriction {
         w.vec(scale * (J * f2 - sine * c1)), w.vec(scale * (J * f1 - sine * c2));
     }
 };
+
+}  // namespace
 
 TC_KERNELS(friction_kernels, BendingFriction, ShearFriction)
 

@@ -1,4 +1,5 @@
-// All kernels of the engine. Each file of this folder gives its own; they are compiled side by side.
+// All kernels of the engine. Each file of this folder gives its own, in a namespace without name: two structs of one name
+// in two files would be one. They are compiled side by side.
 #pragma once
 
 #include <vector>

@@ -3,6 +3,7 @@
 #include "surface.h"
 
 namespace tc {
+namespace {
 
 // The surface seen from another rest shape: F -> F A with A by rows. strain.py
 template <class T>
@@ -154,6 +155,8 @@ struct IsotropicSheet : Sheet<Isotropic> { static constexpr const char* name = "
 struct IsotropicColumns : OfSurface<Isotropic> { static constexpr const char* name = "aep"; };
 struct OrthotropicSheet : Sheet<Orthotropic> { static constexpr const char* name = "orthotropic_sheet"; };
 struct OrthotropicColumns : OfSurface<Orthotropic> { static constexpr const char* name = "orthotropic"; };
+
+}  // namespace
 
 TC_KERNELS(material_kernels, SeenFrom, PulledBack, Grown, NormYield, IsotropicSheet, IsotropicColumns, OrthotropicSheet,
            OrthotropicColumns)

@@ -3,6 +3,7 @@
 #include "../vec.h"
 
 namespace tc {
+namespace {
 
 // Values at the corners, weights -> value at the point.
 struct AtPoint {
@@ -62,6 +63,8 @@ struct Shared {
         w.vec(weight.x * impulse), w.vec(weight.y * impulse), w.vec(weight.z * impulse);
     }
 };
+
+}  // namespace
 
 TC_KERNELS(point_kernels, AtPoint, Reach, Claim, Shared)
 

@@ -3,6 +3,7 @@
 #include "../vec.h"
 
 namespace tc {
+namespace {
 
 template <class T>
 struct Polar {
@@ -166,6 +167,8 @@ struct GridDistance {
              select(flat, r.vec(), gradient / select(flat, 1.0, length)));
     }
 };
+
+}  // namespace
 
 TC_KERNELS(shape_kernels, PlaneDistance, SphereDistance, BoxDistance, CapsuleDistance, CylinderDistance, GridPlace, GridDistance)
 

@@ -3,6 +3,7 @@
 #include "surface.h"
 
 namespace tc {
+namespace {
 
 // dt, velocity, force, mass -> velocity free of the boundaries.
 struct Kick {
@@ -130,6 +131,8 @@ struct Copied {
 };
 struct Copy : Copied<3> { static constexpr const char* name = "copy3"; };
 struct CopyStress : Copied<15> { static constexpr const char* name = "copy15"; };
+
+}  // namespace
 
 TC_KERNELS(surface_kernels, Surface, Assemble, Kick, Resisted, KickInAir, Loaded, Push, Scaled, Plus, Drift, Copy, CopyStress)
 
