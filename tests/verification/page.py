@@ -26,6 +26,7 @@ THEMES = {
     "bending": "Bending",
     "dynamics": "Motion",
     "contact": "Contact between layers",
+    "folding": "Folding at the size of a garment",
     "plasticity": "Plastic set",
     "convergence": "Convergence",
 }
