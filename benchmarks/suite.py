@@ -67,7 +67,9 @@ def entries(plan: Plan) -> list[Entry]:
         *(Entry(Task("standard", "forward", 250, batch), best) for batch in (1, 8, 32)),
         *(Entry(Task(f"sheet-{size}", "forward", 250), best, "size") for size in SIZES),
         *(Entry(Task("sheet-800", "forward", count), best, f"steps-{count}") for count in (250, 2500)),
-        *(Entry(Task("standard", q, SECOND), best, "1s") for q in _QUANTITIES[:2]),
+        Entry(Task("standard", "forward", SECOND), all_engines, "1s"),
+        Entry(Task("standard", "gradient", SECOND), best, "1s"),
+        *([Entry(Task("standard-everywhere", "forward", SECOND), mpm, "1s")] if mpm else []),
     ]
     return [_small(entry) for entry in found] if plan.fast else found
 
