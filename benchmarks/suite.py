@@ -88,7 +88,7 @@ def _small(entry: Entry) -> Entry:
     names = entry.names
     if entry.task.quantity == "gradient":
         names = tuple(name for name in names if name != "taichi")  # it compiles for minutes
-    fewest = 100 if entry.task.quantity == "gradient" else 4  # in float32 dE of a sheet that has hardly moved is rounding
+    fewest = 100 if entry.task.quantity == "gradient" else 4  # dE of a sheet that hardly moved is rounding
     substeps = max(fewest, entry.task.substeps // 60)
     return replace(entry, task=replace(entry.task, small=True, substeps=substeps), names=names)
 
