@@ -23,7 +23,10 @@ from .validation import check_extent
 
 
 class Interval(NamedTuple):
-    """The time between two frames, in ``count`` equal substeps; ``fused``: the engine that runs them, or None."""
+    """The time between two frames, in ``count`` equal substeps.
+
+    ``fused``: the engine that runs them, or None. ``moves``: ``motion`` on the substeps, where it is there already.
+    """
 
     model: functional.Model
     motion: Mapping[str, Trajectory]
@@ -31,6 +34,7 @@ class Interval(NamedTuple):
     end: float  # s
     count: int
     fused: Fused | None = None
+    moves: Mapping[str, Drive] | None = None
 
     @property
     def dt(self) -> float:
@@ -43,8 +47,17 @@ class Interval(NamedTuple):
 
     def drives(self) -> dict[str, Drive]:
         """The trajectories on the substeps."""
-        times = self.times()
-        return {name: drive(trajectory, times.to(trajectory.pose)) for name, trajectory in self.motion.items()}
+        return dict(_drives(self.motion, self.times()) if self.moves is None else self.moves)
+
+
+def _drives(motion: Mapping[str, Trajectory], times: Tensor) -> dict[str, Drive]:
+    return {name: drive(trajectory, times.to(trajectory.pose)) for name, trajectory in motion.items()}
+
+
+def _part(whole: Drive, first: int, last: int) -> Drive:
+    """Some of the substeps."""
+    increment, pose = (field[..., first:last, :, :] for field in (whole.increment, whole.pose))
+    return Drive(increment, pose, whole.closed[first:last])
 
 
 class Plan(NamedTuple):
@@ -59,9 +72,16 @@ class Plan(NamedTuple):
     longest: float  # m, extent that the contact grid has room for
 
     def intervals(self) -> Iterator[Interval]:
-        """One after the other."""
-        for (start, end), count in zip(pairwise(self.frames), self.counts, strict=True):
-            yield Interval(self.model, self.motion, start, end, count, self.choice.fused)
+        """One after the other; the motion is resolved for all of them at once, which costs what one of them does."""
+        found = [
+            Interval(self.model, self.motion, start, end, count, self.choice.fused)
+            for (start, end), count in zip(pairwise(self.frames), self.counts, strict=True)
+        ]
+        drives, first = _drives(self.motion, torch.cat([*(i.times()[:-1] for i in found), found[-1].times()[-1:]])), 0
+        for interval in found:
+            last = first + interval.count
+            yield interval._replace(moves={name: _part(whole, first, last) for name, whole in drives.items()})
+            first = last
 
     def check(self, state: ClothState) -> None:
         """Refuse a cloth that has been torn apart."""

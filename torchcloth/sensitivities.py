@@ -123,7 +123,7 @@ class _Poses(NamedTuple):
             motion = self.becomes(_dual_motion(self.motion, self.along, self.count, batch))
             like = interval.motion
             motion = {name: m._replace(pose=m.pose.to(like[name].pose)) for name, m in motion.items()}
-            drives = interval._replace(motion=motion).drives()
+            drives = interval._replace(motion=motion, moves=None).drives()
             return {
                 name: drives[name]._replace(
                     increment=_tangent(drives[name].increment), pose=_tangent(drives[name].pose)
