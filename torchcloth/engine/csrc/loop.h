@@ -13,7 +13,6 @@ namespace tc {
 constexpr int OWN = -1;     // item i reads and writes row i
 constexpr int SHARED = -2;  // all items read, or add to, row 0
 constexpr int VARYING = -3; // and below: rows that contact finds at every substep
-constexpr int MOST = 64;    // components of a field
 constexpr int CELL = 11;    // registers that a lookup gives
 
 // lookup: three registers, a place on a grid in cells, give the fractions of its cell and the values at its corners.

@@ -70,20 +70,6 @@ struct Loaded {
     }
 };
 
-// dt, force, mass -> change of velocity.
-struct Push {
-    static constexpr const char* name = "push";
-    static constexpr int inputs = 5, outputs = 3;
-    static constexpr auto fixed = bits(0, 1);
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const T dt = r.number();
-        const auto force = r.vec();
-        Write<T>{out}.vec(dt * (force / r.number()));
-    }
-};
-
 // A vector times a number.
 struct Scaled {
     static constexpr const char* name = "scaled3";
@@ -134,6 +120,6 @@ struct CopyStress : Copied<15> { static constexpr const char* name = "copy15"; }
 
 }  // namespace
 
-TC_KERNELS(surface_kernels, Surface, Assemble, Kick, Resisted, KickInAir, Loaded, Push, Scaled, Plus, Drift, Copy, CopyStress)
+TC_KERNELS(surface_kernels, Surface, Assemble, Kick, Resisted, KickInAir, Loaded, Scaled, Plus, Drift, Copy, CopyStress)
 
 }  // namespace tc
