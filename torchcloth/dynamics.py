@@ -16,6 +16,11 @@ from .types import ClothState, Memory, Moment, Surface
 Impulses = dict[str, Tensor]  # name of a driven boundary -> [..., 6] N s, N m s: what it gave the cloth
 
 
+def added(total: Impulses, more: Impulses) -> Impulses:
+    """Impulses of one stretch of time and the next together."""
+    return {name: total[name] + value if name in total else value for name, value in more.items()}
+
+
 def vertex_forces(
     model: Model, state: ClothState, s: Surface, memory: Memory, columns: tuple[Tensor, Tensor]
 ) -> Tensor:

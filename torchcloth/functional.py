@@ -15,7 +15,7 @@ from torch import Tensor
 from . import apic
 from ._math import dot
 from .boundaries import Drive
-from .dynamics import Impulses, constrain, resistance_of, resisted, vertex_forces
+from .dynamics import Impulses, added, constrain, resistance_of, resisted, vertex_forces
 from .model import Geometry, Model, surface
 from .self_contact import Layers, add_columns, director_energy, follow, near_layers, pressure, repulsion
 from .strain import elastic, evolve, membrane_stress
@@ -59,7 +59,7 @@ def rollout(model: Model, state: ClothState, dt: float, drives: Mapping[str, Dri
         if model.grid is not None:
             layers = near_layers(model, model.grid, state.x, layers)
         state, impulses = advance(model, state, dt, drives, k, layers)
-        total = {name: total[name] + value if name in total else value for name, value in impulses.items()}
+        total = added(total, impulses)
     return state, total
 
 

@@ -13,10 +13,10 @@ from torch.utils.checkpoint import checkpoint as recompute
 
 from . import functional
 from .boundaries import Drive, drive
+from .dynamics import Impulses, added
 from .engine.choice import Choice
 from .engine.fused import Fused
 from .errors import SimulationDiverged
-from .functional import Impulses
 from .self_contact import CHUNK
 from .types import ClothState, Rollout, Trajectory
 from .validation import check_extent
@@ -139,7 +139,7 @@ def _by_reference(
         run = partial(functional.rollout, interval.model, dt=interval.dt, drives=drives, substeps=substeps, first=first)
         store = checkpoint and torch.is_grad_enabled()
         state, impulses = recompute(run, state, use_reentrant=False, preserve_rng_state=False) if store else run(state)
-        total = {name: total[name] + value if name in total else value for name, value in impulses.items()}
+        total = added(total, impulses)
     return state, total
 
 

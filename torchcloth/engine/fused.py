@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint as recompute
 
 from ..boundaries import Drive
-from ..dynamics import Impulses
+from ..dynamics import Impulses, added
 from ..model import Model
 from ..self_contact import CHUNK
 from ..types import ClothState
@@ -61,7 +61,7 @@ class Fused:
             state, impulses = (
                 recompute(run, state, use_reentrant=False, preserve_rng_state=False) if again else run(state)
             )
-            total = _sum(total, impulses)
+            total = added(total, impulses)
         return state, total
 
     def job(self, state: ClothState, dt: float, drives: Mapping[str, Drive], substeps: int) -> Job:
@@ -96,7 +96,7 @@ class Fused:
             force, memory = parts.force(state, dt)
             state, impulses = self._call(state, fixed | _cut(moves, k, k + 1), 1, False, force)
             state = state._replace(memory=state.memory | memory)
-            total = _sum(total, impulses)
+            total = added(total, impulses)
         return state, total
 
     def _call(
@@ -144,7 +144,3 @@ def _cut(moves: Mapping[Field, Tensor], first: int, last: int) -> dict[Field, Te
 
 def _needs_gradient(inputs: list[Tensor]) -> bool:
     return torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-
-
-def _sum(total: Impulses, more: Impulses) -> Impulses:
-    return {name: total[name] + value if name in total else value for name, value in more.items()}
