@@ -128,12 +128,6 @@ class Lowering:
         for sheet in self.sheets.values():
             sheet.close()
 
-    def resisted(self, loop: Loop, change: list[int], at: int | None = None) -> list[int]:
-        """Registers of a change of velocity in the air that moves along, of all vertices or those of a table."""
-        if self.resistance is None:
-            return change
-        return loop.call("resisted", loop.load(self.resistance, at), loop.load(self.mass, at), change)
-
     def momentum(self, loop: Loop, change: list[int], at: int | None = None) -> list[int]:
         """Registers of the momentum that a change of velocity takes, that of the air included."""
         mass = loop.load(self.mass, at)

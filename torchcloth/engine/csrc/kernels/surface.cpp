@@ -28,19 +28,6 @@ constexpr Vec<T> resisted(Symmetric<T> air, T mass, Vec<T> change) {
     return change - solve(Symmetric<T>{b.xx + 1.0, b.xy, b.xz, b.yy + 1.0, b.yz, b.zz + 1.0}, b * change);
 }
 
-// Mass of the air at a vertex, its own mass, a change of velocity -> what is left of it.
-struct Resisted {
-    static constexpr const char* name = "resisted";
-    static constexpr int inputs = 10, outputs = 3;
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const auto air = r.symmetric();
-        const T mass = r.number();
-        Write<T>{out}.vec(resisted(air, mass, r.vec()));
-    }
-};
-
 // dt, velocity, force, own mass, mass of the air -> velocity free of the boundaries.
 struct KickInAir {
     static constexpr const char* name = "kick_in_air";
@@ -120,6 +107,6 @@ struct CopyStress : Copied<15> { static constexpr const char* name = "copy15"; }
 
 }  // namespace
 
-TC_KERNELS(surface_kernels, Surface, Assemble, Kick, Resisted, KickInAir, Loaded, Scaled, Plus, Drift, Copy, CopyStress)
+TC_KERNELS(surface_kernels, Surface, Assemble, Kick, KickInAir, Loaded, Scaled, Plus, Drift, Copy, CopyStress)
 
 }  // namespace tc
