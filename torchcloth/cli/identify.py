@@ -1,4 +1,4 @@
-"""The command line: ``torchcloth identify | demo | doctor | bench``. Wrong input: one line on stderr, exit code 2."""
+"""``torchcloth identify | demo``: fits fabric parameters to recorded episodes."""
 
 from __future__ import annotations
 
@@ -6,63 +6,35 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from importlib import metadata, resources
+from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from .errors import InvalidInput, RecordingError, TorchclothError
+from ..errors import InvalidInput, RecordingError
 
 if TYPE_CHECKING:
-    from .cloth import Cloth
-    from .identification import Identification
-    from .recordings import Recording
+    from ..cloth import Cloth
+    from ..identification import Identification
+    from ..recordings import Recording
 
 DEMO = "bimanual_swing"
+STOPPED = "; `--resume` continues from the last iteration"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
-    try:
-        return options.run(options)
-    except TorchclothError as error:
-        print(f"torchcloth: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"torchcloth: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("torchcloth: stopped; `--resume` continues from the last iteration", file=sys.stderr)
-        return 130
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="torchcloth", description="Differentiable cloth for robotics.")
-    parser.add_argument("--version", action="version", version=metadata.version("torchcloth"))
-    verbs = parser.add_subparsers(required=True, metavar="VERB")
+def add(verbs: Any) -> None:
+    """The verbs and their options."""
     identify = verbs.add_parser("identify", help="fit fabric parameters to recorded episodes")
     identify.add_argument("episodes", nargs="+", metavar="EPISODE", help="folder of a recording")
     identify.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result and pictures")
-    identify.set_defaults(run=_identify)
-    _add_fit_options(identify)
+    identify.set_defaults(run=_identify, stopped=STOPPED)
+    _add_options(identify)
     demo = verbs.add_parser("demo", help="identify the shipped example")
     demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default out/demo")
-    demo.set_defaults(run=_demo)
-    _add_fit_options(demo)
-    doctor = verbs.add_parser("doctor", help="say what is installed and what works")
-    doctor.set_defaults(run=_doctor)
-    bench = verbs.add_parser("bench", help="measure speed and memory, also beside other simulators")
-    bench.add_argument("--peers", action="store_true", help="beside Taichi, Warp, Newton, MuJoCo, where installed")
-    bench.add_argument("--json", action="store_true", help="one JSON object on stdout instead of tables")
-    bench.add_argument("--out", type=Path, metavar="DIR", help="folder for bench.json and a plot of cost by size")
-    bench.add_argument("--fast", action="store_true", help="tiny scenes: whether it works, not how fast it is")
-    bench.add_argument("--threads", type=int, metavar="N", help="of each contestant that can use them (all cores)")
-    bench.set_defaults(run=_bench)
-    return parser
+    demo.set_defaults(run=_demo, stopped=STOPPED)
+    _add_options(demo)
 
 
-def _add_fit_options(parser: argparse.ArgumentParser) -> None:
+def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fit", nargs="+", metavar="NAME", help="parameters to fit (default: all of the model)")
     parser.add_argument(
         "--start", nargs="+", default=[], metavar="NAME=VALUE", help="start values, SI units, e.g. youngs_modulus=2e5"
@@ -100,7 +72,7 @@ def _demo(options: argparse.Namespace) -> int:
 def _identify(options: argparse.Namespace) -> int:
     import torch
 
-    from . import recordings
+    from .. import recordings
 
     torch.set_default_dtype(torch.float64)  # sensitivities lose digits over thousands of substeps in float32
     torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
@@ -116,9 +88,9 @@ def _identify(options: argparse.Namespace) -> int:
 
 
 def _cloth(options: argparse.Namespace, recording: Recording) -> Cloth:
-    from .identification import cloth_from
-    from .identification.unknowns import available
-    from .transfer import Contact
+    from ..identification import cloth_from
+    from ..identification.unknowns import available
+    from ..transfer import Contact
 
     cloth = cloth_from(recording, contact=None if options.contact is None else Contact(options.contact))
     cloth.engine = options.engine
@@ -144,8 +116,8 @@ def _assignments(pairs: Sequence[str]) -> dict[str, float]:
 def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording], guess: dict | None) -> Identification:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from .identification import identify
-    from .identification.result import write_atomically
+    from ..identification import identify
+    from ..identification.result import write_atomically
 
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*columns, refresh_per_second=2, disable=not sys.stdout.isatty()) as progress:
@@ -186,9 +158,9 @@ def _resume(folder: Path) -> dict[str, float]:
 
 
 def _report(folder: Path, fit: Identification, cloth: Cloth, recordings: list[Recording]) -> int:
-    from .identification import episode
-    from .identification.pictures import draw
-    from .identification.tables import print_fit
+    from ..identification import episode
+    from ..identification.pictures import draw
+    from ..identification.tables import print_fit
 
     path = fit.save(folder)
     (folder / "progress.json").unlink(missing_ok=True)
@@ -197,35 +169,3 @@ def _report(folder: Path, fit: Identification, cloth: Cloth, recordings: list[Re
     print(f"result:   {path}")
     print("pictures: " + ", ".join(str(p) for p in pictures))
     return 0
-
-
-def _bench(options: argparse.Namespace) -> int:
-    from .benchmarks import command  # pyright: ignore[reportMissingImports] - mapped from benchmarks/ at installation
-
-    return command.run(options)
-
-
-def _doctor(options: argparse.Namespace) -> int:
-    from importlib.util import find_spec
-
-    import torch
-
-    from .engine import library
-
-    print(f"torchcloth {metadata.version('torchcloth')}, torch {torch.__version__}, CUDA {torch.cuda.is_available()}")
-    print(f"{'engine':20s} {library.status()}")
-    packages = {
-        "pytorch_kinematics": "robots",
-        "yourdfpy": "robots",
-        "trimesh": "robots",
-        "open3d": "observe",
-        "lightning": "training",
-    }
-    for name, extra in packages.items():
-        state = "installed" if find_spec(name) else f'missing: pip install "torchcloth[{extra}]"'
-        print(f"{name:20s} {state}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

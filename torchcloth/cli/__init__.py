@@ -1,0 +1,35 @@
+"""The command line: one module a verb. Wrong input: one line on stderr, exit code 2."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib import metadata
+
+from ..errors import TorchclothError
+from . import bench, doctor, identify
+
+VERBS = (identify, doctor, bench)  # each has add(verbs)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except (TorchclothError, OSError) as error:
+        print(f"torchcloth: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"torchcloth: stopped{getattr(options, 'stopped', '')}", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="torchcloth", description="Differentiable cloth for robotics.")
+    parser.add_argument("--version", action="version", version=metadata.version("torchcloth"))
+    verbs = parser.add_subparsers(required=True, metavar="VERB")
+    for verb in VERBS:
+        verb.add(verbs)
+    return parser
