@@ -199,13 +199,13 @@ def fold_half_a_metre(fast: bool) -> Outcome:
         *judged("quarter", x[-1], mesh),
         Row(
             "layers that cross, edges through triangles in any frame",
-            max((w > unseen).sum() for w in ways),
+            max(int((w > unseen).sum()) for w in ways),
             0.0,
             mark=AT_MOST,
         ),
         Row(
             "the same within a crease, where contact does not look",
-            max((w <= unseen).sum() for w in ways),
+            max(int((w <= unseen).sum()) for w in ways),
             finding=True,
         ),
         Row("top speed of the hands", speed, unit="m/s", finding=True),
