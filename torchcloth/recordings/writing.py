@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import uuid
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,14 @@ MESH, INITIAL = "cloth.obj", "cloth_initial.npy"
 POINT_SCALE = 1e-4  # m; far below any sensor's noise
 
 
-def write(recording: Recording, path: str | Path, *, overwrite: bool = False, compact: bool = True) -> Path:
+def write(
+    recording: Recording,
+    path: str | Path,
+    *,
+    overwrite: bool = False,
+    compact: bool = True,
+    on_image: Callable[[], None] = lambda: None,
+) -> Path:
     """Write an episode folder atomically; what cannot be read back is refused.
 
     The final name only ever holds a whole episode. Overwriting moves the old folder aside first and brings it back
@@ -35,6 +43,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False, co
         path: the episode folder.
         overwrite: replace an existing episode; a folder that is not an episode is never replaced.
         compact: store points in tenths of a millimetre (int16) where they fit, else as float32.
+        on_image: called after each image, for a progress bar.
 
     Returns:
         The path of the episode.
@@ -47,7 +56,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False, co
     part = target.absolute().with_name(f".{target.absolute().name}.{uuid.uuid4().hex}.partial")
     try:
         part.mkdir(parents=True)
-        _fill(part, recording, compact)
+        _fill(part, recording, compact, on_image)
         read_folder(Folder(part, shown=target), with_truth=True)
         _sync(part)
         _put(part, target.absolute(), overwrite)
@@ -69,7 +78,7 @@ def _check_target(target: Path, overwrite: bool) -> None:
         raise RecordingError(f"{target} is not an episode", expected="an episode folder", remedy="choose another name")
 
 
-def _fill(part: Path, recording: Recording, compact: bool) -> None:
+def _fill(part: Path, recording: Recording, compact: bool, on_image: Callable[[], None]) -> None:
     text = json.dumps(_episode(recording), indent=1, allow_nan=False, default=_plain)
     (part / EPISODE).write_text(text + "\n", encoding="utf-8")
     _write_cloth(part, recording.cloth)
@@ -82,7 +91,7 @@ def _fill(part: Path, recording: Recording, compact: bool) -> None:
     if recording.truth is not None:
         save_npz(part / streams.TRUTH, _held(recording.truth))
     for name, camera in recording.cameras.items():
-        _write_images(part / checks.name(name, f"cameras[{name!r}]"), camera)
+        _write_images(part / checks.name(name, f"cameras[{name!r}]"), camera, on_image)
 
 
 def _episode(recording: Recording) -> dict[str, Any]:
@@ -151,7 +160,7 @@ def _point_arrays(held: dict[str, Any], compact: bool) -> dict[str, Any]:
     return {**held, "xyz": xyz.astype(np.float32)}
 
 
-def _write_images(folder: Path, camera: Camera) -> None:
+def _write_images(folder: Path, camera: Camera, on_image: Callable[[], None]) -> None:
     every: dict[images.Kind, images.ImageStream]
     every = {kind: getattr(camera, kind) for kind in images.KINDS if getattr(camera, kind) is not None}
     if not every:
@@ -160,8 +169,7 @@ def _write_images(folder: Path, camera: Camera) -> None:
     (folder / images.TIMESTAMPS).write_text(images.dump_times(every), encoding="utf-8")
     for kind, stream in every.items():
         (folder / kind).mkdir()
-        for frame, source in zip(stream.frames.tolist(), stream.paths, strict=True):
-            shutil.copyfile(source, folder / kind / f"{frame:06d}{source.suffix}")
+        stream.save(folder / kind, on_image)
 
 
 def _put(part: Path, target: Path, overwrite: bool) -> None:
