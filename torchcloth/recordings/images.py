@@ -5,9 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import math
-import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -64,8 +63,8 @@ class ImageStream:
             return self._decoded(image, f"{self.kind} image {i}")
         raise RecordingError(f"{self.kind} image {i} is missing", expected=f"{len(self)} images", remedy="record again")
 
-    def save(self, folder: Path, on_image: Callable[[], None] = lambda: None) -> None:
-        """Put the images into ``folder`` as numbered files; those of a source are decoded and checked on the way.
+    def files(self) -> Iterator[tuple[int, str, bytes]]:
+        """Frame number, suffix and bytes of each image as a file; those of a source are decoded and checked.
 
         Pixels become PNG, which keeps every one of them; PNG and JPEG files stay as they are.
         """
@@ -74,25 +73,24 @@ class ImageStream:
             frame = next(frames, None)
             if frame is None:
                 raise RecordingError(f"{self.kind} images are too many", expected=f"{len(self)}, one for each time")
-            name = folder / f"{frame:06d}"
             if isinstance(image, Path):
-                shutil.copyfile(image, name.with_suffix(image.suffix))
+                yield frame, image.suffix, image.read_bytes()
             else:
-                self._write(image, name)
-            on_image()
+                yield frame, *self._file(image, f"{self.kind} image {frame}")
         if (frame := next(frames, None)) is not None:
             raise RecordingError(f"{self.kind} image {frame} is missing", expected="one for each time")
 
-    def _write(self, image: np.ndarray | bytes, name: Path) -> None:
-        pixels = self._decoded(image, f"{self.kind} image {int(name.stem)}")
+    def _file(self, image: np.ndarray | bytes, place: str) -> tuple[str, bytes]:
+        pixels = self._decoded(image, place)
         if isinstance(image, bytes):
             suffix = ".png" if image.startswith(PNG) else ".jpg"
             if suffix not in _SUFFIXES[self.kind]:
-                raise RecordingError(f"{self.kind} images are JPEG", expected="PNG", remedy="export without loss")
-            name.with_suffix(suffix).write_bytes(image)
-            return
+                raise RecordingError(f"{place} is JPEG", expected="PNG", remedy="export without loss")
+            return suffix, image
         grey = pixels.astype(np.uint8) * np.uint8(255) if self.kind == "mask" else pixels
-        _pillow().fromarray(grey).save(name.with_suffix(".png"), compress_level=1)  # level 6: 4 times as long, 5 % less
+        file = io.BytesIO()
+        _pillow().fromarray(grey).save(file, "PNG", compress_level=1)  # 6 takes 4 times as long for 5 % less
+        return ".png", file.getvalue()
 
     def _decoded(self, image: Path | bytes | np.ndarray, place: str) -> np.ndarray:
         """The pixels of a file or of its bytes, of the kind's type and the camera's size."""

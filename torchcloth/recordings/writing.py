@@ -58,7 +58,7 @@ def write(
         part.mkdir(parents=True)
         _fill(part, recording, compact, on_image)
         read_folder(Folder(part, shown=target), with_truth=True)
-        _sync(part)
+        _sync_all(part)
         _put(part, target.absolute(), overwrite)
     except RecordingError:
         raise
@@ -79,22 +79,23 @@ def _check_target(target: Path, overwrite: bool) -> None:
 
 
 def _fill(part: Path, recording: Recording, compact: bool, on_image: Callable[[], None]) -> None:
-    text = json.dumps(_episode(recording), indent=1, allow_nan=False, default=_plain)
+    text = json.dumps(episode(recording), indent=1, allow_nan=False, default=plain)
     (part / EPISODE).write_text(text + "\n", encoding="utf-8")
     _write_cloth(part, recording.cloth)
-    if motion := _motion_arrays(recording):
+    if motion := motion_arrays(recording):
         save_npz(part / streams.MOTION, motion)
     if recording.points is not None:
-        save_npz(part / streams.POINTS, _point_arrays(_held(recording.points), compact))
+        save_npz(part / streams.POINTS, _point_arrays(held(recording.points), compact))
     if recording.markers is not None:
-        save_npz(part / streams.MARKERS, _held(recording.markers))
+        save_npz(part / streams.MARKERS, held(recording.markers))
     if recording.truth is not None:
-        save_npz(part / streams.TRUTH, _held(recording.truth))
+        save_npz(part / streams.TRUTH, held(recording.truth))
     for name, camera in recording.cameras.items():
         _write_images(part / checks.name(name, f"cameras[{name!r}]"), camera, on_image)
 
 
-def _episode(recording: Recording) -> dict[str, Any]:
+def episode(recording: Recording) -> dict[str, Any]:
+    """The object of episode.json."""
     known = {
         "format": FORMAT,
         "version": VERSION,
@@ -104,8 +105,8 @@ def _episode(recording: Recording) -> dict[str, Any]:
             name: _with(c.extra, plane={"point": c.point, "normal": c.normal}, friction=c.friction)
             for name, c in recording.colliders.items()
         },
-        "robots": {name: _held(r) for name, r in recording.robots.items()},
-        "cameras": {name: _held(c, skip=images.KINDS) for name, c in recording.cameras.items()},
+        "robots": {name: held(r) for name, r in recording.robots.items()},
+        "cameras": {name: held(c, skip=images.KINDS) for name, c in recording.cameras.items()},
         "observation_noise": _with({}, std=recording.observation_noise_std),
         "clock_offset": recording.clock_offset,
         "gravity": recording.gravity,
@@ -128,7 +129,7 @@ def _cloth(cloth: ClothInfo) -> dict[str, Any]:
 
 
 def _grasp(grasp: GraspInfo) -> dict[str, Any]:
-    return _held(grasp, skip=("radius",) if grasp.uv is None else ())
+    return held(grasp, skip=("radius",) if grasp.uv is None else ())
 
 
 def _write_cloth(part: Path, cloth: ClothInfo) -> None:
@@ -140,8 +141,8 @@ def _write_cloth(part: Path, cloth: ClothInfo) -> None:
         np.save(part / INITIAL, cloth.initial_vertices, allow_pickle=False)
 
 
-def _motion_arrays(recording: Recording) -> dict[str, Any]:
-    """One group per name; a gripper that is also an arm shares t, closed, force and torque with it."""
+def motion_arrays(recording: Recording) -> dict[str, Any]:
+    """Arrays of motion.npz, a group per name; a gripper that is also an arm shares t, closed, force and torque."""
     for name in recording.grippers.keys() & recording.joints.keys():
         gripper, arm = recording.grippers[name], recording.joints[name]
         for key in ("t", "closed", "force", "torque"):
@@ -149,7 +150,7 @@ def _motion_arrays(recording: Recording) -> dict[str, Any]:
                 what = f"grippers[{name!r}].{key} differs from joints[{name!r}].{key}"
                 raise RecordingError(what, expected="the same, they are stored once", remedy="resample one of them")
     motions = [*recording.grippers.items(), *recording.joints.items()]
-    return {f"{name}/{key}": value for name, motion in motions for key, value in _held(motion).items()}
+    return {f"{name}/{key}": value for name, motion in motions for key, value in held(motion).items()}
 
 
 def _point_arrays(held: dict[str, Any], compact: bool) -> dict[str, Any]:
@@ -169,7 +170,9 @@ def _write_images(folder: Path, camera: Camera, on_image: Callable[[], None]) ->
     (folder / images.TIMESTAMPS).write_text(images.dump_times(every), encoding="utf-8")
     for kind, stream in every.items():
         (folder / kind).mkdir()
-        stream.save(folder / kind, on_image)
+        for frame, suffix, data in stream.files():
+            (folder / kind / f"{frame:06d}{suffix}").write_bytes(data)
+            on_image()
 
 
 def _put(part: Path, target: Path, overwrite: bool) -> None:
@@ -183,18 +186,19 @@ def _put(part: Path, target: Path, overwrite: bool) -> None:
         if old.exists():
             old.rename(target)
         raise
-    _sync_one(target.parent)
+    sync(target.parent)
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _sync(root: Path) -> None:
+def _sync_all(root: Path) -> None:
     for folder, _, files in os.walk(root, topdown=False):
         for file in files:
-            _sync_one(Path(folder, file))
-        _sync_one(Path(folder))
+            sync(Path(folder, file))
+        sync(Path(folder))
 
 
-def _sync_one(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Bring a file or folder to the disk."""
     if path.is_dir() and os.name == "nt":  # Windows cannot open a folder
         return
     handle = os.open(path, os.O_RDONLY)
@@ -204,7 +208,7 @@ def _sync_one(path: Path) -> None:
         os.close(handle)
 
 
-def _held(bag: Any, skip: tuple[str, ...] = ()) -> dict[str, Any]:
+def held(bag: Any, skip: tuple[str, ...] = ()) -> dict[str, Any]:
     """The fields of a bag that are not None, then its unknown extras."""
     return _with(bag.extra, **{f.name: getattr(bag, f.name) for f in fields(bag) if f.name not in (*skip, "extra")})
 
@@ -220,7 +224,7 @@ def _same(a: np.ndarray | None, b: np.ndarray | None) -> bool:
     return (a is None and b is None) or (a is not None and b is not None and np.array_equal(a, b))
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """JSON for what numpy holds."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
