@@ -53,6 +53,7 @@ COLOR_MODES = {
 MODES = {"depth": DEPTH_MODES, "color": COLOR_MODES}
 LENSES: dict[Kind, str] = {"depth": "CALIBRATION_CameraLocationD0", "color": "CALIBRATION_CameraLocationPV0"}
 PARAMETERS = 14  # cx cy fx fy k1 k2 k3 k4 k5 k6 codx cody p2 p1, in parts of the sensor's size
+HEAD = 256  # bytes that hold the heads of the file and of its segment
 TOLERANCE = 1_000_000  # ns; Matroska may store whole milliseconds
 SLACK = 1.6  # frames that the last one may lie before the end that the file's head names
 
@@ -70,6 +71,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     source = scene.source
     names = {kind: source.maybe(source.text, kind) or kind for kind in TRACKS}
     nothing_left(source)
+    _whole(path)
     tracks, calibration = _tracks(path)
     times = {kind: packet_times(path, track["index"]) for kind, track in tracks.items()}
     for kind, track in tracks.items():
@@ -94,6 +96,27 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
         turn = depth_to_color(calibration, path)
         found.cameras[names["color"]].known["T_world_camera"] = pose @ np.linalg.inv(turn)
     return found
+
+
+def _whole(path: Path) -> None:
+    """Refuse a file whose length is not the one that its head names; while recording it names none."""
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+    with damaged(path, "Matroska file"):
+        start, length, _ = _element(head, 0)
+        start, length, unknown = _element(head, start + length)
+    if not unknown and start + length != path.stat().st_size:
+        got, expected = f"{path.stat().st_size} bytes", f"{start + length}, as its head says"
+        raise RecordingError(f"{path} is truncated or damaged", got=got, expected=expected, remedy="copy it again")
+
+
+def _element(data: bytes, at: int) -> tuple[int, int, bool]:
+    """Where the content of the EBML element at ``at`` begins, its length, and whether that is unknown (RFC 8794)."""
+    at += 9 - data[at].bit_length()  # the leading zeros of the first byte tell how many follow
+    width = 9 - data[at].bit_length()
+    bits = 7 * width
+    length = int.from_bytes(data[at : at + width], "big") & ((1 << bits) - 1)
+    return at + width, length, length == (1 << bits) - 1
 
 
 def _tracks(path: Path) -> tuple[dict[Kind, dict[str, Any]], dict[str, Any] | None]:

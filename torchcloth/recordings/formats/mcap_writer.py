@@ -57,8 +57,7 @@ def write(
         _Bag(part, recording, on_image).write()
         file = part / f"{part.name}.mcap"
         mcap_checksums.seal(file)
-        scene = Scene.read(None)
-        scene.complete(ros2.read(file, scene, None), target)  # what cannot be read back is refused
+        _read_back(file, target)
         writing.sync(file)
         file.replace(target.absolute())
     except (OSError, ValueError, TypeError) as error:
@@ -68,6 +67,16 @@ def write(
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return target
+
+
+def _read_back(file: Path, target: Path) -> None:
+    """Refuse what cannot be read again, under the final name."""
+    scene = Scene.read(None)
+    try:
+        scene.complete(ros2.read(file, scene, None), target)
+    except RecordingError as error:
+        what = error.what.replace(str(file), str(target))
+        raise RecordingError(what, got=error.got, expected=error.expected, remedy=error.remedy) from error
 
 
 class _Bag:

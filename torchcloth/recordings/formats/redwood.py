@@ -43,6 +43,7 @@ COLOR, INTRINSIC = ("color", "rgb", "image"), ("camera_intrinsic.json", "intrins
 TRAJECTORY = ("trajectory.log", "scene/trajectory.log")
 CAMERA = "cam0"
 MILLIMETRE = 0.001
+TOGETHER = 50_000_000  # ns between the images of a pair
 LEAST, MOST = 0.05, 30.0  # m; where half of all depths lie
 _STAMPED = re.compile(r"\d+-(\d{6,})")
 
@@ -67,6 +68,10 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
         got = f"{len(color)} colour and {len(depth)} depth images"
         raise RecordingError(f"{path} is not made of pairs", got=got, expected="as many of each")
     times = {"color": _times(color, fps), "depth": _times(depth, fps)}
+    apart = np.abs(times["color"] - times["depth"])
+    if apart.max() > TOGETHER:
+        got = f"{apart.max() / NANO:.3g} s between {color[int(apart.argmax())].name} and its depth image"
+        raise RecordingError(f"{path} is not made of pairs", got=got, expected=f"at most {TOGETHER / NANO:g} s")
     start = int(min(t[0] for t in times.values()))
     size = camera.known["width"], camera.known["height"]
     kinds: dict[Kind, list[Path]] = {"depth": depth, "color": color}
@@ -122,8 +127,10 @@ def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     if any(n is None for n in numbers):
         raise RecordingError(f"{folder} holds unnumbered images", got=paths[0].name, expected="frame numbers as names")
     order = [int(n.group(1)) for n in numbers if n]
-    if (np.diff(order) != 1).any():
-        i = int(np.argmax(np.diff(order) != 1))
+    lengths = [len(p.stem) for p in paths]
+    wrong = (np.diff(order) != 1) | (np.diff(lengths) != 0)
+    if wrong.any():
+        i = int(np.argmax(wrong))
         got = f"{paths[i].name} then {paths[i + 1].name}"
         raise RecordingError(f"{folder} misses an image", got=got, expected="consecutive numbers, of one length")
     return paths

@@ -40,10 +40,10 @@ class VideoFrames(ImageSource):
 
     def __iter__(self) -> Iterator[np.ndarray]:
         with opened(self.path) as container, listening(self.path):
-            stream = container.streams[self.track]
-            stream.codec_context.options = STRICT
-            if self.times[0] > SEEK:
-                with damaged(self.path, "video"):
+            with damaged(self.path, "video"):
+                stream = container.streams[self.track]
+                stream.codec_context.options = STRICT
+                if self.times[0] > SEEK:
                     container.seek(int(self.times[0] - SEEK // 2) // 1000)
             i = 0
             for ns, frame in self._frames(container, stream):
