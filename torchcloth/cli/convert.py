@@ -34,12 +34,15 @@ def add(verbs: Any) -> None:
 
 
 def _convert(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
     from .. import recordings
     from ..recordings import formats
 
     if options.target.exists() and not options.overwrite:
         raise InvalidInput("DST exists", got=options.target, expected="a new name", remedy="or --overwrite")
-    recording = formats.read(options.source, format=options.format, scene=options.scene, episode=options.episode)
+    with Console(stderr=True).status(f"reading {options.source}"):  # silent where nobody looks
+        recording = formats.read(options.source, format=options.format, scene=options.scene, episode=options.episode)
     write = formats.write_mcap if options.target.suffix == MCAP else recordings.write
     _with_progress(
         recording, lambda on_image: write(recording, options.target, overwrite=options.overwrite, on_image=on_image)
@@ -79,12 +82,12 @@ def _report(recording: Recording, target: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("stream", "holds", "samples", "from [s]", "to [s]", "rate [Hz]")
+    table = Table("stream", "holds", "samples", "from, s", "to, s", "rate, Hz")
     for name, holds, t in _streams(recording):
         rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else float("nan")
         table.add_row(name, holds, str(len(t)), f"{t[0]:.3f}", f"{t[-1]:.3f}", "" if rate != rate else f"{rate:.1f}")
     Console(soft_wrap=True).print(table)
     source = recording.extra.get("source")
-    if isinstance(source, dict) and source.get("checksums") == "none":
-        print("no checksums: a changed number or pixel in this file could not be noticed")
+    if isinstance(source, dict) and source.get("unchecked"):
+        print(f"no checksum covers {source['unchecked']}: damage there would go unnoticed")
     print(f"written: {target}")

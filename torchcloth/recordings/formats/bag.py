@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,48 +41,55 @@ class Bag:
         files = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.suffix in MAGICS)
         covers = [_check(file) for file in files] or ["none"]
         self.checksums = min(covers, key=("none", "messages", "all bytes").index)  # of the least protected file
-        with self._reader() as reader:
-            self.types = {c.topic: c.msgtype for c in reader.connections}
+        self.types, self._store = self._open()
 
     def messages(self, topics: Sequence[str]) -> Iterator[Message]:
         """The messages of these topics in the order of their logging; every one that the bag counts."""
-        with self._reader() as reader:
+        from rosbags.rosbag2 import Reader  # pyright: ignore[reportMissingImports]  (optional)
+
+        with damaged(self.path, "ROS 2 bag"):
+            reader = Reader(self.path)
+            reader.open()
+        try:
             wanted = [c for c in reader.connections if c.topic in topics]
             seen: Counter[str] = Counter()
-            stream: Iterator[Any] = reader.messages(connections=wanted) if wanted else iter(())
-            while True:
-                with damaged(self.path, "ROS 2 bag"):
-                    found = next(stream, None)
-                    if found is None:
-                        break
-                    connection, logged, raw = found
-                    place = f"{self.path}: {connection.topic}[{seen[connection.topic]}]"
-                    body = reader.deserialize(raw, connection.msgtype)
-                seen[connection.topic] += 1
-                yield Message(connection.topic, int(logged), body, place)
+            for message in self._deserialized(reader, wanted, seen):
+                seen[message.topic] += 1
+                yield message
             counted: Counter[str] = Counter()
             for connection in wanted:
                 counted[connection.topic] += connection.msgcount
             if counted != seen:
                 got, expected = dict(seen), f"{dict(counted)}, as the bag counts"
                 raise RecordingError(f"{self.path} has lost messages", got=got, expected=expected)
+        finally:
+            reader.close()
 
-    @contextmanager
-    def _reader(self) -> Iterator[Any]:
+    def _deserialized(self, reader: Any, wanted: list[Any], seen: Counter[str]) -> Iterator[Message]:
+        stream: Iterator[Any] = reader.messages(connections=wanted) if wanted else iter(())
+        while True:
+            with damaged(self.path, "ROS 2 bag"):
+                found = next(stream, None)
+                if found is None:
+                    return
+                connection, logged, raw = found
+                place = f"{self.path}: {connection.topic}[{seen[connection.topic]}]"
+                body = self._store.deserialize_cdr(raw, connection.msgtype)
+            yield Message(connection.topic, int(logged), body, place)
+
+    def _open(self) -> tuple[dict[str, str], Any]:
+        """Types by topic, and the definitions of all types, from the bag or else of ROS 2 Humble."""
         try:
             from rosbags.highlevel import AnyReader  # pyright: ignore[reportMissingImports]  (optional)
             from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]
         except ImportError as error:
-            raise MissingDependency("reading ROS 2 bags needs rosbags", remedy='pip install "torchcloth[data]"') from (
-                error
-            )
-        with damaged(self.path, "ROS 2 bag"):
-            reader = AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-            reader.open()
-        try:
-            yield reader
-        finally:
-            reader.close()
+            message = "reading ROS 2 bags needs rosbags"
+            raise MissingDependency(message, remedy='pip install "torchcloth[data]"') from error
+        with (
+            damaged(self.path, "ROS 2 bag"),
+            AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader,
+        ):
+            return {c.topic: c.msgtype for c in reader.connections}, reader.typestore
 
 
 def is_bag(path: Path) -> bool:

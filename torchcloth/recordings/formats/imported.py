@@ -26,6 +26,7 @@ class ImportedCamera:
 
     known: dict[str, Any] = field(default_factory=dict)
     streams: dict[Kind, ImageStream] = field(default_factory=dict)
+    placed_by: str | None = None  # another camera, whose pose in the scene also places this one
 
 
 @dataclass

@@ -53,6 +53,7 @@ COLOR_MODES = {
 MODES = {"depth": DEPTH_MODES, "color": COLOR_MODES}
 LENSES: dict[Kind, str] = {"depth": "CALIBRATION_CameraLocationD0", "color": "CALIBRATION_CameraLocationPV0"}
 PARAMETERS = 14  # cx cy fx fy k1 k2 k3 k4 k5 k6 codx cody p2 p1, in parts of the sensor's size
+UNCHECKED = "pixels, times and calibration"
 HEAD = 256  # bytes that hold the heads of the file and of its segment
 TOLERANCE = 1_000_000  # ns; Matroska may store whole milliseconds
 SLACK = 1.6  # frames that the last one may lie before the end that the file's head names
@@ -79,7 +80,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     numbers = {kind: np.arange(len(t)) for kind, t in times.items()}
     if "color" in times:
         numbers["color"], numbers["depth"] = frame_numbers(times["color"], times["depth"], TOGETHER)
-    found = Imported(notes={"format": NAME, "serial": tracks["depth"]["serial"], "start_ns": 0})
+    found = Imported(notes={"format": NAME, "serial": tracks["depth"]["serial"], "unchecked": UNCHECKED})
     for kind, track in tracks.items():
         size = track["size"]
         known: dict[str, Any] = {"width": size[0], "height": size[1]}
@@ -89,7 +90,8 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
             known |= intrinsics(_lens(calibration, kind, path), kind, size, str(path))
         frames = _frames(path, kind, track, times[kind])
         stream = ImageStream(kind, numbers[kind], seconds(times[kind], 0), (), size, frames)
-        found.cameras[names[kind]] = ImportedCamera(known, {kind: stream})
+        placed_by = names["depth"] if kind == "color" and calibration is not None else None
+        found.cameras[names[kind]] = ImportedCamera(known, {kind: stream}, placed_by)
     said = scene.camera(names["depth"]).get("T_world_camera")
     if said is not None and calibration is not None and "color" in tracks:
         pose = checks.array(said, f"{scene.name}: cameras.{names['depth']}.T_world_camera", (4, 4))

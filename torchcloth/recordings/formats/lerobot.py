@@ -35,6 +35,7 @@ NAME = "lerobot"
 TITLE = "LeRobot v3 data set"
 INFO = "meta/info.json"
 EXAMPLE = '"source": {"motion": {"left": {"column": "observation.state", "joints": [0, 1, 2], "unit": "rad"}}}'
+UNCHECKED = "pixels"
 TOLERANCE = 1e-4  # s; LeRobot's own for video and row times
 AGREE = 1e-5  # relative; statistics are kept in float64 of float32 values
 
@@ -55,7 +56,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     if not source.rest:
         expected = f"the scene with {EXAMPLE}"
         raise RecordingError(f"{path}: no column is mapped", got=f"columns {sorted(features.rest)}", expected=expected)
-    found = Imported(notes={"format": NAME, "episode": int(row["episode_index"]), "fps": fps})
+    found = Imported(notes={"format": NAME, "episode": int(row["episode_index"]), "fps": fps, "unchecked": UNCHECKED})
     t = np.arange(len(table["frame_index"])) / fps
     for name, fields in source.each("motion").items():
         found.motion[name] = _motion(fields, features, table, row, t)

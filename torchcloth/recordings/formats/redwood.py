@@ -42,6 +42,7 @@ TITLE = "Open3D/Redwood RGB-D folder"
 COLOR, INTRINSIC = ("color", "rgb", "image"), ("camera_intrinsic.json", "intrinsic.json", "camera.json")
 TRAJECTORY = ("trajectory.log", "scene/trajectory.log")
 CAMERA = "cam0"
+UNCHECKED = "intrinsics, pose, and pixels of JPEG images"
 MILLIMETRE = 0.001
 TOGETHER = 50_000_000  # ns between the images of a pair
 LEAST, MOST = 0.05, 30.0  # m; where half of all depths lie
@@ -82,7 +83,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     if image_size(depth[0]) != size:
         raise RecordingError(f"{depth[0]} has the wrong size", got=image_size(depth[0]), expected=f"{size}")
     _plausible(camera.streams["depth"], float(camera.known["depth_scale"]), depth[0])
-    found = Imported(cameras={name: camera}, notes={"format": NAME, "start_ns": start})
+    found = Imported(cameras={name: camera}, notes={"format": NAME, "start_ns": start, "unchecked": UNCHECKED})
     log = next((path / n for n in TRAJECTORY if (path / n).is_file()), None)
     if log is not None:
         camera.known["T_world_camera"] = fixed_pose(_poses(log, len(depth)), str(log))

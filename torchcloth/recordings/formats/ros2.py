@@ -35,6 +35,7 @@ from .side import Scene
 
 NAME = "ros2"
 TITLE = "ROS 2 bag (rosbag2 folder, .mcap, .db3)"
+UNCHECKED = {"all bytes": "", "messages": "", "none": "numbers and pixels"}
 EXAMPLE = '"source": {"motion": {"left": {"pose": TOPIC, "closed": true}}, "points": {"topic": TOPIC}}'
 
 
@@ -71,7 +72,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
         motion={name: part.arrays(start) for name, part in motion.items()},
         points=clouds.arrays(start) if clouds else None,
         cameras={name: part.camera(start) for name, part in cameras.items()},
-        notes={"format": NAME, "start_ns": start, "checksums": bag.checksums},
+        notes={"format": NAME, "start_ns": start, "checksums": bag.checksums, "unchecked": UNCHECKED[bag.checksums]},
     )
     return embedded.restore(found, scene)
 

@@ -102,7 +102,7 @@ class Scene:
         lost = [
             name
             for name, camera in imported.cameras.items()
-            if "T_world_camera" not in camera.known and "T_world_camera" not in self.camera(name)
+            if not camera.placed_by and "T_world_camera" not in {**camera.known, **self.camera(name)}
         ]
         if lost:
             lacks.append('"cameras": {' + ", ".join(f'"{name}": {{{POSE}}}' for name in lost) + "}")

@@ -39,6 +39,7 @@ from .side import Scene
 NAME = "tum"
 TITLE = "TUM RGB-D folder"
 CAMERA = "cam0"
+UNCHECKED = "times, poses, and pixels of JPEG images"
 DEPTH_SCALE = 1 / 5000  # m per unit
 TOGETHER = 20_000_000  # ns; associate.py of the data set takes the same
 LISTS: dict[Kind, str] = {"color": "rgb.txt", "depth": "depth.txt"}
@@ -70,7 +71,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     for kind, rows in lists.items():
         source_of = FileImages([file for _, file in rows])
         camera.streams[kind] = ImageStream(kind, numbers[kind], seconds(stamps[kind], start), (), size, source_of)
-    found = Imported(cameras={name: camera}, notes={"format": NAME, "start_ns": start})
+    found = Imported(cameras={name: camera}, notes={"format": NAME, "start_ns": start, "unchecked": UNCHECKED})
     if truth is not None and hand is None:
         remedy = f'if {TRUTH} tracks a gripper, write "source": {{"trajectory": "left", "closed": true}}'
         poses = pose_matrix(truth[1], truth[2], str(path / TRUTH))
@@ -133,6 +134,12 @@ def _list(folder: Path, name: str) -> list[tuple[int, Path]]:
     if strange is not None or len(set(files)) < len(files):
         got = strange or "a file listed twice"
         raise RecordingError(f"{folder / name} names wrong files", got=repr(got), expected="images below the folder")
+    parents = {((folder / f).parent, Path(f).suffix) for f in files}
+    beside = {p for parent, suffix in parents for p in parent.glob("*") if p.suffix == suffix}
+    forgotten = sorted(beside - {folder / f for f in files})
+    if forgotten:
+        got, expected = f"{forgotten[0].name} not listed", "every image; the list may have been cut"
+        raise RecordingError(f"{folder / name} is incomplete", got=got, expected=expected, remedy="list or remove it")
     return list(zip(_stamps(rows, folder / name).tolist(), (folder / f for f in files), strict=True))
 
 
