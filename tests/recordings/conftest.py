@@ -12,19 +12,20 @@ from PIL import Image
 from torchcloth import recordings as rec
 
 
-def compare(a, b, *, atol: float = 0.0, at: str = "recording") -> None:
-    """Compare two bags of arrays field by field; paths may differ, image bytes may not."""
+def compare(a, b, *, atol: float = 0.0, times: float = 0.0, at: str = "recording") -> None:
+    """Compare two bags of arrays field by field; ``atol`` is for points. Paths may differ, image bytes may not."""
     if is_dataclass(a):
         assert type(a) is type(b), at
         for f in fields(a):
-            compare(getattr(a, f.name), getattr(b, f.name), atol=atol, at=f"{at}.{f.name}")
+            compare(getattr(a, f.name), getattr(b, f.name), atol=atol, times=times, at=f"{at}.{f.name}")
     elif isinstance(a, np.ndarray):
         assert a.dtype == b.dtype, at
-        np.testing.assert_allclose(a, b, rtol=0, atol=atol if at.endswith("points.xyz") else 0, err_msg=at)
+        allowed = {"xyz": atol if at.endswith("points.xyz") else 0.0, "t": times}.get(at.rpartition(".")[2], 0.0)
+        np.testing.assert_allclose(a, b, rtol=0, atol=allowed, err_msg=at)
     elif isinstance(a, dict):
         assert a.keys() == b.keys(), at
         for key in a:
-            compare(a[key], b[key], atol=atol, at=f"{at}.{key}")
+            compare(a[key], b[key], atol=atol, times=times, at=f"{at}.{key}")
     elif isinstance(a, tuple) and a and isinstance(a[0], Path):
         assert [p.read_bytes() for p in a] == [p.read_bytes() for p in b], at
     elif not at.endswith(".path"):

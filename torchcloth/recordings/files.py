@@ -7,7 +7,7 @@ import json
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 
@@ -16,10 +16,13 @@ from . import checks
 
 
 class Folder:
-    """An episode folder; ``shown`` is the name used in messages (a write checks its work under the final name)."""
+    """An episode folder; ``shown`` is the name used in messages (a write checks its work under the final name).
 
-    def __init__(self, path: Path, shown: Path | None = None) -> None:
-        self.path, self.shown = path, shown or path
+    ``held`` are files by name that lie in memory instead, as those that another format carries.
+    """
+
+    def __init__(self, path: Path, shown: Path | None = None, held: Mapping[str, bytes] | None = None) -> None:
+        self.path, self.shown, self.held = path, shown or path, held or {}
 
     def place(self, name: str) -> str:
         """The file's name in messages."""
@@ -32,7 +35,7 @@ class Folder:
     def has(self, name: str) -> bool:
         """Whether a file or folder of this name lies here."""
         try:
-            return (self.path / name).exists()
+            return name in self.held or (self.path / name).exists()
         except (OSError, ValueError):  # a name that no file system can hold
             return False
 
@@ -42,6 +45,8 @@ class Folder:
         checks.name(name, f"{place} file name")
         if not self.has(name):
             raise RecordingError(f"{place} is missing", expected="a file", remedy="restore it or stop naming it")
+        if name in self.held:
+            return self.held[name]
         try:
             return (self.path / name).read_bytes()
         except OSError as error:
@@ -102,14 +107,14 @@ class Folder:
         return arrays
 
 
-def save_npz(path: Path, arrays: Mapping[str, Any]) -> None:
+def save_npz(file: Path | BinaryIO, arrays: Mapping[str, Any]) -> None:
     """Write named arrays; the same arrays give the same bytes, and any name is allowed (unlike ``np.savez``)."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for key, value in arrays.items():
             member = zipfile.ZipInfo(f"{key}.npy")
             member.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(member, "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, np.asarray(value), allow_pickle=False)
+            with archive.open(member, "w", force_zip64=True) as opened:
+                np.lib.format.write_array(opened, np.asarray(value), allow_pickle=False)
 
 
 def _no_constant(text: str) -> NoReturn:

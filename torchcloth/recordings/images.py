@@ -1,12 +1,16 @@
-"""Image folders of a camera: listed when the episode is read, decoded only when asked for."""
+"""Images of a camera, in folders or inside a file of another format: decoded only when asked for."""
 
 from __future__ import annotations
 
 import csv
+import io
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,49 +21,109 @@ from .files import Folder
 Kind = Literal["depth", "color", "mask"]
 KINDS: tuple[Kind, ...] = ("depth", "color", "mask")
 TIMESTAMPS = "timestamps.csv"
+PNG = b"\x89PNG\r\n\x1a\n"
 _COLUMNS = ["frame", "t_color", "t_depth"]
 _SUFFIXES: dict[Kind, set[str]] = {"depth": {".png"}, "color": {".jpg", ".jpeg", ".png"}, "mask": {".png"}}
 
 
+class ImageSource(ABC):
+    """Images inside a file of another format, decoded one after the other; it can be run through again."""
+
+    @abstractmethod
+    def __iter__(self) -> Iterator[np.ndarray | bytes]:
+        """Each image: its pixels as `ImageStream.load` gives them, or the bytes of a whole PNG or JPEG file."""
+
+
 @dataclass(frozen=True, eq=False)
 class ImageStream:
-    """N images of one kind with their times."""
+    """N images of one kind with their times: files of their own, or decoded from a source when they are written."""
 
     kind: Kind
     frames: np.ndarray  # [N] frame numbers, as in the file names
     t: np.ndarray  # [N] s
-    paths: tuple[Path, ...]
+    paths: tuple[Path, ...]  # one per image; empty with a source
     size: tuple[int, int]  # (width, height) in pixels
+    source: ImageSource | None = None
 
     def __len__(self) -> int:
-        return len(self.paths)
+        return len(self.frames)
 
     def load(self, i: int) -> np.ndarray:
         """Decode image ``i``: depth uint16 [H, W] (0 = invalid), colour uint8 [H, W, 3], mask bool [H, W].
+
+        From a source this runs through all images before it; write the episode first to read many.
 
         Raises:
             RecordingError: the file is damaged or does not have the camera's size.
             MissingDependency: Pillow is not installed.
         """
-        try:
-            from PIL import Image  # pyright: ignore[reportMissingImports]  (optional)
-        except ImportError as error:
-            raise MissingDependency("reading images needs Pillow", remedy="pip install pillow") from error
-        path = self.paths[i]
-        try:
-            with Image.open(path) as image:
-                pixels = np.asarray(image.convert("RGB") if self.kind == "color" else image)
-        except Exception as error:  # a damaged image raises whatever its decoder pleases
-            raise RecordingError(f"{path} cannot be decoded", got=type(error).__name__, remedy="restore it") from error
+        if self.source is None:
+            return self._decoded(self.paths[i], str(self.paths[i]))
+        for image in islice(self.source, range(len(self))[i], None):
+            return self._decoded(image, f"{self.kind} image {i}")
+        raise RecordingError(f"{self.kind} image {i} is missing", expected=f"{len(self)} images", remedy="record again")
+
+    def files(self) -> Iterator[tuple[int, str, bytes]]:
+        """Frame number, suffix and bytes of each image as a file; those of a source are decoded and checked.
+
+        Pixels become PNG, which keeps every one of them; PNG and JPEG files stay as they are.
+        """
+        frames = iter(self.frames.tolist())
+        for image in self.paths if self.source is None else self.source:
+            frame = next(frames, None)
+            if frame is None:
+                raise RecordingError(f"{self.kind} images are too many", expected=f"{len(self)}, one for each time")
+            if isinstance(image, Path):
+                yield frame, image.suffix, image.read_bytes()
+            else:
+                yield frame, *self._file(image, f"{self.kind} image {frame}")
+        if (frame := next(frames, None)) is not None:
+            raise RecordingError(f"{self.kind} image {frame} is missing", expected="one for each time")
+
+    def _file(self, image: np.ndarray | bytes, place: str) -> tuple[str, bytes]:
+        pixels = self._decoded(image, place)
+        if isinstance(image, bytes):
+            suffix = ".png" if image.startswith(PNG) else ".jpg"
+            if suffix not in _SUFFIXES[self.kind]:
+                raise RecordingError(f"{place} is JPEG", expected="PNG", remedy="export without loss")
+            return suffix, image
+        grey = pixels.astype(np.uint8) * np.uint8(255) if self.kind == "mask" else pixels
+        file = io.BytesIO()
+        _pillow().fromarray(grey).save(file, "PNG", compress_level=1)  # 6 takes 4 times as long for 5 % less
+        return ".png", file.getvalue()
+
+    def _decoded(self, image: Path | bytes | np.ndarray, place: str) -> np.ndarray:
+        """The pixels of a file or of its bytes, of the kind's type and the camera's size."""
+        pixels = image if isinstance(image, np.ndarray) else _decode(image, place, rgb=self.kind == "color")
         if self.kind == "depth" and pixels.dtype != np.uint16:
             raise RecordingError(
-                f"{path} is no depth image", got=pixels.dtype, expected="uint16", remedy="export raw depth"
+                f"{place} is no depth image", got=pixels.dtype, expected="uint16", remedy="export raw depth"
             )
         if pixels.shape[:2] != self.size[::-1]:
             raise RecordingError(
-                f"{path} has the wrong size", got=pixels.shape[1::-1], expected=f"{self.size}, as calibrated"
+                f"{place} has the wrong size", got=pixels.shape[1::-1], expected=f"{self.size}, as calibrated"
             )
         return np.any(pixels.reshape(*self.size[::-1], -1), axis=-1, keepdims=False) if self.kind == "mask" else pixels
+
+
+def _pillow() -> Any:
+    try:
+        from PIL import Image  # pyright: ignore[reportMissingImports]  (optional)
+    except ImportError as error:
+        raise MissingDependency("reading images needs Pillow", remedy="pip install pillow") from error
+    return Image
+
+
+def _decode(image: Path | bytes, place: str, *, rgb: bool) -> np.ndarray:
+    reader = _pillow()
+    try:
+        data = image if isinstance(image, bytes) else image.read_bytes()
+        if data.startswith(PNG):
+            reader.open(io.BytesIO(data)).verify()  # checksums, which decoding does not look at
+        with reader.open(io.BytesIO(data)) as opened:
+            return np.asarray(opened.convert("RGB") if rgb else opened)
+    except Exception as error:  # a damaged image raises whatever its decoder pleases
+        raise RecordingError(f"{place} cannot be decoded", got=type(error).__name__, remedy="restore it") from error
 
 
 def find_streams(folder: Folder, size: tuple[int, int]) -> dict[Kind, ImageStream]:

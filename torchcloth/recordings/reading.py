@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import RecordingError
-from . import scene, streams
+from . import images, scene, streams
 from .checks import Fields
 from .files import Folder
-from .types import GraspInfo, Recording
+from .types import Camera, GraspInfo, Recording
 
 EPISODE = "episode.json"
 FORMAT, VERSION = "torchcloth-recording", 1
@@ -36,29 +38,56 @@ def read_folder(folder: Folder, *, with_truth: bool) -> Recording:
     _refuse_no_episode(folder)
     root = folder.json(EPISODE)
     _check_version(root)
-    grippers, joints = streams.motions(folder) if folder.has(streams.MOTION) else ({}, {})
+    groups = streams.groups(folder) if folder.has(streams.MOTION) else {}
+    grippers, joints = streams.motions(groups, folder.place(streams.MOTION))
+    held = {
+        "grippers": grippers,
+        "joints": joints,
+        "points": streams.points(folder.npz(streams.POINTS), folder.place(streams.POINTS))
+        if folder.has(streams.POINTS)
+        else None,
+        "markers": streams.markers(folder) if folder.has(streams.MARKERS) else None,
+        "truth": streams.truth(folder) if with_truth and folder.has(streams.TRUTH) else None,
+        "path": folder.shown,
+    }
+    return assemble(root, folder, held, lambda name, size: images.find_streams(folder.sub(name), size))
+
+
+def assemble(
+    root: Fields,
+    folder: Folder,
+    held: dict[str, Any],
+    images_of: Callable[[str, tuple[int, int]], dict[images.Kind, images.ImageStream]],
+) -> Recording:
+    """Put what episode.json says together with the streams, and check that they fit.
+
+    Args:
+        root: the object in episode.json.
+        folder: where the files lie that it names; for messages, where the episode lies.
+        held: the streams, by the names of `Recording`.
+        images_of: finds the images of a camera by its name and (width, height).
+    """
     gravity = root.maybe(root.array, "gravity", 3)
     noise, air = root.inside("observation_noise"), root.inside("air")
+
+    def camera(name: str, fields: Fields) -> Camera:
+        return scene.camera(fields, lambda size: images_of(name, size))
+
     recording = Recording(
         cloth=scene.cloth(_needed(root, "cloth"), folder),
         provenance=_provenance(root),
         grasps={name: scene.grasp(f) for name, f in root.each("grasps").items()},
-        grippers=grippers,
-        joints=joints,
         robots={name: scene.robot(f) for name, f in root.each("robots").items()},
-        cameras={name: scene.camera(f, folder.sub(name)) for name, f in root.each("cameras").items()},
+        cameras={name: camera(name, f) for name, f in root.each("cameras").items()},
         colliders={name: scene.collider(f) for name, f in root.each("colliders").items()},
-        points=streams.points(folder) if folder.has(streams.POINTS) else None,
-        markers=streams.markers(folder) if folder.has(streams.MARKERS) else None,
-        truth=streams.truth(folder) if with_truth and folder.has(streams.TRUTH) else None,
         observation_noise_std=noise.maybe(noise.number, "std", least=0, most=1, suspect="millimetres"),
         clock_offset=root.maybe(root.number, "clock_offset") or 0.0,
         gravity=np.array([0.0, 0.0, -9.81]) if gravity is None else gravity,
         air_density=air.maybe(air.number, "density", least=0),
         split=_split(root),
         licence=root.maybe(root.text, "licence"),
-        path=folder.shown,
         extra=root.left(observation_noise=noise, air=air),
+        **held,
     )
     _check_cloth(recording, folder)
     for name in recording.grasps:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,10 @@ import numpy as np
 from ..errors import InvalidInput, RecordingError
 from ..meshes import obj
 from ..meshes.mesh import per_vertex
-from . import checks, images
+from . import checks
 from .checks import Fields
 from .files import Folder
+from .images import ImageStream, Kind
 from .types import Camera, ClothInfo, Collider, GraspInfo, RobotInfo
 
 HEAVIEST = 20.0  # kg/m^2; above this a density was given in g/m^2
@@ -77,8 +79,8 @@ def collider(fields: Fields) -> Collider:
     return Collider(point, normal, fields.maybe(fields.number, "friction", least=0), fields.left(plane=plane))
 
 
-def camera(fields: Fields, folder: Folder) -> Camera:
-    """Read one camera and list its images; depth images need their scale."""
+def camera(fields: Fields, images_of: Callable[[tuple[int, int]], dict[Kind, ImageStream]]) -> Camera:
+    """Read one camera and list its images, which ``images_of`` finds for (width, height); depth needs its scale."""
     size = fields.whole("width"), fields.whole("height")
     matrix = fields.array("K", 3, 3)
     if min(matrix[0, 0], matrix[1, 1]) <= 0 or not np.array_equal(matrix[2], [0, 0, 1]):
@@ -86,7 +88,7 @@ def camera(fields: Fields, folder: Folder) -> Camera:
         raise RecordingError(
             f"{fields.at('K')} is no camera matrix", got=got, expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]]"
         )
-    streams = images.find_streams(folder, size)
+    streams = images_of(size)
     if "depth" in streams and not fields.has("depth_scale"):
         raise RecordingError(
             f"{fields.at('depth_scale')} is missing", expected="metres per unit", remedy="0.001 for mm"

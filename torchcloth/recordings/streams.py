@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,14 @@ LARGEST_ANGLE = 4 * np.pi  # rad; no arm joint turns further, and a few degrees 
 MOTION, POINTS, MARKERS, TRUTH = "motion.npz", "points.npz", "markers.npz", "truth.npz"
 
 
-def motions(folder: Folder) -> tuple[dict[str, GripperMotion], dict[str, JointMotion]]:
-    """Read every gripper and arm; one name may be both."""
+def motions(
+    groups: Mapping[str, dict[str, np.ndarray]], file: str
+) -> tuple[dict[str, GripperMotion], dict[str, JointMotion]]:
+    """Turn the arrays of each name into grippers and arms; one name may be both. ``file`` is for messages."""
     grippers: dict[str, GripperMotion] = {}
     joints: dict[str, JointMotion] = {}
-    for name, group in _groups(folder).items():
-        place = f"{folder.place(MOTION)}: {name}"
+    for name, group in groups.items():
+        place = f"{file}: {name}"
         if not {"position", "quat_wxyz", "q"} & group.keys():
             raise RecordingError(f"{place} has no motion", got=sorted(group), expected="position and quat_wxyz, or q")
         fields = Fields(group, place, "/")
@@ -36,9 +39,9 @@ def motions(folder: Folder) -> tuple[dict[str, GripperMotion], dict[str, JointMo
     return grippers, joints
 
 
-def points(folder: Folder) -> PointClouds:
-    """Read the point clouds, stored as floats in metres or as int16 with a scale."""
-    fields = Fields(folder.npz(POINTS), folder.place(POINTS), ": ")
+def points(arrays: dict[str, np.ndarray], file: str) -> PointClouds:
+    """Turn the arrays of the point clouds, floats in metres or int16 with a scale, into clouds."""
+    fields = Fields(arrays, file, ": ")
     t = _times(fields)
     counts = fields.array("counts", len(t), kind="int")
     stored = fields.take("xyz")
@@ -104,7 +107,8 @@ def truth(folder: Folder) -> Truth:
     return Truth(t, vertices, faces, fields.rest)
 
 
-def _groups(folder: Folder) -> dict[str, dict[str, np.ndarray]]:
+def groups(folder: Folder) -> dict[str, dict[str, np.ndarray]]:
+    """The arrays of motion.npz by name of the gripper or arm."""
     groups: dict[str, dict[str, np.ndarray]] = {}
     for key, value in folder.npz(MOTION).items():
         name, slash, field = key.partition("/")

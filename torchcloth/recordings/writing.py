@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import uuid
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,14 @@ MESH, INITIAL = "cloth.obj", "cloth_initial.npy"
 POINT_SCALE = 1e-4  # m; far below any sensor's noise
 
 
-def write(recording: Recording, path: str | Path, *, overwrite: bool = False, compact: bool = True) -> Path:
+def write(
+    recording: Recording,
+    path: str | Path,
+    *,
+    overwrite: bool = False,
+    compact: bool = True,
+    on_image: Callable[[], None] = lambda: None,
+) -> Path:
     """Write an episode folder atomically; what cannot be read back is refused.
 
     The final name only ever holds a whole episode. Overwriting moves the old folder aside first and brings it back
@@ -35,6 +43,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False, co
         path: the episode folder.
         overwrite: replace an existing episode; a folder that is not an episode is never replaced.
         compact: store points in tenths of a millimetre (int16) where they fit, else as float32.
+        on_image: called after each image, for a progress bar.
 
     Returns:
         The path of the episode.
@@ -47,9 +56,9 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False, co
     part = target.absolute().with_name(f".{target.absolute().name}.{uuid.uuid4().hex}.partial")
     try:
         part.mkdir(parents=True)
-        _fill(part, recording, compact)
+        _fill(part, recording, compact, on_image)
         read_folder(Folder(part, shown=target), with_truth=True)
-        _sync(part)
+        _sync_all(part)
         _put(part, target.absolute(), overwrite)
     except RecordingError:
         raise
@@ -69,23 +78,24 @@ def _check_target(target: Path, overwrite: bool) -> None:
         raise RecordingError(f"{target} is not an episode", expected="an episode folder", remedy="choose another name")
 
 
-def _fill(part: Path, recording: Recording, compact: bool) -> None:
-    text = json.dumps(_episode(recording), indent=1, allow_nan=False, default=_plain)
+def _fill(part: Path, recording: Recording, compact: bool, on_image: Callable[[], None]) -> None:
+    text = json.dumps(episode(recording), indent=1, allow_nan=False, default=plain)
     (part / EPISODE).write_text(text + "\n", encoding="utf-8")
     _write_cloth(part, recording.cloth)
-    if motion := _motion_arrays(recording):
+    if motion := motion_arrays(recording):
         save_npz(part / streams.MOTION, motion)
     if recording.points is not None:
-        save_npz(part / streams.POINTS, _point_arrays(_held(recording.points), compact))
+        save_npz(part / streams.POINTS, _point_arrays(held(recording.points), compact))
     if recording.markers is not None:
-        save_npz(part / streams.MARKERS, _held(recording.markers))
+        save_npz(part / streams.MARKERS, held(recording.markers))
     if recording.truth is not None:
-        save_npz(part / streams.TRUTH, _held(recording.truth))
+        save_npz(part / streams.TRUTH, held(recording.truth))
     for name, camera in recording.cameras.items():
-        _write_images(part / checks.name(name, f"cameras[{name!r}]"), camera)
+        _write_images(part / checks.name(name, f"cameras[{name!r}]"), camera, on_image)
 
 
-def _episode(recording: Recording) -> dict[str, Any]:
+def episode(recording: Recording) -> dict[str, Any]:
+    """The object of episode.json."""
     known = {
         "format": FORMAT,
         "version": VERSION,
@@ -95,8 +105,8 @@ def _episode(recording: Recording) -> dict[str, Any]:
             name: _with(c.extra, plane={"point": c.point, "normal": c.normal}, friction=c.friction)
             for name, c in recording.colliders.items()
         },
-        "robots": {name: _held(r) for name, r in recording.robots.items()},
-        "cameras": {name: _held(c, skip=images.KINDS) for name, c in recording.cameras.items()},
+        "robots": {name: held(r) for name, r in recording.robots.items()},
+        "cameras": {name: held(c, skip=images.KINDS) for name, c in recording.cameras.items()},
         "observation_noise": _with({}, std=recording.observation_noise_std),
         "clock_offset": recording.clock_offset,
         "gravity": recording.gravity,
@@ -119,7 +129,7 @@ def _cloth(cloth: ClothInfo) -> dict[str, Any]:
 
 
 def _grasp(grasp: GraspInfo) -> dict[str, Any]:
-    return _held(grasp, skip=("radius",) if grasp.uv is None else ())
+    return held(grasp, skip=("radius",) if grasp.uv is None else ())
 
 
 def _write_cloth(part: Path, cloth: ClothInfo) -> None:
@@ -131,8 +141,8 @@ def _write_cloth(part: Path, cloth: ClothInfo) -> None:
         np.save(part / INITIAL, cloth.initial_vertices, allow_pickle=False)
 
 
-def _motion_arrays(recording: Recording) -> dict[str, Any]:
-    """One group per name; a gripper that is also an arm shares t, closed, force and torque with it."""
+def motion_arrays(recording: Recording) -> dict[str, Any]:
+    """Arrays of motion.npz, a group per name; a gripper that is also an arm shares t, closed, force and torque."""
     for name in recording.grippers.keys() & recording.joints.keys():
         gripper, arm = recording.grippers[name], recording.joints[name]
         for key in ("t", "closed", "force", "torque"):
@@ -140,7 +150,7 @@ def _motion_arrays(recording: Recording) -> dict[str, Any]:
                 what = f"grippers[{name!r}].{key} differs from joints[{name!r}].{key}"
                 raise RecordingError(what, expected="the same, they are stored once", remedy="resample one of them")
     motions = [*recording.grippers.items(), *recording.joints.items()]
-    return {f"{name}/{key}": value for name, motion in motions for key, value in _held(motion).items()}
+    return {f"{name}/{key}": value for name, motion in motions for key, value in held(motion).items()}
 
 
 def _point_arrays(held: dict[str, Any], compact: bool) -> dict[str, Any]:
@@ -151,7 +161,7 @@ def _point_arrays(held: dict[str, Any], compact: bool) -> dict[str, Any]:
     return {**held, "xyz": xyz.astype(np.float32)}
 
 
-def _write_images(folder: Path, camera: Camera) -> None:
+def _write_images(folder: Path, camera: Camera, on_image: Callable[[], None]) -> None:
     every: dict[images.Kind, images.ImageStream]
     every = {kind: getattr(camera, kind) for kind in images.KINDS if getattr(camera, kind) is not None}
     if not every:
@@ -160,8 +170,9 @@ def _write_images(folder: Path, camera: Camera) -> None:
     (folder / images.TIMESTAMPS).write_text(images.dump_times(every), encoding="utf-8")
     for kind, stream in every.items():
         (folder / kind).mkdir()
-        for frame, source in zip(stream.frames.tolist(), stream.paths, strict=True):
-            shutil.copyfile(source, folder / kind / f"{frame:06d}{source.suffix}")
+        for frame, suffix, data in stream.files():
+            (folder / kind / f"{frame:06d}{suffix}").write_bytes(data)
+            on_image()
 
 
 def _put(part: Path, target: Path, overwrite: bool) -> None:
@@ -175,18 +186,19 @@ def _put(part: Path, target: Path, overwrite: bool) -> None:
         if old.exists():
             old.rename(target)
         raise
-    _sync_one(target.parent)
+    sync(target.parent)
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _sync(root: Path) -> None:
+def _sync_all(root: Path) -> None:
     for folder, _, files in os.walk(root, topdown=False):
         for file in files:
-            _sync_one(Path(folder, file))
-        _sync_one(Path(folder))
+            sync(Path(folder, file))
+        sync(Path(folder))
 
 
-def _sync_one(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Bring a file or folder to the disk."""
     if path.is_dir() and os.name == "nt":  # Windows cannot open a folder
         return
     handle = os.open(path, os.O_RDONLY)
@@ -196,7 +208,7 @@ def _sync_one(path: Path) -> None:
         os.close(handle)
 
 
-def _held(bag: Any, skip: tuple[str, ...] = ()) -> dict[str, Any]:
+def held(bag: Any, skip: tuple[str, ...] = ()) -> dict[str, Any]:
     """The fields of a bag that are not None, then its unknown extras."""
     return _with(bag.extra, **{f.name: getattr(bag, f.name) for f in fields(bag) if f.name not in (*skip, "extra")})
 
@@ -212,7 +224,7 @@ def _same(a: np.ndarray | None, b: np.ndarray | None) -> bool:
     return (a is None and b is None) or (a is not None and b is not None and np.array_equal(a, b))
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """JSON for what numpy holds."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()

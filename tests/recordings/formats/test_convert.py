@@ -1,0 +1,72 @@
+"""``torchcloth convert`` as a user meets it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import foreign
+
+from torchcloth import recordings as rec
+from torchcloth.cli import convert, main
+from torchcloth.recordings import formats
+
+
+def call(*arguments) -> int:
+    return main(["convert", *map(str, arguments)])
+
+
+def test_the_choices_are_the_formats():
+    assert set(convert.FORMATS) == set(formats.NAMES)
+
+
+def test_a_folder_becomes_an_episode_and_the_episode_mcap(tmp_path, capsys):
+    truth = foreign.tum(tmp_path)
+    scene, episode, bag = truth.write_scene(), tmp_path / "ep", tmp_path / "ep.mcap"
+    assert call(truth.path, episode, "--scene", scene, "--from", "tum") == 0
+    said = capsys.readouterr().out
+    assert "cam0/depth" in said
+    assert "16 x 12 px" in said
+    assert "30.0" in said
+    assert call(episode, bag) == 0
+    assert call(bag, tmp_path / "back") == 0
+    images = [rec.read(p).cameras["cam0"].color for p in (episode, tmp_path / "back")]
+    assert [p.read_bytes() for p in images[0].paths] == [p.read_bytes() for p in images[1].paths]
+
+
+def test_a_refusal_is_one_line_and_leaves_nothing(tmp_path, capsys):
+    truth = foreign.tum(tmp_path)
+    out = tmp_path / "out" / "ep"
+    scene = truth.write_scene()
+    for arguments, match in (
+        ([], "does not tell everything"),
+        (["--scene", scene, "--from", "redwood"], "mislabelled; got content of tum; expected redwood"),
+        (["--scene", tmp_path / "lost.json"], "cannot be read"),
+        (["--scene", scene, "--episode", "3"], "holds one episode"),
+    ):
+        assert call(truth.path, out, *arguments) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("torchcloth: ")
+        assert said.count("\n") == 1
+        assert match in said
+    image = sorted((truth.path / "depth").iterdir())[2]
+    image.write_bytes(image.read_bytes()[:-20])
+    assert call(truth.path, out, "--scene", scene) == 2
+    assert "depth image 2 cannot be decoded" in capsys.readouterr().err
+    assert not out.exists()
+    assert not any(out.parent.glob("*"))
+
+
+@pytest.mark.parametrize("suffix", ["", ".mcap"])
+def test_nothing_is_overwritten_unasked(tmp_path, capsys, suffix):
+    truth = foreign.tum(tmp_path)
+    scene, out = truth.write_scene(), tmp_path / f"ep{suffix}"
+    assert call(truth.path, out, "--scene", scene) == 0
+    capsys.readouterr()
+    assert call(truth.path, out, "--scene", scene) == 2
+    assert "DST exists" in capsys.readouterr().err
+    assert call(truth.path, out, "--scene", scene, "--overwrite") == 0

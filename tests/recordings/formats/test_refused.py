@@ -1,0 +1,281 @@
+"""What is mislabelled, contradictory or incomplete is refused in one line that says what to do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import foreign
+
+from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.recordings import formats
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Each format once, to be copied."""
+    return {name: write(tmp_path_factory.mktemp(name)) for name, write in foreign.WRITERS.items()}
+
+
+@pytest.fixture
+def copy(written, tmp_path):
+    """A function that copies one format here and gives its scene to be changed."""
+
+    def make(name: str) -> foreign.Foreign:
+        truth = written[name]
+        target = tmp_path / truth.path.name
+        (shutil.copytree if truth.path.is_dir() else shutil.copy)(truth.path, target)
+        scene = json.loads(json.dumps(truth.scene))
+        return foreign.Foreign(target, scene, truth.images, truth.times, truth.arrays, dict(truth.options))
+
+    return make
+
+
+def refuse(truth: foreign.Foreign, match: str, **options):
+    with pytest.raises((RecordingError, InvalidInput), match=match) as caught:
+        formats.read(truth.path, scene=truth.write_scene(), **{**truth.options, **options})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", foreign.WRITERS)
+def test_without_a_scene_it_says_what_to_write(name, copy):
+    truth = copy(name)
+    kept = {key: value for key, value in truth.scene.items() if key in ("source", "cameras")}
+    truth.scene = kept
+    refuse(truth, r'does not tell everything; expected .*"cloth": \{"sheet".*"areal_density".*"provenance": "measured"')
+
+
+@pytest.mark.parametrize("name", ["tum", "ros2", "lerobot", "kinect"])
+def test_without_a_camera_pose_it_says_what_to_write(name, copy):
+    truth = copy(name)
+    for camera in truth.scene["cameras"].values():
+        camera.pop("T_world_camera", None)
+    if name == "tum":
+        (truth.path / "groundtruth.txt").unlink()
+    refuse(truth, r'"cameras": \{"\w+": \{"T_world_camera": \[\[1,0,0,0\]')
+
+
+@pytest.mark.parametrize("name", foreign.WRITERS)
+def test_another_name_is_refused(name, copy):
+    other = "tum" if name != "tum" else "redwood"
+    refuse(copy(name), f"mislabelled; got content of {name}; expected {other}", format=other)
+
+
+def test_an_unknown_format_is_refused(copy):
+    refuse(copy("tum"), "format is unknown; got 'bag'", format="bag")
+
+
+@pytest.mark.parametrize(
+    ("head", "what"),
+    [
+        (b"\x00\x00\x00\x20ftypisom", "an MP4 video"),
+        (b"PAR1....", "a parquet file"),
+        (b"#ROSBAG V2.0", "a ROS 1 bag"),
+        (b"", "b''"),
+        (b"hello world", "b'hello wo'"),
+    ],
+)
+def test_a_file_of_no_known_format(tmp_path, head, what):
+    file = tmp_path / "take.mkv"
+    file.write_bytes(head)
+    with pytest.raises(RecordingError, match=f"no known format; got {what}"):
+        formats.read(file)
+    with pytest.raises(RecordingError, match="does not exist"):
+        formats.read(tmp_path / "nothing")
+
+
+def test_an_mcap_file_with_another_suffix(copy):
+    truth = copy("ros2")
+    file = truth.path / "take.db3"
+    (truth.path / f"{truth.path.name}.mcap").rename(file)
+    truth.path = file
+    refuse(truth, "mislabelled; got content of a .mcap file; expected .db3 content")
+
+
+def test_a_camera_that_contradicts_the_file(copy):
+    truth = copy("redwood")
+    truth.scene["cameras"] = {"cam0": {"K": [[14.0, 0, 7.5], [0, 16.0, 5.25], [0, 0, 1]]}}
+    refuse(truth, "cameras.cam0.K contradicts the file")
+    truth.scene["cameras"]["cam0"]["K"][1][1] = 15.0001  # rounding
+    recording = formats.read(truth.path, scene=truth.write_scene())
+    np.testing.assert_array_equal(recording.cameras["cam0"].K, [[14, 0, 7.5], [0, 15, 5.25], [0, 0, 1]])
+
+
+def test_a_row_major_intrinsic(copy):
+    truth = copy("redwood")
+    file = truth.path / "camera_intrinsic.json"
+    said = json.loads(file.read_text())
+    said["intrinsic_matrix"] = np.reshape(said["intrinsic_matrix"], (3, 3)).T.reshape(-1).tolist()
+    file.write_text(json.dumps(said))
+    refuse(truth, "is no camera matrix.*column by column")
+
+
+def test_redwood_images_without_times(copy):
+    truth = copy("redwood")
+    for i, file in enumerate(sorted(truth.path.rglob("*.png"))):
+        file.rename(file.with_name(f"{i % 3:06d}.png"))
+    refuse(truth, 'carry no times; expected the scene with "source": {"fps": 30}')
+    truth.scene["source"] = {"fps": 20}
+    recording = formats.read(truth.path, scene=truth.write_scene())
+    np.testing.assert_array_equal(recording.cameras["cam0"].depth.t, [0, 0.05, 0.1])
+    truth.scene["source"] = {"fsp": 20}
+    refuse(truth, "source.fsp is unknown")
+
+
+def test_depth_in_other_units(copy):
+    truth = copy("redwood")
+    truth.scene["cameras"] = {"cam0": {"depth_scale": 0.1}}
+    refuse(truth, "units of 0.1 m; got a median depth of 1")
+
+
+@pytest.mark.parametrize(("name", "file"), [("redwood", "trajectory.log"), ("tum", "groundtruth.txt")])
+def test_a_moving_camera(copy, name, file):
+    truth = copy(name)
+    path = truth.path / file
+    before = path.read_text()
+    after = before.replace("0.50000000", "0.51000000", 1) if name == "redwood" else before.replace(" 0.5 ", " 0.51 ", 1)
+    assert after != before
+    path.write_text(after)
+    refuse(truth, "moves; got 0.01 m and 0 degrees; expected a camera that stands still")
+
+
+def test_tum_may_track_the_hand(copy):
+    truth = copy("tum")
+    truth.scene["cameras"]["cam0"]["T_world_camera"] = foreign.POSE
+    truth.scene["source"] = {"trajectory": "hand"}
+    refuse(truth, "source.closed is unclear; expected true or false")
+    truth.scene["source"]["closed"] = True
+    hand = formats.read(truth.path, scene=truth.write_scene()).grippers["hand"]
+    np.testing.assert_allclose(hand.t, 0.000496 + np.arange(10) / 100, atol=1e-12)
+    np.testing.assert_array_equal(hand.position[0], [0.5, 0.1, 1.5])
+    np.testing.assert_array_equal(hand.quat_wxyz[0], [0.0, 0.70710678, 0.70710678, 0.0])
+
+
+WRONG_SOURCES = {
+    "no topic": (["motion", "left", "pose"], "/nothing", r"pose is not in the bag; got '/nothing'; expected one of"),
+    "other type": (["motion", "left", "pose"], "/cloth", "is of another type; got sensor_msgs/msg/PointCloud2"),
+    "other frame": (["motion", "left", "frame"], "table", "frame 'table' is unknown"),
+    "wrench frame": (["motion", "left", "wrench_frame"], "tool", "wrench_frame is unclear"),
+    "joint name": (["motion", "arm", "joints", "names"], ["j0", "elbow"], r"lacks joints; got \['elbow'\]"),
+    "closed": (["motion", "arm", "closed"], "yes", "closed is not in the bag"),
+    "late": (["motion", "left", "closed"], 3, "closed is unclear; got 3"),
+    "misspelt": (["points", "topics"], "/cloth", "source.points.topics is unknown"),
+    "rectified": (["cameras", "cam0", "rectified"], "no", "rectified is unclear"),
+    "epoch": (["epoch"], 1.5, "epoch is no time"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_SOURCES)
+def test_a_wrong_mapping_of_topics(copy, case):
+    keys, value, match = WRONG_SOURCES[case]
+    truth = copy("ros2")
+    node = truth.scene["source"]
+    for key in keys[:-1]:
+        node = node[key]
+    node[keys[-1]] = value
+    refuse(truth, match)
+
+
+def test_without_a_mapping_the_topics_are_listed(copy):
+    truth = copy("ros2")
+    del truth.scene["source"]
+    refuse(truth, r"no topic is mapped; got the topics /closed \(Bool\), /cloth \(PointCloud2\)")
+
+
+def test_frames_are_placed_in_the_world(copy):
+    """A pose given in the frame of a robot's base, a wrench given in the gripper's."""
+    truth = copy("ros2")
+    base = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    truth.scene["robots"]["arm"]["T_world_base"] = base.tolist()
+    truth.scene["source"]["motion"]["left"] |= {"frame": "arm", "wrench_frame": "gripper"}
+    left = formats.read(truth.path, scene=truth.write_scene()).grippers["left"]
+    there = truth.arrays["left/position"]
+    np.testing.assert_allclose(left.position, there @ base[:3, :3].T + base[:3, 3], atol=1e-15)
+    from scipy.spatial.transform import Rotation
+
+    local = Rotation.from_quat(truth.arrays["left/quat_wxyz"], scalar_first=True)
+    world = Rotation.from_matrix(base[:3, :3]) * local
+    assert (world * Rotation.from_quat(left.quat_wxyz, scalar_first=True).inv()).magnitude().max() < 1e-14
+    np.testing.assert_allclose(left.force, world.apply(truth.arrays["left/force"]), atol=1e-14)
+
+
+def test_lerobot_episodes(copy):
+    truth = copy("lerobot")
+    refuse(truth, "holds 2 episodes; got no --episode; expected one of 0 to 1", episode=None)
+    refuse(truth, "holds 2 episodes; got --episode 2", episode=2)
+    first = formats.read(truth.path, scene=truth.write_scene(), episode=0)
+    assert len(first.joints["left"].t) == len(first.cameras["cam0"].color) == 6
+    assert abs(int(first.cameras["cam0"].color.load(0).mean()) - foreign.lerobot_truth.grey(0, 0)) <= 2
+
+
+def test_lerobot_units_are_asked_for(copy):
+    truth = copy("lerobot")
+    left = truth.scene["source"]["motion"]["left"]
+    left["unit"] = "turns"
+    refuse(truth, "unit is unknown; got 'turns'; expected rad or deg")
+    left["unit"] = "deg"
+    degrees = formats.read(truth.path, scene=truth.write_scene(), **truth.options).joints["left"].q
+    np.testing.assert_allclose(degrees, np.radians(truth.arrays["left/q"]), rtol=1e-15)
+    left["joints"] = ["joint_9.pos"]
+    refuse(truth, "joints is unknown; got 'joint_9.pos'; expected one of joint_1.pos")
+
+
+def test_lerobot_values_are_held_against_their_statistics(copy):
+    """A parquet file that pyarrow itself wrote, sound in every byte, with one number that was not recorded."""
+    import pyarrow
+    from pyarrow import parquet
+
+    truth = copy("lerobot")
+    file = truth.path / "data" / "chunk-000" / "file-000.parquet"
+    table = parquet.read_table(file)
+    rows = table.column("observation.state").to_pylist()
+    rows[8][2] += 1e-3
+    column = pyarrow.array(rows, type=table.schema.field("observation.state").type)
+    parquet.write_table(table.set_column(0, "observation.state", column), file)
+    refuse(truth, "observation.state contradicts its statistics; got a mean of .* in entry 2")
+
+
+def test_another_lerobot_version(copy):
+    truth = copy("lerobot")
+    file = truth.path / "meta" / "info.json"
+    file.write_text(file.read_text().replace('"v3.0"', '"v2.1"'))
+    refuse(truth, "another version; got 'v2.1'; expected 'v3")
+
+
+def test_kinect_calibration(copy):
+    """K by hand from the factory's numbers; a point seen by both lenses is at one place of the world."""
+    truth = copy("kinect")
+    recording = formats.read(truth.path, scene=truth.write_scene())
+    depth, color = recording.cameras["depth"], recording.cameras["color"]
+    factory = foreign.FACTORY
+    assert depth.K[0, 0] == pytest.approx(factory[2] * 512)
+    assert depth.K[0, 2] == pytest.approx(factory[0] * 512 - 96 - 0.5)
+    assert depth.K[1, 2] == pytest.approx(factory[1] * 512 - 90 - 0.5)
+    k1, k2, k3, k4, k5, k6 = factory[4:10]
+    np.testing.assert_allclose(depth.distortion, [k1, k2, factory[13], factory[12], k3, k4, k5, k6])
+    assert depth.depth_scale == 0.001
+    assert color.K[1, 2] == pytest.approx(0.5 * 960 - 120 - 0.5)
+    in_depth = np.array([0.1, 0.2, 1.5, 1.0])
+    c, s = np.cos(foreign.TILT), np.sin(foreign.TILT)
+    in_color = np.array([[1, 0, 0, -0.032], [0, c, -s, -0.002], [0, s, c, 0.004], [0, 0, 0, 1]]) @ in_depth
+    np.testing.assert_allclose(depth.T_world_camera @ in_depth, color.T_world_camera @ in_color, atol=1e-12)
+
+
+def test_a_matroska_file_of_another_camera(tmp_path):
+    import av
+
+    path = tmp_path / "take.mkv"
+    with av.open(str(path), "w", format="matroska") as container:
+        stream = container.add_stream("ffv1", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 16, 12, "gray"
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((12, 16), np.uint8), format="gray")))
+        container.mux(stream.encode())
+    with pytest.raises(RecordingError, match="no Azure Kinect recording; got no depth track"):
+        formats.read(path)

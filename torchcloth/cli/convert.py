@@ -1,0 +1,93 @@
+"""``torchcloth convert``: recordings of other formats into episodes, episodes into MCAP."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InvalidInput
+
+if TYPE_CHECKING:
+    from ..recordings import Recording
+
+FORMATS = ("episode", "ros2", "lerobot", "redwood", "tum", "kinect")
+MCAP = ".mcap"
+
+
+def add(verbs: Any) -> None:
+    """The verb and its options."""
+    convert = verbs.add_parser(
+        "convert",
+        help="turn a recording of another format into an episode, or an episode into MCAP",
+        epilog="--scene: a JSON file in the words of episode.json (cloth, grasps, robots, cameras, provenance), and "
+        'under "source" which topic or column is what. Without it the message says what to write.',
+    )
+    convert.add_argument("source", type=Path, metavar="SRC", help="file or folder to read")
+    convert.add_argument("target", type=Path, metavar="DST", help=f"episode folder to write, or a file ending {MCAP}")
+    convert.add_argument("--from", dest="format", choices=FORMATS, help="what SRC must be (default: found by content)")
+    convert.add_argument("--scene", type=Path, metavar="FILE", help="JSON with what the recording does not tell")
+    convert.add_argument("--episode", type=int, metavar="N", help="which one, where SRC holds many (LeRobot)")
+    convert.add_argument("--overwrite", action="store_true", help="replace DST")
+    convert.set_defaults(run=_convert, stopped="; nothing was written")
+
+
+def _convert(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from .. import recordings
+    from ..recordings import formats
+
+    if options.target.exists() and not options.overwrite:
+        raise InvalidInput("DST exists", got=options.target, expected="a new name", remedy="or --overwrite")
+    with Console(stderr=True).status(f"reading {options.source}"):  # silent where nobody looks
+        recording = formats.read(options.source, format=options.format, scene=options.scene, episode=options.episode)
+    write = formats.write_mcap if options.target.suffix == MCAP else recordings.write
+    _with_progress(
+        recording, lambda on_image: write(recording, options.target, overwrite=options.overwrite, on_image=on_image)
+    )
+    _report(recording, options.target)
+    return 0
+
+
+def _streams(recording: Recording) -> list[tuple[str, str, Any]]:
+    """Name, what it holds, and times of every stream."""
+    rows: list[tuple[str, str, Any]] = []
+    for name, gripper in recording.grippers.items():
+        rows.append((name, "pose" + ", wrench" * (gripper.force is not None), gripper.t))
+    for name, arm in recording.joints.items():
+        rows.append((name, f"{arm.q.shape[1]} joints" + ", width" * (arm.width is not None), arm.t))
+    if recording.points is not None:
+        rows.append(("points", f"{int(recording.points.counts.mean())} a cloud", recording.points.t))
+    if recording.markers is not None:
+        rows.append(("markers", f"{recording.markers.xyz.shape[1]} points", recording.markers.t))
+    for name, camera in recording.cameras.items():
+        for stream in filter(None, (camera.depth, camera.color, camera.mask)):
+            rows.append((f"{name}/{stream.kind}", f"{stream.size[0]} x {stream.size[1]} px", stream.t))
+    return rows
+
+
+def _with_progress(recording: Recording, write: Any) -> None:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    images = sum(len(s) for c in recording.cameras.values() for s in (c.depth, c.color, c.mask) if s is not None)
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, transient=True, disable=not sys.stdout.isatty()) as progress:
+        task = progress.add_task("images", total=images or None)
+        write(lambda: progress.advance(task))
+
+
+def _report(recording: Recording, target: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("stream", "holds", "samples", "from, s", "to, s", "rate, Hz")
+    for name, holds, t in _streams(recording):
+        rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else float("nan")
+        table.add_row(name, holds, str(len(t)), f"{t[0]:.3f}", f"{t[-1]:.3f}", "" if rate != rate else f"{rate:.1f}")
+    Console(soft_wrap=True).print(table)
+    source = recording.extra.get("source")
+    if isinstance(source, dict) and source.get("unchecked"):
+        print(f"no checksum covers {source['unchecked']}: damage there would go unnoticed")
+    print(f"written: {target}")

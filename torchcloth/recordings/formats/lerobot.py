@@ -1,0 +1,254 @@
+"""LeRobot data sets, version 3, read by pyarrow and PyAV.
+
+    meta/info.json  meta/episodes/**.parquet  data/**.parquet  videos/KEY/**.mp4
+
+One file holds many episodes: ``--episode N`` chooses one. The columns of a vector are named in info.json; what they
+mean, and in which unit, only the user knows:
+
+    "source": {"motion": {"left": {"column": "observation.state", "joints": ["j1.pos", ...], "unit": "rad" | "deg",
+                                   "width": "gripper.width", "width_scale": 1.0, "closed": true}},
+               "cameras": {"cam0": {"color": "observation.images.top"}}}
+
+Joints and width are names (of info.json) or indices. Times are those of the data set's regular clock. Checked: page
+checksums where written, one row and one video frame for every tick of that clock, and the smallest, largest and mean
+value of every column against the statistics that LeRobot keeps for each episode. Not noticed: changed bytes that
+decode to another picture, for AV1 and H.264 carry no checksum.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import MissingDependency, RecordingError
+from .. import checks
+from ..checks import Fields
+from ..images import ImageStream
+from .imported import NANO, Imported, ImportedCamera, damaged, file_text, nothing_left
+from .side import Scene
+from .video import VideoFrames
+
+NAME = "lerobot"
+TITLE = "LeRobot v3 data set"
+INFO = "meta/info.json"
+EXAMPLE = '"source": {"motion": {"left": {"column": "observation.state", "joints": [0, 1, 2], "unit": "rad"}}}'
+UNCHECKED = "pixels"
+TOLERANCE = 1e-4  # s; LeRobot's own for video and row times
+AGREE = 1e-5  # relative; statistics are kept in float64 of float32 values
+
+
+def matches(path: Path) -> bool:
+    """Whether the folder is laid out like this."""
+    return (path / INFO).is_file()
+
+
+def read(path: Path, scene: Scene, episode: int | None) -> Imported:
+    """Read one episode; video is decoded when it is written."""
+    info = _info(path)
+    row = _episode(path, episode)
+    fps = info.number("fps", above=0, most=10_000, suspect="milliseconds")
+    features = info.inside("features")
+    table = _table(path, info, row, fps)
+    source = scene.source
+    if not source.rest:
+        expected = f"the scene with {EXAMPLE}"
+        raise RecordingError(f"{path}: no column is mapped", got=f"columns {sorted(features.rest)}", expected=expected)
+    found = Imported(notes={"format": NAME, "episode": int(row["episode_index"]), "fps": fps, "unchecked": UNCHECKED})
+    t = np.arange(len(table["frame_index"])) / fps
+    for name, fields in source.each("motion").items():
+        found.motion[name] = _motion(fields, features, table, row, t)
+    for name, fields in source.each("cameras").items():
+        found.cameras[name] = _camera(path, fields, info, features, row, t)
+    nothing_left(source)
+    return found
+
+
+def _info(path: Path) -> Fields:
+    file = path / INFO
+    try:
+        info = Fields(json.loads(file_text(file)), str(file), ": ")
+    except RecordingError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"{file} is not valid JSON", got=error, remedy="restore it") from error
+    version = info.text("codebase_version")
+    if not version.startswith("v3."):
+        remedy = "convert it with lerobot's own script first"
+        raise RecordingError(f"{file}: another version", got=repr(version), expected="'v3.*'", remedy=remedy)
+    return info
+
+
+def _read_table(file: Path, *, filters: Any = None) -> dict[str, list[Any]]:
+    """The columns of a parquet file, its page checksums verified."""
+    try:
+        from pyarrow import parquet  # pyright: ignore[reportMissingImports]  (optional)
+    except ImportError as error:
+        raise MissingDependency("reading LeRobot needs pyarrow", remedy='pip install "torchcloth[data]"') from error
+    if not file.is_file():
+        raise RecordingError(f"{file} is missing", expected="a parquet file", remedy="download it")
+    with damaged(file, "parquet file"):
+        table = parquet.read_table(file, page_checksum_verification=True, filters=filters)
+        table.validate(full=True)
+        return table.to_pydict()
+
+
+def _episode(path: Path, episode: int | None) -> dict[str, Any]:
+    """The line about one episode in meta/episodes."""
+    rows: dict[int, dict[str, Any]] = {}
+    for file in sorted((path / "meta" / "episodes").rglob("*.parquet")):
+        columns = _read_table(file)
+        if "episode_index" not in columns:
+            raise RecordingError(f"{file} lists no episodes", got=sorted(columns)[:5], expected="episode_index")
+        for i, index in enumerate(columns["episode_index"]):
+            if index in rows or not isinstance(index, int):
+                raise RecordingError(f"{file} lists an episode twice", got=index)
+            rows[index] = {key: values[i] for key, values in columns.items()} | {"file": str(file)}
+    chosen = next(iter(rows)) if len(rows) == 1 and episode is None else episode
+    if chosen not in rows:
+        known = sorted(rows)
+        got = "no --episode" if episode is None else f"--episode {episode}"
+        expected = f"one of {known[0]} to {known[-1]}" if known else "meta/episodes"
+        raise RecordingError(f"{path} holds {len(rows)} episodes", got=got, expected=expected)
+    return rows[chosen]
+
+
+def _table(path: Path, info: Fields, row: dict[str, Any], fps: float) -> dict[str, np.ndarray]:
+    """The episode's rows, which must be one for each tick."""
+    file = path / _file(info, "data_path", row, "data")
+    number, length = row["episode_index"], _whole(row, "length")
+    columns = _read_table(file, filters=[("episode_index", "=", number)])
+    place = f"{file}: episode {number}"
+    with damaged(place, "table"):
+        table = {key: np.asarray(values) for key, values in columns.items()}
+    first = _whole(row, "dataset_from_index")
+    expected = {
+        "frame_index": np.arange(length),
+        "index": np.arange(first, first + length),
+        "timestamp": np.arange(length) / fps,
+    }
+    for key, values in expected.items():
+        column = checks.array(table.get(key), f"{place}, {key}", (length,))
+        if not np.allclose(column, values, rtol=0, atol=TOLERANCE if key == "timestamp" else 0):
+            i = int(np.argmax(np.abs(column - values)))
+            got = f"{column[i]:g} in row {i}"
+            raise RecordingError(f"{place}, {key} is not regular", got=got, expected=f"{values[i]:g}")
+    if _whole(row, "dataset_to_index") - first != length:
+        raise RecordingError(f"{row['file']} contradicts itself", got=f"length {length}", expected="its indices")
+    return table
+
+
+def _motion(fields: Fields, features: Fields, table: dict, row: dict[str, Any], t: np.ndarray) -> dict[str, np.ndarray]:
+    """The arrays of motion.npz for one arm."""
+    column = fields.text("column")
+    names = _names(features, column, fields)
+    values = checks.array(table.get(column), f"{fields.at('column')} {column}", (len(t), len(names)))
+    _agree(values, row, column)
+    unit = fields.text("unit")
+    if unit not in ("rad", "deg"):
+        raise RecordingError(f"{fields.at('unit')} is unknown", got=repr(unit), expected="rad or deg")
+    q = values[:, [_index(j, names, fields.at("joints")) for j in fields.take("joints")]]
+    out = {"t": t, "q": np.radians(q) if unit == "deg" else q}
+    width = fields.maybe(fields.take, "width")
+    scale = fields.maybe(fields.number, "width_scale", above=0) or 1.0
+    if width is not None:
+        out["width"] = values[:, _index(width, names, fields.at("width"))] * scale
+    closed = fields.maybe(fields.take, "closed")
+    if closed is not None:
+        if not isinstance(closed, bool):
+            raise RecordingError(f"{fields.at('closed')} is unclear", got=closed, expected="true or false")
+        out["closed"] = np.full(len(t), closed)
+    nothing_left(fields)
+    return out
+
+
+def _names(features: Fields, column: str, fields: Fields) -> list[str]:
+    """The names of a vector's entries; numbers where it has none."""
+    if not features.has(column):
+        raise RecordingError(f"{fields.at('column')} is unknown", got=repr(column), expected=f"{sorted(features.rest)}")
+    feature = Fields(features.rest[column], features.at(column))
+    shape = feature.array("shape", "N", kind="int").tolist()
+    if len(shape) != 1:
+        raise RecordingError(f"{features.at(column)} is no vector", got=shape, expected="one dimension")
+    names = feature.rest.get("names")
+    if isinstance(names, dict):  # lerobot also writes {"motors": [...]}
+        names = next(iter(names.values()), None)
+    if names is None:
+        return [str(i) for i in range(shape[0])]
+    if not isinstance(names, list) or len(names) != shape[0] or len({str(n) for n in names}) != shape[0]:
+        raise RecordingError(f"{features.at(column)}.names do not fit", got=names, expected=f"{shape[0]} names")
+    return [str(n) for n in names]
+
+
+def _index(word: Any, names: list[str], place: str) -> int:
+    if isinstance(word, str) and word in names:
+        return names.index(word)
+    if isinstance(word, int) and not isinstance(word, bool) and 0 <= word < len(names):
+        return word
+    raise RecordingError(f"{place} is unknown", got=repr(word), expected=f"one of {', '.join(names)}")
+
+
+def _agree(values: np.ndarray, row: dict[str, Any], column: str) -> None:
+    """Hold a column against the statistics that LeRobot kept when it recorded."""
+    size = np.abs(values).max() + 1e-9
+    for name, of in (("min", values.min(axis=0)), ("max", values.max(axis=0)), ("mean", values.mean(axis=0))):
+        kept = row.get(f"stats/{column}/{name}")
+        if kept is None:
+            continue
+        kept = checks.array(kept, f"{row['file']}: stats/{column}/{name}", of.shape)
+        if np.abs(kept - of).max() > AGREE * size:
+            i = int(np.argmax(np.abs(kept - of)))
+            got, expected = f"a {name} of {of[i]:.9g} in entry {i}", f"{kept[i]:.9g}, as recorded"
+            raise RecordingError(f"{column} contradicts its statistics", got=got, expected=expected)
+
+
+def _camera(
+    path: Path, fields: Fields, info: Fields, features: Fields, row: dict[str, Any], t: np.ndarray
+) -> ImportedCamera:
+    """A camera whose colour images are a stretch of a video."""
+    key = fields.text("color")
+    nothing_left(fields)
+    if not features.has(key):
+        raise RecordingError(f"{fields.at('color')} is unknown", got=repr(key), expected=f"{sorted(features.rest)}")
+    feature = Fields(features.rest[key], features.at(key))
+    if feature.text("dtype") != "video":
+        raise RecordingError(f"{features.at(key)} is no video", got=feature.at("dtype"), expected="video")
+    names: Any = feature.rest.get("names")
+    shape: dict[Any, int] = dict(zip(names or (), feature.array("shape", 3, kind="int").tolist(), strict=False))
+    if not {"height", "width"} <= shape.keys():
+        raise RecordingError(f"{feature.at('names')} are unclear", got=names, expected="height, width, channels")
+    size = shape["width"], shape["height"]
+    file = path / _file(info, "video_path", row, f"videos/{key}", video_key=key)
+    if not file.is_file():
+        raise RecordingError(f"{file} is missing", expected="a video", remedy="download it")
+    start = row.get(f"videos/{key}/from_timestamp")
+    end = row.get(f"videos/{key}/to_timestamp")
+    span = checks.array([start, end], f"{row['file']}: videos/{key}", (2,))
+    step = t[1] if len(t) > 1 else span[1] - span[0]
+    if abs(span[1] - span[0] - len(t) * step) > TOLERANCE * 10:
+        got = f"{span[1] - span[0]:g} s for {len(t)} frames"
+        raise RecordingError(f"{row['file']}: videos/{key} does not last", got=got, expected=f"{len(t) * step:g} s")
+    times = np.round((span[0] + t) * NANO).astype(np.int64)
+    frames = VideoFrames(file, 0, "color", times, round(TOLERANCE * NANO))
+    stream = ImageStream("color", np.arange(len(t)), t, (), size, frames)
+    return ImportedCamera({"width": size[0], "height": size[1]}, {"color": stream})
+
+
+def _file(info: Fields, key: str, row: dict[str, Any], group: str, **names: str) -> str:
+    """A path from its template in info.json."""
+    template = str(info.rest.get(key, ""))
+    numbers = {n: _whole(row, f"{group}/{n}") for n in ("chunk_index", "file_index")}
+    with damaged(info.at(key), "path template"):
+        path = template.format(**numbers, **names)
+    if not path or Path(path).is_absolute() or ".." in Path(path).parts:
+        raise RecordingError(f"{info.at(key)} leaves the data set", got=repr(template))
+    return path
+
+
+def _whole(row: dict[str, Any], key: str) -> int:
+    value = row.get(key)
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise RecordingError(f"{row['file']}: {key} is no number", got=repr(value), expected="a whole number")
+    return value

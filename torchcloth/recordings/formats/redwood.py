@@ -1,0 +1,173 @@
+"""RGB-D folders as Open3D and the Redwood data sets lay them out.
+
+    color/*.jpg|png  depth/*.png  camera_intrinsic.json|intrinsic.json  [trajectory.log]
+
+The intrinsic matrix in Open3D's JSON is stored column by column; the poses in a ``.log`` are camera-to-world, of a
+camera in the OpenCV convention. Depth is in millimetres unless the file says otherwise. Times are in the names of
+Redwood's images (``FRAME-MICROSECONDS.png``); Open3D's own carry none, then ``fps`` comes from the intrinsic file
+that its recorders write, or from the scene. Images are pairs in the order of their names.
+
+Text carries no checksum: a changed digit in the intrinsic or pose files goes unnoticed where it stays plausible, and
+so do changed bytes in the pixels of a JPEG; PNG files are verified.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import RecordingError
+from .. import checks
+from ..checks import Fields
+from ..images import ImageStream, Kind
+from .imported import (
+    NANO,
+    FileImages,
+    Imported,
+    ImportedCamera,
+    file_text,
+    fixed_pose,
+    image_size,
+    nothing_left,
+    seconds,
+)
+from .side import Scene
+
+NAME = "redwood"
+TITLE = "Open3D/Redwood RGB-D folder"
+COLOR, INTRINSIC = ("color", "rgb", "image"), ("camera_intrinsic.json", "intrinsic.json", "camera.json")
+TRAJECTORY = ("trajectory.log", "scene/trajectory.log")
+CAMERA = "cam0"
+UNCHECKED = "intrinsics, pose, and pixels of JPEG images"
+MILLIMETRE = 0.001
+TOGETHER = 50_000_000  # ns between the images of a pair
+LEAST, MOST = 0.05, 30.0  # m; where half of all depths lie
+_STAMPED = re.compile(r"\d+-(\d{6,})")
+
+
+def matches(path: Path) -> bool:
+    """Whether the folder is laid out like this."""
+    color = any((path / name).is_dir() for name in COLOR)
+    return (path / "depth").is_dir() and color and any((path / name).is_file() for name in INTRINSIC)
+
+
+def read(path: Path, scene: Scene, episode: int | None) -> Imported:
+    """Read the folder; the images are checked when they are copied."""
+    source = scene.source
+    name = source.maybe(source.text, "camera") or CAMERA
+    fps = source.maybe(source.number, "fps", above=0, most=1000, suspect="milliseconds")
+    nothing_left(source)
+    camera, fps = _camera(path, fps)
+    camera.known.setdefault("depth_scale", scene.camera(name).get("depth_scale", MILLIMETRE))
+    color = _images(path / next(n for n in COLOR if (path / n).is_dir()), (".jpg", ".jpeg", ".png"))
+    depth = _images(path / "depth", (".png",))
+    if len(color) != len(depth):
+        got = f"{len(color)} colour and {len(depth)} depth images"
+        raise RecordingError(f"{path} is not made of pairs", got=got, expected="as many of each")
+    times = {"color": _times(color, fps), "depth": _times(depth, fps)}
+    apart = np.abs(times["color"] - times["depth"])
+    if apart.max() > TOGETHER:
+        got = f"{apart.max() / NANO:.3g} s between {color[int(apart.argmax())].name} and its depth image"
+        raise RecordingError(f"{path} is not made of pairs", got=got, expected=f"at most {TOGETHER / NANO:g} s")
+    start = int(min(t[0] for t in times.values()))
+    size = camera.known["width"], camera.known["height"]
+    kinds: dict[Kind, list[Path]] = {"depth": depth, "color": color}
+    for kind, paths in kinds.items():
+        numbers = np.arange(len(paths))
+        stream = ImageStream(kind, numbers, seconds(times[kind], start), (), size, FileImages(paths))
+        camera.streams[kind] = stream
+    if image_size(depth[0]) != size:
+        raise RecordingError(f"{depth[0]} has the wrong size", got=image_size(depth[0]), expected=f"{size}")
+    _plausible(camera.streams["depth"], float(camera.known["depth_scale"]), depth[0])
+    found = Imported(cameras={name: camera}, notes={"format": NAME, "start_ns": start, "unchecked": UNCHECKED})
+    log = next((path / n for n in TRAJECTORY if (path / n).is_file()), None)
+    if log is not None:
+        camera.known["T_world_camera"] = fixed_pose(_poses(log, len(depth)), str(log))
+    return found
+
+
+def _camera(path: Path, fps: float | None) -> tuple[ImportedCamera, float | None]:
+    """Intrinsics, and what Open3D's recorders add: the rate and the depth scale."""
+    file = path / next(n for n in INTRINSIC if (path / n).is_file())
+    try:
+        fields = Fields(json.loads(file_text(file)), str(file), ": ")
+    except RecordingError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"{file} is not valid JSON", got=error, remedy="restore it") from error
+    flat = fields.array("intrinsic_matrix", 9)
+    K = flat.reshape(3, 3).T
+    if min(K[0, 0], K[1, 1]) <= 0 or not np.array_equal(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
+        got, expected = flat.tolist(), "[fx, 0, 0, s, fy, 0, cx, cy, 1], column by column as Open3D writes it"
+        raise RecordingError(f"{fields.at('intrinsic_matrix')} is no camera matrix", got=got, expected=expected)
+    width, height = fields.whole("width"), fields.whole("height")
+    if not (0 < K[0, 2] < width and 0 < K[1, 2] < height):
+        got = f"principal point {K[:2, 2].tolist()} in {width} x {height} pixels"
+        raise RecordingError(f"{fields.at('intrinsic_matrix')} looks away from the image", got=got)
+    known: dict[str, Any] = {"width": width, "height": height, "K": K}
+    units = fields.maybe(fields.number, "depth_scale", above=0, most=1e6, suspect="metres per unit")
+    if units is not None:
+        known["depth_scale"] = 1 / units  # Open3D stores units per metre
+    rate = fields.maybe(fields.number, "fps", above=0, most=1000, suspect="milliseconds")
+    if rate is not None and fps is not None and rate != fps:
+        raise RecordingError("source.fps contradicts the file", got=fps, expected=f"{rate:g}", remedy="leave it out")
+    return ImportedCamera(known), rate or fps
+
+
+def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    paths = sorted(p for p in folder.iterdir() if p.is_file())
+    wrong = [p for p in paths if p.suffix.lower() not in suffixes]
+    if not paths or wrong:
+        got = wrong[0].name if wrong else "no image"
+        raise RecordingError(f"{folder} is no image folder", got=got, expected=f"only {' '.join(suffixes)} files")
+    numbers = [re.match(r"\D*(\d+)", p.stem) for p in paths]
+    if any(n is None for n in numbers):
+        raise RecordingError(f"{folder} holds unnumbered images", got=paths[0].name, expected="frame numbers as names")
+    order = [int(n.group(1)) for n in numbers if n]
+    lengths = [len(p.stem) for p in paths]
+    wrong = (np.diff(order) != 1) | (np.diff(lengths) != 0)
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        got = f"{paths[i].name} then {paths[i + 1].name}"
+        raise RecordingError(f"{folder} misses an image", got=got, expected="consecutive numbers, of one length")
+    return paths
+
+
+def _times(paths: list[Path], fps: float | None) -> np.ndarray:
+    stamps = [_STAMPED.fullmatch(p.stem) for p in paths]
+    if all(stamps):
+        return np.array([int(s.group(1)) * 1000 for s in stamps if s])
+    if any(stamps):
+        raise RecordingError(f"{paths[0].parent}: some names carry a time", expected="all or none")
+    if fps is None:
+        expected = 'the scene with "source": {"fps": 30}'
+        raise RecordingError(f"{paths[0].parent}: the images carry no times", expected=expected)
+    return np.round(np.arange(len(paths)) * (NANO / fps)).astype(np.int64)
+
+
+def _plausible(depth: ImageStream, scale: float, path: Path) -> None:
+    """Refuse depths that lie beyond any cloth experiment in the unit that was assumed."""
+    seen = depth.load(0)
+    middle = float(np.median(seen[seen > 0])) * scale if (seen > 0).any() else 1.0
+    if not LEAST < middle < MOST:
+        got, remedy = f"a median depth of {middle:.3g} m", "set cameras.NAME.depth_scale in the scene"
+        raise RecordingError(f"{path} is not in units of {scale:g} m", got=got, expected="0.05 to 30 m", remedy=remedy)
+
+
+def _poses(log: Path, count: int) -> np.ndarray:
+    """Camera-to-world poses [N, 4, 4]; each follows a line ``i j n``."""
+    lines = [line.split() for line in file_text(log).splitlines() if line.strip()]
+    blocks = [lines[i : i + 5] for i in range(0, len(lines), 5)]
+    try:
+        heads = [[int(word) for word in block[0]] for block in blocks]
+        poses = np.array([[[float(word) for word in row] for row in block[1:]] for block in blocks])
+    except ValueError as error:
+        raise RecordingError(f"{log} is damaged", got=error, expected="i j n and four rows of four numbers") from error
+    poses = checks.array(poses, str(log), (count, 4, 4))
+    if any(head[:2] != [i, i] for i, head in enumerate(heads)):
+        raise RecordingError(f"{log} is not in order", expected=f"frames 0 to {count - 1}, one pose each")
+    return poses

@@ -1,0 +1,121 @@
+"""What single ROS 2 messages hold, as arrays. Messages are objects with the fields of sensor_msgs and geometry_msgs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...errors import RecordingError
+from .imported import NANO
+
+# encoding: (dtype, channels, whether blue comes first)
+PIXELS = {
+    "16UC1": ("u2", 1, False),
+    "mono16": ("u2", 1, False),
+    "32FC1": ("f4", 1, False),
+    "mono8": ("u1", 1, False),
+    "8UC1": ("u1", 1, False),
+    "rgb8": ("u1", 3, False),
+    "bgr8": ("u1", 3, True),
+    "8UC3": ("u1", 3, True),
+    "rgba8": ("u1", 4, False),
+    "bgra8": ("u1", 4, True),
+}
+DEPTHS = ("16UC1", "mono16", "32FC1")
+MODELS = ("plumb_bob", "rational_polynomial", "")  # those whose D is in OpenCV's order; "" with an empty D
+POINT_TYPES = {7: "f4", 8: "f8"}
+JPEG, PNG = b"\xff\xd8", b"\x89PNG"
+LEAST_STAMP = 1  # ns; a stamp of zero was never set
+
+
+def stamp(message: Any, place: str) -> int:
+    """The time of measurement [ns] in a message's header."""
+    value = message.header.stamp
+    ns = int(value.sec) * NANO + int(value.nanosec)
+    if ns < LEAST_STAMP or not 0 <= value.nanosec < NANO:
+        got = f"{value.sec} s, {value.nanosec} ns"
+        raise RecordingError(f"{place} has no time stamp", got=got, remedy="set header.stamp when recording")
+    return ns
+
+
+def position(value: Any) -> np.ndarray:
+    """[3] of a Point or Vector3."""
+    return np.array([value.x, value.y, value.z], dtype=float)
+
+
+def quaternion(value: Any) -> np.ndarray:
+    """[4] scalar first of a Quaternion, which ROS stores scalar last."""
+    return np.array([value.w, value.x, value.y, value.z], dtype=float)
+
+
+def pixels(message: Any, place: str) -> np.ndarray:
+    """The array [H, W] or [H, W, 3] of an Image, in its own type."""
+    if message.encoding not in PIXELS:
+        expected = f"one of {', '.join(PIXELS)}"
+        raise RecordingError(f"{place} has an unknown encoding", got=repr(message.encoding), expected=expected)
+    code, channels, swapped = PIXELS[message.encoding]
+    dtype = np.dtype(code).newbyteorder(">" if message.is_bigendian else "<")
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row = width * channels * dtype.itemsize
+    data = np.asarray(message.data, dtype=np.uint8)
+    if step < row or len(data) != step * height or not row:
+        got = f"{len(data)} bytes, step {step}"
+        raise RecordingError(f"{place} does not fill its image", got=got, expected=f"{height} rows of {row} bytes")
+    rows = np.ascontiguousarray(data.reshape(height, step)[:, :row]).view(dtype)
+    rows = rows.astype(dtype.newbyteorder("="))
+    if channels == 1:
+        return rows
+    rows = rows.reshape(height, width, channels)[..., :3]
+    return rows[..., ::-1] if swapped else rows
+
+
+def compressed(message: Any, place: str) -> bytes:
+    """The PNG or JPEG file in a CompressedImage; the depth transport puts twelve bytes before its PNG."""
+    data = bytes(message.data)
+    if "compressedDepth" in message.format:
+        if not message.format.startswith("16UC1"):
+            raise RecordingError(f"{place} holds quantised depth", got=message.format, expected="16UC1")
+        data = data[12:]
+    if not data.startswith((JPEG, PNG)):
+        raise RecordingError(f"{place} is neither JPEG nor PNG", got=repr(message.format))
+    return data
+
+
+def intrinsics(message: Any, place: str, *, rectified: bool) -> dict[str, Any]:
+    """Size, K and distortion of a CameraInfo in the words of episode.json; rectified images take P and no D."""
+    if message.distortion_model not in MODELS:
+        expected = "plumb_bob or rational_polynomial"
+        raise RecordingError(f"{place} has another lens model", got=repr(message.distortion_model), expected=expected)
+    K = np.asarray(message.k, dtype=float).reshape(3, 3)
+    P = np.asarray(message.p, dtype=float).reshape(3, 4)
+    known = {"width": int(message.width), "height": int(message.height)}
+    if rectified:
+        return {**known, "K": P[:, :3]}
+    return {**known, "K": K, "distortion": np.asarray(message.d, dtype=float)}
+
+
+def cloud(message: Any, place: str) -> np.ndarray:
+    """The finite points [N, 3] of a PointCloud2, in the message's frame."""
+    by_name = {f.name: f for f in message.fields}
+    wrong = [n for n in "xyz" if n not in by_name or by_name[n].datatype not in POINT_TYPES or by_name[n].count > 1]
+    if wrong:
+        raise RecordingError(f"{place} has no {wrong[0]}", got=sorted(by_name), expected="x, y, z as floats")
+    height, width = int(message.height), int(message.width)
+    step, row_step = int(message.point_step), int(message.row_step)
+    data = np.asarray(message.data, dtype=np.uint8)
+    ends = [int(by_name[n].offset) + np.dtype(POINT_TYPES[by_name[n].datatype]).itemsize for n in "xyz"]
+    if max(ends) > step or row_step < width * step or len(data) != row_step * height:
+        got = f"{len(data)} bytes, row_step {row_step}, point_step {step}"
+        raise RecordingError(f"{place} does not fill its points", got=got, expected=f"{height} rows of {width}")
+    order = ">" if message.is_bigendian else "<"
+    layout: Any = {
+        "names": list("xyz"),
+        "formats": [order + POINT_TYPES[by_name[n].datatype] for n in "xyz"],
+        "offsets": [int(by_name[n].offset) for n in "xyz"],
+        "itemsize": step,
+    }
+    rows = np.ascontiguousarray(data.reshape(height, row_step)[:, : width * step]) if height else data
+    points = rows.reshape(-1).view(np.dtype(layout))
+    xyz = np.stack([points[n].astype(float) for n in "xyz"], axis=-1).reshape(-1, 3)
+    return xyz[np.isfinite(xyz).all(axis=1)]
