@@ -4,6 +4,7 @@ film = viewing.film_of(recordings.read("episodes/ep_01"))
 viewing.animate(film, "ep_01.gif")
 """
 
+from .distances import film_of_fit, with_cloth
 from .episodes import film_of
 from .film import Cloud, Curve, Film, Plane, Sheet, Solid, Trace, View
 from .pictures import animate, picture
@@ -19,5 +20,7 @@ __all__ = [
     "View",
     "animate",
     "film_of",
+    "film_of_fit",
     "picture",
+    "with_cloth",
 ]

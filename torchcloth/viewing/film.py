@@ -15,6 +15,7 @@ from ..recordings import Camera
 
 Array = np.ndarray
 Colour = tuple[int, int, int]  # sRGB, 0 to 255
+DISTANCE = "distance"  # name of the curve that belongs to the sheets' values; pictures draw it below
 
 CLOTH, TRUTH, POINTS, MARKERS = (158, 184, 206), (126, 168, 110), (30, 34, 40), (200, 40, 120)
 ARM, COLLIDER, PATH = (206, 210, 215), (206, 196, 180), (70, 110, 190)
@@ -28,6 +29,7 @@ class Sheet:
     faces: Array  # [F, 3]
     values: Array | None = None  # [T, V] in the film's unit, NaN where unknown; None: plain colour
     colour: Colour = CLOTH
+    net: bool = False  # show its hems or edges only, so that another sheet can be seen behind
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +185,19 @@ class Film:
         yield from ((name, s.poses) for name, s in self.solids.items())
         yield from ((name, t.poses) for name, t in self.traces.items())
         yield from ((name, v.index) for name, v in self.views.items())
+
+
+def edges_of(faces: Array) -> Array:
+    """[E, 2] vertices of the edges of triangles [F, 3], each once."""
+    return np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+
+
+def hems_of(faces: Array) -> Array:
+    """[E, 2] vertices of the edges that only one of the triangles [F, 3] has."""
+    edges, count = np.unique(
+        np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True
+    )
+    return edges[count == 1]
 
 
 def placed(solid: Solid, frame: int) -> Array:

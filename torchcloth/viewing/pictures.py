@@ -14,7 +14,7 @@ from .saving import atomically
 from .stage import Stage
 
 RATE = 25.0  # 1/s; browsers slow a GIF of more than 50 down
-COLOURS = 64  # of a GIF
+COLOURS = 96  # of a GIF
 PANELS = 4  # moments on a PNG
 
 
@@ -22,7 +22,7 @@ def animate(
     film: Film,
     path: str | Path,
     *,
-    size: tuple[int, int] = (640, 480),
+    size: tuple[int, int] = (560, 420),
     rate: float = RATE,
     look: tuple[float, float] | None = None,
     on_frame: Callable[[int, int], None] | None = None,

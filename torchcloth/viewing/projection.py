@@ -8,18 +8,27 @@ import numpy as np
 
 from ..observe import DepthCamera, look_at
 from .colours import colours
-from .film import Array, Film, Sheet, placed
+from .film import Array, Film, Sheet, edges_of, hems_of, placed
 
 FOCAL = 2.2  # image heights: a long lens, so that lengths can be compared
 MARGIN = 0.06  # of the image, left free around what the film is about
 ABOVE = 0.15  # m, shown of the arms above the grippers
 TURN = 20.0  # degrees, by which the eye stands beside the recorded camera, or beside straight on
 ELEVATIONS = (12.0, 55.0)  # degrees, of the eye above what it looks at
-AMBIENT = 0.55  # share of light that comes from everywhere
-LIGHT = np.array([-0.45, -0.55, -0.7])  # direction to the light, in the camera's axes (x right, y down, z forward)
+LIGHT = np.array([-0.3, -0.6, -0.75])  # direction to the light, in the camera's axes (x right, y down, z forward)
 DOT = 0.0038  # of the image's height, radius of a point
 IN_FRONT = 0.015  # of the scene's size, by which points come before the surface that they were measured on
-BEHIND = 0.82  # brightness of a cloth's back
+NEAR = 0.05  # m, what is nearer to the camera is not drawn
+
+
+class Light(NamedTuple):
+    """How much shape darkens colours."""
+
+    ambient: float  # share that comes from everywhere
+    behind: float  # brightness of a back side
+
+
+PLAIN, READABLE = Light(0.55, 0.82), Light(0.82, 1.0)  # the other where colours are read against a scale
 
 
 class Polygons(NamedTuple):
@@ -73,10 +82,13 @@ def _direction(film: Film, centre: Array) -> tuple[float, float]:
 def polygons(film: Film, frame: int, camera: DepthCamera) -> Polygons:
     """Everything in a frame but planes and lines."""
     low, high = film.box()
-    parts = [_sheet(sheet, frame, film.worst, camera) for sheet in film.sheets.values()]
+    reach = IN_FRONT * float(np.linalg.norm(high - low))
+    parts = [
+        _net(sheet, frame, reach, camera) if sheet.net else _sheet(sheet, frame, film.worst, camera)
+        for sheet in film.sheets.values()
+    ]
     for solid in film.solids.values():
         parts.append(_solid(placed(solid, frame), solid.faces, np.array(solid.colour), camera))
-    reach = IN_FRONT * float(np.linalg.norm(high - low))
     parts += [_dots(cloud.frames[frame], np.array(cloud.colour), reach, camera) for cloud in film.clouds.values()]
     if not parts:
         return Polygons(np.zeros((0, 4, 2)), np.zeros((0, 3)))
@@ -87,32 +99,44 @@ def polygons(film: Film, frame: int, camera: DepthCamera) -> Polygons:
 
 def _sheet(sheet: Sheet, frame: int, worst: float, camera: DepthCamera) -> tuple[Array, Array, Array]:
     x, faces = sheet.vertices[frame].astype(float), sheet.faces
+    normals = _smooth_normals(x, faces)
     if sheet.values is None:
-        colour = np.broadcast_to(np.array(sheet.colour, float), (len(faces), 3))
-    else:
-        colour = colours(sheet.values[frame], worst).astype(float)[faces].mean(1)
-    return _shaded(x, faces, _smooth_normals(x, faces), colour, camera)
+        return _shaded(x, faces, normals, np.array(sheet.colour), PLAIN, camera)
+    colour = colours(sheet.values[frame], worst).astype(float)[faces].mean(1)
+    return _shaded(x, faces, normals, colour, READABLE, camera)
+
+
+def _net(sheet: Sheet, frame: int, reach: float, camera: DepthCamera) -> tuple[Array, Array, Array]:
+    """Hems as polygons without area; where there are none, all edges."""
+    pixels, depth = camera.project(sheet.vertices[frame].astype(float))
+    edges = hems_of(sheet.faces)
+    edges = edges if len(edges) else edges_of(sheet.faces)
+    edges = edges[depth[edges].min(1) > NEAR]
+    colour = np.broadcast_to(np.array(sheet.colour) / 255, (len(edges), 3))
+    return pixels[edges][:, [0, 1, 1, 1]], colour, depth[edges].mean(1) - reach
 
 
 def _solid(x: Array, faces: Array, colour: Array, camera: DepthCamera) -> tuple[Array, Array, Array]:
     normal = _normals(x, faces)
     outside = ((camera.T_world_camera[:3, 3] - x[faces[:, 0]]) * normal).sum(-1) > 0
     faces, normal = faces[outside], normal[outside]
-    return _shaded(x, faces, normal, np.broadcast_to(colour.astype(float), (len(faces), 3)), camera)
+    return _shaded(x, faces, normal, colour, PLAIN, camera)
 
 
-def _shaded(x: Array, faces: Array, normal: Array, colour: Array, camera: DepthCamera) -> tuple[Array, Array, Array]:
+def _shaded(
+    x: Array, faces: Array, normal: Array, colour: Array, paint: Light, camera: DepthCamera
+) -> tuple[Array, Array, Array]:
     """Corners [F, 4, 2] px, colours [F, 3] and depths [F] m of the triangles that lie in front of the camera."""
     pixels, depth = camera.project(x)
     corner_depth = depth[faces]
-    ahead = corner_depth.min(1) > 0.05
-    faces, normal, colour = faces[ahead], normal[ahead], colour[ahead]
+    ahead = corner_depth.min(1) > NEAR
+    faces, normal, colour = faces[ahead], normal[ahead], np.broadcast_to(colour, (len(ahead), 3))[ahead]
     towards = camera.T_world_camera[:3, 3] - x[faces].mean(1)
     back = (towards * normal).sum(-1) < 0
     normal = np.where(back[:, None], -normal, normal)
     light = camera.T_world_camera[:3, :3] @ (LIGHT / np.linalg.norm(LIGHT))
-    bright = AMBIENT + (1 - AMBIENT) * np.clip(normal @ light, 0, 1)
-    bright = np.where(back, BEHIND * bright, bright)
+    bright = paint.ambient + (1 - paint.ambient) * np.clip(normal @ light, 0, 1)
+    bright = np.where(back, paint.behind * bright, bright)
     corners = pixels[faces][:, [0, 1, 2, 2]]
     return corners, np.clip(colour / 255 * bright[:, None], 0, 1), corner_depth[ahead].mean(1)
 
@@ -120,7 +144,7 @@ def _shaded(x: Array, faces: Array, normal: Array, colour: Array, camera: DepthC
 def _dots(points: Array, colour: Array, reach: float, camera: DepthCamera) -> tuple[Array, Array, Array]:
     """Points as small diamonds."""
     pixels, depth = camera.project(points)
-    pixels, depth = pixels[depth > 0.05], depth[depth > 0.05]
+    pixels, depth = pixels[depth > NEAR], depth[depth > NEAR]
     shape = DOT * camera.height * np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
     return pixels[:, None] + shape, np.broadcast_to(colour / 255, (len(pixels), 3)), depth - reach
 

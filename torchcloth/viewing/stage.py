@@ -9,14 +9,13 @@ import numpy as np
 
 from ..errors import InvalidInput
 from .colours import colour_map
-from .film import Array, Film, Plane, placed
+from .film import DISTANCE, Array, Film, Plane, placed
 from .projection import camera_for, polygons
 
 INK, FAINT, GRID, SHADE, PAPER = "#22262b", "#6d747c", "#dfe2e6", 0.86, "#ffffff"
 DPI = 100
 CELL = 0.1  # m, of the grid on a plane or floor
-DISTANCE = "distance"  # the curve that is drawn below the picture
-STRIP, BAR = 0.17, 0.13  # of the height, of the width, for the curve and the colour bar
+STRIP, BAR = 0.14, 0.13  # of the height, of the width, for the curve and the colour bar
 SMALLEST = 120  # pixels
 FLOOR = (255, 255, 255)
 
@@ -156,13 +155,15 @@ class Stage:
     def _strip(self, strip: float) -> Callable[[int], None]:
         """A curve over the film's time, with a mark that runs along it."""
         curve = self.film.curves[DISTANCE]
-        place = self.figure.add_axes((0.09, 0.09, 0.88 - (BAR if self.film.measured else 0), strip - 0.1))
+        width, height = self.figure.get_size_inches() * DPI
+        left, low = 52 / width, 24 / height  # pixels that the labels take
+        place = self.figure.add_axes((left, low, 0.97 - left - (BAR if self.film.measured else 0), strip - low))
         place.plot(curve.t, curve.values, color=INK, linewidth=1)
         place.set(xlim=(self.film.times[0], self.film.times[-1]), ylim=(0, 1.15 * float(curve.values.max())))
         place.tick_params(labelsize=7, colors=FAINT, length=2)
         place.locator_params(axis="y", nbins=2)
         place.spines[["top", "right"]].set_visible(False)
-        place.set_ylabel(f"mean\n[{curve.unit}]", fontsize=7, color=FAINT)
+        place.set_ylabel(f"mean\n{curve.unit}", fontsize=7, color=FAINT)
         (mark,) = place.plot([], [], "o", color="#bd0026", markersize=4, animated=True, clip_on=False)
 
         def draw(frame: int) -> None:
