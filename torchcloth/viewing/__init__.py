@@ -7,9 +7,12 @@ viewing.animate(film, "ep_01.gif")
 from .distances import film_of_fit, with_cloth
 from .episodes import film_of
 from .film import Cloud, Curve, Film, Plane, Sheet, Solid, Trace, View
-from .pictures import animate, picture
+from .pictures import RATE, animate, picture
+from .rerun_file import write_rrd
+from .viser_view import Viewer, write_viser
 
 __all__ = [
+    "RATE",
     "Cloud",
     "Curve",
     "Film",
@@ -18,9 +21,12 @@ __all__ = [
     "Solid",
     "Trace",
     "View",
+    "Viewer",
     "animate",
     "film_of",
     "film_of_fit",
     "picture",
     "with_cloth",
+    "write_rrd",
+    "write_viser",
 ]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from .film import Array
+from .geometry import Array
 
 UNKNOWN = (196, 198, 202)  # sRGB of what no measured point lies near
 MAP = "YlOrRd"
@@ -16,8 +18,8 @@ def colours(values: Array, worst: float) -> Array:
     return np.where(np.isnan(values)[..., None], np.array(UNKNOWN, np.uint8), shown)
 
 
-def colour_map():
-    """The map, for a colour bar."""
+def colour_map(name: str = MAP) -> Any:
+    """One of matplotlib's maps, for a colour bar."""
     from matplotlib import colormaps
 
-    return colormaps[MAP]
+    return colormaps[name]

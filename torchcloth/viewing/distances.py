@@ -12,7 +12,8 @@ from ..identification import replayed
 from ..losses import closest
 from ..recordings import Recording
 from .episodes import film_of
-from .film import DISTANCE, Array, Curve, Film, Sheet, edges_of
+from .film import DISTANCE, Curve, Film, Sheet
+from .geometry import Array, edges_of
 
 QUANTILE = 0.95  # of the distances, is dark red
 NOISES = 4.0  # standard deviations of the sensor that the colour bar spans at least

@@ -16,7 +16,6 @@ from ..types import Trajectory
 from .film import (
     MARKERS,
     TRUTH,
-    Array,
     Cloud,
     Curve,
     Film,
@@ -25,8 +24,8 @@ from .film import (
     Solid,
     Trace,
     View,
-    nearest,
 )
+from .geometry import Array, nearest
 
 RATE = 25.0  # 1/s, frames of an episode that was not observed
 MARGIN = 0.3  # m, by which a collider's plane is drawn beyond what lies over it

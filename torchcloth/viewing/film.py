@@ -12,12 +12,14 @@ import numpy as np
 
 from ..errors import InvalidInput
 from ..recordings import Camera
+from .geometry import Array, nearest
 
-Array = np.ndarray
 Colour = tuple[int, int, int]  # sRGB, 0 to 255
 DISTANCE = "distance"  # name of the curve that belongs to the sheets' values; pictures draw it below
 
 CLOTH, TRUTH, POINTS, MARKERS = (158, 184, 206), (126, 168, 110), (30, 34, 40), (200, 40, 120)
+CELL = 0.1  # m, of the grid on a plane or floor
+FLOOR = (255, 255, 255)
 ARM, COLLIDER, PATH = (206, 210, 215), (206, 196, 180), (70, 110, 190)
 
 
@@ -76,13 +78,14 @@ class View:
     camera: Camera
     index: Array  # [T] int64
 
-    def depth(self, frame: int) -> Array | None:
-        """The depth image [H, W] m of a film's frame, NaN where the sensor saw nothing; None where there is none."""
-        stream, scale = self.camera.depth, self.camera.depth_scale
-        if stream is None or scale is None or self.index[frame] < 0:
+    def raw(self, frame: int) -> Array | None:
+        """The depth image uint16 [H, W] of a film's frame, 0 where invalid; None where there is none.
+
+        Times ``camera.depth_scale`` it is in metres.
+        """
+        if self.camera.depth is None or self.camera.depth_scale is None or self.index[frame] < 0:
             return None
-        raw = stream.load(int(self.index[frame]))
-        return np.where(raw > 0, raw * scale, np.nan)
+        return self.camera.depth.load(int(self.index[frame]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,28 +190,20 @@ class Film:
         yield from ((name, v.index) for name, v in self.views.items())
 
 
-def edges_of(faces: Array) -> Array:
-    """[E, 2] vertices of the edges of triangles [F, 3], each once."""
-    return np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
-
-
-def hems_of(faces: Array) -> Array:
-    """[E, 2] vertices of the edges that only one of the triangles [F, 3] has."""
-    edges, count = np.unique(
-        np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True
-    )
-    return edges[count == 1]
-
-
 def placed(solid: Solid, frame: int) -> Array:
     """Vertices [V, 3] m of a solid in the world at a frame."""
     pose = solid.poses[frame if len(solid.poses) > 1 else 0]
     return solid.vertices @ pose[:3, :3].T + pose[:3, 3]
 
 
-def nearest(times: Array, wanted: Array) -> Array:
-    """[N] index into ``times`` [K], increasing, of the entry nearest to each of ``wanted`` [N]."""
-    after = np.clip(np.searchsorted(times, wanted), 1, max(1, len(times) - 1))
-    before = after - 1
-    after = np.minimum(after, len(times) - 1)
-    return np.where(wanted - times[before] <= times[after] - wanted, before, after)
+def ground_of(film: Film) -> list[Plane]:
+    """The film's planes; without any, a level floor under everything, for orientation."""
+    if film.planes:
+        return list(film.planes.values())
+    low, high = film.box()
+    lowest = [low[2], *(placed(solid, 0)[:, 2].min() for solid in film.solids.values())]
+    height, half = min(lowest), float(np.linalg.norm(high - low))
+    middle = np.round((low + high)[:2] / 2 / CELL) * CELL
+    half = np.ceil(half / CELL) * CELL
+    corners = middle + half * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    return [Plane(np.column_stack([corners, np.full(4, height)]), FLOOR)]

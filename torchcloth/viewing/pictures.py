@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from ..errors import InvalidInput
-from .film import Array, Film
+from .film import Film
+from .geometry import Array
 from .saving import atomically
 from .stage import Stage
 
 RATE = 25.0  # 1/s; browsers slow a GIF of more than 50 down
 COLOURS = 96  # of a GIF
+GIF, MOMENT = (560, 420), (480, 420)  # pixels
 PANELS = 4  # moments on a PNG
 
 
@@ -22,7 +24,7 @@ def animate(
     film: Film,
     path: str | Path,
     *,
-    size: tuple[int, int] = (560, 420),
+    size: tuple[int, int] | None = None,
     rate: float = RATE,
     look: tuple[float, float] | None = None,
     on_frame: Callable[[int, int], None] | None = None,
@@ -32,7 +34,7 @@ def animate(
     Args:
         film: what to show, e.g. ``film_of(recording)``.
         path: the file; it only ever holds a whole GIF.
-        size: (width, height) pixels.
+        size: (width, height) pixels; None: 560 x 420.
         rate: at most so many frames a second, up to 50.
         look: (azimuth, elevation) degrees of the eye; None: chosen by the film.
         on_frame: called with (frames done, frames in all).
@@ -48,7 +50,7 @@ def animate(
     if not 0 < rate <= 50:
         raise InvalidInput("rate", got=rate, expected="up to 50 frames a second, what a GIF can hold")
     film = film.at_most(rate)
-    stage = Stage(film, size, look)
+    stage = Stage(film, size or GIF, look)
     palette = _palette(stage)
     images = []
     for frame in range(len(film)):
@@ -65,14 +67,14 @@ def animate(
 
 
 def picture(
-    film: Film, path: str | Path, *, size: tuple[int, int] = (480, 420), look: tuple[float, float] | None = None
+    film: Film, path: str | Path, *, size: tuple[int, int] | None = None, look: tuple[float, float] | None = None
 ) -> Path:
     """Write a PNG with four moments of the film, from the first frame to the last, side by side.
 
     Args:
         film: what to show.
         path: the file; it only ever holds a whole PNG.
-        size: (width, height) pixels of one moment.
+        size: (width, height) pixels of one moment; None: 480 x 420.
         look: as of ``animate``.
 
     Returns:
@@ -81,7 +83,7 @@ def picture(
     from PIL import Image
 
     shown = np.unique(np.linspace(0, len(film) - 1, PANELS).round().astype(int))
-    stage = Stage(film, size, look)
+    stage = Stage(film, size or MOMENT, look)
     row = np.concatenate([stage.pixels(int(frame)) for frame in shown], axis=1)
     with atomically(Path(path)) as part:
         Image.fromarray(row).save(part, format="PNG", optimize=True)

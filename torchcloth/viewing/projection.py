@@ -8,7 +8,8 @@ import numpy as np
 
 from ..observe import DepthCamera, look_at
 from .colours import colours
-from .film import Array, Film, Sheet, edges_of, hems_of, placed
+from .film import Film, Sheet, placed
+from .geometry import Array, edges_of, face_normals, hems_of, unit, vertex_normals
 
 FOCAL = 2.2  # image heights: a long lens, so that lengths can be compared
 MARGIN = 0.06  # of the image, left free around what the film is about
@@ -117,7 +118,7 @@ def _net(sheet: Sheet, frame: int, reach: float, camera: DepthCamera) -> tuple[A
 
 
 def _solid(x: Array, faces: Array, colour: Array, camera: DepthCamera) -> tuple[Array, Array, Array]:
-    normal = _normals(x, faces)
+    normal = face_normals(x, faces)
     outside = ((camera.T_world_camera[:3, 3] - x[faces[:, 0]]) * normal).sum(-1) > 0
     faces, normal = faces[outside], normal[outside]
     return _shaded(x, faces, normal, colour, PLAIN, camera)
@@ -149,23 +150,6 @@ def _dots(points: Array, colour: Array, reach: float, camera: DepthCamera) -> tu
     return pixels[:, None] + shape, np.broadcast_to(colour / 255, (len(pixels), 3)), depth - reach
 
 
-def _normals(x: Array, faces: Array) -> Array:
-    a, b, c = x[faces[:, 0]], x[faces[:, 1]], x[faces[:, 2]]
-    return _unit(np.cross(b - a, c - a))
-
-
 def _smooth_normals(x: Array, faces: Array) -> Array:
     """[F, 3] normals of the triangles, each the mean of its corners' normals."""
-    return _unit(vertex_normals(x, faces)[faces].sum(1))
-
-
-def vertex_normals(x: Array, faces: Array) -> Array:
-    """[V, 3] unit normals, the mean of the triangles' around, weighted by area."""
-    a, b, c = x[faces[:, 0]], x[faces[:, 1]], x[faces[:, 2]]
-    total = np.zeros_like(x)
-    np.add.at(total, faces, np.cross(b - a, c - a)[:, None])
-    return _unit(total)
-
-
-def _unit(v: Array) -> Array:
-    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
+    return unit(vertex_normals(x, faces)[faces].sum(1))

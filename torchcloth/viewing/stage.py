@@ -9,15 +9,14 @@ import numpy as np
 
 from ..errors import InvalidInput
 from .colours import colour_map
-from .film import DISTANCE, Array, Film, Plane, placed
+from .film import CELL, DISTANCE, Film, Plane, ground_of
+from .geometry import Array
 from .projection import camera_for, polygons
 
 INK, FAINT, GRID, SHADE, PAPER = "#22262b", "#6d747c", "#dfe2e6", 0.86, "#ffffff"
 DPI = 100
-CELL = 0.1  # m, of the grid on a plane or floor
 STRIP, BAR = 0.14, 0.13  # of the height, of the width, for the curve and the colour bar
 SMALLEST = 120  # pixels
-FLOOR = (255, 255, 255)
 
 
 class Stage:
@@ -48,7 +47,7 @@ class Stage:
         self.camera = camera_for(film, inner, look)
         self.axes.set(xlim=(-0.5, inner[0] - 0.5), ylim=(inner[1] - 0.5, -0.5))
         self.axes.axis("off")
-        self.ground = _ground(film)
+        self.ground = ground_of(film)
         self._scenery()
         self.moving = [self._shadow(), self._bodies(), self._clock()]
         if film.measured:
@@ -172,19 +171,6 @@ class Stage:
             place.draw_artist(mark)
 
         return draw
-
-
-def _ground(film: Film) -> list[Plane]:
-    """The film's planes; without any, a level floor under everything, for orientation."""
-    if film.planes:
-        return list(film.planes.values())
-    low, high = film.box()
-    lowest = [low[2], *(placed(solid, 0)[:, 2].min() for solid in film.solids.values())]
-    height, half = min(lowest), float(np.linalg.norm(high - low))
-    middle = np.round((low + high)[:2] / 2 / CELL) * CELL
-    half = np.ceil(half / CELL) * CELL
-    corners = middle + half * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
-    return [Plane(np.column_stack([corners, np.full(4, height)]), FLOOR)]
 
 
 def _grid(plane: Plane) -> list[Array]:
