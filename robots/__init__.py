@@ -5,7 +5,7 @@ if __name__ != "torchcloth.robots":
 
 from .arm import Arm, Limits, Primitive, load
 from .description import models
-from .replay import replay
+from .replay import arm_of, replay
 from .scene import Scene, bimanual_rig
 
-__all__ = ["Arm", "Limits", "Primitive", "Scene", "bimanual_rig", "load", "models", "replay"]
+__all__ = ["Arm", "Limits", "Primitive", "Scene", "arm_of", "bimanual_rig", "load", "models", "replay"]

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from importlib import metadata
 
 from ..errors import TorchclothError
-from . import bench, convert, doctor, identify
+from . import bench, convert, doctor, identify, view
 
-VERBS = (identify, convert, doctor, bench)  # each has add(verbs)
+VERBS = (identify, view, convert, doctor, bench)  # each has add(verbs)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,0 +1,32 @@
+"""Episodes to look at: in a browser, in rerun's viewer, as GIF and PNG.
+
+film = viewing.film_of(recordings.read("episodes/ep_01"))
+viewing.animate(film, "ep_01.gif")
+"""
+
+from .distances import film_of_fit, with_cloth
+from .episodes import film_of
+from .film import Cloud, Curve, Film, Plane, Sheet, Solid, Trace, View
+from .pictures import RATE, animate, picture
+from .rerun_file import write_rrd
+from .viser_view import Viewer, write_viser
+
+__all__ = [
+    "RATE",
+    "Cloud",
+    "Curve",
+    "Film",
+    "Plane",
+    "Sheet",
+    "Solid",
+    "Trace",
+    "View",
+    "Viewer",
+    "animate",
+    "film_of",
+    "film_of_fit",
+    "picture",
+    "with_cloth",
+    "write_rrd",
+    "write_viser",
+]
