@@ -11,7 +11,7 @@ Array = np.ndarray
 
 
 def to_points(camera: DepthCamera, depth: Array, mask: Array | None = None) -> Array:
-    """World points [N, 3] m of the pixels that have a depth and lie in the mask, row by row.
+    """World points [N, 3] m of the pixels that have a depth, a ray and lie in the mask, row by row.
 
     Args:
         camera: the camera that took the image.
@@ -27,8 +27,8 @@ def to_points(camera: DepthCamera, depth: Array, mask: Array | None = None) -> A
         if image is not None and np.shape(image) != shape:
             raise InvalidInput(name, got=f"shape {np.shape(image)}", expected=f"{shape}, the camera's size")
     wanted = depth > 0 if mask is None else (depth > 0) & np.asarray(mask, bool)
-    rows, columns = np.nonzero(wanted)
-    return camera.unproject(np.stack([columns, rows], -1), depth[rows, columns])
+    rows, columns = np.nonzero(wanted & np.isfinite(camera.grid[..., 0]))
+    return camera.at_pixels(rows, columns, depth[rows, columns])
 
 
 def erode(mask: Array, pixels: int = 1) -> Array:

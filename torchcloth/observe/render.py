@@ -44,10 +44,11 @@ def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> 
     origin, directions = camera.rays()
     if not body:
         return np.zeros(directions.shape[:2], np.float32), np.full(directions.shape[:2], -1, np.int32)
-    rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1).astype(np.float32)
-    hit = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)))
+    looking = np.isfinite(directions[..., :1])
+    rays = np.concatenate([np.broadcast_to(origin, directions.shape), np.where(looking, directions, 1.0)], -1)
+    hit = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays, np.float32)))
     depth, geometry = hit["t_hit"].numpy(), hit["geometry_ids"].numpy()
-    seen = np.isfinite(depth) & (depth >= camera.range[0]) & (depth <= camera.range[1])
+    seen = np.isfinite(depth) & (depth >= camera.range[0]) & (depth <= camera.range[1]) & looking[..., 0]
     ids = np.full(depth.shape, -1, np.int32)
     ids[seen] = np.array(body, np.int32)[geometry[seen]]
     return np.where(seen, depth, 0).astype(np.float32), ids
