@@ -64,11 +64,16 @@ def thin_to_spacing(points: Array, spacing: float) -> Array:
         points: [N, 3] m.
         spacing: m.
     """
+    return np.asarray(points, dtype=float)[spaced(points, spacing)]
+
+
+def spaced(points: Array, spacing: float) -> Array:
+    """Indices, in order, of the points that `thin_to_spacing` keeps."""
     points = np.asarray(points, dtype=float)
     if not spacing > 0:
         raise InvalidInput("spacing", got=spacing, expected="a positive length in m")
     if len(points) == 0:
-        return points
+        return np.zeros(0, int)
     _, cell = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()
     counts = np.bincount(cell)
@@ -76,4 +81,4 @@ def thin_to_spacing(points: Array, spacing: float) -> Array:
     distance = ((points - mean[cell]) ** 2).sum(1)
     order = np.lexsort((np.arange(len(points)), distance, cell))
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    return points[np.sort(order[first])]
+    return np.sort(order[first])

@@ -32,7 +32,7 @@ def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> 
         MissingDependency: open3d cannot be imported.
         InvalidInput: a mesh that has the wrong shape, an index out of bounds or a vertex that is not finite.
     """
-    o3d = _open3d()
+    o3d = open3d_or_refuse()
     scene = o3d.t.geometry.RaycastingScene()
     body = []
     for index, (vertices, faces) in enumerate(meshes):
@@ -67,12 +67,13 @@ def _checked(index: int, vertices: Array, faces: Array) -> tuple[Array, Array]:
     return vertices, faces
 
 
-def _open3d() -> Any:
+def open3d_or_refuse() -> Any:
+    """The module open3d, or how to install it."""
     try:
         return import_module("open3d")  # here, not above: it takes seconds and needs a system library
     except ImportError as error:
         raise MissingDependency(
-            "rendering depth needs open3d",
+            "depth cameras and clouds need open3d",
             got=str(error),
             remedy='pip install "torchcloth[observe]"; a missing libusb-1.0.so.0 is the system package libusb-1.0-0 '
             "(apt-get install libusb-1.0-0)",
