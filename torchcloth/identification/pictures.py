@@ -22,13 +22,14 @@ def draw(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray, fo
     """Write fit.png, distances.png and parameters.png into ``folder``; returns their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     return [
-        _save(shapes(fit, episodes[0], faces), folder / "fit.png"),
-        _save(distances(fit, episodes, faces), folder / "distances.png"),
-        _save(parameters(fit), folder / "parameters.png"),
+        save_figure(shapes(fit, episodes[0], faces), folder / "fit.png"),
+        save_figure(distances(fit, episodes, faces), folder / "distances.png"),
+        save_figure(parameters(fit), folder / "parameters.png"),
     ]
 
 
-def _save(figure: Any, path: Path) -> Path:
+def save_figure(figure: Any, path: Path) -> Path:
+    """Write a matplotlib figure as PNG so that a crash leaves the old one or the new, never half."""
     part = path.with_name(f".{path.name}.part.png")
     figure.savefig(part, dpi=110, bbox_inches="tight")
     os.replace(part, path)

@@ -1,0 +1,85 @@
+"""``torchcloth inspect`` as a user meets it."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from swinging import episode, markers
+
+from torchcloth import recordings
+from torchcloth.cli import main
+
+
+@pytest.fixture
+def folder(tmp_path):
+    stream = markers(lag=0.1, extra={"grid": np.array([8, 8])})
+    return recordings.write(episode(markers=stream), tmp_path / "episode")
+
+
+def test_tables_a_result_and_a_picture(folder, tmp_path, capsys):
+    out = tmp_path / "deep" / "out"
+    assert main(["inspect", str(folder), "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "lag of the observations" in text
+    assert "rejected frames, markers" in text
+    assert sorted(path.name for path in out.iterdir()) == ["inspection.json", "inspection.png"]
+    assert json.loads((out / "inspection.json").read_text())["lag"]["value"] == pytest.approx(0.1, abs=0.01)
+
+
+def test_json_alone_on_standard_output(folder, capsys):
+    assert main(["inspect", str(folder), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["streams"]["markers"]["frames"] == 84
+    assert found["episode"] == str(folder)
+
+
+@pytest.mark.parametrize("damage", ["absent", "not json", "times", "out is a file"])
+def test_a_bad_episode_is_one_line_and_nothing_is_written(damage, folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    if damage == "absent":
+        folder = tmp_path / "nowhere"
+    elif damage == "not json":
+        (folder / "episode.json").write_text("{")
+    elif damage == "times":
+        with np.load(folder / "markers.npz") as file:
+            arrays = dict(file)
+        np.savez(folder / "markers.npz", **{**arrays, "t": arrays["t"][::-1]})
+    else:
+        out.write_text("taken")
+    assert main(["inspect", str(folder), "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("torchcloth: ")
+    assert error.count("\n") == 1
+    assert damage == "out is a file" or not out.exists()
+
+
+def test_depth_images_are_looked_at_and_a_damaged_one_is_one_line(tmp_path, capsys):
+    image = pytest.importorskip("PIL.Image")
+    from torchcloth.observe import DepthCamera, encode
+
+    camera = DepthCamera.azure_kinect_nfov(np.eye(4))
+    source = tmp_path / "images"
+    source.mkdir()
+    depth = np.full((576, 640), 1.25, np.float32)
+    depth[:144] = 0
+    paths = []
+    for k in range(3):
+        paths.append(source / f"{k:06d}.png")
+        image.fromarray(encode(depth)).save(paths[-1])
+    stream = recordings.ImageStream("depth", np.arange(3), np.arange(3) / 30, tuple(paths), (640, 576))
+    recorded = recordings.Camera(**camera.calibration(), depth_scale=0.001, depth=stream)
+    folder = recordings.write(episode(cameras={"cam0": recorded}), tmp_path / "episode")
+    assert main(["inspect", str(folder), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["depth"]["cam0"]["invalid"] == pytest.approx(0.25)
+    assert found["depth"]["cam0"]["middle"] == pytest.approx(1.25)
+    assert found["depth"]["cam0"]["distorted"]
+    assert found["streams"]["cam0/depth"]["rate"] == pytest.approx(30)
+    (folder / "cam0" / "depth" / "000001.png").write_bytes(b"no image")
+    assert main(["inspect", str(folder)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

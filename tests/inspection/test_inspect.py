@@ -1,0 +1,166 @@
+"""Faults that were put into an episode are found, in size and number."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from swinging import clouds, episode, markers, path, pattern
+
+from torchcloth import recordings as rec
+from torchcloth.inspection import draw, inspect, show
+from torchcloth.inspection.streams import ticks
+
+GRID = {"extra": {"grid": np.array([8, 8])}}
+
+
+@pytest.mark.parametrize(
+    ("observed", "lag"), [("markers", 0.32), ("markers", -0.15), ("points", 0.0), ("points", 0.32)]
+)
+def test_the_lag_is_found_within_its_error(lag, observed, needs_open3d):
+    stream = {"markers": markers(lag=lag, **GRID)} if observed == "markers" else {"points": clouds(lag=lag)}
+    found = inspect(episode(**stream)).lag
+    assert found.told
+    assert found.std < 0.02
+    assert abs(found.value - lag) < max(3 * found.std, 0.01)
+    assert found.stated == 0.0
+
+
+def test_a_lag_that_the_recording_states_is_no_news():
+    recording = replace(episode(markers=markers(lag=0.2, **GRID)), clock_offset=-0.2)
+    report = inspect(recording)
+    assert report.lag.value == pytest.approx(0.2, abs=0.01)
+    assert report.lag.stated == 0.2
+    assert not any("clocks differ" in note for note in report.notes)
+    assert any("set clock_offset to -0.2" in n for n in inspect(replace(recording, clock_offset=0.0)).notes)
+
+
+def test_its_standard_error_is_honest():
+    values = [inspect(episode(markers=markers(noise=0.01, seed=seed, **GRID))).lag for seed in range(8)]
+    spread, stated = np.std([v.value for v in values]), np.median([v.std for v in values])
+    assert spread / 3 < stated < 6 * spread + 0.003
+
+
+def test_a_motion_at_constant_speed_tells_no_lag():
+    t = np.arange(0, 8, 0.02)
+    straight = np.stack([0 * t, 0.1 * t, 0 * t + 0.5], -1)
+    recording = episode(markers=markers(**GRID))
+    stream = recording.markers
+    xyz = stream.xyz - path(stream.t)[:, None] + np.array([0, 0.1, 0]) * stream.t[:, None, None] + np.array([0, 0, 0.5])
+    quat, closed = np.tile([1.0, 0, 0, 0], (400, 1)), np.ones(400, bool)
+    steady = rec.GripperMotion(t, straight, quat, closed)
+    report = inspect(replace(recording, grippers={"hand": steady}, markers=replace(stream, xyz=xyz)))
+    assert not report.lag.told
+    assert any("does not tell a lag" in note for note in report.notes)
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.004])
+def test_static_noise_is_what_was_added(noise, needs_open3d):
+    report = inspect(episode(markers=markers(noise=noise, **GRID), points=clouds(noise=noise)))
+    assert report.noise["markers"].std == pytest.approx(noise, rel=0.15)
+    assert report.noise["markers"].axes == pytest.approx((noise,) * 3, rel=0.15)
+    assert "all stands" in report.noise["markers"].method
+    assert report.noise["points"].std == pytest.approx(noise, rel=0.15)
+    assert "still frames" in report.noise["points"].method
+
+
+def test_noise_in_one_direction_is_told_in_it():
+    stream = markers(noise=0.0, **GRID)
+    ray = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
+    scatter = np.random.default_rng(0).standard_normal((*stream.xyz.shape[:2], 1))
+    found = inspect(episode(markers=replace(stream, xyz=stream.xyz + 0.003 * scatter * ray))).noise["markers"]
+    assert found.std == pytest.approx(0.003, rel=0.1)
+    assert found.axes[2] < 1e-4
+
+
+@pytest.mark.parametrize("known", ["grid", "uv", "neither"])
+def test_frames_of_another_size_are_rejected_and_no_others(known):
+    extra = {"grid": GRID, "uv": {"uv": pattern()}, "neither": {}}[known]
+    stream = markers(noise=0.001, **extra)
+    spoiled = stream.xyz.copy()
+    middle = spoiled.mean(1, keepdims=True)
+    spoiled[10:15] = (middle + 1.15 * (spoiled - middle))[10:15]
+    spoiled[40] = (middle + 0.8 * (spoiled - middle))[40]
+    spoiled[60] = np.nan
+    spoiled[5:9, ::7] = np.nan  # unseen, not wrong
+    found = inspect(episode(markers=replace(stream, xyz=spoiled))).frames["markers"]
+    np.testing.assert_array_equal(np.flatnonzero(found.rejected), [10, 11, 12, 13, 14, 40, 60])
+    assert found.coverage[60] == 0
+    assert found.coverage[5] == pytest.approx(54 / 64)
+    assert ("unknown" in found.why) == (known == "neither")
+
+
+def test_a_wrong_size_throughout_is_seen_where_the_size_is_known():
+    stream = markers(**GRID)
+    large = replace(stream, xyz=1.2 * stream.xyz)
+    assert inspect(episode(markers=large)).frames["markers"].rejected.all()
+
+
+def test_clouds_outliers_crop_area_and_strangers(needs_open3d):
+    stream = clouds(noise=0.001, count=800)
+    rng = np.random.default_rng(1)
+    frames = [stream.frame(i) for i in range(len(stream))]
+    for i, frame in enumerate(frames):
+        frames[i] = np.concatenate([frame[frame[:, 2] > 0.3], frame.mean(0) + rng.uniform(0.3, 0.6, (5, 3))])
+    frames[20] = frames[20] * 2.0
+    spoiled = rec.PointClouds(stream.t, np.concatenate(frames), np.array([len(f) for f in frames]))
+    found = inspect(episode(points=spoiled)).frames["points"]
+    assert np.flatnonzero(found.rejected).tolist() == [20]
+    assert sum(found.removed.values()) == pytest.approx(5 * len(frames), rel=0.2)
+    assert found.cuts == {"z >": pytest.approx(0.3, abs=2e-3)}
+    whole = inspect(episode(points=stream)).frames["points"]
+    assert whole.cuts == {}
+    assert np.median(whole.coverage) == pytest.approx(1.0, abs=0.2)
+    assert np.median(found.coverage) < 0.85 * np.median(whole.coverage)  # 0.5 m - 0.3 m of the 0.3 m are left
+
+
+def test_ticks_gaps_and_jitter():
+    t = np.arange(50) / 10
+    even = ticks("points", t)
+    assert (even.frames, even.span, even.gaps) == (50, pytest.approx(4.9), 0)
+    assert even.rate == pytest.approx(10)
+    assert even.jitter < 1e-12
+    holed = ticks("points", np.delete(t, [20, 21, 22, 40]))
+    assert (holed.gaps, holed.largest_gap) == (2, pytest.approx(0.4))
+    assert holed.rate == pytest.approx(45 / 4.9)
+    noise = 0.01 * np.random.default_rng(0).standard_normal(2000)
+    assert ticks("points", np.arange(2000) / 10 + noise).jitter == pytest.approx(0.01 * np.sqrt(2), rel=0.1)
+    assert ticks("points", t[:1]).rate == 0.0
+
+
+def test_an_episode_without_observations_says_so(capsys, tmp_path):
+    report = inspect(episode())
+    assert report.lag is None
+    assert report.noise == report.frames == {}
+    assert any("nothing to compare" in note for note in report.notes)
+    show(report)
+    assert "hand" in capsys.readouterr().out
+    assert draw(report, tmp_path).is_file()
+
+
+def test_without_motion_there_is_no_lag():
+    report = inspect(replace(episode(markers=markers(**GRID)), grippers={}))
+    assert report.lag is None
+    assert "markers" in report.frames
+    assert report.noise == {}
+
+
+def test_the_report_is_json_and_a_picture(tmp_path, capsys, needs_open3d):
+    report = inspect(episode(markers=markers(lag=0.1, **GRID), points=clouds(lag=0.1)))
+    stored = json.loads(json.dumps(report.as_dict(), allow_nan=False))
+    assert stored["lag"]["value"] == pytest.approx(0.1, abs=0.01)
+    assert "constant speed" in stored["lag"]["cannot_tell"]
+    assert set(stored["streams"]) == {"hand", "points", "markers"}
+    assert len(stored["frames"]["points"]["coverage"]) == len(report.recording.points)
+    assert draw(report, tmp_path).read_bytes().startswith(b"\x89PNG")
+    assert [p.name for p in tmp_path.iterdir()] == ["inspection.png"]
+    show(report)
+    text = capsys.readouterr().out
+    assert "rate [Hz]" in text
+    assert "0.1" in text
+    assert max(map(len, text.splitlines())) <= 120

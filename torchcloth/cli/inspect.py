@@ -1,0 +1,39 @@
+"""``torchcloth inspect``: what an episode holds, and how far it can be trusted."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from ..errors import InvalidInput
+
+
+def add(verbs: Any) -> None:
+    """The verb."""
+    inspect = verbs.add_parser("inspect", help="streams, rates, gaps, lag, noise, rejected frames of an episode")
+    inspect.add_argument("episode", metavar="EPISODE", help="folder of a recording")
+    inspect.add_argument("--out", type=Path, metavar="DIR", help="also write inspection.json and inspection.png")
+    inspect.add_argument("--json", action="store_true", help="print inspection.json instead of tables")
+    inspect.set_defaults(run=_inspect)
+
+
+def _inspect(options: argparse.Namespace) -> int:
+    from .. import inspection, recordings
+    from ..identification.result import write_atomically
+
+    if options.out is not None and options.out.exists() and not options.out.is_dir():
+        raise InvalidInput("--out", got=f"{options.out}, a file", expected="a folder, new or existing")
+    report = inspection.inspect(recordings.read(options.episode))
+    text = json.dumps(report.as_dict(), indent=1, allow_nan=False) + "\n"
+    if options.json:
+        print(text, end="")
+    else:
+        inspection.show(report)
+    if options.out is not None:
+        picture = inspection.draw(report, options.out)
+        path = write_atomically(options.out / "inspection.json", text)
+        if not options.json:
+            print(f"result:  {path}\npicture: {picture}")
+    return 0

@@ -1,0 +1,186 @@
+"""Which frames cannot be the cloth, how much of it each shows, and what is cut off or stray."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import MissingDependency
+from ..observe import Segmentation, segment
+from ..recordings import ClothInfo, Markers, PointClouds
+
+TOLERANCE = 0.1  # of the cloth's size
+NEIGHBOURS = 4  # of a marker, whose pattern distances are looked at
+AREA = 8  # neighbours that say how much area a point stands for
+FLAT, MOVES = 1e-3, 0.02  # m: a bound that stays within the one while the cloud moves by the other is a cut
+LINK = 3.0  # times the usual distance of neighbours, within which points belong together
+QUERIES = 300
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Frame by frame.
+
+    Attributes:
+        rejected: [T] bool, that cannot be the cloth.
+        why: how they were told.
+        coverage: [T] share of the markers seen; of clouds, area seen over the cloth's (NaN where that is unknown).
+        removed: of clouds, how many points of all frames each stage of a `Segmentation` takes.
+        cuts: of clouds, bounds at which they end whatever the cloth does: {"z >": 0.075}.
+    """
+
+    rejected: np.ndarray
+    why: str
+    coverage: np.ndarray
+    removed: dict[str, int]
+    cuts: dict[str, float]
+
+
+def of_markers(markers: Markers, cloth: ClothInfo) -> Frames:
+    """Frames of markers: their distances must be those of the cloth to 10 %.
+
+    A grid (``extra["grid"]``, [rows, columns] of the markers in order) on a sheet: median arc along its rows and along
+    its columns against the sheet's sides. With ``uv``: median ratio of the distances of neighbours to those in the
+    pattern. With neither: to their own usual ones.
+    """
+    seen = np.isfinite(markers.xyz[..., 0])
+    if "grid" in markers.extra and cloth.sheet is not None:
+        ratio, why = _arcs(markers, cloth.sheet), "arcs along rows and columns against the sheet's sides"
+    else:
+        ratio, why = _neighbours(markers)
+    with np.errstate(invalid="ignore"):
+        rejected = np.logical_not(np.all(np.abs(ratio - 1) <= TOLERANCE, axis=-1))
+    return Frames(rejected, why, seen.mean(1), {}, {})
+
+
+def _arcs(markers: Markers, sheet: tuple[float, float]) -> np.ndarray:
+    """[T, 2] median lengths of rows and columns, each over the side of the sheet that it usually is nearer to."""
+    rows, columns = (int(n) for n in markers.extra["grid"])
+    grid = markers.xyz.reshape(len(markers.t), rows, columns, 3)
+    arcs = np.stack([_median(_arc(np.linalg.norm(np.diff(grid, axis=k), axis=-1), k)) for k in (1, 2)], -1)
+    usual = np.nanmedian(arcs, axis=0)
+    sides = np.array([sheet, sheet[::-1]])
+    return arcs / sides[np.argmin(np.abs(sides - usual).sum(1))]
+
+
+def _arc(pieces: np.ndarray, axis: int) -> np.ndarray:
+    """Sums of lengths along an axis; up to half of them may be unseen, and count as the mean of the others."""
+    seen = np.isfinite(pieces)
+    enough = seen.mean(axis) >= 0.5
+    mean = np.where(seen, pieces, 0.0).sum(axis) / np.maximum(seen.sum(axis), 1)
+    return np.where(enough, mean * pieces.shape[axis], np.nan)
+
+
+def _neighbours(markers: Markers) -> tuple[np.ndarray, str]:
+    """[T, 1] median ratio of neighbours' distances to what they should be."""
+    xyz = markers.xyz
+    if markers.uv is not None:
+        reference, why = markers.uv, "distances of neighbours against the pattern's"
+    else:
+        reference, why = np.nanmedian(xyz, axis=0), "distances of neighbours against their usual ones, size unknown"
+    away = np.linalg.norm(reference[:, None] - reference, axis=-1)
+    np.fill_diagonal(away, np.inf)
+    count = min(NEIGHBOURS, len(away) - 1)
+    if count < 1:
+        return np.ones((len(xyz), 1)), "a single marker: nothing to compare"
+    near = np.argsort(away, axis=1)[:, :count]
+    distance = np.linalg.norm(xyz[:, near] - xyz[:, :, None], axis=-1).reshape(len(xyz), -1)
+    pattern = markers.uv is not None
+    expected = np.take_along_axis(away, near, axis=1).ravel() if pattern else _median(distance.T)
+    return _median(distance / expected)[:, None], why
+
+
+def of_clouds(clouds: PointClouds, cloth: ClothInfo) -> tuple[Frames, list[str]]:
+    """Frames of clouds: no point may be farther from its middle than the cloth is long, to 10 %, outliers aside.
+
+    Returns:
+        The frames, and notes on what could not be done.
+    """
+    kept, removed, notes = [], {}, []
+    for i in range(len(clouds)):
+        cloud = clouds.frame(i)
+        try:
+            found = segment(cloud, _stages(cloud))
+        except MissingDependency as error:
+            kept, removed, notes = [clouds.frame(k) for k in range(len(clouds))], {}, [f"outliers not counted: {error}"]
+            break
+        kept.append(found.points)
+        removed = {stage: removed.get(stage, 0) + count for stage, count in found.removed.items()}
+    longest, area = _size(cloth)
+    extent = np.array([_longest(c) for c in kept])
+    seen = np.array([_area(c) for c in kept]) / (area or np.nan)
+    why = "larger than the cloth" if longest else "none: the cloth's size is unknown"
+    rejected = np.greater(extent, (1 + TOLERANCE) * longest if longest else np.inf) | (extent == 0)
+    return Frames(rejected, why, seen, removed, _cuts(clouds)), notes
+
+
+def _longest(cloud: np.ndarray) -> float:
+    """Largest width of a cloud, m, over many directions: its diameter to 2 %."""
+    if len(cloud) == 0:
+        return 0.0
+    turn, height = np.meshgrid(np.arange(24) * np.pi / 12, np.linspace(0, 1, 8))
+    flat = np.sqrt(1 - height**2)
+    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], -1).reshape(-1, 3)
+    return float(np.ptp(cloud @ directions.T, axis=0).max())
+
+
+def _stages(cloud: np.ndarray) -> Segmentation:
+    """Outliers and pieces apart, on the cloud's own scale."""
+    return Segmentation(gap=max(0.01, LINK * _spacing(cloud)), crowd=4)
+
+
+def _nearest(cloud: np.ndarray, count: int) -> np.ndarray:
+    """[Q] m, distance of some points to their ``count``-th neighbour."""
+    if len(cloud) <= count:
+        return np.zeros(0)
+    some = cloud[np.unique(np.linspace(0, len(cloud) - 1, QUERIES).astype(int))]
+    squared = (some**2).sum(1)[:, None] - 2 * some @ cloud.T + (cloud**2).sum(1)
+    return np.sqrt(np.maximum(np.partition(squared, count, axis=1)[:, count], 0))
+
+
+def _spacing(cloud: np.ndarray) -> float:
+    away = _nearest(cloud, 4)
+    return float(np.median(away)) if len(away) else 0.0
+
+
+def _area(cloud: np.ndarray) -> float:
+    """m^2, to about 20 %: of points strewn at random over a surface, a disc to the k-th neighbour holds k of them.
+
+    Rims make it too large, points in a regular lattice too small.
+    """
+    away = _nearest(cloud, AREA)
+    return float(len(cloud) * np.pi * (away**2).mean() / AREA) if len(away) else 0.0
+
+
+def _size(cloth: ClothInfo) -> tuple[float | None, float | None]:
+    """Longest distance on the cloth, m, and its area, m^2."""
+    if cloth.vertices is not None and cloth.faces is not None:
+        a, b, c = (cloth.vertices[cloth.faces[:, k]] for k in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+        return float(np.linalg.norm(np.ptp(cloth.vertices, axis=0))), float(area)
+    if cloth.sheet is not None:
+        return float(np.hypot(*cloth.sheet)), float(np.prod(cloth.sheet))
+    return None, None
+
+
+def _cuts(clouds: PointClouds) -> dict[str, float]:
+    """Bounds that frames share to 1 mm while the clouds' middles move along that axis by more than 2 cm."""
+    frames = [clouds.frame(i) for i in range(len(clouds))]
+    found = {}
+    for axis, name in enumerate("xyz"):
+        middle = [np.median(f[:, axis]) for f in frames]
+        if len(frames) < 4 or np.diff(np.quantile(middle, [0.1, 0.9]))[0] < MOVES:
+            continue
+        for sign, pick in ((">", np.min), ("<", np.max)):
+            bound = np.array([pick(f[:, axis]) for f in frames])
+            usual = np.median(bound)
+            if np.mean(np.abs(bound - usual) < FLAT) > 0.5:
+                found[f"{name} {sign}"] = float(usual)
+    return found
+
+
+def _median(values: np.ndarray) -> np.ndarray:
+    """Median over the last axis, NaN where nothing is seen, without a warning."""
+    seen = np.any(np.isfinite(values), axis=-1)
+    return np.where(seen, np.nanmedian(np.where(seen[..., None], values, 0.0), axis=-1), np.nan)

@@ -1,0 +1,160 @@
+"""An episode looked at: streams, clocks, noise, frames."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import MissingDependency
+from ..recordings import Recording
+from . import frames, images, noise, streams
+from .frames import Frames
+from .images import Depth
+from .lag import CANNOT, Lag, lag
+from .noise import Noise
+from .paths import Path, paths
+from .streams import Stream
+
+CONVENTION = (
+    "SI units. Times on each stream's own clock. lag: observation stamps minus motion stamps of the same event (the "
+    "recording's clock_offset should be minus the lag); std by jackknife over stretches. noise: one standard deviation "
+    "of a coordinate. rejected: frames whose lengths differ from the cloth's by more than 10 %. coverage: share of the "
+    "markers seen, or area seen over the cloth's area (both sides of a fold count, a side that is not seen does not)."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """What `inspect` found.
+
+    Attributes:
+        recording: what was looked at.
+        streams: by name.
+        paths: of the grippers, by name.
+        lag: between observations and motion; None without either.
+        noise, frames: of "points" and "markers", where present.
+        depth: of cameras with depth images.
+        notes: what could not be done, and what to mistrust.
+    """
+
+    recording: Recording = field(repr=False)
+    streams: dict[str, Stream]
+    paths: dict[str, Path] = field(repr=False)
+    lag: Lag | None
+    noise: dict[str, Noise]
+    frames: dict[str, Frames]
+    depth: dict[str, Depth]
+    notes: list[str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of inspection.json."""
+        curve = None
+        if self.lag is not None:
+            told = {key: getattr(self.lag, key) for key in ("value", "std", "told", "stated", "misfit")}
+            curve = {**told, "cannot_tell": CANNOT}
+        whole = {
+            "episode": None if self.recording.path is None else str(self.recording.path),
+            "streams": {name: asdict(s) for name, s in self.streams.items()},
+            "lag": curve,
+            "noise": {name: asdict(n) for name, n in self.noise.items()},
+            "frames": {name: _frames(f) for name, f in self.frames.items()},
+            "depth": {name: asdict(d) for name, d in self.depth.items()},
+            "convention": CONVENTION,
+            "notes": self.notes,
+        }
+        return _plain(whole)
+
+
+def inspect(recording: Recording) -> Inspection:
+    """Look at an episode.
+
+    Args:
+        recording: read by `recordings.read`.
+
+    Raises:
+        RecordingError: an image that cannot be decoded, or joints without their arm.
+    """
+    notes: list[str] = []
+    try:
+        moved = paths(recording)
+    except MissingDependency as error:
+        moved = {}
+        notes.append(f"no gripper paths, so no lag: {error}")
+    seen: dict[str, Frames] = {}
+    if recording.markers is not None:
+        seen["markers"] = frames.of_markers(recording.markers, recording.cloth)
+    if recording.points is not None:
+        seen["points"], more = frames.of_clouds(recording.points, recording.cloth)
+        notes += more
+    late = lag(recording, moved, {name: ~found.rejected for name, found in seen.items()})
+    shift = late.value if late is not None and late.told else -recording.clock_offset
+    depth = {}
+    for name, camera in recording.cameras.items():
+        try:
+            if (found := images.depth_of(camera)) is not None:
+                depth[name] = found
+        except MissingDependency as error:
+            notes.append(f"{name}: {error}")
+    return Inspection(
+        recording,
+        {name: streams.ticks(kind, t) for name, (kind, t) in streams.times(recording).items()},
+        moved,
+        late,
+        _noises(recording, moved, seen, shift),
+        seen,
+        depth,
+        notes + _remarks(recording, moved, late),
+    )
+
+
+def _noises(recording: Recording, moved: dict[str, Path], seen: dict[str, Frames], shift: float) -> dict[str, Noise]:
+    def still(t: np.ndarray) -> np.ndarray:
+        return np.all([path.still(t - shift) for path in moved.values()], axis=0) if moved else np.zeros(len(t), bool)
+
+    found = {}
+    if (markers := recording.markers) is not None:
+        found["markers"] = noise.of_markers(markers, still(markers.t), ~seen["markers"].rejected)
+    if (points := recording.points) is not None:
+        found["points"] = noise.of_clouds(points, still(points.t))
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _remarks(recording: Recording, moved: dict[str, Path], late: Lag | None) -> list[str]:
+    """What a person should do about it."""
+    remarks = []
+    if late is None and moved:
+        remarks.append("no lag: too few observed frames")
+    if late is not None and not late.told:
+        remarks.append(f"the recording does not tell a lag: {CANNOT}")
+    elif late is not None and abs(late.value - late.stated) > max(3 * late.std, 0.02):
+        remarks.append(
+            f"the clocks differ: observations come {late.value:.3f} s late, the recording says {late.stated:.3f} s; "
+            f"set clock_offset to {-late.value:.3f} if the stamps are to blame"
+        )
+    if recording.points is None and recording.markers is None:
+        remarks.append("no points and no markers: nothing to compare a simulation with")
+    return remarks
+
+
+def _frames(found: Frames) -> dict[str, Any]:
+    return {
+        "rejected": np.flatnonzero(found.rejected),
+        "rejected_share": found.rejected.mean(),
+        "why": found.why,
+        "coverage": found.coverage,
+        "removed": found.removed,
+        "cuts": found.cuts,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Lists and numbers that JSON can hold; NaN becomes null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value
