@@ -14,10 +14,11 @@ from torchcloth.robots import Scene
 
 Array = np.ndarray
 Mesh = tuple[Array, Array]
+K = np.array([[503.8, 0.0, 321.5], [0.0, 503.8, 329.0], [0.0, 0.0, 1.0]])  # of the rectified image
 
 
 @dataclass(frozen=True)
-class View:
+class Place:
     """The camera's place and how its images become points.
 
     Attributes:
@@ -38,22 +39,30 @@ class View:
     points: int = 250
 
     def camera(self) -> observe.DepthCamera:
-        """The camera in its place."""
+        """The camera in its place, its image rectified."""
         flat = np.cos(self.elevation)
         away = [flat * np.cos(self.azimuth), flat * np.sin(self.azimuth), np.sin(self.elevation)]
         eye = np.asarray(self.target) + self.distance * np.array(away)
-        return observe.DepthCamera.azure_kinect_nfov(observe.look_at(eye, self.target))
+        return observe.DepthCamera(640, 576, K, observe.look_at(eye, self.target), (0.5, 3.86))
+
+    def view(self) -> observe.View:
+        """The camera with its noise."""
+        return observe.View(self.camera(), self.noise, self.rim, self.points)
 
 
 def arm_meshes(rig: Scene, q: dict[str, Array]) -> Callable[[int], list[Mesh]]:
     """The arms' solids at knot k of the joint positions [K, 7], by arm."""
     solids = rig.geometry({name: torch.as_tensor(value) for name, value in q.items()})
-    placed = [(solid.kind, solid.size, solid.pose.detach().numpy()) for solid in solids]
-    return lambda k: [observe.solid_mesh(kind, size, pose[k]) for kind, size, pose in placed]
+    return lambda k: observe.solid_meshes(solids, at=k)
 
 
 def observe_cloth(
-    view: View, t: Array, x: Array, faces: Array, occluders: Callable[[int], list[Mesh]], rng: np.random.Generator
+    view: observe.View,
+    t: Array,
+    x: Array,
+    faces: Array,
+    occluders: Callable[[int], list[Mesh]],
+    rng: np.random.Generator,
 ) -> tuple[PointClouds, float, Array]:
     """Points of the cloth in every frame.
 
@@ -68,16 +77,12 @@ def observe_cloth(
         The points, the standard deviation of their depth in m (mean over all points), and per frame the share [T] of
         the unhidden cloth's pixels that were kept by the mask.
     """
-    camera = view.camera()
     clouds, sigma, share = [], [], []
     for i in range(len(t)):
-        clean, ids = observe.render_depth(camera, [(x[i], faces), *occluders(i)])
-        alone, _ = observe.render_depth(camera, [(x[i], faces)])
-        mask = observe.erode(ids == 0, view.rim)
-        noisy = view.noise.apply(clean, rng)
-        cloud = observe.thin_to_count(observe.to_points(camera, noisy, mask), view.points, rng)
-        clouds.append(cloud)
-        sigma.append(view.noise.sigma(camera.project(cloud)[1]).mean())
-        share.append((mask & (noisy > 0)).sum() / (alone > 0).sum())
+        seen = observe.capture(view, x[i], faces, occluders(i), rng=rng)
+        alone, _ = observe.render_depth(view.camera, [(x[i], faces)])
+        clouds.append(seen.points)
+        sigma.append(view.noise.sigma(view.camera.project(seen.points)[1]).mean())
+        share.append((seen.mask & (seen.depth > 0)).sum() / (alone > 0).sum())
     counts = np.array([len(cloud) for cloud in clouds])
     return PointClouds(np.asarray(t), np.concatenate(clouds), counts), float(np.mean(sigma)), np.array(share)

@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 import torch
 from flex_sheet import SheetSpec, bilinear, grid
-from kinect_view import View, arm_meshes, observe_cloth
+from kinect_view import Place, arm_meshes, observe_cloth
 from mujoco_cloth import Grip, MujocoCloth, Result, settle
 from swing_motion import SIDE, Swing, demands, forward, joints
 
@@ -61,7 +61,7 @@ class Plan:
     step: float = 5e-5  # s
     settling: float = 2.0  # s
     swing: Swing = field(default_factory=lambda: Swing(stretch=0.02))
-    view: View = field(default_factory=View)
+    place: Place = field(default_factory=Place)
     every: int = 4  # motion knots per frame: 25 Hz
     fit_nodes: int = 17
     initial_error: float = 1e-3  # m, along the cloth's normal
@@ -122,7 +122,7 @@ def make(plan: Plan) -> tuple[recordings.Recording, dict[str, object]]:
     result, faces = simulate(plan, t, forward(rig, q), start)
     frames = np.arange(0, len(t), plan.every)
     shapes = arm_meshes(rig, {name: value[frames] for name, value in q.items()})
-    points, sigma, share = observe_cloth(plan.view, t[frames], result.x[frames], faces, shapes, seen)
+    points, sigma, share = observe_cloth(plan.place.view(), t[frames], result.x[frames], faces, shapes, seen)
     facts = {
         **load,
         "grasp_error": result.grasp_error,
@@ -172,7 +172,7 @@ def _cloth(plan: Plan, uv: Array, faces: Array, first: Array) -> recordings.Clot
 
 
 def _camera(plan: Plan) -> recordings.Camera:
-    camera = plan.view.camera()
+    camera = plan.place.camera()
     return recordings.Camera(width=camera.width, height=camera.height, K=camera.K, T_world_camera=camera.T_world_camera)
 
 

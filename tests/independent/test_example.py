@@ -12,7 +12,7 @@ pytest.importorskip("pytorch_kinematics")
 import make_example
 import torch
 from flex_sheet import SheetSpec, bilinear, grid
-from kinect_view import View, arm_meshes, observe_cloth
+from kinect_view import Place, arm_meshes, observe_cloth
 from swing_motion import Swing, demands, joints
 
 from torchcloth import observe, recordings, robots
@@ -137,7 +137,7 @@ def test_the_motion_stays_inside_the_arms_limits_and_starts_still():
 
 
 def test_an_arm_in_front_hides_cloth(open3d):
-    view = View()
+    view = Place().view()
     sheet = SheetSpec(nodes=(5, 5))
     uv, faces = grid(sheet)
     x = np.column_stack([np.full(25, 0.5), 0.2 - uv[:, 0], 0.1 + uv[:, 1]])[None]

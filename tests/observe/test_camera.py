@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from torchcloth import recordings
 from torchcloth.errors import InvalidInput
 from torchcloth.observe import DepthCamera, look_at
 
@@ -20,10 +21,10 @@ def test_projecting_what_was_unprojected_returns_the_pixel(camera):
 
 def test_the_target_is_seen_at_the_principal_point_and_up_is_up(camera):
     pixel, depth = camera.project([0.5, 0.0, 0.3])
-    np.testing.assert_allclose(pixel, [321.5, 329.0], atol=1e-9)
+    np.testing.assert_allclose(pixel, camera.K[:2, 2], atol=1e-9)
     assert depth == pytest.approx(np.linalg.norm([1.0, 0.4, 0.3]))
-    assert camera.project([0.5, 0.0, 0.4])[0][1] < 329.0  # rows count downwards
-    assert camera.project([0.5, 0.1, 0.3])[0][0] > 321.5  # seen from +x, +y is on the right
+    assert camera.project([0.5, 0.0, 0.4])[0][1] < 328.5  # rows count downwards
+    assert camera.project([0.5, 0.1, 0.3])[0][0] > 321.0  # seen from +x, +y is on the right
 
 
 def test_a_ray_s_parameter_is_its_depth(camera):
@@ -32,13 +33,23 @@ def test_a_ray_s_parameter_is_its_depth(camera):
     np.testing.assert_allclose(origin + 1.7 * directions[100, 200], camera.unproject([200, 100], 1.7), atol=1e-12)
 
 
-def test_field_of_view_is_near_the_maker_s_75_by_65_degrees(camera):
-    # Microsoft gives a field of interest of 75 x 65 degrees; the undistorted pinhole spans a little less across
-    across = np.rad2deg(np.arctan(321.5 / 503.8) + np.arctan((639 - 321.5) / 503.8))
-    down = np.rad2deg(np.arctan(329.0 / 503.8) + np.arctan((575 - 329.0) / 503.8))
-    assert across == pytest.approx(75, abs=11)
-    assert down == pytest.approx(65, abs=6)
-    assert (camera.width, camera.height, camera.range) == (640, 576, (0.5, 3.86))
+def test_the_d435_s_field_of_view_is_the_maker_s():
+    # datasheet: 87 +- 3 by 58 +- 1 degrees; the device whose numbers these are says 89.97 across
+    camera = DepthCamera.realsense_d435(np.eye(4))
+    across, down = (np.rad2deg(2 * np.arctan(size / 2 / 424.229)) for size in (848, 480))
+    assert across == pytest.approx(89.97, abs=0.01)
+    assert down == pytest.approx(58, abs=1.1)
+    assert (camera.width, camera.height, camera.range) == (848, 480, (0.2, 10.0))
+
+
+def test_a_recorded_camera_and_back(camera):
+    recorded = recordings.Camera(**camera.calibration(), depth_scale=0.001)
+    again = DepthCamera.of(recorded, camera.range)
+    np.testing.assert_array_equal(again.grid, camera.grid)
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (20, 3))
+    np.testing.assert_array_equal(again.project(points)[0], camera.project(points)[0])
+    assert again.range == (0.5, 3.86)
+    assert camera.rectified().lens.plain
 
 
 @pytest.mark.parametrize(

@@ -60,9 +60,8 @@ def test_jitter_invents_no_points_between_two_surfaces():
 def test_bias_is_smooth_has_its_amplitude_and_must_be_shared():
     noise = DepthNoise(sigma_base=0.0, sigma_slope=0.0, jitter=0.0, bias_amplitude=0.005, bias_length=10)
     field = noise.bias_field((400, 400), np.random.default_rng(0))
-    # bilinear between unit values: variance (2/3)^2 on average
-    assert field.std() == pytest.approx(2 / 3, rel=0.1)
-    assert np.abs(np.diff(field, axis=0)).max() < 0.6
+    assert field.std() == pytest.approx(1, rel=0.1)
+    assert np.abs(np.diff(field, axis=0)).max() < 0.8
     depth = np.full((400, 400), 1.0, np.float32)
     np.testing.assert_allclose(noise.apply(depth, np.random.default_rng(0), field) - 1, 0.005 * field, atol=1e-6)
     with pytest.raises(InvalidInput, match="bias"):
@@ -76,3 +75,26 @@ def test_illegal_parameters_are_refused():
         DepthNoise(bias_length=0.5)
     with pytest.raises(InvalidInput, match="depth"):
         DepthNoise().apply(np.zeros(4), np.random.default_rng(0))
+
+
+def test_flying_pixels_lie_between_both_sides_of_an_edge_only():
+    depth = np.full((200, 40), 1.0, np.float32)
+    depth[:, 20:] = 1.5
+    noise = DepthNoise(sigma_base=0.0, sigma_slope=0.0, jitter=0.0, flying=0.5)
+    flown = noise.apply(depth, np.random.default_rng(0))
+    between = (flown > 1.001) & (flown < 1.499)
+    assert not between[:, :19].any()
+    assert not between[:, 21:].any()
+    assert between[:, 19:21].mean() == pytest.approx(0.5, abs=0.08)  # of 400 pixels
+
+
+def test_the_kinect_s_bias_keeps_within_the_maker_s_bound():
+    noise, depth = DepthNoise.azure_kinect(), np.full((576, 640), 2.0, np.float32)
+    quiet = DepthNoise(0.0, 0.0, jitter=0.0, bias_amplitude=noise.bias_amplitude, bias_relative=noise.bias_relative)
+    errors = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        errors.append(quiet.apply(depth, rng, quiet.bias_field(depth.shape, rng))[::40, ::40] - 2)
+    inside = np.abs(errors) < 0.011 + 0.001 * 2
+    assert inside.mean() == pytest.approx(0.954, abs=0.03)  # two standard deviations
+    assert not noise.without_bias().biased

@@ -17,8 +17,9 @@ def test_a_plane_has_its_depth_at_every_pixel(render, rectangle):
 
 
 def test_a_tilted_plane_has_the_depth_of_the_ray_plane_intersection(render, rectangle):
-    depth, _ = render(KINECT, [rectangle(-5, 5, -5, 5, 1.5, tilt=0.4)])
-    slope = (np.arange(640) - 321.5) / 503.8
+    camera = KINECT.rectified()
+    depth, _ = render(camera, [rectangle(-5, 5, -5, 5, 1.5, tilt=0.4)])
+    slope = (np.arange(640) - camera.K[0, 2]) / camera.K[0, 0]
     expected = 1.5 / (1 - 0.4 * slope)  # z = 1.5 + 0.4 x with x = slope z
     np.testing.assert_allclose(depth, np.broadcast_to(expected, depth.shape), atol=1e-4)
 

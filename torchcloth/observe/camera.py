@@ -1,30 +1,43 @@
-"""A pinhole depth camera: where a pixel looks, and where a point falls."""
+"""A depth camera: where a pixel looks, and where a point falls."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
 from ..errors import InvalidInput
+from .lens import Lens
 
 Array = np.ndarray
 
 
+class Calibration(Protocol):
+    """What a recorded camera tells of itself, for example a ``recordings.Camera``."""
+
+    width: int
+    height: int
+    K: Array
+    T_world_camera: Array
+    distortion: Array
+
+
 @dataclass(frozen=True, eq=False)
 class DepthCamera:
-    """A depth camera without lens distortion, in the OpenCV convention (x right, y down, z forward; pixel centres at
-    integers).
+    """A depth camera in the OpenCV convention (x right, y down, z forward; pixel centres at integers).
 
     Attributes:
         width, height: pixels.
         K: [3, 3] intrinsic matrix, pixels.
         T_world_camera: [4, 4] camera to world, m.
         range: (nearest, farthest) depth that the camera reports, m; other pixels are 0.
+        distortion: [0, 4, 5, 8, 12 or 14] coefficients of the lens in OpenCV's order (see `Lens`).
 
     Raises:
         InvalidInput: a size that is not positive, an intrinsic matrix that is not upper triangular with positive focal
-            lengths, a pose that is not rigid, or a range that is not increasing.
+            lengths, a pose that is not rigid, a range that is not increasing, or another number of coefficients.
     """
 
     width: int
@@ -32,8 +45,10 @@ class DepthCamera:
     K: Array
     T_world_camera: Array
     range: tuple[float, float] = (0.0, float("inf"))
+    distortion: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "distortion", self.lens.coefficients)
         object.__setattr__(self, "K", np.array(self.K, dtype=float))
         object.__setattr__(self, "T_world_camera", np.array(self.T_world_camera, dtype=float))
         if self.width < 1 or self.height < 1:
@@ -54,48 +69,102 @@ class DepthCamera:
             raise InvalidInput("range", got=self.range, expected="0 <= nearest < farthest, in m")
 
     @classmethod
-    def azure_kinect_nfov(cls, T_world_camera: Array) -> DepthCamera:
-        """The Azure Kinect DK's depth camera in NFOV unbinned mode, undistorted.
+    def of(cls, recorded: Calibration, range: tuple[float, float] = (0.0, float("inf"))) -> DepthCamera:
+        """The camera of a recording: ``DepthCamera.of(recording.cameras["cam0"])``."""
+        return cls(recorded.width, recorded.height, recorded.K, recorded.T_world_camera, range, recorded.distortion)
 
-        Size and range: Microsoft, "Azure Kinect DK hardware specifications" (640 x 576, 0.5 to 3.86 m). Focal length
-            and principal
-        point: the factory calibration quoted in microsoft/Azure-Kinect-Sensor-SDK issue 1617 (0.492 and 0.5 of the
-            1024 px sensor),
-        with the crop of (192, 180) px of this mode. Each device has its own calibration; this is one example of them.
+    @classmethod
+    def azure_kinect_nfov(cls, T_world_camera: Array) -> DepthCamera:
+        """The Azure Kinect DK's depth camera in NFOV unbinned mode: its raw image, strongly distorted.
+
+        Size and range: Microsoft, "Azure Kinect DK hardware specifications" (640 x 576, 0.5 to 3.86 m). Lens: the
+        factory calibration quoted in microsoft/Azure-Kinect-Sensor-SDK issue 1617, scaled to the 1024 px sensor and
+        cropped by (192, 180) px as mode_specific_calibration.c does, which also takes off half a pixel because the
+        factory counts from the corner of a pixel and OpenCV from its centre. Each device has its own calibration; this
+        is one example of them. The mode's hexagonal mask is left out.
 
         Args:
             T_world_camera: [4, 4] camera to world, m.
         """
-        K = np.array([[503.8, 0.0, 321.5], [0.0, 503.8, 329.0], [0.0, 0.0, 1.0]])
-        return cls(640, 576, K, T_world_camera, (0.5, 3.86))
+        sensor = 1024 * np.array([0.49203813, 0.49193162, 0.50147575, 0.49704871])
+        fx, fy, cx, cy = sensor - [0.0, 0.0, 192.5, 180.5]
+        k = (4.72473669, 3.20922279, 0.17059645, 5.05585957, 4.77578020, 0.88649416)
+        p1, p2 = 5.87981e-6, 1.238212e-4  # the factory's order is p2, p1
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return cls(640, 576, K, T_world_camera, (0.5, 3.86), np.array([k[0], k[1], p1, p2, *k[2:]]))
+
+    @classmethod
+    def realsense_d435(cls, T_world_camera: Array) -> DepthCamera:
+        """A RealSense D435's depth camera at 848 x 480, its best resolution; rectified by the camera, no distortion.
+
+        Focal length: as one device reports it (realsense-ros issue 2788: 424.23 px, 89.97 degrees across); the
+        principal point of that device, of which only the column is quoted, is put at its 423.4 and mid-height. Range:
+        about 0.2 m, where the search for 126 px of disparity ends (f b / 126 = 0.17 m), to 10 m
+        (Intel, "RealSense D400 series datasheet").
+
+        Args:
+            T_world_camera: [4, 4] camera to world, m.
+        """
+        K = np.array([[424.229, 0.0, 423.426], [0.0, 424.229, 239.5], [0.0, 0.0, 1.0]])
+        return cls(848, 480, K, T_world_camera, (0.2, 10.0))
+
+    def calibration(self) -> dict[str, Any]:
+        """What a recording keeps of it: ``recordings.Camera(**camera.calibration(), depth_scale=0.001)``."""
+        return {name: getattr(self, name) for name in ("width", "height", "K", "T_world_camera", "distortion")}
+
+    def rectified(self) -> DepthCamera:
+        """The same camera with an ideal lens."""
+        return replace(self, distortion=np.zeros(0))
+
+    @cached_property
+    def lens(self) -> Lens:
+        """Its distortion."""
+        return Lens(self.distortion)
 
     def project(self, points: Array) -> tuple[Array, Array]:
         """Pixel coordinates [..., 2] (column, row) and depth [...] m of world points [..., 3] m; depth <= 0 is
-        behind the camera.
+        behind the camera. Pixels are NaN where the lens model ends.
         """
         local = (np.asarray(points, dtype=float) - self.T_world_camera[:3, 3]) @ self.T_world_camera[:3, :3]
         z = local[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            image = local @ self.K.T
-            return image[..., :2] / image[..., 2:], z
+            if self.lens.plain:
+                image = local @ self.K.T
+                return image[..., :2] / image[..., 2:], z
+            fallen = self.lens.distort(local[..., :2] / z[..., None])
+        return fallen @ self.K[:2, :2].T + self.K[:2, 2], z
 
     def unproject(self, pixels: Array, depth: Array) -> Array:
         """World points [..., 3] m of pixel coordinates [..., 2] (column, row) at depths [...] m along the optical
-        axis.
+        axis; NaN where no ray falls by the lens model.
         """
-        pixels, depth = np.asarray(pixels, dtype=float), np.asarray(depth, dtype=float)
-        y = (pixels[..., 1] - self.K[1, 2]) / self.K[1, 1]
-        x = (pixels[..., 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
-        local = np.stack([x * depth, y * depth, depth], -1)
-        return local @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
+        return self._place(self._rays(np.asarray(pixels, dtype=float)), np.asarray(depth, dtype=float))
 
     def rays(self) -> tuple[Array, Array]:
         """Origin [3] m and directions [H, W, 3], world; a direction's length is such that its parameter is the depth
-        in m.
+        in m. NaN where no ray falls by the lens model.
         """
-        columns, rows = np.meshgrid(np.arange(self.width), np.arange(self.height))
         origin = self.T_world_camera[:3, 3]
-        return origin, self.unproject(np.stack([columns, rows], -1), np.ones((self.height, self.width))) - origin
+        return origin, self._place(self.grid, np.ones((self.height, self.width))) - origin
+
+    @cached_property
+    def grid(self) -> Array:
+        """Rays [H, W, 2] (x / z, y / z) of the pixels in the camera's axes; NaN where there is none."""
+        columns, rows = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        return self._rays(np.stack([columns, rows], -1).astype(float))
+
+    def at_pixels(self, rows: Array, columns: Array, depth: Array) -> Array:
+        """World points [N, 3] m of whole pixels at depths [N] m; NaN where no ray falls by the lens model."""
+        return self._place(self.grid[rows, columns], np.asarray(depth, dtype=float))
+
+    def _rays(self, pixels: Array) -> Array:
+        y = (pixels[..., 1] - self.K[1, 2]) / self.K[1, 1]
+        x = (pixels[..., 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
+        return self.lens.undistort(np.stack([x, y], -1))
+
+    def _place(self, rays: Array, depth: Array) -> Array:
+        local = np.concatenate([rays * depth[..., None], depth[..., None]], -1)
+        return local @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
 
 
 def look_at(eye: Array, target: Array, up: Array = (0.0, 0.0, 1.0)) -> Array:  # type: ignore[assignment]

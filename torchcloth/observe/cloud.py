@@ -11,7 +11,7 @@ Array = np.ndarray
 
 
 def to_points(camera: DepthCamera, depth: Array, mask: Array | None = None) -> Array:
-    """World points [N, 3] m of the pixels that have a depth and lie in the mask, row by row.
+    """World points [N, 3] m of the pixels that have a depth, a ray and lie in the mask, row by row.
 
     Args:
         camera: the camera that took the image.
@@ -27,8 +27,8 @@ def to_points(camera: DepthCamera, depth: Array, mask: Array | None = None) -> A
         if image is not None and np.shape(image) != shape:
             raise InvalidInput(name, got=f"shape {np.shape(image)}", expected=f"{shape}, the camera's size")
     wanted = depth > 0 if mask is None else (depth > 0) & np.asarray(mask, bool)
-    rows, columns = np.nonzero(wanted)
-    return camera.unproject(np.stack([columns, rows], -1), depth[rows, columns])
+    rows, columns = np.nonzero(wanted & np.isfinite(camera.grid[..., 0]))
+    return camera.at_pixels(rows, columns, depth[rows, columns])
 
 
 def erode(mask: Array, pixels: int = 1) -> Array:
@@ -64,11 +64,16 @@ def thin_to_spacing(points: Array, spacing: float) -> Array:
         points: [N, 3] m.
         spacing: m.
     """
+    return np.asarray(points, dtype=float)[spaced(points, spacing)]
+
+
+def spaced(points: Array, spacing: float) -> Array:
+    """Indices, in order, of the points that `thin_to_spacing` keeps."""
     points = np.asarray(points, dtype=float)
     if not spacing > 0:
         raise InvalidInput("spacing", got=spacing, expected="a positive length in m")
     if len(points) == 0:
-        return points
+        return np.zeros(0, int)
     _, cell = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()
     counts = np.bincount(cell)
@@ -76,4 +81,4 @@ def thin_to_spacing(points: Array, spacing: float) -> Array:
     distance = ((points - mean[cell]) ** 2).sum(1)
     order = np.lexsort((np.arange(len(points)), distance, cell))
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    return points[np.sort(order[first])]
+    return np.sort(order[first])

@@ -1,8 +1,9 @@
-"""What a time-of-flight camera does to a perfect depth image."""
+"""What depth cameras do to a perfect depth image: the interface, and time of flight."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -11,14 +12,63 @@ from ..errors import InvalidInput
 Array = np.ndarray
 
 
+class AbstractNoise(ABC):
+    """A sensor's errors: random ones in every image, and a bias that stays with the device."""
+
+    @abstractmethod
+    def sigma(self, depth: Array) -> Array:
+        """Standard deviation [...] m of the random error at depths [...] m, away from edges."""
+
+    @abstractmethod
+    def apply(self, depth: Array, rng: np.random.Generator, bias: Array | None = None) -> Array:
+        """A noisy copy of a depth image.
+
+        Args:
+            depth: [H, W] m, 0 where nothing is seen.
+            rng: source of the random numbers; the same generator state gives the same image.
+            bias: [..., H, W] what the device adds to every image of a sequence, drawn once by :meth:`bias_field`;
+                needed where :attr:`biased`.
+
+        Returns:
+            [H, W] float32, m, 0 where nothing is seen or the pixel was lost.
+        """
+
+    @abstractmethod
+    def bias_field(self, shape: tuple[int, int], rng: np.random.Generator) -> Array:
+        """What a device adds to all its images, drawn once: [..., H, W], smooth, fixed to the image."""
+
+    @property
+    @abstractmethod
+    def biased(self) -> bool:
+        """Whether an image needs a bias field."""
+
+    def checked(self, depth: Array, bias: Array | None) -> Array:
+        """The image as float32.
+
+        Raises:
+            InvalidInput: no image, or a bias that is missing or of another size.
+        """
+        depth = np.asarray(depth, np.float32)
+        if depth.ndim != 2:
+            raise InvalidInput("depth", got=f"shape {depth.shape}", expected="[H, W]")
+        if self.biased and (bias is None or bias.shape[-2:] != depth.shape):
+            raise InvalidInput(
+                "bias",
+                got=None if bias is None else f"shape {bias.shape}",
+                expected=f"a field {depth.shape} when a bias amplitude is set",
+                remedy="draw one by bias_field(shape, rng)",
+            )
+        return depth
+
+
 @dataclass(frozen=True)
-class DepthNoise:
-    """Random error, pixel jitter, lost edges and a slowly varying bias of a depth camera.
+class DepthNoise(AbstractNoise):
+    """Random error, pixel jitter, lost edges, flying pixels and a slowly varying bias of a time-of-flight camera.
 
     The defaults are a working model of the Azure Kinect DK: sigma(z) = 0.5 mm + 1 mm/m * max(z - 0.5 m, 0), jitter
     0.25 px and dropped edges as in BlenderProc's Azure Kinect post-processing, which cites Toelgyessy et al., Sensors
     21(2):413 (2021). The maker's bounds are wider: standard deviation <= 17 mm, systematic error < 11 mm + 0.1 %
-    (Microsoft, "Azure Kinect DK hardware specifications"). The bias is off unless asked for.
+    (Microsoft, "Azure Kinect DK hardware specifications"). Bias and flying pixels are off unless asked for.
 
     Attributes:
         sigma_base: m, standard deviation of a pixel's depth up to ``sigma_start``.
@@ -31,6 +81,9 @@ class DepthNoise:
         bias_relative: m/m, further standard deviation of the bias per metre of depth.
         bias_length: px, distance over which the bias field varies; the field is fixed to the image, as a calibration
             error is.
+        flying: share of the pixels at a step in depth of more than ``flying_step`` (and less than ``edge_range``) that
+            report a mixture of both sides.
+        flying_step: m.
     """
 
     sigma_base: float = 0.5e-3
@@ -41,71 +94,104 @@ class DepthNoise:
     bias_amplitude: float = 0.0
     bias_relative: float = 0.0
     bias_length: float = 160.0
+    flying: float = 0.0
+    flying_step: float = 0.02
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if not np.isfinite(value) or value < 0:
-                raise InvalidInput(item.name, got=value, expected="a finite number that is not negative")
+        check_fields(self)
         if self.bias_length < 1:
             raise InvalidInput("bias_length", got=self.bias_length, expected="at least 1 px")
+        if self.flying > 1:
+            raise InvalidInput("flying", got=self.flying, expected="a share, 0 to 1")
+
+    @classmethod
+    def azure_kinect(cls) -> DepthNoise:
+        """With a bias that keeps within the maker's 11 mm + 0.1 % at two standard deviations, and flying pixels.
+
+        That half of the pixels at an edge fly is our guess, not a measurement.
+        """
+        return cls(bias_amplitude=5.5e-3, bias_relative=0.5e-3, flying=0.5)
+
+    def without_bias(self) -> DepthNoise:
+        """The same with random errors only."""
+        return replace(self, bias_amplitude=0.0, bias_relative=0.0)
+
+    @property
+    def biased(self) -> bool:
+        """Whether an image needs a bias field."""
+        return bool(self.bias_amplitude or self.bias_relative)
 
     def sigma(self, depth: Array) -> Array:
         """Standard deviation [...] m of the random error at depths [...] m."""
         return self.sigma_base + self.sigma_slope * np.maximum(np.asarray(depth) - self.sigma_start, 0.0)
 
     def apply(self, depth: Array, rng: np.random.Generator, bias: Array | None = None) -> Array:
-        """A noisy copy of a depth image.
-
-        Args:
-            depth: [H, W] m, 0 where nothing is seen.
-            rng: source of the random numbers; the same generator state gives the same image.
-            bias: [H, W] unit-variance field of :meth:`bias_field`; needed when a bias amplitude is set, so that all
-                images of a sequence share it.
-
-        Returns:
-            [H, W] float32, m, 0 where nothing is seen or the pixel was lost.
-        """
-        depth = np.asarray(depth, np.float32)
-        if depth.ndim != 2:
-            raise InvalidInput("depth", got=f"shape {depth.shape}", expected="[H, W]")
-        if (self.bias_amplitude or self.bias_relative) and bias is None:
-            raise InvalidInput(
-                "bias", expected="a field when a bias amplitude is set", remedy="draw one by bias_field(shape, rng)"
-            )
+        """A noisy copy [H, W] float32 m of a depth image [H, W] m, see :meth:`AbstractNoise.apply`."""
+        depth = self.checked(depth, bias)
         out = _jittered(depth, self.jitter, rng) if self.jitter else depth.copy()
         seen = (out > 0) & (depth > 0)
+        if self.flying:
+            out = _flown(out, depth, self.flying, self.flying_step, rng)
         noisy = out + (self.sigma(out) * rng.standard_normal(out.shape)).astype(np.float32)
         if bias is not None:
             noisy += ((self.bias_amplitude + self.bias_relative * out) * bias).astype(np.float32)
         return np.where(seen & ~lost_edges(depth, self.edge_range) & (noisy > 0), noisy, 0).astype(np.float32)
 
     def bias_field(self, shape: tuple[int, int], rng: np.random.Generator) -> Array:
-        """A smooth random field [H, W] of about unit variance: bilinear between random values ``bias_length`` px
-        apart.
-        """
-        rows, cols = (int(np.ceil(n / self.bias_length)) + 1 for n in shape)
-        knots = rng.standard_normal((rows, cols))
-        r, c = np.arange(shape[0]) / self.bias_length, np.arange(shape[1]) / self.bias_length
-        i, j = r.astype(int), c.astype(int)
-        a, b = (r - i)[:, None], (c - j)[None, :]
-        top = knots[i][:, j] * (1 - b) + knots[i][:, j + 1] * b
-        return top * (1 - a) + (knots[i + 1][:, j] * (1 - b) + knots[i + 1][:, j + 1] * b) * a
+        """A smooth random field [H, W] of unit variance: bilinear between random values ``bias_length`` px apart."""
+        return smooth_field(shape, self.bias_length, rng)
+
+
+def smooth_field(shape: tuple[int, int], length: float, rng: np.random.Generator) -> Array:
+    """A random field [H, W], bilinear between normal values ``length`` px apart, of unit variance everywhere."""
+    rows, cols = (int(np.ceil(n / length)) + 1 for n in shape)
+    knots = rng.standard_normal((rows, cols))
+    r, c = np.arange(shape[0]) / length, np.arange(shape[1]) / length
+    i, j = r.astype(int), c.astype(int)
+    a, b = (r - i)[:, None], (c - j)[None, :]
+    top = knots[i][:, j] * (1 - b) + knots[i][:, j + 1] * b
+    field = top * (1 - a) + (knots[i + 1][:, j] * (1 - b) + knots[i + 1][:, j + 1] * b) * a
+    return field / np.sqrt((a**2 + (1 - a) ** 2) * (b**2 + (1 - b) ** 2))
+
+
+def check_fields(noise: AbstractNoise) -> None:
+    """Refuse parameters of a dataclass that are negative or not finite."""
+    for item in fields(noise):  # type: ignore[arg-type]
+        value = getattr(noise, item.name)
+        if not np.isfinite(value) or value < 0:
+            raise InvalidInput(item.name, got=value, expected="a finite number that is not negative")
 
 
 def lost_edges(depth: Array, edge_range: float) -> Array:
     """Mask [H, W] of pixels whose 3 x 3 neighbourhood spans more than ``edge_range`` m; pixels without depth do not
     count.
     """
-    far = np.where(depth > 0, depth, -np.inf)
-    near = np.where(depth > 0, depth, np.inf)
-    return _window(far, np.maximum) - _window(near, np.minimum) > edge_range
+    near, far = neighbourhood(depth)
+    return far - near > edge_range
+
+
+def neighbourhood(depth: Array, reach: int = 1) -> tuple[Array, Array]:
+    """Nearest and farthest depth [H, W] within ``reach`` px of each pixel, inf and -inf where there is none."""
+    near, far = np.where(depth > 0, depth, np.inf), np.where(depth > 0, depth, -np.inf)
+    for _ in range(reach):
+        near, far = _window(near, np.minimum), _window(far, np.maximum)
+    return near, far
 
 
 def _window(image: Array, pick: np.ufunc) -> Array:
     padded = np.pad(image, 1, mode="edge")
     rows = pick(pick(padded[:-2], padded[1:-1]), padded[2:])
     return pick(pick(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
+
+
+def _flown(out: Array, depth: Array, share: float, step: float, rng: np.random.Generator) -> Array:
+    """Pixels at a step in depth report a mixture of the near and the far side."""
+    near, far = neighbourhood(depth)
+    flies = (far - near > step) & (rng.random(depth.shape) < share)
+    mixture = rng.random(depth.shape)[flies]
+    out = out.copy()
+    out[flies] = near[flies] + (far - near)[flies] * mixture
+    return out
 
 
 def _jittered(depth: Array, jitter: float, rng: np.random.Generator) -> Array:

@@ -32,7 +32,7 @@ def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> 
         MissingDependency: open3d cannot be imported.
         InvalidInput: a mesh that has the wrong shape, an index out of bounds or a vertex that is not finite.
     """
-    o3d = _open3d()
+    o3d = open3d_or_refuse()
     scene = o3d.t.geometry.RaycastingScene()
     body = []
     for index, (vertices, faces) in enumerate(meshes):
@@ -44,10 +44,11 @@ def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> 
     origin, directions = camera.rays()
     if not body:
         return np.zeros(directions.shape[:2], np.float32), np.full(directions.shape[:2], -1, np.int32)
-    rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1).astype(np.float32)
-    hit = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)))
+    looking = np.isfinite(directions[..., :1])
+    rays = np.concatenate([np.broadcast_to(origin, directions.shape), np.where(looking, directions, 1.0)], -1)
+    hit = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays, np.float32)))
     depth, geometry = hit["t_hit"].numpy(), hit["geometry_ids"].numpy()
-    seen = np.isfinite(depth) & (depth >= camera.range[0]) & (depth <= camera.range[1])
+    seen = np.isfinite(depth) & (depth >= camera.range[0]) & (depth <= camera.range[1]) & looking[..., 0]
     ids = np.full(depth.shape, -1, np.int32)
     ids[seen] = np.array(body, np.int32)[geometry[seen]]
     return np.where(seen, depth, 0).astype(np.float32), ids
@@ -66,12 +67,13 @@ def _checked(index: int, vertices: Array, faces: Array) -> tuple[Array, Array]:
     return vertices, faces
 
 
-def _open3d() -> Any:
+def open3d_or_refuse() -> Any:
+    """The module open3d, or how to install it."""
     try:
         return import_module("open3d")  # here, not above: it takes seconds and needs a system library
     except ImportError as error:
         raise MissingDependency(
-            "rendering depth needs open3d",
+            "depth cameras and clouds need open3d",
             got=str(error),
             remedy='pip install "torchcloth[observe]"; a missing libusb-1.0.so.0 is the system package libusb-1.0-0 '
             "(apt-get install libusb-1.0-0)",

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any, Protocol
+
 import numpy as np
 
 from ..errors import InvalidInput
@@ -12,6 +15,39 @@ _BOX = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-
 _BOX_FACES = np.array(
     [0, 1, 3, 0, 3, 2, 4, 6, 7, 4, 7, 5, 0, 4, 5, 0, 5, 1, 2, 3, 7, 2, 7, 6, 0, 2, 6, 0, 6, 4, 1, 5, 7, 1, 7, 3]
 ).reshape(-1, 3)
+
+
+class Solid(Protocol):
+    """A primitive in its place, for example one of ``robots.Scene.geometry(q)``."""
+
+    @property
+    def kind(self) -> str:
+        """Box, cylinder or sphere."""
+        ...
+
+    @property
+    def size(self) -> tuple[float, ...]:
+        """In m, as in `solid_mesh`."""
+        ...
+
+    @property
+    def pose(self) -> Any:
+        """[..., 4, 4] of the centre in the world, m."""
+        ...
+
+
+def solid_meshes(solids: Iterable[Solid], at: int | None = None) -> list[tuple[Array, Array]]:
+    """Meshes of a robot's primitives: ``solid_meshes(scene.geometry(q), at=k)``.
+
+    Args:
+        solids: with kind, size (see `solid_mesh`) and pose, a tensor or array [4, 4] or, of many moments, [K, 4, 4].
+        at: which of the moments; None where there is only one.
+    """
+    placed = []
+    for solid in solids:
+        pose = solid.pose.detach().cpu().numpy() if hasattr(solid.pose, "detach") else np.asarray(solid.pose)
+        placed.append(solid_mesh(solid.kind, solid.size, pose if at is None else pose[at]))
+    return placed
 
 
 def solid_mesh(kind: str, size: tuple[float, ...], pose: Array, segments: int = 24) -> tuple[Array, Array]:

@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+
+from torchcloth.errors import InvalidInput
+from torchcloth.observe import DepthCamera, colors_at, look_at, reproject, steep, to_points
+
+POSE = look_at([1.2, 0.3, 0.8], [0.4, 0.0, 0.2])
+KINECT = DepthCamera.azure_kinect_nfov(POSE)
+
+
+@pytest.fixture
+def color_camera():
+    """Beside the depth camera, with a lens of its own."""
+    pose = POSE.copy()
+    pose[:3, 3] += pose[:3, :3] @ [0.05, 0.01, 0.0]
+    K = np.array([[300.0, 0, 319.5], [0, 300, 179.5], [0, 0, 1]])
+    return DepthCamera(640, 360, K, pose, distortion=[0.1, -0.05, 1e-3, -5e-4, 0.01])
+
+
+@pytest.fixture
+def meshes(rectangle):
+    """A wall and a smaller sheet before it, in the world."""
+
+    def placed(vertices, faces):
+        return vertices @ POSE[:3, :3].T + POSE[:3, 3], faces
+
+    return [placed(*rectangle(-0.15, 0.1, -0.1, 0.15, 0.8, 0.1)), placed(*rectangle(-3, 3, -3, 3, 1.3, 0.2))]
+
+
+def agree(found, true, edge=0.02):
+    """Share of the pixels away from edges at which both see, and the largest error there."""
+    both = (found > 0) & (true > 0) & ~steep(true, edge)
+    error = np.abs(found - true)[both]
+    return both.sum() / ((true > 0) & ~steep(true, edge)).sum(), error
+
+
+def test_without_its_lens_the_image_is_that_of_an_ideal_camera(render, meshes):
+    rectified = KINECT.rectified()
+    found = reproject(render(KINECT, meshes)[0], KINECT, rectified)
+    share, error = agree(found, render(rectified, meshes)[0])
+    assert share > 0.97
+    assert np.quantile(error, 0.99) < 2e-4
+    assert error.max() < 5e-3
+
+
+def test_depth_laid_onto_colour_is_what_the_colour_camera_would_have_seen(render, meshes, color_camera):
+    found = reproject(render(KINECT, meshes)[0], KINECT, color_camera)
+    true = render(color_camera, meshes)[0]
+    # only where the depth camera looks
+    here = (color_camera.height, color_camera.width)
+    points = color_camera.at_pixels(*(i.ravel() for i in np.indices(here)), true.ravel())
+    pixels, _ = KINECT.project(points)
+    inside = ((pixels > 2) & (pixels < [637, 573])).all(-1).reshape(here)
+    share, error = agree(found, np.where(inside, true, 0))
+    assert share > 0.9  # the near sheet hides the wall from one of the two
+    assert np.quantile(error, 0.99) < 2e-4
+
+
+def test_points_take_the_colour_of_their_body_and_hidden_ones_take_none(render, meshes, color_camera):
+    ids = render(color_camera, meshes)[1]
+    color = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 0]], np.uint8)[ids]
+    depth, truth = render(KINECT, meshes)
+    registered = reproject(depth, KINECT, color_camera)
+    points = to_points(KINECT, depth)
+    body = truth[depth > 0]
+    colors, seen = colors_at(points, color, color_camera, registered)
+    away = ~steep(depth, 0.02)[depth > 0]
+    right = colors[np.arange(len(points)), body] == 255
+    assert right[seen & away].mean() > 0.995
+    blind, _ = colors_at(points, color, color_camera)
+    hidden = ~seen & (blind[:, 0] == 255) & (body == 1)  # wall behind the sheet, which would have been red
+    assert hidden.sum() > 100
+    assert 0.5 < seen.mean() < 1
+
+
+def test_images_of_another_size_are_refused(color_camera):
+    with pytest.raises(InvalidInput, match="depth"):
+        reproject(np.zeros((4, 4)), KINECT, color_camera)
+    with pytest.raises(InvalidInput, match="color"):
+        colors_at(np.zeros((4, 3)), np.zeros((4, 4, 3)), color_camera)
+
+
+def test_steps_in_depth_are_steep_and_gentle_slopes_are_not():
+    depth = (1 + 0.003 * np.arange(30))[None].repeat(20, 0)
+    assert not steep(depth, 0.02).any()
+    depth[:, 15:] += 0.1
+    assert steep(depth, 0.02)[:, 14:16].all()
+    assert steep(depth, 0.02).sum() == 40
+    depth[:, 15:] = 0
+    assert not steep(depth, 0.02).any()

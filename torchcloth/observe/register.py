@@ -1,0 +1,71 @@
+"""One camera's depth as another would have it: lens taken out, depth laid onto colour, colours for points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import InvalidInput
+from .camera import DepthCamera
+from .noise import lost_edges
+from .render import render_depth
+
+Array = np.ndarray
+
+
+def reproject(depth: Array, source: DepthCamera, target: DepthCamera, edge: float = 0.02) -> Array:
+    """The depth image [H, W] m that ``target`` would have taken, 0 = invalid.
+
+    Neighbouring pixels of the source span triangles, which the target sees by ray casting: no holes where it has the
+    finer pixels, and what is hidden from it stays hidden. ``reproject(depth, camera, camera.rectified())`` takes the
+    lens out; with the colour camera as target it registers depth to colour.
+
+    Args:
+        depth: [H, W] m, 0 = invalid, of the source.
+        source, target: both with their lenses and poses.
+        edge: m, larger steps between neighbours are edges, not surface.
+
+    Raises:
+        MissingDependency: open3d cannot be imported.
+        InvalidInput: an image that has not the source's size.
+    """
+    depth = np.asarray(depth)
+    if depth.shape != (source.height, source.width):
+        raise InvalidInput("depth", got=f"shape {depth.shape}", expected=f"{(source.height, source.width)}, the source")
+    good = (depth > 0) & np.isfinite(source.grid[..., 0])
+    index = np.where(good, np.cumsum(good).reshape(good.shape) - 1, -1)
+    rows, columns = np.nonzero(good)
+    vertices = source.at_pixels(rows, columns, depth[good])
+    a, b, c, d = (index[i, j].ravel() for i in (slice(-1), slice(1, None)) for j in (slice(-1), slice(1, None)))
+    faces = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
+    faces = faces[(faces >= 0).all(1)]
+    steps = np.ptp(depth[good][faces], axis=1)
+    return render_depth(target, [(vertices, faces[steps <= edge])])[0]
+
+
+def colors_at(points: Array, color: Array, camera: DepthCamera, depth: Array | None = None) -> tuple[Array, Array]:
+    """Colours [N, 3] uint8 of world points [N, 3] m, and which of them [N] the colour camera sees.
+
+    Args:
+        points: [N, 3] m.
+        color: [H, W, 3] uint8.
+        camera: that took it.
+        depth: [H, W] m as registered to the colour camera (`reproject`); a point more than 2 cm behind it is hidden.
+            None: nothing hides.
+    """
+    if np.shape(color) != (camera.height, camera.width, 3):
+        raise InvalidInput("color", got=f"shape {np.shape(color)}", expected=f"{(camera.height, camera.width, 3)}")
+    pixels, z = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        inside = (z > 0) & ((pixels > -0.5) & (pixels < [camera.width - 0.5, camera.height - 0.5])).all(-1)
+    columns, rows = np.rint(np.where(inside[:, None], pixels, 0)).astype(int).T
+    if depth is not None:
+        front = np.asarray(depth)[rows, columns]
+        inside &= (front == 0) | (z < front + 0.02)
+    return np.where(inside[:, None], np.asarray(color)[rows, columns], 0).astype(np.uint8), inside
+
+
+def steep(depth: Array, edge: float) -> Array:
+    """Pixels [H, W] whose 3 x 3 neighbourhood spans more than ``edge`` m: edges, where pixels fly, and slopes that are
+    seen at a grazing angle, where a sensor tells as little.
+    """
+    return (np.asarray(depth) > 0) & lost_edges(np.asarray(depth), edge)
