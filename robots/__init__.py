@@ -1,4 +1,4 @@
-"""Robots: kinematics from URDF, ours or the user's own, as differentiable torch modules."""
+"""Robots: kinematics from URDF as differentiable torch modules, families of motion, and plans for them."""
 
 if __name__ != "torchcloth.robots":
     raise ImportError(f"got {__name__!r}; import this package as torchcloth.robots")
@@ -8,7 +8,7 @@ from .arm import Arm, Limits, Primitive, load
 from .description import models
 from .holds import Hold
 from .plan import ACCELERATION, Plan, plan
-from .replay import replay
+from .replay import arm_of, replay
 from .scene import Scene, Table, bimanual_rig
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "Primitive",
     "Scene",
     "Table",
+    "arm_of",
     "bimanual_rig",
     "load",
     "models",

@@ -10,7 +10,7 @@ from torchcloth.errors import RecordingError
 from torchcloth.recordings import JointMotion, Recording
 from torchcloth.types import Trajectory
 
-from .arm import load
+from .arm import Arm, load
 
 HOLDING_WIDTH = 0.02  # m, fingers opened less than this hold the cloth, when only the width was recorded
 
@@ -34,19 +34,29 @@ def replay(recording: Recording, dtype: torch.dtype = torch.float64) -> dict[str
         pose = _poses(motion.position, motion.quat_wxyz)
         out[name] = Trajectory(_tensor(motion.t), pose.to(dtype), torch.as_tensor(motion.closed, dtype=torch.bool))
     for name, joints in recording.joints.items():
-        if name not in recording.robots:
-            raise RecordingError(
-                f"{recording.path}: joints of {name!r}",
-                got="no robot of that name",
-                expected=f"robots.{name} in episode.json",
-                remedy="name the model and its base pose",
-            )
-        robot = recording.robots[name]
-        arm = load(robot.model, frame=robot.tool_frame or "flange", base=_tensor(robot.T_world_base))
-        out[name] = Trajectory(_tensor(joints.t), arm(_tensor(joints.q)).to(dtype), _closed(joints))
+        pose = arm_of(recording, name)(_tensor(joints.q))
+        out[name] = Trajectory(_tensor(joints.t), pose.to(dtype), _closed(joints))
     if not out:
         raise RecordingError(f"{recording.path}: no motion", expected="grippers or joints in motion.npz")
     return out
+
+
+def arm_of(recording: Recording, name: str) -> Arm:
+    """The arm that an episode's joints of this name belong to, where it stands.
+
+    Raises:
+        RecordingError: the episode names no robot of that name.
+        InvalidInput: the arm's model or frame is unknown.
+    """
+    if name not in recording.robots:
+        raise RecordingError(
+            f"{recording.path}: joints of {name!r}",
+            got="no robot of that name",
+            expected=f"robots.{name} in episode.json",
+            remedy="name the model and its base pose",
+        )
+    robot = recording.robots[name]
+    return load(robot.model, frame=robot.tool_frame or "flange", base=_tensor(robot.T_world_base))
 
 
 def _tensor(array: np.ndarray) -> Tensor:

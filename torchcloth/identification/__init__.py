@@ -5,16 +5,19 @@ from .fit import identify
 from .null import rigid_carry
 from .pictures import draw
 from .result import Estimate, Identification
+from .saved import Replayed, replayed
 from .tables import print_fit
 
 __all__ = [
     "Episode",
     "Estimate",
     "Identification",
+    "Replayed",
     "cloth_from",
     "draw",
     "episode",
     "identify",
     "print_fit",
+    "replayed",
     "rigid_carry",
 ]

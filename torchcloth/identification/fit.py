@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal, cast
 
 import torch
@@ -22,6 +23,7 @@ from .null import rigid_carry
 from .objective import Objective
 from .report import estimates, warnings_of, withdraw
 from .result import Identification
+from .saved import model_of
 from .unknowns import collect
 
 PAPER_ITERATIONS, PAPER_CHAMFER = 35, 0.015  # the DiffCP paper's stop rule: iterations, metres
@@ -88,9 +90,10 @@ def identify(
     if not unknowns:
         raise InvalidInput("parameters", got="none", expected="at least one name")
     objective = Objective(cloth, unknowns, [episode(cloth, r) for r in episodes_in], dt)
-    return _Run(objective, stop, on_progress).solve(
+    found = _Run(objective, stop, on_progress).solve(
         method, iterations, rate, dict(guess or {}), early=not warm_start and stop != "paper"
     )
+    return replace(found, model=model_of(cloth, found, episodes_in, dt))
 
 
 def default_parameters(cloth: Cloth) -> list[str]:

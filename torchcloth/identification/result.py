@@ -50,6 +50,8 @@ class Identification:
         warnings: what to mistrust, in sentences.
         history: one entry per iteration: chamfer [m] and parameter values.
         frames_before, frames_after, frames_null: [T, V, 3] m for each episode.
+        keys: module path by name of the fitted parameters.
+        model: what else a repetition of the simulation needs (see ``saved``).
     """
 
     parameters: dict[str, Estimate]
@@ -61,6 +63,7 @@ class Identification:
     frames_after: list[Tensor] = field(repr=False)
     frames_null: list[Tensor] = field(repr=False)
     keys: dict[str, str] = field(default_factory=dict, repr=False)
+    model: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def as_dict(self) -> dict[str, Any]:
         """The content of identification.json."""
@@ -71,6 +74,7 @@ class Identification:
             "convention": CONVENTION,
             "warnings": self.warnings,
             "history": self.history,
+            "model": self.model,
         }
 
     def save(self, folder: str | Path) -> Path:

@@ -1,0 +1,165 @@
+"""A fit that was written to disk, as a cloth that can be simulated again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..cloth import Cloth
+from ..errors import InvalidInput, RecordingError
+from ..parameters import PhysicalParameter
+from ..recordings import Recording
+from ..transfer import Contact
+from .episodes import Episode, cloth_from, episode
+from .misfit import figures
+from .replays import Replay
+from .result import Identification
+from .unknowns import available
+
+RESULT = "identification.json"
+SAME = 1e-5  # m, between the mean points of one episode, kept and read again
+FAITHFUL = 0.02  # relative difference of Chamfer between the fit and its replay that other machines explain
+
+
+@dataclass(frozen=True, eq=False)
+class Replayed:
+    """An episode simulated with fitted values.
+
+    Attributes:
+        cloth: with all values set.
+        episode: what it was driven by and is compared with.
+        frames: [T, V, 3] m at ``episode.times``.
+        chamfer: [T] m, mean distance of each frame's measured points from the simulated surface.
+        warning: when the distances are not those that the fit had; else empty.
+    """
+
+    cloth: Cloth
+    episode: Episode
+    frames: Tensor
+    chamfer: Tensor
+    warning: str
+
+
+def model_of(cloth: Cloth, fit: Identification, recordings: Sequence[Recording], dt: float | None) -> dict[str, Any]:
+    """What identification.json keeps, beside the estimates, so that ``replayed`` can repeat the simulation."""
+    values = {name: _parameter(cloth, path).value.item() for name, path in available(cloth).items()}
+    values |= {name: fit.parameters[name].value for name in fit.keys}
+    faces = torch.as_tensor(cloth.mesh.faces)
+    episodes = []
+    for recording, frames in zip(recordings, fit.frames_after, strict=True):
+        chamfer = figures([frames], [episode(cloth, recording)], faces).chamfer
+        episodes.append({**_mark(recording), "chamfer": chamfer})
+    contact = None if cloth.contact is None else asdict(cloth.contact)
+    return {"values": values, "contact": contact, "dt": dt, "episodes": episodes}
+
+
+def replayed(path: str | Path, recording: Recording) -> Replayed:
+    """Simulate one of a fit's episodes with the fitted values.
+
+    Args:
+        path: identification.json, or the folder that holds it.
+        recording: one of the episodes that were fitted.
+
+    Raises:
+        InvalidInput: there is no such file, or the fit is of another episode or model.
+        RecordingError: the file cannot be read, or does not hold what is needed.
+    """
+    path = Path(path)
+    path = path / RESULT if path.is_dir() else path
+    model = _read(path)
+    kept = _same(path, model.episodes, recording)
+    cloth = _rebuilt(path, model, recording)
+    data = episode(cloth, recording)
+    with torch.no_grad():
+        frames = Replay(cloth)(data, model.dt)
+    found = figures([frames], [data], torch.as_tensor(cloth.mesh.faces))
+    warning = ""
+    if abs(found.chamfer - kept["chamfer"]) > FAITHFUL * kept["chamfer"]:
+        warning = (
+            f"the simulation is {1e3 * found.chamfer:.2f} mm from the points, the fit was {1e3 * kept['chamfer']:.2f}: "
+            "the fitted model had parts that the episode does not describe"
+        )
+    return Replayed(cloth, data, frames, found.per_frame, warning)
+
+
+@dataclass(frozen=True)
+class _Model:
+    """The entry "model" of identification.json."""
+
+    values: dict[str, float]
+    contact: Contact | None
+    dt: float | None
+    episodes: list[dict[str, Any]]
+
+
+def _read(path: Path) -> _Model:
+    again = "run `torchcloth identify` again"
+    try:
+        content = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise InvalidInput("fit", got=f"no {path}", expected=f"{RESULT}, or the folder that holds it") from None
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path}: unreadable", got=error, remedy=again) from None
+    try:
+        model = content["model"]
+        return _Model(
+            {str(name): float(value) for name, value in model["values"].items()},
+            None if model["contact"] is None else Contact(**model["contact"]),
+            None if model["dt"] is None else float(model["dt"]),
+            [
+                {"name": str(e["name"]), **{key: int(e[key]) for key in ("frames", "points")}}
+                | {"mean": np.asarray(e["mean"], float).reshape(3), "chamfer": float(e["chamfer"])}
+                for e in model["episodes"]
+            ],
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise RecordingError(
+            f"{path}: does not say which model was fitted", got=repr(error), expected="an entry model", remedy=again
+        ) from None
+
+
+def _mark(recording: Recording) -> dict[str, Any]:
+    """What an episode is recognised by, wherever it lies."""
+    points = recording.require("points", by="the fit")
+    name = recording.path.name if recording.path else "recording"
+    return {"name": name, "frames": len(points), "points": len(points.xyz), "mean": points.xyz.mean(0).tolist()}
+
+
+def _same(path: Path, episodes: Sequence[dict[str, Any]], recording: Recording) -> dict[str, Any]:
+    own = _mark(recording)
+    for kept in episodes:
+        alike = all(kept[key] == own[key] for key in ("frames", "points"))
+        if alike and np.abs(np.subtract(kept["mean"], own["mean"])).max() < SAME:
+            return kept
+    raise InvalidInput(
+        f"{path}: a fit of another episode",
+        got=own["name"],
+        expected=" or ".join(str(kept["name"]) for kept in episodes),
+        remedy="view the fitted episode, or fit this one",
+    )
+
+
+def _rebuilt(path: Path, model: _Model, recording: Recording) -> Cloth:
+    cloth = cloth_from(recording, contact=model.contact)
+    names = available(cloth)
+    if other := model.values.keys() ^ names.keys():
+        raise InvalidInput(
+            f"{path}: a fit of another model",
+            got=f"{', '.join(sorted(other))} in only one of them",
+            expected="the model that the episode describes",
+            remedy="show a cloth of your own with viewing.with_cloth",
+        )
+    for name, value in model.values.items():
+        _parameter(cloth, names[name]).set(value)
+    return cloth
+
+
+def _parameter(cloth: Cloth, path: str) -> PhysicalParameter:
+    return cloth.get_submodule(path)  # type: ignore[return-value]

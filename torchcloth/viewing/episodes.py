@@ -1,0 +1,180 @@
+"""A recording as a film."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from ..boundaries.motion import interpolate
+from ..errors import RecordingError, TorchclothError
+from ..observe import solid_mesh
+from ..recordings import Collider, Recording
+from ..robots import arm_of, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..types import Trajectory
+from .film import (
+    MARKERS,
+    TRUTH,
+    Array,
+    Cloud,
+    Curve,
+    Film,
+    Plane,
+    Sheet,
+    Solid,
+    Trace,
+    View,
+    nearest,
+)
+
+RATE = 25.0  # 1/s, frames of an episode that was not observed
+MARGIN = 0.3  # m, by which a collider's plane is drawn beyond what lies over it
+SLACK = 0.5  # of the time between two frames: what was seen farther away than this is not shown
+
+
+def film_of(recording: Recording, *, truth: bool = False, times: Array | None = None) -> Film:
+    """What an episode holds: points, markers, arms, grippers' paths, colliders, cameras, forces.
+
+    A stream that was not recorded is not shown.
+
+    Args:
+        recording: an episode.
+        truth: show the true cloth of a synthetic episode too (read it with ``with_truth=True``).
+        times: [T] s on the motion clock; None: those of the points, else of markers, images or truth, else 25 a second.
+
+    Raises:
+        RecordingError: truth was asked for and is not there, or nothing in the episode has a time.
+        MissingDependency: the kinematics' packages are not installed and the episode has joints.
+    """
+    if truth:
+        recording.require("truth", by="--truth")
+    times = _times(recording, truth) if times is None else np.asarray(times, dtype=float)
+    arms, paths, notes = _arms(recording, times)
+    if recording.grippers:
+        paths = {**replay(replace(recording, joints={})), **paths}
+    film = Film(
+        title=recording.path.name if recording.path else "recording",
+        times=times,
+        sheets={"truth": _truth(recording, times)} if truth else {},
+        clouds=_clouds(recording, times),
+        solids=arms,
+        traces={f"grippers/{name}": _trace(path, times) for name, path in paths.items()},
+        views={f"cameras/{name}": view for name, view in _views(recording, times).items()},
+        curves=_curves(recording),
+        notes=tuple(notes),
+    )
+    planes = {f"colliders/{name}": _plane(c, film.box()) for name, c in recording.colliders.items()}
+    return replace(film, planes=planes)
+
+
+def _times(recording: Recording, truth: bool) -> Array:
+    """On the motion clock; observations are brought to it."""
+    offset = recording.clock_offset
+    for stream in (recording.points, recording.markers):
+        if stream is not None:
+            return stream.t + offset
+    for camera in recording.cameras.values():
+        for images in (camera.depth, camera.color):
+            if images is not None:
+                return images.t + offset
+    if truth and recording.truth is not None:
+        return recording.truth.t
+    motions = [*recording.grippers.values(), *recording.joints.values()]
+    if not motions:
+        raise RecordingError(f"{recording.path}: nothing to view", expected="points, markers, images or motion")
+    start, end = min(m.t[0] for m in motions), max(m.t[-1] for m in motions)
+    return np.linspace(start, end, max(2, round((end - start) * RATE) + 1))
+
+
+def _seen(stream_times: Array, times: Array) -> Array:
+    """[T] which entry of an observed stream belongs to each frame; -1 where none is near."""
+    index = nearest(stream_times, times)
+    steps = np.concatenate([np.diff(stream_times), np.diff(times)])
+    gap = SLACK * float(np.median(steps)) if len(steps) else 0.0
+    return np.where(np.abs(stream_times[index] - times) <= gap * (1 + 1e-6) + 1e-9, index, -1)
+
+
+def _clouds(recording: Recording, times: Array) -> dict[str, Cloud]:
+    out, nothing = {}, np.zeros((0, 3), np.float32)
+    if (points := recording.points) is not None:
+        index = _seen(points.t + recording.clock_offset, times)
+        cuts = np.split(points.xyz.astype(np.float32), np.cumsum(points.counts)[:-1])
+        out["points"] = Cloud(tuple(nothing if i < 0 else cuts[i] for i in index))
+    if (markers := recording.markers) is not None:
+        index = _seen(markers.t + recording.clock_offset, times)
+        rows = [nothing if i < 0 else markers.xyz[i].astype(np.float32) for i in index]
+        out["markers"] = Cloud(tuple(row[np.isfinite(row).all(axis=-1)] for row in rows), MARKERS)
+    return out
+
+
+def _truth(recording: Recording, times: Array) -> Sheet:
+    """The true vertices, linear between their times."""
+    found = recording.require("truth", by="--truth")
+    right = np.clip(np.searchsorted(found.t, times), 1, max(1, len(found.t) - 1))
+    left, right = right - 1, np.minimum(right, len(found.t) - 1)
+    share = np.clip((times - found.t[left]) / np.maximum(found.t[right] - found.t[left], 1e-12), 0, 1)[:, None, None]
+    x = (1 - share) * found.vertices[left] + share * found.vertices[right]
+    return Sheet(x.astype(np.float32), found.faces, colour=TRUTH)
+
+
+def _arms(recording: Recording, times: Array) -> tuple[dict[str, Solid], dict[str, Trajectory], list[str]]:
+    """The solids and the gripper's path of every arm whose joints were recorded; why others are not drawn."""
+    solids, paths, notes = {}, {}, []
+    for name, motion in recording.joints.items():
+        try:
+            arm = arm_of(recording, name)
+            q = np.stack([np.interp(times, motion.t, column) for column in motion.q.T], axis=-1)
+            shapes = arm.geometry(torch.as_tensor(q, dtype=arm.base.dtype))
+            paths |= replay(replace(recording, grippers={}, joints={name: motion}))
+        except ImportError:
+            raise
+        except TorchclothError as error:
+            notes.append(f"arm {name!r} is not drawn: {error}")
+            continue
+        for number, shape in enumerate(shapes):
+            vertices, faces = solid_mesh(shape.kind, shape.size, np.eye(4), segments=16)
+            solids[f"arms/{name}/{number}-{shape.link}"] = Solid(vertices, faces, _poses(shape.pose, len(times)))
+    return solids, paths, notes
+
+
+def _poses(pose: torch.Tensor, count: int) -> Array:
+    """[T, 4, 4], or [1, 4, 4] of what never moves."""
+    poses = np.broadcast_to(pose.detach().numpy(), (count, 4, 4))
+    return poses[:1] if np.allclose(poses, poses[0], rtol=0, atol=1e-9) else poses
+
+
+def _trace(path: Trajectory, times: Array) -> Trace:
+    inside = np.clip(times, float(path.t[0]), float(path.t[-1]))
+    poses = interpolate(path, torch.as_tensor(inside, dtype=path.pose.dtype))
+    return Trace(path.pose[:, :3, 3].numpy(), poses.numpy())
+
+
+def _plane(collider: Collider, box: tuple[Array, Array]) -> Plane:
+    """A square of a collider's surface under everything."""
+    low, high = box
+    normal = collider.normal / np.linalg.norm(collider.normal)
+    middle = (low + high) / 2
+    centre = middle - ((middle - collider.point) @ normal) * normal
+    first = np.cross(np.eye(3)[np.argmin(np.abs(normal))], normal)
+    first /= np.linalg.norm(first)
+    axes = (float(np.linalg.norm(high - low)) / 2 + MARGIN) * np.stack([first, np.cross(normal, first)])
+    return Plane(centre + np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]) @ axes)
+
+
+def _views(recording: Recording, times: Array) -> dict[str, View]:
+    out = {}
+    for name, camera in recording.cameras.items():
+        depth = camera.depth
+        index = np.full(len(times), -1) if depth is None else _seen(depth.t + recording.clock_offset, times)
+        out[name] = View(camera, index)
+    return out
+
+
+def _curves(recording: Recording) -> dict[str, Curve]:
+    """Size of each measured gripper force."""
+    out = {}
+    for name, motion in {**recording.joints, **recording.grippers}.items():
+        if motion.force is not None:
+            out[f"force/{name}"] = Curve(motion.t, np.linalg.norm(motion.force, axis=-1), "N")
+    return out

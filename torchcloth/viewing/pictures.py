@@ -1,0 +1,106 @@
+"""A film as a GIF that plays in real time, or as a PNG of some of its moments. Needs matplotlib and pillow only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InvalidInput
+from .film import Array, Film
+from .saving import atomically
+from .stage import Stage
+
+RATE = 25.0  # 1/s; browsers slow a GIF of more than 50 down
+COLOURS = 96  # of a GIF
+PANELS = 4  # moments on a PNG
+
+
+def animate(
+    film: Film,
+    path: str | Path,
+    *,
+    size: tuple[int, int] = (560, 420),
+    rate: float = RATE,
+    look: tuple[float, float] | None = None,
+    on_frame: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write a film as a GIF, in real time.
+
+    Args:
+        film: what to show, e.g. ``film_of(recording)``.
+        path: the file; it only ever holds a whole GIF.
+        size: (width, height) pixels.
+        rate: at most so many frames a second, up to 50.
+        look: (azimuth, elevation) degrees of the eye; None: chosen by the film.
+        on_frame: called with (frames done, frames in all).
+
+    Returns:
+        ``path``.
+
+    Raises:
+        InvalidInput: a rate that no GIF has, or a size too small.
+    """
+    from PIL import Image
+
+    if not 0 < rate <= 50:
+        raise InvalidInput("rate", got=rate, expected="up to 50 frames a second, what a GIF can hold")
+    film = film.at_most(rate)
+    stage = Stage(film, size, look)
+    palette = _palette(stage)
+    images = []
+    for frame in range(len(film)):
+        pixels = Image.fromarray(stage.pixels(frame))
+        images.append(pixels.quantize(palette=palette, dither=Image.Dither.NONE))
+        if on_frame is not None:
+            on_frame(frame + 1, len(film))
+    steps = _durations(film.times)
+    with atomically(Path(path)) as part:
+        images[0].save(
+            part, format="GIF", save_all=True, append_images=images[1:], duration=steps, loop=0, optimize=True
+        )
+    return Path(path)
+
+
+def picture(
+    film: Film, path: str | Path, *, size: tuple[int, int] = (480, 420), look: tuple[float, float] | None = None
+) -> Path:
+    """Write a PNG with four moments of the film, from the first frame to the last, side by side.
+
+    Args:
+        film: what to show.
+        path: the file; it only ever holds a whole PNG.
+        size: (width, height) pixels of one moment.
+        look: as of ``animate``.
+
+    Returns:
+        ``path``.
+    """
+    from PIL import Image
+
+    shown = np.unique(np.linspace(0, len(film) - 1, PANELS).round().astype(int))
+    stage = Stage(film, size, look)
+    row = np.concatenate([stage.pixels(int(frame)) for frame in shown], axis=1)
+    with atomically(Path(path)) as part:
+        Image.fromarray(row).save(part, format="PNG", optimize=True)
+    return Path(path)
+
+
+def _palette(stage: Stage) -> Any:
+    """One palette for all frames, from three of them: the parts that do not move then cost nothing."""
+    from PIL import Image
+
+    shown = np.unique(np.linspace(0, len(stage.film) - 1, 3).round().astype(int))
+    together = np.concatenate([stage.pixels(int(frame)) for frame in shown])
+    return Image.fromarray(together).quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+
+
+def _durations(times: Array) -> list[int]:
+    """Milliseconds of each frame, in the hundredths of a second that a GIF knows; their sum is right."""
+    if len(times) == 1:
+        return [1000]
+    ends = np.append(times[1:], 2 * times[-1] - times[-2]) - times[0]
+    hundredths = np.diff(np.round(100 * ends).astype(int), prepend=0)
+    return (10 * np.maximum(hundredths, 2)).tolist()
