@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .moves import Action, Grips, Limits, Move, action, along, check, lowest
+from .moves import Action, Grips, Limits, Move, action, along, check, finite, lowest
 
 
 def hang(
@@ -29,4 +29,5 @@ def hang(
     """
     rise = height - lowest(grips)
     check(**{"height over the grips": rise})
+    finite(carry=carry)
     return action(grips, [Move(along(heading, carry, rise))], heading, rest, limits, release=False)

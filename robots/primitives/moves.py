@@ -95,8 +95,7 @@ def minimum_jerk(u: Tensor) -> Tensor:
 
 def along(heading: float, distance: float, rise: float = 0.0) -> Vector:
     """A shift [m] by ``distance`` in the direction ``heading`` [rad] from the x axis, and upwards by ``rise``."""
-    if not math.isfinite(heading):
-        raise InvalidInput("heading", got=heading, expected="a finite angle in radians")
+    finite(heading=heading)
     return distance * math.cos(heading), distance * math.sin(heading), rise
 
 
@@ -119,6 +118,13 @@ def check(**values: float) -> None:
     for name, value in values.items():
         if not (math.isfinite(value) and value > 0):
             raise InvalidInput(name, got=f"{value:g}", expected="a finite value > 0")
+
+
+def finite(**values: float) -> None:
+    """Refuses values that are not finite."""
+    for name, value in values.items():
+        if not math.isfinite(value):
+            raise InvalidInput(name, got=value, expected="a finite number")
 
 
 def _sample(moves: Sequence[Move], limits: Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from .moves import Action, Grips, Limits
+from .moves import Action, Grips, Limits, finite
 from .swing import to_and_fro
 
 
@@ -34,6 +34,7 @@ def shake(
     Raises:
         InvalidInput: a value that gives no motion, or a path through the table.
     """
+    finite(elevation=elevation, heading=heading)
     flat = math.cos(elevation)
     direction = (flat * math.cos(heading), flat * math.sin(heading), math.sin(elevation))
     return to_and_fro(grips, amplitude, direction, cycles, period, heading, rest, limits)

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from importlib import metadata
 
 from ..errors import TorchclothError
-from . import bench, doctor, identify
+from . import bench, doctor, identify, simulate
 
-VERBS = (identify, doctor, bench)  # each has add(verbs)
+VERBS = (identify, simulate, doctor, bench)  # each has add(verbs)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
