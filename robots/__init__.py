@@ -1,11 +1,30 @@
-"""Robots: kinematics from URDF, ours or the user's own, as differentiable torch modules."""
+"""Robots: kinematics from URDF as differentiable torch modules, families of motion, and plans for them."""
 
 if __name__ != "torchcloth.robots":
     raise ImportError(f"got {__name__!r}; import this package as torchcloth.robots")
 
+from . import primitives
 from .arm import Arm, Limits, Primitive, load
 from .description import models
+from .holds import Hold
+from .plan import ACCELERATION, Plan, plan
 from .replay import arm_of, replay
-from .scene import Scene, bimanual_rig
+from .scene import Scene, Table, bimanual_rig
 
-__all__ = ["Arm", "Limits", "Primitive", "Scene", "arm_of", "bimanual_rig", "load", "models", "replay"]
+__all__ = [
+    "ACCELERATION",
+    "Arm",
+    "Hold",
+    "Limits",
+    "Plan",
+    "Primitive",
+    "Scene",
+    "Table",
+    "arm_of",
+    "bimanual_rig",
+    "load",
+    "models",
+    "plan",
+    "primitives",
+    "replay",
+]

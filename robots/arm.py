@@ -61,7 +61,7 @@ def load(
     """
     path = locate(name_or_path)
     home = RIZON_HOME if str(name_or_path) in models() else None
-    return Arm(describe(path, frame), frame=frame, base=base, home=home, dtype=dtype)
+    return Arm(describe(path, frame), model=str(name_or_path), frame=frame, base=base, home=home, dtype=dtype)
 
 
 class Arm(nn.Module):
@@ -72,6 +72,7 @@ class Arm(nn.Module):
 
     Attributes:
         name: of the robot.
+        model: what it was loaded by: a name among ``models()``, or the path of a URDF file.
         frame: the link whose pose is computed.
         joint_names: the names of the J joints, root first.
         joint_types: ``revolute``, ``continuous`` or ``prismatic``, one for each joint.
@@ -92,13 +93,14 @@ class Arm(nn.Module):
         self,
         description: Description,
         *,
+        model: str = "",
         frame: str,
         base: Tensor | None = None,
         home: tuple[float, ...] | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
-        self.name, self.frame = description.name, frame
+        self.name, self.model, self.frame = description.name, model or description.name, frame
         self.joint_names, self.joint_types = description.joint_names, description.joint_types
         self._shapes = description.shapes
         prismatic = torch.tensor([kind == "prismatic" for kind in self.joint_types])
@@ -116,6 +118,11 @@ class Arm(nn.Module):
         for key, value in buffers.items():
             self.register_buffer(key, value.to(dtype), persistent=False)
         self.register_buffer("_prismatic", prismatic, persistent=False)
+
+    @property
+    def bodies(self) -> tuple[int, ...]:
+        """Which joint moves each solid of ``geometry``, counted from 1; 0 for those of the root."""
+        return tuple(shape.body for shape in self._shapes)
 
     @property
     def limits(self) -> Limits:

@@ -19,6 +19,12 @@ RESTARTS = 20  # random postures for the first pose of a sequence; later poses m
 SEED = 0  # the same poses give the same joints
 
 
+class Unreachable(InvalidInput):
+    """A pose that no joint positions were found for; ``pose`` is its index."""
+
+    pose = 0
+
+
 @torch.no_grad()
 def solve(
     arm: Arm, poses: Tensor, q0: Tensor, reference: Tensor, limit: Tensor, tolerance: float, iterations: int
@@ -86,14 +92,16 @@ def _random_postures(q0: Tensor, limit: Tensor) -> list[Tensor]:
     return list(lower + draws * (upper - lower))
 
 
-def _unreached(arm: Arm, index: int, target: Tensor, q: Tensor, limit: Tensor) -> InvalidInput:
+def _unreached(arm: Arm, index: int, target: Tensor, q: Tensor, limit: Tensor) -> Unreachable:
     """The error for the first pose without a solution."""
     error = twist(arm(q), target)
     near = ((q - limit[0]).abs() < 1e-3) | ((q - limit[1]).abs() < 1e-3)
     stuck = [name for name, at_limit in zip(arm.joint_names, near.tolist(), strict=True) if at_limit]
     cause = f"at its soft limit: {', '.join(stuck)}" if stuck else "no joint is at a limit: it is out of reach"
-    return InvalidInput(
+    unreachable = Unreachable(
         f"pose {index} cannot be reached by {arm.name!r} ({cause})",
         got=f"{float(error[:3].norm()):.3g} m and {float(error[3:].norm()):.3g} rad left",
         remedy="move the pose, choose another q0, or add poses on the way to it",
     )
+    unreachable.pose = index
+    return unreachable

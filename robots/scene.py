@@ -1,14 +1,15 @@
-"""Several arms in one world."""
+"""Several arms and a table in one world."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 
 from torchcloth.errors import InvalidInput
+from torchcloth.recordings import RobotInfo
 from torchcloth.types import Trajectory
 
 from .arm import Arm, Primitive, load
@@ -18,18 +19,36 @@ from .arm import Arm, Primitive, load
 HALF_SPAN = 0.316  # m
 
 
+class Table(NamedTuple):
+    """A table: a block whose upper side is level. Default: UniFolding's, as its settings bound it (same source)."""
+
+    x: tuple[float, float] = (0.20, 1.02)  # m, from and to
+    y: tuple[float, float] = (-0.82, 0.82)  # m
+    height: float = 0.0  # m, of its upper side
+    thickness: float = 0.04  # m
+
+    def primitive(self, dtype: torch.dtype = torch.float64) -> Primitive:
+        """The block, for drawing, for what a camera sees and for clearance."""
+        (x0, x1), (y0, y1) = self.x, self.y
+        pose = torch.eye(4, dtype=dtype)
+        pose[:3, 3] = torch.tensor([(x0 + x1) / 2, (y0 + y1) / 2, self.height - self.thickness / 2], dtype=dtype)
+        return Primitive("box", (x1 - x0, y1 - y0, self.thickness), pose, "table")
+
+
 class Scene(nn.Module):
-    """Arms by name; each stands where its own ``base`` says.
+    """Arms by name, each where its own ``base`` says, and perhaps a table.
 
     Args:
         arms: name to arm, e.g. ``{"left": load("rizon4", base=...), "right": ...}``. The names are those of the grasps.
+        table: that the arms must not touch with more than their fingers; None: there is none.
     """
 
-    def __init__(self, arms: Mapping[str, Arm]) -> None:
+    def __init__(self, arms: Mapping[str, Arm], table: Table | None = None) -> None:
         super().__init__()
         if not arms:
             raise InvalidInput("arms is empty", expected="one arm or more")
         self.arms = nn.ModuleDict(dict(arms))
+        self.table = table
 
     def __getitem__(self, name: str) -> Arm:
         return cast(Arm, self.arms[name])
@@ -61,6 +80,13 @@ class Scene(nn.Module):
         self._check_names("q", q)
         return [primitive for name in self.arms for primitive in self[name].geometry(q[name])]
 
+    def infos(self) -> dict[str, RobotInfo]:
+        """What a recording says about the arms, by name."""
+        return {
+            name: RobotInfo(self[name].model, self[name].base.detach().double().cpu().numpy(), self[name].frame)
+            for name in self.arms
+        }
+
     def _check_names(self, argument: str, given: Mapping[str, Tensor]) -> None:
         if given.keys() != set(self.arms):
             raise InvalidInput(f"{argument} names other arms", got=sorted(given), expected=str(list(self.arms)))
@@ -69,8 +95,8 @@ class Scene(nn.Module):
 def bimanual_rig(model: str = "rizon4", frame: str = "tcp_closed", dtype: torch.dtype = torch.float64) -> Scene:
     """Two arms side by side as in UniFolding's rig: ``left`` at (0, 0.316, 0) m, ``right`` at (0, -0.316, 0) m.
 
-    World: origin midway between the bases, x away from the robots over the table, y to the left arm, z up. The table
-    lies level with the bases, at z = 0. The positions are the rounded calibration of xiaoxiaoxh/UniFolding @ cbd0b37;
+    World: origin midway between the bases, x away from the robots over the table, y to the left arm, z up. The table's
+    top is level with the bases, at z = 0. The positions are the rounded calibration of xiaoxiaoxh/UniFolding @ cbd0b37;
     its arms of 2023 very likely had the wrist of ``rizon4_gen2022``.
 
     Args:
@@ -83,4 +109,4 @@ def bimanual_rig(model: str = "rizon4", frame: str = "tcp_closed", dtype: torch.
         base = torch.eye(4, dtype=dtype)
         base[1, 3] = y
         arms[name] = load(model, frame=frame, base=base, dtype=dtype)
-    return Scene(arms)
+    return Scene(arms, Table())

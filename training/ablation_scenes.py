@@ -19,11 +19,11 @@ from torchcloth.errors import InvalidInput
 from torchcloth.materials import AEP
 from torchcloth.materials.presets import find
 from torchcloth.meshes import Mesh
+from torchcloth.robots.primitives import Action, Limits, cover, drag, fling
 from torchcloth.transfer import Contact
 from torchcloth.transfer.contact import GAP, SPARSEST
 
 from .ablation_measures import energies, scaled_poisson
-from .actions import Action, Limits, cover, drag, fling
 
 LEVELS = (25, 50, 75, 125, 150, 175)  # % of the reference
 PARAMETERS = {"E": "youngs_modulus", "nu": "poisson_ratio", "k": "contact_stiffness", "gamma": "shear_stiffness"}

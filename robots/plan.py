@@ -1,0 +1,164 @@
+"""From the grippers' paths to joint motions that the arms can do: within their limits, clear of all that is hard."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import product
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchcloth.errors import InvalidInput
+from torchcloth.recordings import JointMotion
+from torchcloth.types import Trajectory
+
+from .clearance import FAR, Gap
+from .crowd import between_arms, within_arm
+from .holds import Hold, candidates, inward
+from .primitives import Action
+from .scene import Scene
+from .spline import Spline
+from .ways import Load, Task, Way, dense, follow, load, ways
+
+# Flexiv publishes no joint accelerations; 3 rad/s^2 is what the examples of its RDK command (flexiv_rdk @ dca9a15).
+ACCELERATION = 3.0  # rad/s^2
+KEPT = 3  # ways of each arm that are tried with those of the others
+EASE = 1.002  # slower than the limits ask for by that much, for what lies between the samples
+
+
+class Plan(NamedTuple):
+    """Joint motions of all arms of a scene on common knots, and what they cost."""
+
+    t: Tensor  # [K] s
+    q: dict[str, Tensor]  # name -> [K, J] rad
+    closed: dict[str, Tensor]  # name -> [K] bool
+    release: float  # s, when the grippers open
+    slower: float  # times the duration that was asked for
+    limiting: str  # which joint of which arm, by what limit, is nearest to its bound
+    gap: Gap  # what comes nearest
+    holds: dict[str, Hold]
+
+    def motion(self, scene: Scene) -> dict[str, Trajectory]:
+        """The poses that the joints lead through, by gripper."""
+        return {name: Trajectory(self.t, scene[name](self.q[name]).detach(), self.closed[name]) for name in self.q}
+
+    def joints(self) -> dict[str, JointMotion]:
+        """As a recording stores it; with ``scene.infos()`` for its robots, ``replay`` gives the same poses."""
+        t = self.t.numpy()
+        return {name: JointMotion(t, q.numpy(), closed=self.closed[name].numpy()) for name, q in self.q.items()}
+
+
+def plan(
+    scene: Scene,
+    action: Action,
+    *,
+    acceleration: float = ACCELERATION,
+    clearance: float = 0.02,
+    slow_down: bool = True,
+    period: float = 0.01,
+    holds: Mapping[str, Hold] | None = None,
+) -> Plan:
+    """Joint motions that lead the grippers along their paths.
+
+    Each arm tries many directions of its tool and postures, and takes the way that needs least slowing down and stays
+    clear. Checked: reach, soft position limits, velocity limits, accelerations, distances of all solids every 20 ms of
+    the path, and that the joints keep within 0.1 mm of the path, between knots too.
+
+    Args:
+        scene: the arms, and the table if there is one.
+        action: paths of grippers that have the names of arms; an arm without a path stands still at home.
+        acceleration: the most that any joint may do [rad/s^2]; see ``ACCELERATION``.
+        clearance: between two arms, and between an arm and the table [m]; the solids of the tool's own frame (the
+            fingers) may come down to the table. Links of one arm keep 5 mm.
+        slow_down: the whole motion may take longer than asked, as the joints' limits need; else it is refused.
+        period: the longest time between two knots of the result [s].
+        holds: directions of the tools, by arm, instead of a search.
+
+    Raises:
+        InvalidInput: names the joint or the pair of solids in the way, value, limit and time.
+    """
+    if unknown := action.motion.keys() - scene.arms.keys():
+        raise InvalidInput("action moves unknown arms", got=sorted(unknown), expected=f"among {list(scene.arms)}")
+    for name, value in {"acceleration": acceleration, "clearance": clearance, "period": period}.items():
+        if not (math.isfinite(value) and value > 0):
+            raise InvalidInput(name, got=value, expected="a finite value > 0")
+    options = {
+        name: _options(scene, name, action, acceleration, clearance, (holds or {}).get(name)) for name in scene.arms
+    }
+    refusals = []
+    for combination in sorted(product(*options.values()), key=lambda some: max(way.load.factor for way, _ in some)):
+        chosen = {name: way for name, (way, _) in zip(options, combination, strict=True)}
+        gap = between_arms(scene, {name: way.spline for name, way in chosen.items()})
+        if gap.distance >= clearance:
+            nearest = min([gap, *(own for _, own in combination)], key=lambda gap: gap.distance)
+            return _timed(scene, action, chosen, nearest, slow_down, period)
+        refusals.append(gap.refusal(clearance))
+    raise refusals[0]
+
+
+def _options(
+    scene: Scene, name: str, action: Action, acceleration: float, clearance: float, hold: Hold | None
+) -> list[tuple[Way, Gap]]:
+    """A few ways of one arm that are clear of the table and of itself, fastest first."""
+    arm = scene[name]
+    limit = torch.full_like(arm.home, acceleration)
+    if name not in action.motion:
+        times = next(iter(action.motion.values())).t[[0, -1]]
+        still = Spline.through(times, arm.home.expand(2, -1).to(times))
+        return [(Way(Hold(), still, load(arm, still, limit)), Gap(FAR, "", "", 0.0))]
+
+    def check(q: Tensor, times: Tensor) -> InvalidInput | None:
+        return within_arm(scene, name, q, times, clearance)[1]
+
+    task = Task(arm, dense(action.motion[name]), inward(name, action.motion, arm), limit, check)
+    found: list[tuple[Way, Gap]] = []
+    refusals: list[InvalidInput] = []
+    for tried in ways(task, candidates() if hold is None else [hold]):
+        try:
+            way = follow(task, tried)
+        except InvalidInput as error:
+            refusals.append(error)
+            continue
+        found.append((way, within_arm(scene, name, way.spline.q, task.path.t, clearance)[0]))
+        if len(found) == KEPT:
+            break
+    if not found:
+        raise refusals[0]
+    return sorted(found, key=lambda option: option[0].load.factor)
+
+
+def _timed(scene: Scene, action: Action, chosen: dict[str, Way], gap: Gap, slow_down: bool, period: float) -> Plan:
+    """All arms slowed down alike, sampled at every knot of the path and between."""
+    name, hardest = max(chosen.items(), key=lambda item: item[1].load.factor)
+    slower = max(1.0, EASE * hardest.load.factor) if hardest.load.factor > 1 else 1.0
+    if slower > 1 and not slow_down:
+        raise _too_fast(scene, name, hardest.load)
+    splines = {key: way.spline.slower(slower) for key, way in chosen.items()}
+    path = dense(next(iter(action.motion.values())))
+    t = Spline(slower * path.t, path.t[:, None], path.t[:, None]).finer(period)
+    knot = torch.searchsorted(slower * path.t, t + 1e-9, right=True) - 1
+    never = torch.zeros_like(path.closed)
+    held = {key: dense(action.motion[key]).closed if key in action.motion else never for key in chosen}
+    return Plan(
+        t=t,
+        q={key: spline.at(t)[0] for key, spline in splines.items()},
+        closed={key: closed[knot] for key, closed in held.items()},
+        release=slower * action.release,
+        slower=slower,
+        limiting=f"{hardest.load.what} of {scene[name].joint_names[hardest.load.joint]} of {name}",
+        gap=gap._replace(time=slower * gap.time),
+        holds={key: way.hold for key, way in chosen.items()},
+    )
+
+
+def _too_fast(scene: Scene, name: str, load: Load) -> InvalidInput:
+    unit = "rad/s" if load.what == "velocity" else "rad/s^2"
+    return InvalidInput(
+        f"the motion breaks the {load.what} limit of {scene[name].joint_names[load.joint]!r} of {name!r} "
+        f"at t = {load.time:.3g} s",
+        got=f"{load.value:.3g} {unit}",
+        expected=f"at most {load.limit:.3g} {unit}",
+        remedy=f"let it take {EASE * load.factor:.3g} times as long (slow_down=True), or ask for less",
+    )

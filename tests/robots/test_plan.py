@@ -1,0 +1,213 @@
+"""Plans, judged from outside: finite differences of the joints, the forward map, and the layer's own interpolation."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchcloth import recordings, robots
+from torchcloth.boundaries.motion import interpolate
+from torchcloth.errors import InvalidInput
+from torchcloth.robots import Hold, plan
+from torchcloth.robots import primitives as P
+from torchcloth.robots.primitives.moves import PERIOD
+from torchcloth.robots.spline import Spline
+from torchcloth.types import Trajectory
+
+
+def grips(x, z, width=0.32):
+    return {"left": (x, width / 2, z), "right": (x, -width / 2, z)}
+
+
+TABLE, HIGH = grips(0.38, 0.015), grips(0.5, 0.6, 0.4)
+# The holds that the search finds: with them a plan takes a fraction of its time.
+CASES = {
+    "cover": (
+        P.cover(TABLE, 0.37, heading=0.0, landing=0.04, roll=0.0),
+        (0.6, -0.5, True, 0.7),
+        (0.6, 0.5, False, 0.7),
+    ),
+    "rolled": (P.cover(TABLE, 0.37, heading=0.0, landing=0.04, roll=0.7), (0.9, 0, True, 0.7), (0.6, -0.5, True, -0.7)),
+    "fold": (P.fold(TABLE, 0.18, heading=0.0, roll=0.7, landing=0.04), (0.9, 0, True, 0.7), (0.6, -0.5, True, -0.7)),
+    "fling": (P.fling(grips(0.5, 0.6), 0.2, heading=0.0), (0.9, 0.5, True, -0.7), (0.9, 0, True, 0.7)),
+    "drag": (P.drag(grips(0.52, 0.015), 0.2, heading=math.pi), (0.9, 0, False, -0.7), (0.9, 0, False, 0)),
+    "hang": (P.hang(grips(0.5, 0.015), 0.6), (0.9, 0, True, 0.7), (0.9, 0, False, 0.7)),
+    "swing": (P.swing(HIGH), (1.2, 0.5, True, 0), (1.2, -1, False, -0.7)),
+    "shake": (P.shake(HIGH), (1.2, -1, False, -0.7), (1.2, -1, False, 0.7)),
+    "stretch": (P.stretch(HIGH), (0.6, -0.5, True, -0.7), (0.6, 0.5, False, -0.7)),
+}
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return robots.bimanual_rig()
+
+
+@pytest.fixture(scope="module")
+def made(rig):
+    """Every family once."""
+    torch.set_num_threads(1)
+    return {
+        name: (action, plan(rig, action, holds={"left": Hold(*left), "right": Hold(*right)}))
+        for name, (action, left, right) in CASES.items()
+    }
+
+
+def finely(found, name, count=8000):
+    """(step, joints [N, J]) of the curve through the recorded knots, on a fine grid."""
+    times = torch.linspace(0, float(found.t[-1]), count, dtype=torch.float64)
+    return times, Spline.through(found.t, found.q[name]).at(times)[0]
+
+
+@pytest.mark.parametrize("family", CASES)
+@pytest.mark.parametrize("arm", ["left", "right"])
+def test_within_position_velocity_and_acceleration_limits(rig, made, family, arm):
+    _, found = made[family]
+    times, q = finely(found, arm)
+    limits, step = rig[arm].limits, float(times[1])
+    assert bool((q >= limits.soft_lower - 1e-3).all() & (q <= limits.soft_upper + 1e-3).all())
+    velocity = q.diff(dim=0) / step
+    assert bool((velocity.abs() <= limits.velocity).all())
+    acceleration = velocity.diff(dim=0) / step
+    assert float(acceleration.abs().max()) <= robots.ACCELERATION * 1.01
+    assert float(velocity[[0, -1]].abs().max()) < 2 * robots.ACCELERATION * step  # from rest to rest
+
+
+@pytest.mark.parametrize("family", CASES)
+def test_some_limit_is_used_when_slowed_down(rig, made, family):
+    _, found = made[family]
+    if found.slower == 1:
+        return
+    worst = 0.0
+    for name in found.q:
+        times, q = finely(found, name)
+        velocity = q.diff(dim=0) / float(times[1])
+        acceleration = velocity.diff(dim=0) / float(times[1])
+        share = float((velocity.abs() / rig[name].limits.velocity).max())
+        worst = max(worst, share, float(acceleration.abs().max()) / robots.ACCELERATION)
+    assert worst > 0.98
+
+
+@pytest.mark.parametrize("family", CASES)
+@pytest.mark.parametrize("arm", ["left", "right"])
+def test_the_joints_lead_along_the_path_between_knots_too(rig, made, family, arm):
+    """Against what the layer makes of the asked-for path, and what it makes of the recorded knots."""
+    action, found = made[family]
+    times = torch.linspace(0, action.duration, 4001, dtype=torch.float64)
+    asked = interpolate(action.motion[arm], times)
+    still = action.motion[arm].t[(action.motion[arm].pose != action.motion[arm].pose[-1]).any(-1).any(-1)][-1] + PERIOD
+    asked[times >= still] = action.motion[arm].pose[-1]  # the layer would creep by 0.1 mm between knots 0.2 s apart
+    through_joints = rig[arm](Spline.through(found.t, found.q[arm]).at(found.slower * times)[0])
+    assert float((through_joints - asked)[:, :3, 3].norm(dim=-1).max()) < 1e-4
+    replayed = interpolate(found.motion(rig)[arm], (found.slower * times).clamp(max=float(found.t[-1])))
+    assert float((replayed - asked)[:, :3, 3].norm(dim=-1).max()) < 1e-4
+    turn = through_joints[:, :3, :3] @ through_joints[0, :3, :3].mT @ asked[:, :3, :3].mT
+    assert float((turn - torch.eye(3)).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("family", CASES)
+def test_solids_keep_their_distance(rig, made, family):
+    """Points of the arms' solids are outside each other and above the table: no formula shared with the planner."""
+    _, found = made[family]
+    q = {name: value[::5] for name, value in found.q.items()}
+    clouds = {name: [_corners(p) for p in rig[name].geometry(q[name])[4:]] for name in q}
+    for name, cloud in clouds.items():
+        lowest = min(float(points[..., 2].min()) for points in cloud)
+        assert lowest > -1e-3, name
+        assert min(float(points[..., 2].min()) for points in cloud[:-1]) > 0.02 - 1e-3, name
+    far = min(
+        float((a[:, :, None] - b[:, None]).norm(dim=-1).min())
+        for a in clouds["left"][-4:]
+        for b in clouds["right"][-4:]
+    )
+    assert far > 0.02
+
+
+def _corners(p):
+    """Points [T, N, 3] on the surface of a solid."""
+    if p.kind == "box":
+        local = torch.cartesian_prod(*[torch.tensor([-s / 2, s / 2], dtype=torch.float64) for s in p.size])
+    else:
+        angle = torch.linspace(0, 2 * math.pi, 13, dtype=torch.float64)[:-1]
+        ring = torch.stack([p.size[0] * angle.cos(), p.size[0] * angle.sin()], -1)
+        local = torch.cat([torch.cat([ring, torch.full((12, 1), s * p.size[1] / 2)], -1) for s in (-1, 1)])
+    return (p.pose[:, None, :3, :3] @ local[None, :, :, None])[..., 0] + p.pose[:, None, :3, 3]
+
+
+@pytest.mark.parametrize("family", ["fling", "hang"])
+def test_grippers_open_when_they_should(made, family):
+    action, found = made[family]
+    closed = found.closed["left"]
+    if family == "hang":
+        assert bool(closed.all())
+    else:
+        assert found.release == pytest.approx(found.slower * action.release)
+        assert torch.equal(closed, found.t < found.release - 1e-9)
+
+
+def test_a_recording_of_it_replays_to_the_same_poses(rig, made, tmp_path):
+    _, found = made["fling"]
+    recording = recordings.Recording(
+        cloth=recordings.ClothInfo(areal_density=0.2, sheet=(0.4, 0.4)),
+        provenance="synthetic: test",
+        joints=found.joints(),
+        robots=rig.infos(),
+    )
+    again = robots.replay(recordings.read(recordings.write(recording, tmp_path / "episode")))
+    for name, trajectory in found.motion(rig).items():
+        assert torch.equal(again[name].t, trajectory.t)
+        assert float((again[name].pose - trajectory.pose).abs().max()) < 1e-12
+        assert torch.equal(again[name].closed, trajectory.closed)
+
+
+def test_the_search_finds_a_way_and_prefers_a_fast_one(rig):
+    action = P.stretch(HIGH, 0.03, hold=0.2, rest=0.1)
+    found = plan(rig, action, acceleration=1.0)
+    clumsy = plan(rig, action, acceleration=1.0, holds={"left": Hold(0.3, 1.0), "right": Hold(0.3, -1.0)})
+    assert 1 < found.slower < clumsy.slower
+
+
+def test_a_lone_arm_moves_while_the_other_stands(rig):
+    action = P.hang({"left": (0.5, 0.3, 0.1)}, 0.3, rest=0.2)
+    found = plan(rig, action, holds={"left": Hold(0.2)})
+    assert float(found.q["right"].diff(dim=0).abs().max()) == 0
+    assert not bool(found.closed["right"].any())
+    assert float(found.motion(rig)["left"].pose[-1, 2, 3]) == pytest.approx(0.3, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("action", "options", "what"),
+    [
+        (
+            P.swing(HIGH),
+            {"slow_down": False},
+            r"acceleration limit of 'joint\d' of '(left|right)' at t = .* rad/s\^2.*slow_down",
+        ),
+        (P.hang(grips(0.5, 0.2), 1.6), {}, r"pose \d+ cannot be reached by 'rizon4'.* at t = "),
+        (P.hang(grips(0.5, 0.10, 0.02), 0.3), {}, "'.*' of 'left' comes too near to '.*' of 'right' at t = "),
+        (P.hang(grips(0.5, 0.012), 0.3), {"holds": {"left": Hold(1.5)}}, "'.*' of 'left' comes too near to the table"),
+        (P.hang({"middle": (0.5, 0.0, 0.1)}, 0.3), {}, "action moves unknown arms"),
+        (P.swing(HIGH), {"acceleration": float("nan")}, "acceleration"),
+    ],
+)
+def test_refusals_name_what_is_in_the_way(rig, action, options, what):
+    held = {"holds": {"left": Hold(0.6), "right": Hold(0.6)}} | options
+    with pytest.raises(InvalidInput, match=what):
+        plan(rig, action, **held)
+
+
+def test_paths_with_too_few_knots_are_refused(rig):
+    pose = torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
+    pose[:, :3, 3] = torch.tensor([0.5, 0.3, 0.3], dtype=torch.float64)
+    pose[1, 0, 3], pose[2, 2, 3] = 0.7, 0.6
+    t = torch.tensor([0.0, 0.5, 1.0, 1.5], dtype=torch.float64)
+    action = P.Action({"left": Trajectory(t, pose, torch.ones(4, dtype=torch.bool))}, 1.5, 1.5)
+    with pytest.raises(InvalidInput, match=r"stray from the path .*more knots"):
+        plan(rig, action, holds={"left": Hold()})
+
+
+def test_a_plan_is_plain_numpy_for_a_recording(made):
+    for joints in made["swing"][1].joints().values():
+        assert isinstance(joints.q, np.ndarray)
+        assert joints.closed.dtype == bool

@@ -1,0 +1,4 @@
+import pytest
+
+pytest.importorskip("pytorch_kinematics")
+pytest.importorskip("open3d")

@@ -1,0 +1,13 @@
+"""Synthetic recordings: garments and sheets moved by a robot, simulated by this engine, seen by a depth camera.
+
+What a fit recovers from them it recovers under the very model that made them (an inverse crime): they show whether a
+method works at all, never how well it does on cloth. Their provenance says so.
+"""
+
+from __future__ import annotations
+
+from .episodes import make
+from .garments import GARMENTS
+from .orders import CAMERAS, MOTIONS, Order
+
+__all__ = ["CAMERAS", "GARMENTS", "MOTIONS", "Order", "make"]
