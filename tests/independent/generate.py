@@ -49,10 +49,8 @@ def record(
     seen, first, touch = (np.random.default_rng([seed, k]) for k in range(3))
     sensor = replace(scene.sensor, noise=0.0) if exact else scene.sensor
     nominal = Scene()
-    uv, faces, start = measured_mesh(
-        scene.sheet, result.x[0], nodes, 0.0 if exact else INITIAL_ERROR, list(moved.held.values()), nominal.grip.radius,
-        first,
-    )  # fmt: skip
+    size, held = 0.0 if exact else INITIAL_ERROR, list(moved.held.values())
+    uv, faces, start = measured_mesh(scene.sheet, result.x[0], nodes, size, held, nominal.grip.radius, first)
     if moved.table:
         start[:, 2] = np.maximum(start[:, 2], 0.0)
     placed = np.tile(np.eye(4), (len(start), 1, 1))

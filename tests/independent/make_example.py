@@ -94,7 +94,7 @@ def hanging(plan: Plan, uv: Array, rng: np.random.Generator) -> Array:
 
 
 def fit_mesh(plan: Plan, x: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Material coordinates [V, 2], triangles [F, 3] and measured first positions [V, 3] m of the mesh that a fit uses."""
+    """Material coordinates [V, 2], triangles [F, 3] and measured first positions [V, 3] m of a fit's mesh."""
     return measured_mesh(plan.sheet, x, plan.fit_nodes, plan.initial_error, list(CORNER.values()), RADIUS, rng)
 
 

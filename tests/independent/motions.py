@@ -17,7 +17,7 @@ Array = np.ndarray
 KNOT = 0.01  # s
 STILL = 0.2  # s, all stand still before and after
 PIVOT = np.array([0.5, 0.0, 0.0])  # m, about which a heading turns the scene
-TAUT = 1.004  # distance of the grippers over the width; a slack edge snaps through, and no two engines then agree
+TAUT = 1.01  # distance of the grippers over the width; a slack edge snaps through, and no two engines then agree
 
 
 @dataclass(frozen=True)

@@ -57,9 +57,9 @@ class Scene:
     """
 
     sheet: SheetSpec = field(
-        default_factory=lambda: SheetSpec(areal_density=0.25, membrane_stiffness=80.0, damping_time=2e-3)
+        default_factory=lambda: SheetSpec(areal_density=0.25, membrane_stiffness=80.0, damping_time=5e-4)
     )
-    plate: PlateSpec = field(default_factory=lambda: PlateSpec(stiffness=4e-5, damping_time=0.02))
+    plate: PlateSpec = field(default_factory=lambda: PlateSpec(stiffness=1e-4, damping_time=0.02))
     membrane: MembraneSpec = field(default_factory=MembraneSpec)
     air: AirSpec = field(default_factory=AirSpec)
     weight: WeightSpec = field(default_factory=WeightSpec)

@@ -65,7 +65,7 @@ def see(spec: SensorSpec, sheet: SheetSpec, t: Array, x: Array, rng: np.random.G
         walk = fresh if i == 0 else spec.bias_memory * walk + np.sqrt(1 - spec.bias_memory**2) * fresh
         room = np.array([sheet.width, sheet.height]) - 2 * spec.edge
         points = bilinear(sheet, frame, spec.edge + uv * room)[0]
-        seen = np.flatnonzero(~_hidden(spec, points, frame, i / len(frames)))[: spec.points]
+        seen = np.flatnonzero(~_hidden(spec, points, frame, i / max(len(frames) - 1, 1)))[: spec.points]
         clouds.append(_measured(spec, points[seen], noise[seen], walk))
     return PointClouds(stamps, np.concatenate(clouds), np.array([len(c) for c in clouds]))
 

@@ -329,5 +329,5 @@ def test_friction_differs_by_direction_and_falls_with_speed():
 def test_adhesion_pulls_within_its_gap():
     hook, _ = started(Table(TableSpec(adhesion=2.0, gap=1e-3)))
     for height, pull in ((5e-4, 2.0 * 0.04), (2e-3, 0.0)):
-        x = lying(SMALL) + [0, 0, height]
+        x = lying(SMALL) + np.array([0, 0, height])
         assert -hook.force(0.0, x, 0 * x)[:, 2].sum() == pytest.approx(pull)
