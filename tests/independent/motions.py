@@ -17,7 +17,7 @@ Array = np.ndarray
 KNOT = 0.01  # s
 STILL = 0.2  # s, all stand still before and after
 PIVOT = np.array([0.5, 0.0, 0.0])  # m, about which a heading turns the scene
-TAUT = 1.01  # distance of the grippers over the width; a slack edge snaps through, and no two engines then agree
+TAUT = 1.006  # distance of the grippers over the width; a slack edge snaps through, and no two engines then agree
 
 
 @dataclass(frozen=True)
@@ -70,21 +70,21 @@ def _back_and_forth(amplitude: float, leg: float, cycles: int, axis: int) -> _Pl
 
 HANGING = {
     "hang": _Plan([0.0, 1.0], [(0, 0, 0), (0, 0, 0)]),
-    "drape": _Plan([0.0, 1.0], [(0, 0, 0), (0, 0, 0)], apart=[-0.012, -0.012]),
+    "drape": _Plan([0.0, 1.0], [(0, 0, 0), (0, 0, 0)], apart=[-0.010, -0.010]),
     "swing": _back_and_forth(0.05, 0.85, 1, 0),
-    "swing-fast": _back_and_forth(0.05, 0.32, 2, 0),
+    "swing-fast": _back_and_forth(0.04, 0.34, 1, 0),
     "shake": _back_and_forth(0.02, 0.22, 3, 2),
-    "stretch": _Plan([0.0, 0.5, 0.8, 1.3], [(0, 0, 0)] * 4, apart=[0.0, 0.02, 0.02, 0.0]),
+    "stretch": _Plan([0.0, 0.5, 0.8, 1.3], [(0, 0, 0)] * 4, apart=[0.0, 0.010, 0.010, 0.0]),
     "turn": _Plan(
         [0.0, 0.7, 1.1, 1.8], [(0, 0, 0), (0.06, 0, 0), (0.06, 0, 0), (0, 0, 0)], yaw=[0.0, np.pi / 2, np.pi / 2, 0.0]
     ),
 }
 # from a sheet that lies on the table, upper edge held: the path of that edge, and how far apart the grippers go
 LYING = {
-    "drag": _Plan([0.0, 0.25, 1.25], [(0, 0, 0), (0, 0, 0.02), (0.20, 0, 0.02)]),
-    "drag-fast": _Plan([0.0, 0.25, 0.70], [(0, 0, 0), (0, 0, 0.02), (0.20, 0, 0.02)]),
-    "lift": _Plan([0.0, 1.4], [(0, 0, 0), (-0.15, 0, 0.50)]),
-    "fold": _Plan([0.0, 0.7, 1.5], [(0, 0, 0), (-0.16, 0, 0.20), (-0.30, 0, 0.08)]),
+    "drag": _Plan([0.0, 0.25, 1.25], [(0, 0, 0), (0, 0, 0.02), (0.16, 0, 0.02)]),
+    "drag-fast": _Plan([0.0, 0.25, 0.70], [(0, 0, 0), (0, 0, 0.02), (0.16, 0, 0.02)]),
+    "lift": _Plan([0.0, 1.4], [(0, 0, 0), (-0.12, 0, 0.40)]),
+    "fold": _Plan([0.0, 0.7, 1.5], [(0, 0, 0), (-0.12, 0, 0.15), (-0.22, 0, 0.07)]),
 }
 NAMES = (*HANGING, *LYING)
 GRIPPERS = {"left": 1.0, "right": -1.0}  # side along y

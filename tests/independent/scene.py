@@ -37,7 +37,7 @@ class GripSpec:
             by which it is believed to be turned, about the middle of the scene.
     """
 
-    radius: float = 0.026
+    radius: float = 0.038
     wider: float = 0.0
     slip: float = 0.0
     hold: float = 0.3
@@ -57,9 +57,9 @@ class Scene:
     """
 
     sheet: SheetSpec = field(
-        default_factory=lambda: SheetSpec(areal_density=0.25, membrane_stiffness=80.0, damping_time=5e-4)
+        default_factory=lambda: SheetSpec(0.30, 0.30, areal_density=0.25, membrane_stiffness=120.0, damping_time=2e-4)
     )
-    plate: PlateSpec = field(default_factory=lambda: PlateSpec(stiffness=1e-4, damping_time=0.02))
+    plate: PlateSpec = field(default_factory=lambda: PlateSpec(stiffness=6e-5, damping_time=0.015))
     membrane: MembraneSpec = field(default_factory=MembraneSpec)
     air: AirSpec = field(default_factory=AirSpec)
     weight: WeightSpec = field(default_factory=WeightSpec)
