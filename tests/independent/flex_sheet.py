@@ -26,6 +26,8 @@ class SheetSpec:
         air_density: kg/m^3.
         gravity: m/s^2, world z.
         diagonals: "alternating" (union jack) or "parallel".
+        shrink_u, shrink_v: -, share by which the cloth at rest is shorter than its pattern.
+        skew: rad, by which the angle between u and v at rest is less than a right one.
     """
 
     width: float = 0.40
@@ -40,6 +42,9 @@ class SheetSpec:
     air_density: float = 1.204
     gravity: float = -9.81
     diagonals: str = "alternating"
+    shrink_u: float = 0.0
+    shrink_v: float = 0.0
+    skew: float = 0.0
 
 
 def grid(spec: SheetSpec) -> tuple[Array, Array]:
@@ -53,6 +58,13 @@ def grid(spec: SheetSpec) -> tuple[Array, Array]:
             forward = spec.diagonals == "parallel" or (i + j) % 2 == 0
             faces += [(a, b, c), (a, c, d)] if forward else [(a, b, d), (b, c, d)]
     return np.stack([u.ravel(), v.ravel()], 1), np.array(faces)
+
+
+def rest_points(spec: SheetSpec) -> Array:
+    """Where the vertices [V, 2] m of the relaxed cloth lie in its plane; the pattern itself without shrinkage."""
+    uv, _ = grid(spec)
+    lean = np.array([[1.0, np.sin(spec.skew)], [0.0, np.cos(spec.skew)]])
+    return (uv * [1 - spec.shrink_u, 1 - spec.shrink_v]) @ lean.T
 
 
 def bilinear(sheet: SheetSpec, values: Array, uv: Array) -> tuple[Array, Array, Array]:
@@ -88,8 +100,8 @@ def largest_step(spec: SheetSpec) -> float:
 
 def flex_xml(spec: SheetSpec, dt: float) -> str:
     """The sheet, flat in the plane z = 0, as a MuJoCo model with time step ``dt`` s."""
-    uv, faces = grid(spec)
-    points = " ".join(f"{u:.17g} {v:.17g} 0" for u, v in uv)
+    _, faces = grid(spec)
+    points = " ".join(f"{u:.17g} {v:.17g} 0" for u, v in rest_points(spec))
     elements = " ".join(map(str, faces.ravel()))
     bends = spec.bending_stiffness > 0
     # thickness and modulus that give both stiffnesses asked for: Y = E t, D = E t^3 / (12 (1 - nu^2))

@@ -21,7 +21,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-from flex_sheet import SheetSpec, bilinear, grid
+from first_frame import measured_mesh
+from flex_sheet import SheetSpec, grid
 from kinect_view import Place, arm_meshes, observe_cloth
 from mujoco_cloth import Grip, MujocoCloth, Result, settle
 from swing_motion import SIDE, Swing, demands, forward, joints
@@ -93,22 +94,8 @@ def hanging(plan: Plan, uv: Array, rng: np.random.Generator) -> Array:
 
 
 def fit_mesh(plan: Plan, x: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Material coordinates [V, 2], triangles [F, 3] and measured first positions [V, 3] m of the mesh that a fit uses.
-
-    The positions are the truth's, bilinear between its vertices, with a smooth error along the cloth's normal: what a
-    surface fitted to depth images has. Errors of single vertices would be strains of several per cent, which no cloth
-    at rest has. The corners are where the robots say.
-    """
-    uv, faces = grid(SheetSpec(plan.sheet.width, plan.sheet.height, nodes=(plan.fit_nodes, plan.fit_nodes)))
-    position, along_u, along_v = bilinear(plan.sheet, x, uv)
-    normal = np.cross(along_u, along_v)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    knots = rng.standard_normal((5, 5))
-    coarse = SheetSpec(plan.sheet.width, plan.sheet.height, nodes=(5, 5))
-    error = bilinear(coarse, knots.reshape(-1, 1), uv)[0]
-    error *= plan.initial_error / np.sqrt((error**2).mean())
-    free = np.min([np.linalg.norm(uv - corner, axis=1) for corner in CORNER.values()], axis=0) > RADIUS
-    return uv, faces, position + error * normal * free[:, None]
+    """Material coordinates [V, 2], triangles [F, 3] and measured first positions [V, 3] m of a fit's mesh."""
+    return measured_mesh(plan.sheet, x, plan.fit_nodes, plan.initial_error, list(CORNER.values()), RADIUS, rng)
 
 
 def make(plan: Plan) -> tuple[recordings.Recording, dict[str, object]]:

@@ -8,24 +8,38 @@ version is refused.
 
 Integration is MuJoCo's semi-implicit Euler: symplectic, so without numerical damping, and with a step limited by the
 membrane wave. MuJoCo's implicit "discrete" integrator would allow larger steps at the price of numerical damping. Air
-drag is computed here, in numpy. Vertices inside a grasp are prescribed at every step; what it takes to do so is the
-gripper's force.
+drag is computed here, in numpy, and so is everything that `Hook`s add. Vertices inside a grasp are prescribed at every
+step; what it takes to do so is the gripper's force.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-from flex_sheet import Air, SheetSpec, flex_xml, grid, largest_step, vertex_masses
+from flex_sheet import Air, SheetSpec, flex_xml, grid, largest_step, rest_points, vertex_masses
+from hooks import Hook
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from torchcloth.errors import InvalidInput, MissingDependency, SimulationDiverged
 
 Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Slip:
+    """A grip that gives way: the patch creeps along the cloth's pull F at ``mobility (|F| - hold)`` m/s, F > hold.
+
+    Attributes:
+        mobility: m/(s N).
+        hold: N.
+    """
+
+    mobility: float = 0.0
+    hold: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -36,11 +50,13 @@ class Grip:
         vertices: [N] indices of the held vertices.
         t: [K] s, increasing.
         pose: [K, 4, 4] body to world, m; splines (C2) between the knots, constant outside them.
+        slip: how the patch leaves the gripper; None: it does not.
     """
 
     vertices: Array
     t: Array
     pose: Array
+    slip: Slip | None = None
 
 
 @dataclass(frozen=True)
@@ -72,12 +88,24 @@ class _Held:
         self.origin = CubicSpline(grip.t, grip.pose[:, :3, 3])(t)
         self.turn = RotationSpline(grip.t, Rotation.from_matrix(grip.pose[:, :3, :3]))(t).as_matrix()
         self.local = (x0[self.index] - self.origin[0]) @ self.turn[0]
+        self.slip, self.crept = grip.slip, np.zeros(3)
         self.wrench = np.zeros((frames, 6))
         self.sum, self.count = np.zeros(6), 0
 
     def place(self, step: int) -> Array:
         """Positions [N, 3] m at a step."""
         return self.origin[step] + self.local @ self.turn[step].T
+
+    def creep(self, step: int, pull: Array, dt: float) -> None:
+        """Let the patch slip under the cloth's pull [N, 3] N, in which its own inertia does not count."""
+        if self.slip is None:
+            return
+        total = pull.sum(0)
+        size = np.linalg.norm(total)
+        if size > self.slip.hold:
+            move = self.slip.mobility * (size - self.slip.hold) * dt / size * total
+            self.crept += move
+            self.local = self.local + move @ self.turn[step]
 
     def gather(self, step: int, pull: Array) -> None:
         """Add the forces [N, 3] N of one step."""
@@ -97,12 +125,13 @@ class MujocoCloth:
     Args:
         spec: the cloth and the air.
         dt: s, time step; None takes :func:`flex_sheet.largest_step`.
+        hooks: further forces and masses; started anew with every run.
 
     Raises:
         MissingDependency: a MuJoCo whose 2-D elasticity is not the documented one.
     """
 
-    def __init__(self, spec: SheetSpec, dt: float | None = None) -> None:
+    def __init__(self, spec: SheetSpec, dt: float | None = None, hooks: Sequence[Hook] = ()) -> None:
         if int(mujoco.__version__.split(".")[0]) < 4:
             raise MissingDependency(
                 "MuJoCo's 2-D flex elasticity",
@@ -120,7 +149,8 @@ class MujocoCloth:
         self.model.body_mass[1:] = self.mass  # flexcomp gives all points the same mass; the rim must have less
         self.data = mujoco.MjData(self.model)
         mujoco.mj_setConst(self.model, self.data)
-        self._rest = np.column_stack([self.uv, np.zeros(len(self.uv))])
+        self._rest = np.column_stack([rest_points(spec), np.zeros(len(self.uv))])
+        self.hooks = list(hooks)
         self._air = Air(spec, self.faces, len(self.uv)) if spec.drag_normal > 0 else None
 
     def run(
@@ -153,9 +183,11 @@ class MujocoCloth:
         q, v = self.data.qpos.reshape(-1, 3), self.data.qvel.reshape(-1, 3)
         q[:] = x0 - self._rest
         v[:] = 0.0 if v0 is None else v0
+        for hook in self.hooks:
+            hook.start(self, x0)
         xs, vs, error, frame = [x0], [v.copy()], 0.0, 1
         for step in range(frames[-1]):
-            error = max(error, self._step(q, v, held, step, brake, load))
+            error = max(error, self._step(q, v, held, step, clock[step], brake, load))
             if step == 0:
                 for grip in held.values():
                     grip.wrench[0] = grip.sum
@@ -170,7 +202,9 @@ class MujocoCloth:
         torque = {name: grip.wrench[:, 3:] for name, grip in held.items()}
         return Result(clock[frames], np.stack(xs), np.stack(vs), force, torque, error)
 
-    def _step(self, q: Array, v: Array, held: dict[str, _Held], step: int, brake: float, load: Array | None) -> float:
+    def _step(
+        self, q: Array, v: Array, held: dict[str, _Held], step: int, t: float, brake: float, load: Array | None
+    ) -> float:
         """Advance the state by one step in place; returns the grasp error in m at its start."""
         data, error = self.data, 0.0
         x = q + self._rest
@@ -179,19 +213,43 @@ class MujocoCloth:
             applied += load
         if brake:
             applied -= brake * self.mass[:, None] * v
-        data.qfrc_applied[:] = applied.ravel()
+        for hook in self.hooks:
+            applied += hook.force(t, x, v)
         before = v.copy()
-        mujoco.mj_step(self.model, data)
+        self._advance(x, applied)
         push = data.qfrc_passive.reshape(-1, 3) + applied
+        weight = np.array([0.0, 0.0, self.spec.gravity])
         for grip in held.values():
             i = grip.index
             error = max(error, float(np.linalg.norm(data.flexvert_xpos[i] - grip.place(step), axis=1).max()))
+            grip.creep(step, push[i] + self.mass[i, None] * weight, self.dt)
             target = grip.place(step + 1)
             q[i] = target - self._rest[i]
             v[i] = (target - x[i]) / self.dt  # what semi-implicit Euler would have needed to get there
-            gained = (v[i] - before[i]) / self.dt - [0.0, 0.0, self.spec.gravity]
+            gained = (v[i] - before[i]) / self.dt - weight
             grip.gather(step, push[i] - self.mass[i, None] * gained)
         return error
+
+    def _advance(self, x: Array, applied: Array) -> None:
+        """MuJoCo's step under the applied forces [V, 3] N, to which inertial reactions are added in place."""
+        reacting = [hook for hook in self.hooks if hook.reacts]
+        if not reacting:
+            self.data.qfrc_applied[:] = applied.ravel()
+            mujoco.mj_step(self.model, self.data)
+            return
+        mujoco.mj_step1(self.model, self.data)
+        total = self.data.qfrc_passive.reshape(-1, 3) + applied
+        total[:, 2] += self.mass * self.spec.gravity
+        for hook in reacting:
+            applied += hook.reaction(x, total)
+        self.data.qfrc_applied[:] = applied.ravel()
+        mujoco.mj_step2(self.model, self.data)
+
+    def weigh(self, mass: Array) -> None:
+        """Give the vertices the masses [V] kg from now on."""
+        self.mass = mass
+        self.model.body_mass[1:] = mass
+        self.model.dof_M0[:] = np.repeat(mass, 3)  # what MuJoCo takes as the inertia of a lone slide joint
 
     def _check(self, x: Array, t: float) -> None:
         if not np.isfinite(x).all() or any(w.number for w in self.data.warning):

@@ -1,0 +1,173 @@
+"""Bending of the sheet as finite differences on its grid: a Kirchhoff plate, not hinges.
+
+Second differences x_uu and x_vv at the grid's nodes and x_uv in its cells, energy per area B/2 (x_uu^2 + weft x_vv^2 +
+2 sqrt(weft) x_uv^2). Unlike hinges it converges to the plate as the mesh is refined, whatever the diagonals. Rows next
+to the rim stand for it, too, so that a uniformly bent sheet stores its exact energy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from flex_sheet import SheetSpec
+from hooks import Hook, dahl
+from scipy.sparse import csr_matrix, diags, kron, vstack
+
+if TYPE_CHECKING:
+    from mujoco_cloth import MujocoCloth
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class PlateSpec:
+    """How the sheet bends.
+
+    Attributes:
+        stiffness: N m, B along u.
+        weft: -, stiffness along v over that along u, less 1.
+        damping_time: s, viscous over elastic moment.
+        curl: 1/m, rest curvature along u, towards the side of the normal u x v; ``curl_weft`` along v.
+        friction: N, Dahl's limit HB of the moment per width, built up over ``threshold`` 1/m.
+        crease: 1/s, mobility of the rest curvature where the elastic one exceeds ``crease_yield`` 1/m.
+        layer: -, a second layer on the middle ninth of the sheet: this many times its own stiffness more.
+    """
+
+    stiffness: float = 0.0
+    weft: float = 0.0
+    damping_time: float = 0.0
+    curl: float = 0.0
+    curl_weft: float = 0.0
+    friction: float = 0.0
+    threshold: float = 5.0
+    crease: float = 0.0
+    crease_yield: float = 30.0
+    layer: float = 0.0
+
+
+class Stencils:
+    """Second differences of a sheet's grid.
+
+    Attributes:
+        rows: [R, V] sparse, 1/m^2: x_uu, x_vv and sqrt 2 x_uv, one after the other.
+        area: [R] m^2, for which each row stands.
+        kind: [R] 0, 1 or 2.
+        place: [R, V] sparse: means, of a nodal field at the rows' places.
+    """
+
+    def __init__(self, sheet: SheetSpec) -> None:
+        nu, nv = sheet.nodes
+        hu = sheet.width * (1 - sheet.shrink_u) / (nu - 1)
+        hv = sheet.height * (1 - sheet.shrink_v) / (nv - 1)
+        one_u, one_v = diags([np.ones(nu)], [0]), diags([np.ones(nv)], [0])
+        blocks = [
+            kron(one_v, _second(nu, hu)),
+            kron(_second(nv, hv), one_u),
+            np.sqrt(2) * kron(_first(nv, hv), _first(nu, hu)),
+        ]
+        means = [kron(one_v, _inner(nu)), kron(_inner(nv), one_u), kron(_middle(nv), _middle(nu))]
+        areas = [
+            np.kron(_spans(nv, hv), _inner_spans(nu, hu)),
+            np.kron(_inner_spans(nv, hv), _spans(nu, hu)),
+            np.full((nu - 1) * (nv - 1), hu * hv),
+        ]
+        self.rows, self.place = csr_matrix(vstack(blocks)), csr_matrix(vstack(means))
+        self.area, self.kind = np.concatenate(areas), np.repeat([0, 1, 2], [len(a) for a in areas])
+
+
+def _second(n: int, h: float) -> csr_matrix:
+    return diags([1 / h**2, -2 / h**2, 1 / h**2], [0, 1, 2], shape=(n - 2, n))
+
+
+def _first(n: int, h: float) -> csr_matrix:
+    return diags([-1 / h, 1 / h], [0, 1], shape=(n - 1, n))
+
+
+def _inner(n: int) -> csr_matrix:
+    return diags([1.0], [1], shape=(n - 2, n))
+
+
+def _middle(n: int) -> csr_matrix:
+    return diags([0.5, 0.5], [0, 1], shape=(n - 1, n))
+
+
+def _spans(n: int, h: float) -> Array:
+    out = np.full(n, h)
+    out[[0, -1]] = h / 2
+    return out
+
+
+def _inner_spans(n: int, h: float) -> Array:
+    out = np.full(n - 2, h)
+    out[[0, -1]] += h / 2
+    return out
+
+
+class Plate(Hook):
+    """The linear part: elasticity and damping."""
+
+    def __init__(self, spec: PlateSpec) -> None:
+        self.spec = spec
+
+    def start(self, cloth: MujocoCloth, x: Array) -> None:
+        stencils = Stencils(cloth.spec)
+        weight = stencils.area * _moduli(self.spec, stencils) * _layers(self.spec, cloth, stencils)
+        self.matrix = csr_matrix(stencils.rows.T @ diags([weight], [0]) @ stencils.rows)
+
+    def force(self, t: float, x: Array, v: Array) -> Array:
+        return -(self.matrix @ (x + self.spec.damping_time * v))
+
+
+class Moments(Hook):
+    """What acts on the curvature along the normal: rest curvature, internal friction, creases."""
+
+    def __init__(self, spec: PlateSpec) -> None:
+        self.spec = spec
+        self.settles = not (spec.friction or spec.crease)
+
+    def start(self, cloth: MujocoCloth, x: Array) -> None:
+        self.stencils, self.nodes = Stencils(cloth.spec), cloth.spec.nodes
+        self.moduli = _moduli(self.spec, self.stencils) * _layers(self.spec, cloth, self.stencils)
+        self.curl = np.choose(self.stencils.kind, [self.spec.curl, self.spec.curl_weft, 0.0])
+        self.seen, _ = self._curvature(x)
+        self.share, self.crease = np.zeros_like(self.seen), np.zeros_like(self.seen)
+        self.dt = cloth.dt
+
+    def force(self, t: float, x: Array, v: Array) -> Array:
+        spec = self.spec
+        curvature, normal = self._curvature(x)
+        self.share = dahl(self.share, curvature - self.seen, spec.threshold)
+        self.seen = curvature
+        if spec.crease:
+            elastic = curvature - self.curl - self.crease
+            over = np.maximum(np.abs(elastic) - spec.crease_yield, 0.0)
+            self.crease += spec.crease * self.dt * over * np.sign(elastic)
+        moment = spec.friction * self.share - self.moduli * (self.curl + self.crease)
+        return -(self.stencils.rows.T @ ((self.stencils.area * moment)[:, None] * normal))
+
+    def _curvature(self, x: Array) -> tuple[Array, Array]:
+        """Along the normal [R] 1/m, and the normals [R, 3] at the rows' places."""
+        nu, nv = self.nodes
+        table = x.reshape(nv, nu, 3)
+        normal = np.cross(np.gradient(table, axis=1), np.gradient(table, axis=0)).reshape(-1, 3)
+        normal = self.stencils.place @ normal
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-30
+        return np.einsum("rc,rc->r", self.stencils.rows @ x, normal), normal
+
+
+def _moduli(spec: PlateSpec, stencils: Stencils) -> Array:
+    """Bending stiffness [R] N m of each row."""
+    ratio = 1 + spec.weft
+    return spec.stiffness * np.choose(stencils.kind, [1.0, ratio, np.sqrt(ratio)])
+
+
+def _layers(spec: PlateSpec, cloth: MujocoCloth, stencils: Stencils) -> Array:
+    return 1 + spec.layer * (stencils.place @ patch(cloth.spec, cloth.uv))
+
+
+def patch(sheet: SheetSpec, uv: Array) -> Array:
+    """1 on the vertices of the middle ninth of the sheet, 0 elsewhere [V]."""
+    a = np.abs(uv / [sheet.width, sheet.height] - 0.5).max(1)
+    return (a <= 1 / 6 + 1e-9).astype(float)

@@ -1,0 +1,105 @@
+"""Noisy points of the sheet's surface, by numpy alone, and what a sensor may do to them.
+
+Quicker than the ray-cast camera of kinect_view.py: points are drawn from the whole surface, uniformly over the fabric,
+and carry noise along the camera's rays. Layers do not hide each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from flex_sheet import SheetSpec, bilinear
+from scipy.interpolate import CubicSpline
+
+from torchcloth.recordings import PointClouds
+
+Array = np.ndarray
+EYE = np.array([1.66, 0.55, 0.60])  # m, the camera's place
+TARGET = np.array([0.50, 0.0, 0.30])
+
+
+@dataclass(frozen=True)
+class SensorSpec:
+    """The sensor and its errors.
+
+    Attributes:
+        rate: Hz, of the frames.
+        points: per frame.
+        noise: m, standard deviation along the ray.
+        bias: m, standard deviation of a slowly varying depth error: 6 low-order modes over the image, each an
+            autoregression of ``bias_memory`` from frame to frame.
+        occlusion: -, share of the surface behind something that moves across the view.
+        edge: m, band along the sheet's edges that is not seen.
+        delay: s, by which the stamps are later than the light.
+        shift: m, by which the camera is believed to stand further along ``heading`` degrees than it does;
+            ``rotation`` rad, by which it is believed to be turned about the vertical.
+        scale: -, share by which depths read too large; ``offset`` m is added to them.
+    """
+
+    rate: float = 30.0
+    points: int = 250
+    noise: float = 1e-3
+    bias: float = 0.0
+    bias_memory: float = 0.9
+    occlusion: float = 0.0
+    edge: float = 0.0
+    delay: float = 0.0
+    shift: float = 0.0
+    heading: float = 0.0
+    rotation: float = 0.0
+    scale: float = 0.0
+    offset: float = 0.0
+
+
+def see(spec: SensorSpec, sheet: SheetSpec, t: Array, x: Array, rng: np.random.Generator) -> PointClouds:
+    """Points of the true motion x [K, V, 3] m at t [K] s, at the sensor's own frame times."""
+    stamps = np.arange(int((t[-1] - t[0]) * spec.rate + 1e-9) + 1) / spec.rate + t[0]
+    frames = CubicSpline(t, x)(np.maximum(stamps - spec.delay, t[0]))
+    walk = np.zeros(6)
+    clouds = []
+    for i, frame in enumerate(frames):
+        # drawn before anything depends on an effect, so that two episodes of a seed differ by the effect alone
+        uv, noise = rng.random((4 * spec.points, 2)), rng.standard_normal(4 * spec.points)
+        fresh = rng.standard_normal(6)
+        walk = fresh if i == 0 else spec.bias_memory * walk + np.sqrt(1 - spec.bias_memory**2) * fresh
+        room = np.array([sheet.width, sheet.height]) - 2 * spec.edge
+        points = bilinear(sheet, frame, spec.edge + uv * room)[0]
+        seen = np.flatnonzero(~_hidden(spec, points, frame, i / max(len(frames) - 1, 1)))[: spec.points]
+        clouds.append(_measured(spec, points[seen], noise[seen], walk))
+    return PointClouds(stamps, np.concatenate(clouds), np.array([len(c) for c in clouds]))
+
+
+def _measured(spec: SensorSpec, points: Array, noise: Array, walk: Array) -> Array:
+    ray = points - EYE
+    depth = np.linalg.norm(ray, axis=1)
+    across, up = _image(points).T
+    modes = np.stack([np.ones(len(points)), across, up, across * up, across**2, up**2])
+    # modes are of unit size on an image of +-0.2 (0.2 m at 1 m): the error's deviation is about spec.bias
+    slow = spec.bias / np.sqrt(6) * (walk @ (modes * 5.0 ** np.array([0, 1, 1, 2, 2, 2])[:, None]))
+    depth = depth * (1 + spec.scale) + spec.offset + spec.noise * noise + slow
+    found = ray / np.linalg.norm(ray, axis=1, keepdims=True) * depth[:, None]
+    c, s = np.cos(spec.rotation), np.sin(spec.rotation)
+    angle = np.deg2rad(spec.heading)
+    turned = found @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+    return EYE + turned + spec.shift * np.array([np.cos(angle), np.sin(angle), 0.0])
+
+
+def _image(points: Array) -> Array:
+    """Normalised image coordinates [N, 2] of points [N, 3]: to the left and up."""
+    ahead = (TARGET - EYE) / np.linalg.norm(TARGET - EYE)
+    left = np.cross([0.0, 0.0, 1.0], ahead)
+    left /= np.linalg.norm(left)
+    ray = points - EYE
+    return np.stack([ray @ left, ray @ np.cross(ahead, left)], 1) / (ray @ ahead)[:, None]
+
+
+def _hidden(spec: SensorSpec, points: Array, frame: Array, time: float) -> Array:
+    """Which points lie behind a vertical bar that moves from left to right once; its width covers the share."""
+    if not spec.occlusion:
+        return np.zeros(len(points), bool)
+    low, high = np.quantile(_image(frame)[:, 0], [0.0, 1.0])
+    width = spec.occlusion * (high - low)
+    left = high - width - time * (high - low - width)
+    place = _image(points)[:, 0]
+    return (place > left) & (place < left + width)

@@ -1,0 +1,333 @@
+"""The added forces and masses, each against a closed form or a symmetry."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", minversion="4.0")
+
+from air import AddedMass, AirSpec, Drag, LinearDrag
+from flex_sheet import Air, SheetSpec, grid
+from membrane import Membrane, MembraneSpec, orthotropic
+from mujoco_cloth import Grip, MujocoCloth, Slip
+from plate import Moments, Plate, PlateSpec
+from table import Table, TableSpec
+from weight import Weight, WeightSpec
+
+SMALL = SheetSpec(0.2, 0.2, nodes=(7, 7))
+FREE = replace(SMALL, gravity=0.0)
+G = 9.81
+
+
+def lying(spec):
+    uv, _ = grid(spec)
+    return np.column_stack([uv, np.zeros(len(uv))])
+
+
+def standing(spec):
+    uv, _ = grid(spec)
+    return np.column_stack([np.zeros(len(uv)), uv])
+
+
+def started(hook, spec=SMALL, x=None, dt=1e-4):
+    cloth = MujocoCloth(spec, dt, [hook])
+    hook.start(cloth, lying(spec) if x is None else x)
+    return hook, cloth
+
+
+def run(spec, hooks, seconds, x0=None, v0=None, grips=None, dt=3e-4, frames=2, brake=0.0):
+    cloth = MujocoCloth(spec, dt, hooks)
+    x0 = lying(spec) if x0 is None else x0
+    return cloth.run(x0, np.linspace(0, seconds, frames), grips or {}, v0=v0, brake=brake), cloth
+
+
+def top(spec, x0, slip=None):
+    held = np.flatnonzero(grid(spec)[0][:, 1] > spec.height - 1e-9)
+    return {"top": Grip(held, np.array([0.0, 1.0]), np.tile(np.eye(4), (2, 1, 1)), slip)}
+
+
+def crumpled(spec, seed=0):
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    x = lying(spec) @ turn
+    return x + 4e-3 * rng.standard_normal(x.shape), rng.standard_normal(x.shape)
+
+
+def rolled(spec, curvature, axis=0):
+    """A cylinder about v (axis 0) or u, its centre on the side of the normal."""
+    uv, _ = grid(spec)
+    a = uv[:, axis]
+    bent = np.stack([np.sin(curvature * a) / curvature, (1 - np.cos(curvature * a)) / curvature], 1)
+    out = np.empty((len(uv), 3))
+    out[:, axis], out[:, 1 - axis], out[:, 2] = bent[:, 0], uv[:, 1 - axis], bent[:, 1]
+    return out
+
+
+NEUTRAL = [
+    Weight(WeightSpec()),
+    Plate(PlateSpec()),
+    Moments(PlateSpec()),
+    Membrane(MembraneSpec()),
+    Drag(AirSpec()),
+    LinearDrag(0.0),
+    AddedMass(0.0, 1.204),
+    Table(replace(TableSpec(), friction=0.0)),
+]
+
+
+@pytest.mark.parametrize("hook", NEUTRAL, ids=lambda hook: type(hook).__name__)
+def test_amplitude_zero_is_neutral_bit_by_bit(hook):
+    x, v = crumpled(SMALL)
+    x[:, 2] += 1.0  # clear of the table
+    with_it, without = (run(SMALL, hooks, 0.02, x, 0.1 * v)[0] for hooks in ([hook], []))
+    np.testing.assert_array_equal(with_it.x, without.x)
+
+
+INTERNAL = {
+    "plate": Plate(PlateSpec(stiffness=1e-4, weft=-0.5, damping_time=0.02, layer=2.0)),
+    "curl": Moments(PlateSpec(stiffness=1e-4, curl=3.0, curl_weft=1.0)),
+    "bending friction": Moments(PlateSpec(friction=3e-4)),
+    "membrane": Membrane(MembraneSpec(weft=0.5, shear=-0.3, stiffening=10.0, viscosity=5e-3, friction=1.0)),
+}
+
+
+@pytest.mark.parametrize("name", INTERNAL)
+def test_internal_forces_add_up_to_nothing(name):
+    x, v = crumpled(SMALL)
+    hook, _ = started(INTERNAL[name], x=x)
+    y = x + 1e-3 * crumpled(SMALL, 1)[1]
+    force = hook.force(0.0, y, v)
+    size = np.abs(force).max()
+    assert size > 1e-6
+    np.testing.assert_allclose(force.sum(0), 0, atol=1e-10 * size * len(x))
+    if name == "membrane":  # the others' moment along a normal that is held fixed is only nearly balanced
+        np.testing.assert_allclose(np.cross(y, force).sum(0), 0, atol=1e-9 * size)
+
+
+DISSIPATIVE = {
+    "drag": Drag(AirSpec(normal=1.2, tangential=0.5)),
+    "linear": LinearDrag(2.0),
+    "viscous membrane": Membrane(MembraneSpec(viscosity=5e-3)),
+    "viscous plate": Plate(PlateSpec(stiffness=1e-4, damping_time=0.02)),
+}
+
+
+@pytest.mark.parametrize("name", DISSIPATIVE)
+def test_dissipation_takes_power_whatever_the_motion(name):
+    for seed in range(5):
+        x, v = crumpled(SMALL, seed)
+        hook, _ = started(DISSIPATIVE[name])
+        power = ((hook.force(0.0, x, v) - hook.force(0.0, x, 0 * v)) * v).sum()
+        assert power < 0
+
+
+def test_drag_is_that_of_the_example():
+    x, v = crumpled(SMALL)
+    hook, cloth = started(Drag(AirSpec(normal=1.2)))
+    expected = Air(replace(SMALL, drag_normal=1.2), cloth.faces, len(x)).force(x, v)
+    np.testing.assert_allclose(hook.force(0.0, x, v), expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_tangential_drag_slows_as_one_over_time():
+    v0 = np.tile([1.5, 0.0, 0.0], (49, 1))
+    result, cloth = run(FREE, [Drag(AirSpec(tangential=3.0))], 0.21, v0=v0)
+    rate = 0.5 * 1.204 * 3.0 / 0.20
+    mean = result.v[-1][:, 0] @ cloth.mass / cloth.mass.sum()
+    assert mean == pytest.approx(1.5 / (1 + 1.5 * rate * 0.21), rel=2e-3)
+
+
+def test_linear_drag_decays_exponentially():
+    v0 = np.tile([0.3, 0.2, 1.0], (49, 1))
+    result, _ = run(FREE, [LinearDrag(2.0)], 0.3, v0=v0)
+    np.testing.assert_allclose(result.v[-1], v0 * np.exp(-0.6), rtol=1e-3)
+
+
+def test_added_mass_slows_the_fall_of_a_flat_sheet_and_not_of_an_upright_one():
+    air = 1.204 * 0.15
+    flat, _ = run(SMALL, [AddedMass(0.15, 1.204)], 0.099)
+    assert flat.v[-1][:, 2].mean() == pytest.approx(-G * 0.099 * 0.20 / (0.20 + air), rel=1e-3)
+    upright, _ = run(SMALL, [AddedMass(0.15, 1.204)], 0.099, standing(SMALL))
+    assert upright.v[-1][:, 2].mean() == pytest.approx(-G * 0.099, rel=1e-6)
+
+
+def leaning(hooks):
+    """Angle of a strip that hangs at rest, from its first to its last row."""
+    spec = SheetSpec(0.04, 0.2, nodes=(3, 11))
+    x0 = standing(spec)
+    result, _ = run(spec, hooks, 1.2, x0, grips=top(spec, x0), brake=12.0)
+    x = result.x[-1].reshape(11, 3, 3).mean(1)
+    return np.arctan2(x[0, 0] - x[-1, 0], x[-1, 2] - x[0, 2])
+
+
+def test_wind_leans_a_hanging_strip_to_where_pressure_and_weight_balance():
+    pressure = 0.5 * 1.204 * 1.2 * 1.0**2 / (0.20 * G)
+    sine = (np.sqrt(1 + 4 * pressure**2) - 1) / (2 * pressure)  # sin = p cos^2: only the normal wind presses
+    assert leaning([Drag(AirSpec(normal=1.2, wind=1.0))]) == pytest.approx(np.arcsin(sine), rel=0.01)
+
+
+def test_gravity_leans_by_its_tilt():
+    assert leaning([Weight(WeightSpec(tilt=0.05))]) == pytest.approx(0.05, rel=0.01)
+
+
+def test_a_jet_is_felt_in_its_place_only():
+    hook, _ = started(Drag(AirSpec(normal=1.2, jet=1.0, jet_width=0.05, jet_across=0.1, jet_height=0.3)))
+    wind = hook.wind(np.array([[0.7, 0.1, 0.3], [0.7, 0.1, 0.35], [0.7, 0.5, 0.3]]))
+    np.testing.assert_allclose(wind[:, 0], [1.0, np.exp(-0.5), 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("spec", "grams"),
+    [
+        (WeightSpec(density=0.1), 8.8),
+        (WeightSpec(hem=0.02), 8 + 16.0),
+        (WeightSpec(seam=0.02), 8 + 4.0),
+        (WeightSpec(layer=1.0), 8 * (1 + 9 / 36)),  # 3 x 3 vertices, each of a 36th
+    ],
+)
+def test_a_gripper_weighs_the_cloth(spec, grams):
+    x0 = standing(SMALL)
+    result, cloth = run(SMALL, [Weight(spec)], 0.6, x0, grips=top(SMALL, x0), brake=30.0)
+    assert cloth.mass.sum() == pytest.approx(1e-3 * grams, rel=0.01)
+    assert -result.force["top"][-1][2] == pytest.approx(cloth.mass.sum() * G, rel=6e-3)
+
+
+def test_moisture_falls_like_everything_else_and_weighs_more():
+    drift = Weight(WeightSpec(moisture=0.5))
+    fall, _ = run(SMALL, [drift], 0.21)
+    assert fall.v[-1][:, 2].mean() == pytest.approx(-G * 0.21, rel=1e-6)
+    x0 = standing(SMALL)
+    hung, cloth = run(SMALL, [drift], 0.8, x0, grips=top(SMALL, x0), brake=30.0)
+    assert cloth.mass.sum() == pytest.approx(8e-3 * 1.4, rel=1e-3)
+    assert -hung.force["top"][-1][2] == pytest.approx(8e-3 * 1.2 * G, rel=0.02)  # the mean over the run
+
+
+def test_the_orthotropic_membrane_has_the_moduli_asked_for():
+    c11, c12, c22 = orthotropic(100.0, 0.3, 0.5)
+    compliance = np.linalg.inv([[c11, c12], [c12, c22]])
+    np.testing.assert_allclose(1 / np.diag(compliance), [100.0, 50.0])
+    assert -compliance[0, 1] * 100.0 == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    ("spec", "strain", "stress"),
+    [
+        (MembraneSpec(weft=0.5), (0, 0.02, 0), np.diff([100 / (1 - 0.09), 50 / (1 - 0.045)])[0] * 0.02),
+        (MembraneSpec(stiffening=10.0), (0, 0.02, 0), 100 * 10 * 0.02**2),
+        (MembraneSpec(stiffening=10.0), (0, -0.02, 0), 0.0),
+        (MembraneSpec(shear=-0.5), (0, 0, 0.01), -0.5 * 100 / 2.6 * 0.02),
+    ],
+)
+def test_a_uniform_strain_meets_the_stress_of_the_law(spec, strain, stress):
+    sheet = replace(FREE, membrane_stiffness=100.0)
+    eu, ev, euv = strain
+    stretch = np.linalg.cholesky(np.eye(2) + 2 * np.array([[eu, euv], [euv, ev]])).T  # F with F'F = 1 + 2 e
+    uv, _ = grid(sheet)
+    x = np.column_stack([uv @ stretch.T, 0 * uv[:, 0]])
+    hook, _ = started(Membrane(spec), sheet)
+    force = hook.force(0.0, x, 0 * x)
+    pull = np.linalg.solve(stretch, force[uv[:, 1] > 0.2 - 1e-9].sum(0)[:2])  # on the upper edge: - F S n L
+    which = 0 if euv else 1
+    assert -pull[which] == pytest.approx(stress * 0.2, abs=1e-9)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_cylinder_stores_the_plate_s_energy_along_both_directions(axis):
+    sheet = SheetSpec(0.2, 0.2, nodes=(21, 17))
+    hook, _ = started(Plate(PlateSpec(stiffness=1e-4, weft=-0.6)), sheet)
+    x = rolled(sheet, 5.0, axis)
+    energy = 0.5 * (x * (hook.matrix @ x)).sum()
+    assert energy == pytest.approx(0.5 * 1e-4 * (1, 0.4)[axis] * 25 * 0.04, rel=1e-3)
+
+
+def test_a_twisted_sheet_stores_the_plate_s_energy():
+    hook, _ = started(Plate(PlateSpec(stiffness=1e-4)), SMALL)
+    x = lying(SMALL)
+    x[:, 2] = 2.0 * x[:, 0] * x[:, 1]  # x_uv = 2
+    assert 0.5 * (x * (hook.matrix @ x)).sum() == pytest.approx(0.5 * 1e-4 * 2 * 4 * 0.04, rel=1e-9)
+
+
+def test_rest_curvature_is_where_the_sheet_rests_and_turns_over_with_it():
+    spec = PlateSpec(stiffness=1e-4, curl=5.0)
+    sheet = SheetSpec(0.2, 0.2, nodes=(21, 5))
+    for sign, left in ((1, 0.0), (-1, 2.0)):
+        x = rolled(sheet, sign * 5.0)
+        plate, curl = (started(kind(spec), sheet, x)[0].force(0.0, x, 0 * x) for kind in (Plate, Moments))
+        assert np.linalg.norm(plate + curl) == pytest.approx(
+            left * np.linalg.norm(plate), abs=0.03 * np.linalg.norm(plate)
+        )
+
+
+def work(hook, sheet, shapes, skip):
+    """Work that a hook takes along a path of shapes after the first ``skip``."""
+    hook, _ = started(hook, sheet, shapes[0])
+    forces = [hook.force(0.0, x, 0 * x) for x in shapes]
+    steps = [(0.5 * (f + g) * (y - x)).sum() for (f, g), (x, y) in zip(pairwise(forces), pairwise(shapes), strict=True)]
+    return -sum(steps[skip:])
+
+
+def test_bending_friction_loses_the_loop_of_dahl_s_law():
+    sheet, moment, threshold, most = SheetSpec(0.1, 0.1, nodes=(11, 5)), 2e-4, 5.0, 12.0
+    bends = most * np.sin(np.linspace(0.5, 4.5, 801) * np.pi) + 1e-9
+    shapes = [rolled(sheet, k) for k in bends]
+    lost = work(Moments(PlateSpec(friction=moment)), sheet, shapes, 400)  # the second cycle is steady
+    assert lost == pytest.approx(4 * moment * (most - threshold * np.tanh(most / threshold)) * 0.01, rel=0.02)
+
+
+def test_shear_friction_loses_the_loop_of_dahl_s_law():
+    sheet, full, threshold, most = SheetSpec(0.1, 0.1, nodes=(3, 3)), 2.0, 0.01, 0.04
+    path = most * np.sin(np.linspace(0.5, 4.5, 801) * np.pi)
+    uv, _ = grid(sheet)
+    shapes = [np.column_stack([uv[:, 0] + g * uv[:, 1], uv[:, 1], 0 * uv[:, 0]]) for g in path]
+    lost = work(Membrane(MembraneSpec(friction=full)), sheet, shapes, 400)
+    assert lost == pytest.approx(2 * full * (most - threshold * np.tanh(most / threshold)) * 0.01, rel=0.02)
+
+
+def test_a_crease_grows_to_what_exceeds_the_yield():
+    sheet = SheetSpec(0.1, 0.1, nodes=(11, 3))
+    hook, _ = started(Moments(PlateSpec(stiffness=1e-4, crease=20.0, crease_yield=8.0)), sheet, dt=1e-3)
+    x = rolled(sheet, 20.0)
+    for _ in range(50):
+        hook.force(0.0, x, 0 * x)
+    grown = hook.crease[hook.stencils.kind == 0]
+    np.testing.assert_allclose(grown, (20.0 - 8.0) * (1 - np.exp(-1.0)), rtol=0.02)
+    assert np.abs(hook.crease[hook.stencils.kind > 0]).max() < 1e-9
+
+
+def test_a_grip_slips_at_the_speed_of_the_excess_pull():
+    x0 = standing(SMALL)
+    settled, _ = run(SMALL, [], 0.5, x0, grips=top(SMALL, x0), brake=30.0)
+    slip = Slip(mobility=0.4, hold=0.03)
+    result, cloth = run(SMALL, [], 0.5, settled.x[-1], grips=top(SMALL, x0, slip), frames=6, brake=5.0)
+    held = grid(SMALL)[0][:, 1] > 0.2 - 1e-9
+    speed = -(result.x[-1] - result.x[-2])[held, 2].mean() / 0.1
+    assert speed == pytest.approx(0.4 * (cloth.mass.sum() * G - 0.03), rel=0.03)
+    firm, _ = run(SMALL, [], 0.2, settled.x[-1], grips=top(SMALL, x0, Slip(0.4, hold=0.2)), brake=5.0)
+    np.testing.assert_array_equal(firm.x[-1][held], settled.x[-1][held])
+
+
+@pytest.mark.parametrize(("slope", "slides"), [(0.3, False), (0.5, True)])
+def test_a_sheet_on_a_slope_slides_beyond_the_angle_of_friction(slope, slides):
+    weight, table = Weight(WeightSpec(tilt=slope)), Table(TableSpec(friction=0.4))
+    result, cloth = run(SMALL, [weight, table], 0.3, frames=4)
+    speed = result.v[:, :, 0] @ cloth.mass / cloth.mass.sum()
+    pull = G * (np.sin(slope) - 0.4 * np.cos(slope))
+    if slides:
+        assert (speed[-1] - speed[-2]) / 0.1 == pytest.approx(pull, rel=0.02)
+    else:
+        assert abs(speed[-1]) < 1e-3
+    assert np.abs(result.x[-1][:, 2]).max() < 1e-4
+
+
+def test_friction_differs_by_direction_and_falls_with_speed():
+    hook, _ = started(Table(TableSpec(friction=0.4, across=-0.5, excess=0.3, speed=0.01)))
+    directions = np.array([[1.0, 0], [0, 1.0], [1.0, 0]])
+    np.testing.assert_allclose(hook._coefficient(directions, np.array([1.0, 1.0, 0.0])), [0.4, 0.2, 0.7])
+
+
+def test_adhesion_pulls_within_its_gap():
+    hook, _ = started(Table(TableSpec(adhesion=2.0, gap=1e-3)))
+    for height, pull in ((5e-4, 2.0 * 0.04), (2e-3, 0.0)):
+        x = lying(SMALL) + np.array([0, 0, height])
+        assert -hook.force(0.0, x, 0 * x)[:, 2].sum() == pytest.approx(pull)
