@@ -50,13 +50,13 @@ a few of 23 mm, unevenly: whatever a fit says of E, these 248 points do not know
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import trimesh
 from flattening import Edge, area_of, boundary_loops, cut, edges_of, flatten, heights_of, shortest_path, thicken
+from folders import source_folder
 
 from torchcloth import recordings
 from torchcloth.recordings import ClothInfo, Collider, GraspInfo, GripperMotion, PointClouds, Recording
@@ -210,13 +210,7 @@ def main() -> None:
     parser.add_argument("--seconds-per-step", type=float, default=SECONDS_PER_STEP)
     parser.add_argument("--clouds", type=int, metavar="N", help="only the first N clouds")
     options = parser.parse_args()
-    source = options.source
-    if source is None:
-        if "TORCHCLOTH_REALDATA" not in os.environ:
-            parser.error("name the sample's folder with --source, or set TORCHCLOTH_REALDATA")
-        source = Path(os.environ["TORCHCLOTH_REALDATA"], "diffcp_sample")
-    if not source.is_dir():
-        parser.error(f"{source} is not a folder")
+    source = source_folder(parser, options.source, "diffcp_sample")
     recording = convert(source, options.seconds_per_step, options.clouds)
     recordings.write(recording, options.episode)
     size = f"{len(recording.cloth.vertices)} vertices, {len(recording.cloth.faces)} triangles"

@@ -23,11 +23,8 @@ MARK = 5e-3  # m
 
 
 @pytest.fixture
-def source(realdata: Path) -> Path:
-    folder = realdata / "cantilever"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
-    return folder
+def source(measured_in) -> Path:
+    return measured_in("cantilever")
 
 
 @pytest.fixture

@@ -31,11 +31,8 @@ def run(*arguments: str | Path, seconds: float) -> str:
 
 
 @pytest.fixture
-def source(realdata: Path) -> Path:
-    folder = realdata / "diffcp_sample"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
-    return folder
+def source(measured_in) -> Path:
+    return measured_in("diffcp_sample")
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import pytest
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.recordings import writing
+from torchcloth.recordings import placing, writing
 
 FLOAT32 = 1e-7  # relative precision of float32 times the 1 m size of the scene
 HALF_STEP = 0.5e-4 + 1e-12  # points are stored in tenths of a millimetre
@@ -188,7 +188,7 @@ def test_an_existing_target_is_refused(episode, recording, tmp_path):
     home = tmp_path / "home"
     home.mkdir()
     (home / "thesis.tex").write_text("years of work")
-    with pytest.raises(RecordingError, match="is not an episode"):
+    with pytest.raises(RecordingError, match=r"holds no episode\.json"):
         rec.write(recording, home, overwrite=True)
     assert (home / "thesis.tex").exists()
 
@@ -198,7 +198,7 @@ def test_a_target_that_appears_meanwhile_is_kept(recording, tmp_path, monkeypatc
         rec.write(replace(recording, licence="first"), tmp_path / "ep")
 
     with monkeypatch.context() as patch:
-        patch.setattr(writing, "_sync", lambda part: (patch.undo(), appear(part)))
+        patch.setattr(placing, "_sync", lambda part: (patch.undo(), appear(part)))
         with pytest.raises(RecordingError, match="cannot be written"):
             rec.write(recording, tmp_path / "ep")
     assert rec.read(tmp_path / "ep").licence == "first"
@@ -260,7 +260,7 @@ def test_a_crash_at_any_step_keeps_the_old_episode(recording, episode, tmp_path,
     if step == "rename":
         monkeypatch.setattr("pathlib.Path.rename", crash_into_place)
     else:
-        monkeypatch.setattr(writing, step, crash)
+        monkeypatch.setattr(writing if step == "_fill" else placing, step, crash)
     expected = RecordingError if isinstance(error, OSError) else KeyboardInterrupt
     with pytest.raises(expected):
         rec.write(replace(recording, licence="new"), episode, overwrite=True)

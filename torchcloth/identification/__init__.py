@@ -6,16 +6,24 @@ from .null import rigid_carry
 from .pictures import draw
 from .result import Estimate, Identification
 from .saved import Replayed, replayed
+from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial
 from .tables import print_fit
+from .tension import TensionFit, fit_tension
 
 __all__ = [
+    "AbstractSpecimen",
     "Episode",
     "Estimate",
     "Identification",
     "Replayed",
+    "Response",
+    "TensionFit",
+    "Trellis",
+    "Uniaxial",
     "cloth_from",
     "draw",
     "episode",
+    "fit_tension",
     "identify",
     "print_fit",
     "replayed",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -87,10 +88,15 @@ class Identification:
 
     def apply(self, cloth: Cloth) -> Cloth:
         """Set the fitted values in ``cloth``, leaving what is not identifiable as it is; returns it."""
-        for name, path in self.keys.items():
-            if self.parameters[name].identifiable:
-                cloth.get_submodule(path).set(self.parameters[name].value)  # type: ignore[operator]
-        return cloth
+        return set_identified(cloth, self.keys, self.parameters)
+
+
+def set_identified(cloth: Cloth, keys: Mapping[str, str], parameters: Mapping[str, Estimate]) -> Cloth:
+    """Set what is identifiable in ``cloth``; ``keys``: parameter name -> module path."""
+    for name, path in keys.items():
+        if parameters[name].identifiable:
+            cloth.get_submodule(path).set(parameters[name].value)  # type: ignore[operator]
+    return cloth
 
 
 def write_atomically(path: Path, text: str) -> Path:

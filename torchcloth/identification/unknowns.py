@@ -113,7 +113,7 @@ def _unknown(cloth: Cloth, name: str, path: str) -> Unknown:
     else:
         owner, _, own = path.rpartition(".")
         size = getattr(cloth.get_submodule(owner), "amplitudes", {}).get(own)
-        std = 2.0 * (1.0 if size is None else size.typical)
+        std = 2.0 * (max(1.0, start) if size is None else size.typical)  # undeclared: the start says how large it is
     return Unknown(name, f"{path}.raw", parameter, start, std)
 
 

@@ -3,6 +3,8 @@
     recording = recordings.read("episodes/ep_01")
     recordings.write(recording, "episodes/copy")
 
+Readings of a tension machine are no episode: `ForceDisplacement`, `read_tension`, `write_tension`.
+
 A reader refuses what it cannot trust, with a one-line `RecordingError`; a stream that is merely missing is None.
 """
 
@@ -10,6 +12,7 @@ from __future__ import annotations
 
 from .images import ImageStream
 from .reading import read
+from .tension import ForceDisplacement, read_tension, write_tension
 from .types import (
     Camera,
     ClothInfo,
@@ -29,6 +32,7 @@ __all__ = [
     "Camera",
     "ClothInfo",
     "Collider",
+    "ForceDisplacement",
     "GraspInfo",
     "GripperMotion",
     "ImageStream",
@@ -39,5 +43,7 @@ __all__ = [
     "RobotInfo",
     "Truth",
     "read",
+    "read_tension",
     "write",
+    "write_tension",
 ]

@@ -1,11 +1,8 @@
-"""Writes an episode folder: beside its final name first, read back, and only then renamed."""
+"""Writes an episode folder, and reads it back before it is put in its place."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import uuid
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -17,6 +14,7 @@ from ..errors import RecordingError
 from ..meshes import obj
 from . import checks, images, streams
 from .files import Folder, save_npz
+from .placing import place
 from .reading import EPISODE, FORMAT, VERSION, read_folder
 from .types import Camera, ClothInfo, GraspInfo, Recording
 
@@ -51,31 +49,12 @@ def write(
     Raises:
         RecordingError: the target exists, or the recording would be refused by `read`, or the disk fails.
     """
-    target = Path(path)
-    _check_target(target, overwrite)
-    part = target.absolute().with_name(f".{target.absolute().name}.{uuid.uuid4().hex}.partial")
-    try:
-        part.mkdir(parents=True)
+
+    def fill(part: Path, shown: Path) -> None:
         _fill(part, recording, compact, on_image)
-        read_folder(Folder(part, shown=target), with_truth=True)
-        _sync_all(part)
-        _put(part, target.absolute(), overwrite)
-    except RecordingError:
-        raise
-    except (OSError, ValueError, TypeError) as error:  # disk, or a value that JSON and NPZ cannot hold
-        raise RecordingError(f"{target} cannot be written", got=error, remedy="nothing was changed") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return target
+        read_folder(Folder(part, shown=shown), with_truth=True)
 
-
-def _check_target(target: Path, overwrite: bool) -> None:
-    if not os.path.lexists(target):
-        return
-    if not overwrite:
-        raise RecordingError(f"{target} exists", expected="a new name", remedy="pass overwrite=True to replace it")
-    if target.is_symlink() or not (target / EPISODE).is_file():
-        raise RecordingError(f"{target} is not an episode", expected="an episode folder", remedy="choose another name")
+    return place(Path(path), fill, marker=EPISODE, overwrite=overwrite)
 
 
 def _fill(part: Path, recording: Recording, compact: bool, on_image: Callable[[], None]) -> None:
@@ -173,39 +152,6 @@ def _write_images(folder: Path, camera: Camera, on_image: Callable[[], None]) ->
         for frame, suffix, data in stream.files():
             (folder / kind / f"{frame:06d}{suffix}").write_bytes(data)
             on_image()
-
-
-def _put(part: Path, target: Path, overwrite: bool) -> None:
-    """Rename into place; an episode already there steps aside first and comes back on failure."""
-    old = part.with_suffix(".old")
-    if overwrite and target.exists():  # otherwise one that appeared meanwhile makes the rename below fail
-        target.rename(old)
-    try:
-        part.rename(target)
-    except BaseException:
-        if old.exists():
-            old.rename(target)
-        raise
-    sync(target.parent)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _sync_all(root: Path) -> None:
-    for folder, _, files in os.walk(root, topdown=False):
-        for file in files:
-            sync(Path(folder, file))
-        sync(Path(folder))
-
-
-def sync(path: Path) -> None:
-    """Bring a file or folder to the disk."""
-    if path.is_dir() and os.name == "nt":  # Windows cannot open a folder
-        return
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def held(bag: Any, skip: tuple[str, ...] = ()) -> dict[str, Any]:

@@ -23,7 +23,7 @@ import numpy as np
 
 from ...errors import MissingDependency, RecordingError
 from ...meshes import obj
-from .. import images, streams, writing
+from .. import images, placing, streams, writing
 from ..files import save_npz
 from ..types import Camera, Recording
 from . import embedded, mcap_checksums, ros2
@@ -58,7 +58,7 @@ def write(
         file = part / f"{part.name}.mcap"
         mcap_checksums.seal(file)
         _read_back(file, target)
-        writing.sync(file)
+        placing.sync(file)
         file.replace(target.absolute())
     except (OSError, ValueError, TypeError) as error:
         if isinstance(error, RecordingError | MissingDependency):

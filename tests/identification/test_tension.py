@@ -1,0 +1,128 @@
+"""``fit_tension`` on readings from closed forms: values, standard errors, and what it says when the law is wrong."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from math import cos, radians, sin
+
+import numpy as np
+import pytest
+import torch
+
+import torchcloth as tc
+from torchcloth.errors import InvalidInput
+from torchcloth.identification import fit_tension
+from torchcloth.recordings import ForceDisplacement
+
+WARP, WEFT, SHEAR, H = 15e6, 59e6, 3e6, 1e-3
+
+
+def cloth(**changes) -> tc.Cloth:
+    """Far from the truth."""
+    law = {"youngs_modulus": 4e7, "weft_modulus": 2e7, "shear_modulus": 1e7, "poisson_ratio": 0.01, "thickness": H}
+    mesh = tc.meshes.rectangle(0.1, 0.1, triangles=8)
+    return tc.Cloth(mesh, tc.materials.OrthotropicAEP(**{**law, **changes}), 0.1, contact=None)
+
+
+def isotropic(E: float, nu: float) -> tc.Cloth:
+    mesh = tc.meshes.rectangle(0.1, 0.1, triangles=8)
+    return tc.Cloth(mesh, tc.materials.AEP(E, nu, thickness=H), 0.1, contact=None)
+
+
+def readings(degrees: float, noise: float, draw: np.random.Generator, count: int = 40) -> ForceDisplacement:
+    """Jones's off-axis modulus at strains up to 0.1 %, with white noise as a share of the largest force."""
+    c, s = cos(radians(degrees)), sin(radians(degrees))
+    modulus = 1 / (c**4 / WARP + (1 / SHEAR - 0.02 * (WARP * WEFT) ** -0.5) * s**2 * c**2 + s**4 / WEFT)
+    strain = np.linspace(0, 1e-3, count)
+    force = modulus * H * 0.02 * strain
+    force = force + noise * force.max() * draw.normal(size=count)
+    return ForceDisplacement(length=0.1, width=0.02, angle=radians(degrees), displacement=0.1 * strain, force=force)
+
+
+NAMES = ["youngs_modulus", "weft_modulus", "shear_modulus"]
+TRUTH = dict(zip(NAMES, (WARP, WEFT, SHEAR), strict=True))
+
+
+def test_three_moduli_from_three_directions():
+    """Within 3 standard errors; these as for a slope through 0 with white noise: 0.02 / sqrt(40 / 3), or 0.55 %."""
+    found = []
+    for seed in range(3):
+        draw = np.random.default_rng(seed)
+        found.append(fit_tension(cloth(), [readings(a, 0.02, draw) for a in (0, 45, 90)], NAMES))
+    for name, truth in TRUTH.items():
+        values = np.array([f.parameters[name].value for f in found])
+        errors = np.array([f.parameters[name].std for f in found])
+        assert np.abs((values - truth) / errors).max() < 3.5, name
+        if name != "shear_modulus":  # the 45 degrees hang on all three
+            assert np.median(errors) == pytest.approx(0.0055 * truth, rel=0.4), name
+        assert all(f.parameters[name].identifiable for f in found)
+    assert max(f.errors[k]["force_rms_after"] for f in found for k in (0, 1, 2)) < 0.03
+    assert min(f.errors[k]["force_rms_before"] for f in found for k in (0, 1, 2)) > 0.1
+
+
+def test_what_the_data_do_not_see_is_not_identified():
+    """Pulled along the warp only, weft and shear stay within their priors."""
+    fit = fit_tension(cloth(), readings(0, 0.01, np.random.default_rng(0)), NAMES)
+    assert fit.parameters["youngs_modulus"].value == pytest.approx(WARP, rel=0.02)
+    assert fit.parameters["youngs_modulus"].identifiable
+    assert not fit.parameters["weft_modulus"].identifiable
+    assert not fit.parameters["shear_modulus"].identifiable
+    assert sum("not identifiable" in w for w in fit.warnings) == 2
+    changed = fit.apply(cloth())
+    assert changed.material.youngs_modulus.value.item() == pytest.approx(WARP, rel=0.02)
+    assert changed.material.weft_modulus.value.item() == pytest.approx(2e7)
+
+
+def test_contraction_tells_the_poisson_ratio():
+    """Force alone does not; lateral strains -nu e (A-EP at small strain) do, with gaps where marks were not seen."""
+    sheet = isotropic(1e6, 0.15)
+    draw, strain = np.random.default_rng(1), np.linspace(0, 1e-3, 60)
+    narrower = -0.33 * strain + 1e-5 * draw.normal(size=60)
+    data = ForceDisplacement(
+        length=0.1,
+        width=0.02,
+        angle=0.0,
+        displacement=0.1 * strain,
+        force=5e5 * H * 0.02 * strain + 1e-4 * draw.normal(size=60),
+        lateral_strain=np.where(np.arange(60) % 7 == 3, np.nan, narrower),
+    )
+    fit = fit_tension(sheet, data, ["youngs_modulus", "poisson_ratio"])
+    assert fit.parameters["poisson_ratio"].value == pytest.approx(0.33, abs=4 * fit.parameters["poisson_ratio"].std)
+    assert 0.001 < fit.parameters["poisson_ratio"].std < 0.006  # white noise over 51 marks: 0.0024
+    assert fit.parameters["youngs_modulus"].value == pytest.approx(5e5, rel=0.01)
+    blind = fit_tension(sheet, data, ["youngs_modulus", "poisson_ratio"], contraction=False)
+    assert not blind.parameters["poisson_ratio"].identifiable
+    assert "lateral_rms_after" in blind.errors[0]
+
+
+def test_a_wrong_law_is_said():
+    """An isotropic sheet cannot be soft along the warp and stiff along the weft."""
+    sheet = isotropic(1e7, 0.1)
+    draw = np.random.default_rng(0)
+    fit = fit_tension(sheet, [readings(a, 0.01, draw) for a in (0, 90)], ["youngs_modulus"])
+    assert sum("the law misses a force" in w for w in fit.warnings) >= 1
+    assert max(e["force_max_after"] for e in fit.errors) > 0.5
+
+
+def test_saved_and_unchanged(tmp_path):
+    start = cloth()
+    before = {k: v.clone() for k, v in start.state_dict().items()}
+    fit = fit_tension(start, readings(0, 0.01, np.random.default_rng(0)), ["youngs_modulus"])
+    assert all(torch.equal(v, before[k]) for k, v in start.state_dict().items())
+    stored = json.loads(fit.save(tmp_path / "out").read_text())
+    assert stored["parameters"]["youngs_modulus"]["value"] == fit.parameters["youngs_modulus"].value
+    assert stored["errors"] == fit.errors
+    assert stored["convention"].startswith("SI units")
+
+
+def test_what_is_refused():
+    data = readings(0, 0.01, np.random.default_rng(0))
+    with pytest.raises(InvalidInput, match="one of"):
+        fit_tension(cloth(), data, ["stiffness"])
+    with pytest.raises(InvalidInput, match="tables"):
+        fit_tension(cloth(), [])
+    with pytest.raises(InvalidInput, match="none above its preload"):
+        fit_tension(cloth(), replace(data, preload=1e3))
+    with pytest.raises(InvalidInput, match="at least one name"):
+        fit_tension(cloth(), data, [])

@@ -1,0 +1,260 @@
+"""``fit_tension``: force readings of a tension machine are data too, through the same solver as recordings."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from ..cloth import Cloth
+from ..errors import InvalidInput
+from ..parameters import PhysicalParameter
+from ..recordings import ForceDisplacement
+from . import gauss_newton
+from .report import CONFUSED, estimates
+from .result import Estimate, set_identified, write_atomically
+from .specimens import AbstractSpecimen, Response, Uniaxial
+from .unknowns import Unknown, available, collect, needs_contact, overrides
+
+RESOLUTION = 1e-3  # of a table's largest reading: no kind of reading is taken to be better
+MISSED = 0.05  # of a table's largest reading, beyond which the law is said to miss it
+CONVENTION = (
+    "SI units. errors: force and lateral strain, computed minus measured, as a share of the largest reading of their "
+    "table. std: standard error; it allows for errors that are correlated along a curve, not for a wrong law. "
+    "identifiable: std below a quarter of the value (of a typical amplitude, where the amplitude is smaller)."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class TensionFit:
+    """The result of ``fit_tension``.
+
+    Attributes:
+        parameters: estimates by name.
+        correlation: of the fitted parameters, name -> name -> correlation.
+        errors: one entry per table: rms and largest error of force and of lateral strain, before and after.
+        curves: what the fitted law reads, one `Response` per table.
+        warnings: what to mistrust, in sentences.
+        iterations: accepted steps.
+    """
+
+    parameters: dict[str, Estimate]
+    correlation: dict[str, dict[str, float]]
+    errors: list[dict[str, float]]
+    curves: list[Response] = field(repr=False)
+    warnings: list[str]
+    iterations: int
+    keys: dict[str, str] = field(default_factory=dict, repr=False)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write tension.json into ``folder``, atomically; returns its path."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        content: dict[str, Any] = {
+            "parameters": {name: asdict(estimate) for name, estimate in self.parameters.items()},
+            "correlation": self.correlation,
+            "errors": self.errors,
+            "convention": CONVENTION,
+            "warnings": self.warnings,
+            "iterations": self.iterations,
+        }
+        return write_atomically(folder / "tension.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+    def apply(self, cloth: Cloth) -> Cloth:
+        """Set the fitted values in ``cloth``, leaving what is not identifiable as it is; returns it."""
+        return set_identified(cloth, self.keys, self.parameters)
+
+
+def fit_tension(
+    cloth: Cloth,
+    tables: ForceDisplacement | Sequence[ForceDisplacement],
+    parameters: Sequence[str] | None = None,
+    *,
+    specimen: AbstractSpecimen | None = None,
+    contraction: bool = True,
+    iterations: int = 50,
+) -> TensionFit:
+    """Fit the membrane parameters of a cloth to readings of a tension machine.
+
+    Args:
+        cloth: model and start values; only its material is used, and it is left unchanged (see ``TensionFit.apply``).
+        tables: readings of specimens of the same cloth.
+        parameters: public names, e.g. ["youngs_modulus", "shear_modulus"]; None: all of the membrane law that are not
+            zero.
+        specimen: how they deform; None: ``Uniaxial()``.
+        contraction: fit measured lateral strains too, not only forces.
+        iterations: at most this many.
+
+    Returns:
+        Estimates with standard errors, and how far the law is from every table.
+
+    Raises:
+        InvalidInput: unknown names, no tables, or specimens that do not suit ``specimen``.
+        SimulationDiverged: no equilibrium with the start values.
+    """
+    tables = [tables] if isinstance(tables, ForceDisplacement) else list(tables)
+    if not tables or iterations < 1:
+        raise InvalidInput("tables or iterations", got=f"{len(tables)}, {iterations}", expected="at least one of each")
+    for table in tables:
+        if not (table.force > table.preload).any():
+            raise InvalidInput("a table's force", got=f"none above its preload, {table.preload:g} N", expected="a pull")
+    cloth = copy.deepcopy(cloth).to(torch.float64).requires_grad_(False)
+    names = _membrane(cloth) if parameters is None else list(parameters)
+    unknowns = collect(cloth, names, None)
+    if not unknowns:
+        raise InvalidInput("parameters", got="none", expected="at least one name")
+    readings = _Readings(cloth, unknowns, tables, specimen or Uniaxial(), contraction)
+    seen: list[Tensor] = []
+    found = gauss_newton.minimise(
+        readings.problem(), readings.start, iterations, lambda at: seen.append(at.raw) or False
+    )
+    return _statements(readings, found, len(seen) - 1)
+
+
+def _membrane(cloth: Cloth) -> list[str]:
+    """Parameters of the material that are not zero and do not belong to contact."""
+    own = {name: path for name, path in available(cloth).items() if path.startswith("material.")}
+    modules = {name: cloth.get_submodule(path) for name, path in own.items() if not needs_contact(cloth, path)}
+    director = ("contact_stiffness", "shear_stiffness", "cone")
+    return [n for n, m in modules.items() if isinstance(m, PhysicalParameter) and bool(m.value) and n not in director]
+
+
+class _Curves(nn.Module):
+    """The cloth's law in the machine."""
+
+    def __init__(self, cloth: Cloth) -> None:
+        super().__init__()
+        self.cloth = cloth
+
+    def forward(self, specimen: AbstractSpecimen, tables: list[ForceDisplacement]) -> list[Response]:
+        """One response per table."""
+        return [specimen.curve(self.cloth.material, table) for table in tables]  # type: ignore[arg-type]
+
+
+class _Readings:
+    """Tables as the residuals that Gauss-Newton works on: shares of each table's largest reading."""
+
+    def __init__(
+        self,
+        cloth: Cloth,
+        unknowns: list[Unknown],
+        tables: list[ForceDisplacement],
+        specimen: AbstractSpecimen,
+        contraction: bool,
+    ) -> None:
+        self.cloth, self.unknowns, self.tables, self.specimen = cloth, unknowns, tables, specimen
+        self.contraction, self.lateral_scale = contraction, 1.0
+        self.start = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
+        frame, patch, lateral, first = [], [], [], 0
+        for k, (kind, rows) in enumerate(self._misses(self.curves(self.start))):
+            frame.append(torch.arange(len(rows)) + first)
+            patch.append(torch.full((len(rows),), k))
+            lateral.append(torch.full((len(rows),), kind == "lateral"))
+            first += len(rows) + gauss_newton.WINDOW  # windows do not reach across curves
+        self.frame, self.patch, self.lateral = torch.cat(frame), torch.cat(patch), torch.cat(lateral)
+
+    def weigh(self, value: Tensor) -> bool:
+        """Let forces and lateral strains count by how well each kind is met at a first fit; whether there are both."""
+        if not bool(self.lateral.any()):
+            return False
+        force, lateral = (float(value[rows].square().mean().sqrt()) for rows in (~self.lateral, self.lateral))
+        self.lateral_scale = max(lateral, RESOLUTION) / max(force, RESOLUTION)
+        return True
+
+    def curves(self, raw: Tensor) -> list[Response]:
+        """Responses at the unknowns ``raw`` [K]."""
+        entries = {f"cloth.{key}": value for key, value in overrides(self.unknowns, raw).items()}
+        return functional_call(_Curves(self.cloth), entries, (self.specimen, self.tables))
+
+    def problem(self) -> gauss_newton.Problem:
+        """The callbacks of Gauss-Newton."""
+        return gauss_newton.Problem(
+            linearise=self.linearise,
+            evaluate=lambda raw: (self._values(raw), self.patch),
+            clip=lambda raw: torch.tensor([u.clip(float(r)) for u, r in zip(self.unknowns, raw, strict=True)]).to(raw),
+            prior_mean=self.start,
+            prior_std=torch.tensor([u.prior_std for u in self.unknowns], dtype=torch.float64),
+            longest=torch.tensor([u.longest_step for u in self.unknowns], dtype=torch.float64),
+            noise=None,
+        )
+
+    def linearise(self, raw: Tensor) -> gauss_newton.Linearised:
+        """Residuals and their exact derivatives."""
+
+        value, slopes = self._values(raw), torch.autograd.functional.jacobian(self._rows, raw, vectorize=True)
+        return gauss_newton.Linearised(value, slopes, torch.ones_like(value), self.frame, self.patch)
+
+    def _values(self, raw: Tensor) -> Tensor:
+        with torch.no_grad():
+            return self._rows(raw)
+
+    def _rows(self, raw: Tensor) -> Tensor:
+        scale = {"force": 1.0, "lateral": self.lateral_scale}
+        return torch.cat([rows / scale[kind] for kind, rows in self._misses(self.curves(raw))])
+
+    def _misses(self, curves: list[Response]) -> list[tuple[str, Tensor]]:
+        """Force rows, then lateral ones where they were seen, of every table in turn."""
+        out = []
+        for table, curve in zip(self.tables, curves, strict=True):
+            out.append(("force", _share(curve.force, table.force)))
+            if self.contraction and table.lateral_strain is not None:
+                out.append(("lateral", _share(curve.lateral_strain, table.lateral_strain)))
+        return out
+
+
+def _share(computed: Tensor, measured: Any) -> Tensor:
+    """Differences over the largest reading, rows without a reading left out."""
+    data = torch.as_tensor(measured).to(computed.dtype)
+    seen = torch.isfinite(data)
+    return (computed[seen] - data[seen]) / data[seen].abs().max()
+
+
+def _statements(readings: _Readings, found: gauss_newton.Iterate, iterations: int) -> TensionFit:
+    covariance = gauss_newton.covariance(readings.problem(), found)
+    said = estimates(readings.cloth, readings.unknowns, found.raw, covariance)
+    with torch.no_grad():
+        before, after = readings.curves(readings.start), readings.curves(found.raw)
+    errors = [
+        {f"{key}_{when}": value for when, c in (("before", b), ("after", a)) for key, value in misses(t, c).items()}
+        for t, b, a in zip(readings.tables, before, after, strict=True)
+    ]
+    keys = {u.name: u.key.removesuffix(".raw") for u in readings.unknowns}
+    warnings = [] if found.converged else [f"stopped after {iterations} iterations before converging"]
+    warnings += [
+        f"{name} is not identifiable from these data: its value is no estimate"
+        for name in keys
+        if not said.parameters[name].identifiable
+    ]
+    names = list(keys)
+    warnings += [
+        f"{a} and {b} can hardly be told apart (correlation {said.correlation[a][b]:+.2f})"
+        for i, a in enumerate(names)
+        for b in names[:i]
+        if abs(said.correlation[a][b]) > CONFUSED
+    ]
+    warnings += [
+        f"table {k}: the law misses a force by {100 * e['force_max_after']:.0f} % of the largest; no error covers that"
+        for k, e in enumerate(errors)
+        if e["force_max_after"] > MISSED
+    ]
+    return TensionFit(said.parameters, said.correlation, errors, after, warnings, iterations, keys)
+
+
+def misses(table: ForceDisplacement, curve: Response) -> dict[str, float]:
+    """RMS and largest error of a curve, as shares of the table's largest readings."""
+    out = {}
+    for name, computed, measured in (
+        ("force", curve.force, table.force),
+        ("lateral", curve.lateral_strain, table.lateral_strain),
+    ):
+        if measured is not None:
+            share = _share(computed, measured)
+            out |= {f"{name}_rms": float(share.square().mean().sqrt()), f"{name}_max": float(share.abs().max())}
+    return out

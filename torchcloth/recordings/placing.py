@@ -1,0 +1,84 @@
+"""Puts a folder in its place atomically: written beside its final name first, and only then renamed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+
+from ..errors import RecordingError
+
+
+def place(target: Path, fill: Callable[[Path, Path], None], *, marker: str, overwrite: bool) -> Path:
+    """Make a folder; whatever fails, the final name holds the old folder or the new one, whole.
+
+    Args:
+        target: its final name.
+        fill: called with (the folder to write into, its final name for messages).
+        marker: the file by which an old folder shows that it may be replaced.
+        overwrite: replace an old folder; one that lacks the marker is never replaced.
+
+    Returns:
+        ``target``.
+
+    Raises:
+        RecordingError: the target exists, or ``fill`` refuses, or the disk fails.
+    """
+    _check(target, marker, overwrite)
+    part = target.absolute().with_name(f".{target.absolute().name}.{uuid.uuid4().hex}.partial")
+    try:
+        part.mkdir(parents=True)
+        fill(part, target)
+        _sync_all(part)
+        _put(part, target.absolute(), overwrite)
+    except RecordingError:
+        raise
+    except (OSError, ValueError, TypeError) as error:  # disk, or a value that JSON and NPZ cannot hold
+        raise RecordingError(f"{target} cannot be written", got=error, remedy="nothing was changed") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return target
+
+
+def _check(target: Path, marker: str, overwrite: bool) -> None:
+    if not os.path.lexists(target):
+        return
+    if not overwrite:
+        raise RecordingError(f"{target} exists", expected="a new name", remedy="pass overwrite=True to replace it")
+    if target.is_symlink() or not (target / marker).is_file():
+        raise RecordingError(f"{target} holds no {marker}", expected="one to replace", remedy="choose another name")
+
+
+def _put(part: Path, target: Path, overwrite: bool) -> None:
+    """Rename into place; an episode already there steps aside first and comes back on failure."""
+    old = part.with_suffix(".old")
+    if overwrite and target.exists():  # otherwise one that appeared meanwhile makes the rename below fail
+        target.rename(old)
+    try:
+        part.rename(target)
+    except BaseException:
+        if old.exists():
+            old.rename(target)
+        raise
+    sync(target.parent)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _sync_all(root: Path) -> None:
+    for folder, _, files in os.walk(root, topdown=False):
+        for file in files:
+            sync(Path(folder, file))
+        sync(Path(folder))
+
+
+def sync(path: Path) -> None:
+    """Bring a file or folder to the disk."""
+    if path.is_dir() and os.name == "nt":  # Windows cannot open a folder
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
