@@ -198,7 +198,7 @@ def test_a_target_that_appears_meanwhile_is_kept(recording, tmp_path, monkeypatc
         rec.write(replace(recording, licence="first"), tmp_path / "ep")
 
     with monkeypatch.context() as patch:
-        patch.setattr(placing, "_sync", lambda part: (patch.undo(), appear(part)))
+        patch.setattr(placing, "_sync_all", lambda part: (patch.undo(), appear(part)))
         with pytest.raises(RecordingError, match="cannot be written"):
             rec.write(recording, tmp_path / "ep")
     assert rec.read(tmp_path / "ep").licence == "first"
