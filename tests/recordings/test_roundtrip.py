@@ -247,7 +247,7 @@ def test_a_refused_write_leaves_nothing(assert_same, recording, tmp_path, overwr
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
-@pytest.mark.parametrize("step", ["_fill", "_sync", "_put", "rename"])
+@pytest.mark.parametrize("step", ["_fill", "_sync_all", "_put", "rename"])
 def test_a_crash_at_any_step_keeps_the_old_episode(recording, episode, tmp_path, monkeypatch, step, error):
     def crash(*_):
         raise error
