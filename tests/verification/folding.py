@@ -18,9 +18,9 @@ from .registry import AT_LEAST, AT_MOST, Outcome, Row, case
 from .scenes import path, smooth, where
 
 SIZE, N, GAP = 0.5, 57, 0.0035  # m, vertices per side, m
-HALF, QUARTER = (0.0, 0.73), (1.05, 1.0)  # s, when an edge is turned over, and how long that takes
+HALF, QUARTER = (0.0, 0.73), (1.05, 1.3)  # s, when an edge is turned over, and how long that takes
 RELEASED = 0.05  # s after the turn
-FRAMES = (0.0, 0.4, 0.6, 0.78, 1.05, 1.45, 1.75, 1.95, 2.1, 2.25, 2.45)
+FRAMES = (0.0, 0.4, 0.6, 0.78, 1.05, 1.57, 1.96, 2.16, 2.25, 2.35, 2.55, 2.75)
 NEAR_CREASE, NEAR_EDGE = 0.05, 0.01  # m, where no spacing is taken: the loop of a crease, the last millimetres
 ASIDE = (1.0e-5, 1.7e-5)  # m, so that no vertical meets an edge of a mesh that lies as it was made
 
@@ -53,12 +53,13 @@ def towel() -> tc.Cloth:
 
 
 def turned_over(
-    t: Tensor, when: tuple[float, float], direction: int, layers: int, slack: float, short: float
+    t: Tensor, when: tuple[float, float], direction: int, layers: int, slack: float, short: float, above: float = 0.0
 ) -> tc.Trajectory:
     """The far edge of so many layers carried about the middle line like a page, to rest on as many.
 
     ``slack`` shortens the arc at its top, as a share of the radius: a taut cloth would be dragged over the table.
-    ``short`` [m] is left to the crease at the end.
+    ``short`` [m] is left to the crease at the end. ``above`` [m] the stack the hand opens: the loop of an earlier
+    crease, which it holds too, is thicker than two layers and would be pressed through the ones below.
     """
     start, duration = when
     turn = math.pi * smooth((t - start) / duration)
@@ -67,7 +68,7 @@ def turned_over(
     pose[:, direction, direction] = pose[:, 2, 2] = turn.cos()
     pose[:, 2, direction], pose[:, direction, 2] = turn.sin(), -turn.sin()
     pose[:, direction, 3] = SIZE / 2 + (radius - SIZE) * turn.cos() + short * done
-    pose[:, 2, 3] = (radius - SIZE) * turn.sin() + (2 * layers - 1) * GAP * done
+    pose[:, 2, 3] = (radius - SIZE) * turn.sin() + ((2 * layers - 1) * GAP + above) * done
     return tc.Trajectory(t, pose, (t >= start) & (t < start + duration + RELEASED))
 
 
@@ -173,7 +174,7 @@ def folded() -> tuple[tc.Cloth, Sequence[np.ndarray], float]:
         motion = {
             "left": path(t, torch.zeros(len(t), 3), t < HALF[0] + HALF[1] + RELEASED),
             "right": turned_over(t, HALF, 0, 1, slack=0.05, short=0.004),
-            "back": turned_over(t, QUARTER, 1, 2, slack=0.15, short=0.0),
+            "back": turned_over(t, QUARTER, 1, 2, slack=0.15, short=0.004, above=0.004),
         }
         out = cloth(cloth.rest_state(), motion, times=FRAMES)
         edge = motion["right"].pose[:, :3, 3] + SIZE * motion["right"].pose[:, :3, 0]
@@ -192,7 +193,7 @@ def fold_half_a_metre(fast: bool) -> Outcome:
     """The right edge is turned over onto the left one, which is held meanwhile; then both layers' back edge."""
     cloth, x, speed = folded()
     mesh, grid = cloth.mesh, cloth.grid()
-    unseen = tc.transfer.TURNED * grid.reach
+    unseen = tc.transfer.TURNED * grid.reach + mesh.mean_edge  # contact acts between points of triangles
     ways = [crossings(frame, mesh) for frame in x]
     rows = [
         *judged("half", x[FRAMES.index(QUARTER[0])], mesh),
