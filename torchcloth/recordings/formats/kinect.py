@@ -25,9 +25,8 @@ from .. import checks
 from ..checks import Fields
 from ..images import ImageSource, ImageStream, Kind
 from . import matroska
-from .imported import Imported, ImportedCamera, damaged, nothing_left, seconds
+from .imported import Imported, ImportedCamera, damaged, frame_numbers, nothing_left, seconds
 from .side import Scene
-from .tum import TOGETHER, frame_numbers
 from .video import VideoFrames, listening, opened, packet_times
 
 NAME = "kinect"
@@ -82,7 +81,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
         _complete(path, times[kind], kind, track["end"])
     numbers = {kind: np.arange(len(t)) for kind, t in times.items()}
     if "color" in times:
-        numbers["color"], numbers["depth"] = frame_numbers(times["color"], times["depth"], TOGETHER)
+        numbers["color"], numbers["depth"] = frame_numbers(times["color"], times["depth"])
     found = Imported(notes={"format": NAME, "serial": tracks["depth"]["serial"], "unchecked": UNCHECKED})
     for kind, track in tracks.items():
         size = track["size"]

@@ -17,7 +17,6 @@ decode to another picture, for AV1 and H.264 carry no checksum.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,9 @@ import numpy as np
 from ...errors import MissingDependency, RecordingError
 from .. import checks
 from ..checks import Fields
+from ..files import Folder
 from ..images import ImageStream
-from .imported import NANO, Imported, ImportedCamera, damaged, file_text, nothing_left
+from .imported import NANO, Imported, ImportedCamera, damaged, nothing_left
 from .side import Scene
 from .video import VideoFrames
 
@@ -67,17 +67,11 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
 
 
 def _info(path: Path) -> Fields:
-    file = path / INFO
-    try:
-        info = Fields(json.loads(file_text(file)), str(file), ": ")
-    except RecordingError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise RecordingError(f"{file} is not valid JSON", got=error, remedy="restore it") from error
+    info = Folder(path / "meta").json("info.json")
     version = info.text("codebase_version")
     if not version.startswith("v3."):
         remedy = "convert it with lerobot's own script first"
-        raise RecordingError(f"{file}: another version", got=repr(version), expected="'v3.*'", remedy=remedy)
+        raise RecordingError(f"{path / INFO}: another version", got=repr(version), expected="'v3.*'", remedy=remedy)
     return info
 
 

@@ -54,10 +54,10 @@ def blocks(path: Path) -> dict[int, int]:
             length, start, unknown = _number(head, start)
             if name in (BLOCK, SIMPLE_BLOCK) and not unknown:
                 track, after, _ = _number(head, start)
-                flags = head[after + 2] if after + 2 < len(head) else LACING
-                counts[track] += 1
-                if flags & LACING or length < after + 3 - start:
+                if length < after + 3 - start or len(head) < after + 3:
                     raise _damaged(path, at)
+                laced = head[after + 2] & LACING  # then the next byte tells how many frames follow the first
+                counts[track] += 1 + (head[after + 3] if laced and len(head) > after + 3 else 0)
             elif name not in ENTERED and (unknown or name not in SKIPPED):
                 raise _damaged(path, at)
             at += start + (0 if name in ENTERED else length)

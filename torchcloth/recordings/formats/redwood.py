@@ -13,7 +13,6 @@ so do changed bytes in the pixels of a JPEG; PNG files are verified.
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ import numpy as np
 
 from ...errors import RecordingError
 from .. import checks
-from ..checks import Fields
+from ..files import Folder
 from ..images import ImageStream, Kind
 from .imported import (
     NANO,
@@ -93,12 +92,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
 def _camera(path: Path, fps: float | None) -> tuple[ImportedCamera, float | None]:
     """Intrinsics, and what Open3D's recorders add: the rate and the depth scale."""
     file = path / next(n for n in INTRINSIC if (path / n).is_file())
-    try:
-        fields = Fields(json.loads(file_text(file)), str(file), ": ")
-    except RecordingError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise RecordingError(f"{file} is not valid JSON", got=error, remedy="restore it") from error
+    fields = Folder(file.parent).json(file.name)
     flat = fields.array("intrinsic_matrix", 9)
     K = flat.reshape(3, 3).T
     if min(K[0, 0], K[1, 1]) <= 0 or not np.array_equal(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):

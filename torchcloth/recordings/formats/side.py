@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from ..checks import Fields
 from ..files import Folder
 from ..images import ImageStream, Kind
 from ..types import Recording
-from .imported import Imported, ImportedCamera, file_text
+from .imported import Imported, ImportedCamera
 
 CLOTH = '"cloth": {"sheet": {"width": 0.3, "height": 0.3}, "areal_density": 0.15, "thickness": 0.0005}'
 PROVENANCE = '"provenance": "measured"'
@@ -36,14 +35,7 @@ class Scene:
         """Read a JSON file; None gives an empty scene."""
         if path is None:
             return cls({}, Folder(Path()), "the scene (--scene FILE)")
-        try:
-            values = json.loads(file_text(path))
-        except (ValueError, RecursionError) as error:
-            if isinstance(error, RecordingError):
-                raise
-            raise RecordingError(f"{path} is not valid JSON", got=error, remedy="repair it") from error
-        if not isinstance(values, dict):
-            raise RecordingError(f"{path} is no scene", got=type(values).__name__, expected="a JSON object")
+        values = Folder(path.parent).json(path.name).rest
         return cls(values, Folder(path.parent), str(path))
 
     @property
