@@ -143,7 +143,10 @@ def _motion(fields: Fields, features: Fields, table: dict, row: dict[str, Any], 
     unit = fields.text("unit")
     if unit not in ("rad", "deg"):
         raise RecordingError(f"{fields.at('unit')} is unknown", got=repr(unit), expected="rad or deg")
-    q = values[:, [_index(j, names, fields.at("joints")) for j in fields.take("joints")]]
+    joints = fields.take("joints")
+    if not isinstance(joints, list) or not joints:
+        raise RecordingError(f"{fields.at('joints')} is unclear", got=joints, expected="names or indices, in order")
+    q = values[:, [_index(j, names, fields.at("joints")) for j in joints]]
     out = {"t": t, "q": np.radians(q) if unit == "deg" else q}
     width = fields.maybe(fields.take, "width")
     scale = fields.maybe(fields.number, "width_scale", above=0) or 1.0

@@ -61,7 +61,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     fps = source.maybe(source.number, "fps", above=0, most=1000, suspect="milliseconds")
     nothing_left(source)
     camera, fps = _camera(path, fps)
-    camera.known.setdefault("depth_scale", scene.camera(name).get("depth_scale", MILLIMETRE))
+    camera.known.setdefault("depth_scale", scene.depth_scale(name) or MILLIMETRE)
     color = _images(path / next(n for n in COLOR if (path / n).is_dir()), (".jpg", ".jpeg", ".png"))
     depth = _images(path / "depth", (".png",))
     if len(color) != len(depth):
@@ -81,7 +81,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
         camera.streams[kind] = stream
     if image_size(depth[0]) != size:
         raise RecordingError(f"{depth[0]} has the wrong size", got=image_size(depth[0]), expected=f"{size}")
-    _plausible(camera.streams["depth"], float(camera.known["depth_scale"]), depth[0])
+    _plausible(camera.streams["depth"], camera.known["depth_scale"], depth[0])
     found = Imported(cameras={name: camera}, notes={"format": NAME, "start_ns": start, "unchecked": UNCHECKED})
     log = next((path / n for n in TRAJECTORY if (path / n).is_file()), None)
     if log is not None:
