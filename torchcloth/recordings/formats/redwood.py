@@ -45,7 +45,7 @@ UNCHECKED = "intrinsics, pose, and pixels of JPEG images"
 MILLIMETRE = 0.001
 TOGETHER = 50_000_000  # ns between the images of a pair
 LEAST, MOST = 0.05, 30.0  # m; where half of all depths lie
-_STAMPED = re.compile(r"\d+-(\d{6,})")
+_STAMPED = re.compile(r"\d+-(\d{6,15})")
 
 
 def matches(path: Path) -> bool:

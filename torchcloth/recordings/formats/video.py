@@ -106,7 +106,7 @@ def listening(path: Path) -> Iterator[None]:
     before = av.logging.get_level()
     av.logging.set_level(av.logging.ERROR)
     try:
-        with av.logging.Capture() as heard:
+        with av.logging.Capture(local=False) as heard:  # decoders have threads of their own
             yield
             said = [text.strip() for level, _, text in heard if level <= av.logging.ERROR]
     finally:
@@ -125,4 +125,4 @@ def packet_times(path: Path) -> dict[int, np.ndarray]:
                     raise RecordingError(f"{path} is damaged", got="a packet without a time", remedy="copy it again")
                 ns = int(packet.pts * packet.time_base * 10**9)
                 times.setdefault(packet.stream_index, []).append(ns)
-    return {track: np.array(values, dtype=np.int64) for track, values in times.items()}
+        return {track: np.array(values, dtype=np.int64) for track, values in times.items()}
