@@ -8,13 +8,16 @@ import sys
 import pytest
 
 HEAVY = (
+    "av",
     "lightning",
     "matplotlib",
     "mujoco",
     "open3d",
+    "pyarrow",
     "pytorch_kinematics",
     "pytorch_lightning",
     "rich",
+    "rosbags",
     "scipy",
     "trimesh",
     "yourdfpy",

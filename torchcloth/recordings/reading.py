@@ -40,12 +40,11 @@ def read_folder(folder: Folder, *, with_truth: bool) -> Recording:
     _check_version(root)
     groups = streams.groups(folder) if folder.has(streams.MOTION) else {}
     grippers, joints = streams.motions(groups, folder.place(streams.MOTION))
+    clouds = folder.npz(streams.POINTS) if folder.has(streams.POINTS) else None
     held = {
         "grippers": grippers,
         "joints": joints,
-        "points": streams.points(folder.npz(streams.POINTS), folder.place(streams.POINTS))
-        if folder.has(streams.POINTS)
-        else None,
+        "points": None if clouds is None else streams.points(clouds, folder.place(streams.POINTS)),
         "markers": streams.markers(folder) if folder.has(streams.MARKERS) else None,
         "truth": streams.truth(folder) if with_truth and folder.has(streams.TRUTH) else None,
         "path": folder.shown,

@@ -308,13 +308,16 @@ def kinect(folder: Path, *, size: tuple[int, int] = (320, 288), frames: int = FR
         raw = container.add_stream("rawvideo", rate=30)
         raw.width, raw.height, raw.pix_fmt = *size, "gray16be"
         raw.metadata["title"] = "DEPTH"
+        imu = container.add_mux_stream("subrip", rate=1000)
+        imu.metadata["title"] = "IMU"
         container.add_attachment("calibration.json", "application/octet-stream", json.dumps(calibration()).encode())
         for i in range(frames):
-            packet = av.Packet(files[i])
-            packet.pts = packet.dts = i
-            packet.time_base = Fraction(1, 30)
-            packet.stream, packet.is_keyframe = color, True
-            container.mux(packet)
+            for stream, data in ((color, files[i]), (imu, bytes(24))):
+                packet = av.Packet(data)
+                packet.pts = packet.dts = i
+                packet.time_base = Fraction(1, 30)
+                packet.stream, packet.is_keyframe = stream, True
+                container.mux(packet)
             frame = av.VideoFrame.from_ndarray(depth[i], format="gray16le").reformat(format="gray16be")
             frame.pts = i
             container.mux(raw.encode(frame))
@@ -322,7 +325,7 @@ def kinect(folder: Path, *, size: tuple[int, int] = (320, 288), frames: int = FR
     data = bytearray(path.read_bytes())
     at = data.index(struct.pack("<IiiHH", 40, size[0], -size[1], 1, 16))
     data[at : at + 20] = struct.pack("<IiiHH4s", 40, *size, 1, 16, b"b16g")
-    path.write_bytes(data)
+    path.write_bytes(data.replace(b"S_TEXT/UTF8", b"S_K4A/IMU\0\0"))
     times = [round(i / 30, 3) for i in range(frames)]
     images = {"depth/depth": depth, "color/color": [decoded(f) for f in files]}
     scene = {**KNOWN, "cameras": {"depth": {"T_world_camera": POSE}}}

@@ -45,7 +45,7 @@ def test_a_refusal_is_one_line_and_leaves_nothing(tmp_path, capsys):
     for arguments, match in (
         ([], "does not tell everything"),
         (["--scene", scene, "--from", "redwood"], "mislabelled; got content of tum; expected redwood"),
-        (["--scene", tmp_path / "lost.json"], "cannot be read"),
+        (["--scene", tmp_path / "lost.json"], "lost.json is missing"),
         (["--scene", scene, "--episode", "3"], "holds one episode"),
     ):
         assert call(truth.path, out, *arguments) == 2

@@ -6,6 +6,7 @@ format it is said what that may be, and streams always keep their lengths and na
 
 from __future__ import annotations
 
+import copy
 import random
 import re
 import shutil
@@ -209,6 +210,57 @@ UNNOTICEABLE = {  # pixels of PNG only when two whole files change places
     "kinect": f"{PIXELS}|{TIMES}|{LENS}",
 }
 SHARE = {"rosbag2 of MCAP": 0.34, "rosbag2 of sqlite": 0.33, "sealed MCAP": 0.33}  # three ways to write one format
+
+
+def places(node, path=()):
+    """Every key path of a JSON tree."""
+    for key in node.keys() if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ():
+        yield (*path, key)
+        yield from places(node[key], (*path, key))
+
+
+VALUES = [None, True, 0, -1, 1e400, 10**400, "", "x", "/", "\0", [], {}, [[]], [None], [["a"]], [[1, 2], 3], {"": {}}]
+
+
+def wrong_scenes(name: str, tmp_path: Path, count: int) -> Counter:
+    """Side files with faults of people: read, or refused by one line; whatever is read can be written."""
+    rng, outcome = random.Random(name), Counter()
+    truth = foreign.WRITERS[name](tmp_path)
+    table = {"plane": {"point": [0, 0, 0], "normal": [0, 0, 1]}}
+    whole = {"cameras": {}, **truth.scene, "grasps": {}, "colliders": {"table": table}}
+    camera = whole["cameras"].setdefault("depth" if name == "kinect" else "cam0", {})
+    camera["depth_scale"] = 0.0002 if name == "tum" else 0.001
+    if name == "ros2":
+        whole["source"]["motion"]["left"]["frame"] = "arm"
+    paths = list(places(whole))
+    for _ in range(count):
+        truth.scene = copy.deepcopy(whole)
+        *outer, last = rng.choice(paths)
+        node = truth.scene
+        for key in outer:
+            node = node[key]
+        how = rng.randrange(4)
+        if how == 0:
+            del node[last]
+        elif how == 1 and isinstance(node, dict):
+            node[f"{last}s"] = node.pop(last)
+        else:
+            node[last] = rng.choice(VALUES)
+        outcome[attempt(truth, truth.write_scene(), tmp_path / "out") is not None] += 1
+    return outcome
+
+
+@pytest.mark.parametrize("name", foreign.WRITERS)
+def test_wrong_scenes(name, tmp_path):
+    assert wrong_scenes(name, tmp_path, FEW // 4)[False] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", foreign.WRITERS)
+def test_many_wrong_scenes(name, tmp_path):
+    outcome = wrong_scenes(name, tmp_path, MANY)
+    print(name, dict(outcome))
+    assert outcome[False] > MANY / 4
 
 
 @pytest.mark.slow

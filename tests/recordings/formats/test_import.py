@@ -50,6 +50,7 @@ def check(recording: rec.Recording, truth: foreign.Foreign, *, lossy: int = 0, p
 
 @pytest.mark.parametrize("name", foreign.WRITERS)
 def test_import_write_read(name, tmp_path):
+    """As an episode, and from there as MCAP."""
     truth = foreign.WRITERS[name](tmp_path)
     imported = formats.read(truth.path, scene=truth.write_scene(), **truth.options)
     check(imported, truth, lossy=LOSSY.get(name, 0))
@@ -59,3 +60,5 @@ def test_import_write_read(name, tmp_path):
     assert len(counted) == sum(map(len, truth.images.values()))
     assert back.extra["source"]["format"] == name
     assert formats.detect(truth.path) == name
+    again = formats.read(formats.write_mcap(back, tmp_path / "ep.mcap"))
+    check(again, truth, lossy=LOSSY.get(name, 0), points=1e-7)

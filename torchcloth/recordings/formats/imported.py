@@ -18,6 +18,7 @@ from ..images import ImageSource, ImageStream, Kind
 
 LONGEST_NAME = 60  # of a value shown in a message
 NANO = 10**9
+TOGETHER = 20_000_000  # ns between two images taken as one frame, as TUM's associate.py has it
 
 
 @dataclass
@@ -160,6 +161,31 @@ def quaternions(matrices: np.ndarray) -> np.ndarray:
     ]
     quat = np.linalg.eigh(np.moveaxis(np.array(rows), -1, 0))[1][..., -1]
     return quat * np.where(quat[:, :1] < 0, -1.0, 1.0)
+
+
+def frame_numbers(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frame numbers of two streams by their times [ns]: two images that are each other's nearest share one."""
+    to_b, to_a = _nearest(a, b), _nearest(b, a)
+    paired = {i: int(j) for i, j in enumerate(to_b) if to_a[j] == i and abs(int(a[i]) - int(b[j])) <= TOGETHER}
+    partners = {j: i for i, j in paired.items()}
+    events = [(min(int(a[i]), int(b[j])), i, j) for i, j in paired.items()]
+    events += [(int(t), i, None) for i, t in enumerate(a) if i not in paired]
+    events += [(int(t), None, j) for j, t in enumerate(b) if j not in partners]
+    first, second = np.zeros(len(a), dtype=np.int64), np.zeros(len(b), dtype=np.int64)
+    for number, (_, i, j) in enumerate(sorted(events, key=lambda event: event[0])):
+        if i is not None:
+            first[i] = number
+        if j is not None:
+            second[j] = number
+    return first, second
+
+
+def _nearest(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Index into ``b`` of the time nearest to each of ``a``."""
+    right = np.clip(np.searchsorted(b, a), 1, max(len(b) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(b) - 1)
+    return np.where(np.abs(a - b[left]) <= np.abs(b[right] - a), left, right)
 
 
 def nothing_left(fields: Fields) -> None:

@@ -24,17 +24,17 @@ from ...errors import RecordingError
 from .. import checks
 from ..checks import Fields
 from ..images import ImageSource, ImageStream, Kind
-from .imported import Imported, ImportedCamera, damaged, nothing_left, seconds
+from . import matroska
+from .imported import Imported, ImportedCamera, damaged, frame_numbers, nothing_left, seconds
 from .side import Scene
-from .tum import TOGETHER, frame_numbers
 from .video import VideoFrames, listening, opened, packet_times
 
 NAME = "kinect"
 TITLE = "Azure Kinect MKV"
-MAGIC = b"\x1a\x45\xdf\xa3"
 MILLIMETRE = 0.001
 CALIBRATION = "calibration.json"
 TRACKS: dict[Kind, str] = {"depth": "DEPTH", "color": "COLOR"}
+OTHERS = ("IR", "IMU")  # of no use here
 # size: (binned sensor, crop) in pixels
 DEPTH_MODES = {
     (640, 576): ((1024, 1024), (192, 180)),
@@ -54,9 +54,8 @@ MODES = {"depth": DEPTH_MODES, "color": COLOR_MODES}
 LENSES: dict[Kind, str] = {"depth": "CALIBRATION_CameraLocationD0", "color": "CALIBRATION_CameraLocationPV0"}
 PARAMETERS = 14  # cx cy fx fy k1 k2 k3 k4 k5 k6 codx cody p2 p1, in parts of the sensor's size
 UNCHECKED = "pixels, times and calibration"
-HEAD = 256  # bytes that hold the heads of the file and of its segment
 TOLERANCE = 1_000_000  # ns; Matroska may store whole milliseconds
-SLACK = 1.6  # frames that the last one may lie before the end that the file's head names
+SLACK = 10  # frames by which a lens may stop before the file ends
 
 
 def matches(path: Path) -> bool:
@@ -64,7 +63,7 @@ def matches(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        return file.read(4) == MAGIC
+        return file.read(4) == matroska.MAGIC
 
 
 def read(path: Path, scene: Scene, episode: int | None) -> Imported:
@@ -72,14 +71,17 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     source = scene.source
     names = {kind: source.maybe(source.text, kind) or kind for kind in TRACKS}
     nothing_left(source)
-    _whole(path)
     tracks, calibration = _tracks(path)
-    times = {kind: packet_times(path, track["index"]) for kind, track in tracks.items()}
+    every = packet_times(path)
+    if sorted(len(t) for t in every.values()) != sorted(matroska.blocks(path).values()):
+        remedy = "copy it again"
+        raise RecordingError(f"{path} is damaged", got="blocks that FFmpeg cannot find", remedy=remedy)
+    times = {kind: every.get(track["index"], np.zeros(0, dtype=np.int64)) for kind, track in tracks.items()}
     for kind, track in tracks.items():
         _complete(path, times[kind], kind, track["end"])
     numbers = {kind: np.arange(len(t)) for kind, t in times.items()}
     if "color" in times:
-        numbers["color"], numbers["depth"] = frame_numbers(times["color"], times["depth"], TOGETHER)
+        numbers["color"], numbers["depth"] = frame_numbers(times["color"], times["depth"])
     found = Imported(notes={"format": NAME, "serial": tracks["depth"]["serial"], "unchecked": UNCHECKED})
     for kind, track in tracks.items():
         size = track["size"]
@@ -100,27 +102,6 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     return found
 
 
-def _whole(path: Path) -> None:
-    """Refuse a file whose length is not the one that its head names; while recording it names none."""
-    with path.open("rb") as file:
-        head = file.read(HEAD)
-    with damaged(path, "Matroska file"):
-        start, length, _ = _element(head, 0)
-        start, length, unknown = _element(head, start + length)
-    if not unknown and start + length != path.stat().st_size:
-        got, expected = f"{path.stat().st_size} bytes", f"{start + length}, as its head says"
-        raise RecordingError(f"{path} is truncated or damaged", got=got, expected=expected, remedy="copy it again")
-
-
-def _element(data: bytes, at: int) -> tuple[int, int, bool]:
-    """Where the content of the EBML element at ``at`` begins, its length, and whether that is unknown (RFC 8794)."""
-    at += 9 - data[at].bit_length()  # the leading zeros of the first byte tell how many follow
-    width = 9 - data[at].bit_length()
-    bits = 7 * width
-    length = int.from_bytes(data[at : at + width], "big") & ((1 << bits) - 1)
-    return at + width, length, length == (1 << bits) - 1
-
-
 def _tracks(path: Path) -> tuple[dict[Kind, dict[str, Any]], dict[str, Any] | None]:
     """Index, size and codec of the depth and colour tracks, and the attached calibration."""
     found: dict[Kind, dict[str, Any]] = {}
@@ -133,9 +114,15 @@ def _tracks(path: Path) -> tuple[dict[Kind, dict[str, Any]], dict[str, Any] | No
         for stream in container.streams:
             if stream.type == "attachment" and stream.name == CALIBRATION:
                 calibration = json.loads(bytes(stream.data))
-            kind: Kind | None = next((k for k, t in TRACKS.items() if stream.metadata.get("title") == t), None)
-            if stream.type != "video" or kind is None:
+            title = stream.metadata.get("title")
+            kind: Kind | None = next((k for k, t in TRACKS.items() if title == t), None)
+            if stream.type != "attachment" and title not in (*TRACKS.values(), *OTHERS):
+                expected = ", ".join((*TRACKS.values(), *OTHERS))
+                raise RecordingError(f"{path}: a track has an unknown title", got=repr(title), expected=expected)
+            if kind is None:
                 continue
+            if stream.type != "video":
+                raise RecordingError(f"{path}: track {title} is no video", got=stream.type)
             if kind in found:
                 raise RecordingError(f"{path} has two {TRACKS[kind]} tracks", expected="one")
             context = stream.codec_context
@@ -151,6 +138,8 @@ def _tracks(path: Path) -> tuple[dict[Kind, dict[str, Any]], dict[str, Any] | No
 
 def _complete(path: Path, times: np.ndarray, kind: Kind, end: int | None) -> None:
     """Refuse a file that ends before the end which its head names."""
+    if not len(times):
+        raise RecordingError(f"{path} has no {kind} image", expected="a recording of some frames")
     if end is None or len(times) < 2:
         return
     frame = int(np.median(np.diff(times)))

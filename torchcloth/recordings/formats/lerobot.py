@@ -17,7 +17,6 @@ decode to another picture, for AV1 and H.264 carry no checksum.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,9 @@ import numpy as np
 from ...errors import MissingDependency, RecordingError
 from .. import checks
 from ..checks import Fields
+from ..files import Folder
 from ..images import ImageStream
-from .imported import NANO, Imported, ImportedCamera, damaged, file_text, nothing_left
+from .imported import NANO, Imported, ImportedCamera, damaged, nothing_left
 from .side import Scene
 from .video import VideoFrames
 
@@ -37,6 +37,7 @@ INFO = "meta/info.json"
 EXAMPLE = '"source": {"motion": {"left": {"column": "observation.state", "joints": [0, 1, 2], "unit": "rad"}}}'
 UNCHECKED = "pixels"
 TOLERANCE = 1e-4  # s; LeRobot's own for video and row times
+LONGEST = 1e6  # s of video in one file
 AGREE = 1e-5  # relative; statistics are kept in float64 of float32 values
 
 
@@ -51,7 +52,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     row = _episode(path, episode)
     fps = info.number("fps", above=0, most=10_000, suspect="milliseconds")
     features = info.inside("features")
-    table = _table(path, info, row, fps)
+    table = _table(path, info, features, row, fps)
     source = scene.source
     if not source.rest:
         expected = f"the scene with {EXAMPLE}"
@@ -67,22 +68,16 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
 
 
 def _info(path: Path) -> Fields:
-    file = path / INFO
-    try:
-        info = Fields(json.loads(file_text(file)), str(file), ": ")
-    except RecordingError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise RecordingError(f"{file} is not valid JSON", got=error, remedy="restore it") from error
+    info = Folder(path / "meta").json("info.json")
     version = info.text("codebase_version")
     if not version.startswith("v3."):
         remedy = "convert it with lerobot's own script first"
-        raise RecordingError(f"{file}: another version", got=repr(version), expected="'v3.*'", remedy=remedy)
+        raise RecordingError(f"{path / INFO}: another version", got=repr(version), expected="'v3.*'", remedy=remedy)
     return info
 
 
-def _read_table(file: Path, *, filters: Any = None) -> dict[str, list[Any]]:
-    """The columns of a parquet file, its page checksums verified."""
+def _read_table(file: Path, *, columns: list[str] | None = None, episode: int | None = None) -> dict[str, list[Any]]:
+    """Columns of a parquet file, of one episode or all; page checksums are verified where there are any."""
     try:
         from pyarrow import parquet  # pyright: ignore[reportMissingImports]  (optional)
     except ImportError as error:
@@ -90,36 +85,38 @@ def _read_table(file: Path, *, filters: Any = None) -> dict[str, list[Any]]:
     if not file.is_file():
         raise RecordingError(f"{file} is missing", expected="a parquet file", remedy="download it")
     with damaged(file, "parquet file"):
-        table = parquet.read_table(file, page_checksum_verification=True, filters=filters)
+        rows = None if episode is None else [("episode_index", "=", episode)]
+        table = parquet.read_table(file, columns=columns, filters=rows, page_checksum_verification=True)
         table.validate(full=True)
         return table.to_pydict()
 
 
 def _episode(path: Path, episode: int | None) -> dict[str, Any]:
     """The line about one episode in meta/episodes."""
-    rows: dict[int, dict[str, Any]] = {}
+    files: dict[int, Path] = {}
     for file in sorted((path / "meta" / "episodes").rglob("*.parquet")):
-        columns = _read_table(file)
-        if "episode_index" not in columns:
-            raise RecordingError(f"{file} lists no episodes", got=sorted(columns)[:5], expected="episode_index")
-        for i, index in enumerate(columns["episode_index"]):
-            if index in rows or not isinstance(index, int):
-                raise RecordingError(f"{file} lists an episode twice", got=index)
-            rows[index] = {key: values[i] for key, values in columns.items()} | {"file": str(file)}
-    chosen = next(iter(rows)) if len(rows) == 1 and episode is None else episode
-    if chosen not in rows:
-        known = sorted(rows)
+        for index in _read_table(file, columns=["episode_index"]).get("episode_index", [None]):
+            if index in files or not isinstance(index, int):
+                raise RecordingError(f"{file} lists an episode twice or not at all", got=index, expected="numbers")
+            files[index] = file
+    chosen = next(iter(files)) if len(files) == 1 and episode is None else episode
+    if chosen not in files:
+        known = sorted(files)
         got = "no --episode" if episode is None else f"--episode {episode}"
         expected = f"one of {known[0]} to {known[-1]}" if known else "meta/episodes"
-        raise RecordingError(f"{path} holds {len(rows)} episodes", got=got, expected=expected)
-    return rows[chosen]
+        raise RecordingError(f"{path} holds {len(files)} episodes", got=got, expected=expected)
+    columns = _read_table(files[chosen], episode=chosen)
+    if columns.get("episode_index") != [chosen]:
+        raise RecordingError(f"{files[chosen]} has lost episode {chosen}", remedy="download it again")
+    return {key: values[0] for key, values in columns.items()} | {"file": str(files[chosen])}
 
 
-def _table(path: Path, info: Fields, row: dict[str, Any], fps: float) -> dict[str, np.ndarray]:
+def _table(path: Path, info: Fields, features: Fields, row: dict[str, Any], fps: float) -> dict[str, np.ndarray]:
     """The episode's rows, which must be one for each tick."""
     file = path / _file(info, "data_path", row, "data")
     number, length = row["episode_index"], _whole(row, "length")
-    columns = _read_table(file, filters=[("episode_index", "=", number)])
+    plain = [key for key, feature in features.rest.items() if _dtype(feature) not in ("video", "image", "string")]
+    columns = _read_table(file, columns=plain, episode=number)
     place = f"{file}: episode {number}"
     with damaged(place, "table"):
         table = {key: np.asarray(values) for key, values in columns.items()}
@@ -149,7 +146,10 @@ def _motion(fields: Fields, features: Fields, table: dict, row: dict[str, Any], 
     unit = fields.text("unit")
     if unit not in ("rad", "deg"):
         raise RecordingError(f"{fields.at('unit')} is unknown", got=repr(unit), expected="rad or deg")
-    q = values[:, [_index(j, names, fields.at("joints")) for j in fields.take("joints")]]
+    joints = fields.take("joints")
+    if not isinstance(joints, list) or not joints:
+        raise RecordingError(f"{fields.at('joints')} is unclear", got=joints, expected="names or indices, in order")
+    q = values[:, [_index(j, names, fields.at("joints")) for j in joints]]
     out = {"t": t, "q": np.radians(q) if unit == "deg" else q}
     width = fields.maybe(fields.take, "width")
     scale = fields.maybe(fields.number, "width_scale", above=0) or 1.0
@@ -162,6 +162,10 @@ def _motion(fields: Fields, features: Fields, table: dict, row: dict[str, Any], 
         out["closed"] = np.full(len(t), closed)
     nothing_left(fields)
     return out
+
+
+def _dtype(feature: Any) -> Any:
+    return feature.get("dtype") if isinstance(feature, dict) else None
 
 
 def _names(features: Fields, column: str, fields: Fields) -> list[str]:
@@ -213,8 +217,8 @@ def _camera(
     if not features.has(key):
         raise RecordingError(f"{fields.at('color')} is unknown", got=repr(key), expected=f"{sorted(features.rest)}")
     feature = Fields(features.rest[key], features.at(key))
-    if feature.text("dtype") != "video":
-        raise RecordingError(f"{features.at(key)} is no video", got=feature.at("dtype"), expected="video")
+    if _dtype(feature.rest) != "video":
+        raise RecordingError(f"{features.at(key)} is no video", got=_dtype(feature.rest), expected="video")
     names: Any = feature.rest.get("names")
     shape: dict[Any, int] = dict(zip(names or (), feature.array("shape", 3, kind="int").tolist(), strict=False))
     if not {"height", "width"} <= shape.keys():
@@ -227,7 +231,7 @@ def _camera(
     end = row.get(f"videos/{key}/to_timestamp")
     span = checks.array([start, end], f"{row['file']}: videos/{key}", (2,))
     step = t[1] if len(t) > 1 else span[1] - span[0]
-    if abs(span[1] - span[0] - len(t) * step) > TOLERANCE * 10:
+    if not 0 <= span[0] <= LONGEST or abs(span[1] - span[0] - len(t) * step) > TOLERANCE * 10:
         got = f"{span[1] - span[0]:g} s for {len(t)} frames"
         raise RecordingError(f"{row['file']}: videos/{key} does not last", got=got, expected=f"{len(t) * step:g} s")
     times = np.round((span[0] + t) * NANO).astype(np.int64)

@@ -174,7 +174,7 @@ class _Bag:
     def _joints(self, topic: str, arm: Any, times: list[int]) -> dict[str, Any]:
         names = [f"joint_{j + 1}" for j in range(arm.q.shape[1])]
         kind, none = "sensor_msgs/msg/JointState", np.zeros(0)
-        values = arm.q if arm.width is None else np.column_stack([arm.q, arm.width])
+        values = np.ascontiguousarray(arm.q if arm.width is None else np.column_stack([arm.q, arm.width]))
         every = names if arm.width is None else [*names, FINGER]
         self._topic(
             topic, kind, lambda i: self._type(kind, self._header(times[i], ""), every, values[i], none, none), times

@@ -13,7 +13,6 @@ so do changed bytes in the pixels of a JPEG; PNG files are verified.
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ import numpy as np
 
 from ...errors import RecordingError
 from .. import checks
-from ..checks import Fields
+from ..files import Folder
 from ..images import ImageStream, Kind
 from .imported import (
     NANO,
@@ -46,7 +45,7 @@ UNCHECKED = "intrinsics, pose, and pixels of JPEG images"
 MILLIMETRE = 0.001
 TOGETHER = 50_000_000  # ns between the images of a pair
 LEAST, MOST = 0.05, 30.0  # m; where half of all depths lie
-_STAMPED = re.compile(r"\d+-(\d{6,})")
+_STAMPED = re.compile(r"\d+-(\d{6,15})")
 
 
 def matches(path: Path) -> bool:
@@ -62,7 +61,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     fps = source.maybe(source.number, "fps", above=0, most=1000, suspect="milliseconds")
     nothing_left(source)
     camera, fps = _camera(path, fps)
-    camera.known.setdefault("depth_scale", scene.camera(name).get("depth_scale", MILLIMETRE))
+    camera.known.setdefault("depth_scale", scene.depth_scale(name) or MILLIMETRE)
     color = _images(path / next(n for n in COLOR if (path / n).is_dir()), (".jpg", ".jpeg", ".png"))
     depth = _images(path / "depth", (".png",))
     if len(color) != len(depth):
@@ -82,7 +81,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
         camera.streams[kind] = stream
     if image_size(depth[0]) != size:
         raise RecordingError(f"{depth[0]} has the wrong size", got=image_size(depth[0]), expected=f"{size}")
-    _plausible(camera.streams["depth"], float(camera.known["depth_scale"]), depth[0])
+    _plausible(camera.streams["depth"], camera.known["depth_scale"], depth[0])
     found = Imported(cameras={name: camera}, notes={"format": NAME, "start_ns": start, "unchecked": UNCHECKED})
     log = next((path / n for n in TRAJECTORY if (path / n).is_file()), None)
     if log is not None:
@@ -93,12 +92,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
 def _camera(path: Path, fps: float | None) -> tuple[ImportedCamera, float | None]:
     """Intrinsics, and what Open3D's recorders add: the rate and the depth scale."""
     file = path / next(n for n in INTRINSIC if (path / n).is_file())
-    try:
-        fields = Fields(json.loads(file_text(file)), str(file), ": ")
-    except RecordingError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise RecordingError(f"{file} is not valid JSON", got=error, remedy="restore it") from error
+    fields = Folder(file.parent).json(file.name)
     flat = fields.array("intrinsic_matrix", 9)
     K = flat.reshape(3, 3).T
     if min(K[0, 0], K[1, 1]) <= 0 or not np.array_equal(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):

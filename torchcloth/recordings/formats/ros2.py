@@ -58,10 +58,8 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     if epoch is not None and (isinstance(epoch, bool) or not isinstance(epoch, int) or abs(epoch) > 2**62):
         raise RecordingError(f"{source.at('epoch')} is no time", got=epoch, expected="whole nanoseconds")
     motion = {name: MotionTopics(fields, bag, scene) for name, fields in source.each("motion").items()}
-    cameras = {
-        name: CameraTopics(fields, bag, scene.camera(name).get("depth_scale"))
-        for name, fields in source.each("cameras").items()
-    }
+    each = source.each("cameras")
+    cameras = {name: CameraTopics(fields, bag, scene.depth_scale(name)) for name, fields in each.items()}
     clouds = CloudTopic(source.inside("points"), bag, scene) if source.has("points") else None
     nothing_left(source)
     parts = [*motion.values(), *cameras.values(), *([clouds] if clouds else [])]

@@ -12,9 +12,8 @@ from ..checks import Fields
 from ..images import KINDS, ImageSource, ImageStream, Kind
 from . import ros2_messages
 from .bag import Bag, Message
-from .imported import ImportedCamera, image_size, nothing_left, seconds
+from .imported import ImportedCamera, frame_numbers, image_size, nothing_left, seconds
 from .ros2_topics import topic
-from .tum import TOGETHER, frame_numbers
 
 MILLIMETRE = 0.001  # of 16UC1, by REP 118
 FINE = 0.0002  # m per unit for depth in metres (32FC1): 0.1 mm of rounding, up to 13 m
@@ -102,7 +101,7 @@ class CameraTopics:
             return dict(self.numbers)
         numbers: dict[Kind, np.ndarray] = {kind: np.arange(len(s)) for kind, s in stamps.items()}
         if "color" in stamps and "depth" in stamps:
-            numbers["color"], numbers["depth"] = frame_numbers(stamps["color"], stamps["depth"], TOGETHER)
+            numbers["color"], numbers["depth"] = frame_numbers(stamps["color"], stamps["depth"])
         of: Kind | None = next((kind for kind in KINDS if kind in stamps and kind != "mask"), None)
         if "mask" in stamps and of:
             by_time = dict(zip(stamps[of].tolist(), numbers[of].tolist(), strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from ..checks import Fields
 from ..files import Folder
 from ..images import ImageStream, Kind
 from ..types import Recording
-from .imported import Imported, ImportedCamera, file_text
+from .imported import Imported, ImportedCamera
 
 CLOTH = '"cloth": {"sheet": {"width": 0.3, "height": 0.3}, "areal_density": 0.15, "thickness": 0.0005}'
 PROVENANCE = '"provenance": "measured"'
@@ -36,14 +35,7 @@ class Scene:
         """Read a JSON file; None gives an empty scene."""
         if path is None:
             return cls({}, Folder(Path()), "the scene (--scene FILE)")
-        try:
-            values = json.loads(file_text(path))
-        except (ValueError, RecursionError) as error:
-            if isinstance(error, RecordingError):
-                raise
-            raise RecordingError(f"{path} is not valid JSON", got=error, remedy="repair it") from error
-        if not isinstance(values, dict):
-            raise RecordingError(f"{path} is no scene", got=type(values).__name__, expected="a JSON object")
+        values = Folder(path.parent).json(path.name).rest
         return cls(values, Folder(path.parent), str(path))
 
     @property
@@ -53,9 +45,12 @@ class Scene:
 
     def camera(self, name: str) -> dict[str, Any]:
         """What it says of one camera."""
-        cameras = self.values.get("cameras") or {}
-        found = cameras.get(name) if isinstance(cameras, dict) else None
-        return found if isinstance(found, dict) else {}
+        return self._item("cameras", name)
+
+    def depth_scale(self, name: str) -> float | None:
+        """The unit [m] of a camera's depth images."""
+        fields = Fields(self.camera(name), f"{self.name}: cameras.{name}")
+        return fields.maybe(fields.number, "depth_scale", above=0, most=0.1, suspect="units per metre")
 
     def transform(self, frame: str) -> np.ndarray:
         """The pose [4, 4] in the world of "world", a camera or a robot's base.
@@ -66,14 +61,20 @@ class Scene:
         if frame == "world":
             return np.eye(4)
         for group, key in (("cameras", "T_world_camera"), ("robots", "T_world_base")):
-            item = (self.values.get(group) or {}).get(frame)
-            if isinstance(item, dict) and key in item:
+            item = self._item(group, frame)
+            if key in item:
                 place = f"{self.name}: {group}.{frame}.{key}"
                 matrix = checks.array(item[key], place, (4, 4))
                 checks.transform(matrix, place)
                 return matrix
         expected = '"world", or a camera or robot that the scene places'
         raise RecordingError(f"{self.name}: frame {frame!r} is unknown", expected=expected)
+
+    def _item(self, group: str, name: str) -> dict[str, Any]:
+        """An object in a group; what is none is refused later, with all others."""
+        every = self.values.get(group)
+        found = every.get(name) if isinstance(every, dict) else None
+        return found if isinstance(found, dict) else {}
 
     def complete(self, imported: Imported, path: Path) -> Recording:
         """Put the file and the scene together into one checked recording; where both speak they must agree."""
@@ -131,7 +132,7 @@ class Scene:
 def _agree(a: Any, b: Any) -> bool:
     try:
         x, y = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # words, ragged lists, whole numbers beyond any float
         return a == b
     if x.ndim == 1 and y.ndim == 1:  # trailing zeros of a distortion may be left out
         longest = max(len(x), len(y))

@@ -28,6 +28,7 @@ from .imported import (
     ImportedCamera,
     file_text,
     fixed_pose,
+    frame_numbers,
     image_size,
     nanoseconds,
     nothing_left,
@@ -41,7 +42,6 @@ TITLE = "TUM RGB-D folder"
 CAMERA = "cam0"
 UNCHECKED = "times, poses, and pixels of JPEG images"
 DEPTH_SCALE = 1 / 5000  # m per unit
-TOGETHER = 20_000_000  # ns; associate.py of the data set takes the same
 LISTS: dict[Kind, str] = {"color": "rgb.txt", "depth": "depth.txt"}
 TRUTH = "groundtruth.txt"
 
@@ -65,7 +65,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     truth = _truth(path / TRUTH) if (path / TRUTH).is_file() else None
     start = int(min(t[0] for t in stamps.values()))
     numbers: dict[Kind, np.ndarray] = {}
-    numbers["color"], numbers["depth"] = frame_numbers(stamps["color"], stamps["depth"], TOGETHER)
+    numbers["color"], numbers["depth"] = frame_numbers(stamps["color"], stamps["depth"])
     size = image_size(lists["depth"][0][1])
     camera = ImportedCamera({"width": size[0], "height": size[1], "depth_scale": DEPTH_SCALE})
     for kind, rows in lists.items():
@@ -84,31 +84,6 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     elif hand is not None:
         raise RecordingError(f"{path / TRUTH} is missing", expected=f"the path of {hand!r}")
     return found
-
-
-def frame_numbers(a: np.ndarray, b: np.ndarray, within: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frame numbers of two streams by their times [ns]: images that are each other's nearest share one."""
-    to_b, to_a = _nearest(a, b), _nearest(b, a)
-    paired = {i: int(j) for i, j in enumerate(to_b) if to_a[j] == i and abs(int(a[i]) - int(b[j])) <= within}
-    partners = {j: i for i, j in paired.items()}
-    events = [(min(int(a[i]), int(b[j])), i, j) for i, j in paired.items()]
-    events += [(int(t), i, None) for i, t in enumerate(a) if i not in paired]
-    events += [(int(t), None, j) for j, t in enumerate(b) if j not in partners]
-    first, second = np.zeros(len(a), dtype=np.int64), np.zeros(len(b), dtype=np.int64)
-    for number, (_, i, j) in enumerate(sorted(events, key=lambda event: event[0])):
-        if i is not None:
-            first[i] = number
-        if j is not None:
-            second[j] = number
-    return first, second
-
-
-def _nearest(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Index into ``b`` of the time nearest to each of ``a``."""
-    right = np.clip(np.searchsorted(b, a), 1, max(len(b) - 1, 1))
-    left = right - 1
-    right = np.minimum(right, len(b) - 1)
-    return np.where(np.abs(a - b[left]) <= np.abs(b[right] - a), left, right)
 
 
 def _rows(file: Path, columns: int) -> list[list[str]]:

@@ -106,7 +106,7 @@ def listening(path: Path) -> Iterator[None]:
     before = av.logging.get_level()
     av.logging.set_level(av.logging.ERROR)
     try:
-        with av.logging.Capture() as heard:
+        with av.logging.Capture(local=False) as heard:  # decoders have threads of their own
             yield
             said = [text.strip() for level, _, text in heard if level <= av.logging.ERROR]
     finally:
@@ -115,14 +115,14 @@ def listening(path: Path) -> Iterator[None]:
         raise RecordingError(f"{path} is damaged", got=said[0][:120], remedy="copy or record it again")
 
 
-def packet_times(path: Path, track: int) -> np.ndarray:
-    """Times [N] ns of the frames of a track, from the start of the file, without decoding them."""
+def packet_times(path: Path) -> dict[int, np.ndarray]:
+    """Times [N] ns of the packets of each track in the order of the file, from its start, without decoding them."""
+    times: dict[int, list[int]] = {}
     with opened(path) as container, listening(path), damaged(path, "video"):
-        stream = container.streams[track]
-        packets = [p for p in container.demux(stream) if p.size]
-        if any(p.pts is None or p.is_corrupt for p in packets):
-            raise RecordingError(f"{path} is damaged", got="a packet without a time", remedy="copy it again")
-        times = sorted(int(p.pts * stream.time_base * 10**9) for p in packets)
-    if not times:
-        raise RecordingError(f"{path} has an empty track", got=f"no frame in track {track}")
-    return np.array(times, dtype=np.int64)
+        for packet in container.demux():
+            if packet.size:
+                if packet.pts is None or packet.is_corrupt:
+                    raise RecordingError(f"{path} is damaged", got="a packet without a time", remedy="copy it again")
+                ns = int(packet.pts * packet.time_base * 10**9)
+                times.setdefault(packet.stream_index, []).append(ns)
+        return {track: np.array(values, dtype=np.int64) for track, values in times.items()}
