@@ -10,6 +10,7 @@ import numpy as np
 
 from ..recordings import Markers, PointClouds, Recording
 from .paths import Path
+from .robust import median
 
 SEARCH, COARSE = 1.0, 0.02  # s to either side; step
 NEAR, FINE = 0.16, 0.004  # the same about the least
@@ -85,6 +86,8 @@ def lag(
     fine = _curve(follow, paths, t, close)
     level = cost[best] + VALLEY * (np.median(cost) - cost[best])
     value = _bottom(close, _mean(fine), level)
+    if not np.isfinite(value):
+        return None
     block = np.arange(len(t)) * BLOCKS // len(t)
     others = np.array([_bottom(close, _mean(fine[block != k]), level) for k in range(BLOCKS)])
     misfit = float(np.nanmin(_mean(fine)))
@@ -99,17 +102,18 @@ class _MarkersFollow:
     """Offsets of tracked points from a gripper, in axes that turn with it."""
 
     def __init__(self, markers: Markers, frames: np.ndarray) -> None:
-        self.xyz = markers.xyz[frames]
-        self.xyz = self.xyz[:, np.isfinite(self.xyz[..., 0]).mean(0) > 0.5]
+        xyz = markers.xyz[frames]
+        well = np.isfinite(xyz[..., 0]).mean(0) > 0.5
+        self.xyz = xyz[:, well if well.any() else slice(None)]
 
     def misfit(self, covered: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
         """[C] m of the markers that are nearest, in the covered frames."""
         offset = np.einsum("fij,fmi->fmj", rotation, self.xyz[covered] - position[:, None])
         count = max(FEWEST, int(SHARE * offset.shape[1]))
-        near = offset[:, np.argsort(np.nanmedian((offset**2).sum(-1), axis=0))[:count]]
-        away = _soft(near - np.nanmedian(near, axis=0))
-        unseen = np.all(np.isnan(away), axis=1)
-        return np.where(unseen, SCALE, np.nanmean(np.where(unseen[:, None], 0.0, away), axis=1))
+        near = offset[:, np.argsort(median((offset**2).sum(-1), 0))[:count]]
+        away = _soft(near - median(near, 0))
+        seen = np.isfinite(away)
+        return np.where(seen.any(1), np.where(seen, away, 0.0).sum(1) / np.maximum(seen.sum(1), 1), SCALE)
 
 
 class _CloudFollows:
@@ -133,7 +137,9 @@ class _CloudFollows:
         return _soft(offset - np.median(offset, axis=0))
 
 
-def _curve(follow: _MarkersFollow | _CloudFollows, paths: dict[str, Path], t: np.ndarray, tried: np.ndarray):
+def _curve(
+    follow: _MarkersFollow | _CloudFollows, paths: dict[str, Path], t: np.ndarray, tried: np.ndarray
+) -> np.ndarray:
     """Misfit [F, N] m, mean over the grippers; NaN where a path does not reach."""
     start, end = max(p.t[0] for p in paths.values()), min(p.t[-1] for p in paths.values())
     out = np.full((len(t), len(tried)), np.nan)
@@ -176,8 +182,10 @@ def _soft(offset: np.ndarray) -> np.ndarray:
 
 
 def _bottom(tried: np.ndarray, cost: np.ndarray, level: float) -> float:
-    """Vertex of the parabola through the valley: what lies below the level, 5 values at least."""
+    """Vertex of the parabola through the valley: what lies below the level, 5 values at least; NaN of too few."""
     tried, cost = tried[np.isfinite(cost)], cost[np.isfinite(cost)]
+    if len(cost) < FEWEST:
+        return float("nan")
     order = np.argsort(cost)
     valley = cost <= max(level, cost[order[min(4, len(cost) - 1)]])
     a, b, _ = np.polyfit(tried[valley], cost[valley], 2)
