@@ -10,9 +10,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from swinging import clouds, episode, markers, path, pattern
+from swinging import clouds, episode, markers, motion, path, pattern
 
 from torchcloth import recordings as rec
+from torchcloth.errors import RecordingError
 from torchcloth.inspection import draw, inspect, show
 from torchcloth.inspection.streams import ticks
 
@@ -93,6 +94,33 @@ def test_frames_of_another_size_are_rejected_and_no_others(known):
     assert found.coverage[60] == 0
     assert found.coverage[5] == pytest.approx(54 / 64)
     assert ("unknown" in found.why) == (known == "neither")
+
+
+@pytest.mark.parametrize("grid", [np.array([8, 9]), np.array(64)])
+def test_a_grid_that_does_not_fit_is_refused(grid):
+    with pytest.raises(RecordingError, match="grid"):
+        inspect(episode(markers=markers(extra={"grid": grid})))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("frames", [1, 3, 12, 84])
+def test_poor_streams_are_looked_at_without_a_murmur(frames, needs_open3d, tmp_path):
+    stream = markers(extra={})
+    xyz = stream.xyz[:frames].copy()
+    xyz[np.random.default_rng(0).random(xyz.shape[:2]) < 0.7] = np.nan
+    poor = rec.Markers(stream.t[:frames], xyz)
+    single = rec.PointClouds(stream.t[:frames], np.zeros((frames, 3)), np.ones(frames, int))
+    for paths in (episode().grippers, {}, {"hand": motion(length=0.5)}):
+        report = inspect(replace(episode(markers=poor, points=single), grippers=paths))
+        json.dumps(report.as_dict(), allow_nan=False)
+        assert draw(report, tmp_path).is_file()
+
+
+def test_an_arm_that_is_not_known_is_a_note():
+    t = np.arange(5) / 10
+    arm = {"left": rec.JointMotion(t, np.zeros((5, 7)))}
+    report = inspect(replace(episode(markers=markers(**GRID)), grippers={}, joints=arm))
+    assert any("left" in note and "no lag" in note for note in report.notes)
 
 
 def test_a_wrong_size_throughout_is_seen_where_the_size_is_known():

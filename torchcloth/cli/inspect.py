@@ -20,12 +20,15 @@ def add(verbs: Any) -> None:
 
 
 def _inspect(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
     from .. import inspection, recordings
     from ..identification.result import write_atomically
 
     if options.out is not None and options.out.exists() and not options.out.is_dir():
         raise InvalidInput("--out", got=f"{options.out}, a file", expected="a folder, new or existing")
-    report = inspection.inspect(recordings.read(options.episode))
+    with Console(stderr=True).status(f"looking at {options.episode}"):
+        report = inspection.inspect(recordings.read(options.episode))
     text = json.dumps(report.as_dict(), indent=1, allow_nan=False) + "\n"
     if options.json:
         print(text, end="")

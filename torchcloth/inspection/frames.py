@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import MissingDependency
+from ..errors import MissingDependency, RecordingError
 from ..observe import Segmentation, segment
 from ..recordings import ClothInfo, Markers, PointClouds
+from .robust import median
 
 TOLERANCE = 0.1  # of the cloth's size
 NEIGHBOURS = 4  # of a marker, whose pattern distances are looked at
@@ -42,7 +43,7 @@ def of_markers(markers: Markers, cloth: ClothInfo) -> Frames:
 
     A grid (``extra["grid"]``, [rows, columns] of the markers in order) on a sheet: median arc along its rows and along
     its columns against the sheet's sides. With ``uv``: median ratio of the distances of neighbours to those in the
-    pattern. With neither: to their own usual ones.
+    pattern. With neither: to their own usual ones. A cloth that is folded between most of its markers looks too short.
     """
     seen = np.isfinite(markers.xyz[..., 0])
     if "grid" in markers.extra and cloth.sheet is not None:
@@ -56,10 +57,17 @@ def of_markers(markers: Markers, cloth: ClothInfo) -> Frames:
 
 def _arcs(markers: Markers, sheet: tuple[float, float]) -> np.ndarray:
     """[T, 2] median lengths of rows and columns, each over the side of the sheet that it usually is nearer to."""
-    rows, columns = (int(n) for n in markers.extra["grid"])
+    given = np.asarray(markers.extra["grid"])
+    if given.shape != (2,) or given.prod() != markers.xyz.shape[1]:
+        raise RecordingError(
+            "markers: grid does not fit",
+            got=given.tolist(),
+            expected=f"[rows, columns] of {markers.xyz.shape[1]} markers",
+        )
+    rows, columns = given.astype(int).tolist()
     grid = markers.xyz.reshape(len(markers.t), rows, columns, 3)
-    arcs = np.stack([_median(_arc(np.linalg.norm(np.diff(grid, axis=k), axis=-1), k)) for k in (1, 2)], -1)
-    usual = np.nanmedian(arcs, axis=0)
+    arcs = np.stack([median(_arc(np.linalg.norm(np.diff(grid, axis=k), axis=-1), k), -1) for k in (1, 2)], -1)
+    usual = median(arcs, 0)
     sides = np.array([sheet, sheet[::-1]])
     return arcs / sides[np.argmin(np.abs(sides - usual).sum(1))]
 
@@ -78,7 +86,7 @@ def _neighbours(markers: Markers) -> tuple[np.ndarray, str]:
     if markers.uv is not None:
         reference, why = markers.uv, "distances of neighbours against the pattern's"
     else:
-        reference, why = np.nanmedian(xyz, axis=0), "distances of neighbours against their usual ones, size unknown"
+        reference, why = median(xyz, 0), "distances of neighbours against their usual ones, size unknown"
     away = np.linalg.norm(reference[:, None] - reference, axis=-1)
     np.fill_diagonal(away, np.inf)
     count = min(NEIGHBOURS, len(away) - 1)
@@ -87,8 +95,10 @@ def _neighbours(markers: Markers) -> tuple[np.ndarray, str]:
     near = np.argsort(away, axis=1)[:, :count]
     distance = np.linalg.norm(xyz[:, near] - xyz[:, :, None], axis=-1).reshape(len(xyz), -1)
     pattern = markers.uv is not None
-    expected = np.take_along_axis(away, near, axis=1).ravel() if pattern else _median(distance.T)
-    return _median(distance / expected)[:, None], why
+    expected = np.take_along_axis(away, near, axis=1).ravel() if pattern else median(distance, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):  # of markers in one place
+        ratio = np.where(expected > 0, distance / expected, np.nan)
+    return median(ratio, -1)[:, None], why
 
 
 def of_clouds(clouds: PointClouds, cloth: ClothInfo) -> tuple[Frames, list[str]]:
@@ -178,9 +188,3 @@ def _cuts(clouds: PointClouds) -> dict[str, float]:
             if np.mean(np.abs(bound - usual) < FLAT) > 0.5:
                 found[f"{name} {sign}"] = float(usual)
     return found
-
-
-def _median(values: np.ndarray) -> np.ndarray:
-    """Median over the last axis, NaN where nothing is seen, without a warning."""
-    seen = np.any(np.isfinite(values), axis=-1)
-    return np.where(seen, np.nanmedian(np.where(seen[..., None], values, 0.0), axis=-1), np.nan)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..recordings import Markers, PointClouds, Recording
 from .paths import Path
+from .robust import median
 
 SEARCH, COARSE = 1.0, 0.02  # s to either side; step
 NEAR, FINE = 0.16, 0.004  # the same about the least
@@ -34,7 +35,7 @@ class Lag:
     Attributes:
         value: s.
         std: s, standard error: stretches of the recording left out in turn (jackknife), which allows for errors that
-            last.
+            last, and what the misfit and the unsteadiness of the motion allow at best.
         told: whether the recording tells it: a minimum inside the search, a standard error below 0.05 s, and a misfit
             clearly below the usual.
         stated: s, what the recording says (minus its clock_offset).
@@ -76,36 +77,43 @@ def lag(
     follow = _MarkersFollow(stream, frames) if isinstance(stream, Markers) else _CloudFollows(stream, frames)
     t = stream.t[frames]
     tried = np.arange(-SEARCH, SEARCH + COARSE / 2, COARSE) - recording.clock_offset
-    coarse = _curve(follow, paths, t, tried)
-    cost = coarse.mean(0)
+    cost = _mean(_curve(follow, paths, t, tried))
+    tried, cost = tried[np.isfinite(cost)], cost[np.isfinite(cost)]
+    if len(cost) < FEWEST:
+        return None
     best = int(np.argmin(cost))
     close = tried[best] + np.arange(-NEAR, NEAR + FINE / 2, FINE)
     fine = _curve(follow, paths, t, close)
     level = cost[best] + VALLEY * (np.median(cost) - cost[best])
-    value = _bottom(close, fine.mean(0), level)
+    value = _bottom(close, _mean(fine), level)
+    if not np.isfinite(value):
+        return None
     block = np.arange(len(t)) * BLOCKS // len(t)
-    others = np.array([_bottom(close, fine[block != k].mean(0), level) for k in range(BLOCKS)])
-    std = float(np.sqrt((BLOCKS - 1) / BLOCKS * ((others - others.mean()) ** 2).sum()))
+    others = np.array([_bottom(close, _mean(fine[block != k]), level) for k in range(BLOCKS)])
+    misfit = float(np.nanmin(_mean(fine)))
+    jackknife = np.sqrt((BLOCKS - 1) / BLOCKS * ((others - others.mean()) ** 2).sum())
+    std = float(np.hypot(jackknife, misfit / max(_unsteady(paths, t - value) * np.sqrt(len(t)), 1e-9)))
     inside = 0 < best < len(tried) - 1
     told = bool(inside and std < WORST and np.median(cost) > CONTRAST * cost[best])
-    return Lag(value, std, told, 0.0 - recording.clock_offset, float(fine.mean(0).min()), tried, cost)
+    return Lag(value, std, told, 0.0 - recording.clock_offset, misfit, tried, cost)
 
 
 class _MarkersFollow:
     """Offsets of tracked points from a gripper, in axes that turn with it."""
 
     def __init__(self, markers: Markers, frames: np.ndarray) -> None:
-        self.xyz = markers.xyz[frames]
-        self.xyz = self.xyz[:, np.isfinite(self.xyz[..., 0]).mean(0) > 0.5]
+        xyz = markers.xyz[frames]
+        well = np.isfinite(xyz[..., 0]).mean(0) > 0.5
+        self.xyz = xyz[:, well if well.any() else slice(None)]
 
-    def misfit(self, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """[F] m of the markers that are nearest."""
-        offset = np.einsum("fij,fmi->fmj", rotation, self.xyz - position[:, None])
+    def misfit(self, covered: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """[C] m of the markers that are nearest, in the covered frames."""
+        offset = np.einsum("fij,fmi->fmj", rotation, self.xyz[covered] - position[:, None])
         count = max(FEWEST, int(SHARE * offset.shape[1]))
-        near = offset[:, np.argsort(np.nanmedian((offset**2).sum(-1), axis=0))[:count]]
-        away = _soft(near - np.nanmedian(near, axis=0))
-        unseen = np.all(np.isnan(away), axis=1)
-        return np.where(unseen, SCALE, np.nanmean(np.where(unseen[:, None], 0.0, away), axis=1))
+        near = offset[:, np.argsort(median((offset**2).sum(-1), 0))[:count]]
+        away = _soft(near - median(near, 0))
+        seen = np.isfinite(away)
+        return np.where(seen.any(1), np.where(seen, away, 0.0).sum(1) / np.maximum(seen.sum(1), 1), SCALE)
 
 
 class _CloudFollows:
@@ -118,10 +126,10 @@ class _CloudFollows:
             cloud = clouds.xyz[ends[i] - clouds.counts[i] : ends[i]]
             self.clouds.append(cloud[:: max(1, len(cloud) // POINTS)])
 
-    def misfit(self, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """[F] m."""
+    def misfit(self, covered: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """[C] m, in the covered frames."""
         offset = np.empty_like(position)
-        for f, cloud in enumerate(self.clouds):
+        for f, cloud in enumerate(self.clouds[k] for k in np.flatnonzero(covered)):
             away = ((cloud - position[f]) ** 2).sum(1)
             count = min(NEAREST, len(cloud))
             nearest = cloud[np.argpartition(away, count - 1)[:count]].mean(0)
@@ -129,10 +137,34 @@ class _CloudFollows:
         return _soft(offset - np.median(offset, axis=0))
 
 
-def _curve(follow: _MarkersFollow | _CloudFollows, paths: dict[str, Path], t: np.ndarray, tried: np.ndarray):
-    """Misfit [F, N] m, mean over the grippers."""
-    columns = [np.mean([follow.misfit(*_turned(path, t - by)) for path in paths.values()], axis=0) for by in tried]
-    return np.stack(columns, 1)
+def _curve(
+    follow: _MarkersFollow | _CloudFollows, paths: dict[str, Path], t: np.ndarray, tried: np.ndarray
+) -> np.ndarray:
+    """Misfit [F, N] m, mean over the grippers; NaN where a path does not reach."""
+    start, end = max(p.t[0] for p in paths.values()), min(p.t[-1] for p in paths.values())
+    out = np.full((len(t), len(tried)), np.nan)
+    for k, by in enumerate(tried):
+        covered = (t - by >= start) & (t - by <= end)
+        if covered.sum() >= FEWEST:
+            each = [follow.misfit(covered, *_turned(path, t[covered] - by)) for path in paths.values()]
+            out[covered, k] = np.mean(each, axis=0)
+    return out
+
+
+def _unsteady(paths: dict[str, Path], t: np.ndarray) -> float:
+    """Standard deviation of the grippers' velocity, m/s: what a lag shows against, as a mean velocity is an offset."""
+    step = 0.05
+    speeds = [(path.at(t + step)[0] - path.at(t - step)[0]) / (2 * step) for path in paths.values()]
+    start, end = max(p.t[0] for p in paths.values()) + step, min(p.t[-1] for p in paths.values()) - step
+    inside = (t > start) & (t < end)
+    return float(np.sqrt(np.mean([v[inside].var(0).sum() for v in speeds]))) if inside.sum() > 1 else 0.0
+
+
+def _mean(curve: np.ndarray) -> np.ndarray:
+    """[N] mean over the frames; NaN where the motion covers less than half of them."""
+    seen = np.isfinite(curve)
+    mean = np.where(seen, curve, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
+    return np.where(seen.mean(0) >= 0.5, mean, np.nan)
 
 
 def _turned(path: Path, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,7 +182,10 @@ def _soft(offset: np.ndarray) -> np.ndarray:
 
 
 def _bottom(tried: np.ndarray, cost: np.ndarray, level: float) -> float:
-    """Vertex of the parabola through the valley: what lies below the level, 5 values at least."""
+    """Vertex of the parabola through the valley: what lies below the level, 5 values at least; NaN of too few."""
+    tried, cost = tried[np.isfinite(cost)], cost[np.isfinite(cost)]
+    if len(cost) < FEWEST:
+        return float("nan")
     order = np.argsort(cost)
     valley = cost <= max(level, cost[order[min(4, len(cost) - 1)]])
     a, b, _ = np.polyfit(tried[valley], cost[valley], 2)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import MissingDependency
+from ..errors import MissingDependency, TorchclothError
 from ..recordings import Recording
 from . import frames, images, noise, streams
 from .frames import Frames
@@ -74,12 +74,12 @@ def inspect(recording: Recording) -> Inspection:
         recording: read by `recordings.read`.
 
     Raises:
-        RecordingError: an image that cannot be decoded, or joints without their arm.
+        RecordingError: an image that cannot be decoded.
     """
     notes: list[str] = []
     try:
         moved = paths(recording)
-    except MissingDependency as error:
+    except TorchclothError as error:  # joints without an arm that is known here: all else can still be looked at
         moved = {}
         notes.append(f"no gripper paths, so no lag: {error}")
     seen: dict[str, Frames] = {}

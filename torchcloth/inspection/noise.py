@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..recordings import Markers, PointClouds
+from .robust import median
 
 SHORTEST = 6  # frames
 QUIET = 2.0  # of a coordinate's scatter over that of its steps, 1 of white noise: beyond, the cloth was moving
@@ -46,7 +47,8 @@ def of_markers(markers: Markers, still: np.ndarray, use: np.ndarray) -> Noise | 
         use: [T] bool, frames that are not rejected.
     """
     stretches = [markers.xyz[stretch][use[stretch]] for stretch in _stretches(still)]
-    stretches = [xyz - np.nanmedian(xyz, axis=0) for xyz in stretches if len(xyz) >= SHORTEST]
+    stretches = [xyz - median(xyz, 0) for xyz in stretches if len(xyz) >= SHORTEST]
+    stretches = [xyz for xyz in stretches if np.isfinite(_scatter(xyz)).all()]
     if not stretches:
         return None
     about = [_scatter(xyz) for xyz in stretches]
@@ -102,7 +104,7 @@ def _scatter(deviation: np.ndarray) -> np.ndarray:
     well = deviation[:, np.isfinite(deviation[..., 0]).sum(0) >= SHORTEST - 1]
     if well.shape[1] == 0:
         return np.full(deviation.shape[-1], np.nan)
-    return TO_SIGMA * np.median(np.nanmedian(np.abs(well - np.nanmedian(well, axis=0)), axis=0), axis=0)
+    return TO_SIGMA * np.median(median(np.abs(well - median(well, 0)), 0), axis=0)
 
 
 def _noisiest(deviation: np.ndarray) -> np.ndarray:

@@ -119,7 +119,7 @@ def _quality(axis: Any, report: Inspection) -> None:
         axis.plot(t[found.rejected], found.coverage[found.rejected], "v", markersize=5, color=BAD)
     axis.set(
         xlabel="time on the observation clock [s]",
-        ylim=(0, 1.05 * max(np.nanmax(f.coverage, initial=0) for f in report.frames.values())),
+        ylim=(0, 1.05 * max(0.1, *(np.nanmax(f.coverage, initial=0) for f in report.frames.values()))),
     )
     axis.legend(fontsize=8)
 
