@@ -8,7 +8,7 @@ from .arm import Arm, Limits, Primitive, load
 from .description import models
 from .holds import Hold
 from .plan import ACCELERATION, Plan, plan
-from .replay import arm_of, replay
+from .replay import arm_of, gripper_motion, replay
 from .scene import Scene, Table, bimanual_rig
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "Table",
     "arm_of",
     "bimanual_rig",
+    "gripper_motion",
     "load",
     "models",
     "plan",

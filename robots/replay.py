@@ -1,4 +1,4 @@
-"""Recorded motion to end-effector trajectories."""
+"""Recorded motion to end-effector trajectories, and back."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcloth.errors import RecordingError
-from torchcloth.recordings import JointMotion, Recording
+from torchcloth.recordings import GripperMotion, JointMotion, Recording
 from torchcloth.types import Trajectory
 
 from .arm import Arm, load
@@ -39,6 +39,13 @@ def replay(recording: Recording, dtype: torch.dtype = torch.float64) -> dict[str
     if not out:
         raise RecordingError(f"{recording.path}: no motion", expected="grippers or joints in motion.npz")
     return out
+
+
+def gripper_motion(path: Trajectory) -> GripperMotion:
+    """A path [K] as a recording stores it; `replay` gives it back."""
+    pose = path.pose.detach().double().cpu().numpy()
+    quat = _quaternions(pose[:, :3, :3])
+    return GripperMotion(path.t.detach().double().cpu().numpy(), pose[:, :3, 3], quat, path.closed.cpu().numpy())
 
 
 def arm_of(recording: Recording, name: str) -> Arm:
@@ -83,3 +90,15 @@ def _poses(position: np.ndarray, quat_wxyz: np.ndarray) -> Tensor:
     pose[:, :3, :3] = torch.stack([torch.stack(row, -1) for row in rows], -2)
     pose[:, :3, 3] = _tensor(position)
     return pose
+
+
+def _quaternions(rotation: np.ndarray) -> np.ndarray:
+    """[K, 4] wxyz, without jumps of sign, of rotations [K, 3, 3]: eigenvectors of a symmetric matrix (Bar-Itzhack)."""
+    k = np.zeros((len(rotation), 4, 4))
+    k[:, 0, 0] = np.trace(rotation, axis1=1, axis2=2)
+    skew = rotation - rotation.transpose(0, 2, 1)
+    k[:, 0, 1:] = k[:, 1:, 0] = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
+    k[:, 1:, 1:] = rotation + rotation.transpose(0, 2, 1) - k[:, 0, 0, None, None] * np.eye(3)
+    q = np.linalg.eigh(k)[1][..., -1]
+    flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(-1) < 0, -1.0, 1.0))
+    return q * np.concatenate([[1.0], flips])[:, None] * np.sign(q[0, np.abs(q[0]).argmax()])

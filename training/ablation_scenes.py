@@ -19,7 +19,13 @@ from torchcloth.errors import InvalidInput
 from torchcloth.materials import AEP
 from torchcloth.materials.presets import find
 from torchcloth.meshes import Mesh
-from torchcloth.robots.primitives import Action, Limits, cover, drag, fling
+from torchcloth.robots.primitives import (  # pyright: ignore[reportMissingImports] - mapped from robots/
+    Action,
+    Limits,
+    cover,
+    drag,
+    fling,
+)
 from torchcloth.transfer import Contact
 from torchcloth.transfer.contact import GAP, SPARSEST
 

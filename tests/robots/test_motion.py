@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import torchcloth.robots as robots
+from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput
 from torchcloth.types import Trajectory
 
@@ -125,3 +126,20 @@ def test_refuses_what_does_not_match(arm, waypoints):
     refused("closed has the wrong shape or type", closed=torch.ones(4))
     refused("stop has the wrong shape or type", stop=torch.ones(3, dtype=torch.bool))
     refused("period", period=0.0)
+
+
+def test_a_path_is_recorded_and_replayed(random_q, tmp_path):
+    """Any turns, half a turn among them, and quaternions without jumps of sign."""
+    arm = robots.load("rizon4")
+    pose = arm(random_q(arm, 40, seed=5))
+    pose[0, :3, :3] = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
+    path = Trajectory(torch.linspace(0, 1, 40, dtype=torch.float64), pose, torch.arange(40) < 30)
+    motion = robots.gripper_motion(path)
+    again = robots.replay(
+        rec.Recording(
+            cloth=rec.ClothInfo(areal_density=0.2, sheet=(0.1, 0.1)), provenance="test", grippers={"hand": motion}
+        )
+    )["hand"]
+    torch.testing.assert_close(again.pose, pose, atol=1e-12, rtol=0)
+    assert torch.equal(again.closed, path.closed)
+    assert ((motion.quat_wxyz[1:] * motion.quat_wxyz[:-1]).sum(-1) >= 0).all()

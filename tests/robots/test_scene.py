@@ -54,3 +54,20 @@ def test_refuses_other_names(rig):
         rig({"left": rig["left"].home})
     with pytest.raises(InvalidInput, match="closed names unknown arms"):
         rig.motion(homes(rig, 2), T, {"middle": torch.ones(2, dtype=torch.bool)})
+
+
+def test_the_table_stands_where_the_arms_work(rig):
+    """UniFolding's: its top level with the bases, 0.82 x 1.64 m."""
+    board = rig.table.primitive()
+    assert board.kind == "box"
+    assert board.size == pytest.approx((0.82, 1.64, 0.04))
+    low, high = board.pose[:3, 3] - torch.tensor(board.size) / 2, board.pose[:3, 3] + torch.tensor(board.size) / 2
+    torch.testing.assert_close(low, torch.tensor([0.20, -0.82, -0.04], dtype=torch.float64))
+    torch.testing.assert_close(high, torch.tensor([1.02, 0.82, 0.0], dtype=torch.float64))
+    assert robots.Scene({"one": rig["left"]}).table is None
+
+
+def test_infos_name_model_place_and_tool(rig):
+    info = rig.infos()["right"]
+    assert (info.model, info.tool_frame) == ("rizon4", "tcp_closed")
+    assert info.T_world_base[1, 3] == pytest.approx(-0.316)

@@ -44,9 +44,7 @@ def add(verbs: Any) -> None:
     option("--camera", choices=CAMERAS, default=Order.camera, help="default azure_kinect")
     option("--rate", type=float, default=Order.rate, metavar="HZ", help="frames per second (15)")
     option("--speed", type=float, default=Order.speed, metavar="M_S", help="of the grippers, at most [m/s] (1)")
-    hands = parser.add_mutually_exclusive_group()
-    hands.add_argument("--arms", action="store_true", help="two Rizon 4, as fast as their joints can (the default)")
-    hands.add_argument("--grippers-only", action="store_true", help="grippers without arms, as fast as asked")
+    option("--grippers-only", action="store_true", help="no arms: grippers fly, as fast as asked (two Rizon 4)")
     option("--no-pictures", action="store_true", help="episodes only")
     parser.set_defaults(run=_simulate, stopped=STOPPED)
 
@@ -177,7 +175,7 @@ def _print(out: Path, rows: list[tuple[Order, float | None]]) -> None:
 
     from .. import recordings
 
-    table = Table("episode", "frames", "seconds", "slower than asked", "nearest solids", "made in", title=str(out))
+    table = Table("episode", "frames", "seconds", "slower than asked", "nearest solids", "CPU", title=str(out))
     for order, spent in rows:
         recording = recordings.read(out / order.name)
         table.add_row(order.name, *_facts(recording), "was there" if spent is None else f"{spent:.0f} s")

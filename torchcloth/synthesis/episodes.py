@@ -18,13 +18,18 @@ from ..recordings import (
     ClothInfo,
     Collider,
     GraspInfo,
-    GripperMotion,
     ImageStream,
     PointClouds,
     Recording,
     Truth,
 )
-from ..robots import Plan, Scene, bimanual_rig, plan  # pyright: ignore[reportMissingImports] - mapped at installation
+from ..robots import (  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+    Plan,
+    Scene,
+    bimanual_rig,
+    gripper_motion,
+    plan,
+)
 from ..types import Trajectory
 from .garments import numbers
 from .orders import Order
@@ -111,24 +116,18 @@ def _recorded(
     values = numbers(order.cloth_fabric)
     cloth = ClothInfo(
         areal_density=values["areal_density"],
-        thickness=float(staged.cloth.material.thickness),
+        thickness=values["thickness"],
         vertices=staged.rest,
         faces=staged.mesh.faces,
         uv=staged.mesh.pattern if staged.mesh.uv is None else staged.mesh.uv,
         initial_vertices=done.x[0],
     )
-    arms = {} if done.plan is None else {"joints": done.plan.joints(), "robots": done.scene.infos()}
-    flying = {"grippers": {name: _flown(path) for name, path in done.motion.items()}} if done.plan is None else {}
     truth = Truth(done.t, done.x.astype(np.float32), staged.mesh.faces.astype(np.int32), _parameters(staged))
     return Recording(
         cloth=cloth,
         provenance=f"synthetic: torchcloth {metadata.version('torchcloth')} simulate, same engine (inverse crime)",
         licence="CC0-1.0",
-        grasps={
-            name: GraspInfo(vertices=part.index.numpy())
-            for name, part in staged.cloth.boundaries.items()
-            if name != "table"
-        },
+        grasps={name: GraspInfo(vertices=held) for name, held in staged.held.items()},
         colliders={"table": Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), FRICTION)},
         cameras={"cam0": camera},
         points=points,
@@ -136,9 +135,10 @@ def _recorded(
         observation_noise_std=sigma,
         air_density=AIR,
         split={"motion": order.motion, "replicate_of": None},
+        grippers={} if done.plan else {name: gripper_motion(path) for name, path in done.motion.items()},
+        joints=done.plan.joints() if done.plan else {},
+        robots=done.scene.infos() if done.plan else {},
         extra={"order": order.facts(), **_planned(done)},
-        **arms,
-        **flying,
     )
 
 
@@ -173,26 +173,6 @@ def _occluders(done: Performance) -> Callable[[int], Sequence[Any]]:
     knots = np.searchsorted(done.plan.t.numpy(), done.t).clip(max=len(done.plan.t) - 1)
     solids = done.scene.geometry({name: q[torch.as_tensor(knots)] for name, q in done.plan.q.items()})
     return lambda i: [*table, *solid_meshes(solids, i)]
-
-
-def _flown(path: Trajectory) -> GripperMotion:
-    """A gripper without an arm."""
-    return GripperMotion(
-        path.t.numpy(), path.pose[:, :3, 3].numpy(), _quaternions(path.pose[:, :3, :3].numpy()), path.closed.numpy()
-    )
-
-
-def _quaternions(rotation: np.ndarray) -> np.ndarray:
-    """[K, 4] wxyz of rotations [K, 3, 3]: the eigenvector of a symmetric matrix (Bar-Itzhack 2000), sign continuous."""
-    r = rotation
-    k = np.zeros((len(r), 4, 4))
-    k[:, 0, 0] = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]
-    skew = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], -1)
-    k[:, 0, 1:], k[:, 1:, 0] = skew, skew
-    k[:, 1:, 1:] = r + r.transpose(0, 2, 1) - k[:, 0, 0, None, None] * np.eye(3)
-    q = np.linalg.eigh(k)[1][..., -1]
-    turned = np.cumprod(np.where((q[1:] * q[:-1]).sum(-1) < 0, -1.0, 1.0))
-    return q * np.concatenate([[1.0], turned])[:, None] * np.sign(q[0, np.abs(q[0]).argmax()])
 
 
 def _parameters(staged: Staged) -> dict[str, np.ndarray]:

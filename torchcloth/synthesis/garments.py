@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import meshes
 from ..materials import AEP, AbstractMaterial, OrthotropicAEP
-from ..materials.presets import Fabric, find
+from ..materials.presets import NOMINAL, find
 from ..meshes import Mesh
 
 SHEET = 0.5  # m, its sides
@@ -65,9 +65,13 @@ def material(fabric: str) -> AbstractMaterial:
 
 
 def numbers(fabric: str) -> dict[str, float]:
-    """Areal density [kg/m^2] and bending stiffness [N m] of a fabric, ours where its source gives none."""
-    row: Fabric = find(fabric)
-    return {"areal_density": row.areal_density or DENSITY, "bending_stiffness": row.bending_warp or BENDING}
+    """Areal density [kg/m^2], bending stiffness [N m] and thickness [m], ours where a fabric's source gives none."""
+    row = find(fabric)
+    return {
+        "areal_density": row.areal_density or DENSITY,
+        "bending_stiffness": row.bending_warp or BENDING,
+        "thickness": row.thickness or NOMINAL,
+    }
 
 
 def _softened(values: dict[str, Any]) -> dict[str, Any]:

@@ -39,6 +39,7 @@ class Staged(NamedTuple):
     cloth: Cloth
     action: Action
     rest: np.ndarray  # [V, 3] m, the vertices in the garment's own frame
+    held: dict[str, np.ndarray]  # arm -> indices of the vertices in its grip
     hangs: bool
 
 
@@ -50,7 +51,9 @@ def stage(order: Order, rng: np.random.Generator) -> Staged:
     start[:, :2] += rng.normal(0.0, 0.003, 2)
     mesh = Mesh.build(start, made.faces, made.pattern, made.places)
     action = _action(order, garment, mesh, float(np.ptp(made.vertices[:, 1])))
-    return Staged(mesh, _cloth(order, garment, mesh), action, made.vertices, hangs)
+    radius = max(PAD, mesh.mean_edge)
+    held = {arm: mesh.around(place, radius) for arm, place in zip(ARMS, garment.grips, strict=True)}
+    return Staged(mesh, _cloth(order, mesh, held), action, made.vertices, held, hangs)
 
 
 def _laid(mesh: Mesh, motion: str) -> np.ndarray:
@@ -68,10 +71,9 @@ def _hung(mesh: Mesh) -> np.ndarray:
     return np.stack([0.5 + z, x, LOWEST + y - y.min()], axis=-1)
 
 
-def _cloth(order: Order, garment: Garment, mesh: Mesh) -> Cloth:
+def _cloth(order: Order, mesh: Mesh, held: dict[str, np.ndarray]) -> Cloth:
     values = numbers(order.cloth_fabric)
-    radius = max(PAD, mesh.mean_edge)
-    boundaries = {arm: Grasp.at(place, radius=radius) for arm, place in zip(ARMS, garment.grips, strict=True)}
+    grasps = {arm: Grasp(vertices.tolist()) for arm, vertices in held.items()}
     return Cloth(
         mesh,
         material(order.cloth_fabric),
@@ -81,7 +83,7 @@ def _cloth(order: Order, garment: Garment, mesh: Mesh) -> Cloth:
             "air": AirDrag(),
             "bending": Bending(values["bending_stiffness"], damping_time=DAMPING),
         },
-        {**boundaries, "table": Plane(friction=FRICTION, offset=LAYERS / 2)},
+        {**grasps, "table": Plane(friction=FRICTION, offset=LAYERS / 2)},
         Contact.with_gap(GAP),
     )
 
