@@ -14,6 +14,7 @@ from flex_sheet import SheetSpec, grid, rest_points
 from motions import GRIPPERS, NAMES, minimum_jerk, motion
 from scene import GripSpec, Scene, believed, hooks, play, stable_step
 from sensor import EYE, SensorSpec, see
+from sizes import size
 
 from torchcloth import recordings
 from torchcloth.errors import InvalidInput
@@ -30,6 +31,14 @@ def test_amplitude_zero_leaves_the_scene_alone_and_a_typical_one_does_not(name):
     assert hidden != base
     assert len(hooks(hidden, table)) >= len(hooks(base, table))
     assert 0 < stable_step(hidden) <= 1.2 * stable_step(base)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_a_typical_amplitude_shows(name):
+    cloth, points, _ = size(name)
+    barely = {"air.drag_t": 1e-6}  # known to be too weak to be seen
+    assert max(cloth, points) > barely.get(name, 1e-4)
 
 
 def test_effects_are_parsed_and_wrong_ones_refused():

@@ -180,9 +180,9 @@ def test_a_sheet_on_a_slope_slides_beyond_the_angle_of_friction(slope, slides):
 
 
 def test_friction_differs_by_direction_and_falls_with_speed():
-    hook, _ = started(Table(TableSpec(friction=0.4, across=-0.5, excess=0.3, speed=0.01)))
+    hook, _ = started(Table(TableSpec(friction=0.4, along=-0.5, excess=0.3, speed=0.01)))
     directions = np.array([[1.0, 0], [0, 1.0], [1.0, 0]])
-    np.testing.assert_allclose(hook._coefficient(directions, np.array([1.0, 1.0, 0.0])), [0.4, 0.2, 0.7])
+    np.testing.assert_allclose(hook._coefficient(directions, np.array([1.0, 1.0, 0.0])), [0.2, 0.4, 0.35])
 
 
 def test_adhesion_pulls_within_its_gap():

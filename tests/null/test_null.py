@@ -71,5 +71,5 @@ def test_finished_steps_are_not_repeated_and_the_page_shows_them(study, tmp_path
     assert calls == []
     text = page.table(done.found, ("swing",), done.meshes)
     assert "| swing | 0.50 | 1.00 (0.50) | 1.00 (0.50) | 500.00 |" in text
-    assert page.draw(done.found, ("swing",), tmp_path).stat().st_size > 1000
+    assert page.draw(done.found, ("swing",), done.meshes, tmp_path).stat().st_size > 1000
     assert "bending_stiffness [N m] | 1e-05" in page.write(done.found, ("swing",), done.meshes, tmp_path).read_text()
