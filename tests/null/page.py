@@ -11,6 +11,7 @@ import numpy as np
 from torchcloth.identification.result import write_atomically
 
 COLOURS = ("#c9a58f", "#b0653a", "#1f6f8b")
+ACROSS = 6  # motions side by side
 PERIOD = 0.02  # s, of the truth's frames
 
 
@@ -59,15 +60,19 @@ def draw(found: dict[str, Any], motions: Sequence[str], meshes: Sequence[int], f
 
     style = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False}
     with rc_context(style):
-        figure = Figure(figsize=(1.7 * len(motions), 3.4), layout="constrained")
-        axes = figure.subplots(2, len(motions), squeeze=False)
+        columns = min(ACROSS, len(motions))
+        rows = -(-len(motions) // columns)
+        figure = Figure(figsize=(1.7 * columns, 3.0 * rows + 0.3), layout="constrained")
+        axes = figure.subplots(2 * rows, columns, squeeze=False)
+        for axis in axes.ravel():
+            axis.set_visible(False)
         for k, name in enumerate(motions):
-            _growth(axes[0, k], found, name, meshes)
-            image = _map(axes[1, k], found[_series(meshes)[-1][1].format(name)]["places"])
-            figure.colorbar(image, ax=axes[1, k], shrink=0.7, aspect=12)
-        axes[0, 0].set_ylabel("RMS, mm")
-        axes[1, 0].set_ylabel(f"{_series(meshes)[-1][0]}, mm", fontsize=6)
+            above, below = axes[2 * (k // columns) : 2 * (k // columns) + 2, k % columns]
+            _growth(above, found, name, meshes)
+            image = _map(below, found[_series(meshes)[-1][1].format(name)]["places"])
+            figure.colorbar(image, ax=below, shrink=0.8, aspect=12)
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+        figure.supylabel(f"RMS, mm: over time; and over the fabric ({_series(meshes)[-1][0]})", fontsize=8)
         file = folder / "null.png"
         figure.savefig(file, dpi=100, metadata={"Software": None})
     return file
@@ -77,12 +82,14 @@ def _growth(axis: Any, found: dict[str, Any], name: str, meshes: Sequence[int]) 
     for (label, key), colour in zip(_series(meshes), COLOURS, strict=False):
         values = 1e3 * np.asarray(found[key.format(name)]["frames"])
         axis.plot(PERIOD * np.arange(len(values)), values, color=colour, label=label, lw=1)
+    axis.set_visible(True)
     axis.set_title(name)
     axis.set_ylim(bottom=0)
     axis.set_xlabel("t, s")
 
 
 def _map(axis: Any, places: list[float]) -> Any:
+    axis.set_visible(True)
     n = round(len(places) ** 0.5)
     image = axis.imshow(1e3 * np.asarray(places).reshape(n, n), origin="lower", cmap="viridis", vmin=0)
     axis.set_xticks([])
