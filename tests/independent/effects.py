@@ -59,7 +59,7 @@ CATALOGUE = {
     "grip.slip": Effect("grip", "slip", "m/(s N)", 0.05, "stretch", ("hold",)),
     "grip.width": Effect("grip", "wider", "m", 0.02, "turn"),
     "contact.mu": Effect("table", "friction", "-", 0.2, "drag"),
-    "contact.aniso": Effect("table", "across", "-", -0.5, "drag"),
+    "contact.aniso": Effect("table", "along", "-", -0.5, "drag"),
     "contact.adhesion": Effect("table", "adhesion", "Pa", 1.5, "lift", ("gap",)),
     "env.gravity_tilt": Effect("weight", "tilt", "rad", 0.01, "hang", ("heading",)),
     "obs.extrinsic": Effect("sensor", "shift", "m", 4e-3, "hang", ("heading", "rotation")),

@@ -47,45 +47,45 @@ def record(
         exact: no noise at all: points on the surface, first positions and forces as they are.
     """
     seen, first, touch = (np.random.default_rng([seed, k]) for k in range(3))
-    sensor = replace(scene.sensor, noise=0.0) if exact else scene.sensor
-    nominal = Scene()
-    size, held = 0.0 if exact else INITIAL_ERROR, list(moved.held.values())
-    uv, faces, start = measured_mesh(scene.sheet, result.x[0], nodes, size, held, nominal.grip.radius, first)
+    nominal, sensor = Scene(), replace(scene.sensor, noise=0.0) if exact else scene.sensor
+    noise = {key: 0.0 if exact else value for key, value in (("force", FORCE_NOISE), ("torque", TORQUE_NOISE))}
+    grasps = {key: recordings.GraspInfo(np.array([uv]), nominal.grip.radius) for key, uv in moved.held.items()}
+    table = recordings.Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), nominal.table.friction)
+    faces, size = grid(scene.sheet)[1].astype(np.int32), {"nodes": np.array(scene.sheet.nodes)}
+    return recordings.Recording(
+        cloth=_cloth(scene, moved, result.x[0], nodes, 0.0 if exact else INITIAL_ERROR, first),
+        provenance=f"synthetic: MuJoCo flex {mujoco.__version__}, tests/independent/generate.py",
+        licence="CC0-1.0",
+        grasps=grasps,
+        grippers={key: _gripper(scene, moved, result, key, noise, touch) for key in moved.pose},
+        colliders={"table": table} if moved.table else {},
+        points=see(sensor, scene.sheet, moved.t, result.x, seen),
+        truth=recordings.Truth(moved.t[::2], result.x[::2].astype(np.float32), faces, size),
+        observation_noise_std=nominal.sensor.noise,
+        gravity=np.array([0.0, 0.0, nominal.sheet.gravity]),
+        split={"motion": name, "replicate_of": None},
+    )
+
+
+def _cloth(
+    scene: Scene, moved: Motion, x: Array, nodes: int, error: float, rng: np.random.Generator
+) -> recordings.ClothInfo:
+    """What is said of the cloth: the effect-free fabric's values, and where it was seen to be at first."""
+    nominal, held = Scene(), list(moved.held.values())
+    uv, faces, start = measured_mesh(scene.sheet, x, nodes, error, held, nominal.grip.radius, rng)
     if moved.table:
         start[:, 2] = np.maximum(start[:, 2], 0.0)
     placed = np.tile(np.eye(4), (len(start), 1, 1))
     placed[:, :3, 3] = start
-    noise = {key: 0.0 if exact else value for key, value in (("force", FORCE_NOISE), ("torque", TORQUE_NOISE))}
-    return recordings.Recording(
-        cloth=recordings.ClothInfo(
-            areal_density=nominal.sheet.areal_density,
-            areal_density_std=0.02 * nominal.sheet.areal_density,
-            thickness=1e-3,
-            initial_vertices=believed(scene.grip, placed)[:, :3, 3],
-            vertices=np.column_stack([uv, np.zeros(len(uv))]),
-            faces=faces,
-            uv=uv,
-            nominal=data_sheet(nominal),
-        ),
-        provenance=f"synthetic: MuJoCo flex {mujoco.__version__}, tests/independent/generate.py",
-        licence="CC0-1.0",
-        grasps={key: recordings.GraspInfo(np.array([uv]), nominal.grip.radius) for key, uv in moved.held.items()},
-        grippers={key: _gripper(scene, moved, result, key, noise, touch) for key in moved.pose},
-        colliders=(
-            {"table": recordings.Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), nominal.table.friction)}
-            if moved.table
-            else {}
-        ),
-        points=see(sensor, scene.sheet, moved.t, result.x, seen),
-        truth=recordings.Truth(
-            moved.t[::2],
-            result.x[::2].astype(np.float32),
-            grid(scene.sheet)[1].astype(np.int32),
-            {"nodes": np.array(scene.sheet.nodes)},
-        ),
-        observation_noise_std=nominal.sensor.noise,
-        gravity=np.array([0.0, 0.0, nominal.sheet.gravity]),
-        split={"motion": name, "replicate_of": None},
+    return recordings.ClothInfo(
+        areal_density=nominal.sheet.areal_density,
+        areal_density_std=0.02 * nominal.sheet.areal_density,
+        thickness=1e-3,
+        initial_vertices=believed(scene.grip, placed)[:, :3, 3],  # the shape is measured, the robot says where it is
+        vertices=np.column_stack([uv, np.zeros(len(uv))]),
+        faces=faces,
+        uv=uv,
+        nominal=data_sheet(nominal),
     )
 
 

@@ -76,7 +76,7 @@ HANGING = {
     "shake": _back_and_forth(0.02, 0.22, 3, 2),
     "stretch": _Plan([0.0, 0.5, 0.8, 1.3], [(0, 0, 0)] * 4, apart=[0.0, 0.010, 0.010, 0.0]),
     "turn": _Plan(
-        [0.0, 0.7, 1.1, 1.8], [(0, 0, 0), (0.06, 0, 0), (0.06, 0, 0), (0, 0, 0)], yaw=[0.0, np.pi / 2, np.pi / 2, 0.0]
+        [0.0, 1.0, 1.3, 2.3], [(0, 0, 0), (0.04, 0, 0), (0.04, 0, 0), (0, 0, 0)], yaw=[0.0, np.pi / 2, np.pi / 2, 0.0]
     ),
 }
 # from a sheet that lies on the table, upper edge held: the path of that edge, and how far apart the grippers go

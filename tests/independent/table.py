@@ -19,14 +19,14 @@ class TableSpec:
     """The half-space z < 0.
 
     Attributes:
-        friction: -, kinetic coefficient for slip along x.
-        across: -, by which friction along y differs, as a share.
+        friction: -, kinetic coefficient.
+        along: -, by which friction for slip along x differs, as a share.
         excess: -, static less kinetic coefficient, which falls as exp(-(slip / speed)^2); ``speed`` m/s.
         adhesion: Pa, pull on cloth within ``gap`` m above the table.
     """
 
     friction: float = 0.4
-    across: float = 0.0
+    along: float = 0.0
     excess: float = 0.0
     speed: float = 0.01
     adhesion: float = 0.0
@@ -64,5 +64,5 @@ class Table(Hook):
 
     def _coefficient(self, direction: Array, slip: Array) -> Array:
         spec = self.spec
-        ellipse = np.sqrt(direction[:, 0] ** 2 + (direction[:, 1] * (1 + spec.across)) ** 2)
+        ellipse = np.sqrt((direction[:, 0] * (1 + spec.along)) ** 2 + direction[:, 1] ** 2)
         return (spec.friction + spec.excess * np.exp(-((slip / spec.speed) ** 2))) * ellipse

@@ -14,6 +14,7 @@ from flex_sheet import SheetSpec, grid, rest_points
 from motions import GRIPPERS, NAMES, minimum_jerk, motion
 from scene import GripSpec, Scene, believed, hooks, play, stable_step
 from sensor import EYE, SensorSpec, see
+from sizes import size
 
 from torchcloth import recordings
 from torchcloth.errors import InvalidInput
@@ -30,6 +31,14 @@ def test_amplitude_zero_leaves_the_scene_alone_and_a_typical_one_does_not(name):
     assert hidden != base
     assert len(hooks(hidden, table)) >= len(hooks(base, table))
     assert 0 < stable_step(hidden) <= 1.2 * stable_step(base)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_a_typical_amplitude_shows(name):
+    cloth, points, _ = size(name)
+    barely = {"air.drag_t": 1e-6}  # known to be too weak to be seen
+    assert max(cloth, points) > barely.get(name, 1e-4)
 
 
 def test_effects_are_parsed_and_wrong_ones_refused():
@@ -50,8 +59,8 @@ def test_shrinking_and_skewing_change_lengths_and_angle():
     uv, _ = grid(spec)
     rest = rest_points(spec)
     u, v = rest[spec.nodes[0] - 1] - rest[0], rest[-spec.nodes[0]] - rest[0]
-    assert np.linalg.norm(u) == pytest.approx(0.98 * 0.4)
-    assert np.linalg.norm(v) == pytest.approx(0.97 * 0.4)
+    assert np.linalg.norm(u) == pytest.approx(0.98 * 0.3)
+    assert np.linalg.norm(v) == pytest.approx(0.97 * 0.3)
     assert np.arccos(u @ v / np.linalg.norm(u) / np.linalg.norm(v)) == pytest.approx(np.pi / 2 - 0.1)
     np.testing.assert_array_equal(rest_points(SHEET), uv)
 
@@ -87,7 +96,7 @@ def moving_sheet(speed):
     """Knots, and a flat sheet that moves along x."""
     t = np.linspace(0, 1, 101)
     uv, _ = grid(SHEET)
-    still = np.column_stack([np.full(len(uv), 0.5), uv[:, 0] - 0.2, uv[:, 1] + 0.1])
+    still = np.column_stack([np.full(len(uv), 0.5), uv[:, 0] - 0.15, uv[:, 1] + 0.1])
     return t, still + np.multiply.outer(t * speed, [1.0, 0, 0])[:, None]
 
 
@@ -100,7 +109,7 @@ def test_without_errors_points_lie_on_the_sheet():
     clouds = seen()
     assert np.abs(clouds.xyz[:, 0] - 0.5).max() < 1e-12
     assert clouds.counts.tolist() == [250] * 31
-    assert np.ptp(clouds.xyz[:, 1]) > 0.39
+    assert np.ptp(clouds.xyz[:, 1]) > 0.29
 
 
 def test_late_stamps_show_the_past():
@@ -140,8 +149,8 @@ def test_occlusion_hides_a_bar_that_moves_across_and_edges_go_unseen():
     assert first.min() > -0.10  # seen from +x, left is where y is negative
     assert last.max() < 0.10
     inner = seen(edge=0.02).xyz
-    assert np.ptp(inner[:, 1]) <= 0.36
-    assert np.ptp(inner[:, 2]) <= 0.36
+    assert np.ptp(inner[:, 1]) <= 0.26
+    assert np.ptp(inner[:, 2]) <= 0.26
 
 
 def test_backlash_follows_half_its_play_behind():
@@ -180,8 +189,8 @@ def test_episodes_can_be_read_and_show_what_was_hidden(episodes):
         name: -sum(grip.force[:15, 2].mean() for grip in recording.grippers.values())
         for name, recording in (("a", a), ("b", b))
     }
-    assert weight["a"] == pytest.approx(0.25 * 0.16 * 9.81, abs=0.03)
-    assert weight["b"] - weight["a"] == pytest.approx(0.0223 * 1.6 * 9.81, abs=0.04)
+    assert weight["a"] == pytest.approx(0.25 * 0.09 * 9.81, abs=0.02)
+    assert weight["b"] - weight["a"] == pytest.approx(0.0223 * 1.2 * 9.81, abs=0.02)
     assert a.points.counts.tolist() == b.points.counts.tolist()
 
 

@@ -10,24 +10,28 @@ import numpy as np
 
 from torchcloth.identification.result import write_atomically
 
-COLOURS = {"true": "#1f6f8b", "finer": "#8fc1d0", "fitted": "#b0653a"}
+COLOURS = ("#c9a58f", "#b0653a", "#1f6f8b")
+ACROSS = 6  # motions side by side
+PERIOD = 0.02  # s, of the truth's frames
 
 
 def table(found: dict[str, Any], motions: Sequence[str], meshes: Sequence[int]) -> str:
     """Markdown: a row for each motion, distances in mm."""
-    columns = [f"true values, {n} x {n}" for n in meshes] + [f"fitted, {meshes[0]} x {meshes[0]}", "truth coarser"]
-    rows = [
-        "| motion | fastest point, m/s | " + " | ".join(columns) + " |",
-        "|---|---" + "|---" * len(columns) + "|",
-    ]
+    columns = [label for label, _ in _series(meshes)] + [f"truth on {n} × {n}" for n in meshes]
+    rows = ["| motion | fastest point, m/s | " + " | ".join(columns) + " |", "|---|---" + "|---" * len(columns) + "|"]
     for name in motions:
-        cells = [_cell(found.get(f"true {name} {n}")) for n in meshes] + [
-            _cell(found.get(f"fitted {name} {meshes[0]}"))
-        ]
-        own = found.get(f"truth {name}")
-        cells.append("" if own is None else f"{1e3 * own:.2f}")
+        cells = [_cell(found[key.format(name)]) for _, key in _series(meshes)]
+        others = [found.get(f"truth {name} {n}") for n in meshes]
+        cells += ["" if other is None else f"{1e3 * other:.2f}" for other in others]
         rows.append(f"| {name} | {found[f'episode {name}']:.2f} | " + " | ".join(cells) + " |")
     return "\n".join(rows)
+
+
+def _series(meshes: Sequence[int]) -> list[tuple[str, str]]:
+    """Labels and keys of the simulations of a motion."""
+    fitted = (f"{meshes[0]} × {meshes[0]}, fitted values", f"fitted {{}} {meshes[0]}")
+    true = [(f"{n} × {n}, true values", f"true {{}} {n}") for n in meshes]
+    return [true[0], fitted, *true[1:]]
 
 
 def parameters(found: dict[str, Any]) -> str:
@@ -39,8 +43,8 @@ def parameters(found: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
-def _cell(distance: dict[str, Any] | None) -> str:
-    return "" if distance is None else f"{1e3 * distance['material']:.2f} ({1e3 * distance['surface']:.2f})"
+def _cell(distance: dict[str, Any]) -> str:
+    return f"{1e3 * distance['material']:.2f} ({1e3 * distance['surface']:.2f})"
 
 
 def write(found: dict[str, Any], motions: Sequence[str], meshes: Sequence[int], folder: Path) -> Path:
@@ -49,43 +53,43 @@ def write(found: dict[str, Any], motions: Sequence[str], meshes: Sequence[int], 
     return write_atomically(folder / "null.md", text)
 
 
-def draw(found: dict[str, Any], motions: Sequence[str], folder: Path) -> Path:
+def draw(found: dict[str, Any], motions: Sequence[str], meshes: Sequence[int], folder: Path) -> Path:
     """``folder``/null.png: how the distance grows with time, and where in the fabric it is."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    meshes = sorted({int(key.split()[2]) for key in found if key.startswith("true ")})
-    style = {"font.size": 7, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False}
+    style = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False}
     with rc_context(style):
-        figure = Figure(figsize=(1.35 * len(motions) + 0.6, 3.1), layout="constrained")
-        axes = figure.subplots(2, len(motions), squeeze=False)
-        highest = max(np.max(found[f"true {m} {meshes[0]}"]["frames"]) for m in motions)
+        columns = min(ACROSS, len(motions))
+        rows = -(-len(motions) // columns)
+        figure = Figure(figsize=(1.7 * columns, 3.0 * rows + 0.3), layout="constrained")
+        axes = figure.subplots(2 * rows, columns, squeeze=False)
+        for axis in axes.ravel():
+            axis.set_visible(False)
         for k, name in enumerate(motions):
-            _growth(axes[0, k], found, name, meshes, 1e3 * highest)
-            image = _map(axes[1, k], found[f"true {name} {meshes[-1]}"]["places"])
-            figure.colorbar(image, ax=axes[1, k], shrink=0.7, aspect=12)
-        axes[0, 0].set_ylabel("RMS, mm")
-        axes[0, 0].legend(loc="upper left", fontsize=6)
-        axes[1, 0].set_ylabel(f"v, {meshes[-1]} x {meshes[-1]}, mm")
+            above, below = axes[2 * (k // columns) : 2 * (k // columns) + 2, k % columns]
+            _growth(above, found, name, meshes)
+            image = _map(below, found[_series(meshes)[-1][1].format(name)]["places"])
+            figure.colorbar(image, ax=below, shrink=0.8, aspect=12)
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+        figure.supylabel(f"RMS, mm: over time; and over the fabric ({_series(meshes)[-1][0]})", fontsize=8)
         file = folder / "null.png"
-        figure.savefig(file, dpi=110, metadata={"Software": None})
+        figure.savefig(file, dpi=100, metadata={"Software": None})
     return file
 
 
-def _growth(axis: Any, found: dict[str, Any], name: str, meshes: Sequence[int], highest: float) -> None:
-    series = {f"{meshes[0]} x {meshes[0]}": ("true", f"true {name} {meshes[0]}")}
-    if len(meshes) > 1:
-        series[f"{meshes[-1]} x {meshes[-1]}"] = ("finer", f"true {name} {meshes[-1]}")
-    series["fitted"] = ("fitted", f"fitted {name} {meshes[0]}")
-    for label, (colour, key) in series.items():
-        values = 1e3 * np.asarray(found[key]["frames"])
-        axis.plot(0.02 * np.arange(len(values)), values, color=COLOURS[colour], label=label, lw=1)
+def _growth(axis: Any, found: dict[str, Any], name: str, meshes: Sequence[int]) -> None:
+    for (label, key), colour in zip(_series(meshes), COLOURS, strict=False):
+        values = 1e3 * np.asarray(found[key.format(name)]["frames"])
+        axis.plot(PERIOD * np.arange(len(values)), values, color=colour, label=label, lw=1)
+    axis.set_visible(True)
     axis.set_title(name)
-    axis.set_ylim(0, 1.05 * highest)
+    axis.set_ylim(bottom=0)
     axis.set_xlabel("t, s")
 
 
 def _map(axis: Any, places: list[float]) -> Any:
+    axis.set_visible(True)
     n = round(len(places) ** 0.5)
     image = axis.imshow(1e3 * np.asarray(places).reshape(n, n), origin="lower", cmap="viridis", vmin=0)
     axis.set_xticks([])
