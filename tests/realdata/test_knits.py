@@ -37,7 +37,7 @@ def test_readings(measured_in, tmp_path):
         for k in (1, 2, 3):
             pull = back.repeats(k)
             assert (np.diff(pull.displacement) > 0).all()
-            assert (np.diff(pull.force) > -0.5).all(), name
+            assert (np.diff(pull.force) > -0.6).all(), "but for the steps of a load cell that is read by camera"
             assert pull.lateral_strain[-1] < -0.02, "it narrows"
 
 
