@@ -3,7 +3,7 @@
 The strip lies level in a clamp at x < 0 and hangs over its edge at x = 0: arc 0.251 m, 13.6 N/m^2, 0.05 m wide. Its
 midline's 50 measured points are markers without uv, and points. x is along the strip, z up. Clamped are the CLAMPED
 metres of strip before the edge (assumed; the clamp does not bend). Known is also the authors' own table of moment over
-curvature, see `moments`. Not known: membrane stiffness, noise (the profile is smooth to 0.5 mm), the time (none).
+curvature, see `moments`. Not known: membrane stiffness, noise, the time (none).
 """
 
 from __future__ import annotations
