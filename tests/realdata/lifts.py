@@ -1,6 +1,6 @@
 """Adapter: cloths lifted by one corner and seen by a depth camera (github priyasundaresan/diffcloud_real2sim), 7 lifts.
 
-    python tests/realdata/lifts.py OUT_EPISODE --trial lift_paper [--everything] [--source DIR]
+    python tests/realdata/lifts.py OUT_EPISODE --trial lift_paper --spacing 0.01 [--everything] [--source DIR]
     torchcloth identify OUT_EPISODE --out DIR --fit youngs_modulus --iterations 1
 
 Clouds: 25 frames at 10 Hz. `crop=True` keeps what is cloth: above CROP (the table lies below it), at most RISE above
@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from folders import source_folder
 
-from torchcloth import recordings
+from torchcloth import observe, recordings
 from torchcloth.recordings import ClothInfo, Collider, GraspInfo, GripperMotion, PointClouds, Recording
 
 RATE = 10.0  # Hz
@@ -40,7 +40,7 @@ SHIFT = np.array([0.023, -0.029, -0.001])  # m, of the path's first point
 SIDE, SIDE_STD = 0.27, 0.02  # m, mean and error of `sides`: spread 0.008, and ways over points are never straight
 SPREAD = ("lift_tan", "lift_paper", "lift_paper2")  # whose side corners are seen
 DENSITY, DENSITY_STD = 0.15, 0.10  # kg/m^2, assumed: light clothing
-BENDING = 2e-5  # N m, assumed
+BENDING, DAMPING = 2e-5, 0.02  # N m, s, assumed
 
 
 def trials(path: Path) -> list[str]:
@@ -138,13 +138,14 @@ def lying(corner: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     return np.stack([[corner, corner + v], [corner + u, corner + u + v]])
 
 
-def episode(path: Path, trial: str, crop: bool = True) -> Recording:
+def episode(path: Path, trial: str, crop: bool = True, spacing: float | None = None) -> Recording:
     """One lift, e.g. "lift_paper"; see the module's docstring.
 
     Args:
         path: the source's folder.
         trial: one of `trials`.
         crop: keep only cloth; otherwise every point, flagged.
+        spacing: m, thin the cropped clouds to one measured point in a cube of this edge; fits need no more.
     """
     path = Path(path)
     raw, cloth = marked(path, trial)
@@ -153,6 +154,8 @@ def episode(path: Path, trial: str, crop: bool = True) -> Recording:
     t = np.arange(len(raw)) / RATE
     used = [i for i in range(len(raw)) if not crop or i == 0 or cloth[i].any()]
     kept = [c[f] if crop and f.any() else c for c, f in zip(raw, cloth, strict=True)]
+    if crop and spacing is not None:
+        kept = [observe.thin_to_spacing(c, spacing) for c in kept]
     flags = {} if crop else {"cloth": np.concatenate(cloth)}
     table = np.array([0.0, 0.0, gripper[0, 2]])
     below = np.array([(c[:, 2] <= CROP).sum() for c in raw])
@@ -163,7 +166,11 @@ def episode(path: Path, trial: str, crop: bool = True) -> Recording:
             areal_density_std=DENSITY_STD,
             sheet=(SIDE, SIDE),
             initial_vertices=lying(gripper[0], (gripper[-1] - gripper[0])[:2]),
-            nominal={"bending_stiffness": BENDING, "units": {"bending_stiffness": "N m"}},
+            nominal={
+                "bending_stiffness": BENDING,
+                "bending_damping_time": DAMPING,
+                "units": {"bending_stiffness": "N m", "bending_damping_time": "s"},
+            },
         ),
         grasps={"gripper": GraspInfo(np.zeros((1, 2)), 0.015)},
         grippers={
@@ -210,10 +217,13 @@ def main() -> None:
     parser.add_argument("episode", type=Path, metavar="OUT_EPISODE", help="folder to write")
     parser.add_argument("--trial", default="lift_paper")
     parser.add_argument("--everything", action="store_true", help="keep every point, flagged")
+    parser.add_argument(
+        "--spacing", type=float, metavar="M", help="thin to one point in a cube of this edge, e.g. 0.01"
+    )
     parser.add_argument("--source", type=Path, help="default: $TORCHCLOTH_REALDATA/lifted_cloth_clouds")
     options = parser.parse_args()
     source = source_folder(parser, options.source, "lifted_cloth_clouds")
-    recording = episode(source, options.trial, crop=not options.everything)
+    recording = episode(source, options.trial, not options.everything, options.spacing)
     recordings.write(recording, options.episode)
     print(f"{options.episode}: {len(recording.points)} frames, {recording.extra['notes']['points']}")
 

@@ -37,7 +37,7 @@ NOISE = 5e-3  # m, beyond which a residual counts less
 ARC_TOLERANCE = 0.1  # of SIDE
 GUESSES = (0.2, 0.1 / SIDE**2)  # kg/m^2, the authors' two models
 AIR = 1.204  # kg/m^3, assumed
-BENDING = 5e-5  # N m, assumed: without any, slack cloth wrinkles without end
+BENDING, DAMPING = 5e-5, 0.02  # N m, s, assumed: without damping wrinkles grow chaotic, and a fit cannot move
 
 
 class Estimate(NamedTuple):
@@ -175,7 +175,11 @@ def episode(path: Path, run: str) -> Recording:
             areal_density_std=density * np.log(GUESSES[1] / GUESSES[0]) / 2,
             sheet=(SIDE, SIDE),
             initial_vertices=corners,
-            nominal={"bending_stiffness": BENDING, "units": {"bending_stiffness": "N m"}},
+            nominal={
+                "bending_stiffness": BENDING,
+                "bending_damping_time": DAMPING,
+                "units": {"bending_stiffness": "N m", "bending_damping_time": "s"},
+            },
         ),
         grasps={"hanger": GraspInfo(np.stack([edge, np.full(31, SIDE)], -1), 0.006)},
         grippers={"hanger": GripperMotion(t, position, quat, np.ones(len(t), dtype=bool))},

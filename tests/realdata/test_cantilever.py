@@ -9,15 +9,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import cantilever
 import numpy as np
 import pytest
 import torch
+from cantilever import LENGTH, LOAD
 
 import torchcloth as tc
+from torchcloth import recordings
 
 pytestmark = pytest.mark.realdata
 
-LOAD, LENGTH = 13.6, 0.251  # N/m^2, m
 TANGENT, SATURATION, KNEE = 0.00196, 0.335, 2.52  # N m, N, 1/m
 MARK = 5e-3  # m
 
@@ -28,15 +30,14 @@ def source(measured_in) -> Path:
 
 
 @pytest.fixture
-def profile(source: Path) -> np.ndarray:
-    return np.loadtxt(source / "midline_profile.csv", delimiter=",", skiprows=1)
+def profile(source: Path, tmp_path: Path) -> np.ndarray:
+    """Through the disk."""
+    return cantilever.profile(recordings.read(recordings.write(cantilever.episode(source), tmp_path / "episode")))
 
 
 @pytest.fixture
 def table(source: Path) -> np.ndarray:
-    """Rows (curvature, moment), rising from 0, 0."""
-    rows = np.loadtxt(source / "authors_moment_curvature.csv", delimiter=",", skiprows=1)
-    return rows[np.argsort(rows[:, 0])]
+    return cantilever.moments(source)
 
 
 def law(curvature: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchcloth import recordings
-from torchcloth.identification import cloth_from, episode
+from torchcloth.identification import cloth_from, episode, identify
 
 pytestmark = pytest.mark.realdata
 
@@ -70,3 +70,13 @@ def test_through_the_disk_and_into_identify(source, tmp_path):
     assert len(taken.clouds) == len(recording.points)
     assert taken.times[0] == 0
     assert "commanded" in recording.grippers["gripper"].extra
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("trial", ["lift_paper", "lift_navy"])
+def test_identify_runs(source, trial):
+    """Robustness only: a fifth of the distance of a cloth carried rigidly, and no parameter called identified."""
+    recording = lifts.episode(source, trial, spacing=0.015)
+    fit = identify(cloth_from(recording), recording, ["youngs_modulus"], iterations=1)
+    assert fit.fit["chamfer_after"] < 0.3 * fit.fit["chamfer_null"]
+    assert not fit.parameters["youngs_modulus"].identifiable

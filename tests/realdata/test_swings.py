@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import swings
-from swings import SIDE
+from free_swing import chain_frequency
+from swings import AIR, BENDING, DAMPING, SIDE
 
+import torchcloth as tc
 from torchcloth import recordings
 from torchcloth.boundaries import Grasp
-from torchcloth.identification import cloth_from, episode
+from torchcloth.identification import cloth_from, episode, identify
 
 pytestmark = pytest.mark.realdata
 
@@ -142,3 +144,23 @@ def test_what_is_unknown_is_said(recording):
     assert recording.provenance == "measured"
     assert recording.truth is None
     assert recording.cloth.areal_density_std / recording.cloth.areal_density > 0.5
+
+
+@pytest.mark.slow
+def test_identify_finds_the_air_that_moves_along(recording):
+    """The whole run, strokes included, gives the frequency of the free swings, 0.90 Hz, that nothing here was fitted to.
+
+    Reached: 0.91 Hz; three other runs 0.92 Hz. Without added mass 16.1 mm are left instead of 14.9 mm. No parameter is
+    called identified, and rightly: nodes lean by 10 mm at rest already, and drag is another one at small amplitudes.
+    """
+    effects = {
+        "gravity": tc.effects.Gravity(),
+        "air": tc.effects.AirDrag(1.2, AIR),
+        "bending": tc.effects.Bending(BENDING, DAMPING),
+        "added": tc.effects.AddedMass(0.1, AIR),
+    }
+    cloth = cloth_from(recording, effects=effects)
+    fit = identify(cloth, recording, ["air.normal", "added.length"], iterations=6, guess={"air.normal": 6.0})
+    mass = AIR * fit.parameters["added.length"].value / fit.parameters["areal_density"].value
+    assert chain_frequency(SIDE) / (1 + mass) ** 0.5 == pytest.approx(0.90, rel=0.05)
+    assert fit.fit["chamfer_after"] < 0.8 * fit.fit["chamfer_null"]

@@ -255,6 +255,6 @@ def misses(table: ForceDisplacement, curve: Response) -> dict[str, float]:
         ("lateral", curve.lateral_strain, table.lateral_strain),
     ):
         if measured is not None:
-            share = _share(computed, measured)
+            share = _share(computed.detach(), measured)
             out |= {f"{name}_rms": float(share.square().mean().sqrt()), f"{name}_max": float(share.abs().max())}
     return out
