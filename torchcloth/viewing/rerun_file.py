@@ -11,6 +11,7 @@ from ..errors import MissingDependency
 from .colours import colours
 from .film import Film, Solid, Trace, View
 from .geometry import Array, quaternions, vertex_normals
+from .projection import camera_for
 from .saving import atomically
 
 TIME = "time"  # the timeline, s on the motion clock
@@ -19,6 +20,7 @@ DOT = 0.0018  # m, radius of a point
 LINE = 0.0015  # m, radius of a gripper's path
 AXES = 0.05  # m, length of a gripper's axes
 IMAGE_PLANE = 0.15  # m, of a camera's frustum
+WINDOW = (800, 600)  # pixels, that the first place of the eye is good for
 
 
 def write_rrd(film: Film, path: str | Path) -> Path:
@@ -87,11 +89,12 @@ class _Writer:
     def _sheet(self, name: str) -> None:
         sheet, count = self.film.sheets[name], len(self.film)
         x = sheet.vertices
-        normals = np.stack([vertex_normals(frame, sheet.faces) for frame in x]).astype(np.float32)
-        fields = {"vertex_positions": x.reshape(-1, 3), "vertex_normals": normals.reshape(-1, 3)}
+        fields = {"vertex_positions": x.reshape(-1, 3)}
         if sheet.values is None:
             fixed = self.rr.Mesh3D.from_fields(triangle_indices=sheet.faces, albedo_factor=sheet.colour)
-        else:
+            normals = np.stack([vertex_normals(frame, sheet.faces) for frame in x])
+            fields["vertex_normals"] = normals.astype(np.float32).reshape(-1, 3)
+        else:  # without normals it is not shaded, and its colours are those of the scale
             fixed = self.rr.Mesh3D.from_fields(triangle_indices=sheet.faces)
             fields["vertex_colors"] = colours(sheet.values, self.film.worst).reshape(-1, 3)
         self._static(name, fixed)
@@ -145,16 +148,22 @@ class _Writer:
 
 
 def _layout(film: Film) -> Any:
-    """The scene, the curves below it, depth images beside it."""
+    """The scene from where pictures are taken, depth images beside it, curves below, one plot for each quantity."""
     import rerun.blueprint as rrb
 
-    rows = [rrb.Spatial3DView(origin=f"/{WORLD}", name=film.title)]
+    camera = camera_for(film, WINDOW)
+    low, high = film.box()
+    eye = rrb.EyeControls3D(position=camera.T_world_camera[:3, 3], look_target=(low + high) / 2, eye_up=(0.0, 0.0, 1.0))
+    shown: Any = rrb.Spatial3DView(origin=f"/{WORLD}", name=film.title, eye_controls=eye)
     deep = [name for name, view in film.views.items() if (view.index >= 0).any()]
-    images = [rrb.Spatial2DView(origin=f"/{WORLD}/{name}", name=name) for name in deep]
-    top = rrb.Horizontal(*rows, rrb.Vertical(*images), column_shares=[3, 1]) if images else rows[0]
+    if deep:
+        images = (rrb.Spatial2DView(origin=f"/{WORLD}/{name}", name=name) for name in deep)
+        shown = rrb.Horizontal(shown, rrb.Vertical(*images), column_shares=[3, 1])
     if film.curves:
-        top = rrb.Vertical(top, rrb.TimeSeriesView(origin=f"/{CURVES}", name="curves"), row_shares=[3, 1])
-    return rrb.Blueprint(top, collapse_panels=True)
+        quantities = dict.fromkeys(name.split("/")[0] for name in film.curves)
+        plots = (rrb.TimeSeriesView(origin=f"/{CURVES}/{name}", name=name) for name in quantities)
+        shown = rrb.Vertical(shown, rrb.Horizontal(*plots), row_shares=[3, 1])
+    return rrb.Blueprint(shown, collapse_panels=True)
 
 
 def _rerun() -> Any:

@@ -22,7 +22,7 @@ HOST = "127.0.0.1"  # only this machine; `ssh -L` brings it elsewhere
 SPEEDS = (0.1, 2.0)  # times real time
 FASTEST = 60.0  # frames a second that are sent
 REST = 0.5  # s, before the film starts anew
-WINDOW = (960, 720)  # pixels, of the browser that the first place of the eye is good for
+WINDOW = (480, 720)  # pixels, of the part of a browser's window that the panel leaves free
 DEPTH_SIZE, DEPTH_FAR = 320, 0.98  # pixels; quantile of the depths that has the last colour
 DEPTH_MAP = "viridis"
 
@@ -111,7 +111,7 @@ class Viewer:
             gui.add_image(_colour_bar(), label=f"{film.legend}: 0 to {film.worst:g} {film.unit}; grey: none near")
         for name, curve in film.curves.items():
             series = ({"label": "s"}, {"label": f"{name} [{curve.unit}]", "stroke": "#bd0026", "width": 1.5})
-            gui.add_uplot((curve.t, np.asarray(curve.values, float)), series, height=140)
+            gui.add_uplot((curve.t, np.asarray(curve.values, float)), series, scales={"x": {"time": False}}, height=140)
         self._images = [
             (view, gui.add_image(np.zeros((8, 8, 3), np.uint8), label=f"depth of {name}"))
             for name, view in film.views.items()
