@@ -18,7 +18,7 @@ from .geometry import Array, edges_of
 QUANTILE = 0.95  # of the distances, is dark red
 NOISES = 4.0  # standard deviations of the sensor that the colour bar spans at least
 LEAST = 2.0  # mm, that the colour bar spans at least
-THIN = 0.1  # share of the mean density of points below which a vertex counts as unseen
+THIN = 0.2  # share of the mean density of points below which a vertex counts as unseen
 MOST_STEPS = 30
 
 

@@ -68,11 +68,11 @@ class Viewer:
 
     def run(self) -> None:
         """Play, until ``stop`` is called or the process is interrupted."""
-        due = time.monotonic()
+        due = time.monotonic() + self._pause()
         while not self._closing.wait(max(0.0, due - time.monotonic())):
-            due = time.monotonic() + self._pause()
             if self.playing.value:
                 self.show((self.frame + 1) % len(self.film))
+            due = max(due + self._pause(), time.monotonic())  # where the machine is slower, frames are not made up for
 
     def stop(self) -> None:
         """End ``run``, and the server."""
