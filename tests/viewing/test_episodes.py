@@ -41,6 +41,14 @@ def test_what_was_seen_at_another_time_is_not_shown(rich):
     assert [len(frame) for frame in film_of(late).clouds["markers"].frames] == [0, 0, 0]
 
 
+def test_a_slower_stream_is_shown_all_the_time(rich):
+    """Markers five times as seldom as points: each frame has the nearest of them."""
+    t = np.linspace(0.1, 0.5, 21)
+    points = rec.PointClouds(t, np.zeros((21, 3)), np.ones(21, int))
+    slow = replace(rich, points=points, markers=replace(rich.markers, t=np.array([0.1, 0.2, 0.3, 0.4])))
+    assert [len(frame) for frame in film_of(slow).clouds["markers"].frames][:18] == [2] * 3 + [1] * 5 + [2] * 10
+
+
 def test_arms_stand_where_the_kinematics_say(example):
     film = film_of(example)
     arm, joints = robots.arm_of(example, "left"), example.joints["left"]

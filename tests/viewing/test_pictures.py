@@ -114,6 +114,16 @@ def test_the_farthest_comes_first(film):
     assert (red[:2] < red[2:]).all()
 
 
+def test_crowds_of_points_are_thinned_evenly(film):
+    line = np.linspace(-0.1, 0.1, 5000)[:, None] * [1.0, 0, 0]
+    crowd = only(film, sheets={"a": square(-0.05, RED)}, clouds={"points": Cloud((line,))})
+    camera = camera_for(crowd, (300, 300), ABOVE)
+    shown = polygons(crowd, 0, camera).corners[2:].mean(axis=1)  # the square is farther
+    ends = camera.project(line[[0, -1]])[0]
+    assert 750 < len(shown) <= 1500
+    np.testing.assert_allclose(np.sort(shown[:, 1])[[0, -1]], np.sort(ends[:, 1]), atol=0.5)
+
+
 def test_a_gif_plays_in_real_time(film, tmp_path):
     done = []
     path = animate(film, tmp_path / "new" / "a.gif", size=(240, 200), on_frame=lambda *call: done.append(call))

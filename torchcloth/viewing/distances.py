@@ -64,10 +64,11 @@ def with_cloth(film: Film, vertices: Array, faces: Array, *, noise: float | None
         values.append(1e3 * distance)
         means.append(1e3 * mean)
     cloth = Sheet(vertices.astype(np.float32), faces, np.stack(values).astype(np.float32))
+    curve = {DISTANCE: Curve(film.times, np.array(means), "mm")} if np.isfinite(means).any() else {}
     return replace(
         film,
         sheets={**sheets, "cloth": cloth},
-        curves={DISTANCE: Curve(film.times, np.array(means), "mm"), **film.curves},
+        curves={**curve, **film.curves},
         worst=_worst(np.stack(values), noise),
         legend="distance of measured points",
     )

@@ -18,6 +18,7 @@ TURN = 20.0  # degrees, by which the eye stands beside the recorded camera, or b
 ELEVATIONS = (12.0, 55.0)  # degrees, of the eye above what it looks at
 LIGHT = np.array([-0.3, -0.6, -0.75])  # direction to the light, in the camera's axes (x right, y down, z forward)
 DOT = 0.0038  # of the image's height, radius of a point
+BESIDE, ALONE = 1500, 8000  # points of a cloud that are drawn at most, with a cloth to be seen under them and without
 IN_FRONT = 0.015  # of the scene's size, by which points come before the surface that they were measured on
 NEAR = 0.05  # m, what is nearer to the camera is not drawn
 
@@ -90,7 +91,8 @@ def polygons(film: Film, frame: int, camera: DepthCamera) -> Polygons:
     ]
     for solid in film.solids.values():
         parts.append(_solid(placed(solid, frame), solid.faces, np.array(solid.colour), camera))
-    parts += [_dots(cloud.frames[frame], np.array(cloud.colour), reach, camera) for cloud in film.clouds.values()]
+    most = BESIDE if film.sheets else ALONE
+    parts += [_dots(_some(c.frames[frame], most), np.array(c.colour), reach, camera) for c in film.clouds.values()]
     if not film.solids:  # nothing else says where the grippers are
         held = [(trace.poses[frame, None, :3, 3], np.array(trace.colour)) for trace in film.traces.values()]
         parts += [_dots(place, colour, reach, camera, 2.5) for place, colour in held]
@@ -143,6 +145,11 @@ def _shaded(
     bright = np.where(back, paint.behind * bright, bright)
     corners = pixels[faces][:, [0, 1, 2, 2]]
     return corners, np.clip(colour / 255 * bright[:, None], 0, 1), corner_depth[ahead].mean(1)
+
+
+def _some(points: Array, most: int) -> Array:
+    """Points, left out evenly so that no more than ``most`` remain."""
+    return points[:: max(1, -(-len(points) // most))]
 
 
 def _dots(
