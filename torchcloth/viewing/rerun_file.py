@@ -16,11 +16,11 @@ from .saving import atomically
 
 TIME = "time"  # the timeline, s on the motion clock
 WORLD, CURVES = "world", "curves"
-DOT = 0.0018  # m, radius of a point
+DOT = 0.0025  # m, radius of a point
 LINE = 0.0015  # m, radius of a gripper's path
 AXES = 0.05  # m, length of a gripper's axes
 IMAGE_PLANE = 0.15  # m, of a camera's frustum
-WINDOW = (800, 600)  # pixels, that the first place of the eye is good for
+WINDOW, NEARER = (800, 600), 0.5  # pixels; its lens is wider than that of pictures, so the eye comes nearer
 
 
 def write_rrd(film: Film, path: str | Path) -> Path:
@@ -148,13 +148,23 @@ class _Writer:
 
 
 def _layout(film: Film) -> Any:
-    """The scene from where pictures are taken, depth images beside it, curves below, one plot for each quantity."""
+    """The scene from where pictures are taken, depth images beside it, curves below, one plot for each quantity.
+
+    Sheets that others show as nets would hide what they are compared with: they are off at first.
+    """
     import rerun.blueprint as rrb
 
-    camera = camera_for(film, WINDOW)
     low, high = film.box()
-    eye = rrb.EyeControls3D(position=camera.T_world_camera[:3, 3], look_target=(low + high) / 2, eye_up=(0.0, 0.0, 1.0))
-    shown: Any = rrb.Spatial3DView(origin=f"/{WORLD}", name=film.title, eye_controls=eye)
+    target = (low + high) / 2
+    position = target + NEARER * (camera_for(film, WINDOW).T_world_camera[:3, 3] - target)
+    shown: Any = rrb.Spatial3DView(
+        origin=f"/{WORLD}",
+        name=film.title,
+        eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, 0.0, 1.0)),
+        overrides={
+            f"/{WORLD}/{name}": rrb.EntityBehavior(visible=False) for name, sheet in film.sheets.items() if sheet.net
+        },
+    )
     deep = [name for name, view in film.views.items() if (view.index >= 0).any()]
     if deep:
         images = (rrb.Spatial2DView(origin=f"/{WORLD}/{name}", name=name) for name in deep)
