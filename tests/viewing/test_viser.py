@@ -10,6 +10,8 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+import viser
+import websockets.sync.client
 import zstandard
 
 from torchcloth.errors import MissingDependency
@@ -79,6 +81,31 @@ def test_the_slider_moves_the_scene(viewer, whole):
     viewer.slider.value = 3
     assert viewer.frame == 3
     np.testing.assert_array_equal(handle(viewer, "/points").points, whole.clouds["points"].frames[3])
+
+
+def test_a_browser_receives_what_is_shown(viewer, whole):
+    """The positions of a frame's points come over the wire as they are."""
+    address, version = f"ws://127.0.0.1:{viewer.port}", f"viser-v{viser.__version__}"
+    wanted = whole.clouds["points"].frames[5].tobytes()
+    with websockets.sync.client.connect(address, subprotocols=[version], max_size=None) as browser:
+        viewer.show(5)
+        deadline = time.monotonic() + 10
+        while wanted not in browser.recv(timeout=10, decode=False):
+            assert time.monotonic() < deadline
+
+
+def test_messages_come_from_the_servers_thread(viewer, monkeypatch):
+    """From another one viser fails now and then: "deque mutated during iteration"."""
+    threads = set()
+    show = viewer.scene.show
+    monkeypatch.setattr(viewer.scene, "show", lambda frame: (threads.add(threading.get_ident()), show(frame)))
+    loop = viewer.server.get_event_loop()
+    viewer.show(1)
+    viewer.slider.value = 2
+    where = []
+    loop.call_soon_threadsafe(lambda: where.append(threading.get_ident()))
+    viewer.show(3)
+    assert threads == set(where)
 
 
 def test_groups_are_switched(viewer):

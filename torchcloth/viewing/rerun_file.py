@@ -150,22 +150,21 @@ class _Writer:
 def _layout(film: Film) -> Any:
     """The scene from where pictures are taken, depth images beside it, curves below, one plot for each quantity.
 
-    Sheets that others show as nets would hide what they are compared with: they are off at first.
+    Sheets that others show as nets and the points of depth images would hide the rest: they are off at first.
     """
     import rerun.blueprint as rrb
 
     low, high = film.box()
     target = (low + high) / 2
     position = target + NEARER * (camera_for(film, WINDOW).T_world_camera[:3, 3] - target)
+    deep = [name for name, view in film.views.items() if (view.index >= 0).any()]
+    hidden = [*(name for name, sheet in film.sheets.items() if sheet.net), *(f"{name}/depth" for name in deep)]
     shown: Any = rrb.Spatial3DView(
         origin=f"/{WORLD}",
         name=film.title,
         eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, 0.0, 1.0)),
-        overrides={
-            f"/{WORLD}/{name}": rrb.EntityBehavior(visible=False) for name, sheet in film.sheets.items() if sheet.net
-        },
+        overrides={f"/{WORLD}/{name}": rrb.EntityBehavior(visible=False) for name in hidden},
     )
-    deep = [name for name, view in film.views.items() if (view.index >= 0).any()]
     if deep:
         images = (rrb.Spatial2DView(origin=f"/{WORLD}/{name}", name=name) for name in deep)
         shown = rrb.Horizontal(shown, rrb.Vertical(*images), column_shares=[3, 1])
