@@ -154,7 +154,7 @@ def _rebuilt(path: Path, model: _Model, recording: Recording) -> Cloth:
             f"{path}: a fit of another model",
             got=f"{', '.join(sorted(other))} in only one of them",
             expected="the model that the episode describes",
-            remedy="show a cloth of your own with viewing.with_cloth",
+            remedy="fit this episode, or show a cloth of your own with viewing.with_cloth",
         )
     for name, value in model.values.items():
         _parameter(cloth, names[name]).set(value)

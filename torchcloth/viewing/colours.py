@@ -8,7 +8,7 @@ import numpy as np
 
 from .geometry import Array
 
-UNKNOWN = (196, 198, 202)  # sRGB of what no measured point lies near
+UNKNOWN = (164, 168, 176)  # sRGB of what no measured point lies near
 MAP = "YlOrRd"
 
 

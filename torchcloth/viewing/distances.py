@@ -18,7 +18,7 @@ from .geometry import Array, edges_of
 QUANTILE = 0.95  # of the distances, is dark red
 NOISES = 4.0  # standard deviations of the sensor that the colour bar spans at least
 LEAST = 2.0  # mm, that the colour bar spans at least
-THIN = 0.1  # share of the mean density of points below which a vertex counts as unseen
+THIN = 0.2  # share of the mean density of points below which a vertex counts as unseen
 MOST_STEPS = 30
 
 
@@ -64,10 +64,11 @@ def with_cloth(film: Film, vertices: Array, faces: Array, *, noise: float | None
         values.append(1e3 * distance)
         means.append(1e3 * mean)
     cloth = Sheet(vertices.astype(np.float32), faces, np.stack(values).astype(np.float32))
+    curve = {DISTANCE: Curve(film.times, np.array(means), "mm")} if np.isfinite(means).any() else {}
     return replace(
         film,
         sheets={**sheets, "cloth": cloth},
-        curves={DISTANCE: Curve(film.times, np.array(means), "mm"), **film.curves},
+        curves={**curve, **film.curves},
         worst=_worst(np.stack(values), noise),
         legend="distance of measured points",
     )

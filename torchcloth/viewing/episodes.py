@@ -29,7 +29,7 @@ from .geometry import Array, nearest
 
 RATE = 25.0  # 1/s, frames of an episode that was not observed
 MARGIN = 0.3  # m, by which a collider's plane is drawn beyond what lies over it
-SLACK = 0.5  # of the time between two frames: what was seen farther away than this is not shown
+SLACK = 0.5  # of the time between two frames of the slower stream: what was seen farther away is not shown
 
 
 def film_of(recording: Recording, *, truth: bool = False, times: Array | None = None) -> Film:
@@ -89,8 +89,7 @@ def _times(recording: Recording, truth: bool) -> Array:
 def _seen(stream_times: Array, times: Array) -> Array:
     """[T] which entry of an observed stream belongs to each frame; -1 where none is near."""
     index = nearest(stream_times, times)
-    steps = np.concatenate([np.diff(stream_times), np.diff(times)])
-    gap = SLACK * float(np.median(steps)) if len(steps) else 0.0
+    gap = SLACK * max((float(np.median(np.diff(t))) for t in (stream_times, times) if len(t) > 1), default=0.0)
     return np.where(np.abs(stream_times[index] - times) <= gap * (1 + 1e-6) + 1e-9, index, -1)
 
 

@@ -26,6 +26,18 @@ def face_normals(x: Array, faces: Array) -> Array:
     return unit(np.cross(b - a, c - a))
 
 
+def soft_normals(x: Array, faces: Array) -> Array:
+    """[F, 3] unit normals of triangles, drawn towards those around where these agree: a seam stays an edge."""
+    a, b, c = x[faces[:, 0]], x[faces[:, 1]], x[faces[:, 2]]
+    own = np.cross(b - a, c - a)
+    size = np.linalg.norm(own, axis=-1)
+    total, weight = np.zeros_like(x), np.zeros(len(x))
+    np.add.at(total, faces, own[:, None])
+    np.add.at(weight, faces, size[:, None])
+    agreed = total / np.maximum(weight, 1e-12)[:, None]  # short where normals cancel
+    return unit(agreed[faces].sum(1) + unit(own))
+
+
 def vertex_normals(x: Array, faces: Array) -> Array:
     """[V, 3] unit normals, the mean of the triangles' around, weighted by area."""
     a, b, c = x[faces[:, 0]], x[faces[:, 1]], x[faces[:, 2]]

@@ -9,7 +9,7 @@ import numpy as np
 from ..observe import DepthCamera, look_at
 from .colours import colours
 from .film import Film, Sheet, placed
-from .geometry import Array, edges_of, face_normals, hems_of, unit, vertex_normals
+from .geometry import Array, edges_of, face_normals, hems_of, soft_normals
 
 FOCAL = 2.2  # image heights: a long lens, so that lengths can be compared
 MARGIN = 0.06  # of the image, left free around what the film is about
@@ -18,6 +18,7 @@ TURN = 20.0  # degrees, by which the eye stands beside the recorded camera, or b
 ELEVATIONS = (12.0, 55.0)  # degrees, of the eye above what it looks at
 LIGHT = np.array([-0.3, -0.6, -0.75])  # direction to the light, in the camera's axes (x right, y down, z forward)
 DOT = 0.0038  # of the image's height, radius of a point
+BESIDE, ALONE = 1500, 8000  # points of a cloud that are drawn at most, with a cloth to be seen under them and without
 IN_FRONT = 0.015  # of the scene's size, by which points come before the surface that they were measured on
 NEAR = 0.05  # m, what is nearer to the camera is not drawn
 
@@ -90,7 +91,11 @@ def polygons(film: Film, frame: int, camera: DepthCamera) -> Polygons:
     ]
     for solid in film.solids.values():
         parts.append(_solid(placed(solid, frame), solid.faces, np.array(solid.colour), camera))
-    parts += [_dots(cloud.frames[frame], np.array(cloud.colour), reach, camera) for cloud in film.clouds.values()]
+    most = BESIDE if film.sheets else ALONE
+    parts += [_dots(_some(c.frames[frame], most), np.array(c.colour), reach, camera) for c in film.clouds.values()]
+    if not film.solids:  # nothing else says where the grippers are
+        held = [(trace.poses[frame, None, :3, 3], np.array(trace.colour)) for trace in film.traces.values()]
+        parts += [_dots(place, colour, reach, camera, 2.5) for place, colour in held]
     if not parts:
         return Polygons(np.zeros((0, 4, 2)), np.zeros((0, 3)))
     corners, shades, depth = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -100,7 +105,7 @@ def polygons(film: Film, frame: int, camera: DepthCamera) -> Polygons:
 
 def _sheet(sheet: Sheet, frame: int, worst: float, camera: DepthCamera) -> tuple[Array, Array, Array]:
     x, faces = sheet.vertices[frame].astype(float), sheet.faces
-    normals = _smooth_normals(x, faces)
+    normals = soft_normals(x, faces)
     if sheet.values is None:
         return _shaded(x, faces, normals, np.array(sheet.colour), PLAIN, camera)
     colour = colours(sheet.values[frame], worst).astype(float)[faces].mean(1)
@@ -133,7 +138,7 @@ def _shaded(
     ahead = corner_depth.min(1) > NEAR
     faces, normal, colour = faces[ahead], normal[ahead], np.broadcast_to(colour, (len(ahead), 3))[ahead]
     towards = camera.T_world_camera[:3, 3] - x[faces].mean(1)
-    back = (towards * normal).sum(-1) < 0
+    back = (towards * face_normals(x, faces)).sum(-1) < 0
     normal = np.where(back[:, None], -normal, normal)
     light = camera.T_world_camera[:3, :3] @ (LIGHT / np.linalg.norm(LIGHT))
     bright = paint.ambient + (1 - paint.ambient) * np.clip(normal @ light, 0, 1)
@@ -142,14 +147,16 @@ def _shaded(
     return corners, np.clip(colour / 255 * bright[:, None], 0, 1), corner_depth[ahead].mean(1)
 
 
-def _dots(points: Array, colour: Array, reach: float, camera: DepthCamera) -> tuple[Array, Array, Array]:
+def _some(points: Array, most: int) -> Array:
+    """Points, left out evenly so that no more than ``most`` remain."""
+    return points[:: max(1, -(-len(points) // most))]
+
+
+def _dots(
+    points: Array, colour: Array, reach: float, camera: DepthCamera, size: float = 1.0
+) -> tuple[Array, Array, Array]:
     """Points as small diamonds."""
     pixels, depth = camera.project(points)
     pixels, depth = pixels[depth > NEAR], depth[depth > NEAR]
-    shape = DOT * camera.height * np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
+    shape = size * DOT * camera.height * np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
     return pixels[:, None] + shape, np.broadcast_to(colour / 255, (len(pixels), 3)), depth - reach
-
-
-def _smooth_normals(x: Array, faces: Array) -> Array:
-    """[F, 3] normals of the triangles, each the mean of its corners' normals."""
-    return unit(vertex_normals(x, faces)[faces].sum(1))

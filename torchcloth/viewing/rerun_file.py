@@ -11,14 +11,16 @@ from ..errors import MissingDependency
 from .colours import colours
 from .film import Film, Solid, Trace, View
 from .geometry import Array, quaternions, vertex_normals
+from .projection import camera_for
 from .saving import atomically
 
 TIME = "time"  # the timeline, s on the motion clock
 WORLD, CURVES = "world", "curves"
-DOT = 0.0018  # m, radius of a point
+DOT = 0.0025  # m, radius of a point
 LINE = 0.0015  # m, radius of a gripper's path
 AXES = 0.05  # m, length of a gripper's axes
 IMAGE_PLANE = 0.15  # m, of a camera's frustum
+WINDOW, NEARER = (800, 600), 0.5  # pixels; its lens is wider than that of pictures, so the eye comes nearer
 
 
 def write_rrd(film: Film, path: str | Path) -> Path:
@@ -87,11 +89,12 @@ class _Writer:
     def _sheet(self, name: str) -> None:
         sheet, count = self.film.sheets[name], len(self.film)
         x = sheet.vertices
-        normals = np.stack([vertex_normals(frame, sheet.faces) for frame in x]).astype(np.float32)
-        fields = {"vertex_positions": x.reshape(-1, 3), "vertex_normals": normals.reshape(-1, 3)}
+        fields = {"vertex_positions": x.reshape(-1, 3)}
         if sheet.values is None:
             fixed = self.rr.Mesh3D.from_fields(triangle_indices=sheet.faces, albedo_factor=sheet.colour)
-        else:
+            normals = np.stack([vertex_normals(frame, sheet.faces) for frame in x])
+            fields["vertex_normals"] = normals.astype(np.float32).reshape(-1, 3)
+        else:  # without normals it is not shaded, and its colours are those of the scale
             fixed = self.rr.Mesh3D.from_fields(triangle_indices=sheet.faces)
             fields["vertex_colors"] = colours(sheet.values, self.film.worst).reshape(-1, 3)
         self._static(name, fixed)
@@ -145,16 +148,31 @@ class _Writer:
 
 
 def _layout(film: Film) -> Any:
-    """The scene, the curves below it, depth images beside it."""
+    """The scene from where pictures are taken, depth images beside it, curves below, one plot for each quantity.
+
+    Sheets that others show as nets and the points of depth images would hide the rest: they are off at first.
+    """
     import rerun.blueprint as rrb
 
-    rows = [rrb.Spatial3DView(origin=f"/{WORLD}", name=film.title)]
+    low, high = film.box()
+    target = (low + high) / 2
+    position = target + NEARER * (camera_for(film, WINDOW).T_world_camera[:3, 3] - target)
     deep = [name for name, view in film.views.items() if (view.index >= 0).any()]
-    images = [rrb.Spatial2DView(origin=f"/{WORLD}/{name}", name=name) for name in deep]
-    top = rrb.Horizontal(*rows, rrb.Vertical(*images), column_shares=[3, 1]) if images else rows[0]
+    hidden = [*(name for name, sheet in film.sheets.items() if sheet.net), *(f"{name}/depth" for name in deep)]
+    shown: Any = rrb.Spatial3DView(
+        origin=f"/{WORLD}",
+        name=film.title,
+        eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, 0.0, 1.0)),
+        overrides={f"/{WORLD}/{name}": rrb.EntityBehavior(visible=False) for name in hidden},
+    )
+    if deep:
+        images = (rrb.Spatial2DView(origin=f"/{WORLD}/{name}", name=name) for name in deep)
+        shown = rrb.Horizontal(shown, rrb.Vertical(*images), column_shares=[3, 1])
     if film.curves:
-        top = rrb.Vertical(top, rrb.TimeSeriesView(origin=f"/{CURVES}", name="curves"), row_shares=[3, 1])
-    return rrb.Blueprint(top, collapse_panels=True)
+        quantities = dict.fromkeys(name.split("/")[0] for name in film.curves)
+        plots = (rrb.TimeSeriesView(origin=f"/{CURVES}/{name}", name=name) for name in quantities)
+        shown = rrb.Vertical(shown, rrb.Horizontal(*plots), row_shares=[3, 1])
+    return rrb.Blueprint(shown, collapse_panels=True)
 
 
 def _rerun() -> Any:

@@ -158,7 +158,7 @@ class Stage:
         left, low = 52 / width, 24 / height  # pixels that the labels take
         place = self.figure.add_axes((left, low, 0.97 - left - (BAR if self.film.measured else 0), strip - low))
         place.plot(curve.t, curve.values, color=INK, linewidth=1)
-        place.set(xlim=(self.film.times[0], self.film.times[-1]), ylim=(0, 1.15 * float(curve.values.max())))
+        place.set(xlim=(self.film.times[0], self.film.times[-1]), ylim=(0, 1.15 * float(np.nanmax(curve.values))))
         place.tick_params(labelsize=7, colors=FAINT, length=2)
         place.locator_params(axis="y", nbins=2)
         place.spines[["top", "right"]].set_visible(False)

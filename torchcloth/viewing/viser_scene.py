@@ -128,7 +128,9 @@ class ViserScene:
     def _view(self, name: str, view: View) -> None:
         camera = view.camera
         fov = 2 * np.arctan2(camera.height / 2, camera.K[1, 1])
-        frustum = self.scene.add_camera_frustum(name, float(fov), camera.width / camera.height, scale=FRUSTUM)
+        frustum = self.scene.add_camera_frustum(
+            name, float(fov), camera.width / camera.height, scale=FRUSTUM, thickness=LINE, thickness_units="screen"
+        )
         self._follow(frustum, camera.T_world_camera[None])
 
     def _follow(self, handle: Any, poses: Array) -> None:

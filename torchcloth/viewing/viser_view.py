@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import threading
 import time
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -21,8 +23,9 @@ from .viser_scene import ViserScene, viser
 HOST = "127.0.0.1"  # only this machine; `ssh -L` brings it elsewhere
 SPEEDS = (0.1, 2.0)  # times real time
 FASTEST = 60.0  # frames a second that are sent
+LONGEST = 60.0  # s, for one frame; only a server that was stopped meanwhile takes so long
 REST = 0.5  # s, before the film starts anew
-WINDOW = (960, 720)  # pixels, of the browser that the first place of the eye is good for
+WINDOW = (480, 720)  # pixels, of the part of a browser's window that the panel leaves free
 DEPTH_SIZE, DEPTH_FAR = 320, 0.98  # pixels; quantile of the depths that has the last colour
 DEPTH_MAP = "viridis"
 
@@ -45,18 +48,24 @@ class Viewer:
         self.film, self.frame = film, 0
         self.server = _server(film, port)
         self.port: int = self.server.get_port()
-        self.scene = ViserScene(film, self.server)
-        _aim(self.server, film)
-        self._lock, self._closing = threading.Lock(), threading.Event()
-        self._play_controls()
-        self._layers()
-        self._readings()
-        self.show(0)
+        self._closing = threading.Event()
+        self._inside(self._build)
 
     def show(self, frame: int) -> None:
         """Show a frame; the slider follows."""
-        with self._lock, self.server.atomic():
-            self.frame = frame
+        self._inside(lambda: self._show(frame))
+
+    def _build(self) -> None:
+        _aim(self.server, self.film)
+        self.scene = ViserScene(self.film, self.server)
+        self._play_controls()
+        self._layers()
+        self._readings()
+        self._show(0)
+
+    def _show(self, frame: int) -> None:
+        self.frame = frame
+        with self.server.atomic():
             self.scene.show(frame)
             self._clock.content = _words(self.film, frame)
             for view, image in self._images:
@@ -64,15 +73,31 @@ class Viewer:
                 image.visible = pixels is not None
                 if pixels is not None:
                     image.image = pixels
-        self.slider.value = frame  # outside the lock: its callback comes back here when the frame is another
+            self.slider.value = frame
+
+    def _inside(self, act: Callable[[], None]) -> None:
+        """Do something in the server's own thread.
+
+        Elsewhere viser 1.1 now and then fails with "deque mutated during iteration": whoever sends a message wakes the
+        senders of all clients, which only their own thread may do.
+        """
+        loop = self.server.get_event_loop()
+
+        async def acted() -> None:
+            act()
+
+        if _running_loop() is loop:
+            act()
+        elif not self._closing.is_set():
+            asyncio.run_coroutine_threadsafe(acted(), loop).result(LONGEST)
 
     def run(self) -> None:
         """Play, until ``stop`` is called or the process is interrupted."""
-        due = time.monotonic()
+        due = time.monotonic() + self._pause()
         while not self._closing.wait(max(0.0, due - time.monotonic())):
-            due = time.monotonic() + self._pause()
             if self.playing.value:
                 self.show((self.frame + 1) % len(self.film))
+            due = max(due + self._pause(), time.monotonic())  # where the machine is slower, frames are not made up for
 
     def stop(self) -> None:
         """End ``run``, and the server."""
@@ -102,7 +127,10 @@ class Viewer:
         with gui.add_folder("show"):
             for group in self.scene.groups:
                 box = gui.add_checkbox(group, initial_value=True)
-                box.on_update(lambda event, group=group: self.scene.switch(group, event.target.value))
+                box.on_update(lambda event, group=group: self._switch(group, event.target.value))
+
+    def _switch(self, group: str, visible: bool) -> None:
+        self._inside(lambda: self.scene.switch(group, visible))
 
     def _readings(self) -> None:
         """Colour bar, curves, depth images, notes."""
@@ -111,7 +139,7 @@ class Viewer:
             gui.add_image(_colour_bar(), label=f"{film.legend}: 0 to {film.worst:g} {film.unit}; grey: none near")
         for name, curve in film.curves.items():
             series = ({"label": "s"}, {"label": f"{name} [{curve.unit}]", "stroke": "#bd0026", "width": 1.5})
-            gui.add_uplot((curve.t, np.asarray(curve.values, float)), series, height=140)
+            gui.add_uplot((curve.t, np.asarray(curve.values, float)), series, scales={"x": {"time": False}}, height=140)
         self._images = [
             (view, gui.add_image(np.zeros((8, 8, 3), np.uint8), label=f"depth of {name}"))
             for name, view in film.views.items()
@@ -150,6 +178,13 @@ def write_viser(film: Film, path: str | Path) -> Path:
     finally:
         _stop(server)
     return path
+
+
+def _running_loop() -> asyncio.AbstractEventLoop | None:
+    try:
+        return asyncio.get_running_loop()
+    except RuntimeError:
+        return None
 
 
 def _server(film: Film, port: int) -> Any:

@@ -1,0 +1,59 @@
+"""A fit on disk is the model that was fitted: its simulation repeats."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import twins
+
+from torchcloth import recordings
+from torchcloth.errors import InvalidInput
+from torchcloth.identification import cloth_from, identify, replayed
+from torchcloth.identification.saved import _read
+from torchcloth.transfer import Contact
+
+
+def test_the_frames_of_the_fit_come_back(pair, recording, tmp_path):
+    pair.save(tmp_path)
+    again = replayed(tmp_path, recording)
+    torch.testing.assert_close(again.frames, pair.frames_after[0], rtol=0, atol=1e-9)
+    assert float(again.chamfer.mean()) == pytest.approx(pair.fit["chamfer_after"], rel=1e-6)
+    assert again.warning == ""
+
+
+def test_start_values_that_were_not_fitted_are_kept(pair, tmp_path):
+    """`pair` fits stiffness and air; the rest is the data sheet's."""
+    pair.save(tmp_path)
+    values = _read(tmp_path / "identification.json").values
+    assert values["poisson_ratio"] == pytest.approx(twins.NOMINAL.poisson)
+    assert values["bending.damping_time"] == pytest.approx(twins.NOMINAL.damping_time)
+    assert values["youngs_modulus"] == pair.parameters["youngs_modulus"].value != pytest.approx(2e4)
+
+
+def test_points_may_have_been_rounded_on_disk(pair, recording, tmp_path):
+    """Fitted in memory, viewed from a folder whose points are in tenths of a millimetre."""
+    path = recordings.write(recording, tmp_path / "episode")
+    again = replayed(pair.save(tmp_path), recordings.read(path))
+    assert np.allclose(again.frames, pair.frames_after[0], atol=1e-6)
+
+
+def test_contact_and_step_are_kept(brief, tmp_path):
+    """As they were given: the simulation with other ones would be another."""
+    cloth = cloth_from(brief, contact=Contact(0.05, damping=0.2, play=0.1))
+    fit = identify(cloth, brief, ["youngs_modulus"], iterations=1, dt=1e-4)
+    again = replayed(fit.save(tmp_path), brief)
+    assert again.cloth.contact == Contact(0.05, damping=0.2, play=0.1)
+    torch.testing.assert_close(again.frames, fit.frames_after[0], rtol=0, atol=1e-9)
+    assert json.loads((tmp_path / "identification.json").read_text())["model"]["dt"] == 1e-4
+
+
+def test_the_right_one_of_several_episodes_is_found(recording, brief, tmp_path):
+    fit = identify(twins.at(brief), [brief, recording], ["youngs_modulus"], iterations=1)
+    fit.save(tmp_path)
+    for number, one in enumerate((brief, recording)):
+        again = replayed(tmp_path, one)
+        torch.testing.assert_close(again.frames, fit.frames_after[number], rtol=0, atol=1e-9)
+        assert again.warning == ""
+    with pytest.raises(InvalidInput, match="a fit of another episode; got recording; expected recording or recording"):
+        replayed(tmp_path, twins.first(recording, 5))

@@ -1,0 +1,154 @@
+"""A simulated cloth beside points: colours, figures, and the fit that it comes from."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from torchcloth import recordings
+from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.losses import chamfer_to_surface
+from torchcloth.viewing import Cloud, film_of_fit, with_cloth
+from torchcloth.viewing.distances import _worst
+
+
+@pytest.fixture
+def bare(film):
+    """(film without cloth, the cloth)."""
+    return replace(film, sheets={}), film.sheets["cloth"]
+
+
+def test_points_one_millimetre_away_colour_the_cloth_so(bare):
+    film, cloth = bare
+    shown = with_cloth(film, cloth.vertices, cloth.faces)
+    values = shown.sheets["cloth"].values
+    assert values[np.isfinite(values)] == pytest.approx(1.0, abs=1e-3)
+    assert shown.curves["distance"].values == pytest.approx(1.0, abs=1e-3)
+    assert shown.worst == 2.0
+
+
+def test_fabric_without_points_is_unknown(bare):
+    film, cloth = bare
+    one_side = tuple(points[points[:, 0] > 0] for points in film.clouds["points"].frames)
+    shown = with_cloth(replace(film, clouds={"points": Cloud(one_side)}), cloth.vertices, cloth.faces)
+    known = np.isfinite(shown.sheets["cloth"].values[0])
+    x = cloth.vertices[0]
+    assert not known[x[:, 0] < -0.15].any()
+    inside = (np.abs(x[:, 1]) < 0.12) & (x[:, 0] > 0.03) & (x[:, 0] < 0.14)
+    assert known[inside].all()
+
+
+def test_near_and_far_points_colour_their_own_places(bare):
+    film, cloth = bare
+    lift = [np.where(p[:, :1] > 0, 4e-3, 0.0) * [[0.0, 0, 1]] for p in film.clouds["points"].frames]
+    moved = tuple(p + dz for p, dz in zip(film.clouds["points"].frames, lift, strict=True))
+    values = (
+        with_cloth(replace(film, clouds={"points": Cloud(moved)}), cloth.vertices, cloth.faces).sheets["cloth"].values
+    )
+    x = cloth.vertices[0]
+    assert np.nanmedian(values[:, x[:, 0] > 0.08]) == pytest.approx(5.0, abs=0.3)
+    assert np.nanmedian(values[:, x[:, 0] < -0.08]) == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_frame_without_points_has_no_distance(bare):
+    film, cloth = bare
+    frames = (np.zeros((0, 3), np.float32), *film.clouds["points"].frames[1:])
+    shown = with_cloth(replace(film, clouds={"points": Cloud(frames)}), cloth.vertices, cloth.faces)
+    assert np.isnan(shown.sheets["cloth"].values[0]).all()
+    assert np.isnan(shown.curves["distance"].values[0])
+    assert np.isfinite(shown.curves["distance"].values[1:]).all()
+
+
+def test_without_points_the_cloth_is_plain(bare):
+    film, cloth = bare
+    shown = with_cloth(replace(film, clouds={}), cloth.vertices, cloth.faces)
+    assert shown.sheets["cloth"].values is None
+    assert "distance" not in shown.curves
+
+
+def test_other_cloths_become_nets(film):
+    cloth = film.sheets["cloth"]
+    shown = with_cloth(replace(film, sheets={"truth": cloth}), cloth.vertices, cloth.faces)
+    assert [(name, sheet.net) for name, sheet in shown.sheets.items()] == [("truth", True), ("cloth", False)]
+
+
+@pytest.mark.parametrize(
+    ("values", "noise", "worst"),
+    [([0.1], None, 2.0), ([0.1], 1.2e-3, 5.0), ([13.0] * 9, 1e-3, 15.0), ([np.nan], None, 2.0)],
+)
+def test_the_colour_bar_ends_at_a_round_number(values, noise, worst):
+    assert _worst(np.array(values), noise) == pytest.approx(worst)
+
+
+@pytest.fixture(scope="module")
+def fitted(short):
+    """The film of the shipped episode's first frames with its fit."""
+    folder, fit = short
+    torch.set_default_dtype(torch.float64)
+    return film_of_fit(recordings.read(folder), fit)
+
+
+def test_the_fit_is_simulated_again(fitted, short):
+    """Values near the truth follow the points to about the sensor's noise, 1.2 mm; the data sheet's do not."""
+    points = recordings.read(short[0]).points
+    cloth, distance = fitted.sheets["cloth"], fitted.curves["distance"]
+    for i in range(len(points)):
+        x = torch.as_tensor(cloth.vertices[i], dtype=torch.float64)
+        expected = chamfer_to_surface(torch.as_tensor(points.frame(i)), x, torch.as_tensor(cloth.faces))
+        assert distance.values[i] == pytest.approx(1e3 * float(expected), rel=1e-3)
+    assert 0.8 < distance.values.mean() < 1.2
+    assert f"fitted, {distance.values.mean():.2f} mm" in fitted.title
+
+
+def test_a_replay_that_is_not_the_fits_is_said(spoiled):
+    folder, path, content = spoiled
+    content["model"]["episodes"][0]["chamfer"] = 0.003
+    path.write_text(json.dumps(content))
+    film = film_of_fit(recordings.read(folder), path.parent)  # the folder will do
+    assert any("the fit was 3.00" in note for note in film.notes)
+
+
+def test_a_fit_of_another_episode_is_refused(short, example):
+    with pytest.raises(InvalidInput, match="a fit of another episode; got bimanual_swing; expected swing"):
+        film_of_fit(example, short[1])
+
+
+BROKEN = {
+    "no json": (lambda c: "{", "unreadable"),
+    "an older file": (lambda c: json.dumps({"parameters": {}}), "does not say which model was fitted"),
+    "a list": (lambda c: "[]", "does not say which model was fitted"),
+    "a word for a number": (lambda c: json.dumps(c).replace("0.0665", '"soft"'), "does not say which model"),
+    "wrong contact": (
+        lambda c: json.dumps(c).replace('"contact": null', '"contact": {"gap": 1}'),
+        "does not say which",
+    ),
+    "an effect that is not there": (
+        lambda c: json.dumps(c).replace("air.normal", "hem.stiffness"),
+        "air.normal, hem.st",
+    ),
+    "an impossible value": (lambda c: json.dumps(c).replace("51294.0", "-1.0"), "got -1 Pa"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_fit_is_refused(spoiled, case):
+    folder, path, content = spoiled
+    change, said = BROKEN[case]
+    path.write_text(change(content))
+    with pytest.raises((InvalidInput, RecordingError), match=said) as refused:
+        film_of_fit(recordings.read(folder), path)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_fit_that_is_not_there(short, tmp_path):
+    with pytest.raises(InvalidInput, match=r"no .*identification\.json; expected"):
+        film_of_fit(recordings.read(short[0]), tmp_path)
+
+
+def test_moving_the_episode_does_not_matter(short, tmp_path, fitted):
+    moved = shutil.copytree(short[0], tmp_path / "elsewhere")
+    again = film_of_fit(recordings.read(moved), short[1])
+    np.testing.assert_array_equal(again.sheets["cloth"].vertices, fitted.sheets["cloth"].vertices)

@@ -1,0 +1,130 @@
+"""A recording as a film: clocks, places, and what is not there."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchcloth import recordings as rec
+from torchcloth import robots
+from torchcloth.errors import RecordingError
+from torchcloth.viewing import film_of
+from torchcloth.viewing.film import placed
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "recordings"))
+from conftest import make_recording
+
+
+@pytest.fixture
+def rich(tmp_path) -> rec.Recording:
+    """Every stream there is; observations run 10 ms behind the motion's clock."""
+    return make_recording(tmp_path)
+
+
+def test_frames_are_the_points_on_the_motions_clock(rich):
+    film = film_of(rich)
+    assert film.times == pytest.approx(rich.points.t + 0.01)
+    for i in range(3):
+        np.testing.assert_allclose(film.clouds["points"].frames[i], rich.points.frame(i), atol=1e-6)
+
+
+def test_markers_that_were_not_seen_are_not_shown(rich):
+    shown = film_of(rich).clouds["markers"].frames
+    assert [len(frame) for frame in shown] == [2, 1, 2]
+    np.testing.assert_allclose(shown[1][0], rich.markers.xyz[1, 1], atol=1e-6)
+
+
+def test_what_was_seen_at_another_time_is_not_shown(rich):
+    late = replace(rich, markers=replace(rich.markers, t=rich.markers.t + 5.0))
+    assert [len(frame) for frame in film_of(late).clouds["markers"].frames] == [0, 0, 0]
+
+
+def test_a_slower_stream_is_shown_all_the_time(rich):
+    """Markers five times as seldom as points: each frame has the nearest of them."""
+    t = np.linspace(0.1, 0.5, 21)
+    points = rec.PointClouds(t, np.zeros((21, 3)), np.ones(21, int))
+    slow = replace(rich, points=points, markers=replace(rich.markers, t=np.array([0.1, 0.2, 0.3, 0.4])))
+    assert [len(frame) for frame in film_of(slow).clouds["markers"].frames][:18] == [2] * 3 + [1] * 5 + [2] * 10
+
+
+def test_arms_stand_where_the_kinematics_say(example):
+    film = film_of(example)
+    arm, joints = robots.arm_of(example, "left"), example.joints["left"]
+    at = 7
+    q = np.array([np.interp(film.times[at], joints.t, column) for column in joints.q.T])
+    shapes = arm.geometry(arm.home.new_tensor(q))
+    solids = [solid for name, solid in film.solids.items() if name.startswith("arms/left/")]
+    assert len(solids) == len(shapes) > 10
+    for solid, shape in zip(solids, shapes, strict=True):
+        np.testing.assert_allclose(placed(solid, at).mean(0), shape.pose[:3, 3].numpy(), atol=1e-6)
+
+
+def test_grippers_follow_the_replayed_motion(example):
+    film = film_of(example)
+    path = robots.replay(example)["right"]
+    knots = np.searchsorted(path.t.numpy(), film.times)
+    np.testing.assert_allclose(film.traces["grippers/right"].poses, path.pose[knots].numpy(), atol=1e-6)
+    assert len(film.traces["grippers/right"].points) == len(path.t)
+
+
+def test_a_robot_that_is_not_known_is_left_out_and_named(rich):
+    film = film_of(rich)
+    assert not [name for name in film.solids if name.startswith("arms/spare")]
+    assert any("'spare' is not drawn" in note for note in film.notes)
+    assert "grippers/left" in film.traces
+
+
+def test_a_collider_is_a_square_of_its_plane(rich):
+    table = rec.Collider(np.array([0.0, 0, 0.3]), np.array([0.0, 0.6, 0.8]))
+    corners = film_of(replace(rich, colliders={"wedge": table})).planes["colliders/wedge"].corners
+    assert (corners - table.point) @ table.normal == pytest.approx(0)
+    a, b, c, d = corners
+    assert np.linalg.norm(b - a) == pytest.approx(np.linalg.norm(d - a))
+    assert np.cross(b - a, c - a) @ table.normal > 0  # counterclockwise seen from outside
+
+
+def test_depth_images_come_at_their_time(rich):
+    film = film_of(rich)
+    view = film.views["cameras/cam0"]
+    assert view.index.tolist() == [0, 1, -1]
+    np.testing.assert_array_equal(view.raw(1), rich.cameras["cam0"].depth.load(1))
+    assert view.raw(2) is None
+    assert film.views["cameras/cam1"].raw(0) is None
+
+
+def test_forces_are_curves(rich):
+    curve = film_of(rich).curves["force/left"]
+    assert curve.unit == "N"
+    assert curve.values == pytest.approx(np.linalg.norm(rich.grippers["left"].force, axis=1))
+
+
+def test_truth_only_on_request(rich):
+    assert "truth" not in film_of(rich).sheets
+    shown = film_of(rich, truth=True).sheets["truth"]
+    t = rich.truth.t
+    share = (film_of(rich).times[0] - t[0]) / (t[1] - t[0])
+    expected = (1 - share) * rich.truth.vertices[0] + share * rich.truth.vertices[1]
+    np.testing.assert_allclose(shown.vertices[0], expected, atol=1e-6)
+    with pytest.raises(RecordingError, match="has no truth, which --truth needs"):
+        film_of(replace(rich, truth=None), truth=True)
+
+
+def test_streams_that_are_missing_are_not_shown(rich):
+    motion = replace(rich, points=None, markers=None, cameras={}, truth=None, joints={}, robots={}, colliders={})
+    film = film_of(motion)
+    assert (film.clouds, film.solids, film.planes, film.views) == ({}, {}, {}, {})
+    assert film.times[[0, -1]] == pytest.approx([0, 1])
+    assert len(film) == 26  # 25 a second
+    with pytest.raises(RecordingError, match="nothing to view"):
+        film_of(replace(motion, grippers={}))
+
+
+def test_frames_of_an_episode_without_points(rich):
+    """Markers, else images, else truth give the times."""
+    assert film_of(replace(rich, points=None)).times == pytest.approx(rich.markers.t + 0.01)
+    images = replace(rich, points=None, markers=None)
+    assert film_of(images).times == pytest.approx(rich.cameras["cam0"].depth.t + 0.01)
+    alone = replace(images, cameras={})
+    assert film_of(alone, truth=True).times == pytest.approx(rich.truth.t)

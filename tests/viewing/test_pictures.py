@@ -1,0 +1,189 @@
+"""What is seen on the pictures is where and what the film says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from torchcloth.errors import InvalidInput
+from torchcloth.viewing import Cloud, Curve, Sheet, animate, picture
+from torchcloth.viewing.pictures import _durations
+from torchcloth.viewing.projection import camera_for, polygons
+from torchcloth.viewing.stage import Stage
+
+ABOVE = (0.0, 89.0)  # azimuth, elevation: straight down, nearly
+RED, BLUE = (255, 0, 0), (0, 0, 255)
+
+
+def square(z, colour, half=0.1):
+    """One frame of a level square at a height."""
+    x = np.array([[[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]], np.float32)
+    return Sheet(x, np.array([[0, 1, 2], [0, 2, 3]]), colour=colour)
+
+
+def only(film, **parts):
+    """One frame with nothing but these parts."""
+    empty = {kind: {} for kind in ("sheets", "clouds", "solids", "planes", "traces", "curves")}
+    return replace(film, times=np.array([0.0]), **{**empty, **parts})
+
+
+def at(stage, point, frame=0):
+    """The colour of the pixel where a world point is seen, 0 to 1."""
+    column, row = stage.camera.project(np.asarray(point, float))[0].round().astype(int)
+    return stage.pixels(frame)[row, column] / 255
+
+
+@pytest.mark.parametrize("look", [(0.0, 20.0), (130.0, 35.0), ABOVE, None])
+def test_the_camera_sees_everything(film, look):
+    camera = camera_for(film, (400, 300), look)
+    low, high = film.box()
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+    pixels, depth = camera.project(corners)
+    assert (depth > 0.1).all()
+    assert pixels.min() > 0
+    assert (pixels.max(0) < [400, 300]).all()
+    spread = np.ptp(pixels, axis=0) / [400, 300]
+    assert spread.max() > 0.6  # and it is not far away
+
+
+def test_lengths_are_equal_in_all_directions(film):
+    """Looking along an axis, what is equally long and equally far is equally long in the picture."""
+    camera = camera_for(film, (500, 300), (0.0, 0.0))
+    origin, along, up = camera.project(np.array([[0.0, 0, 0.1], [0, 0.1, 0.1], [0, 0, 0.2]]))[0]
+    assert np.linalg.norm(along - origin) == pytest.approx(np.linalg.norm(up - origin), rel=1e-6)
+    assert up[1] < origin[1]  # z is up
+
+
+def test_what_is_in_front_is_seen(film):
+    near, far = {"a": square(0.1, RED), "b": square(0.0, BLUE)}, {"a": square(-0.1, RED), "b": square(0.0, BLUE)}
+    red, blue = (at(Stage(only(film, sheets=s), (300, 300), ABOVE), (0, 0, 0)) for s in (near, far))
+    assert red[0] > 0.5 > red[2]
+    assert blue[2] > 0.5 > blue[0]
+
+
+def test_points_are_hidden_by_the_cloth_before_them(film):
+    def seen(z):
+        cloud = {"points": Cloud((np.array([[0.05, 0.02, z]]),), BLUE)}
+        return at(Stage(only(film, sheets={"a": square(0.0, RED)}, clouds=cloud), (300, 300), ABOVE), (0.05, 0.02, z))
+
+    assert seen(0.001)[2] > seen(0.001)[0]  # measured on the surface, give or take noise
+    assert seen(-0.001)[2] > seen(-0.001)[0]
+    assert seen(-0.05)[0] > seen(-0.05)[2]
+
+
+def test_light_falls_on_both_sides_and_shows_the_slope(film):
+    level, steep = square(0.0, (200, 200, 200)), square(0.0, (200, 200, 200))
+    steep.vertices[..., 2] = 2.0 * steep.vertices[..., 1]  # turned away from the light
+    over = dict(
+        zip(
+            ("level", "steep"),
+            (at(Stage(only(film, sheets={"a": s}), (300, 300), ABOVE), (0, 0, 0)) for s in (level, steep)),
+            strict=True,
+        )
+    )
+    assert over["level"].mean() > over["steep"].mean() > 0.2
+    below = replace(level, faces=level.faces[:, ::-1])
+    assert 0.3 < at(Stage(only(film, sheets={"a": below}), (300, 300), ABOVE), (0, 0, 0)).mean() < over["level"].mean()
+
+
+def test_values_have_the_colours_of_the_bar(film):
+    good, bad = np.zeros((1, 4), np.float32), np.full((1, 4), 9.0, np.float32)
+    colours = []
+    for values in (good, bad, np.full((1, 4), np.nan, np.float32)):
+        sheet = replace(square(0.0, RED), values=values)
+        colours.append(at(Stage(only(film, sheets={"a": sheet}, worst=5.0), (300, 300), ABOVE), (0, 0, 0)))
+    pale, dark, unknown = colours
+    assert pale.min() > 0.6
+    assert dark[0] > 0.3
+    assert dark[1:].max() < 0.2
+    assert np.ptp(unknown) < 0.05  # grey
+
+
+def test_closed_bodies_hide_their_far_side(film):
+    ball = only(film, solids={"ball": replace(film.solids["arms/one/ball"], poses=np.eye(4)[None])})
+    shown = polygons(ball, 0, camera_for(ball, (300, 300)))
+    assert 0.3 < len(shown.corners) / len(film.solids["arms/one/ball"].faces) < 0.6
+
+
+def test_the_farthest_comes_first(film):
+    camera = camera_for(film, (300, 300))
+    one, both = only(film, sheets={"a": square(0.3, RED)}), {"b": square(0.3, RED), "a": square(0.0, BLUE)}
+    assert len(polygons(one, 0, camera).corners) == 2
+    red = polygons(only(film, sheets=both), 0, camera).colours[:, 0]
+    assert (red[:2] < red[2:]).all()
+
+
+def test_crowds_of_points_are_thinned_evenly(film):
+    line = np.linspace(-0.1, 0.1, 5000)[:, None] * [1.0, 0, 0]
+    crowd = only(film, sheets={"a": square(-0.05, RED)}, clouds={"points": Cloud((line,))})
+    camera = camera_for(crowd, (300, 300), ABOVE)
+    shown = polygons(crowd, 0, camera).corners[2:].mean(axis=1)  # the square is farther
+    ends = camera.project(line[[0, -1]])[0]
+    assert 750 < len(shown) <= 1500
+    np.testing.assert_allclose(np.sort(shown[:, 1])[[0, -1]], np.sort(ends[:, 1]), atol=0.5)
+
+
+def test_a_gif_plays_in_real_time(film, tmp_path):
+    done = []
+    path = animate(film, tmp_path / "new" / "a.gif", size=(240, 200), on_frame=lambda *call: done.append(call))
+    with Image.open(path) as gif:
+        assert (gif.size, gif.n_frames) == ((240, 200), 6)
+        lasting = []
+        for i in range(6):
+            gif.seek(i)
+            lasting.append(gif.info["duration"])
+        first, last = (np.asarray((gif.seek(i), gif.convert("RGB"))[1]) for i in (0, 5))
+    assert sum(lasting) == 600  # the last frame lasts as long as the one before
+    assert done[-1] == (6, 6)
+    assert (first != last).any(axis=-1).mean() > 0.02
+    assert [p.name for p in path.parent.iterdir()] == ["a.gif"]
+
+
+def test_durations_are_hundredths_whose_sum_is_right():
+    times = np.arange(31) / 30  # 33.3 ms
+    found = _durations(times)
+    assert set(found) == {30, 40}
+    assert sum(found[:30]) == 1000
+    assert _durations(np.array([3.0])) == [1000]
+
+
+def test_a_gif_has_at_most_fifty_frames_a_second(film, tmp_path):
+    with pytest.raises(InvalidInput, match="rate; got 60"):
+        animate(film, tmp_path / "a.gif", rate=60.0)
+    with pytest.raises(InvalidInput, match="got 60x400; expected at least 120"):
+        animate(film, tmp_path / "a.gif", size=(60, 400))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_png_has_four_moments(film, tmp_path):
+    with Image.open(picture(film, tmp_path / "a.png", size=(200, 160))) as image:
+        pixels = np.asarray(image.convert("RGB"))
+    assert pixels.shape == (160, 800, 3)
+    assert (pixels[:, :200] != pixels[:, 600:]).any()
+
+
+def test_one_frame_is_enough(film, tmp_path):
+    still = film.take(np.array([2]))
+    with Image.open(animate(still, tmp_path / "a.gif", size=(200, 160))) as gif:
+        assert gif.n_frames == 1
+    with Image.open(picture(still, tmp_path / "a.png", size=(200, 160))) as image:
+        assert image.size == (200, 160)
+
+
+def test_the_curve_of_distances_is_drawn_below(film):
+    curve = {"distance": Curve(film.times, np.linspace(1, 3, 6), "mm")}
+    plain, measured = Stage(film, (300, 240)), Stage(replace(film, curves=curve), (300, 240))
+    assert measured.camera.height < plain.camera.height
+    below = measured.camera.height
+    assert (measured.pixels(0)[below:] != measured.pixels(5)[below:]).any()  # the mark runs
+
+
+def test_a_failure_leaves_nothing_behind(film, tmp_path, monkeypatch):
+    old = tmp_path / "a.gif"
+    old.write_text("mine")
+    monkeypatch.setattr(Image.Image, "save", lambda *_, **__: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        animate(film, old, size=(200, 160))
+    assert old.read_text() == "mine"
+    assert len(list(tmp_path.iterdir())) == 1

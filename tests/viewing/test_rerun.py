@@ -1,0 +1,133 @@
+"""The file for rerun, read back with rerun's own reader."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from torchcloth.errors import MissingDependency
+from torchcloth.recordings import Camera, ImageStream
+from torchcloth.viewing import View, with_cloth, write_rrd
+from torchcloth.viewing.colours import colours
+
+
+@pytest.fixture
+def whole(film, tmp_path):
+    """The film with a measured cloth, its truth, and a camera that saw two depth images."""
+    from PIL import Image
+
+    paths = tuple(tmp_path / f"{i}.png" for i in range(2))
+    for i, path in enumerate(paths):
+        Image.fromarray(np.full((6, 8), 700 + i, np.uint16)).save(path)
+    stream = ImageStream("depth", np.arange(2), np.array([1.0, 1.3]), paths, (8, 6))
+    pose = np.array([[0.0, 0, -1, 1], [1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]])
+    K = np.array([[9.0, 0, 3.5], [0, 9, 2.5], [0, 0, 1]])
+    camera = Camera(width=8, height=6, K=K, T_world_camera=pose, depth_scale=0.001, depth=stream)
+    view = View(camera, np.array([0, -1, -1, 1, -1, -1]))
+    cloth = film.sheets["cloth"]
+    film = replace(film, sheets={"truth": cloth}, views={"cameras/cam0": view})
+    return with_cloth(film, cloth.vertices, cloth.faces)
+
+
+@pytest.fixture
+def read(whole, tmp_path):
+    """Entity path -> columns -> values of all its chunks; the timeline as "time" in seconds."""
+    from rerun.chunk import RrdReader
+
+    found = {}
+    for chunk in RrdReader(write_rrd(whole, tmp_path / "film.rrd")).stream():
+        batch = chunk.to_record_batch()
+        columns = found.setdefault(chunk.entity_path, {})
+        for name in batch.schema.names:
+            values, column = batch.column(name), columns.setdefault(name, [])
+            if name == "time":
+                column += (values.cast("int64").to_numpy() / 1e9).tolist()
+            elif ":" in name and not name.startswith("RecordingInfo"):
+                column += values.to_pylist()
+    return found
+
+
+def test_every_part_has_its_entity(read):
+    parts = {"cloth", "truth", "points", "arms/one/ball", "colliders/table", "grippers/one", "cameras/cam0"}
+    assert {f"/world/{part}" for part in parts} <= read.keys()
+    assert {"/curves/distance", "/curves/force/one"} <= read.keys()
+
+
+def test_the_world_is_z_up(read):
+    (coordinates,) = read["/world"]["ViewCoordinates:xyz"]
+    assert coordinates == [[3, 5, 1]]  # right, forward, up: right-handed with z up
+
+
+def test_meshes_move_over_time(read, whole):
+    for name in ("cloth", "truth"):
+        entity = read[f"/world/{name}"]
+        assert entity["time"] == pytest.approx(whole.times)
+        np.testing.assert_allclose(np.array(entity["Mesh3D:vertex_positions"]), whole.sheets[name].vertices)
+        assert np.array_equal(entity["Mesh3D:triangle_indices"][0], whole.sheets[name].faces)
+    shown = np.array(read["/world/cloth"]["Mesh3D:vertex_colors"], np.uint32)
+    expected = colours(whole.sheets["cloth"].values, whole.worst).astype(np.uint32)
+    np.testing.assert_array_equal(shown, (expected * [1 << 24, 1 << 16, 1 << 8]).sum(-1) + 255)
+
+
+def test_points_may_be_another_number_in_each_frame(film, tmp_path):
+    from rerun.chunk import RrdReader
+
+    frames = tuple(points[: 7 * i] for i, points in enumerate(film.clouds["points"].frames))
+    film = replace(film, clouds={"points": replace(film.clouds["points"], frames=frames)})
+    chunks = [c for c in RrdReader(write_rrd(film, tmp_path / "a.rrd")).stream() if c.entity_path == "/world/points"]
+    (rows,) = [c.to_record_batch().column("Points3D:positions").to_pylist() for c in chunks if not c.is_static]
+    assert [len(row) for row in rows] == [0, 7, 14, 21, 28, 35]
+    np.testing.assert_allclose(rows[2], frames[2])
+
+
+def test_solids_and_grippers_follow_their_poses(read, whole):
+    for name, poses in (
+        ("arms/one/ball", whole.solids["arms/one/ball"].poses),
+        ("grippers/one/now", whole.traces["grippers/one"].poses),
+    ):
+        entity = read[f"/world/{name}"]
+        np.testing.assert_allclose(np.array(entity["Transform3D:translation"])[:, 0], poses[:, :3, 3], atol=1e-6)
+
+
+def test_cameras_look_where_they_did(read):
+    """Quaternions are xyzw; the pinhole's matrix is stored by columns."""
+    from scipy.spatial.transform import Rotation
+
+    entity = read["/world/cameras/cam0"]
+    (((x, y, z, w),),) = entity["Transform3D:quaternion"]
+    assert Rotation.from_quat([x, y, z, w]).as_matrix() == pytest.approx(
+        np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]]), abs=1e-6
+    )
+    ((matrix,),) = entity["Pinhole:image_from_camera"]
+    assert pytest.approx(np.array([[9.0, 0, 3.5], [0, 9, 2.5], [0, 0, 1]])) == np.reshape(matrix, (3, 3)).T
+
+
+def test_depth_images_come_at_their_frames(read, whole):
+    entity = read["/world/cameras/cam0/depth"]
+    assert entity["time"] == pytest.approx(whole.times[[0, 3]])
+    pixels = [np.frombuffer(bytes(buffer[0]), np.uint16) for buffer in entity["DepthImage:buffer"]]
+    assert [set(p.tolist()) for p in pixels] == [{700}, {701}]
+    assert entity["DepthImage:meter"][0] == pytest.approx([1000.0])
+
+
+def test_curves_are_scalars_at_their_own_times(read, whole):
+    for name in ("distance", "force/one"):
+        entity, curve = read[f"/curves/{name}"], whole.curves[name]
+        assert entity["time"] == pytest.approx(curve.t)
+        assert np.ravel(entity["Scalars:scalars"]) == pytest.approx(curve.values)
+
+
+def test_reruns_own_check_accepts_the_file(film, tmp_path):
+    path = write_rrd(film, tmp_path / "film.rrd")
+    done = subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", path], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["film.rrd"]
+
+
+def test_without_rerun(film, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(MissingDependency, match=r'pip install "torchcloth\[viz\]"'):
+        write_rrd(film, tmp_path / "film.rrd")
+    assert list(tmp_path.iterdir()) == []
