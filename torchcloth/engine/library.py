@@ -115,6 +115,7 @@ def _declare(lib: ctypes.CDLL, letter: str) -> None:
         "call": (number, [pointer, number, pointer, pointer, number]),
         "lookup": (number, [pointer] + [number] * 6),
         "sieve": (None, [pointer] + [number] * 7 + [ctypes.c_double]),
+        "per_mass": (None, [pointer] + [number] * 3 + [ctypes.c_double]),
         "stencil": (None, [pointer] + [number] * 5),
         "transfer": (number, [pointer] + [number] * 7),
         "contact": (None, [pointer, pointer, number, pointer, number, pointer, number] + [pointer] * 6),

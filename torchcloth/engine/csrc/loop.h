@@ -6,7 +6,7 @@
 #include <type_traits>
 
 #include "program.h"
-#include "transfer.h"
+#include "transfer_along.h"
 
 namespace tc {
 
@@ -25,6 +25,7 @@ struct Instruction {
     bool feeds = false;        // another call reads what this one gives
     int slot = 0;              // of its table among those of the loop
     bool packed = false;       // the field's kind is points
+    int fixed = -1;            // number of what Scene::fixed has for this load; -1: it varies
 };
 
 // The items of one run: all, those of a list, or as many as contact counts.
@@ -116,8 +117,38 @@ struct Loop : Stage<R> {
     // Where the numbers of a pack begin, in a field of points: [packs, comps, L].
     static size_t packed(const Instruction& i, int first) { return size_t(first) * i.comps; }
 
+    // What never changes during a run, in the order of this loop: gathered once, or when contact lists other points.
+    bool is_fixed(int field, int table) const {
+        const Field& f = program.fields[field];
+        const bool given = f.kind == Kind::constant || f.kind == Kind::parameter;
+        return given && list < 0 && table > VARYING - WOKEN_LIST && table != SHARED && (table != OWN || f.comps > 1);
+    }
+    void fix(Scene<R>& s, const Span& all) const {
+        P* regs = s.regs.data;
+        for (const Instruction& i : code) {
+            if (i.fixed < 0) continue;
+            Fixed<R>& to = s.fixed[i.fixed];
+            const int wanted = i.table <= VARYING ? s.lists_made : 0;
+            if (to.made == wanted) continue;
+            to.made = wanted;
+            to.packs.reset(size_t(round_up(all.items, L)) * i.comps);
+            for (int first = 0; first < all.items; first += L) {
+                gather(i, s.value[i.field], regs, first, all);
+                copy(reinterpret_cast<P*>(to.packs.data + packed(i, first)), regs + i.reg, i.comps);
+            }
+        }
+    }
+    // The frequent numbers as constants: no call.
+    static TC_INLINE void copy(P* to, const P* from, int count) {
+        auto some = [&](auto n) { std::memcpy(static_cast<void*>(to), from, n * sizeof(P)); };
+        if (count == 3) some(std::integral_constant<size_t, 3>{});
+        else if (count == 1) some(std::integral_constant<size_t, 1>{});
+        else if (count == 4) some(std::integral_constant<size_t, 4>{});
+        else if (count == 16) some(std::integral_constant<size_t, 16>{});
+        else some(size_t(count));
+    }
+
     TC_APART void gather(const Instruction& i, const R* from, P* to, int first, const Span& s) const {
-        if (i.packed) return void(std::memcpy(static_cast<void*>(to + i.reg), from + packed(i, first), i.comps * sizeof(P)));
         rows(i, first, s, [&](auto place, auto step) {
             if (step == 1)
                 for (int lane = 0; lane < L; lane++) to[i.reg].v[lane] = from[place(lane)];
@@ -158,8 +189,7 @@ struct Loop : Stage<R> {
         else scatter(i, to, from, first, s, [](auto& place, auto x) { place = place + x; });
     }
     TC_APART void store(const Instruction& i, R* to, const P* from, int first, const Span& s) const {
-        if (i.packed) std::memcpy(static_cast<void*>(to + packed(i, first)), from + i.reg, i.comps * sizeof(P));
-        else scatter(i, to, from, first, s, [](auto& place, auto x) { place = x; });
+        scatter(i, to, from, first, s, [](auto& place, auto x) { place = x; });
     }
     TC_APART void look(const Instruction& i, const R* table, P* regs) const {
         const int *in = i.in.data(), out = i.out[0];
@@ -194,6 +224,7 @@ struct Loop : Stage<R> {
         P* regs = s.regs.data;
         const Span all = span(s);
         if (all.items == 0) return;
+        fix(s, all);
         for (const Instruction& i : code) if (is_shared(i)) gather(i, s.value[i.field], regs, 0, all);
         for (int first = 0; first < all.items; first += L) {
             pick(s, first);
@@ -209,10 +240,17 @@ struct Loop : Stage<R> {
     TC_INLINE void compute(Scene<R>& s, const Instruction& i, int first, const Span& all, P* regs) const {
         R* field = i.field >= 0 ? s.value[i.field] : nullptr;
         switch (i.code) {
-            case Instruction::load: if (!is_shared(i)) gather(i, field, regs, first, all); break;
+            case Instruction::load:
+                if (i.fixed >= 0) field = s.fixed[i.fixed].packs.data;
+                if (i.fixed >= 0 || i.packed) copy(regs + i.reg, reinterpret_cast<const P*>(field + packed(i, first)), i.comps);
+                else if (!is_shared(i)) gather(i, field, regs, first, all);
+                break;
             case Instruction::call: kernels[i.kernel].value(regs, i.in.data(), i.out.data()); break;
             case Instruction::add: add(i, field, regs, first, all); break;
-            case Instruction::put: store(i, field, regs, first, all); break;
+            case Instruction::put:
+                if (i.packed) copy(reinterpret_cast<P*>(field + packed(i, first)), regs + i.reg, i.comps);
+                else store(i, field, regs, first, all);
+                break;
             case Instruction::lookup: look(i, field, regs); break;
             case Instruction::spread:
                 transfer<Transfer>(i, first, all, [&](auto t) { t.spread(regs + i.in[0], regs + i.in[1], field); });
@@ -227,6 +265,7 @@ struct Loop : Stage<R> {
         P *regs = s.regs.data, *bars = s.bars.data;
         const Span all = span(s);
         if (flat || all.items == 0) return;
+        fix(s, all);
         for (const Instruction& i : code)
             if (is_shared(i)) {
                 gather(i, s.value[i.field], regs, 0, all);
@@ -301,6 +340,7 @@ struct Loop : Stage<R> {
         D* dots = s.dots.data;
         const Span all = span(s);
         if (all.items == 0) return;
+        fix(s, all);
         for (const Instruction& i : code)  // what has no tangent
             if (i.code == Instruction::load && s.dot[i.field] == nullptr)
                 std::memset(static_cast<void*>(dots + size_t(i.reg) * L), 0, size_t(i.comps) * L * sizeof(D));
