@@ -214,7 +214,7 @@ class Cloth(nn.Module):
     def stable_step(self) -> float:
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
         with torch.no_grad():
-            return stable_step_of(self.model(), self._gradient)
+            return self._step_of(self.model())
 
     def model(self) -> Model:
         """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
@@ -247,9 +247,10 @@ class Cloth(nn.Module):
         """What ``forward`` does, checked."""
         frames = check_times(times)
         motion = check_motions(motion, self.boundaries, frames, self._area)
-        limit = check_step(dt, self.stable_step())
+        model = self.model()
+        limit = check_step(dt, self._step_of(model))
         counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
-        return self._ready(state, motion, frames, counts)
+        return self._ready(model, state, motion, frames, counts)
 
     def settling(
         self, state: ClothState, motion: Mapping[str, Trajectory], start: float, duration: float, rate: float
@@ -257,13 +258,18 @@ class Cloth(nn.Module):
         """What ``settle`` does, checked."""
         frames = [start, start + duration]
         motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
-        count = int(np.ceil(duration * (1 / self.stable_step() + rate)))
-        return self._ready(state, motion, frames, [count], rate)
+        model = self.model()
+        count = int(np.ceil(duration * (1 / self._step_of(model) + rate)))
+        return self._ready(model, state, motion, frames, [count], rate)
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
     def _parts(self) -> Iterable[tuple[str, AbstractEffect]]:
         return cast("Iterable[tuple[str, AbstractEffect]]", self.effects.items())
+
+    @torch.no_grad()
+    def _step_of(self, model: Model) -> float:
+        return stable_step_of(model, self._gradient)
 
     def grid(self) -> Grid | None:
         """The contact grid; None without contact."""
@@ -271,13 +277,13 @@ class Cloth(nn.Module):
 
     def _ready(
         self,
+        model: Model,
         state: ClothState,
         motion: Mapping[str, Trajectory],
         frames: list[float],
         counts: list[int],
         settling: float | None = None,
     ) -> Plan:
-        model = self.model()
         check_state(state, likeness(model, self._vertices))
         if settling is not None:
             model = damped(model, settling)

@@ -60,7 +60,7 @@ struct Contact : Stage<R> {
         list_woken(s, near, before);
         near.asleep.list(near.mask, false, search.corner, s.substep == s.substeps - 1 ? search.triangles : 0, each());
         if (changed) near.points.weigh(place);
-        near.nodes.place(near.points, s.value[x], spacing, changed);
+        near.nodes.place(near.points, s.value[x], program.fields[x].rows, spacing, changed);
         show(s, near);
         make_room(s, near);
     }
