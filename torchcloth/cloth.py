@@ -119,6 +119,13 @@ class Cloth(nn.Module):
     def engine(self, setting: Setting) -> None:
         self._engine: Setting = check_setting(setting)
 
+    @property
+    def engine_in_use(self) -> str:
+        """What computes the substeps: "fused", "fused, with effects.NAME in torch", or "reference (and why)"."""
+        with torch.no_grad():
+            model = self.model()
+            return str(self._choice(model, likeness(model, self._vertices)))
+
     # -- states ---------------------------------------------------------------------------------------------------
 
     def rest_state(self) -> ClothState:
@@ -213,8 +220,7 @@ class Cloth(nn.Module):
 
     def stable_step(self) -> float:
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
-        with torch.no_grad():
-            return self._step_of(self.model())
+        return stable_step_of(self.model(), self._gradient)
 
     def model(self) -> Model:
         """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
@@ -248,7 +254,7 @@ class Cloth(nn.Module):
         frames = check_times(times)
         motion = check_motions(motion, self.boundaries, frames, self._area)
         model = self.model()
-        limit = check_step(dt, self._step_of(model))
+        limit = check_step(dt, stable_step_of(model, self._gradient))
         counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
         return self._ready(model, state, motion, frames, counts)
 
@@ -259,17 +265,13 @@ class Cloth(nn.Module):
         frames = [start, start + duration]
         motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
         model = self.model()
-        count = int(np.ceil(duration * (1 / self._step_of(model) + rate)))
+        count = int(np.ceil(duration * (1 / stable_step_of(model, self._gradient) + rate)))
         return self._ready(model, state, motion, frames, [count], rate)
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
     def _parts(self) -> Iterable[tuple[str, AbstractEffect]]:
         return cast("Iterable[tuple[str, AbstractEffect]]", self.effects.items())
-
-    @torch.no_grad()
-    def _step_of(self, model: Model) -> float:
-        return stable_step_of(model, self._gradient)
 
     def grid(self) -> Grid | None:
         """The contact grid; None without contact."""
@@ -300,7 +302,4 @@ class Cloth(nn.Module):
         """Data sheet: size, contact, step."""
         size = f"{len(self.mesh.vertices)} vertices, {len(self.mesh.faces)} triangles, {self.mesh.area.sum():.4g} m^2"
         grid = "none" if self._grid is None else self._grid.words
-        with torch.no_grad():
-            model = self.model()
-            engine = self._choice(model, likeness(model, self._vertices))
-        return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s\nengine: {engine}"
+        return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s\nengine: {self.engine_in_use}"

@@ -14,6 +14,7 @@ from .strain import grown_gradient
 SAFETY = 0.7  # of the linear limit: leaves room for tangents that double beyond what the material states
 
 
+@torch.no_grad()
 def stable_step_of(model: Model, gradient: Tensor) -> float:
     """``stable_step`` of a cloth with all its parts; ``gradient``: of the shape functions of the pattern.
 

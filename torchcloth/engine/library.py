@@ -118,7 +118,7 @@ def _declare(lib: ctypes.CDLL, letter: str) -> None:
         "per_mass": (None, [pointer] + [number] * 3 + [ctypes.c_double]),
         "stencil": (None, [pointer] + [number] * 5),
         "transfer": (number, [pointer] + [number] * 7),
-        "contact": (None, [pointer, pointer, number, pointer, number, pointer, number] + [pointer] * 6),
+        "contact": (number, [pointer, pointer, number, pointer, number, pointer, number] + [pointer] * 6),
         "ready": (None, [pointer]),
         "size": (ctypes.c_int64, [pointer, number]),
         "records": (ctypes.c_int64, [pointer, ctypes.c_int64, ctypes.c_int64]),

@@ -10,6 +10,8 @@ import numpy as np
 
 from .fields import Field
 
+PATCH = 8  # triangles of a patch, as in csrc/search.h: a bit of a byte for each
+
 
 class Shape(IntEnum):
     """Of a stencil's operator; as in csrc/stencil.h."""
@@ -33,7 +35,7 @@ class Layers(NamedTuple):
     def emit(self, handle, api) -> None:
         """Write it down."""
         ids = tuple(field.id for field in self.fields)
-        limits = (self.chunk, len(self.starts) - 1)
+        limits = (self.chunk, len(self.starts) - 1, PATCH)
         sizes = self.corners.shape[1], len(self.places)
         lengths = np.array(self.lengths, np.float64)
         search = (np.ascontiguousarray(a) for a in (self.order, self.starts, self.meet, self.apart))

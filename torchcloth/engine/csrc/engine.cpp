@@ -91,18 +91,20 @@ struct Engine {
             engine.program.registers = std::max(engine.program.registers, share + tc::SHARES);                         \
         });                                                                                                            \
     }                                                                                                                  \
-    TC_API void tc_contact_##s(void* e, const int* fields, int count, const int* corners, int triangles,               \
-                               const double* places, int each, const double* lengths, const int* limits,               \
-                               const int* order, const int* starts, const uint8_t* meet, const uint8_t* apart) {       \
+    TC_API int tc_contact_##s(void* e, const int* fields, int count, const int* corners, int triangles,                \
+                              const double* places, int each, const double* lengths, const int* limits,                \
+                              const int* order, const int* starts, const uint8_t* meet, const uint8_t* apart) {        \
         auto& program = static_cast<Engine<R>*>(e)->program;                                                           \
-        auto contact = std::make_unique<tc::Contact<R>>(program);                                                      \
-        contact->x = fields[0], contact->base = fields[1], contact->grid.assign(fields + 2, fields + count);           \
-        contact->spacing = R(lengths[0]), contact->skin = R(lengths[1]);                                               \
-        contact->chunk = limits[0];                                                                                    \
-        contact->place.assign(places, places + 3 * each);                                                              \
-        contact->search.fill(corners, triangles, R(lengths[2]), limits[1], order, starts, meet, apart);                \
-        program.words = (triangles + 31) / 32, program.rows = tc::LISTS, program.counts = tc::COUNTS;                  \
-        program.stages.push_back(std::move(contact));                                                                  \
+        return guarded([&] {                                                                                           \
+            auto contact = std::make_unique<tc::Contact<R>>(program);                                                  \
+            contact->x = fields[0], contact->base = fields[1], contact->grid.assign(fields + 2, fields + count);       \
+            contact->spacing = R(lengths[0]), contact->skin = R(lengths[1]), contact->chunk = limits[0];               \
+            contact->place.assign(places, places + 3 * each);                                                          \
+            if (limits[2] != tc::Search<R>::MOST) throw std::logic_error("patches of another size: stages.py");       \
+            contact->search.fill(corners, triangles, R(lengths[2]), limits[1], order, starts, meet, apart);            \
+            program.words = (triangles + 31) / 32, program.rows = tc::LISTS, program.counts = tc::COUNTS;              \
+            program.stages.push_back(std::move(contact));                                                              \
+        });                                                                                                            \
     }                                                                                                                  \
     TC_API void tc_per_mass_##s(void* e, int mass, int given, int out, double least) {                                 \
         static_cast<Engine<R>*>(e)->program.stages.push_back(                                                          \
