@@ -119,6 +119,13 @@ class Cloth(nn.Module):
     def engine(self, setting: Setting) -> None:
         self._engine: Setting = check_setting(setting)
 
+    @property
+    def engine_in_use(self) -> str:
+        """What computes the substeps: "fused", "fused, with effects.NAME in torch", or "reference (and why)"."""
+        with torch.no_grad():
+            model = self.model()
+            return str(self._choice(model, likeness(model, self._vertices)))
+
     # -- states ---------------------------------------------------------------------------------------------------
 
     def rest_state(self) -> ClothState:
@@ -213,8 +220,7 @@ class Cloth(nn.Module):
 
     def stable_step(self) -> float:
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
-        with torch.no_grad():
-            return stable_step_of(self.model(), self._gradient)
+        return stable_step_of(self.model(), self._gradient)
 
     def model(self) -> Model:
         """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
@@ -247,9 +253,10 @@ class Cloth(nn.Module):
         """What ``forward`` does, checked."""
         frames = check_times(times)
         motion = check_motions(motion, self.boundaries, frames, self._area)
-        limit = check_step(dt, self.stable_step())
+        model = self.model()
+        limit = check_step(dt, stable_step_of(model, self._gradient))
         counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
-        return self._ready(state, motion, frames, counts)
+        return self._ready(model, state, motion, frames, counts)
 
     def settling(
         self, state: ClothState, motion: Mapping[str, Trajectory], start: float, duration: float, rate: float
@@ -257,8 +264,9 @@ class Cloth(nn.Module):
         """What ``settle`` does, checked."""
         frames = [start, start + duration]
         motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
-        count = int(np.ceil(duration * (1 / self.stable_step() + rate)))
-        return self._ready(state, motion, frames, [count], rate)
+        model = self.model()
+        count = int(np.ceil(duration * (1 / stable_step_of(model, self._gradient) + rate)))
+        return self._ready(model, state, motion, frames, [count], rate)
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
@@ -271,13 +279,13 @@ class Cloth(nn.Module):
 
     def _ready(
         self,
+        model: Model,
         state: ClothState,
         motion: Mapping[str, Trajectory],
         frames: list[float],
         counts: list[int],
         settling: float | None = None,
     ) -> Plan:
-        model = self.model()
         check_state(state, likeness(model, self._vertices))
         if settling is not None:
             model = damped(model, settling)
@@ -294,7 +302,4 @@ class Cloth(nn.Module):
         """Data sheet: size, contact, step."""
         size = f"{len(self.mesh.vertices)} vertices, {len(self.mesh.faces)} triangles, {self.mesh.area.sum():.4g} m^2"
         grid = "none" if self._grid is None else self._grid.words
-        with torch.no_grad():
-            model = self.model()
-            engine = self._choice(model, likeness(model, self._vertices))
-        return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s\nengine: {engine}"
+        return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s\nengine: {self.engine_in_use}"

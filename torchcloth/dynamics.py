@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from ._math import cross
 from .boundaries import Drive
+from .effects import AbstractEffect
+from .errors import InvalidInput
 from .model import Model, assemble
 from .types import ClothState, Memory, Moment, Surface
 
@@ -32,7 +34,7 @@ def vertex_forces(
     first = -(second + third)
     direct = None
     for name, (effect, c) in model.effects.items():
-        force = effect.force(c, Moment(state.x, state.v, s, model.mass, memory.get(f"effects.{name}")))
+        force = force_of(name, effect, c, Moment(state.x, state.v, s, model.mass, memory.get(f"effects.{name}")))
         if force is None:
             continue
         if effect.acts_on == "triangles":
@@ -42,6 +44,20 @@ def vertex_forces(
             direct = force if direct is None else direct + force
     total = assemble(g, (first, second, third), state.x)
     return total if direct is None else total + direct
+
+
+def force_of(name: str, effect: AbstractEffect, c: Any, now: Moment) -> Tensor | None:
+    """What an effect gives [..., V or E, 3] N; None: nothing.
+
+    Raises:
+        InvalidInput: another shape than it promised.
+    """
+    force = effect.force(c, now)
+    rows = (now.x if effect.acts_on == "vertices" else now.surface.n).shape[-2]
+    if force is not None and force.shape[-2:] != (rows, 3):
+        expected = f"[..., {rows}, 3], a row for each of the {effect.acts_on}"
+        raise InvalidInput(f"force of effect {name!r}", got=f"shape {tuple(force.shape)}", expected=expected)
+    return force
 
 
 def resistance_of(model: Model, s: Surface, x: Tensor) -> Tensor | None:

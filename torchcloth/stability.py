@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from .errors import InvalidInput
 from .materials import Stiffness
@@ -13,8 +14,11 @@ from .strain import grown_gradient
 SAFETY = 0.7  # of the linear limit: leaves room for tangents that double beyond what the material states
 
 
+@torch.no_grad()
 def stable_step_of(model: Model, gradient: Tensor) -> float:
     """``stable_step`` of a cloth with all its parts; ``gradient``: of the shape functions of the pattern.
+
+    What was found last for a mesh is remembered, with all numbers that it hangs on.
 
     Raises:
         InvalidInput: a precision in which a substep is lost in rounding.
@@ -25,9 +29,18 @@ def stable_step_of(model: Model, gradient: Tensor) -> float:
     spacing = None if model.grid is None else model.grid.spacing
     extra = [effect.rates(c, model.mass) for effect, c in model.effects.values()]
     elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
-    gradient = gradient if model.rest is None else grown_gradient(gradient, model.rest)
     stiffness = model.material.stiffness(model.coefficients)
-    return stable_step(gradient, model.areal_density, stiffness, spacing, elastic, damping)
+    numbers = (*stiffness, model.areal_density, *([] if model.rest is None else [model.rest]))
+    hangs_on = (gradient._version, spacing, elastic, damping, *((t.dtype, t.detach().tolist()) for t in numbers))
+    before, step = _KNOWN.get(gradient) or (None, 0.0)
+    if before != hangs_on:
+        shape = gradient if model.rest is None else grown_gradient(gradient, model.rest)
+        step = stable_step(shape, model.areal_density, stiffness, spacing, elastic, damping)
+        _KNOWN[gradient] = hangs_on, step
+    return step
+
+
+_KNOWN: WeakTensorKeyDictionary = WeakTensorKeyDictionary()  # by the gradient, which belongs to one mesh
 
 
 def stable_step(

@@ -198,6 +198,8 @@ def test_the_engine_may_be_set_at_any_time():
 
 def test_print_says_which_engine_runs_and_why():
     assert "\n  engine: fused\n" in str(sheet())
+    assert sheet().engine_in_use == "fused"
+    assert sheet("reference").engine_in_use == "reference (as asked for)"
     assert "engine: reference (as asked for)" in str(sheet("reference"))
     assert "engine: reference (boundary 'floor' (Floor) has no kernels)" in str(sheet(boundaries={"floor": Floor()}))
 

@@ -182,3 +182,25 @@ def test_memory_is_bounded_by_checkpoints(monkeypatch):
         return total
 
     assert kept(True) < kept(False) / 20
+
+
+class Clumsy(Pull):
+    """One row for all."""
+
+    def force(self, c, now):
+        return c * now.v.mean(-2, keepdim=True)
+
+
+class Misplaced(Blow):
+    """Rows of the vertices where those of triangles are due."""
+
+    def force(self, c, now):
+        return c * now.v
+
+
+@pytest.mark.parametrize("engine", ["reference", "auto"])
+@pytest.mark.parametrize("kind", [Clumsy, Misplaced])
+def test_a_force_of_another_shape_is_refused_by_name(engine, kind):
+    cloth = cloth_with(engine, kind)
+    with pytest.raises(tc.errors.InvalidInput, match=r"force of effect 'own'.*a row for each of the"):
+        cloth(start(cloth), opening(END), TIMES)

@@ -21,8 +21,8 @@ from pathlib import Path
 
 SOURCES = Path(__file__).parent / "csrc"
 FLAGS = (
-    "-std=c++20 -O3 -march=native -fPIC -fno-math-errno -fno-trapping-math -fno-signed-zeros -fvisibility=hidden "
-    "-Wno-psabi -pthread"
+    "-std=c++20 -O3 -march=native -fPIC -fno-strict-aliasing -fno-math-errno -fno-trapping-math -fno-signed-zeros "
+    "-fvisibility=hidden -Wno-psabi -pthread"
 )
 CLANG = "-fbracket-depth=16384 -fconstexpr-steps=200000000"  # its limits are lower than a kernel's trace
 SPEED = 500.0  # bytes of kernels that one core compiles in a second, measured with g++ 12

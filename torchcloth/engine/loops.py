@@ -15,7 +15,6 @@ from enum import IntEnum
 
 from .fields import Field
 from .library import kernels
-from .stages import ints
 
 OWN, SHARED, VARYING = -1, -2, -3
 LOAD, ADD, PUT, SPREAD, COLLECT = 0, 2, 3, 5, 6
@@ -110,7 +109,7 @@ class Loop:
             else:
                 number, takes, gives = rest
                 feeds = int(any(reg in read or ~reg in read for reg in gives))
-                api("call")(handle, number, ints(takes), ints(gives), feeds)
+                api("call")(handle, number, tuple(takes), tuple(gives), feeds)
 
     def _read(self) -> set[int]:
         """Registers whose values the reverse sweep needs."""

@@ -56,6 +56,7 @@ class Lowering:
         x, v: positions and velocities.
         memory: internal variables by key, as in ``ClothState.memory``.
         force: [V, 3], to be added to.
+        pulls: kernels that give each vertex a force of its own, and the fields whose rows they take; see ``pull``.
         resistance: [V, 6] kg, mass of the air that moves along (xx, xy, xz, yy, yz, zz), to be added to; None without.
         triangles: the loop over triangles that comes first; ``Triangles`` has what is computed there already.
         sheets: how the sheet is bent at its vertices, by the weights of the derivatives.
@@ -79,6 +80,7 @@ class Lowering:
         self.dt = self.program.parameter(1, 1)
         self.mass = self.parameter(model.mass)
         self.force = self.program.temporary(self.vertices, 3)
+        self.pulls: list[tuple[str, tuple[Field, ...]]] = []
         self.torch_force = self._forces_from_torch() if in_torch else None
         self.resistance: Field | None = None
         order = scattered(self.faces)
@@ -101,10 +103,13 @@ class Lowering:
         """All that goes on from substep to substep, by its name in the state."""
         return {"x": self.x, "v": self.v, **self.memory}
 
+    def pull(self, kernel: str, *fields: Field) -> None:
+        """A force on every vertex, from the vertex's own row of these fields."""
+        self.pulls.append((kernel, fields))
+
     def _forces_from_torch(self) -> Field:
         given = self.program.parameter(self.vertices, 3)
-        loop = self.loop(self.vertices)
-        loop.add(loop.call("copy3", loop.load(given)), self.force)
+        self.pull("copy3", given)
         return given
 
     def number(self, value: float) -> Field:
@@ -166,9 +171,8 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive], in_torch
     if contact is not None:
         contact.press()
     velocity = _kick(low)
-    for name, boundary in model.boundaries.items():
-        boundaries.lower(low, name, boundary, velocity)
-    _drift(low, velocity)
+    boundaries.lower(low, velocity)
+    velocity.drift()
     if contact is not None:
         contact.follow()
     low.program = low.program.ready()
@@ -186,12 +190,8 @@ def _part(name: str, lower: Callable[[], None]) -> None:
 def _kick(low: Lowering) -> Velocities:
     loop = low.loop(low.vertices)
     dt, v, force, mass = (loop.load(field) for field in (low.dt, low.v.now, low.force, low.mass))
+    for kernel, fields in low.pulls:
+        loop.call(kernel, *(loop.load(field) for field in fields), into=force)
     if low.resistance is None:
         return Velocities(low, loop, loop.call("kick", dt, v, force, mass))
     return Velocities(low, loop, loop.call("kick_in_air", dt, v, force, mass, loop.load(low.resistance)))
-
-
-def _drift(low: Lowering, velocity: Velocities) -> None:
-    loop, v = velocity.loop, velocity.now
-    loop.put(v, low.v.after)
-    loop.put(loop.call("drift", loop.load(low.dt), loop.load(low.x.now), v), low.x.after)

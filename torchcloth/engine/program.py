@@ -11,9 +11,10 @@ import ctypes
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import cached_property
 from itertools import count
 from typing import Any
-from weakref import WeakValueDictionary
+from weakref import WeakValueDictionary, finalize
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from .constants import array
 from .fields import Field, Kind
 from .library import library
 from .loops import OWN, Loop
-from .stages import Layers, PointTables, Shape, Sieve, Stencil
+from .stages import Layers, PerMass, PointTables, Shape, Sieve, Stencil
 
 
 class Program:
@@ -38,7 +39,7 @@ class Program:
         self.fields: list[Field] = []
         self._constants: dict[bytes, Field] = {}
         self._tables: dict[bytes, int] = {}
-        self._stages: list[Loop | Stencil | Sieve | Layers] = []
+        self._stages: list[Loop | Stencil | Sieve | Layers | PerMass] = []
         self._lists = 0
         self._written: list[tuple[str, tuple]] = []
 
@@ -78,9 +79,9 @@ class Program:
         """Added up over all substeps."""
         return self._field(Kind.SUM, 1, comps)
 
-    def nodes(self, comps: int) -> Field:
-        """Of contact, which sees to its memory: numbers of the nodes that are touched, or of the points."""
-        return self._field(Kind.NODES, 0, comps)
+    def nodes(self) -> Field:
+        """Of contact, which sees to its memory: mass and a vector of the nodes that are touched."""
+        return self._field(Kind.NODES, 0, 4)
 
     def points(self, comps: int) -> Field:
         """What varying loops over points tell each other; put once in a substep."""
@@ -133,6 +134,10 @@ class Program:
         """Find at every substep what the varying loops run over."""
         self._stages.append(layers)
 
+    def per_mass(self, mass: Field, given: Field, out: Field, least: float) -> None:
+        """out = given / mass on the nodes, where the mass is more than ``least``; see ``csrc/per_mass.h``."""
+        self._stages.append(PerMass(mass, given, out, least))
+
     def sieve(self, x: Field, reach: Field, dt: Field, points: PointTables, steep: float) -> int:
         """A list of the points on triangles that may touch a body in this substep; see ``csrc/sieve.h``.
 
@@ -165,12 +170,12 @@ class Program:
         self._written.clear()
         return known
 
-    @property
+    @cached_property
     def inputs(self) -> list[Field]:
         """States, parameters and drives, in the order in which the operators take them."""
         return [f for f in self.fields if f.kind in (Kind.STATE, Kind.PARAMETER, Kind.DRIVE)]
 
-    @property
+    @cached_property
     def outputs(self) -> list[Field]:
         """Nexts and sums, in the order in which the operators give them."""
         return [f for f in self.fields if f.kind in (Kind.NEXT, Kind.SUM)]
@@ -197,18 +202,19 @@ class Program:
         return write
 
     def _key(self) -> bytes:
-        known = hashlib.sha256(self._letter.encode())
+        known, text = hashlib.sha256(self._letter.encode()), []
         for name, arguments in self._written:
-            known.update(name.encode())
             for value in arguments:
-                known.update(bytes(value) if isinstance(value, (np.ndarray, ctypes.Array)) else repr(value).encode())
-                known.update(b",")
+                if isinstance(value, np.ndarray):
+                    known.update(_digest(value))
+            text.append((name, *(v.shape if isinstance(v, np.ndarray) else v for v in arguments)))
+        known.update(repr(text).encode())
         return known.digest()
 
     def _hand_over(self) -> None:
         self._handle = ctypes.c_void_p(getattr(library(), f"tc_new_{self._letter}")())
         for name, arguments in self._written:
-            done = self._call(name, *(a.ctypes.data if isinstance(a, np.ndarray) else a for a in arguments))
+            done = self._call(name, *(_for_c(a) for a in arguments))
             if name not in ("field", "table"):  # they give a number
                 _check(done or 0)
         self._call("ready")
@@ -223,6 +229,27 @@ MOST_KEPT = 64  # programs that wait for the next call, besides those that are i
 _KEPT: OrderedDict[bytes, Program] = OrderedDict()
 _KNOWN: WeakValueDictionary[int, Program] = WeakValueDictionary()
 _NUMBERS = count()
+
+
+def _for_c(value: Any) -> Any:
+    """Arrays by their memory, tuples as arrays of int."""
+    if isinstance(value, np.ndarray):
+        return value.ctypes.data
+    return (ctypes.c_int * len(value))(*value) if isinstance(value, tuple) else value
+
+
+def _digest(values: np.ndarray) -> bytes:
+    """Of the numbers; remembered for large arrays that nobody can write to."""
+    if values.nbytes < LARGE or values.flags.writeable or values.base is not None:
+        return hashlib.sha256(values.data).digest() if values.nbytes else b""
+    if id(values) not in _DIGESTS:
+        _DIGESTS[id(values)] = hashlib.sha256(values.data).digest()
+        finalize(values, _DIGESTS.pop, id(values))
+    return _DIGESTS[id(values)]
+
+
+LARGE = 2**14  # bytes
+_DIGESTS: dict[int, bytes] = {}
 
 
 def program_of(number: int) -> Program:

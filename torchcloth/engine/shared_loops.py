@@ -130,13 +130,16 @@ class Velocities:
     """The vertices' velocities on their way from the forces to the drift: registers, as long as one loop will do.
 
     Attributes:
-        loop: over the vertices, the last of the program.
+        loop: over the vertices, where they are in registers.
         now: registers of the velocities in it.
         before: registers of what they were before the present boundary.
+        field: where they are otherwise, for what changes few of them.
     """
 
     def __init__(self, low: Lowering, loop: Loop, now: list[int]) -> None:
         self._low, self.loop, self.now, self.before = low, loop, now, now
+        self.field: Field | None = None
+        self._drifted = False
 
     def store(self) -> Field:
         """End the loop; returns the velocities, for what is not done vertex by vertex. ``resume`` when it is done."""
@@ -148,6 +151,42 @@ class Velocities:
         """A new loop, with the velocities of a field."""
         self.loop = self._low.loop(self._low.vertices)
         self.now, self.before = self.loop.load(field), self.loop.load(self._stored)
+
+    def leave(self, drift: bool) -> Field:
+        """Put all into ``field``; ``drift``: there they stay, so that the positions can follow at once."""
+        if self.field is None and drift:
+            self.drift()
+            self.field = self._low.v.after
+        elif self.field is None:
+            self.before = self.now
+            self.field = self.store()
+        return self.field
+
+    def enter(self) -> None:
+        """Back into registers."""
+        if self.field is not None:
+            self.resume(self.field)
+            self.field = None
+
+    def overwrite(self, loop: Loop, rows: int, now: list[int]) -> None:
+        """Other velocities for some rows of ``field``, from a loop over these."""
+        if self.field is None:
+            raise ValueError("the velocities are in registers")
+        loop.put(now, self.field, rows)
+        if self._drifted:
+            self._follow(loop, now, rows)
+
+    def drift(self) -> None:
+        """Positions follow, once."""
+        if not self._drifted:
+            self.enter()
+            self.loop.put(self.now, self._low.v.after)
+            self._follow(self.loop, self.now)
+            self._drifted = True
+
+    def _follow(self, loop: Loop, now: list[int], rows: int | None = None) -> None:
+        low = self._low
+        loop.put(loop.call("drift", loop.load(low.dt), loop.load(low.x.now, rows), now), low.x.after, rows)
 
     def _put(self, regs: list[int]) -> Field:
         field = self._low.program.temporary(self._low.vertices, 3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
@@ -10,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .fields import Field
+
+PATCH = 8  # triangles of a patch, as in csrc/search.h: a bit of a byte for each
 
 
 class Shape(IntEnum):
@@ -25,7 +26,6 @@ class Layers(NamedTuple):
     corners: np.ndarray  # [3, E] int32
     places: np.ndarray  # [S, 3] float64, barycentric
     lengths: tuple[float, float, float]  # spacing, skin, reach [m]
-    wrap: int
     chunk: int
     order: np.ndarray  # [E] int32, patch by patch
     starts: np.ndarray  # [patches + 1] int32; [1]: all triangles take part always
@@ -34,13 +34,26 @@ class Layers(NamedTuple):
 
     def emit(self, handle, api) -> None:
         """Write it down."""
-        ids = ints([field.id for field in self.fields])
-        limits = ints([self.wrap, self.chunk, len(self.starts) - 1])
-        lengths = (ctypes.c_double * 3)(*self.lengths)
-        corners, places = _array(self.corners), _array(self.places)
-        search = (_array(a) for a in (self.order, self.starts, self.meet, self.apart))
+        ids = tuple(field.id for field in self.fields)
+        limits = (self.chunk, len(self.starts) - 1, PATCH)
         sizes = self.corners.shape[1], len(self.places)
+        lengths = np.array(self.lengths, np.float64)
+        search = (np.ascontiguousarray(a) for a in (self.order, self.starts, self.meet, self.apart))
+        corners, places = np.ascontiguousarray(self.corners), np.ascontiguousarray(self.places)
         api("contact")(handle, ids, len(ids), corners, sizes[0], places, sizes[1], lengths, limits, *search)
+
+
+class PerMass(NamedTuple):
+    """See ``Program.per_mass``."""
+
+    mass: Field
+    given: Field
+    out: Field
+    least: float
+
+    def emit(self, handle, api) -> None:
+        """Write it down."""
+        api("per_mass")(handle, self.mass.id, self.given.id, self.out.id, self.least)
 
 
 class PointTables(NamedTuple):
@@ -79,12 +92,3 @@ class Stencil(NamedTuple):
     def emit(self, handle, api) -> None:
         """Write it down."""
         api("stencil")(handle, self.table, self.weight.id, self.x.id, self.y.id, int(self.shape))
-
-
-def ints(values: Sequence[int]):
-    """As C takes them."""
-    return (ctypes.c_int * len(values))(*values)
-
-
-def _array(values: np.ndarray):
-    return np.ctypeslib.as_ctypes(np.ascontiguousarray(values).reshape(-1))

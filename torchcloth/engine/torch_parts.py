@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..boundaries import Drive
-from ..dynamics import vertex_forces
+from ..dynamics import force_of, vertex_forces
 from ..effects import AbstractEffect
 from ..model import Model, assemble, surface
 from ..strain import evolve, membrane_stress
@@ -54,7 +54,8 @@ class TorchParts:
             return vertex_forces(self.model, state, s, memory, membrane_stress(self.model, s, memory)), memory
         total, shares = torch.zeros_like(state.x), None
         for name, (effect, c) in self.model.effects.items():
-            force = effect.force(c, Moment(state.x, state.v, s, self.model.mass, memory.get(f"effects.{name}")))
+            now = Moment(state.x, state.v, s, self.model.mass, memory.get(f"effects.{name}"))
+            force = force_of(name, effect, c, now)
             if force is not None and effect.acts_on == "triangles":
                 shares = force / 3 if shares is None else shares + force / 3
             elif force is not None:

@@ -14,8 +14,8 @@
 namespace tc {
 
 // Rows of Scene::rows and Scene::counts, in the order of engine/parts/contact.py.
-enum Listed { POINTS_LIST, WOKEN_LIST = 7, ASLEEP_LIST = 13, LISTS = 19 };
-enum Counted { POINTS, WOKEN, ASLEEP, NODES, COUNTS };
+enum Listed { POINTS_LIST, ASLEEP_LIST = 13, LISTS = 19 };
+enum Counted { POINTS, WOKEN, ASLEEP, COUNTS };
 
 // What one scene remembers.
 template <class R>
@@ -36,7 +36,6 @@ struct Contact : Stage<R> {
     std::vector<R> place;      // [points of a triangle, 3] barycentric
     int chunk;                 // substeps after which the search is repeated anyway: intervals.py
     R spacing, skin;
-    int wrap;
 
     Contact(const Program<R>& p) : program(p) { this->again = true; }
 
@@ -56,11 +55,12 @@ struct Contact : Stage<R> {
         if (changed) {
             near.points.list(near.mask, true, search.corner, search.triangles, each());
             near.listed = near.mask;
+            s.lists_made++;
         }
         list_woken(s, near, before);
         near.asleep.list(near.mask, false, search.corner, s.substep == s.substeps - 1 ? search.triangles : 0, each());
         if (changed) near.points.weigh(place);
-        near.nodes.place(near.points, s.value[x], spacing, wrap, changed);
+        near.nodes.place(near.points, s.value[x], program.fields[x].rows, spacing, changed);
         show(s, near);
         make_room(s, near);
     }
@@ -112,16 +112,15 @@ struct Contact : Stage<R> {
     void show(Scene<R>& s, const Layers<R>& near) const {
         near.points.show(&s.rows[POINTS_LIST]), near.woken.show(&s.rows[WOKEN_LIST]), near.asleep.show(&s.rows[ASLEEP_LIST]);
         s.rows[WOKEN_LIST - 1] = near.nodes.around.data();
-        const int points = near.points.size();
-        s.counts = {points, near.woken.size(), near.asleep.size(), points ? near.nodes.count : 0};
-        s.value[base] = const_cast<R*>(near.nodes.lowest.data);
+        s.counts = {near.points.size(), near.woken.size(), near.asleep.size()};
+        s.value[base] = const_cast<R*>(reinterpret_cast<const R*>(near.nodes.lowest.data));
     }
 
     void make_room(Scene<R>& s, Layers<R>& near) const {
         const size_t packed = round_up(near.points.size(), LANES<R>);
         for (size_t i = 0; i < grid.size(); i++) {
             const Field& f = program.fields[grid[i]];
-            const size_t count = f.kind == Kind::points ? packed * f.comps : size_t(near.nodes.count) * ON_NODE;
+            const size_t count = f.kind == Kind::points ? packed * f.comps : size_t(near.nodes.count()) * ON_BLOCK;
             const bool adds = i < 2;
             s.value[grid[i]] = room(near.value[i], count, adds);
             if (s.bars.size) s.bar[grid[i]] = room(near.bar[i], count, true);

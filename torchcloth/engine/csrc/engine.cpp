@@ -5,6 +5,7 @@
 #include "kernels/kernels.h"
 #include "derivatives.h"
 #include "loop.h"
+#include "per_mass.h"
 #include "run.h"
 #include "sieve.h"
 #include "stencil.h"
@@ -90,18 +91,24 @@ struct Engine {
             engine.program.registers = std::max(engine.program.registers, share + tc::SHARES);                         \
         });                                                                                                            \
     }                                                                                                                  \
-    TC_API void tc_contact_##s(void* e, const int* fields, int count, const int* corners, int triangles,               \
-                               const double* places, int each, const double* lengths, const int* limits,               \
-                               const int* order, const int* starts, const uint8_t* meet, const uint8_t* apart) {       \
+    TC_API int tc_contact_##s(void* e, const int* fields, int count, const int* corners, int triangles,                \
+                              const double* places, int each, const double* lengths, const int* limits,                \
+                              const int* order, const int* starts, const uint8_t* meet, const uint8_t* apart) {        \
         auto& program = static_cast<Engine<R>*>(e)->program;                                                           \
-        auto contact = std::make_unique<tc::Contact<R>>(program);                                                      \
-        contact->x = fields[0], contact->base = fields[1], contact->grid.assign(fields + 2, fields + count);           \
-        contact->spacing = R(lengths[0]), contact->skin = R(lengths[1]);                                               \
-        contact->wrap = limits[0], contact->chunk = limits[1];                                                         \
-        contact->place.assign(places, places + 3 * each);                                                              \
-        contact->search.fill(corners, triangles, R(lengths[2]), limits[2], order, starts, meet, apart);                \
-        program.words = (triangles + 31) / 32, program.rows = tc::LISTS, program.counts = tc::COUNTS;                  \
-        program.stages.push_back(std::move(contact));                                                                  \
+        return guarded([&] {                                                                                           \
+            auto contact = std::make_unique<tc::Contact<R>>(program);                                                  \
+            contact->x = fields[0], contact->base = fields[1], contact->grid.assign(fields + 2, fields + count);       \
+            contact->spacing = R(lengths[0]), contact->skin = R(lengths[1]), contact->chunk = limits[0];               \
+            contact->place.assign(places, places + 3 * each);                                                          \
+            if (limits[2] != tc::Search<R>::MOST) throw std::logic_error("patches of another size: stages.py");       \
+            contact->search.fill(corners, triangles, R(lengths[2]), limits[1], order, starts, meet, apart);            \
+            program.words = (triangles + 31) / 32, program.rows = tc::LISTS, program.counts = tc::COUNTS;              \
+            program.stages.push_back(std::move(contact));                                                              \
+        });                                                                                                            \
+    }                                                                                                                  \
+    TC_API void tc_per_mass_##s(void* e, int mass, int given, int out, double least) {                                 \
+        static_cast<Engine<R>*>(e)->program.stages.push_back(                                                          \
+            std::make_unique<tc::PerMass<R>>(mass, given, out, R(least)));                                             \
     }                                                                                                                  \
     TC_API int tc_move_##s(void* e, int code, int field, int table, int reg) {                                         \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
@@ -111,6 +118,8 @@ struct Engine {
             loop.code.push_back(                                                                                       \
                 {tc::Instruction::Code(code), field, table, reg, comps, -1, {}, {}, false, loop.slot(table),           \
                  engine.program.fields[field].kind == tc::Kind::points});                                              \
+            if (code == tc::Instruction::load && loop.is_fixed(field, table))                                          \
+                loop.code.back().fixed = engine.program.fixed++;                                                       \
             engine.program.registers = std::max(engine.program.registers, reg + comps);                                \
         });                                                                                                            \
     }                                                                                                                  \

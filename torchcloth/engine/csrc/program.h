@@ -65,6 +65,15 @@ struct List {
     int count = 0;
 };
 
+// Inputs in the order in which a loop needs them: [packs, components, lanes].
+template <class R>
+struct Fixed {
+    Buffer<R> packs;
+    int made = -1;  // for which lists of contact
+};
+
+constexpr int WOKEN_LIST = 7;  // where rows begin that contact lists anew at every substep: contact.h
+
 template <class R>
 struct Layers;  // contact.h
 
@@ -80,6 +89,8 @@ struct Scene {
     std::vector<int> counts;
     std::vector<const int*> rows;
     std::shared_ptr<Layers<R>> layers;
+    std::vector<Fixed<R>> fixed;
+    int lists_made = 0;  // how often contact listed other points
     int64_t substep = 0, substeps = 0;
     int32_t* masks = nullptr;  // triangles that take part, a bit each: [substeps, words]
     bool knows = false;        // masks are there already
@@ -102,7 +113,7 @@ struct Program {
     std::vector<int> next;  // by field: of a state, where it goes; else -1
     std::vector<std::vector<int>> tables;  // padded to whole packs
     std::vector<std::unique_ptr<Stage<R>>> stages;
-    int registers = 0, lists = 0;
+    int registers = 0, lists = 0, fixed = 0;
     int counts = 0, rows = 0, words = 0;  // sizes of what Scene has for contact
     size_t state_size = 0, record_size = 0;  // numbers
 

@@ -184,6 +184,7 @@ class Run {
         m.scene.substeps = call.substeps, m.scene.knows = mode == Mode::reverse;
         m.scene.masks = call.every ? reinterpret_cast<int32_t*>(record(scene, 1 + (call.substeps + call.every - 1) / call.every)) : nullptr;
         m.scene.regs.reset(program.registers), m.scene.lists.resize(program.lists);
+        m.scene.fixed.resize(program.fixed);
         if (mode == Mode::reverse) m.scene.bars.reset(program.registers);
         if (mode == Mode::tangent) m.scene.dots.reset(size_t(program.registers) * LANES<R>);
         for (size_t f = 0; f < count; f++) {

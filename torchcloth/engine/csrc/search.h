@@ -75,8 +75,9 @@ struct Search {
         }
     }
 
+    static constexpr int MOST = 8;  // triangles of a patch: engine/stages.py
+
   private:
-    static constexpr int MOST = 8;  // triangles of a patch: parts/patches.py
     using Eight = Pack<R, MOST>;
     struct Together {
         Eight at[3];

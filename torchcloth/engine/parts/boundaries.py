@@ -2,39 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, cast
 
-import torch
-from torch import Tensor
-
-from ...boundaries import AbstractBoundary, AbstractCollider, Box, Capsule, Cylinder, Grasp, MeshSolid, Plane, Sphere
+from ...boundaries import AbstractCollider, Box, Capsule, Cylinder, Grasp, MeshSolid, Plane, Sphere
 from ...effects import GripSlip
 from ..fields import Field
+from ..loops import Loop
 from ..lowering import Lowering, Unfused
 from ..shared_loops import Velocities
 from . import points
 from .body import Body
 
 
-def lower(low: Lowering, name: str, boundary: AbstractBoundary, velocity: Velocities) -> None:
-    """Add a boundary to the program, and what it gives if it is driven. dynamics.py, ``constrain``"""
-    part = _BOUNDARIES.get(type(boundary))
-    if part is None:
-        raise Unfused(f"boundary {name!r} ({type(boundary).__name__})")
-    velocity.before = velocity.now
-    part(low, name, boundary, velocity)
-    if name in low.drives:
-        _slip(low, name, boundary, velocity)
-        _report(low, name, velocity)
+def lower(low: Lowering, velocity: Velocities) -> None:
+    """Add all boundaries to the program, in order, and what the driven ones give. dynamics.py, ``constrain``"""
+    parts = list(low.model.boundaries.items())
+    for k, (name, boundary) in enumerate(parts):
+        if type(boundary) is Grasp:
+            field = velocity.leave(drift=all(type(other) is Grasp for _, other in parts[k:]))
+            if name in low.drives:
+                _grasp(low, name, boundary, velocity, field)
+            continue
+        if type(boundary) not in _SOLIDS:
+            raise Unfused(f"boundary {name!r} ({type(boundary).__name__})")
+        velocity.enter()
+        velocity.before = velocity.now
+        _collide(low, name, cast("AbstractCollider", boundary), velocity)
+        if name in low.drives:
+            _report(low, name, velocity.loop, None, velocity.before, velocity.now)
 
 
-def _grasp(low: Lowering, name: str, grasp: Grasp, velocity: Velocities) -> None:
-    if name not in low.drives:
-        return
-    loop, (increment, _, closed) = velocity.loop, low.drives[name]
-    numbers = (increment, low.dt, _held(low, grasp.index), closed, low.x.now)
-    velocity.now = loop.call("grasp", *(loop.load(field) for field in numbers), velocity.now)
+def _grasp(low: Lowering, name: str, grasp: Grasp, velocity: Velocities, field: Field) -> None:
+    """On the held vertices alone, whose rows are overwritten; what they were is kept for the reverse sweep."""
+    rows, count, (increment, _, closed) = low.program.table(grasp.index), len(grasp.index), low.drives[name]
+    free = low.program.temporary(count, 3)
+    loop = low.loop(count)
+    loop.put(loop.load(field, rows), free)
+    loop = low.loop(count)
+    numbers = [loop.load(given) for given in (increment, low.dt, closed)]
+    held = loop.call("grasp", *numbers, loop.load(low.x.now, rows), loop.load(free))
+    for key, (effect, c) in low.model.effects.items():
+        if effect.grasp != name:
+            continue
+        if type(effect) is not GripSlip:
+            raise Unfused(f"effect {key!r} ({type(effect).__name__})")
+        loop, held = _slip(low, rows, loop, free, held, c)
+    _report(low, name, loop, rows, loop.load(free), held)
+    velocity.overwrite(loop, rows, held)
 
 
 def _collide(low: Lowering, name: str, solid: AbstractCollider, velocity: Velocities) -> None:
@@ -45,37 +59,22 @@ def _collide(low: Lowering, name: str, solid: AbstractCollider, velocity: Veloci
     velocity.now = loop.call("plus3", velocity.now, body.change(loop, loop.load(low.x.now), velocity.now))
 
 
-def _held(low: Lowering, index: Tensor) -> Field:
-    """1 for the vertices of a patch, 0 for the others: on all of them a loop need not be interrupted."""
-    held = torch.zeros(low.vertices, 1)
-    held[index.cpu()] = 1
-    return low.program.constant(held)
+def _slip(low: Lowering, rows: int, loop: Loop, free: Field, held: list[int], c: Any) -> tuple[Loop, list[int]]:
+    """(a new loop over the held vertices, their velocities in it)."""
+    pull, still = low.program.temporary(1, 4), low.program.temporary(free.rows, 3)
+    loop.add(loop.call("pull", loop.load(low.mass, rows), loop.load(free), held), pull)
+    loop.put(held, still)
+    loop = low.loop(free.rows)
+    fields = (pull, low.parameter(c.mobility), low.parameter(c.hold), low.dt)
+    return loop, loop.call("creep", loop.load(still), *(loop.load(field) for field in fields))
 
 
-def _slip(low: Lowering, name: str, boundary: AbstractBoundary, velocity: Velocities) -> None:
-    for key, (effect, c) in low.model.effects.items():
-        if effect.grasp != name:
-            continue
-        if type(effect) is not GripSlip:
-            raise Unfused(f"effect {key!r} ({type(effect).__name__})")
-        held, pull = _held(low, cast("Tensor", boundary.index)), low.program.temporary(1, 4)
-        loop = velocity.loop
-        parts = (loop.load(held), loop.load(low.mass), velocity.before, velocity.now)
-        loop.add(loop.call("pull", *parts), pull)
-        velocity.resume(velocity.store())
-        loop, fields = velocity.loop, (pull, low.parameter(c.mobility), low.parameter(c.hold), low.dt)
-        velocity.now = loop.call("creep", loop.load(held), velocity.now, *(loop.load(field) for field in fields))
-
-
-def _report(low: Lowering, name: str, velocity: Velocities) -> None:
+def _report(low: Lowering, name: str, loop: Loop, rows: int | None, before: list[int], after: list[int]) -> None:
     """Impulse and its moment about the body."""
-    loop, (increment, pose, _) = velocity.loop, low.drives[name]
-    momentum = low.momentum(loop, loop.call("change", velocity.now, velocity.before))
-    place = [loop.load(field) for field in (low.x.now, increment, pose)]
+    increment, pose, _ = low.drives[name]
+    momentum = low.momentum(loop, loop.call("change", after, before), rows)
+    place = loop.load(low.x.now, rows), loop.load(increment), loop.load(pose)
     loop.add(loop.call("impulse", momentum, *place), low.impulses[name])
 
 
-_BOUNDARIES: dict[type, Callable[[Lowering, str, Any, Velocities], None]] = {
-    Grasp: _grasp,
-    **dict.fromkeys((Box, Capsule, Cylinder, MeshSolid, Plane, Sphere), _collide),
-}
+_SOLIDS = (Box, Capsule, Cylinder, MeshSolid, Plane, Sphere)

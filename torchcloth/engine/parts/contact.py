@@ -38,7 +38,7 @@ class Rows(IntEnum):
 class Count(IntEnum):
     """And how many."""
 
-    POINTS, WOKEN, ASLEEP, NODES = range(4)
+    POINTS, WOKEN, ASLEEP = range(3)
 
 
 class Contact:
@@ -53,12 +53,12 @@ class Contact:
         self.low, self.grid = low, grid
         self.d3, self.closing = low.memory[DIRECTORS], low.memory["contact"]
         program = low.program
-        self.mass, self.momentum, self.change, self.velocity = self.nodes = [program.nodes(4) for _ in range(4)]
-        self.lowest = program.nodes(3)
+        self.mass, self.momentum, self.change, self.velocity = self.nodes = [program.nodes() for _ in range(4)]
         self.points = [program.points(comps) for comps in (16, 3, 1)]  # surface, offset, mass
+        self.lowest = program.points(3)  # node
         self.lengths = program.constant(torch.tensor([[grid.spacing, 1 / grid.spacing]], dtype=torch.float64))
         self.share = low.number(1 / len(grid.points))
-        self.least = low.number(torch.finfo(program.dtype).tiny ** 0.5)
+        self.least = torch.finfo(program.dtype).tiny ** 0.5  # kg
         self.play = low.number(grid.play)
         slowing = 2 * grid.damping / (FADING * grid.spacing) ** 2
         self.losses = program.constant(torch.tensor([[grid.damping, slowing]], dtype=torch.float64))
@@ -82,8 +82,7 @@ class Contact:
         p.to_corners(forces, self.low.force)
         shares = p.loop.call("force_shares", p.lengths, d3, p.mass, given[6:])
         p.loop.spread(p.offset, shares, self.mass, Rows.NODES.table(), By.SLOPES)
-        loop = self.low.program.varying(Count.NODES, again=True)
-        loop.put(loop.call("node_change", loop.load(self.least), loop.load(self.mass)), self.change)
+        self.low.program.per_mass(self.mass, self.mass, self.change, self.least)
         self._repel()
 
     def _repel(self) -> None:
@@ -98,9 +97,7 @@ class Contact:
         v = p.corners(self.low.v.after)
         carried = p.loop.call("carried", p.surface, *v, p.mass, p.place, p.shape, p.lengths)
         p.loop.spread(p.offset, carried, self.momentum, Rows.NODES.table(), By.ARMS)
-        loop = self.low.program.varying(Count.NODES, again=True)
-        parts = (loop.load(field) for field in (self.least, self.mass, self.momentum))
-        loop.put(loop.call("node_velocity", *parts), self.velocity)
+        self.low.program.per_mass(self.mass, self.momentum, self.velocity, self.least)
         self._turn()
         after = self.low.x.after, self.d3.after, self.closing.after
         self._alone(Count.ASLEEP, Rows.ASLEEP, *after)
@@ -137,7 +134,6 @@ class Contact:
             corners=corners.cpu().numpy().astype("int32"),
             places=grid.points.cpu().double().numpy(),
             lengths=(grid.spacing, grid.skin, grid.reach),
-            wrap=grid.nodes,
             chunk=CHUNK,
             order=found.order,
             starts=found.starts,

@@ -34,14 +34,11 @@ def lower(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
 
 
 def _gravity(low: Lowering, name: str, effect: Gravity, c: Any) -> None:
-    loop = low.loop(low.vertices)
-    loop.add(loop.call("weight", loop.load(low.mass), loop.load(low.parameter(c))), low.force)
+    low.pull("weight", low.mass, low.parameter(c))
 
 
 def _mass_damping(low: Lowering, name: str, effect: MassDamping, c: Any) -> None:
-    loop = low.loop(low.vertices)
-    rate, mass, v = (loop.load(field) for field in (low.parameter(c), low.mass, low.v.now))
-    loop.add(loop.call("mass_damping", rate, mass, v), low.force)
+    low.pull("mass_damping", low.parameter(c), low.mass, low.v.now)
 
 
 def _air_drag(low: Lowering, name: str, effect: AirDrag, c: Any) -> None:

@@ -1,4 +1,7 @@
-"""Patches of neighbouring triangles, so that the search for layers need not look at all pairs."""
+"""Patches of neighbouring triangles, so that the search for layers need not look at all pairs.
+
+They are small against the way along the cloth from which on layers are seen.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,7 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from ...transfer import Grid
-
-# Triangles of a patch, as in csrc/search.h: a bit of a byte for each, and small against the way along the cloth from
-# which on layers are seen.
-SIZE = 8
+from ..stages import PATCH
 
 
 class Patches(NamedTuple):
@@ -41,7 +41,10 @@ def _found(apart: np.ndarray, corners: np.ndarray) -> Patches:
     bit = (1 << np.arange(len(order)) - np.repeat(starts[:-1], np.diff(starts))).astype(np.uint8)
     bits = np.add.reduceat(apart[np.ix_(order, order)] * bit, starts[:-1], axis=1, dtype=np.uint8)
     meet = np.logical_or.reduceat(bits != 0, starts[:-1], axis=0)
-    return Patches(order, starts, (meet | meet.T).astype(np.uint8), bits)
+    found = Patches(order, starts, (meet | meet.T).astype(np.uint8), bits)
+    for part in found:
+        part.setflags(write=False)
+    return found
 
 
 def _grown(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,7 +61,7 @@ def _grown(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         left.discard(first)
         while k < len(patch):
             for other in (t for vertex in corners[:, patch[k]] for t in around[vertex]):
-                if other in left and len(patch) < SIZE:
+                if other in left and len(patch) < PATCH:
                     patch.append(other)
                     left.discard(other)
             k += 1

@@ -5,21 +5,21 @@
 namespace tc {
 namespace {
 
-// increment [4, 4], dt, whether this vertex is held, whether the gripper is closed, position, velocity -> velocity.
+// increment [4, 4], dt, whether the gripper is closed, position and velocity of a held vertex -> its velocity.
 // boundaries/grasp.py
 struct Grasp {
     static constexpr const char* name = "grasp";
-    static constexpr int inputs = 25, outputs = 3;
-    static constexpr auto fixed = bits(16, 3);
+    static constexpr int inputs = 24, outputs = 3;
+    static constexpr auto fixed = bits(16, 2);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
         const auto motion = r.pose();
         r.at += 4;
-        const T dt = r.number(), held = r.number(), closed = r.number();
+        const T dt = r.number(), closed = r.number();
         const auto x = r.vec(), v = r.vec();
         const auto target = motion.R * x + motion.t;
-        Write<T>{out}.vec(select(held * closed, (target - x) / dt, v));
+        Write<T>{out}.vec(select(closed, (target - x) / dt, v));
     }
 };
 
@@ -53,37 +53,33 @@ struct Impulse {
     }
 };
 
-// Whether this vertex is held, mass, velocity free and held -> what the gripper gives it, mass of the patch.
-// effects/grip_slip.py
+// Mass, velocity free and held of a held vertex -> what the gripper gives it, mass of the patch. effects/grip_slip.py
 struct Pull {
     static constexpr const char* name = "pull";
-    static constexpr int inputs = 8, outputs = 4;
-    static constexpr auto fixed = bits(0, 1);
+    static constexpr int inputs = 7, outputs = 4;
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
-        const T held = r.number(), mass = held * r.number();
+        const T mass = r.number();
         const auto before = r.vec(), after = r.vec();
         Write<T> w{out};
-        w.vec(mass * (after - before)), w.number(mass);
+        w.vec(mass * (after - before)), w.number(1.0 * mass);
     }
 };
 
-// Whether this vertex is held, velocity, pull and mass of the patch, mobility, hold, dt -> velocity.
-// effects/grip_slip.py
+// Velocity of a held vertex, pull and mass of the patch, mobility, hold, dt -> velocity. effects/grip_slip.py
 struct Creep {
     static constexpr const char* name = "creep";
-    static constexpr int inputs = 11, outputs = 3;
-    static constexpr auto fixed = bits(0, 1) | bits(10, 1);
+    static constexpr int inputs = 10, outputs = 3;
+    static constexpr auto fixed = bits(9, 1);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
-        const T held = r.number();
         const auto v = r.vec(), pull = r.vec();
         const T mass = r.number(), mobility = r.number(), hold = r.number(), dt = r.number();
         const T size = safe_norm(pull), slips = less(hold * dt, size);
         const T excess = select(slips, 1.0 - hold * dt / select(slips, size, 1.0), 0.0);
-        Write<T>{out}.vec(v - (held * (mobility * excess / (dt + mobility * mass))) * pull);
+        Write<T>{out}.vec(v - (mobility * excess / (dt + mobility * mass)) * pull);
     }
 };
 

@@ -84,39 +84,6 @@ struct ForceShares {
     }
 };
 
-// Least mass, mass of a node -> what to divide by; less mass than that has no say, and its square underflows.
-template <class T>
-constexpr T divisor(T least, T mass) { return select(less(least, mass), mass, 1.0); }
-
-// Least mass, mass and force on a node -> acceleration. transfer.push
-struct NodeChange {
-    static constexpr const char* name = "node_change";
-    static constexpr int inputs = 5, outputs = 4;
-    static constexpr auto fixed = bits(0, 1);
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const T least = r.number(), mass = divisor(least, r.number());
-        Write<T> w{out};
-        w.number(constant(mass, 0.0)), w.vec(r.vec() / mass);
-    }
-};
-
-// Least mass, mass of a node (and force), momentum -> velocity.
-struct NodeVelocity {
-    static constexpr const char* name = "node_velocity";
-    static constexpr int inputs = 9, outputs = 4;
-    static constexpr auto fixed = bits(0, 1);
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const T least = r.number(), mass = divisor(least, r.number());
-        r.vec(), r.number();
-        Write<T> w{out};
-        w.number(constant(mass, 0.0)), w.vec(r.vec() / mass);
-    }
-};
-
 // Surface, mass, what was collected of the nodes' accelerations, place, shape, spacing and one over it -> forces on the
 // corners.
 // self_contact.repulsion
@@ -236,7 +203,6 @@ struct Alone {
 
 }  // namespace
 
-TC_KERNELS(contact_kernels, PointMass, Pressure, Offset, ForceShares, NodeChange, NodeVelocity,
-           CornerForces, Carried, Follow, Alone)
+TC_KERNELS(contact_kernels, PointMass, Pressure, Offset, ForceShares, CornerForces, Carried, Follow, Alone)
 
 }  // namespace tc
