@@ -102,7 +102,9 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
             assert 0.005 <= float(steps[0]) <= 0.1
             return linear(self.secant)
 
-    at_start = gauss_newton.Iterate(torch.zeros(1), linear(1.0), True, 1e-3, 1.0)
+    at_start = gauss_newton.Iterate(
+        torch.zeros(1), linear(1.0), True, torch.tensor([1e-3]), torch.ones(1), torch.tensor([torch.inf])
+    )
     for secant, warned in ((1.2, False), (5.0, True)):
         fake = Fake(unknowns=[SimpleNamespace(name="youngs_modulus")], secant=secant)
         final, warnings = fits._Run(fake, "converged", None)._check_linearity(at_start)

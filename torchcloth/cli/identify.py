@@ -55,6 +55,23 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="at most N on all frames, after up to 10 on early ones (35)",
     )
+    parser.add_argument(
+        "--use", nargs="+", choices=["points", "markers", "force"], help="kinds of data (default: all of an episode)"
+    )
+    parser.add_argument(
+        "--nuisance",
+        nargs="+",
+        default=[],
+        metavar="NAME[=STD]",
+        help="of each episode: clock, camera, grasp, shape, tare; with the prior's standard deviation, e.g. clock=0.4",
+    )
+    parser.add_argument(
+        "--prior",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE,SPREAD",
+        help="SPREAD: a factor for positive parameters, a standard deviation for others",
+    )
     parser.add_argument("--contact", type=float, metavar="SPACING", help="contact grid [m]; left out: no contact")
     parser.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
     parser.add_argument(
@@ -102,14 +119,31 @@ def _cloth(options: argparse.Namespace, recording: Recording) -> Cloth:
     return cloth
 
 
-def _assignments(pairs: Sequence[str]) -> dict[str, float]:
+def _assignments(pairs: Sequence[str], option: str = "--start") -> dict[str, float]:
     out = {}
     for pair in pairs:
         name, _, value = pair.partition("=")
         try:
             out[name] = float(value)
         except ValueError:
-            raise InvalidInput("--start", got=repr(pair), expected="NAME=NUMBER in SI units") from None
+            raise InvalidInput(option, got=repr(pair), expected="NAME=NUMBER in SI units") from None
+    return out
+
+
+def _nuisances(given: Sequence[str]) -> dict[str, float | None]:
+    plain = dict.fromkeys(name for name in given if "=" not in name)
+    return plain | _assignments([pair for pair in given if "=" in pair], "--nuisance")
+
+
+def _priors(pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
+    out = {}
+    for pair in pairs:
+        name, _, numbers = pair.partition("=")
+        try:
+            value, spread = (float(number) for number in numbers.split(","))
+        except ValueError:
+            raise InvalidInput("--prior", got=repr(pair), expected="NAME=VALUE,SPREAD") from None
+        out[name] = (value, spread)
     return out
 
 
@@ -142,6 +176,9 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording], g
             guess=guess,
             warm_start=guess is not None,
             dt=options.dt,
+            use=options.use,
+            nuisances=_nuisances(options.nuisance),
+            priors=_priors(options.prior),
             on_progress=advance,
         )
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..losses import chamfer_to_vertices
 from .objective import Objective
-from .replays import simulate
+from .replays import detached
 
 
 def descend(
@@ -24,12 +24,12 @@ def descend(
     for _ in range(iterations):
         optimiser.zero_grad()
         frames = []
-        for episode in objective.episodes:
-            x = simulate(objective.cloth, objective.unknowns, raw, episode, objective.dt)
-            clouds = zip(episode.clouds, x, strict=True)
-            loss = torch.stack([chamfer_to_vertices(cloud, vertices) for cloud, vertices in clouds]).mean()
+        for i, episode in enumerate(objective.episodes):
+            seen = objective.simulate(raw, i)
+            pairs = ((episode.positions(t), vertices) for t, vertices in enumerate(seen.x))
+            loss = torch.stack([chamfer_to_vertices(cloud, x) for cloud, x in pairs if len(cloud)]).mean()
             (loss / len(objective.episodes)).backward()
-            frames.append(x.detach())
+            frames.append(detached(seen))
         objective.simulations += len(frames)
         objective.remember(raw.detach(), frames)
         seen = raw.detach().clone()

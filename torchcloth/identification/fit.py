@@ -15,14 +15,16 @@ from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from . import gauss_newton
+from .blocks import blocks_for
 from .descent import descend
 from .episodes import episode
 from .misfit import Figures, figures
+from .nuisances import chosen
 from .null import rigid_carry
 from .objective import Objective
-from .report import estimates, warnings_of, withdraw
+from .report import estimates, nuisance_estimates, warnings_of, withdraw
 from .result import Identification
-from .unknowns import collect
+from .unknowns import collect, with_priors
 
 PAPER_ITERATIONS, PAPER_CHAMFER = 35, 0.015  # the DiffCP paper's stop rule: iterations, metres
 ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
@@ -46,9 +48,13 @@ def identify(
     guess: Mapping[str, float] | None = None,
     warm_start: bool = False,
     dt: float | None = None,
+    use: Sequence[str] | None = None,
+    nuisances: Mapping[str, float | None] | Sequence[str] = (),
+    priors: Mapping[str, tuple[float, float]] | None = None,
+    noise: Mapping[str, float] | None = None,
     on_progress: Progress | None = None,
 ) -> Identification:
-    """Fit scalar parameters of a cloth to point clouds, by gradients through the simulation.
+    """Fit scalar parameters of a cloth to what was seen and felt, by gradients through the simulation.
 
     Args:
         cloth: model and start values; left unchanged (see ``Identification.apply``).
@@ -64,6 +70,13 @@ def identify(
             that the result is compared with.
         warm_start: the guess is near the solution (an interrupted fit): skip the stage on the early frames.
         dt: largest substep [s]; None: the stable one, chosen anew for every set of values.
+        use: kinds of data, some of "points", "markers" and "force"; None: all that an episode has.
+        nuisances: what may differ from episode to episode: "clock" [s], "camera" [m], "grasp" [m], "shape" [m], "tare"
+            [N]; as names, or with the standard deviation of the prior, e.g. {"clock": 0.4}. "rim" [m], an offset of the
+            cloud's rim, always joins where points are used, unless it is given as 0.
+        priors: by parameter (value, factor) for positive ones: 68 % within that factor; (value, standard deviation)
+            for others. Default: around the start, a factor of 10 for positive parameters.
+        noise: least standard deviation by kind of data: "points", "edges", "markers" [m], "force" [N], "torque" [N m].
         on_progress: called with (iteration, chamfer, values) after every iteration.
 
     Returns:
@@ -84,10 +97,13 @@ def identify(
     if not episodes_in:
         raise InvalidInput("recordings", got="none", expected="at least one episode")
     names = default_parameters(cloth) if parameters is None else list(parameters)
-    unknowns = collect(cloth, names, episodes_in[0].cloth.areal_density_std)
+    unknowns = with_priors(collect(cloth, names, episodes_in[0].cloth.areal_density_std), priors or {})
     if not unknowns:
         raise InvalidInput("parameters", got="none", expected="at least one name")
-    objective = Objective(cloth, unknowns, [episode(cloth, r) for r in episodes_in], dt)
+    blocks = blocks_for(use)
+    episodes = [episode(cloth, r) for r in episodes_in]
+    seen = any(block.name == "points" for block in blocks) and any(len(c) for e in episodes for c in e.clouds)
+    objective = Objective(cloth, unknowns, episodes, dt, chosen(nuisances, implied=seen), blocks, noise)
     return _Run(objective, stop, on_progress).solve(
         method, iterations, rate, dict(guess or {}), early=not warm_start and stop != "paper"
     )
@@ -135,22 +151,23 @@ class _Run:
         null = [rigid_carry(e) for e in full.episodes]
         distances = (figures(x, full.episodes, full.faces) for x in (before, after, null))
         fit: dict[str, Any] = self._fit_figures(*distances)
-        fit["independent_observations"] = final.share * float((final.linear.value != 0).sum())
+        fit |= self._counts(final)
         fit["converged"] = final.converged
         warnings += [stopped] if stopped else []
         if rough or fit["chamfer_after"] >= fit["chamfer_null"]:  # steep chaotic slopes promise tiny errors
             found = withdraw(found)
         warnings += warnings_of(full.cloth, full.episodes, found, fit, after, full.faces)
         keys = {u.name: u.key.removesuffix(".raw") for u in full.unknowns}
+        nuisances = nuisance_estimates(full.episodes, full.placed, final.raw, covariance)
         return Identification(
-            found.parameters, fit, found.correlation, warnings, self.history, before, after, null, keys
+            found.parameters, fit, found.correlation, warnings, self.history, before, after, null, keys, nuisances
         )
 
     def _gauss_newton(self, iterations: int, start: Tensor, early: bool) -> gauss_newton.Iterate:
         """First the early frames, where a wrong start has not yet led the cloth elsewhere; then all of them."""
         full = self.objective
         if early:
-            part = Objective(full.cloth, full.unknowns, [e.until(EARLY) for e in full.episodes], full.dt)
+            part = full.part(EARLY)
             budget = min(EARLY_ITERATIONS, iterations)
             start = gauss_newton.minimise(
                 part.problem(), start, budget, lambda it: self._record(it.raw, part), tolerance=1.0
@@ -174,8 +191,11 @@ class _Run:
         deviation = gauss_newton.covariance(full.problem(), final).diagonal().sqrt()
         prior = full.problem().prior_std
         steps = torch.minimum(torch.maximum(deviation, SMALLEST * prior), LARGEST * prior)
+        steps = steps[: len(full.unknowns)]
         secants = full.secants(final.raw, steps)
-        missed = (secants.jacobian - final.linear.jacobian).norm(dim=0) / secants.jacobian.norm(dim=0).clamp(min=1e-12)
+        weight = final.influence()[0].sqrt()[:, None]
+        moved, slope = (weight * j[:, : len(steps)] for j in (secants.jacobian, final.linear.jacobian))
+        missed = (moved - slope).norm(dim=0) / moved.norm(dim=0).clamp(min=1e-12)
         if float(missed.max()) < NONLINEAR:
             return final, []
         names = ", ".join(u.name for u, error in zip(full.unknowns, missed, strict=True) if error >= NONLINEAR)
@@ -184,6 +204,17 @@ class _Run:
             f"by up to {min(1000.0, 100 * float(missed.max())):.0f} %): no parameter counts as identified"
         )
         return final._replace(linear=secants), [warning]
+
+    def _counts(self, final: gauss_newton.Iterate) -> dict[str, float]:
+        """Independent observations, in all and by kind of data, and how far each kind is off."""
+        out, total = {}, 0.0
+        for b, block in enumerate(self.objective.blocks):
+            own = final.linear.value[final.linear.kind == b]
+            own = own[own != 0]
+            if len(own):
+                out[f"{block.name}_residual"] = float(final.scale[b])
+                total += float(final.share[b]) * len(own)
+        return {"independent_observations": total, **out}
 
     def _record(self, raw: Tensor, objective: Objective) -> bool:
         now = figures(objective.frames(raw), objective.episodes, objective.faces)

@@ -12,17 +12,24 @@ from ..errors import SimulationDiverged, UnstableStep
 from .misfit import huber, noise_scale
 
 TRUSTED_GAIN = 0.5  # share of the predicted decrease above which an updated Jacobian is good enough
+GATE = 5.0  # standard deviations
 WINDOW = 5  # frames within which residuals of one patch count as one observation
 
 
 class Linearised(NamedTuple):
     """Residuals of all episodes at one point; rows keep their meaning between points."""
 
-    value: Tensor  # [R] m
+    value: Tensor  # [R] in units of the data
     jacobian: Tensor  # [R, K]
-    factor: Tensor  # [R]
+    factor: Tensor  # [R] prior weight
     frame: Tensor  # [R] int64, counted through all episodes
-    patch: Tensor  # [R] int64
+    patch: Tensor  # [R] int64, what errs together
+    block: Tensor | None = None  # [R] int64, kind of data: each has noise of its own. None: all alike
+
+    @property
+    def kind(self) -> Tensor:
+        """[R] the block of every row."""
+        return torch.zeros_like(self.frame) if self.block is None else self.block
 
 
 class Problem(NamedTuple):
@@ -34,7 +41,8 @@ class Problem(NamedTuple):
     prior_mean: Tensor  # [K]
     prior_std: Tensor  # [K]
     longest: Tensor  # [K], longest step
-    noise: float | None
+    noise: Tensor | float | None  # least standard deviation of a residual, for each block [B]
+    gate: Tensor | None = None  # [B] residuals beyond it and five standard deviations do not count; None: all do
 
 
 class Iterate(NamedTuple):
@@ -43,9 +51,22 @@ class Iterate(NamedTuple):
     raw: Tensor
     linear: Linearised
     exact: bool  # the Jacobian was computed here, not updated from elsewhere
-    scale: float  # m, of one residual
-    share: float  # independent observations per residual, <= 1
+    scale: Tensor  # [B] standard deviation of a residual
+    share: Tensor  # [B] independent observations per residual, <= 1
+    gate: Tensor  # [B] in standard deviations
     converged: bool = False  # set on the point that is returned
+
+    @property
+    def rows(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Standard deviation, weight and gate of every row [R]."""
+        kind = self.linear.kind
+        return self.scale[kind], self.share[kind] * self.linear.factor, self.gate[kind]
+
+    def influence(self) -> tuple[Tensor, Tensor]:
+        """(weight of each row [R] in the normal equations, its standardised residual)."""
+        scale, factor, gate = self.rows
+        z = self.linear.value / scale
+        return factor * huber(z, gate)[1] / scale**2, z
 
 
 def minimise(
@@ -130,33 +151,42 @@ def _exact(problem: Problem, at: Iterate) -> Iterate:
 
 
 def _iterate(problem: Problem, raw: Tensor, linear: Linearised, exact: bool) -> Iterate:
-    scale = noise_scale(linear.value, problem.noise)
-    return Iterate(raw, linear, exact, scale, _independent_share(linear, scale))
+    kind = linear.kind
+    count = int(kind.max()) + 1
+    floor = problem.noise if isinstance(problem.noise, Tensor) else torch.full((count,), problem.noise or 0.0)
+    scale = torch.tensor([noise_scale(linear.value[kind == b], float(floor[b])) for b in range(count)])
+    gate = torch.full((count,), torch.inf) if problem.gate is None else GATE + problem.gate[:count].to(scale) / scale
+    share = _independent_share(linear, scale, gate)
+    return Iterate(raw, linear, exact, scale.to(linear.value), share.to(linear.value), gate.to(linear.value))
 
 
-def _independent_share(linear: Linearised, scale: float) -> float:
-    """Effective over nominal number of observations, from how residuals add up within patches and windows.
+def _independent_share(linear: Linearised, scale: Tensor, gate: Tensor) -> Tensor:
+    """[B], effective over nominal number of observations, from how residuals add up within patches and windows.
 
     Residuals of a wrong shape agree over centimetres and frames; counted one by one they would overrule every prior
     and promise errors far too small.
     """
-    _, weight = huber(linear.value / scale)
-    z = weight * linear.value / scale
-    z = torch.where(linear.factor < 1, 0.0, z)  # in-plane rows are one-sided: their sum says nothing
+    kind = linear.kind
+    z = linear.value / scale.to(linear.value)[kind]
+    z = huber(z, gate.to(z)[kind])[1] * z
     group = (linear.frame // WINDOW) * (int(linear.patch.max()) + 1) + linear.patch
-    summed = z.new_zeros(int(group.max()) + 1).index_add(0, group, z)
-    return min(1.0, float((z * z).sum() / (summed * summed).sum().clamp(min=1e-12)))
+    out = []
+    for b in range(len(scale)):
+        own = kind == b
+        summed = z.new_zeros(int(group.max()) + 1).index_add(0, group[own], z[own])
+        out.append(min(1.0, float((z[own] ** 2).sum() / (summed * summed).sum().clamp(min=1e-12))))
+    return torch.tensor(out)
 
 
 def _cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
     """Robust cost with the scales of ``at``, so that points can be compared."""
     prior = ((raw - problem.prior_mean) / problem.prior_std).square().sum()
-    return float(at.share * (at.linear.factor * huber(value / at.scale)[0]).sum() + 0.5 * prior)
+    scale, factor, gate = at.rows
+    return float((factor * huber(value / scale, gate)[0]).sum() + 0.5 * prior)
 
 
 def _normal_equations(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
-    _, weight = huber(at.linear.value / at.scale)
-    weighted = (at.share * at.linear.factor * weight / at.scale**2)[:, None] * at.linear.jacobian
+    weighted = at.influence()[0][:, None] * at.linear.jacobian
     gradient = weighted.mT @ at.linear.value + (at.raw - problem.prior_mean) / problem.prior_std**2
     return gradient, weighted.mT @ at.linear.jacobian + torch.diag(problem.prior_std**-2)
 
@@ -175,8 +205,7 @@ def covariance(problem: Problem, at: Iterate) -> Tensor:
     """
     gradient, hessian = _normal_equations(problem, at)
     inverse = torch.linalg.inv(hessian)
-    _, weight = huber(at.linear.value / at.scale)
-    scores = (at.share * at.linear.factor * weight * at.linear.value / at.scale**2)[:, None] * at.linear.jacobian
+    scores = (at.influence()[0] * at.linear.value)[:, None] * at.linear.jacobian
     count = int(at.linear.frame.max()) + 1
     summed = torch.zeros(count, scores.shape[1], dtype=scores.dtype).index_add(0, at.linear.frame, scores)
     summed = summed[summed.abs().sum(1) > 0]

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..cloth import Cloth
 from ..materials import AEP
 from .episodes import Episode
+from .nuisances import Placed
 from .result import Estimate
 from .unknowns import Unknown, available, collect, needs_contact
 
@@ -30,7 +31,7 @@ class Found(NamedTuple):
 def estimates(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, covariance: Tensor) -> Found:
     """Physical values, standard errors (delta method), 95 % intervals (in the unconstrained coordinate)."""
     deviation = covariance.diagonal().sqrt()
-    parameters = {u.name: _estimate(u, float(r), float(s)) for u, r, s in zip(unknowns, raw, deviation, strict=True)}
+    parameters = {u.name: _estimate(u, float(r), float(s)) for u, r, s in zip(unknowns, raw, deviation, strict=False)}
     if isinstance(cloth.material, AEP) and "youngs_modulus" in parameters:
         parameters = {
             "membrane_stiffness": _times(parameters["youngs_modulus"], cloth.material.thickness, "N/m"),
@@ -46,6 +47,22 @@ def estimates(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, covariance
     names = [u.name for u in unknowns]
     correlation = {a: {b: float(matrix[i, j]) for j, b in enumerate(names)} for i, a in enumerate(names)}
     return Found(parameters, correlation)
+
+
+def nuisance_estimates(
+    episodes: Sequence[Episode], placed: Sequence[Sequence[Placed]], raw: Tensor, covariance: Tensor
+) -> dict[str, dict[str, Estimate]]:
+    """For every episode what was found of its nuisances; known when the data say more than the prior."""
+    deviation, out = covariance.diagonal().sqrt(), {}
+    for i, (episode, own) in enumerate(zip(episodes, placed, strict=True)):
+        name = episode.name if episode.name not in out else f"{episode.name} ({i + 1})"
+        out[name] = {}
+        for p in own:
+            numbers = zip(p.names, p.units, p.stds, raw[p.where].tolist(), deviation[p.where].tolist(), strict=True)
+            for part, unit, prior, value, std in numbers:
+                interval = (value - 1.96 * std, value + 1.96 * std)
+                out[name][part] = Estimate(value, std, interval, unit, 0.0, std < 0.5 * prior, "nuisance")
+    return out
 
 
 def withdraw(found: Found) -> Found:

@@ -49,7 +49,8 @@ class Identification:
         correlation: of the fitted parameters, name -> name -> correlation.
         warnings: what to mistrust, in sentences.
         history: one entry per iteration: chamfer [m] and parameter values.
-        frames_before, frames_after, frames_null: [T, V, 3] m for each episode.
+        frames_before, frames_after, frames_null: [T, V, 3] m for each episode, as its observer sees them.
+        nuisances: by episode, estimates of what is not the fabric's: clock, camera, first shape.
     """
 
     parameters: dict[str, Estimate]
@@ -61,6 +62,7 @@ class Identification:
     frames_after: list[Tensor] = field(repr=False)
     frames_null: list[Tensor] = field(repr=False)
     keys: dict[str, str] = field(default_factory=dict, repr=False)
+    nuisances: dict[str, dict[str, Estimate]] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """The content of identification.json."""
@@ -68,6 +70,10 @@ class Identification:
             "parameters": {name: asdict(estimate) for name, estimate in self.parameters.items()},
             "fit": self.fit,
             "correlation": self.correlation,
+            "nuisances": {
+                episode: {name: asdict(estimate) for name, estimate in own.items()}
+                for episode, own in self.nuisances.items()
+            },
             "convention": CONVENTION,
             "warnings": self.warnings,
             "history": self.history,

@@ -36,6 +36,7 @@ def print_fit(fit: Identification) -> None:
     console.print(table)
     if absent:
         console.print(f"Not in the model, because contact was left out: {', '.join(absent)}")
+    _print_nuisances(console, fit)
     distances = Table(title="Distance cloud to surface, one-sided, metres", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("", "Chamfer", "rms"):
         distances.add_column(heading, justify="right" if heading else "left")
@@ -50,6 +51,14 @@ def print_fit(fit: Identification) -> None:
     )
     for warning in fit.warnings:
         console.print(f"note: {warning}", style="yellow", markup=False)
+
+
+def _print_nuisances(console, fit: Identification) -> None:
+    """What is no property of the fabric, by episode, in as few lines as can be."""
+    for episode, own in fit.nuisances.items():
+        if own:
+            numbers = [f"{name} {e.value:.2g} ± {e.std:.1g} {e.unit}" for name, e in own.items()]
+            console.print(f"{episode}: {', '.join(numbers)}", markup=False)
 
 
 def _statement(e: Estimate) -> tuple[str, str, str]:
