@@ -8,8 +8,7 @@ import torch
 from twins import at
 
 import torchcloth as tc
-from torchcloth.identification import fit as fits
-from torchcloth.identification import gauss_newton, result
+from torchcloth.identification import gauss_newton, linearity, result
 from torchcloth.identification.misfit import Figures
 from torchcloth.identification.report import Found, estimates, warnings_of
 from torchcloth.identification.result import Estimate, Identification, write_atomically
@@ -107,7 +106,7 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
     )
     for secant, warned in ((1.2, False), (5.0, True)):
         fake = Fake(unknowns=[SimpleNamespace(name="youngs_modulus")], secant=secant)
-        final, warnings = fits._Run(fake, "converged", None)._check_linearity(at_start)
+        final, warnings = linearity.check(fake, at_start)
         assert bool(warnings) == warned
         assert (final.linear is not at_start.linear) == warned
     assert "tangents of youngs_modulus miss finite steps by up to 80 %" in warnings[0]

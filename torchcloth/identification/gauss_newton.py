@@ -111,7 +111,7 @@ def minimise(
 def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None, float, float]:
     """(accepted point or None, actual over predicted decrease, next damping)."""
     gradient, hessian = _normal_equations(problem, at)
-    cost = _cost(problem, at, at.raw, at.linear.value)
+    now = cost(problem, at, at.raw, at.linear.value)
     for _ in range(6):
         step = torch.linalg.solve(hessian + damping * torch.diag(hessian.diagonal()), -gradient)
         step = step.clamp(-problem.longest, problem.longest)  # one by one: a runaway must not hold back the others
@@ -120,7 +120,7 @@ def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None
         value, patch = _try(problem, raw)
         if value is not None:
             predicted = -float(gradient @ step + 0.5 * step @ hessian @ step)
-            decrease = cost - _cost(problem, at, raw, value)
+            decrease = now - cost(problem, at, raw, value)
             if decrease > 0:
                 gain = decrease / max(predicted, 1e-12)
                 return _updated(problem, at, raw, step, value, patch), gain, max(damping / 5, 1e-6)
@@ -140,6 +140,11 @@ def _updated(problem: Problem, at: Iterate, raw: Tensor, step: Tensor, value: Te
     missed = value - at.linear.value - at.linear.jacobian @ step
     jacobian = at.linear.jacobian + torch.outer(missed, step) / (step @ step)
     return _iterate(problem, raw, at.linear._replace(value=value, jacobian=jacobian, patch=patch), exact=False)
+
+
+def judged(problem: Problem, raw: Tensor, linear: Linearised) -> Iterate:
+    """A point with the noise scales that its residuals have; their derivatives may be zero."""
+    return _iterate(problem, raw, linear, exact=False)
 
 
 def _linearise(problem: Problem, raw: Tensor) -> Iterate:
@@ -178,7 +183,7 @@ def _independent_share(linear: Linearised, scale: Tensor, gate: Tensor) -> Tenso
     return torch.tensor(out)
 
 
-def _cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
+def cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
     """Robust cost with the scales of ``at``, so that points can be compared."""
     prior = ((raw - problem.prior_mean) / problem.prior_std).square().sum()
     scale, factor, gate = at.rows
@@ -197,11 +202,11 @@ def _is_small(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> 
     return float(step @ hessian @ step) < tolerance**2
 
 
-def covariance(problem: Problem, at: Iterate) -> Tensor:
+def covariance(problem: Problem, at: Iterate, episode: Tensor | None = None) -> Tensor:
     """Covariance of the estimate [K, K]: sandwich with residuals correlated within and between nearby frames.
 
-    Never smaller than what the counted independent observations would give. Model error that persists over a whole
-    episode is beyond it.
+    Never smaller than what the counted independent observations would give; nor, where ``episode`` [R] names three or
+    more, than what leaving out one after the other shows. Model error that all episodes share is beyond it.
     """
     gradient, hessian = _normal_equations(problem, at)
     inverse = torch.linalg.inv(hessian)
@@ -211,8 +216,23 @@ def covariance(problem: Problem, at: Iterate) -> Tensor:
     summed = summed[summed.abs().sum(1) > 0]
     meat = _long_run(summed) * len(summed) / max(1, len(summed) - len(gradient))
     robust = inverse @ (meat + torch.diag(problem.prior_std**-2)) @ inverse
-    inflate = torch.sqrt((inverse.diagonal() / robust.diagonal()).clamp(min=1.0))
+    least = inverse.diagonal()
+    if episode is not None and int(episode.max()) >= 2:
+        least = torch.maximum(least, _jackknife(at, hessian, episode))
+    inflate = torch.sqrt((least / robust.diagonal()).clamp(min=1.0))
     return robust * inflate[:, None] * inflate[None, :]
+
+
+def _jackknife(at: Iterate, hessian: Tensor, episode: Tensor) -> Tensor:
+    """Variances [K] from leaving out one episode after the other, each by one Newton step (Efron 1982)."""
+    weighted, moved = at.influence()[0][:, None] * at.linear.jacobian, []
+    count = int(episode.max()) + 1
+    for e in range(count):
+        own = episode == e
+        less = hessian - weighted[own].mT @ at.linear.jacobian[own]
+        moved.append(torch.linalg.solve(less, weighted[own].mT @ at.linear.value[own]))
+    shifts = torch.stack(moved)
+    return (count - 1) / count * (shifts - shifts.mean(0)).square().sum(0)
 
 
 def _long_run(scores: Tensor) -> Tensor:

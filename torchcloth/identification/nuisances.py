@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -138,10 +138,10 @@ class Rim(AbstractNuisance):
         return frames._replace(edge=frames.edge + values[0])
 
 
-class Grasp3(AbstractNuisance):
+class Held(AbstractNuisance):
     """The held places are off by so much at the first frame; between grippers the error is blended."""
 
-    name, unit, std = "grasp", "m", 0.003
+    name, unit, std = "grasp", "m", 0.0015
 
     def parts(self, cloth: Cloth, episode: Episode) -> list[str]:
         """Three axes for each gripper."""
@@ -179,11 +179,21 @@ class Shape(AbstractNuisance):
         return torch.einsum("mv,ab->mavb", fields, torch.eye(3).to(fields)).flatten(0, 1)
 
 
-KINDS: dict[str, type[AbstractNuisance]] = {kind.name: kind for kind in (Clock, Camera, Tare, Rim, Grasp3, Shape)}
-IMPLIED = ("rim",)  # where points are used: no camera sees an edge where it is
+KINDS: dict[str, type[AbstractNuisance]] = {kind.name: kind for kind in (Clock, Camera, Tare, Rim, Held, Shape)}
 
 
-def chosen(wanted: Mapping[str, float | None] | Sequence[str], implied: bool = True) -> list[AbstractNuisance]:
+def implied(uses: Collection[str], episodes: Sequence[Episode]) -> list[str]:
+    """What data of these kinds cannot be read without.
+
+    No camera sees an edge where it is; and a first shape that is a millimetre off between the grippers strains a sheet
+    by what its force shows clearly.
+    """
+    rim = "points" in uses and any(len(cloud) for e in episodes for cloud in e.clouds)
+    grasp = "force" in uses and any(e.settles and e.wrenches for e in episodes)
+    return [name for name, needed in (("rim", rim), ("grasp", grasp)) if needed]
+
+
+def chosen(wanted: Mapping[str, float | None] | Sequence[str], implied: Sequence[str] = ()) -> list[AbstractNuisance]:
     """Nuisances by name, with a standard deviation of their own where one is given; 0 leaves one out.
 
     Raises:
@@ -195,7 +205,7 @@ def chosen(wanted: Mapping[str, float | None] | Sequence[str], implied: bool = T
             raise InvalidInput("nuisance", got=repr(name), expected=f"one of {', '.join(KINDS)}")
         if std is not None and not (math.isfinite(std) and std >= 0):
             raise InvalidInput(f"nuisance {name}", got=std, expected=f"a standard deviation >= 0 in {KINDS[name].unit}")
-    every = {**(dict.fromkeys(IMPLIED) if implied else {}), **given}
+    every = {**dict.fromkeys(implied), **given}
     return [kind(every[name]) for name, kind in KINDS.items() if name in every and every[name] != 0]
 
 

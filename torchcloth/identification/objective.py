@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +16,8 @@ from ..parameters import PhysicalParameter
 from . import gauss_newton
 from .blocks import BLOCKS, Block
 from .episodes import Episode
+from .journal import Journal
+from .misfit import Figures, figures, huber
 from .nuisances import AbstractNuisance, Placed, place
 from .replays import Frames, each, simulate, tangents
 from .rows import Rows, scene_of
@@ -49,13 +52,16 @@ class Objective:
         self.prior_std = torch.tensor([*(u.prior_std for u in unknowns), *stds], dtype=torch.float64)
         self.start = torch.tensor([*(u.start for u in unknowns), *(0.0 for _ in stds)], dtype=torch.float64)
         self.middle = torch.tensor([*(u.middle for u in unknowns), *(0.0 for _ in stds)], dtype=torch.float64)
+        self.journal: Journal | None = None
         self.simulations = 0
         self._recent: dict[tuple[float, ...], list[Frames]] = {}
 
     def part(self, share: float) -> Objective:
         """The same for the first ``share`` of the frames."""
         early = [e.until(share) for e in self.episodes]
-        return Objective(self.cloth, self.unknowns, early, self.dt, self.nuisances, self.blocks, self.floors)
+        part = Objective(self.cloth, self.unknowns, early, self.dt, self.nuisances, self.blocks, self.floors)
+        part.journal = self.journal
+        return part
 
     def problem(self) -> gauss_newton.Problem:
         """The callbacks of Gauss-Newton."""
@@ -95,6 +101,29 @@ class Objective:
     def values(self, raw: Tensor) -> dict[str, float]:
         """Physical values of the fabric's unknowns by name."""
         return {u.name: u.value(float(r)) for u, r in zip(self.unknowns, raw, strict=False)}
+
+    def identity(self) -> list[object]:
+        """What the answers to the solvers' questions depend on."""
+        data = [
+            part
+            for e in self.episodes
+            for part in (
+                e.times,
+                e.initial,
+                *e.clouds,
+                e.markers,
+                *e.wrenches.values(),
+                *(m.pose for m in e.motion.values()),
+            )
+        ]
+        model = [*self.cloth.state_dict().values(), self.cloth.mesh.rest.tobytes(), self.dt, self.cloth.engine]
+        names = [u.name for u in self.unknowns], [b.name for b in self.blocks], self.floors
+        return [*data, *model, *names, self.middle, self.prior_std]
+
+    def episode_of(self, linear: gauss_newton.Linearised) -> Tensor:
+        """[R] which episode a row belongs to."""
+        ends = torch.tensor([len(e.times) + gauss_newton.WINDOW for e in self.episodes]).cumsum(0)
+        return torch.searchsorted(ends, linear.frame, right=True)
 
     # -- simulation -----------------------------------------------------------------------------------------------
 
@@ -154,15 +183,66 @@ class Objective:
 
     def evaluate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         """Residual rows and their patches."""
-        rows = self._rows([(frames, None) for frames in self.seen(raw)])
+        rows = self.evaluate_all(raw)
         return rows.value, rows.patch
+
+    def evaluate_all(self, raw: Tensor) -> gauss_newton.Linearised:
+        """Residual rows without derivatives."""
+        work = lambda: self._rows([(frames, None) for frames in self.seen(raw)])  # noqa: E731
+        return gauss_newton.Linearised(*self._ask("evaluate", raw, work))
 
     def linearise(self, raw: Tensor) -> gauss_newton.Linearised:
         """Residual rows with exact sensitivities, by forward mode through the whole simulation."""
-        both = [self._tangents(raw, i) for i in range(len(self.episodes))]
+
+        def work() -> gauss_newton.Linearised:
+            both = [self._tangents(raw, i) for i in range(len(self.episodes))]
+            self.remember(raw, [frames for frames, _ in both])
+            return self._rows(both)
+
         self.simulations += len(self.unknowns) * len(self.episodes)
-        self.remember(raw, [frames for frames, _ in both])
-        return self._rows(both)
+        return gauss_newton.Linearised(*self._ask("linearise", raw, work))
+
+    def figures(self, raw: Tensor) -> Figures:
+        """Distances at a point."""
+        chamfer, rms, per_frame = self._ask("figures", raw, lambda: self._figures(raw))
+        return Figures(float(chamfer), float(rms), per_frame)
+
+    def _figures(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        now = figures(self.frames(raw), self.episodes, self.faces)
+        return torch.tensor(now.chamfer), torch.tensor(now.rms), now.per_frame
+
+    def cost(self, raw: Tensor, i: int, at: gauss_newton.Iterate) -> Tensor:
+        """Robust cost of episode ``i`` by the scales of ``at``, without priors; differentiable in reverse mode."""
+        scene = scene_of(self.simulate(raw, i), None, self.episodes[i], self.sheet)
+        total = raw.new_zeros(())
+        for b, block in enumerate(self.blocks):
+            rows = block.rows(scene)
+            if rows is not None:
+                loss, _ = huber(rows.value.to(at.scale) / at.scale[b], at.gate[b])
+                total = total + at.share[b] * loss.sum()
+        return total
+
+    def value_and_slope(
+        self, question: str, raw: Tensor, loss: Callable[[Objective, Tensor, int], Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """A loss summed over the episodes, and its gradient [K] in reverse mode; one graph at a time."""
+
+        def work() -> tuple[Tensor, Tensor]:
+            leaf, total = raw.clone().requires_grad_(), torch.zeros((), dtype=raw.dtype)
+            for i in range(len(self.episodes)):
+                part = loss(self, leaf, i)
+                part.backward()
+                total += part.detach()
+            return total, torch.zeros_like(raw) if leaf.grad is None else leaf.grad
+
+        self.simulations += len(self.episodes)
+        value, slope = self._ask(question, raw, work)
+        return value, slope
+
+    def _ask(self, question: str, raw: Tensor, work: Callable[[], Any]) -> Any:
+        if self.journal is None:
+            return work()
+        return self.journal.ask(f"{question}-{len(self.episodes[0].times)}", raw, work)
 
     def secants(self, raw: Tensor, steps: Tensor) -> gauss_newton.Linearised:
         """The same with one-sided differences over finite ``steps`` of the fabric's unknowns.

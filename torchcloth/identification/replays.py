@@ -93,11 +93,6 @@ def each(frames: Frames, function: Callable[[Tensor], Tensor]) -> Frames:
     return Frames(function(frames.x), function(frames.v), wrench, function(frames.edge))
 
 
-def detached(frames: Frames) -> Frames:
-    """Without a graph."""
-    return each(frames, Tensor.detach)
-
-
 def _frames(rollout: Rollout) -> Frames:
     return Frames(rollout.x, rollout.v, rollout.wrench, rollout.x.new_zeros(rollout.x.shape[:-2]))
 

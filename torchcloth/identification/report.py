@@ -65,11 +65,20 @@ def nuisance_estimates(
     return out
 
 
-def withdraw(found: Found) -> Found:
-    """No parameter counts as identified: the model does not describe these data."""
-    parameters = {
-        name: e if e.source == "prior" else replace(e, identifiable=False) for name, e in found.parameters.items()
-    }
+def withdraw(found: Found, unknowns: Sequence[Unknown]) -> Found:
+    """No parameter counts as identified, because the model does not describe these data: errors are the priors'."""
+    prior = {u.name: _absent(u, "data") for u in unknowns}
+    parameters = dict(found.parameters)
+    for name, e in found.parameters.items():
+        if e.source == "data" and name in prior:
+            p = prior[name]
+            interval = (min(p.ci95[0], e.value), max(p.ci95[1], e.value))
+            parameters[name] = replace(e, std=p.std, ci95=interval, identifiable=False)
+        elif e.source != "prior":
+            parameters[name] = replace(e, identifiable=False)
+    if "membrane_stiffness" in parameters and "youngs_modulus" in parameters:
+        thickness = found.parameters["membrane_stiffness"].value / found.parameters["youngs_modulus"].value
+        parameters["membrane_stiffness"] = _times(parameters["youngs_modulus"], thickness, "N/m")
     return found._replace(parameters=parameters)
 
 
