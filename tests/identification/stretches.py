@@ -45,7 +45,8 @@ class Setting:
     depth: float = 1.0e-3  # m, noise along the camera's axis
     lateral: float = 0.35e-3  # m, a quarter of a pixel
     occluded: float = 0.3  # of the sheet's length, a bar in front of it
-    initial: float = 0.5e-3  # m, error of the first shape
+    grasp: float = 0.5e-3  # m, error of the first shape at each jaw, and linearly between them
+    initial: float = 0.2e-3  # m, more of it at every free vertex
     clock: float = 0.0  # s
     resolution: tuple[int, int] = TRUTH
 
@@ -132,7 +133,7 @@ def record(
             vertices=mesh.vertices,
             faces=mesh.faces,
             uv=mesh.uv,
-            initial_vertices=first + setting.initial * rng.standard_normal(first.shape),
+            initial_vertices=first + _first_error(np.asarray(mesh.uv), setting, rng),
         ),
         provenance="synthetic: tests/identification/stretches.py",
         grasps={name: rec.GraspInfo(jaw(name), RADIUS) for name in SIDES},
@@ -158,6 +159,14 @@ def _cloud(x: np.ndarray, setting: Setting, rng: np.random.Generator) -> np.ndar
     points = at(x, setting.resolution, uv[~hidden])
     noise = rng.standard_normal(points.shape)
     return points + noise * (setting.lateral * (1 - FACING) + setting.depth * FACING)
+
+
+def _first_error(uv: np.ndarray, setting: Setting, rng: np.random.Generator) -> np.ndarray:
+    """[V, 3] m: as a shape that was fitted to an image is off, smoothly."""
+    share = uv[:, :1] / WIDTH
+    left, right = setting.grasp * rng.standard_normal((2, 3))
+    free = (uv[:, :1] > 1e-6) & (uv[:, :1] < WIDTH - 1e-6)
+    return (1 - share) * left + share * right + setting.initial * free * rng.standard_normal((len(uv), 3))
 
 
 def _markers(x: np.ndarray, t: np.ndarray, side: int, setting: Setting, rng: np.random.Generator) -> rec.Markers:

@@ -4,7 +4,8 @@ from .episodes import Episode, cloth_from, episode
 from .fit import identify
 from .null import rigid_carry
 from .pictures import draw
-from .result import Estimate, Identification
+from .result import Identification
+from .statements import Estimate
 from .tables import print_fit
 
 __all__ = [

@@ -14,6 +14,7 @@ from .objective import Objective
 
 OnIterate = Callable[[Tensor, Objective], bool]
 ROUNDS = 3  # of L-BFGS, each with the noise scales of the point where it begins
+HOPELESS = 1e30  # cost of what cannot be simulated
 SETTLED = 1e-3  # decrease of the robust cost below which a round ends: a few hundredths of a standard error
 
 
@@ -49,7 +50,9 @@ def chamfer(objective: Objective, raw: Tensor, i: int) -> Tensor:
     return loss / len(objective.episodes)
 
 
-def quasi_newton(objective: Objective, start: Tensor, iterations: int, on_iterate: OnIterate) -> tuple[Tensor, bool]:
+def quasi_newton(
+    objective: Objective, start: Tensor, iterations: int, on_iterate: OnIterate
+) -> tuple[Tensor, bool]:
     """L-BFGS on the robust cost of all data and priors, in units of the priors' standard deviations.
 
     Returns:
@@ -58,39 +61,40 @@ def quasi_newton(objective: Objective, start: Tensor, iterations: int, on_iterat
     best, left = start.clone(), iterations
     for number in range(ROUNDS):
         at = gauss_newton.judged(objective.problem(), best, objective.evaluate_all(best))
-        best, used = _round(objective, at, best, left, on_iterate, number)
+        best, used, stopped = _round(objective, at, best, left, on_iterate, number)
         left -= used
-        if left <= 0:
+        if stopped or left <= 0:
             return best, False
     return best, True
 
 
 def _round(
     objective: Objective, at: gauss_newton.Iterate, start: Tensor, iterations: int, on_iterate: OnIterate, number: int
-) -> tuple[Tensor, int]:
-    """(end, iterations used) with fixed noise scales."""
+) -> tuple[Tensor, int, bool]:
+    """(end, iterations used, whether it was stopped) with fixed noise scales."""
     unit, middle = objective.prior_std, objective.middle
     scaled = ((start - middle) / unit).requires_grad_()
-    optimiser = torch.optim.LBFGS([scaled], lr=0.3, max_iter=1, history_size=10, line_search_fn="strong_wolfe")
+    optimiser = torch.optim.LBFGS(
+        [scaled], lr=0.3, max_iter=1, max_eval=20, tolerance_change=1e-12, line_search_fn="strong_wolfe"
+    )
     loss = lambda o, raw, i: o.cost(raw, i, at)  # noqa: E731
 
     def closure() -> Tensor:
         raw = objective.clip(middle + unit * scaled.detach())
+        prior = (raw - middle) / unit
         try:
             value, slope = objective.value_and_slope(f"cost{number}", raw, loss)
         except (SimulationDiverged, UnstableStep):
-            value, slope = torch.tensor(torch.inf, dtype=raw.dtype), torch.zeros_like(raw)
-        prior = (raw - middle) / unit
+            value, slope = scaled.new_tensor(HOPELESS), torch.zeros_like(raw)
         scaled.grad = slope * unit + prior
         return value + 0.5 * prior.square().sum()
 
-    best, before = start, torch.inf
+    values: list[float] = []
     for used in range(iterations):
-        value = float(optimiser.step(closure))  # at the point where the step began
-        raw = objective.clip(middle + unit * scaled.detach())
-        if on_iterate(best, objective):
-            return best, iterations
-        if before - value < SETTLED:
-            return (best if value > before else raw), used + 1
-        best, before = raw, value
-    return best, iterations
+        before = objective.clip(middle + unit * scaled.detach())
+        values.append(float(optimiser.step(closure)))
+        if on_iterate(before, objective):
+            return before, used, True
+        if len(values) > 1 and values[-2] - values[-1] < SETTLED:
+            return before, used, False
+    return objective.clip(middle + unit * scaled.detach()), iterations, False

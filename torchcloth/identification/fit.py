@@ -16,7 +16,9 @@ from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from . import gauss_newton, linearity
 from .blocks import blocks_for
+from .considered import with_first_shape
 from .episodes import episode
+from .identifiability import combinations, influences
 from .journal import Journal
 from .misfit import figures
 from .nuisances import chosen, implied
@@ -70,9 +72,8 @@ def identify(
         dt: largest substep [s]; None: the stable one, chosen anew for every set of values.
         use: kinds of data, some of "points", "markers" and "force"; None: all that an episode has.
         nuisances: what may differ from episode to episode: "clock" [s], "camera" [m], "grasp" [m], "shape" [m], "tare"
-            [N]; as names, or with the standard deviation of the prior, e.g. {"clock": 0.4}. Unless they are given as 0,
-            "rim" [m], an offset of the cloud's rim, joins where there are points, and "grasp" where there are forces
-            and a measured first shape.
+            [N]; as names, or with the standard deviation of the prior, e.g. {"clock": 0.4}. "rim" [m], an offset of
+            the cloud's rim, always joins where there are points, unless it is given as 0.
         priors: by parameter (value, factor) for positive ones: 68 % within that factor; (value, standard deviation)
             for others. Default: around the start, a factor of 10 for positive parameters.
         noise: least standard deviation by kind of data: "points", "edges", "markers" [m], "force" [N], "torque" [N m].
@@ -140,9 +141,10 @@ def default_parameters(cloth: Cloth) -> list[str]:
 def _concluded(search: Search, before: list[Tensor], outcome: Outcome, began: float) -> Identification:
     """From where a search ended to statements."""
     full = search.objective
-    final, warnings = linearity.check(full, outcome.final)
+    final, reach, warnings = linearity.check(full, outcome.final)
     after, null = full.frames(final.raw), [rigid_carry(e) for e in full.episodes]
     covariance = gauss_newton.covariance(full.problem(), final, full.episode_of(final.linear))
+    covariance = with_first_shape(full, final, covariance)
     found = estimates(full.cloth, full.unknowns, final.raw, covariance)
     fit: dict[str, Any] = _figures(full, before, after, null)
     fit |= {
@@ -163,7 +165,18 @@ def _concluded(search: Search, before: list[Tensor], outcome: Outcome, began: fl
     keys = {u.name: u.key.removesuffix(".raw") for u in full.unknowns}
     nuisances = nuisance_estimates(full.episodes, full.placed, final.raw, covariance)
     return Identification(
-        found.parameters, fit, found.correlation, warnings, search.history, before, after, null, keys, nuisances
+        found.parameters,
+        fit,
+        found.correlation,
+        warnings,
+        search.history,
+        before,
+        after,
+        null,
+        keys,
+        nuisances,
+        influences(full.unknowns, final.raw, reach, found.parameters),
+        combinations(full.unknowns, final.raw, covariance),
     )
 
 

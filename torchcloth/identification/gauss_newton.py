@@ -196,6 +196,11 @@ def _normal_equations(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
     return gradient, weighted.mT @ at.linear.jacobian + torch.diag(problem.prior_std**-2)
 
 
+def information(problem: Problem, at: Iterate) -> Tensor:
+    """[K, K] of data and priors."""
+    return _normal_equations(problem, at)[1]
+
+
 def _is_small(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> bool:
     """Below ``tolerance`` standard errors in every direction."""
     _, hessian = _normal_equations(problem, at)

@@ -183,14 +183,8 @@ KINDS: dict[str, type[AbstractNuisance]] = {kind.name: kind for kind in (Clock, 
 
 
 def implied(uses: Collection[str], episodes: Sequence[Episode]) -> list[str]:
-    """What data of these kinds cannot be read without.
-
-    No camera sees an edge where it is; and a first shape that is a millimetre off between the grippers strains a sheet
-    by what its force shows clearly.
-    """
-    rim = "points" in uses and any(len(cloud) for e in episodes for cloud in e.clouds)
-    grasp = "force" in uses and any(e.settles and e.wrenches for e in episodes)
-    return [name for name, needed in (("rim", rim), ("grasp", grasp)) if needed]
+    """What data of these kinds cannot be read without: no camera sees an edge where it is."""
+    return ["rim"] if "points" in uses and any(len(cloud) for e in episodes for cloud in e.clouds) else []
 
 
 def chosen(wanted: Mapping[str, float | None] | Sequence[str], implied: Sequence[str] = ()) -> list[AbstractNuisance]:

@@ -16,6 +16,7 @@ from ..parameters import PhysicalParameter
 from . import gauss_newton
 from .blocks import BLOCKS, Block
 from .episodes import Episode
+from .identifiability import Reach
 from .journal import Journal
 from .misfit import Figures, figures, huber
 from .nuisances import AbstractNuisance, Placed, place
@@ -58,10 +59,16 @@ class Objective:
 
     def part(self, share: float) -> Objective:
         """The same for the first ``share`` of the frames."""
-        early = [e.until(share) for e in self.episodes]
-        part = Objective(self.cloth, self.unknowns, early, self.dt, self.nuisances, self.blocks, self.floors)
-        part.journal = self.journal
-        return part
+        return self._like([e.until(share) for e in self.episodes], self.nuisances)
+
+    def beside(self, nuisances: Sequence[AbstractNuisance]) -> Objective:
+        """The same with other nuisances."""
+        return self._like(self.episodes, nuisances)
+
+    def _like(self, episodes: Sequence[Episode], nuisances: Sequence[AbstractNuisance]) -> Objective:
+        other = Objective(self.cloth, self.unknowns, episodes, self.dt, nuisances, self.blocks, self.floors)
+        other.journal = self.journal
+        return other
 
     def problem(self) -> gauss_newton.Problem:
         """The callbacks of Gauss-Newton."""
@@ -244,8 +251,8 @@ class Objective:
             return work()
         return self.journal.ask(f"{question}-{len(self.episodes[0].times)}", raw, work)
 
-    def secants(self, raw: Tensor, steps: Tensor) -> gauss_newton.Linearised:
-        """The same with one-sided differences over finite ``steps`` of the fabric's unknowns.
+    def secants(self, raw: Tensor, steps: Tensor) -> tuple[gauss_newton.Linearised, Reach]:
+        """The same with one-sided differences over finite ``steps`` of the fabric's unknowns, and how far these reach.
 
         They are what survives where the motion is unstable.
         """
@@ -257,7 +264,11 @@ class Objective:
                 moved.x[k] = (ahead.x - frames.x) / step
                 for name in moved.wrench:
                     moved.wrench[name][k] = (ahead.wrench[name] - frames.wrench[name]) / step
-        return self._rows(both)
+        count = len(self.unknowns)
+        position = torch.stack([m.x[:count].square().sum(-1).mean((1, 2)) for _, m in both])
+        wrenches = [w[:count, 1:, :3].square().sum(-1).mean(1) for _, m in both for w in m.wrench.values()]
+        force = torch.stack(wrenches).mean(0) if wrenches else torch.zeros(count)
+        return self._rows(both), Reach(position.mean(0).sqrt(), force.sqrt())
 
     def _rows(self, both: Sequence[tuple[Frames, Frames | None]]) -> gauss_newton.Linearised:
         parts: list[tuple[int, int, Rows]] = []

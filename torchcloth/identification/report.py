@@ -13,7 +13,7 @@ from ..cloth import Cloth
 from ..materials import AEP
 from .episodes import Episode
 from .nuisances import Placed
-from .result import Estimate
+from .statements import Estimate
 from .unknowns import Unknown, available, collect, needs_contact
 
 TRUSTED = 0.25  # a parameter counts as identified when its standard error is below a quarter of its value
@@ -129,7 +129,7 @@ def _estimate(unknown: Unknown, raw: float, deviation: float) -> Estimate:
     value = unknown.value(raw)
     std = unknown.slope(raw) * deviation
     low, high = (unknown.value(unknown.clip(raw + sign * 1.96 * deviation)) for sign in (-1, 1))
-    identifiable = std < TRUSTED * max(abs(value), _typical(unknown))
+    identifiable = std < TRUSTED * max(abs(value), unknown.typical)
     return Estimate(
         value,
         std,
@@ -139,11 +139,6 @@ def _estimate(unknown: Unknown, raw: float, deviation: float) -> Estimate:
         identifiable,
         "prior" if unknown.measured else "data",
     )
-
-
-def _typical(unknown: Unknown) -> float:
-    """Amplitudes may be zero: they are judged against their typical size (half their prior)."""
-    return 0.5 * unknown.prior_std if unknown.parameter.domain == "nonnegative" else 0.0
 
 
 def _absent(unknown: Unknown, source: str) -> Estimate:

@@ -49,6 +49,11 @@ class Unknown:
         """Of one iteration: a factor of 2.7 on a log parameter, half the typical size of an amplitude."""
         return 0.25 * self.prior_std if self.parameter.domain == "nonnegative" else 1.0
 
+    @property
+    def typical(self) -> float:
+        """Amplitudes may be zero: they are judged against their typical size (half their prior)."""
+        return 0.5 * self.prior_std if self.parameter.domain in ("nonnegative", "real") else 0.0
+
     def value(self, raw: float) -> float:
         """Physical value of an unconstrained one."""
         return float(to_value(torch.tensor(raw, dtype=torch.float64), self.parameter.domain))
