@@ -215,7 +215,7 @@ def test_a_guess_is_where_the_search_begins_and_not_what_it_is_compared_with(mod
     assert all(entry["frames"] == 1 for entry in fit.history)  # no early stage: the guess is past it
     assert fit.parameters["youngs_modulus"].initial == pytest.approx(8e4)
     assert fit.fit["chamfer_before"] > 2 * fit.history[0]["chamfer"]
-    assert fit.fit["iterations"] <= 3
+    assert fit.fit["iterations"] <= 5  # the rim's offset is found anew
     error = abs(fit.parameters["youngs_modulus"].value - guess["youngs_modulus"])
     assert error < fit.parameters["youngs_modulus"].std
 

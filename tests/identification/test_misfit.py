@@ -8,8 +8,9 @@ from torch import Tensor
 
 import torchcloth as tc
 from torchcloth.identification.episodes import Episode
-from torchcloth.identification.misfit import HUBER, figures, huber, noise_scale, patches_of
+from torchcloth.identification.misfit import HUBER, figures, huber, noise_scale
 from torchcloth.identification.null import rigid_carry
+from torchcloth.identification.sheet import patches_of
 
 
 def seen(clouds: list[Tensor], motion=None, initial=None) -> Episode:

@@ -8,11 +8,11 @@ import torch
 from twins import at
 
 import torchcloth as tc
-from torchcloth.identification import fit as fits
-from torchcloth.identification import gauss_newton, result
+from torchcloth.identification import gauss_newton, linearity, result
 from torchcloth.identification.misfit import Figures
 from torchcloth.identification.report import Found, estimates, warnings_of
-from torchcloth.identification.result import Estimate, Identification, write_atomically
+from torchcloth.identification.result import Identification, write_atomically
+from torchcloth.identification.statements import Estimate
 from torchcloth.identification.unknowns import collect
 
 GOOD = Estimate(2.0, 0.1, (1.8, 2.2), "-", 1.0, True)
@@ -100,12 +100,14 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
 
         def secants(self, raw, steps):
             assert 0.005 <= float(steps[0]) <= 0.1
-            return linear(self.secant)
+            return linear(self.secant), None
 
-    at_start = gauss_newton.Iterate(torch.zeros(1), linear(1.0), True, 1e-3, 1.0)
+    at_start = gauss_newton.Iterate(
+        torch.zeros(1), linear(1.0), True, torch.tensor([1e-3]), torch.ones(1), torch.tensor([torch.inf])
+    )
     for secant, warned in ((1.2, False), (5.0, True)):
         fake = Fake(unknowns=[SimpleNamespace(name="youngs_modulus")], secant=secant)
-        final, warnings = fits._Run(fake, "converged", None)._check_linearity(at_start)
+        final, _, warnings = linearity.check(fake, at_start)
         assert bool(warnings) == warned
         assert (final.linear is not at_start.linear) == warned
     assert "tangents of youngs_modulus miss finite steps by up to 80 %" in warnings[0]

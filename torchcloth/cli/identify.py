@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InvalidInput, RecordingError
+from ..errors import InvalidInput
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -18,7 +17,8 @@ if TYPE_CHECKING:
     from ..recordings import Recording
 
 DEMO = "bimanual_swing"
-STOPPED = "; `--resume` continues from the last iteration"
+STOPPED = "; `--resume` goes on from there"
+PROGRESS = "progress"  # folder in DIR, while a fit is not done
 
 
 def add(verbs: Any) -> None:
@@ -41,9 +41,9 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--method",
-        choices=["gauss-newton", "adam"],
+        choices=["gauss-newton", "lbfgs", "adam", "gradient-descent"],
         default="gauss-newton",
-        help="default gauss-newton; adam: the paper's descent",
+        help="default gauss-newton; the last two: on the paper's Chamfer distance, to compare",
     )
     parser.add_argument(
         "--stop", choices=["converged", "paper"], default="converged", help="paper: Chamfer below 1.5 cm"
@@ -55,12 +55,30 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="at most N on all frames, after up to 10 on early ones (35)",
     )
+    parser.add_argument(
+        "--use", nargs="+", choices=["points", "markers", "force"], help="kinds of data (default: all of an episode)"
+    )
+    parser.add_argument(
+        "--nuisance",
+        nargs="+",
+        default=[],
+        metavar="NAME[=STD]",
+        help="of each episode: clock, camera, grasp, shape, tare; with the prior's standard deviation, e.g. clock=0.4",
+    )
+    parser.add_argument(
+        "--prior",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE,SPREAD",
+        help="SPREAD: a factor for positive parameters, a standard deviation for others",
+    )
     parser.add_argument("--contact", type=float, metavar="SPACING", help="contact grid [m]; left out: no contact")
     parser.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
     parser.add_argument(
         "--engine", choices=["auto", "reference", "fused"], default="auto", help="default auto: fused where it can be"
     )
-    parser.add_argument("--resume", action="store_true", help="continue from DIR/progress.json")
+    parser.add_argument("--starts", type=int, default=1, metavar="N", help="starts over two decades (1)")
+    parser.add_argument("--resume", action="store_true", help="go on where a stopped fit into DIR was")
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -80,10 +98,9 @@ def _identify(options: argparse.Namespace) -> int:
         raise InvalidInput("--out", got=f"{options.out}, a file", expected="a folder, new or existing")
     episodes = [recordings.read(path) for path in options.episodes]
     cloth = _cloth(options, episodes[0])
-    guess = _resume(options.out) if options.resume else None
     size = f"{len(episodes)} episode(s), {len(cloth.mesh.faces)} triangles"
     print(f"{size}, stable substep {cloth.stable_step():.3g} s with the start values")
-    fit = _fit(options, cloth, episodes, guess)
+    fit = _fit(options, cloth, episodes)
     return _report(options.out, fit, cloth, episodes)
 
 
@@ -102,30 +119,44 @@ def _cloth(options: argparse.Namespace, recording: Recording) -> Cloth:
     return cloth
 
 
-def _assignments(pairs: Sequence[str]) -> dict[str, float]:
+def _assignments(pairs: Sequence[str], option: str = "--start") -> dict[str, float]:
     out = {}
     for pair in pairs:
         name, _, value = pair.partition("=")
         try:
             out[name] = float(value)
         except ValueError:
-            raise InvalidInput("--start", got=repr(pair), expected="NAME=NUMBER in SI units") from None
+            raise InvalidInput(option, got=repr(pair), expected="NAME=NUMBER in SI units") from None
     return out
 
 
-def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording], guess: dict | None) -> Identification:
+def _nuisances(given: Sequence[str]) -> dict[str, float | None]:
+    plain = dict.fromkeys(name for name in given if "=" not in name)
+    return plain | _assignments([pair for pair in given if "=" in pair], "--nuisance")
+
+
+def _priors(pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
+    out = {}
+    for pair in pairs:
+        name, _, numbers = pair.partition("=")
+        try:
+            value, spread = (float(number) for number in numbers.split(","))
+        except ValueError:
+            raise InvalidInput("--prior", got=repr(pair), expected="NAME=VALUE,SPREAD") from None
+        out[name] = (value, spread)
+    return out
+
+
+def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -> Identification:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from ..identification import identify
-    from ..identification.result import write_atomically
 
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*columns, refresh_per_second=2, disable=not sys.stdout.isatty()) as progress:
         task = progress.add_task("simulating with the start values", total=None)
 
         def advance(iteration: int, chamfer: float, values: dict[str, float]) -> None:
-            options.out.mkdir(parents=True, exist_ok=True)  # not before the arguments were found good
-            write_atomically(options.out / "progress.json", json.dumps(values) + "\n")
             shown = ", ".join(f"{name} {value:.4g}" for name, value in list(values.items())[:3])
             text = f"Chamfer {1e3 * chamfer:.2f} mm, {shown}"
             progress.update(task, completed=iteration, description=text)
@@ -139,32 +170,26 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording], g
             method=options.method,
             stop=options.stop,
             iterations=options.iterations,
-            guess=guess,
-            warm_start=guess is not None,
+            starts=options.starts,
+            journal=options.out / PROGRESS,
+            resume=options.resume,
             dt=options.dt,
+            use=options.use,
+            nuisances=_nuisances(options.nuisance),
+            priors=_priors(options.prior),
             on_progress=advance,
         )
 
 
-def _resume(folder: Path) -> dict[str, float]:
-    path = folder / "progress.json"
-    try:
-        values = json.loads(path.read_text())
-        return {str(name): float(value) for name, value in values.items()}
-    except FileNotFoundError:
-        raise InvalidInput("--resume", got=f"no {path}", expected="an interrupted fit in DIR") from None
-    except (ValueError, TypeError, AttributeError):
-        raise RecordingError(f"{path}: unreadable", remedy="delete it and start again without --resume") from None
-
-
 def _report(folder: Path, fit: Identification, cloth: Cloth, recordings: list[Recording]) -> int:
     from ..identification import episode
+    from ..identification.journal import clear
     from ..identification.pictures import draw
     from ..identification.tables import print_fit
 
     path = fit.save(folder)
-    (folder / "progress.json").unlink(missing_ok=True)
     pictures = draw(fit, [episode(cloth, r) for r in recordings], cloth.mesh.faces, folder)
+    clear(folder / PROGRESS)
     print_fit(fit)
     print(f"result:   {path}")
     print("pictures: " + ", ".join(str(p) for p in pictures))

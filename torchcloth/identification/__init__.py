@@ -4,9 +4,10 @@ from .episodes import Episode, cloth_from, episode
 from .fit import identify
 from .null import rigid_carry
 from .pictures import draw
-from .result import Estimate, Identification
+from .result import Identification
 from .saved import Replayed, replayed
 from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial
+from .statements import Estimate
 from .tables import print_fit
 from .tension import TensionFit, fit_tension
 

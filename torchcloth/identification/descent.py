@@ -1,4 +1,4 @@
-"""The paper's way: gradient descent on the Chamfer distance by reverse mode through the whole rollout."""
+"""Searches by reverse mode through the whole simulation: gradient descent and Adam as the paper has them, L-BFGS."""
 
 from __future__ import annotations
 
@@ -7,35 +7,92 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from ..errors import SimulationDiverged, UnstableStep
 from ..losses import chamfer_to_vertices
+from . import gauss_newton
 from .objective import Objective
-from .replays import simulate
+
+OnIterate = Callable[[Tensor, Objective], bool]
+ROUNDS = 3  # of L-BFGS, each with the noise scales of the point where it begins
+HOPELESS = 1e30  # cost of what cannot be simulated
+SETTLED = 1e-3  # decrease of the robust cost below which a round ends: a few hundredths of a standard error
 
 
 def descend(
-    objective: Objective, start: Tensor, iterations: int, rate: float, on_iterate: Callable[[Tensor, Objective], bool]
+    objective: Objective, start: Tensor, iterations: int, rate: float, on_iterate: OnIterate, adam: bool = True
 ) -> Tensor:
-    """Adam on the unconstrained parameters [K]; ``on_iterate(raw, objective)`` returns True to stop.
+    """Adam, or plain descent, on the unconstrained unknowns [K]; ``on_iterate(raw, objective)`` returns True to stop.
 
-    The loss is the DiffCP paper's one-sided Chamfer distance, cloud to nearest vertex.
+    The loss is the DiffCP paper's one-sided Chamfer distance, cloud to nearest vertex. Plain descent divides by the
+    first gradient's length, so that its first step is ``rate`` long.
     """
     raw, seen = start.clone().requires_grad_(), start
-    optimiser = torch.optim.Adam([raw], lr=rate)
+    optimiser = torch.optim.Adam([raw], lr=rate) if adam else torch.optim.SGD([raw], lr=rate)
+    size = 0.0
     for _ in range(iterations):
-        optimiser.zero_grad()
-        frames = []
-        for episode in objective.episodes:
-            x = simulate(objective.cloth, objective.unknowns, raw, episode, objective.dt)
-            clouds = zip(episode.clouds, x, strict=True)
-            loss = torch.stack([chamfer_to_vertices(cloud, vertices) for cloud, vertices in clouds]).mean()
-            (loss / len(objective.episodes)).backward()
-            frames.append(x.detach())
-        objective.simulations += len(frames)
-        objective.remember(raw.detach(), frames)
+        _, raw.grad = objective.value_and_slope("chamfer", raw.detach(), chamfer)
         seen = raw.detach().clone()
         if on_iterate(seen, objective):
             break
+        if not adam:
+            size = size or max(float(raw.grad.norm()), 1e-30)
+            raw.grad = raw.grad / size
         optimiser.step()
         with torch.no_grad():
             raw.copy_(objective.clip(raw))
     return seen
+
+
+def chamfer(objective: Objective, raw: Tensor, i: int) -> Tensor:
+    """The paper's loss [m] of episode ``i``, as a part of the mean over all."""
+    pairs = ((objective.episodes[i].positions(t), x) for t, x in enumerate(objective.simulate(raw, i).x))
+    loss = torch.stack([chamfer_to_vertices(cloud, x) for cloud, x in pairs if len(cloud)]).mean()
+    return loss / len(objective.episodes)
+
+
+def quasi_newton(objective: Objective, start: Tensor, iterations: int, on_iterate: OnIterate) -> tuple[Tensor, bool]:
+    """L-BFGS on the robust cost of all data and priors, in units of the priors' standard deviations.
+
+    Returns:
+        (end, whether it converged)
+    """
+    best, left = start.clone(), iterations
+    for number in range(ROUNDS):
+        at = gauss_newton.judged(objective.problem(), best, objective.evaluate_all(best))
+        best, used, stopped = _round(objective, at, best, left, on_iterate, number)
+        left -= used
+        if stopped or left <= 0:
+            return best, False
+    return best, True
+
+
+def _round(
+    objective: Objective, at: gauss_newton.Iterate, start: Tensor, iterations: int, on_iterate: OnIterate, number: int
+) -> tuple[Tensor, int, bool]:
+    """(end, iterations used, whether it was stopped) with fixed noise scales."""
+    unit, middle = objective.prior_std, objective.middle
+    scaled = ((start - middle) / unit).requires_grad_()
+    optimiser = torch.optim.LBFGS(
+        [scaled], lr=0.3, max_iter=1, max_eval=20, tolerance_change=1e-12, line_search_fn="strong_wolfe"
+    )
+    loss = lambda o, raw, i: o.cost(raw, i, at)  # noqa: E731
+
+    def closure() -> Tensor:
+        raw = objective.clip(middle + unit * scaled.detach())
+        prior = (raw - middle) / unit
+        try:
+            value, slope = objective.value_and_slope(f"cost{number}", raw, loss)
+        except (SimulationDiverged, UnstableStep):
+            value, slope = scaled.new_tensor(HOPELESS), torch.zeros_like(raw)
+        scaled.grad = slope * unit + prior
+        return value + 0.5 * prior.square().sum()
+
+    values: list[float] = []
+    for used in range(iterations):
+        before = objective.clip(middle + unit * scaled.detach())
+        values.append(float(optimiser.step(closure)))
+        if on_iterate(before, objective):
+            return before, used, True
+        if len(values) > 1 and values[-2] - values[-1] < SETTLED:
+            return before, used, False
+    return objective.clip(middle + unit * scaled.detach()), iterations, False

@@ -1,9 +1,9 @@
-"""Recordings as the simulator takes them: a cloth with its boundaries, motion, frame times, clouds."""
+"""Recordings as the simulator takes them: a cloth with its boundaries, motion, frame times, what was seen and felt."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,14 @@ from ..boundaries.motion import interpolate
 from ..cloth import Cloth
 from ..effects import AbstractEffect, AirDrag, Bending, Gravity
 from ..errors import InvalidInput, RecordingError
+from ..losses import Hits
 from ..materials import AEP, AbstractMaterial
 from ..meshes import Mesh, rectangle
 from ..recordings import Recording
 from ..robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..transfer import Contact
 from ..types import Trajectory
+from . import streams
 
 DEFAULT_STIFFNESS = 300.0  # N/m, a start in the middle of the published fabrics, where an episode names none
 DEFAULT_POISSON = 0.2
@@ -36,10 +38,14 @@ class Episode:
         name: how messages and pictures call it.
         motion: grippers' trajectories by name.
         times: [T] s, frame times on the motion's clock.
-        clouds: T tensors [N_t, 3] m.
+        clouds: T tensors [N_t, 3] m, empty where none was seen.
         initial: [V, 3] m, vertex positions at the first frame.
         settles: whether ``initial`` was measured, so that its noise is damped out before the first frame.
         noise: standard deviation of one point [m], or None when unknown.
+        markers: [T, M, 3] m, material points, NaN where unseen; or None.
+        places: where the markers are on the mesh.
+        wrenches: gripper -> [T, 6] N, N m, what the cloth exerts on it about its origin: mean over the interval that
+            ends at the frame, NaN where not measured.
     """
 
     name: str
@@ -49,11 +55,27 @@ class Episode:
     initial: Tensor
     settles: bool
     noise: float | None
+    markers: Tensor | None = None
+    places: Hits | None = None
+    wrenches: Mapping[str, Tensor] = field(default_factory=dict)
 
     def until(self, share: float) -> Episode:
         """The first ``share`` of the frames, at least four."""
         count = max(4, round(share * len(self.clouds)))
-        return replace(self, times=self.times[:count], clouds=self.clouds[:count])
+        return replace(
+            self,
+            times=self.times[:count],
+            clouds=self.clouds[:count],
+            markers=None if self.markers is None else self.markers[:count],
+            wrenches={name: wrench[:count] for name, wrench in self.wrenches.items()},
+        )
+
+    def positions(self, frame: int) -> Tensor:
+        """[N, 3] m, all that was seen of the cloth: its cloud; its markers where it has no cloud at all."""
+        if self.markers is None or any(len(cloud) for cloud in self.clouds):
+            return self.clouds[frame]
+        seen = self.markers[frame]
+        return seen[seen.isfinite().all(-1)]
 
 
 def cloth_from(
@@ -108,10 +130,11 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
     """Check a recording against a cloth and turn it into tensors of the cloth's dtype.
 
     Raises:
-        RecordingError: no points, or no motion for one of the cloth's grasps.
+        RecordingError: neither points nor markers, or no motion for one of the cloth's grasps.
         InvalidInput: initial vertices that do not belong to the cloth's mesh.
     """
-    points = recording.require("points", by="identify")
+    if recording.markers is None:
+        recording.require("points", by="identify")
     name = recording.path.name if recording.path else "recording"
     dtype = cloth.state(torch.as_tensor(cloth.mesh.vertices)).x.dtype
     motion = replay(recording, dtype)
@@ -119,10 +142,36 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
     missing = [key for key in needed if key not in motion]
     if missing:
         raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=f"motion of {sorted(motion)}")
-    if len(points) < 2:
-        raise RecordingError(f"{name}: points", got=f"{len(points)} frame(s)", expected="at least two")
-    times, kept = _overlap(points.t + recording.clock_offset, motion, needed)
-    clouds = [torch.as_tensor(np.asarray(points.frame(i)), dtype=dtype) for i in kept]
+    times = _frame_times(name, recording, motion, needed)
+    initial = _initial(name, cloth, recording).to(dtype)
+    _check_place(name, cloth, motion, initial, times[0])
+    markers = streams.markers(recording, times, dtype)
+    return Episode(
+        name=name,
+        motion={key: motion[key] for key in needed},
+        times=torch.as_tensor(times),
+        clouds=streams.clouds(recording, times, dtype),
+        initial=initial,
+        settles=recording.cloth.initial_vertices is not None,
+        noise=recording.observation_noise_std,
+        markers=markers,
+        places=None if markers is None else streams.on_pattern(cloth.mesh, recording.markers.uv),  # type: ignore
+        wrenches=streams.wrenches(recording, needed, times, dtype),
+    )
+
+
+def _frame_times(name: str, recording: Recording, motion: Mapping[str, Trajectory], needed: list[str]) -> np.ndarray:
+    """Of the points and markers from the first frame on, which is the points' first where there are points."""
+    seen = [s.t + recording.clock_offset for s in (recording.points, recording.markers) if s is not None]
+    first = seen[0]
+    if len(first) < 2:
+        stream = "points" if recording.points is not None else "markers"
+        raise RecordingError(f"{name}: {stream}", got=f"{len(first)} frame(s)", expected="at least two")
+    times = streams.joined(seen)
+    return _overlap(times[times >= first[0] - streams.SAME], motion, needed)
+
+
+def _initial(name: str, cloth: Cloth, recording: Recording) -> Tensor:
     initial = recording.cloth.initial_vertices
     if initial is not None and initial.ndim == 3 and cloth.mesh.uv is not None:
         initial = recording.cloth.initial_at(cloth.mesh.uv)
@@ -134,16 +183,7 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
             expected=f"{len(cloth.mesh.vertices)}, one per vertex",
             remedy="give the mesh that the initial vertices belong to",
         )
-    _check_place(name, cloth, motion, torch.as_tensor(vertices, dtype=dtype), times[0])
-    return Episode(
-        name=name,
-        motion={key: motion[key] for key in needed},
-        times=torch.as_tensor(times),
-        clouds=clouds,
-        initial=torch.as_tensor(vertices, dtype=dtype),
-        settles=initial is not None,
-        noise=recording.observation_noise_std,
-    )
+    return torch.as_tensor(vertices)
 
 
 def _check_place(name: str, cloth: Cloth, motion: Mapping[str, Trajectory], x: Tensor, start: float) -> None:
@@ -169,7 +209,7 @@ def _number(nominal: Mapping[str, Any], key: str, default: float) -> float:
         raise RecordingError(f"cloth.nominal.{key}", got=repr(nominal[key]), expected="a number in SI units") from None
 
 
-def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[str]) -> tuple[np.ndarray, list[int]]:
+def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[str]) -> np.ndarray:
     """Frames that the motion covers; the first frame must be one of them, it is where the cloth is known."""
     start = max((float(motion[key].t[0]) for key in needed), default=-np.inf)
     end = min((float(motion[key].t[-1]) for key in needed), default=np.inf)
@@ -181,7 +221,7 @@ def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[s
             expected="motion that covers the first frame",
             remedy="check clock_offset",
         )
-    return times[inside], inside.tolist()
+    return times[inside]
 
 
 def _effects(recording: Recording) -> dict[str, AbstractEffect]:

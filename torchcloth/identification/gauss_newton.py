@@ -12,17 +12,24 @@ from ..errors import SimulationDiverged, UnstableStep
 from .misfit import huber, noise_scale
 
 TRUSTED_GAIN = 0.5  # share of the predicted decrease above which an updated Jacobian is good enough
+GATE = 5.0  # standard deviations
 WINDOW = 5  # frames within which residuals of one patch count as one observation
 
 
 class Linearised(NamedTuple):
     """Residuals of all episodes at one point; rows keep their meaning between points."""
 
-    value: Tensor  # [R] m
+    value: Tensor  # [R] in units of the data
     jacobian: Tensor  # [R, K]
-    factor: Tensor  # [R]
+    factor: Tensor  # [R] prior weight
     frame: Tensor  # [R] int64, counted through all episodes
-    patch: Tensor  # [R] int64
+    patch: Tensor  # [R] int64, what errs together
+    block: Tensor | None = None  # [R] int64, kind of data: each has noise of its own. None: all alike
+
+    @property
+    def kind(self) -> Tensor:
+        """[R] the block of every row."""
+        return torch.zeros_like(self.frame) if self.block is None else self.block
 
 
 class Problem(NamedTuple):
@@ -34,7 +41,8 @@ class Problem(NamedTuple):
     prior_mean: Tensor  # [K]
     prior_std: Tensor  # [K]
     longest: Tensor  # [K], longest step
-    noise: float | None
+    noise: Tensor | float | None  # least standard deviation of a residual, for each block [B]
+    gate: Tensor | None = None  # [B] residuals beyond it and five standard deviations do not count; None: all do
 
 
 class Iterate(NamedTuple):
@@ -43,9 +51,22 @@ class Iterate(NamedTuple):
     raw: Tensor
     linear: Linearised
     exact: bool  # the Jacobian was computed here, not updated from elsewhere
-    scale: float  # m, of one residual
-    share: float  # independent observations per residual, <= 1
+    scale: Tensor  # [B] standard deviation of a residual
+    share: Tensor  # [B] independent observations per residual, <= 1
+    gate: Tensor  # [B] in standard deviations
     converged: bool = False  # set on the point that is returned
+
+    @property
+    def rows(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Standard deviation, weight and gate of every row [R]."""
+        kind = self.linear.kind
+        return self.scale[kind], self.share[kind] * self.linear.factor, self.gate[kind]
+
+    def influence(self) -> tuple[Tensor, Tensor]:
+        """(weight of each row [R] in the normal equations, its standardised residual)."""
+        scale, factor, gate = self.rows
+        z = self.linear.value / scale
+        return factor * huber(z, gate)[1] / scale**2, z
 
 
 def minimise(
@@ -90,7 +111,7 @@ def minimise(
 def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None, float, float]:
     """(accepted point or None, actual over predicted decrease, next damping)."""
     gradient, hessian = _normal_equations(problem, at)
-    cost = _cost(problem, at, at.raw, at.linear.value)
+    now = cost(problem, at, at.raw, at.linear.value)
     for _ in range(6):
         step = torch.linalg.solve(hessian + damping * torch.diag(hessian.diagonal()), -gradient)
         step = step.clamp(-problem.longest, problem.longest)  # one by one: a runaway must not hold back the others
@@ -99,7 +120,7 @@ def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None
         value, patch = _try(problem, raw)
         if value is not None:
             predicted = -float(gradient @ step + 0.5 * step @ hessian @ step)
-            decrease = cost - _cost(problem, at, raw, value)
+            decrease = now - cost(problem, at, raw, value)
             if decrease > 0:
                 gain = decrease / max(predicted, 1e-12)
                 return _updated(problem, at, raw, step, value, patch), gain, max(damping / 5, 1e-6)
@@ -121,6 +142,11 @@ def _updated(problem: Problem, at: Iterate, raw: Tensor, step: Tensor, value: Te
     return _iterate(problem, raw, at.linear._replace(value=value, jacobian=jacobian, patch=patch), exact=False)
 
 
+def judged(problem: Problem, raw: Tensor, linear: Linearised) -> Iterate:
+    """A point with the noise scales that its residuals have; their derivatives may be zero."""
+    return _iterate(problem, raw, linear, exact=False)
+
+
 def _linearise(problem: Problem, raw: Tensor) -> Iterate:
     return _iterate(problem, raw, problem.linearise(raw), exact=True)
 
@@ -130,35 +156,49 @@ def _exact(problem: Problem, at: Iterate) -> Iterate:
 
 
 def _iterate(problem: Problem, raw: Tensor, linear: Linearised, exact: bool) -> Iterate:
-    scale = noise_scale(linear.value, problem.noise)
-    return Iterate(raw, linear, exact, scale, _independent_share(linear, scale))
+    kind = linear.kind
+    count = int(kind.max()) + 1
+    floor = problem.noise if isinstance(problem.noise, Tensor) else torch.full((count,), problem.noise or 0.0)
+    scale = torch.tensor([noise_scale(linear.value[kind == b], float(floor[b])) for b in range(count)])
+    gate = torch.full((count,), torch.inf) if problem.gate is None else GATE + problem.gate[:count].to(scale) / scale
+    share = _independent_share(linear, scale, gate)
+    return Iterate(raw, linear, exact, scale.to(linear.value), share.to(linear.value), gate.to(linear.value))
 
 
-def _independent_share(linear: Linearised, scale: float) -> float:
-    """Effective over nominal number of observations, from how residuals add up within patches and windows.
+def _independent_share(linear: Linearised, scale: Tensor, gate: Tensor) -> Tensor:
+    """[B], effective over nominal number of observations, from how residuals add up within patches and windows.
 
     Residuals of a wrong shape agree over centimetres and frames; counted one by one they would overrule every prior
     and promise errors far too small.
     """
-    _, weight = huber(linear.value / scale)
-    z = weight * linear.value / scale
-    z = torch.where(linear.factor < 1, 0.0, z)  # in-plane rows are one-sided: their sum says nothing
+    kind = linear.kind
+    z = linear.value / scale.to(linear.value)[kind]
+    z = huber(z, gate.to(z)[kind])[1] * z
     group = (linear.frame // WINDOW) * (int(linear.patch.max()) + 1) + linear.patch
-    summed = z.new_zeros(int(group.max()) + 1).index_add(0, group, z)
-    return min(1.0, float((z * z).sum() / (summed * summed).sum().clamp(min=1e-12)))
+    out = []
+    for b in range(len(scale)):
+        own = kind == b
+        summed = z.new_zeros(int(group.max()) + 1).index_add(0, group[own], z[own])
+        out.append(min(1.0, float((z[own] ** 2).sum() / (summed * summed).sum().clamp(min=1e-12))))
+    return torch.tensor(out)
 
 
-def _cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
+def cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
     """Robust cost with the scales of ``at``, so that points can be compared."""
     prior = ((raw - problem.prior_mean) / problem.prior_std).square().sum()
-    return float(at.share * (at.linear.factor * huber(value / at.scale)[0]).sum() + 0.5 * prior)
+    scale, factor, gate = at.rows
+    return float((factor * huber(value / scale, gate)[0]).sum() + 0.5 * prior)
 
 
 def _normal_equations(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
-    _, weight = huber(at.linear.value / at.scale)
-    weighted = (at.share * at.linear.factor * weight / at.scale**2)[:, None] * at.linear.jacobian
+    weighted = at.influence()[0][:, None] * at.linear.jacobian
     gradient = weighted.mT @ at.linear.value + (at.raw - problem.prior_mean) / problem.prior_std**2
     return gradient, weighted.mT @ at.linear.jacobian + torch.diag(problem.prior_std**-2)
+
+
+def information(problem: Problem, at: Iterate) -> Tensor:
+    """[K, K] of data and priors."""
+    return _normal_equations(problem, at)[1]
 
 
 def _is_small(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> bool:
@@ -167,23 +207,37 @@ def _is_small(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> 
     return float(step @ hessian @ step) < tolerance**2
 
 
-def covariance(problem: Problem, at: Iterate) -> Tensor:
+def covariance(problem: Problem, at: Iterate, episode: Tensor | None = None) -> Tensor:
     """Covariance of the estimate [K, K]: sandwich with residuals correlated within and between nearby frames.
 
-    Never smaller than what the counted independent observations would give. Model error that persists over a whole
-    episode is beyond it.
+    Never smaller than what the counted independent observations would give; nor, where ``episode`` [R] names three or
+    more, than what leaving out one after the other shows. Model error that all episodes share is beyond it.
     """
     gradient, hessian = _normal_equations(problem, at)
     inverse = torch.linalg.inv(hessian)
-    _, weight = huber(at.linear.value / at.scale)
-    scores = (at.share * at.linear.factor * weight * at.linear.value / at.scale**2)[:, None] * at.linear.jacobian
+    scores = (at.influence()[0] * at.linear.value)[:, None] * at.linear.jacobian
     count = int(at.linear.frame.max()) + 1
     summed = torch.zeros(count, scores.shape[1], dtype=scores.dtype).index_add(0, at.linear.frame, scores)
     summed = summed[summed.abs().sum(1) > 0]
     meat = _long_run(summed) * len(summed) / max(1, len(summed) - len(gradient))
     robust = inverse @ (meat + torch.diag(problem.prior_std**-2)) @ inverse
-    inflate = torch.sqrt((inverse.diagonal() / robust.diagonal()).clamp(min=1.0))
+    least = inverse.diagonal()
+    if episode is not None and int(episode.max()) >= 2:
+        least = torch.maximum(least, _jackknife(at, hessian, episode))
+    inflate = torch.sqrt((least / robust.diagonal()).clamp(min=1.0))
     return robust * inflate[:, None] * inflate[None, :]
+
+
+def _jackknife(at: Iterate, hessian: Tensor, episode: Tensor) -> Tensor:
+    """Variances [K] from leaving out one episode after the other, each by one Newton step (Efron 1982)."""
+    weighted, moved = at.influence()[0][:, None] * at.linear.jacobian, []
+    count = int(episode.max()) + 1
+    for e in range(count):
+        own = episode == e
+        less = hessian - weighted[own].mT @ at.linear.jacobian[own]
+        moved.append(torch.linalg.solve(less, weighted[own].mT @ at.linear.value[own]))
+    shifts = torch.stack(moved)
+    return (count - 1) / count * (shifts - shifts.mean(0)).square().sum(0)
 
 
 def _long_run(scores: Tensor) -> Tensor:

@@ -2,49 +2,97 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from ..boundaries import Grasp
 from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from . import gauss_newton
+from .blocks import BLOCKS, Block
 from .episodes import Episode
-from .misfit import patches_of, rows
-from .replays import simulate, tangents
+from .identifiability import Reach
+from .journal import Journal
+from .misfit import Figures, figures, huber
+from .nuisances import AbstractNuisance, Placed, place
+from .replays import Frames, each, simulate, tangents
+from .rows import Rows, scene_of
+from .sheet import BAND, SHORTEST, sheet_of
 from .unknowns import Unknown
+
+PER_PIECE = 12  # points that a piece of the rim should have in a frame
 
 
 class Objective:
-    """Residuals and simulated frames as functions of the unknowns; counts simulations."""
+    """Residuals and simulated frames as functions of the unknowns; counts simulations.
+
+    The vector of unknowns holds the fabric's first, then the nuisances of one episode after the other.
+    """
 
     def __init__(
-        self, cloth: Cloth, unknowns: Sequence[Unknown], episodes: Sequence[Episode], dt: float | None = None
+        self,
+        cloth: Cloth,
+        unknowns: Sequence[Unknown],
+        episodes: Sequence[Episode],
+        dt: float | None = None,
+        nuisances: Sequence[AbstractNuisance] = (),
+        blocks: Sequence[Block] = BLOCKS,
+        floors: Mapping[str, float] | None = None,
     ) -> None:
         self.cloth, self.unknowns, self.episodes, self.dt = cloth, list(unknowns), list(episodes), dt
-        self.faces, self.patches = torch.as_tensor(cloth.mesh.faces), patches_of(cloth.mesh)
-        self.start = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
+        self.nuisances, self.blocks, self.floors = list(nuisances), list(blocks), dict(floors or {})
+        self.sheet = sheet_of(cloth.mesh, _held(cloth), _piece(cloth, self.episodes))
+        self.faces = self.sheet.faces
+        self.placed = place(self.nuisances, cloth, self.episodes, len(self.unknowns))
+        stds = [std for own in self.placed for p in own for std in p.stds]
+        self.prior_std = torch.tensor([*(u.prior_std for u in unknowns), *stds], dtype=torch.float64)
+        self.start = torch.tensor([*(u.start for u in unknowns), *(0.0 for _ in stds)], dtype=torch.float64)
+        self.middle = torch.tensor([*(u.middle for u in unknowns), *(0.0 for _ in stds)], dtype=torch.float64)
+        self.journal: Journal | None = None
         self.simulations = 0
-        self._recent: dict[tuple[float, ...], list[Tensor]] = {}
+        self._recent: dict[tuple[float, ...], list[Frames]] = {}
+
+    def part(self, share: float) -> Objective:
+        """The same for the first ``share`` of the frames."""
+        return self._like([e.until(share) for e in self.episodes], self.nuisances)
+
+    def beside(self, nuisances: Sequence[AbstractNuisance]) -> Objective:
+        """The same with other nuisances."""
+        return self._like(self.episodes, nuisances)
+
+    def _like(self, episodes: Sequence[Episode], nuisances: Sequence[AbstractNuisance]) -> Objective:
+        other = Objective(self.cloth, self.unknowns, episodes, self.dt, nuisances, self.blocks, self.floors)
+        other.journal = self.journal
+        return other
 
     def problem(self) -> gauss_newton.Problem:
         """The callbacks of Gauss-Newton."""
-        noises = [e.noise for e in self.episodes if e.noise is not None]
+        longest = [*(u.longest_step for u in self.unknowns), *self.prior_std[len(self.unknowns) :].tolist()]
         return gauss_newton.Problem(
             linearise=self.linearise,
             evaluate=self.evaluate,
             clip=self.clip,
-            prior_mean=self.start,
-            prior_std=torch.tensor([u.prior_std for u in self.unknowns], dtype=torch.float64),
-            longest=torch.tensor([u.longest_step for u in self.unknowns], dtype=torch.float64),
-            noise=max(noises) if noises else None,
+            prior_mean=self.middle,
+            prior_std=self.prior_std,
+            longest=torch.tensor(longest, dtype=torch.float64),
+            noise=torch.tensor([self._floor(block) for block in self.blocks], dtype=torch.float64),
+            gate=torch.tensor([block.gate for block in self.blocks], dtype=torch.float64),
         )
+
+    def _floor(self, block: Block) -> float:
+        noises = [e.noise for e in self.episodes if e.noise is not None]
+        stated = max(noises) if noises and block.name == "points" else block.floor
+        return self.floors.get(block.name, stated)
 
     def clip(self, raw: Tensor) -> Tensor:
         """The nearest legal point."""
-        return torch.tensor([u.clip(float(r)) for u, r in zip(self.unknowns, raw, strict=True)], dtype=raw.dtype)
+        legal = [u.clip(float(r)) for u, r in zip(self.unknowns, raw, strict=False)]
+        return torch.cat([torch.tensor(legal, dtype=raw.dtype), raw[len(legal) :]])
 
     def raw(self, values: Mapping[str, float]) -> Tensor:
         """Unconstrained start with some values by name replaced; unknown names are refused."""
@@ -58,64 +106,214 @@ class Objective:
         return out
 
     def values(self, raw: Tensor) -> dict[str, float]:
-        """Physical values by name."""
-        return {u.name: u.value(float(r)) for u, r in zip(self.unknowns, raw, strict=True)}
+        """Physical values of the fabric's unknowns by name."""
+        return {u.name: u.value(float(r)) for u, r in zip(self.unknowns, raw, strict=False)}
+
+    def identity(self) -> list[object]:
+        """What the answers to the solvers' questions depend on."""
+        data = [
+            part
+            for e in self.episodes
+            for part in (
+                e.times,
+                e.initial,
+                *e.clouds,
+                e.markers,
+                *e.wrenches.values(),
+                *(m.pose for m in e.motion.values()),
+            )
+        ]
+        model = [*self.cloth.state_dict().values(), self.cloth.mesh.rest.tobytes(), self.dt, self.cloth.engine]
+        names = [u.name for u in self.unknowns], [b.name for b in self.blocks], self.floors
+        return [*data, *model, *names, self.middle, self.prior_std]
+
+    def episode_of(self, linear: gauss_newton.Linearised) -> Tensor:
+        """[R] which episode a row belongs to."""
+        ends = torch.tensor([len(e.times) + gauss_newton.WINDOW for e in self.episodes]).cumsum(0)
+        return torch.searchsorted(ends, linear.frame, right=True)
+
+    # -- simulation -----------------------------------------------------------------------------------------------
 
     def frames(self, raw: Tensor) -> list[Tensor]:
-        """Simulated frames [T, V, 3] m of every episode; the last few points are remembered."""
+        """Frames [T, V, 3] m of every episode as they are seen."""
+        return [frames.x for frames in self.seen(raw)]
+
+    def seen(self, raw: Tensor) -> list[Frames]:
+        """What is seen and felt of every episode; the last few points are remembered."""
         key = tuple(raw.tolist())
         if key not in self._recent:
             with torch.no_grad():
-                frames = [simulate(self.cloth, self.unknowns, raw, e, self.dt) for e in self.episodes]
+                found = [self.simulate(raw, i) for i in range(len(self.episodes))]
             self.simulations += len(self.episodes)
-            self.remember(raw, frames)
+            self.remember(raw, found)
         return self._recent[key]
 
-    def remember(self, raw: Tensor, frames: list[Tensor]) -> None:
-        """Keep the frames of a point that was simulated elsewhere."""
-        self._recent[tuple(raw.tolist())] = frames
+    def simulate(self, raw: Tensor, i: int) -> Frames:
+        """One episode; differentiable in reverse mode when ``raw`` requires grad."""
+        fabric, episode = raw[: len(self.unknowns)], self._begun(raw, i)
+        frames = simulate(self.cloth, self.unknowns, fabric, episode, self.dt)
+        for p in self.placed[i]:
+            frames = p.nuisance.see(frames, raw[p.where].to(frames.x), self.episodes[i])
+        return frames
+
+    def remember(self, raw: Tensor, found: list[Frames]) -> None:
+        """Keep what was simulated elsewhere."""
+        self._recent[tuple(raw.tolist())] = found
         while len(self._recent) > 4:
             del self._recent[next(iter(self._recent))]
 
+    def _modes(self, i: int) -> list[tuple[slice, Tensor]]:
+        found = ((p.where, p.nuisance.modes(self.cloth, self.episodes[i])) for p in self.placed[i])
+        return [(where, modes) for where, modes in found if modes is not None]
+
+    def _begun(self, raw: Tensor, i: int) -> Episode:
+        """The episode with its first shape as the nuisances have it."""
+        episode = self.episodes[i]
+        for where, modes in self._modes(i):
+            shift = torch.einsum("k,kvc->vc", raw[where].to(modes), modes)
+            episode = replace(episode, initial=episode.initial + shift, settles=True)
+        return episode
+
+    def _tangents(self, raw: Tensor, i: int) -> tuple[Frames, Frames]:
+        """One episode, and its derivatives by all unknowns."""
+        own, episode = self._modes(i), self._begun(raw, i)
+        modes = torch.cat([m for _, m in own]) if own else None
+        fabric = raw[: len(self.unknowns)]
+        frames, few = tangents(self.cloth, self.unknowns, fabric, episode, self.dt, modes)
+        index = [*range(len(self.unknowns)), *(k for where, _ in own for k in range(where.start, where.stop))]
+        moved = each(few, lambda d: d.new_zeros(len(raw), *d.shape[1:]).index_copy(0, torch.tensor(index), d))
+        for p in self.placed[i]:
+            frames, moved = _push(p, frames, moved, raw, self.episodes[i])
+        return frames, moved
+
+    # -- residuals ------------------------------------------------------------------------------------------------
+
     def evaluate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         """Residual rows and their patches."""
-        parts = [
-            rows(x, None, e, self.faces, self.patches) for x, e in zip(self.frames(raw), self.episodes, strict=True)
-        ]
-        return torch.cat([p.value for p in parts]).to(torch.float64), torch.cat([p.patch for p in parts])
+        rows = self.evaluate_all(raw)
+        return rows.value, rows.patch
+
+    def evaluate_all(self, raw: Tensor) -> gauss_newton.Linearised:
+        """Residual rows without derivatives."""
+        work = lambda: self._rows([(frames, None) for frames in self.seen(raw)])  # noqa: E731
+        return gauss_newton.Linearised(*self._ask("evaluate", raw, work))
 
     def linearise(self, raw: Tensor) -> gauss_newton.Linearised:
         """Residual rows with exact sensitivities, by forward mode through the whole simulation."""
-        both = [tangents(self.cloth, self.unknowns, raw, e, self.dt) for e in self.episodes]
+
+        def work() -> gauss_newton.Linearised:
+            both = [self._tangents(raw, i) for i in range(len(self.episodes))]
+            self.remember(raw, [frames for frames, _ in both])
+            return self._rows(both)
+
         self.simulations += len(self.unknowns) * len(self.episodes)
-        self.remember(raw, [x for x, _ in both])
-        return self._rows(both)
+        return gauss_newton.Linearised(*self._ask("linearise", raw, work))
 
-    def secants(self, raw: Tensor, steps: Tensor) -> gauss_newton.Linearised:
-        """The same with one-sided differences over finite ``steps`` [K]: what survives where the motion is unstable."""
-        base, moved = self.frames(raw), []
-        for i, step in enumerate(steps):
+    def figures(self, raw: Tensor) -> Figures:
+        """Distances at a point."""
+        chamfer, rms, per_frame = self._ask("figures", raw, lambda: self._figures(raw))
+        return Figures(float(chamfer), float(rms), per_frame)
+
+    def _figures(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        now = figures(self.frames(raw), self.episodes, self.faces)
+        return torch.tensor(now.chamfer), torch.tensor(now.rms), now.per_frame
+
+    def cost(self, raw: Tensor, i: int, at: gauss_newton.Iterate) -> Tensor:
+        """Robust cost of episode ``i`` by the scales of ``at``, without priors; differentiable in reverse mode."""
+        scene = scene_of(self.simulate(raw, i), None, self.episodes[i], self.sheet)
+        total = raw.new_zeros(())
+        for b, block in enumerate(self.blocks):
+            rows = block.rows(scene)
+            if rows is not None:
+                loss, _ = huber(rows.value.to(at.scale) / at.scale[b], at.gate[b])
+                total = total + at.share[b] * loss.sum()
+        return total
+
+    def value_and_slope(
+        self, question: str, raw: Tensor, loss: Callable[[Objective, Tensor, int], Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """A loss summed over the episodes, and its gradient [K] in reverse mode; one graph at a time."""
+
+        def work() -> tuple[Tensor, Tensor]:
+            leaf, total = raw.clone().requires_grad_(), torch.zeros((), dtype=raw.dtype)
+            for i in range(len(self.episodes)):
+                part = loss(self, leaf, i)
+                part.backward()
+                total += part.detach()
+            return total, torch.zeros_like(raw) if leaf.grad is None else leaf.grad
+
+        self.simulations += len(self.episodes)
+        value, slope = self._ask(question, raw, work)
+        return value, slope
+
+    def _ask(self, question: str, raw: Tensor, work: Callable[[], Any]) -> Any:
+        if self.journal is None:
+            return work()
+        return self.journal.ask(f"{question}-{len(self.episodes[0].times)}", raw, work)
+
+    def secants(self, raw: Tensor, steps: Tensor) -> tuple[gauss_newton.Linearised, Reach]:
+        """The same with one-sided differences over finite ``steps`` of the fabric's unknowns, and how far these reach.
+
+        They are what survives where the motion is unstable.
+        """
+        both = [self._tangents(raw, i) for i in range(len(self.episodes))]
+        for k, step in enumerate(steps[: len(self.unknowns)]):
             shifted = raw.clone()
-            shifted[i] += step
-            moved.append(self.frames(shifted))
-        both = []
-        for e in range(len(self.episodes)):
-            slopes = [(m[e] - base[e]) / step for m, step in zip(moved, steps, strict=True)]
-            both.append((base[e], torch.stack(slopes)))
-        return self._rows(both)
+            shifted[k] += step
+            for (frames, moved), ahead in zip(both, self.seen(shifted), strict=True):
+                moved.x[k] = (ahead.x - frames.x) / step
+                for name in moved.wrench:
+                    moved.wrench[name][k] = (ahead.wrench[name] - frames.wrench[name]) / step
+        count = len(self.unknowns)
+        position = torch.stack([m.x[:count].square().sum(-1).mean((1, 2)) for _, m in both])
+        wrenches = [w[:count, 1:, :3].square().sum(-1).mean(1) for _, m in both for w in m.wrench.values()]
+        force = torch.stack(wrenches).mean(0) if wrenches else torch.zeros(count)
+        return self._rows(both), Reach(position.mean(0).sqrt(), force.sqrt())
 
-    def _rows(self, both: Sequence[tuple[Tensor, Tensor]]) -> gauss_newton.Linearised:
-        parts, counted, first = [], [], 0
-        for (x, tangent), e in zip(both, self.episodes, strict=True):
-            part = rows(x, tangent, e, self.faces, self.patches)
-            parts.append(part)
-            counted.append(part.frame + first)
-            first += len(e.clouds) + gauss_newton.WINDOW  # windows do not reach across episodes
-        double = torch.float64
+    def _rows(self, both: Sequence[tuple[Frames, Frames | None]]) -> gauss_newton.Linearised:
+        parts: list[tuple[int, int, Rows]] = []
+        first = 0
+        for (frames, moved), episode in zip(both, self.episodes, strict=True):
+            scene = scene_of(frames, moved, episode, self.sheet)
+            for b, block in enumerate(self.blocks):
+                rows = block.rows(scene)
+                if rows is not None:
+                    parts.append((b, first, rows))
+            first += len(episode.times) + gauss_newton.WINDOW  # windows do not reach across episodes
+        if not parts:
+            raise InvalidInput("use", got="no data of this kind", expected="data that an episode has")
+        double, count = torch.float64, len(self.start)
+        jacobians = [r.value.new_zeros(len(r.value), count) if r.jacobian is None else r.jacobian for *_, r in parts]
+        value = torch.cat([r.value for *_, r in parts]).to(double)
         return gauss_newton.Linearised(
-            value=torch.cat([p.value for p in parts]).to(double),
-            jacobian=torch.cat([p.jacobian for p in parts if p.jacobian is not None]).to(double),
-            factor=torch.cat([p.factor for p in parts]).to(double),
-            frame=torch.cat(counted),
-            patch=torch.cat([p.patch for p in parts]),
+            value=value,
+            jacobian=torch.cat(jacobians).to(double),
+            factor=torch.ones_like(value),
+            frame=torch.cat([r.frame + offset for _, offset, r in parts]),
+            patch=torch.cat([r.patch for *_, r in parts]),
+            block=torch.cat([torch.full((len(r.value),), b) for b, _, r in parts]),
         )
+
+
+def _push(p: Placed, frames: Frames, moved: Frames, raw: Tensor, episode: Episode) -> tuple[Frames, Frames]:
+    """A nuisance's view of the frames, and the derivatives through it."""
+    values = raw[p.where].to(frames.x)
+    own = values.new_zeros(len(raw), len(values))
+    own[p.where] = torch.eye(len(values), dtype=values.dtype)
+    see = lambda f, v: p.nuisance.see(f, v, episode)  # noqa: E731
+    along = lambda df, dv: torch.func.jvp(see, (frames, values), (df, dv))[1]  # noqa: E731
+    return see(frames, values), torch.func.vmap(along)(moved, own)
+
+
+def _held(cloth: Cloth):
+    index = [part.index for part in cloth.boundaries.values() if isinstance(part, Grasp)]
+    return torch.cat(index).cpu().numpy() if index else None
+
+
+def _piece(cloth: Cloth, episodes: Sequence[Episode]) -> float:
+    """Length of rim [m] in whose band about ``PER_PIECE`` points lie."""
+    counts = [len(cloud) for e in episodes for cloud in e.clouds if len(cloud)]
+    if not counts:
+        return SHORTEST
+    density = sorted(counts)[len(counts) // 2] / float(cloth.mesh.area.sum())
+    return max(SHORTEST, PER_PIECE / (density * BAND))

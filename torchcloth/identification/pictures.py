@@ -47,20 +47,22 @@ def shapes(fit: Identification, episode: Episode, faces: np.ndarray) -> Any:
     from matplotlib.figure import Figure
 
     index = torch.as_tensor(faces)
-    shown = np.linspace(0, len(episode.clouds) - 1, 5).round().astype(int)[1:]
+    clouds = [episode.positions(t) for t in range(len(episode.times))]
+    seen = np.flatnonzero([len(cloud) for cloud in clouds])
+    shown = seen[np.linspace(0, len(seen) - 1, 5).round().astype(int)[1:]]
     figure = Figure(figsize=(15, 7.5))
     axes = figure.subplots(2, 4, subplot_kw={"projection": "3d", "computed_zorder": False})
     figure.subplots_adjust(wspace=0.02, hspace=0.05, top=0.92, bottom=0.02, left=0.02)
-    everything = torch.cat([fit.frames_after[0][shown].reshape(-1, 3), *(episode.clouds[i] for i in shown)]).numpy()
+    everything = torch.cat([fit.frames_after[0][shown].reshape(-1, 3), *(clouds[i] for i in shown)]).numpy()
     middle, half = (everything.max(0) + everything.min(0)) / 2, np.ptp(everything, axis=0).max() / 2
-    worst = 1e3 * max(np.quantile(_distance(episode.clouds[i], fit.frames_before[0][i], index), 0.95) for i in shown)
+    worst = 1e3 * max(np.quantile(_distance(clouds[i], fit.frames_before[0][i], index), 0.95) for i in shown)
     for row, (label, frames) in enumerate((("start", fit.frames_before[0]), ("fitted", fit.frames_after[0]))):
         for column, i in enumerate(shown):
-            axis, x, cloud = axes[row, column], frames[i].numpy(), episode.clouds[i].numpy()
+            axis, x, cloud = axes[row, column], frames[i].numpy(), clouds[i].numpy()
             axis.plot_trisurf(
                 *x.T, triangles=faces, color="#dde5ea", edgecolor="#8fa3ad", linewidth=0.2, alpha=0.6, zorder=1
             )
-            distance = 1e3 * _distance(episode.clouds[i], frames[i], index)
+            distance = 1e3 * _distance(clouds[i], frames[i], index)
             axis.scatter(*cloud.T, c=distance, s=5, cmap="inferno_r", vmin=0, vmax=worst, depthshade=False, zorder=2)
             axis.set_title(f"{label}, t = {float(episode.times[i]):.2f} s: {distance.mean():.2f} mm", fontsize=10)
             axis.set(**{f"{a}lim": (m - half, m + half) for a, m in zip("xyz", middle, strict=True)})
@@ -89,8 +91,9 @@ def distances(fit: Identification, episodes: Sequence[Episode], faces: np.ndarra
     )
     for label, frames, colour in sources:
         for k, (x, episode) in enumerate(zip(frames, episodes, strict=True)):
-            mean = [1e3 * _distance(c, v, index).mean() for c, v in zip(episode.clouds, x, strict=True)]
-            over_time.plot(episode.times, mean, color=colour, label=label if k == 0 else None)
+            shown = [t for t in range(len(x)) if len(episode.positions(t))]
+            mean = [1e3 * _distance(episode.positions(t), x[t], index).mean() for t in shown]
+            over_time.plot(episode.times[shown], mean, color=colour, label=label if k == 0 else None)
     over_time.set(xlabel="time [s]", ylabel="mean distance cloud to surface [mm]", yscale="log")
     over_time.legend()
     for share in sorted({entry["frames"] for entry in fit.history}):

@@ -12,7 +12,8 @@ from torch import Tensor
 from ..cloth import Cloth
 from ..materials import AEP
 from .episodes import Episode
-from .result import Estimate
+from .nuisances import Placed
+from .statements import Estimate
 from .unknowns import Unknown, available, collect, needs_contact
 
 TRUSTED = 0.25  # a parameter counts as identified when its standard error is below a quarter of its value
@@ -30,7 +31,7 @@ class Found(NamedTuple):
 def estimates(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, covariance: Tensor) -> Found:
     """Physical values, standard errors (delta method), 95 % intervals (in the unconstrained coordinate)."""
     deviation = covariance.diagonal().sqrt()
-    parameters = {u.name: _estimate(u, float(r), float(s)) for u, r, s in zip(unknowns, raw, deviation, strict=True)}
+    parameters = {u.name: _estimate(u, float(r), float(s)) for u, r, s in zip(unknowns, raw, deviation, strict=False)}
     if isinstance(cloth.material, AEP) and "youngs_modulus" in parameters:
         parameters = {
             "membrane_stiffness": _times(parameters["youngs_modulus"], cloth.material.thickness, "N/m"),
@@ -48,11 +49,36 @@ def estimates(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, covariance
     return Found(parameters, correlation)
 
 
-def withdraw(found: Found) -> Found:
-    """No parameter counts as identified: the model does not describe these data."""
-    parameters = {
-        name: e if e.source == "prior" else replace(e, identifiable=False) for name, e in found.parameters.items()
-    }
+def nuisance_estimates(
+    episodes: Sequence[Episode], placed: Sequence[Sequence[Placed]], raw: Tensor, covariance: Tensor
+) -> dict[str, dict[str, Estimate]]:
+    """For every episode what was found of its nuisances; known when the data say more than the prior."""
+    deviation, out = covariance.diagonal().sqrt(), {}
+    for i, (episode, own) in enumerate(zip(episodes, placed, strict=True)):
+        name = episode.name if episode.name not in out else f"{episode.name} ({i + 1})"
+        out[name] = {}
+        for p in own:
+            numbers = zip(p.names, p.units, p.stds, raw[p.where].tolist(), deviation[p.where].tolist(), strict=True)
+            for part, unit, prior, value, std in numbers:
+                interval = (value - 1.96 * std, value + 1.96 * std)
+                out[name][part] = Estimate(value, std, interval, unit, 0.0, std < 0.5 * prior, "nuisance")
+    return out
+
+
+def withdraw(found: Found, unknowns: Sequence[Unknown]) -> Found:
+    """No parameter counts as identified, because the model does not describe these data: errors are the priors'."""
+    prior = {u.name: _absent(u, "data") for u in unknowns}
+    parameters = dict(found.parameters)
+    for name, e in found.parameters.items():
+        if e.source == "data" and name in prior:
+            p = prior[name]
+            interval = (min(p.ci95[0], e.value), max(p.ci95[1], e.value))
+            parameters[name] = replace(e, std=p.std, ci95=interval, identifiable=False)
+        elif e.source != "prior":
+            parameters[name] = replace(e, identifiable=False)
+    if "membrane_stiffness" in parameters and "youngs_modulus" in parameters:
+        thickness = found.parameters["membrane_stiffness"].value / found.parameters["youngs_modulus"].value
+        parameters["membrane_stiffness"] = _times(parameters["youngs_modulus"], thickness, "N/m")
     return found._replace(parameters=parameters)
 
 
@@ -103,7 +129,7 @@ def _estimate(unknown: Unknown, raw: float, deviation: float) -> Estimate:
     value = unknown.value(raw)
     std = unknown.slope(raw) * deviation
     low, high = (unknown.value(unknown.clip(raw + sign * 1.96 * deviation)) for sign in (-1, 1))
-    identifiable = std < TRUSTED * max(abs(value), _typical(unknown))
+    identifiable = std < TRUSTED * max(abs(value), unknown.typical)
     return Estimate(
         value,
         std,
@@ -113,11 +139,6 @@ def _estimate(unknown: Unknown, raw: float, deviation: float) -> Estimate:
         identifiable,
         "prior" if unknown.measured else "data",
     )
-
-
-def _typical(unknown: Unknown) -> float:
-    """Amplitudes may be zero: they are judged against their typical size (half their prior)."""
-    return 0.5 * unknown.prior_std if unknown.parameter.domain == "nonnegative" else 0.0
 
 
 def _absent(unknown: Unknown, source: str) -> Estimate:

@@ -13,6 +13,7 @@ from typing import Any
 from torch import Tensor
 
 from ..cloth import Cloth
+from .statements import Combination, Estimate, Influence
 
 CONVENTION = (
     "SI units. chamfer: one-sided, cloud to surface: mean over frames of the mean distance [m] from each measured "
@@ -25,21 +26,6 @@ CONVENTION = (
 )
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """One parameter. ``identifiable`` is False when the data leave it within its prior, whatever its value says."""
-
-    value: float
-    std: float
-    ci95: tuple[float, float]
-    unit: str
-    initial: float
-    identifiable: bool
-    source: str = (
-        "data"  # "data", "prior" (a measurement stated by the recording), "derived", "not in the model", "held fixed"
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Identification:
     """The result of ``identify``.
@@ -50,7 +36,10 @@ class Identification:
         correlation: of the fitted parameters, name -> name -> correlation.
         warnings: what to mistrust, in sentences.
         history: one entry per iteration: chamfer [m] and parameter values.
-        frames_before, frames_after, frames_null: [T, V, 3] m for each episode.
+        frames_before, frames_after, frames_null: [T, V, 3] m for each episode, as its observer sees them.
+        influences: what the data can tell of each fitted parameter, and which experiment would tell more.
+        combinations: of parameters, that the data determine together or leave open.
+        nuisances: by episode, estimates of what is not the fabric's: clock, camera, first shape.
         keys: module path by name of the fitted parameters.
         model: what else a repetition of the simulation needs (see ``saved``).
     """
@@ -64,6 +53,9 @@ class Identification:
     frames_after: list[Tensor] = field(repr=False)
     frames_null: list[Tensor] = field(repr=False)
     keys: dict[str, str] = field(default_factory=dict, repr=False)
+    nuisances: dict[str, dict[str, Estimate]] = field(default_factory=dict)
+    influences: dict[str, Influence] = field(default_factory=dict)
+    combinations: list[Combination] = field(default_factory=list)
     model: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def as_dict(self) -> dict[str, Any]:
@@ -72,6 +64,12 @@ class Identification:
             "parameters": {name: asdict(estimate) for name, estimate in self.parameters.items()},
             "fit": self.fit,
             "correlation": self.correlation,
+            "identifiability": {name: asdict(influence) for name, influence in self.influences.items()},
+            "combinations": [{"of": c.text, **asdict(c)} for c in self.combinations],
+            "nuisances": {
+                episode: {name: asdict(estimate) for name, estimate in own.items()}
+                for episode, own in self.nuisances.items()
+            },
             "convention": CONVENTION,
             "warnings": self.warnings,
             "history": self.history,

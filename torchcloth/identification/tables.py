@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from .result import Estimate, Identification
+from .result import Identification
+from .statements import Estimate
 
 COLUMNS = {
     "parameter": "left",
@@ -36,6 +37,8 @@ def print_fit(fit: Identification) -> None:
     console.print(table)
     if absent:
         console.print(f"Not in the model, because contact was left out: {', '.join(absent)}")
+    _print_nuisances(console, fit)
+    _print_influences(console, fit)
     distances = Table(title="Distance cloud to surface, one-sided, metres", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("", "Chamfer", "rms"):
         distances.add_column(heading, justify="right" if heading else "left")
@@ -50,6 +53,31 @@ def print_fit(fit: Identification) -> None:
     )
     for warning in fit.warnings:
         console.print(f"note: {warning}", style="yellow", markup=False)
+
+
+def _print_influences(console, fit: Identification) -> None:
+    """How far parameters move the cloth, and what would determine those that are not known."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title="What the data can tell", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("parameter", "10 % moves the cloth by", "its forces by", "to determine it"):
+        table.add_column(heading, justify="right" if "by" in heading else "left", no_wrap=heading == "parameter")
+    for name, i in fit.influences.items():
+        table.add_row(name, f"{i.tenth_mm:.2g} mm", f"{i.tenth_newton:.2g} N", i.experiment)
+    if fit.influences:
+        console.print(table)
+    for c in fit.combinations:
+        if c.determined:
+            console.print(f"known together: {c.text}, to {100 * c.std:.2g} %", markup=False)
+
+
+def _print_nuisances(console, fit: Identification) -> None:
+    """What is no property of the fabric, by episode, in as few lines as can be."""
+    for episode, own in fit.nuisances.items():
+        if own:
+            numbers = [f"{name} {e.value:.2g} ± {e.std:.1g} {e.unit}" for name, e in own.items()]
+            console.print(f"{episode}: {', '.join(numbers)}", markup=False)
 
 
 def _statement(e: Estimate) -> tuple[str, str, str]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -26,7 +26,8 @@ class Unknown:
         key: name of the stored tensor in the cloth's state.
         parameter: the parameter at its start value.
         start: unconstrained start value.
-        prior_std: standard deviation of the prior around ``start``, in the unconstrained coordinate.
+        prior_std: standard deviation of the prior, in the unconstrained coordinate.
+        mean: the prior's middle; None: the start.
         measured: the prior is a measurement (areal density), not ignorance.
     """
 
@@ -36,11 +37,22 @@ class Unknown:
     start: float
     prior_std: float
     measured: bool = False
+    mean: float | None = None
+
+    @property
+    def middle(self) -> float:
+        """Of the prior, unconstrained."""
+        return self.start if self.mean is None else self.mean
 
     @property
     def longest_step(self) -> float:
         """Of one iteration: a factor of 2.7 on a log parameter, half the typical size of an amplitude."""
         return 0.25 * self.prior_std if self.parameter.domain == "nonnegative" else 1.0
+
+    @property
+    def typical(self) -> float:
+        """Amplitudes may be zero: they are judged against their typical size (half their prior)."""
+        return 0.5 * self.prior_std if self.parameter.domain in ("nonnegative", "real") else 0.0
 
     def value(self, raw: float) -> float:
         """Physical value of an unconstrained one."""
@@ -115,6 +127,30 @@ def _unknown(cloth: Cloth, name: str, path: str) -> Unknown:
         size = getattr(cloth.get_submodule(owner), "amplitudes", {}).get(own)
         std = 2.0 * (max(1.0, start) if size is None else size.typical)  # undeclared: the start says how large it is
     return Unknown(name, f"{path}.raw", parameter, start, std)
+
+
+def with_priors(unknowns: Sequence[Unknown], priors: Mapping[str, tuple[float, float]]) -> list[Unknown]:
+    """Priors (value, factor) of positive parameters and (value, standard deviation) of others, by name.
+
+    Raises:
+        InvalidInput: a name that is not fitted, or numbers that make no prior.
+    """
+    names = [u.name for u in unknowns]
+    for name, pair in priors.items():
+        if name not in names:
+            raise InvalidInput("priors", got=repr(name), expected=f"some of {', '.join(names)}")
+        positive = unknowns[names.index(name)].parameter.domain == "positive"
+        if len(pair) != 2 or not (math.isfinite(pair[1]) and pair[1] > (1.0 if positive else 0.0)):
+            expected = "(value, factor > 1)" if positive else "(value, standard deviation > 0)"
+            raise InvalidInput(f"priors[{name!r}]", got=pair, expected=expected)
+    return [_around(u, *priors[u.name]) if u.name in priors else u for u in unknowns]
+
+
+def _around(unknown: Unknown, value: float, spread: float) -> Unknown:
+    p = unknown.parameter
+    mean = float(PhysicalParameter(value, p.unit, p.domain, name=f"priors[{unknown.name!r}]").raw.detach())
+    std = math.log(spread) if p.domain == "positive" else spread / unknown.slope(mean)
+    return replace(unknown, mean=mean, prior_std=std, measured=True)
 
 
 def overrides(unknowns: Sequence[Unknown], raw: Tensor) -> dict[str, Tensor]:

@@ -1,0 +1,131 @@
+"""Markers and forces beside points: where they come from, and what they say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import stretches
+import torch
+import twins
+
+from torchcloth import recordings as rec
+from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.identification import episode, identify, streams
+from torchcloth.identification.blocks import blocks_for
+from torchcloth.identification.objective import Objective
+from torchcloth.identification.unknowns import collect
+
+
+@pytest.fixture(scope="module")
+def pulled():
+    with twins.doubles():
+        return stretches.record(markers=5)
+
+
+@pytest.fixture
+def model(pulled):
+    return stretches.model(pulled, youngs_modulus=7e4, poisson_ratio=0.3)
+
+
+def test_streams_share_one_list_of_times(pulled, model):
+    """Markers seen between the clouds: frames without a cloud, clouds without markers."""
+    late = replace(pulled, markers=replace(pulled.markers, t=pulled.markers.t + 0.02))
+    seen = episode(model, late)
+    assert len(seen.times) == 2 * len(pulled.points)
+    assert [len(c) > 0 for c in seen.clouds[:4]] == [True, False, True, False]
+    assert bool(seen.markers[0].isnan().all())
+    np.testing.assert_array_equal(seen.markers[1].numpy(), pulled.markers.xyz[0])
+    assert seen.clouds[0].shape == seen.positions(0).shape
+
+
+def test_markers_lie_on_their_material_points(pulled, model):
+    seen = episode(model, pulled)
+    flat = torch.nn.functional.pad(torch.as_tensor(model.mesh.uv), (0, 1))
+    np.testing.assert_allclose(seen.places.on(flat)[:, :2].numpy(), pulled.markers.uv, atol=1e-12)
+    uv = pulled.markers.uv.copy()
+    uv[3] = [-0.1, 0.1]
+    off = replace(pulled, markers=replace(pulled.markers, uv=uv))
+    with pytest.raises(InvalidInput, match=r"markers.uv\[3\]; got 0.1"):
+        episode(model, off)
+
+
+def test_markers_without_uv_are_points(pulled, model):
+    plain = replace(pulled, markers=replace(pulled.markers, uv=None))
+    seen = episode(model, plain)
+    assert seen.markers is None
+    known = np.isfinite(pulled.markers.xyz[1]).all(-1)
+    assert len(seen.clouds[1]) == pulled.points.counts[1] + known.sum()
+
+
+def test_markers_alone_will_do(pulled, model):
+    fit = identify(model, replace(pulled, points=None), ["youngs_modulus"], iterations=3)
+    assert fit.parameters["membrane_stiffness"].value == pytest.approx(60.0, rel=0.03)
+    assert "points_residual" not in fit.fit
+    assert fit.fit["chamfer_after"] < fit.fit["chamfer_before"]
+
+
+def test_neither_points_nor_markers_is_refused(pulled, model):
+    with pytest.raises(RecordingError, match="has no points"):
+        episode(model, replace(pulled, points=None, markers=None))
+
+
+def test_means_of_a_signal_between_frames():
+    """Of a parabola through its knots: the trapezoidal rule is exact for what lies linearly between them."""
+    t = np.array([0.0, 0.1, 0.3, 0.4])
+    value = np.stack([t, np.full(4, 2.0), [0.0, 1.0, 1.0, 0.0]], axis=1)
+    mean = streams._means(t, value, np.array([0.0, 0.2, 0.4]))
+    assert np.isnan(mean[0]).all()
+    np.testing.assert_allclose(mean[1:, 0], [0.1, 0.3])
+    np.testing.assert_allclose(mean[1:, 1], 2.0)
+    np.testing.assert_allclose(mean[1:, 2], [0.75, 0.75])
+
+
+def test_forces_are_those_of_the_rollout(pulled, model):
+    """At the truth, on the truth's mesh: what is left is the sensor's noise, averaged over some three knots."""
+    exact = stretches.cloth(stretches.Fabric(), stretches.TRUTH)
+    seen = episode(model, pulled)
+    start = torch.as_tensor(stretches.flat(exact.mesh))
+    with torch.no_grad():
+        state = exact.settle(exact.state(start), seen.motion, duration=0.6)
+        out = exact(state, seen.motion, seen.times)
+    for name in ("left", "right"):
+        error = (out.wrench[name] - seen.wrenches[name])[1:, :3]
+        assert float(error.std()) < 1.5 * stretches.FORCE_NOISE
+        assert float(seen.wrenches[name][1:, 0].abs().max()) > 0.4  # N: the noise is small beside it
+        assert bool(seen.wrenches[name][:, 3:].isnan().all())  # moments were not measured
+
+
+def test_each_kind_has_a_scale_of_its_own(pulled, model):
+    problem = Objective(model, collect(model, ["youngs_modulus"], None), [episode(model, pulled)])
+    linear = problem.linearise(problem.start)
+    assert [b.name for b in problem.blocks] == ["points", "edges", "markers", "force", "torque"]
+    assert sorted(set(linear.block.tolist())) == [0, 1, 2, 3]
+    for block, unit in ((2, 1e-2), (3, 1.0)):  # metres and newtons, from a start that is off
+        assert 0.01 * unit < float(linear.value[linear.block == block].abs().median()) < unit
+
+
+def test_force_gives_stiffness_without_a_density(pulled, model):
+    """Positions of a shaken sheet give stiffness over density only; its own weight is not in question here."""
+    blind = identify(model, replace(pulled, markers=None), ["youngs_modulus"], use=["points"], iterations=2)
+    felt = identify(model, pulled, ["youngs_modulus"], use=["points", "force"], iterations=2)
+    assert felt.parameters["youngs_modulus"].std < 0.5 * blind.parameters["youngs_modulus"].std
+    assert felt.parameters["membrane_stiffness"].value == pytest.approx(60.0, rel=0.03)
+
+
+def test_use_is_checked(pulled, model):
+    with pytest.raises(InvalidInput, match=r"use; got 'forces'; expected some of points, markers, force"):
+        blocks_for(["forces"])
+    still = replace(pulled, grippers={n: replace(m, force=None) for n, m in pulled.grippers.items()})
+    with pytest.raises(InvalidInput, match="use; got no data of this kind"):
+        identify(model, still, ["youngs_modulus"], use=["force"])
+
+
+def test_a_point_far_from_everything_does_not_count(pulled, model):
+    """A hand in the picture, half a metre off: as if it were not there."""
+    p = pulled.points
+    hand = np.tile([0.0, 0.0, 1.6], (20, 1))
+    xyz = np.concatenate([np.concatenate([p.frame(i), hand]) for i in range(len(p))])
+    spoilt = replace(pulled, points=rec.PointClouds(p.t, xyz, p.counts + 20))
+    clean, dirty = (identify(model, r, ["youngs_modulus"], use=["points"], iterations=2) for r in (pulled, spoilt))
+    a, b = (fit.parameters["youngs_modulus"] for fit in (clean, dirty))
+    assert abs(a.value - b.value) < 0.3 * a.std

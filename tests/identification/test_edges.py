@@ -1,0 +1,106 @@
+"""The rim's place from points, against sheets whose rim is known."""
+
+import pytest
+import torch
+
+import torchcloth as tc
+from torchcloth.identification.edges import edge_rows
+from torchcloth.identification.episodes import Episode
+from torchcloth.identification.replays import Frames
+from torchcloth.identification.rows import scene_of
+from torchcloth.identification.sheet import BAND, sheet_of
+
+SIDE = 0.3
+MESH = tc.meshes.rectangle(SIDE, SIDE, resolution=(7, 7))
+FRAMES = 60
+
+
+def clouds(larger, generator, density=5000.0, blur=0.0, hidden=None):
+    """Points of a sheet whose rim lies ``larger`` [m] farther out everywhere."""
+    side = SIDE + 2 * larger
+    out = []
+    for _ in range(FRAMES):
+        uv = torch.rand(round(density * side**2), 2, generator=generator) * side - larger
+        if hidden is not None:
+            uv = uv[~hidden(uv)]
+        noise = blur * torch.randn(len(uv), 3, generator=generator)
+        out.append(torch.nn.functional.pad(uv, (0, 1)) + noise)
+    return out
+
+
+def scene(cloud, moved=None, length=0.1, mesh=MESH, held=None):
+    x = torch.as_tensor(mesh.vertices).expand(len(cloud), -1, -1)
+    nothing = x.new_zeros(len(cloud))
+    episode = Episode("fake", {}, torch.arange(len(cloud)) * 0.1, cloud, x[0], True, 1e-3)
+    return scene_of(Frames(x, 0 * x, {}, nothing), moved, episode, sheet_of(mesh, held, length))
+
+
+def offset(cloud, **options):
+    """(mean [m], its standard error) over all frames and pieces."""
+    value = edge_rows(scene(cloud, **options)).value
+    value = value[value != 0]
+    return float(value.mean()), float(value.std() / len(value) ** 0.5)
+
+
+@pytest.mark.parametrize("larger", [-8e-3, -2e-3, 0.0, 2e-3, 8e-3])
+def test_the_rim_is_where_the_points_end(larger):
+    """Inside as well as outside; a ratio of means is biased by some h / (6 n): 0.1 mm of 25 points a piece."""
+    found, error = offset(clouds(larger, torch.Generator().manual_seed(0)))
+    assert error < 0.2e-3
+    assert found == pytest.approx(larger, abs=3 * error + 0.15e-3)
+
+
+def test_noise_moves_the_rim_by_twice_its_variance_over_the_band():
+    """As the file's head says: 2 mm of noise, 0.5 mm."""
+    generator = torch.Generator().manual_seed(0)
+    found, error = offset(clouds(0.0, generator, blur=2e-3))
+    assert found == pytest.approx(2 * (2e-3) ** 2 / BAND, abs=3 * error + 0.15e-3)
+
+
+def test_what_is_hidden_does_not_pull():
+    """A bar across the sheet hides a third of two sides."""
+    found, error = offset(
+        clouds(0.0, torch.Generator().manual_seed(0), hidden=lambda uv: (uv[:, 0] - 0.15).abs() < 0.05)
+    )
+    assert found == pytest.approx(0.0, abs=3 * error + 0.15e-3)
+
+
+def test_a_piece_without_points_says_nothing():
+    rows = edge_rows(scene(clouds(0.0, torch.Generator().manual_seed(0), hidden=lambda uv: uv[:, 0] < 0.1)))
+    left = rows.value.reshape(FRAMES - 1, -1) == 0
+    assert int(left.all(0).sum()) >= 3  # of the hidden side
+    assert not bool(left.all(0).all())
+
+
+def test_the_slope_is_that_of_the_rim():
+    """A rim that moves outwards leaves the points behind, metre by metre."""
+    cloud = clouds(0.0, torch.Generator().manual_seed(0))
+    x = torch.as_tensor(MESH.vertices)
+    grow = (x - x.mean(0)) / (SIDE / 2)  # 1 at every side, across it
+    moved = Frames(grow.expand(1, FRAMES, -1, -1), 0 * grow.expand(1, FRAMES, -1, -1), {}, torch.zeros(1, FRAMES))
+    rows = edge_rows(scene(cloud, moved))
+    assert float(rows.jacobian[rows.value != 0].mean()) == pytest.approx(-1.0, abs=1e-6)
+    shifted = [edge_rows(scene(clouds(d, torch.Generator().manual_seed(1)))).value.mean() for d in (0.0, 2e-3)]
+    assert float(shifted[1] - shifted[0]) == pytest.approx(2e-3, rel=0.1)
+
+
+def test_held_sides_are_no_rim():
+    held = MESH.nearest_vertices([[0.0, v / 20 * SIDE] for v in range(21)], 0.01)
+    assert sheet_of(MESH, held, 0.1).rim.count == 9
+    assert sheet_of(MESH, None, 0.1).rim.count == 12
+
+
+def test_another_layer_is_not_beyond_the_rim():
+    """Points of the sheet's other end, folded to just beside this one's rim, belong there and not here."""
+    x = torch.as_tensor(MESH.vertices).clone()
+    over = x[:, 0] > SIDE / 2
+    x[over, 2] = 8e-3
+    x[over, 0] = SIDE - x[over, 0] + 0.02  # the upper rim lies 2 cm inside the lower one
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.distributions.Dirichlet(torch.ones(3)).sample((FRAMES, 600))
+    faces = torch.as_tensor(MESH.faces)[torch.randint(len(MESH.faces), (FRAMES, 600), generator=generator)]
+    cloud = list((weights.unsqueeze(-1) * x[faces]).sum(-2))
+    given = scene(cloud)
+    rows = edge_rows(scene_of(given.seen._replace(x=x.expand(FRAMES, -1, -1)), None, given.episode, given.sheet))
+    seen = rows.value[rows.value != 0]
+    assert abs(float(seen.mean())) < 1.5e-3

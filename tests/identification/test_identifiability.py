@@ -1,0 +1,95 @@
+"""What the data can tell, on problems where it is known."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import stretches
+import torch
+import twins
+
+from torchcloth.identification import identify
+from torchcloth.identification.identifiability import Reach, combinations, experiment_for, influences
+from torchcloth.identification.statements import Estimate
+from torchcloth.identification.unknowns import collect
+
+NAMES = ("youngs_modulus", "areal_density", "air.normal")
+
+
+@pytest.fixture
+def unknowns(model):
+    return collect(model, NAMES, None)
+
+
+def start(unknowns):
+    return torch.tensor([u.start for u in unknowns])
+
+
+def after(information, unknowns):
+    """Covariance with the priors."""
+    return torch.linalg.inv(information + torch.diag(torch.tensor([u.prior_std**-2 for u in unknowns])))
+
+
+def test_a_ratio_that_alone_is_known_is_named(unknowns):
+    """ln E - ln rho to 2 %, nothing else: positions without force."""
+    slope = torch.tensor([1.0, -1.0, 0.0])
+    found = combinations(unknowns, start(unknowns), after(torch.outer(slope, slope) / 0.02**2, unknowns))
+    known = [c for c in found if c.determined]
+    assert len(known) == 1
+    assert set(known[0].powers) == {"youngs_modulus", "areal_density"}
+    assert known[0].powers["youngs_modulus"] * known[0].powers["areal_density"] == pytest.approx(-1.0, rel=1e-6)
+    assert known[0].std == pytest.approx(0.02, rel=1e-3)
+    assert known[0].text in ("youngs_modulus · areal_density^-1", "areal_density · youngs_modulus^-1")
+
+
+def test_parameters_that_are_known_alone_are_no_combination(unknowns):
+    information = torch.diag(torch.tensor([1e4, 1e2, 1e3]))
+    assert combinations(unknowns, start(unknowns), after(information, unknowns)) == []
+
+
+def test_nuisances_are_allowed_for(unknowns):
+    """An offset that only shows together with the modulus: without its prior the modulus would not be known."""
+    together = torch.tensor([1.0, 0.0, 0.0, 1.0])
+    information = torch.outer(together, together) / 0.01**2 + torch.diag(torch.tensor([0, 1e4, 1e4, 0.5**-2]))
+    prior = torch.diag(torch.tensor([*(u.prior_std**-2 for u in unknowns), 0.0]))
+    marginal = torch.linalg.inv(information + prior)
+    assert float(marginal[0, 0]) ** 0.5 == pytest.approx(0.5, rel=0.05)
+    assert not [c for c in combinations(unknowns, start(unknowns), marginal) if c.determined]
+
+
+def test_reach_is_told_in_millimetres_and_newtons(unknowns):
+    reach = Reach(torch.tensor([2e-3, 1e-3, 0.0]), torch.tensor([0.5, 0.0, 0.0]))
+    known = {n: Estimate(1.0, 0.1, (0.8, 1.2), "-", 1.0, n == "youngs_modulus") for n in NAMES}
+    found = influences(unknowns, start(unknowns), reach, known)
+    assert found["youngs_modulus"].tenth_mm == pytest.approx(0.2)  # of the logarithm
+    assert found["youngs_modulus"].tenth_newton == pytest.approx(0.05)
+    assert found["youngs_modulus"].prior_mm == pytest.approx(2 * math.log(10))
+    assert found["youngs_modulus"].experiment == ""
+    assert found["areal_density"].statement == "not identifiable from these data"
+    assert "weigh" in found["areal_density"].experiment
+    assert found["air.normal"].statement == "no effect on these data"
+
+
+def test_every_parameter_has_an_experiment():
+    for name in ("youngs_modulus", "weft_modulus", "bending.stiffness", "bending.damping_time", "cone", "air.wind"):
+        assert experiment_for(name) != experiment_for("something else")
+    assert "force" in experiment_for("youngs_modulus")
+    assert "overhang" in experiment_for("bending.stiffness")
+
+
+def test_without_force_only_the_ratio_and_with_force_both():
+    """Equivalence 2 of mechanics: motion alone does not know a scale. A twin's density, free of its measurement."""
+    with twins.doubles():
+        pulled = stretches.record()
+        model = stretches.model(pulled, youngs_modulus=6.5e4, poisson_ratio=0.3)
+        for name in ("air.normal", "bending.stiffness"):  # they would tell a scale
+            model.get_submodule(f"effects.{name}").set(0.0)
+    names, options = ["youngs_modulus", "areal_density"], {"iterations": 2, "nuisances": {"grasp": 1e-3}}
+    blind = identify(model, pulled, names, use=["points"], **options)
+    felt = identify(model, pulled, names, **options)
+    assert blind.parameters["areal_density"].std > 3 * felt.parameters["areal_density"].std
+    best = blind.combinations[0]
+    assert best.powers["areal_density"] / best.powers["youngs_modulus"] == pytest.approx(-1.0, abs=0.1)
+    content = felt.as_dict()
+    assert set(content["identifiability"]) == set(names)
+    assert SimpleNamespace(**content["identifiability"]["youngs_modulus"]).tenth_newton > 0.01

@@ -1,0 +1,97 @@
+"""What differs from episode to episode: derivatives, recovery, and that it is kept apart from the fabric."""
+
+import numpy as np
+import pytest
+import stretches
+import torch
+import twins
+
+from torchcloth.errors import InvalidInput
+from torchcloth.identification import episode, identify
+from torchcloth.identification.nuisances import KINDS, chosen
+from torchcloth.identification.objective import Objective
+from torchcloth.identification.unknowns import collect
+
+EVERY = ("clock", "camera", "tare", "grasp", "shape")
+
+
+@pytest.fixture(scope="module")
+def pulled():
+    with twins.doubles():
+        return stretches.record(markers=5)
+
+
+def near(recording):
+    """A start that is wrong by a sixth: the search is short."""
+    return stretches.model(recording, youngs_modulus=7e4, poisson_ratio=0.3)
+
+
+@pytest.fixture
+def objective(pulled):
+    model = stretches.model(pulled)
+    seen = episode(model, pulled).until(0.3)
+    return Objective(model, collect(model, ["youngs_modulus"], None), [seen, seen], 4e-4, chosen(EVERY))
+
+
+def test_every_unknown_has_its_slope(objective):
+    """Against central differences away from zero, where turns are not linear: markers, forces and points alike."""
+    generator = torch.Generator().manual_seed(0)
+    raw = objective.start + 0.3 * objective.prior_std * torch.randn(len(objective.start), generator=generator)
+    raw[0] = objective.start[0]
+    raw[1] = 4e-3  # the clock, inside an interval: at the first frame the cloth stands before and moves after
+    exact = objective.linearise(raw)
+    assert exact.jacobian.shape[1] == 1 + 2 * (1 + 6 + 6 + 1 + 6 + 9)
+    rows = exact.block >= 2  # markers and forces: points jump to another triangle, and the rim is right on average
+    for k in range(1, 30):
+        h = 1e-4 * float(objective.prior_std[k])
+        step = torch.zeros_like(raw)
+        step[k] = h
+        slope = (objective.evaluate(raw + step)[0] - objective.evaluate(raw - step)[0]) / (2 * h)
+        error, size = ((part[rows]).norm() for part in (slope - exact.jacobian[:, k], exact.jacobian[:, k]))
+        assert float(error) < 1e-3 * float(size) + 1e-9, k
+
+
+def test_an_episodes_nuisances_do_not_touch_the_other(objective):
+    linear = objective.linearise(objective.start)
+    first = linear.frame < len(objective.episodes[0].times)
+    assert float(linear.jacobian[first, 30:].abs().max()) == 0.0
+    assert float(linear.jacobian[~first, 1:30].abs().max()) == 0.0
+
+
+def test_a_late_clock_is_found(pulled):
+    late = stretches.record(setting=stretches.Setting(clock=0.02))
+    fit = identify(near(late), late, ["youngs_modulus"], nuisances={"clock": 0.05}, iterations=4)
+    (own,) = fit.nuisances.values()
+    assert abs(own["clock"].value - 0.02) < 4 * own["clock"].std
+    assert own["clock"].value == pytest.approx(0.02, abs=3e-3)
+    assert own["clock"].unit == "s"
+    assert "clock" not in fit.parameters
+
+
+def test_a_shifted_camera_is_found_and_the_fabric_stays(pulled):
+    from dataclasses import replace
+
+    points, markers = pulled.points, pulled.markers
+    shift = np.array([0.002, -0.003, 0.004])
+    moved = replace(
+        pulled,
+        points=replace(points, xyz=points.xyz + shift),
+        markers=replace(markers, xyz=markers.xyz + shift),
+    )
+    fit = identify(near(moved), moved, ["youngs_modulus"], nuisances={"camera": 0.01}, iterations=4)
+    (own,) = fit.nuisances.values()
+    for axis, value in zip("xyz", shift, strict=True):
+        assert own[f"camera.{axis}"].value == pytest.approx(value, abs=1e-3)
+    assert fit.parameters["membrane_stiffness"].value == pytest.approx(60.0, rel=0.05)
+
+
+def test_names_and_deviations():
+    found = chosen({"clock": 0.4, "camera": None}, implied=["rim"])
+    assert [(n.name, n.std) for n in found] == [("clock", 0.4), ("camera", 0.002), ("rim", 0.002)]
+    assert chosen({"rim": 0}, implied=["rim"]) == []
+    assert chosen(()) == []
+    with pytest.raises(InvalidInput, match=r"nuisance; got 'clok'; expected one of clock, camera"):
+        chosen(["clok"])
+    with pytest.raises(InvalidInput, match="nuisance clock; got -1"):
+        chosen({"clock": -1.0})
+    assert set(EVERY) < set(KINDS)

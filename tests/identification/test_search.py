@@ -1,0 +1,136 @@
+"""Estimators on one interface, several starts, priors, and resuming where a search was stopped."""
+
+import pytest
+import stretches
+import torch
+import toys
+import twins
+from test_gauss_newton import solve
+
+from torchcloth.errors import InvalidInput
+from torchcloth.identification import gauss_newton, identify, starts
+from torchcloth.identification.unknowns import collect, with_priors
+
+PAIR = ["youngs_modulus", "air.normal"]
+
+
+def test_lbfgs_finds_what_gauss_newton_finds(model, brief):
+    """The same cost by reverse mode: the ends differ by a part of a standard error."""
+    near = {"youngs_modulus": 5e4}
+    a = identify(model, brief, PAIR, guess=near)
+    b = identify(model, brief, PAIR, method="lbfgs", guess=near)
+    assert b.fit["converged"]
+    for name in PAIR:
+        assert abs(a.parameters[name].value - b.parameters[name].value) < 0.5 * a.parameters[name].std, name
+    assert b.fit["simulations"] > a.fit["simulations"]
+
+
+def test_plain_descent_goes_downhill_slowly(model, brief):
+    fit = identify(model, brief, PAIR, method="gradient-descent", iterations=3)
+    chamfer = [entry["chamfer"] for entry in fit.history]
+    assert chamfer == sorted(chamfer, reverse=True)
+    first = torch.tensor([fit.history[1][n] - fit.history[0][n] for n in PAIR])
+    assert float(first.abs().max()) > 0.0
+    assert not fit.fit["converged"]
+
+
+def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_path):
+    """Wherever it is stopped, for every estimator: the same history and values, bit by bit, and little done twice."""
+    for method in ("gauss-newton", "lbfgs", "adam"):
+        options = {"method": method, "iterations": 2, "guess": {"youngs_modulus": 5e4}}
+        whole = identify(model, brief, PAIR, **options)
+
+        class Stop(Exception):
+            pass
+
+        def stop(iteration, *_):
+            if iteration == 1:
+                raise Stop
+
+        folder = tmp_path / method
+        with pytest.raises(Stop):
+            identify(model, brief, PAIR, journal=folder, on_progress=stop, **options)
+        resumed = identify(model, brief, PAIR, journal=folder, resume=True, **options)
+        assert resumed.history == whole.history
+        assert resumed.parameters == whole.parameters
+        assert torch.equal(resumed.frames_after[0], whole.frames_after[0])
+        with pytest.raises(InvalidInput, match="of another fit"):
+            identify(model, brief, PAIR[:1], journal=folder, resume=True, **options)
+
+
+# -- starts ----------------------------------------------------------------------------------------------------------
+
+
+def test_starts_are_spread_over_two_decades(model):
+    unknowns = collect(model, ["youngs_modulus", "poisson_ratio", "air.normal"], 0.005)
+    begin = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
+    found = torch.stack(starts.spread(unknowns, begin, 33))
+    assert torch.equal(found[0], begin)
+    decades = (found[:, 0] - begin[0]) / 2.302585
+    assert float(decades.min()) < -0.9
+    assert float(decades.max()) > 0.9
+    counts = torch.histc(decades[1:], 4, -1, 1)
+    assert float(counts.min()) >= 7  # evenly
+    assert float(found[:, 2].min()) >= 0.0  # amplitudes stay legal
+    assert torch.equal(found[:, 3], begin[3].expand(33))  # what was measured stays
+
+
+def test_starts_that_agree_are_counted():
+    toy, _ = toys.linear(0)
+    ends = [solve(toy), solve(toy, start=torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64))]
+    astray = ends[0]._replace(raw=ends[0].raw + 5.0)
+    astray = gauss_newton.judged(toy.problem(), astray.raw, toy._linearise(astray.raw))
+    reached = starts.best(toy.problem(), [astray, *ends])
+    assert (reached.agree, reached.tried) == (2, 3)
+    assert float((reached.raw - ends[0].raw).abs().max()) < 1e-2
+
+
+def test_several_starts_are_reported(model, brief):
+    fit = identify(model, brief, ["youngs_modulus"], starts=4, iterations=4)
+    assert fit.fit["starts"] == 4
+    assert fit.fit["starts_agreeing"] >= 3
+    assert fit.parameters["membrane_stiffness"].value == pytest.approx(twins.TRUE.membrane, rel=0.15)
+
+
+# -- priors ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_prior_of_ones_own(model, brief):
+    unknowns = collect(model, ["youngs_modulus", "poisson_ratio"], None)
+    given = with_priors(unknowns, {"youngs_modulus": (5e4, 1.5), "poisson_ratio": (0.3, 0.02)})
+    assert given[0].value(given[0].middle) == pytest.approx(5e4)
+    assert given[0].prior_std == pytest.approx(0.405, abs=1e-3)  # ln 1.5
+    assert given[1].slope(given[1].middle) * given[1].prior_std == pytest.approx(0.02)
+    fit = identify(model, brief, ["poisson_ratio"], priors={"poisson_ratio": (0.3, 0.01)}, iterations=2)
+    assert fit.parameters["poisson_ratio"].value == pytest.approx(0.3, abs=0.02)
+    assert fit.parameters["poisson_ratio"].source == "prior"
+
+
+@pytest.mark.parametrize(
+    ("priors", "said"),
+    [
+        ({"stiffness": (1.0, 2.0)}, r"priors; got 'stiffness'; expected some of youngs_modulus"),
+        ({"youngs_modulus": (5e4, 0.5)}, r"priors\['youngs_modulus'\]; got .*; expected \(value, factor > 1\)"),
+        ({"youngs_modulus": (-5e4, 2.0)}, r"expected a value > 0"),
+    ],
+)
+def test_wrong_priors_are_named(model, priors, said):
+    with pytest.raises(InvalidInput, match=said):
+        with_priors(collect(model, ["youngs_modulus"], None), priors)
+
+
+# -- what must show: minutes -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_start_does_not_matter_over_two_decades():
+    """Ten starts of E, full fits: at least nine within a standard error of their median."""
+    with twins.doubles():
+        recording = stretches.record(seed=5)
+    found = []
+    for share in torch.linspace(-1, 1, 10).tolist():
+        model = stretches.model(recording, youngs_modulus=6e4 * 10**share)
+        fit = identify(model, recording, ["youngs_modulus", "poisson_ratio"], nuisances={"grasp": 1e-3})
+        found.append(fit.parameters["youngs_modulus"])
+    values = torch.tensor([e.value for e in found])
+    assert int(((values - values.median()).abs() < min(e.std for e in found)).sum()) >= 9

@@ -1,0 +1,40 @@
+"""Errors that were not fitted, and yet widen the error bars.
+
+Where grippers hold the cloth, the noise of a measured first shape stays: it is not damped out as elsewhere. A sheet
+that is held half a millimetre too far apart shows a force from which its stiffness seems some per cent larger.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..boundaries import Grasp
+from . import gauss_newton
+from .nuisances import Held
+from .objective import Objective
+
+
+def with_first_shape(objective: Objective, final: gauss_newton.Iterate, covariance: Tensor) -> Tensor:
+    """The covariance [K, K] widened by the noise of the held places, as a considered parameter (Schmidt 1966).
+
+    Each held vertex is taken to carry the noise of one point. Nothing is added where the offset was fitted, or where
+    the first shape or its noise are not measured.
+    """
+    fitted = any(nuisance.name == Held.name for nuisance in objective.nuisances)
+    held = [len(part.index) for part in objective.cloth.boundaries.values() if isinstance(part, Grasp)]
+    noises = [e.noise if e.settles and e.noise else 0.0 for e in objective.episodes]
+    if fitted or not held or max(noises) == 0.0:
+        return covariance
+    wider = objective.beside([*objective.nuisances, Held(max(noises) / min(held) ** 0.5)])
+    considered = torch.zeros(len(wider.start), dtype=torch.bool)
+    for own in wider.placed:
+        for p in own:
+            considered[p.where] = p.nuisance.name == Held.name
+    raw = wider.start.clone()
+    raw[~considered] = final.raw
+    slopes = wider.linearise(raw).jacobian[:, considered]
+    weighted = final.influence()[0][:, None] * final.linear.jacobian
+    moved = torch.linalg.solve(gauss_newton.information(objective.problem(), final), weighted.mT @ slopes)
+    moved = moved * wider.prior_std[considered]
+    return covariance + moved @ moved.mT

@@ -1,0 +1,93 @@
+"""What a search has computed, on disk: a search that was stopped is run again and finds its answers there.
+
+A search is deterministic, so the second run takes the same way, bit by bit, and computes only what the first did not.
+That holds for every estimator alike, and there is no state of a search that could be forgotten.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInput
+
+FORMAT = 1
+T = TypeVar("T", bound=Sequence)
+
+
+class Journal:
+    """Answers by question in a folder, one file each.
+
+    Args:
+        folder: made when the first answer is written; it must be a journal's or not exist.
+        problem: what the answers depend on beside the questions: data, model, options.
+        resume: take up what the folder holds; otherwise it is emptied.
+
+    Raises:
+        InvalidInput: nothing to resume, a journal of another problem, or a folder of other things.
+    """
+
+    def __init__(self, folder: str | Path, problem: Sequence[object], resume: bool) -> None:
+        self.folder, self.key = Path(folder), digest([FORMAT, torch.__version__, *problem])
+        self.recalled = 0
+        stamp = self.folder / "problem"
+        if not resume:
+            clear(self.folder)
+            return
+        if not stamp.exists():
+            raise InvalidInput("resume", got=f"no {self.folder}", expected="what an interrupted fit left")
+        if stamp.read_text() != self.key:
+            raise InvalidInput(
+                "resume",
+                got=f"{self.folder} of another fit",
+                expected="the same episodes, parameters and options",
+                remedy="start again without resuming",
+            )
+
+    def ask(self, question: str, raw: Tensor, work: Callable[[], T]) -> T:
+        """The answer of before, or that of ``work``, which is kept: a tuple of tensors."""
+        path = self.folder / f"{question}-{digest([raw])}.pt"
+        try:
+            answer = torch.load(path, weights_only=True)
+            self.recalled += 1
+            return answer
+        except FileNotFoundError:
+            answer = work()
+        self._write(path, tuple(answer))
+        return answer
+
+    def _write(self, path: Path, answer: tuple) -> None:
+        if not self.folder.exists():
+            self.folder.mkdir(parents=True)
+            (self.folder / "problem").write_text(self.key)
+        part = path.with_suffix(".part")
+        torch.save(answer, part)
+        os.replace(part, path)
+
+
+def clear(folder: Path) -> None:
+    """Remove a journal, if there is one.
+
+    Raises:
+        InvalidInput: a folder of other things.
+    """
+    if folder.exists():
+        if not (folder / "problem").exists():
+            raise InvalidInput("journal", got=f"{folder} with other content", expected="a new folder, or a journal")
+        shutil.rmtree(folder)
+
+
+def digest(parts: Sequence[object]) -> str:
+    """A fingerprint of tensors and of whatever prints in full."""
+    found = hashlib.sha256()
+    for part in parts:
+        data = part.detach().contiguous().numpy().tobytes() if isinstance(part, Tensor) else repr(part).encode()
+        found.update(len(data).to_bytes(8, "little") + data)
+    return found.hexdigest()[:24]

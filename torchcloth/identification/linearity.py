@@ -1,0 +1,44 @@
+"""Whether the derivatives at the solution hold over a standard error."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from . import gauss_newton
+from .identifiability import Reach
+from .objective import Objective
+
+NONLINEAR = 0.5  # relative error of the tangents over a finite step above which they are not used for errors
+SMALLEST, LARGEST = 0.005, 0.1  # finite steps, in units of the prior's standard deviation
+
+
+class Checked(NamedTuple):
+    """A solution whose derivatives hold, or have been replaced."""
+
+    final: gauss_newton.Iterate
+    reach: Reach
+    warnings: list[str]
+
+
+def check(objective: Objective, final: gauss_newton.Iterate) -> Checked:
+    """Compare the tangents with finite steps of about a standard error; where they fail, differences replace them.
+
+    Tangents are exact, but where the motion is unstable they describe a neighbourhood too small to matter.
+    """
+    deviation = gauss_newton.covariance(objective.problem(), final).diagonal().sqrt()
+    prior = objective.problem().prior_std
+    steps = torch.minimum(torch.maximum(deviation, SMALLEST * prior), LARGEST * prior)[: len(objective.unknowns)]
+    secants, reach = objective.secants(final.raw, steps)
+    weight = final.influence()[0].sqrt()[:, None]
+    moved, slope = (weight * j[:, : len(steps)] for j in (secants.jacobian, final.linear.jacobian))
+    missed = (moved - slope).norm(dim=0) / moved.norm(dim=0).clamp(min=1e-12)
+    if float(missed.max()) < NONLINEAR:
+        return Checked(final, reach, [])
+    names = ", ".join(u.name for u, error in zip(objective.unknowns, missed, strict=True) if error >= NONLINEAR)
+    warning = (
+        f"the motion is unstable or strongly nonlinear at the solution (tangents of {names} miss finite steps "
+        f"by up to {min(1000.0, 100 * float(missed.max())):.0f} %): no parameter counts as identified"
+    )
+    return Checked(final._replace(linear=secants), reach, [warning])

@@ -1,0 +1,100 @@
+"""One search for the unknowns, by any estimator: its history, when it stops, and from where it begins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+from torch import Tensor
+
+from ..errors import SimulationDiverged, UnstableStep
+from . import gauss_newton, starts
+from .descent import descend, quasi_newton
+from .objective import Objective
+
+Method = Literal["gauss-newton", "lbfgs", "adam", "gradient-descent"]
+METHODS: tuple[str, ...] = ("gauss-newton", "lbfgs", "adam", "gradient-descent")
+PAPER_CHAMFER = 0.015  # m, the DiffCP paper's stop rule
+EARLY = 0.35  # share of the frames that the first stage of the fit sees
+EARLY_ITERATIONS = 10
+
+Progress = Callable[[int, float, dict[str, float]], None]
+
+
+class Outcome(NamedTuple):
+    """Where a search ended."""
+
+    final: gauss_newton.Iterate
+    unfinished: str  # why the end may not be the optimum; empty where it is
+    reached: starts.Reached | None  # with several starts
+
+
+class Search:
+    """Keeps the history and knows when to stop."""
+
+    def __init__(self, objective: Objective, stop: str, on_progress: Progress | None) -> None:
+        self.objective, self.stop, self.on_progress = objective, stop, on_progress
+        self.history: list[dict[str, Any]] = []
+        self.elsewhere = 0  # simulations of parts of the episodes
+
+    @property
+    def simulations(self) -> int:
+        """Of all stages."""
+        return self.elsewhere + self.objective.simulations
+
+    def run(self, method: str, start: Tensor, iterations: int, rate: float, early: bool, count: int) -> Outcome:
+        """From ``start`` [K], or from ``count`` starts around it, to the end."""
+        full, reached = self.objective, None
+        if count > 1:
+            reached = self._from_several(start, count, iterations)
+            start = reached.raw
+        elif early and method == "gauss-newton":
+            part = full.part(EARLY)
+            start = self._early(part, start, iterations).raw
+            self.elsewhere += part.simulations
+        if method == "gauss-newton":
+            final = gauss_newton.minimise(full.problem(), start, iterations, lambda it: self.record(it.raw, full))
+            return Outcome(final, "" if final.converged else self._why(iterations), reached)
+        if method == "lbfgs":
+            raw, done = quasi_newton(full, start, iterations, self.record)
+        else:
+            raw, done = descend(full, start, iterations, rate, self.record, adam=method == "adam"), False
+        final = gauss_newton.minimise(full.problem(), raw, 0, lambda _: True)._replace(converged=done)
+        unfinished = self._why(iterations) if method == "lbfgs" else self._undecided(iterations)
+        return Outcome(final, "" if done else unfinished, reached)
+
+    def record(self, raw: Tensor, objective: Objective) -> bool:
+        """One more iteration; whether the search may stop here."""
+        now, values = objective.figures(raw), objective.values(raw)
+        share = len(objective.episodes[0].clouds) / len(self.objective.episodes[0].clouds)
+        entry = {"iteration": len(self.history), "frames": share, "chamfer": now.chamfer, "rms": now.rms}
+        self.history.append({**entry, **values})
+        if self.on_progress is not None:
+            self.on_progress(len(self.history) - 1, now.chamfer, values)
+        return self.stop == "paper" and objective is self.objective and now.chamfer < PAPER_CHAMFER
+
+    def _early(self, part: Objective, start: Tensor, iterations: int) -> gauss_newton.Iterate:
+        """On early frames, where a wrong start has not yet led the cloth elsewhere."""
+        budget = min(EARLY_ITERATIONS, iterations)
+        return gauss_newton.minimise(part.problem(), start, budget, lambda it: self.record(it.raw, part), tolerance=1.0)
+
+    def _from_several(self, start: Tensor, count: int, iterations: int) -> starts.Reached:
+        part, found = self.objective.part(EARLY), []
+        for raw in starts.spread(self.objective.unknowns, start, count):
+            try:
+                found.append(self._early(part, raw, iterations))
+            except (SimulationDiverged, UnstableStep):
+                if raw is start:
+                    raise
+        self.elsewhere += part.simulations
+        return starts.best(part.problem(), found)
+
+    def _why(self, iterations: int) -> str:
+        if self.stop == "paper" and self.history[-1]["chamfer"] < PAPER_CHAMFER:
+            return "stopped by the paper's rule, Chamfer below 1.5 cm: the values still depend on the start"
+        return f"stopped after {iterations} iterations before converging: the search is unfinished, so are its errors"
+
+    def _undecided(self, iterations: int) -> str:
+        if self.stop == "paper" and self.history[-1]["chamfer"] < PAPER_CHAMFER:
+            return self._why(iterations)
+        return "gradient descent has no test of convergence: values and errors may be those of an unfinished search"

@@ -1,0 +1,104 @@
+"""The cloth's surface as data see it: triangles, parts that err together, and the rim in straight pieces."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..meshes import Mesh
+
+BAND = 0.015  # m, along the rim, in which points tell where it is
+CORNER = 30.0  # degrees, the turn of a rim at which a piece of it ends
+SHORTEST = 0.03  # m, of a piece
+
+
+class Rim(NamedTuple):
+    """Edges of one triangle only, in straight pieces; held ones are left out."""
+
+    edges: Tensor  # [B, 2] int64
+    opposite: Tensor  # [B] int64, the third vertex of the triangle
+    piece: Tensor  # [B] int64
+    distance: Tensor  # [V, B] m, of every vertex from every edge, at rest
+    count: int  # of pieces
+
+
+class Sheet(NamedTuple):
+    """What residuals need to know of a mesh."""
+
+    faces: Tensor  # [F, 3] int64
+    patches: Tensor  # [V] int64, part of the fabric
+    rim: Rim
+
+
+def sheet_of(mesh: Mesh, held: np.ndarray | None = None, length: float = SHORTEST) -> Sheet:
+    """The surface of a cloth, its rim in pieces of about ``length`` [m], without vertices that are ``held``."""
+    return Sheet(torch.as_tensor(mesh.faces), patches_of(mesh), rim_of(mesh, held, length))
+
+
+def patches_of(mesh: Mesh, across: int = 4) -> Tensor:
+    """[V] int64, which of across x across parts of the fabric a vertex belongs to, along its principal axes."""
+    rest = mesh.uv if mesh.uv is not None else mesh.vertices
+    centred = rest - rest.mean(0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
+    place = centred @ axes.T
+    low, high = place.min(0), place.max(0)
+    cell = np.minimum((across * (place - low) / np.maximum(high - low, 1e-12)).astype(int), across - 1)
+    return torch.as_tensor(cell[:, 0] * across + cell[:, 1])
+
+
+def rim_of(mesh: Mesh, held: np.ndarray | None, length: float) -> Rim:
+    """The rim in pieces of about ``length`` [m] that end at corners."""
+    edges, opposite = _free_edges(mesh.faces)
+    x = mesh.vertices if mesh.uv is None else np.pad(mesh.uv, ((0, 0), (0, 1)))
+    piece, count = np.full(len(edges), -1), 0
+    for run in _runs(edges, x):
+        size = np.linalg.norm(x[edges[run, 1]] - x[edges[run, 0]], axis=1)
+        parts = max(1, round(size.sum() / length))
+        piece[run] = count + (parts * (np.cumsum(size) - 0.5 * size) / size.sum()).astype(int)
+        count += parts
+    used = np.ones(len(edges), bool) if held is None else ~np.isin(edges, held).any(1)
+    _, number = np.unique(piece[used], return_inverse=True)
+    distance = torch.as_tensor(_distances(x, edges[used]), dtype=torch.get_default_dtype())
+    kept, third, number = (torch.as_tensor(a) for a in (edges[used], opposite[used], number))
+    return Rim(kept, third, number, distance, int(number.max()) + 1 if len(number) else 0)
+
+
+def _free_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directed edges [B, 2] of one triangle only, and the vertex opposite to each."""
+    directed = np.concatenate([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]])
+    third = np.concatenate([faces[:, 0], faces[:, 1], faces[:, 2]])
+    _, inverse, count = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
+    free = count[inverse.ravel()] == 1
+    return directed[free], third[free]
+
+
+def _runs(edges: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
+    """Indices of edges in order, from corner to corner; a rim without corners is one run."""
+    following = {int(a): i for i, (a, _) in enumerate(edges)}
+    direction = x[edges[:, 1]] - x[edges[:, 0]]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    after = np.array([following.get(int(b), -1) for b in edges[:, 1]])
+    bends = (after < 0) | ((direction * direction[after]).sum(1) < np.cos(np.radians(CORNER)))
+    begins = np.zeros(len(edges), bool)
+    begins[after[bends & (after >= 0)]] = True
+    left, runs = np.ones(len(edges), bool), []
+    for i in [*np.flatnonzero(begins), *range(len(edges))]:
+        run = []
+        while i >= 0 and left[i]:
+            left[i] = False
+            run.append(i)
+            i = -1 if bends[i] else after[i]
+        if run:
+            runs.append(np.array(run))
+    return runs
+
+
+def _distances(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """[V, B] m."""
+    a, along = x[edges[:, 0]], x[edges[:, 1]] - x[edges[:, 0]]
+    offset = x[:, None] - a
+    s = np.clip((offset * along).sum(-1) / (along * along).sum(-1), 0, 1)
+    return np.linalg.norm(offset - s[..., None] * along, axis=-1)

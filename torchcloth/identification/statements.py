@@ -1,0 +1,47 @@
+"""What is said of one parameter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter. ``identifiable`` is False when the data leave it within its prior, whatever its value says."""
+
+    value: float
+    std: float
+    ci95: tuple[float, float]
+    unit: str
+    initial: float
+    identifiable: bool
+    source: str = (
+        "data"  # "data", "prior" (a measurement stated by the recording), "derived", "not in the model", "held fixed"
+    )
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What the data can tell of one parameter."""
+
+    identifiable: bool
+    statement: str
+    prior_mm: float  # the cloth moves by, rms, for one standard deviation of the prior
+    tenth_mm: float  # for 10 % of the value
+    prior_newton: float
+    tenth_newton: float
+    experiment: str
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A product of powers (a sum, near zero) of parameters, and the relative error that the data leave of it."""
+
+    powers: dict[str, float]
+    std: float
+    determined: bool
+
+    @property
+    def text(self) -> str:
+        """E.g. "youngs_modulus · areal_density^-0.97"."""
+        return " · ".join(n if abs(p - 1) < 0.005 else f"{n}^{p:.2g}" for n, p in self.powers.items())
