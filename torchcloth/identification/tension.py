@@ -19,8 +19,9 @@ from ..parameters import PhysicalParameter
 from ..recordings import ForceDisplacement
 from . import gauss_newton
 from .report import CONFUSED, estimates
-from .result import Estimate, set_identified, write_atomically
+from .result import set_identified, write_atomically
 from .specimens import AbstractSpecimen, Response, Uniaxial
+from .statements import Estimate
 from .unknowns import Unknown, available, collect, needs_contact, overrides
 
 RESOLUTION = 1e-3  # of a table's largest reading: no kind of reading is taken to be better
