@@ -127,9 +127,13 @@ def _read(path: Path) -> _Model:
 
 def _mark(recording: Recording) -> dict[str, Any]:
     """What an episode is recognised by, wherever it lies."""
-    points = recording.require("points", by="the fit")
     name = recording.path.name if recording.path else "recording"
-    return {"name": name, "frames": len(points), "points": len(points.xyz), "mean": points.xyz.mean(0).tolist()}
+    points, markers = recording.points, recording.markers
+    seen = [] if points is None else [points.xyz]
+    seen += [] if markers is None else [markers.xyz[np.isfinite(markers.xyz).all(-1)]]
+    every = np.concatenate(seen) if seen else np.zeros((1, 3))
+    frames = sum(len(stream.t) for stream in (points, markers) if stream is not None)
+    return {"name": name, "frames": frames, "points": len(every), "mean": every.mean(0).tolist()}
 
 
 def _same(path: Path, episodes: Sequence[dict[str, Any]], recording: Recording) -> dict[str, Any]:
