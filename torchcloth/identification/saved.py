@@ -78,7 +78,7 @@ def replayed(path: str | Path, recording: Recording) -> Replayed:
     cloth = _rebuilt(path, model, recording)
     data = episode(cloth, recording)
     with torch.no_grad():
-        frames = Replay(cloth)(data, model.dt)
+        frames = Replay(cloth)(data, model.dt).x
     found = figures([frames], [data], torch.as_tensor(cloth.mesh.faces))
     warning = ""
     if abs(found.chamfer - kept["chamfer"]) > FAITHFUL * kept["chamfer"]:
