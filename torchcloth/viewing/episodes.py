@@ -163,8 +163,9 @@ def _plane(collider: Collider, box: tuple[Array, Array]) -> Plane:
 def _views(recording: Recording, times: Array) -> dict[str, View]:
     out = {}
     for name, camera in recording.cameras.items():
-        depth = camera.depth
-        index = np.full(len(times), -1) if depth is None else _seen(depth.t + recording.clock_offset, times)
+        index = np.full(len(times), -1)
+        if camera.depth is not None and camera.depth_scale is not None:
+            index = _seen(camera.depth.t + recording.clock_offset, times)
         out[name] = View(camera, index)
     return out
 

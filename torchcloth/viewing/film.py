@@ -83,7 +83,7 @@ class View:
 
         Times ``camera.depth_scale`` it is in metres.
         """
-        if self.camera.depth is None or self.camera.depth_scale is None or self.index[frame] < 0:
+        if self.camera.depth is None or self.index[frame] < 0:
             return None
         return self.camera.depth.load(int(self.index[frame]))
 
