@@ -37,7 +37,7 @@ class Plan(NamedTuple):
     release: float  # s, when the grippers open
     slower: float  # times the duration that was asked for
     limiting: str  # which joint of which arm, by what limit, is nearest to its bound
-    gap: Gap  # what comes nearest
+    gap: Gap  # what comes nearest, fingers at the table left out
     holds: dict[str, Hold]
 
     def motion(self, scene: Scene) -> dict[str, Trajectory]:
@@ -147,7 +147,7 @@ def _timed(scene: Scene, action: Action, chosen: dict[str, Way], gap: Gap, slow_
         closed={key: closed[knot] for key, closed in held.items()},
         release=slower * action.release,
         slower=slower,
-        limiting=f"{hardest.load.what} of {scene[name].joint_names[hardest.load.joint]} of {name}",
+        limiting=f"{scene[name].joint_names[hardest.load.joint]} of {name}: {hardest.load.what}",
         gap=gap._replace(time=slower * gap.time),
         holds={key: way.hold for key, way in chosen.items()},
     )
