@@ -132,7 +132,7 @@ def _options(
 def _timed(scene: Scene, action: Action, chosen: dict[str, Way], gap: Gap, slow_down: bool, period: float) -> Plan:
     """All arms slowed down alike, sampled at every knot of the path and between."""
     name, hardest = max(chosen.items(), key=lambda item: item[1].load.factor)
-    slower = max(1.0, EASE * hardest.load.factor) if hardest.load.factor > 1 else 1.0
+    slower = EASE * hardest.load.factor if hardest.load.factor > 1 else 1.0
     if slower > 1 and not slow_down:
         raise _too_fast(scene, name, hardest.load)
     splines = {key: way.spline.slower(slower) for key, way in chosen.items()}
