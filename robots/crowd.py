@@ -19,7 +19,9 @@ STEP = 0.02  # s, between the instants that are looked at
 
 
 def within_arm(scene: Scene, name: str, q: Tensor, times: Tensor, clearance: float) -> tuple[Gap, InvalidInput | None]:
-    """The smallest distance of one arm to the table or to itself, and the refusal if it is too small.
+    """The smallest distance of one arm to the table or to itself, and the refusal if one is too small.
+
+    Fingers on the table do not count in the distance: they work there.
 
     Args:
         scene: the arm is in.
@@ -40,7 +42,8 @@ def within_arm(scene: Scene, name: str, q: Tensor, times: Tensor, clearance: flo
         gaps.append((clearance, nearest(solids, [(i, top) for i in others], times)))
         gaps.append((0.0, nearest(solids, [(i, top) for i in fingers], times)))
     refusals = [gap.refusal(least) for least, gap in gaps if gap.distance < least]
-    return min((gap for _, gap in gaps), key=lambda gap: gap.distance), refusals[0] if refusals else None
+    closest = min((gap for least, gap in gaps if least > 0), key=lambda gap: gap.distance)
+    return closest, refusals[0] if refusals else None
 
 
 def between_arms(scene: Scene, splines: Mapping[str, Spline]) -> Gap:

@@ -37,7 +37,7 @@ class Plan(NamedTuple):
     release: float  # s, when the grippers open
     slower: float  # times the duration that was asked for
     limiting: str  # which joint of which arm, by what limit, is nearest to its bound
-    gap: Gap  # what comes nearest
+    gap: Gap  # what comes nearest, fingers at the table left out
     holds: dict[str, Hold]
 
     def motion(self, scene: Scene) -> dict[str, Trajectory]:
@@ -132,7 +132,7 @@ def _options(
 def _timed(scene: Scene, action: Action, chosen: dict[str, Way], gap: Gap, slow_down: bool, period: float) -> Plan:
     """All arms slowed down alike, sampled at every knot of the path and between."""
     name, hardest = max(chosen.items(), key=lambda item: item[1].load.factor)
-    slower = max(1.0, EASE * hardest.load.factor) if hardest.load.factor > 1 else 1.0
+    slower = EASE * hardest.load.factor if hardest.load.factor > 1 else 1.0
     if slower > 1 and not slow_down:
         raise _too_fast(scene, name, hardest.load)
     splines = {key: way.spline.slower(slower) for key, way in chosen.items()}
@@ -147,7 +147,7 @@ def _timed(scene: Scene, action: Action, chosen: dict[str, Way], gap: Gap, slow_
         closed={key: closed[knot] for key, closed in held.items()},
         release=slower * action.release,
         slower=slower,
-        limiting=f"{hardest.load.what} of {scene[name].joint_names[hardest.load.joint]} of {name}",
+        limiting=f"{scene[name].joint_names[hardest.load.joint]} of {name}: {hardest.load.what}",
         gap=gap._replace(time=slower * gap.time),
         holds={key: way.hold for key, way in chosen.items()},
     )

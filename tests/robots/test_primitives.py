@@ -58,13 +58,13 @@ BEFORE = [
 
 @pytest.mark.parametrize(("make", "whole", "knot", "up"), BEFORE, ids=["cover", "fling", "drag"])
 def test_the_ablation_gets_the_paths_it_always_had(make, whole, knot, up):
-    """To the last bit or two, which depend on the machine's sine."""
+    """Equal bit by bit on one machine; sines differ between machines in the last bit or two."""
     a = make()
     t, pose, _ = a.motion["right"]
     i = int(0.45 * len(t))
-    assert (len(t), a.duration, a.release) == pytest.approx(whole, rel=1e-15)
-    assert [float(t[i]), *pose[i, :3, 3].tolist()] == pytest.approx(knot, rel=1e-15, abs=1e-16)
-    assert pose[i, :3, 2].tolist() == pytest.approx(up, rel=1e-15, abs=1e-16)
+    assert (len(t), a.duration, a.release) == pytest.approx(whole, rel=1e-13)
+    assert [float(t[i]), *pose[i, :3, 3].tolist()] == pytest.approx(knot, rel=1e-13, abs=1e-16)
+    assert pose[i, :3, 2].tolist() == pytest.approx(up, rel=1e-13, abs=1e-16)
 
 
 def fine(action, name="left"):

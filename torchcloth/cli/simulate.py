@@ -175,7 +175,7 @@ def _print(out: Path, rows: list[tuple[Order, float | None]]) -> None:
 
     from .. import recordings
 
-    table = Table("episode", "frames", "seconds", "slower than asked", "nearest solids", "CPU", title=str(out))
+    table = Table("episode", "frames", "seconds", "slower", "limited by", "nearest", "CPU", title=str(out))
     for order, spent in rows:
         recording = recordings.read(out / order.name)
         table.add_row(order.name, *_facts(recording), "was there" if spent is None else f"{spent:.0f} s")
@@ -187,7 +187,5 @@ def _facts(recording: Recording) -> tuple[str, ...]:
     frames, seconds = str(len(recording.require("depth")["cam0"])), f"{motion.t[-1]:.2f}"
     plan = recording.extra.get("plan")
     if plan is None:
-        return frames, seconds, "-", "-"
-    near = plan["nearest"]
-    slower = f"{plan['slower']:.2f} x: {plan['limiting']}" if plan["slower"] > 1 else "no"
-    return frames, seconds, slower, f"{1e3 * near['distance']:.0f} mm: {' and '.join(near['solids'])}"
+        return frames, seconds, "-", "-", "-"
+    return frames, seconds, f"{plan['slower']:.2f} x", plan["limiting"], f"{1e3 * plan['nearest']['distance']:.0f} mm"
