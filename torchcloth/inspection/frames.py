@@ -142,9 +142,9 @@ def _stages(cloud: np.ndarray) -> Segmentation:
 
 def _nearest(cloud: np.ndarray, count: int) -> np.ndarray:
     """[Q] m, distance of some points to their ``count``-th neighbour."""
-    cloud = cloud - cloud.mean(0)  # squares of small numbers keep their digits
     if len(cloud) <= count:
         return np.zeros(0)
+    cloud = cloud - cloud.mean(0)  # squares of small numbers keep their digits
     some = cloud[np.unique(np.linspace(0, len(cloud) - 1, QUERIES).astype(int))]
     squared = (some**2).sum(1)[:, None] - 2 * some @ cloud.T + (cloud**2).sum(1)
     return np.sqrt(np.maximum(np.partition(squared, count, axis=1)[:, count], 0))
