@@ -16,7 +16,7 @@ NEIGHBOURS = 4  # of a marker, whose pattern distances are looked at
 AREA = 8  # neighbours that say how much area a point stands for
 FLAT, MOVES = 1e-3, 0.02  # m: a bound that stays within the one while the cloud moves by the other is a cut
 LINK = 3.0  # times the usual distance of neighbours, within which points belong together
-QUERIES = 300
+QUERIES, LARGE = 300, 20_000  # points looked at closely, and among so many
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ def _neighbours(markers: Markers) -> tuple[np.ndarray, str]:
 
 
 def of_clouds(clouds: PointClouds, cloth: ClothInfo) -> tuple[Frames, list[str]]:
-    """Frames of clouds: no point may be farther from its middle than the cloth is long, to 10 %, outliers aside.
+    """Frames of clouds: outliers aside, none may be wider than the cloth is long, to 10 %.
 
     Returns:
         The frames, and notes on what could not be done.
@@ -144,6 +144,7 @@ def _nearest(cloud: np.ndarray, count: int) -> np.ndarray:
     """[Q] m, distance of some points to their ``count``-th neighbour."""
     if len(cloud) <= count:
         return np.zeros(0)
+    cloud = cloud - cloud.mean(0)  # squares of small numbers keep their digits
     some = cloud[np.unique(np.linspace(0, len(cloud) - 1, QUERIES).astype(int))]
     squared = (some**2).sum(1)[:, None] - 2 * some @ cloud.T + (cloud**2).sum(1)
     return np.sqrt(np.maximum(np.partition(squared, count, axis=1)[:, count], 0))
@@ -154,13 +155,15 @@ def _spacing(cloud: np.ndarray) -> float:
     return float(np.median(away)) if len(away) else 0.0
 
 
-def _area(cloud: np.ndarray) -> float:
-    """m^2, to about 20 %: of points strewn at random over a surface, a disc to the k-th neighbour holds k of them.
+def _area(full: np.ndarray) -> float:
+    """m^2, to about 20 %: of points strewn evenly over a surface, a disc to the k-th neighbour holds k of them.
 
-    Rims make it too large, points in a regular lattice too small.
+    By the median disc, which has k - 1/3, so that rims and stray points do not count. Where points lie much denser on
+    one part of the surface than on another, it is only an order of magnitude.
     """
+    cloud = full[:: len(full) // LARGE + 1]
     away = _nearest(cloud, AREA)
-    return float(len(cloud) * np.pi * (away**2).mean() / AREA) if len(away) else 0.0
+    return float(len(cloud) * np.pi * np.median(away) ** 2 / (AREA - 1 / 3)) if len(away) else 0.0
 
 
 def _size(cloth: ClothInfo) -> tuple[float | None, float | None]:

@@ -14,7 +14,7 @@ QUIET = 2.0  # of a coordinate's scatter over that of its steps, 1 of white nois
 ALIKE = 1.5  # times the scatter of the quietest stretch: beyond, too
 PATCH = 20  # points of a local surface
 QUADRIC = 6  # its unknowns
-QUERIES, FRAMES = 200, 20
+QUERIES, FRAMES, LARGE = 200, 20, 20_000  # points looked at closely, in so many frames, among so many points
 TO_SIGMA = 1.4826  # of the median absolute deviation
 
 
@@ -54,7 +54,7 @@ def of_markers(markers: Markers, still: np.ndarray, use: np.ndarray) -> Noise | 
     about = [_scatter(xyz) for xyz in stretches]
     steps = [_scatter(np.diff(xyz, axis=0)) / np.sqrt(2) for xyz in stretches]
     size, size_of_steps = np.linalg.norm(about, axis=1), np.linalg.norm(steps, axis=1)
-    quiet = np.flatnonzero((size < QUIET * size_of_steps) & (size < ALIKE * size.min()))
+    quiet = np.flatnonzero((size <= QUIET * size_of_steps) & (size <= ALIKE * size.min()))
     if len(quiet):
         chosen, method = [stretches[k] for k in quiet], "about their place while all stands"
     else:
@@ -86,6 +86,7 @@ def of_clouds(clouds: PointClouds, still: np.ndarray) -> Noise | None:
 
 def _off_surface(cloud: np.ndarray) -> np.ndarray:
     """Distances of points from the quadric through their neighbours, scaled to what the sensor's own error is."""
+    cloud = cloud[:: len(cloud) // LARGE + 1]
     centre = cloud[np.unique(np.linspace(0, len(cloud) - 1, QUERIES).astype(int))]
     away = ((centre[:, None] - cloud) ** 2).sum(-1)
     patch = cloud[np.argpartition(away, PATCH - 1, axis=1)[:, :PATCH]]
