@@ -148,7 +148,7 @@ def test_what_is_unknown_is_said(recording):
 
 @pytest.mark.slow
 def test_identify_finds_the_air_that_moves_along(recording):
-    """The whole run, strokes included, gives the frequency of the free swings, 0.90 Hz, that nothing here was fitted to.
+    """The whole run, strokes included, gives the frequency of the free swings, 0.90 Hz, to which nothing was fitted.
 
     Reached: 0.91 Hz; three other runs 0.92 Hz. Without added mass 16.1 mm are left instead of 14.9 mm. No parameter is
     called identified, and rightly: nodes lean by 10 mm at rest already, and drag is another one at small amplitudes.
