@@ -12,7 +12,7 @@ import torch
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import fit_tension
+from torchcloth.identification import fit_tension, print_tension
 from torchcloth.recordings import ForceDisplacement
 
 WARP, WEFT, SHEAR, H = 15e6, 59e6, 3e6, 1e-3
@@ -117,6 +117,19 @@ def test_saved_and_unchanged(tmp_path):
     assert stored["parameters"]["youngs_modulus"]["value"] == fit.parameters["youngs_modulus"].value
     assert stored["errors"] == fit.errors
     assert stored["convention"].startswith("SI units")
+
+
+def test_printed(capsys):
+    fit = fit_tension(cloth(), readings(0, 0.01, np.random.default_rng(0)), NAMES)
+    print_tension(fit)
+    lines = capsys.readouterr().out.splitlines()
+    [row] = [line.split() for line in lines if "youngs_modulus " in line and "Pa" in line]
+    assert float(row[2]) == pytest.approx(WARP, rel=0.02)
+    [unknown] = [line for line in lines if "weft_modulus " in line and "Pa" in line]
+    assert "–" in unknown
+    assert "not identifiable" in unknown
+    assert any(line.split()[:1] == ["0"] for line in lines), "a row of errors"
+    assert not any("cone" in line for line in lines)
 
 
 def test_what_is_refused():

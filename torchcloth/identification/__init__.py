@@ -6,7 +6,7 @@ from .null import rigid_carry
 from .pictures import draw
 from .result import Estimate, Identification
 from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial
-from .tables import print_fit
+from .tables import print_fit, print_tension
 from .tension import TensionFit, fit_tension
 
 __all__ = [
@@ -24,5 +24,6 @@ __all__ = [
     "fit_tension",
     "identify",
     "print_fit",
+    "print_tension",
     "rigid_carry",
 ]
