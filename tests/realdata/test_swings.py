@@ -122,6 +122,13 @@ def test_the_sheet_starts_where_it_is_seen(recording):
     assert np.linalg.norm(cloud[:, None] - sheet, axis=-1).min(1).mean() < 0.015
 
 
+def test_the_standing_cloth_leans(source):
+    """By 11 mm in every run: a bias that no fit of fabric should explain."""
+    found = np.array([swings.lean(run) for run in swings.runs(source).values()])
+    assert np.median(found) == pytest.approx(0.011, abs=0.002)
+    assert found.min() > 0.005
+
+
 def test_identify_takes_it(recording):
     """The whole upper edge is held, and the first frame lies before the tool moves."""
     cloth = cloth_from(recording)
