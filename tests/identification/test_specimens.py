@@ -155,5 +155,5 @@ def test_what_is_refused():
 
 def test_no_equilibrium_is_said(monkeypatch):
     monkeypatch.setattr(specimens, "NEWTON_STEPS", 1)
-    with pytest.raises(SimulationDiverged, match="equilibrium; got none up to a strain of"):
+    with pytest.raises(SimulationDiverged, match="equilibrium; got none at a strain of"):
         Uniaxial().curve(woven(), table([0.5], 0.5))

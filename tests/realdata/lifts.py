@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from folders import source_folder
@@ -157,32 +158,13 @@ def episode(path: Path, trial: str, crop: bool = True, spacing: float | None = N
     if crop and spacing is not None:
         kept = [observe.thin_to_spacing(c, spacing) for c in kept]
     flags = {} if crop else {"cloth": np.concatenate(cloth)}
-    table = np.array([0.0, 0.0, gripper[0, 2]])
-    below = np.array([(c[:, 2] <= CROP).sum() for c in raw])
-    whole = [i for i in range(len(raw)) if cloth[i].any()]
+    still = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
+    closed = np.ones(len(t), dtype=bool)
     return Recording(
-        cloth=ClothInfo(
-            areal_density=DENSITY,
-            areal_density_std=DENSITY_STD,
-            sheet=(SIDE, SIDE),
-            initial_vertices=lying(gripper[0], (gripper[-1] - gripper[0])[:2]),
-            nominal={
-                "bending_stiffness": BENDING,
-                "bending_damping_time": DAMPING,
-                "units": {"bending_stiffness": "N m", "bending_damping_time": "s"},
-            },
-        ),
+        cloth=_cloth(gripper),
         grasps={"gripper": GraspInfo(np.zeros((1, 2)), 0.015)},
-        grippers={
-            "gripper": GripperMotion(
-                t,
-                gripper,
-                np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1)),
-                np.ones(len(t), dtype=bool),
-                extra={"commanded": commanded},
-            )
-        },
-        colliders={"table": Collider(table, np.array([0.0, 0.0, 1.0]), 0.4)},
+        grippers={"gripper": GripperMotion(t, gripper, still, closed, extra={"commanded": commanded})},
+        colliders={"table": Collider(np.array([0.0, 0.0, gripper[0, 2]]), np.array([0.0, 0.0, 1.0]), 0.4)},
         points=PointClouds(
             t[used], np.concatenate([kept[i] for i in used]), np.array([len(kept[i]) for i in used]), extra=flags
         ),
@@ -190,25 +172,40 @@ def episode(path: Path, trial: str, crop: bool = True, spacing: float | None = N
         split={"motion": "lift"},
         provenance="measured",
         licence="none stated by its authors (github priyasundaresan/diffcloud_real2sim): for tests here, not to ship",
-        extra={
-            "notes": {
-                "source": f"github priyasundaresan/diffcloud_real2sim, {trial}",
-                "cropped": crop,
-                "points": {
-                    "all": sum(map(len, raw)),
-                    "below the crop": int(below.sum()),
-                    "outliers, in frames that show the cloth": int(
-                        sum(len(raw[i]) - below[i] - cloth[i].sum() for i in whole)
-                    ),
-                },
-                "frames that show no cloth above the crop": [i for i in range(len(raw)) if i not in whole],
-                "gripper": "command turned by -9.0 degrees and shifted by (23, -29, -1) mm to meet the clouds",
-                "side (m)": {"value": SIDE, "std": SIDE_STD, "own": trial in SPREAD},
-                "assumed": "areal density, bending, flat start, table at the gripper's first height and its friction",
-                "not known": "fabric, mass, lag, gripper's rotation; no parameter is identifiable",
-            }
+        extra={"notes": {"trial": trial, "cropped": crop, **_notes(raw, cloth, trial)}},
+    )
+
+
+def _cloth(gripper: np.ndarray) -> ClothInfo:
+    return ClothInfo(
+        areal_density=DENSITY,
+        areal_density_std=DENSITY_STD,
+        sheet=(SIDE, SIDE),
+        initial_vertices=lying(gripper[0], (gripper[-1] - gripper[0])[:2]),
+        nominal={
+            "bending_stiffness": BENDING,
+            "bending_damping_time": DAMPING,
+            "units": {"bending_stiffness": "N m", "bending_damping_time": "s"},
         },
     )
+
+
+def _notes(raw: list[np.ndarray], cloth: list[np.ndarray], trial: str) -> dict[str, Any]:
+    below = [int((c[:, 2] <= CROP).sum()) for c in raw]
+    shown = [i for i in range(len(raw)) if cloth[i].any()]
+    return {
+        "source": "github priyasundaresan/diffcloud_real2sim",
+        "points": {
+            "all": sum(map(len, raw)),
+            "below the crop": sum(below),
+            "outliers, in frames that show the cloth": int(sum(len(raw[i]) - below[i] - cloth[i].sum() for i in shown)),
+        },
+        "frames that show no cloth above the crop": [i for i in range(len(raw)) if i not in shown],
+        "gripper": f"command turned by {np.degrees(YAW):.1f} degrees and shifted by {SHIFT.tolist()} m, to the clouds",
+        "side (m)": {"value": SIDE, "std": SIDE_STD, "own": trial in SPREAD},
+        "assumed": "areal density, bending, flat start, table at the gripper's first height and its friction",
+        "not known": "fabric, mass, lag, gripper's rotation; no parameter is identifiable",
+    }
 
 
 def main() -> None:

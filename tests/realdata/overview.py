@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -27,8 +27,6 @@ import torch
 
 from torchcloth import recordings
 from torchcloth.identification import Trellis, fit_tension
-
-Written = Callable[[recordings.Recording, str], recordings.Recording]
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ Markers: all frames and all 64 nodes as measured, NaN where there was no depth, 
 Cloth: a square sheet whose upper edge is held along its whole length (between its corners it does not sag). At the
 first frame it hangs flat below the line through the upper nodes of the frames before the tool moves. Their corner
 nodes are left out: seen 15 mm low, they are rounded off.
+Bias: at rest the lower edge is seen 11 mm (7 to 16 mm) in front of the vertical below the upper one, as if the camera's
+pose were off by 2 degrees, or the hanger bent the cloth. Which is not known, so nothing is corrected.
 Not known: fabric, mass, thickness, stiffness. The density is the geometric mean of the authors' two guesses, 0.2 kg/m^2
 and 0.1 kg per sheet, with an error that spans both. No two runs repeat one command, whatever their names say.
 """
@@ -22,7 +24,7 @@ from __future__ import annotations
 import argparse
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from folders import source_folder
@@ -152,6 +154,13 @@ def hanging(run: Run) -> tuple[np.ndarray, float]:
     return corners, float(np.sqrt(np.nanmean(off**2)))
 
 
+def lean(run: Run) -> float:
+    """m, of the lowest nodes off the vertical below the upper ones, along y, before the motion."""
+    still = accepted(run) & (run["t_mesh_s"] < start(run))
+    rows = np.nanmedian(run["mesh_base_m"][still][..., 1], axis=(0, 1))
+    return float(rows[0] - rows[-1])
+
+
 def episode(path: Path, run: str) -> Recording:
     """One run, e.g. "range60_rep5"; see the module's docstring.
 
@@ -160,52 +169,57 @@ def episode(path: Path, run: str) -> Recording:
         run: a key of `runs`.
     """
     data = runs(Path(path))[run]
-    t, position, quat = tool(data)
-    good, mesh, seen = accepted(data), data["mesh_base_m"].reshape(len(data["t_mesh_s"]), -1, 3), data["t_mesh_s"]
-    late, offset, spread = lag(data), hanger(data), noise(data)
-    corners, flatness = hanging(data)
+    (t, position, quat), late, good = tool(data), lag(data), accepted(data)
+    seen, mesh = data["t_mesh_s"], data["mesh_base_m"].reshape(len(data["t_mesh_s"]), -1, 3)
     nodes = np.isfinite(mesh).all(-1)
     mesh = np.where(nodes[..., None], mesh, np.nan)
     use = good & (seen - late.value >= t[0]) & (seen - late.value <= t[-1])
-    density = float(np.prod(GUESSES) ** 0.5)
     edge = np.linspace(0, SIDE, 31)
+    frames = {"all": len(seen), "rejected by arc length": int((~good).sum()), "in points": int(use.sum())}
     return Recording(
-        cloth=ClothInfo(
-            areal_density=density,
-            areal_density_std=density * np.log(GUESSES[1] / GUESSES[0]) / 2,
-            sheet=(SIDE, SIDE),
-            initial_vertices=corners,
-            nominal={
-                "bending_stiffness": BENDING,
-                "bending_damping_time": DAMPING,
-                "units": {"bending_stiffness": "N m", "bending_damping_time": "s"},
-            },
-        ),
+        cloth=_cloth(data),
         grasps={"hanger": GraspInfo(np.stack([edge, np.full(31, SIDE)], -1), 0.006)},
         grippers={"hanger": GripperMotion(t, position, quat, np.ones(len(t), dtype=bool))},
         points=PointClouds(seen[use], mesh[use][nodes[use]], nodes[use].sum(1)),
         markers=Markers(seen, mesh, extra={"accepted": good}),
-        observation_noise_std=float(spread[1]),
+        observation_noise_std=float(noise(data)[1]),
         clock_offset=-float(late.value),
         air_density=AIR,
         split={"motion": run.split("_")[0]},
         provenance="measured",
         licence="none stated by its authors (github Alados5/tfm_matlab): for tests here, not to be passed on",
-        extra={
-            "notes": {
-                "source": "github Alados5/tfm_matlab, IRI (CSIC-UPC) 2021, run " + run,
-                "lag (s)": {"value": late.value, "std": late.std, "between runs": "0.31 to 0.35, median 0.33"},
-                "hanger from tool (m)": {"value": offset.value.tolist(), "std": offset.std.tolist()},
-                "frames": {"all": len(seen), "rejected by arc length": int((~good).sum()), "in points": int(use.sum())},
-                "nodes without depth": int((~nodes).sum()),
-                "noise of a standing node (m)": {"x": spread[0], "y, normal to the cloth": spread[1], "z": spread[2]},
-                "standing nodes off the flat sheet (m, RMS)": flatness,
-                "assumed": "areal density, bending stiffness, air density, the whole upper edge is held",
-                "not known": "fabric, mass, thickness, stiffness",
-                "repeats": "none: all 30 commands differ, also those of one range",
-            }
+        extra={"notes": {"run": run, "frames": frames, "nodes without depth": int((~nodes).sum()), **_notes(data)}},
+    )
+
+
+def _cloth(run: Run) -> ClothInfo:
+    density = float(np.prod(GUESSES) ** 0.5)
+    return ClothInfo(
+        areal_density=density,
+        areal_density_std=density * np.log(GUESSES[1] / GUESSES[0]) / 2,
+        sheet=(SIDE, SIDE),
+        initial_vertices=hanging(run)[0],
+        nominal={
+            "bending_stiffness": BENDING,
+            "bending_damping_time": DAMPING,
+            "units": {"bending_stiffness": "N m", "bending_damping_time": "s"},
         },
     )
+
+
+def _notes(run: Run) -> dict[str, Any]:
+    late, offset, spread = lag(run), hanger(run), noise(run)
+    return {
+        "source": "github Alados5/tfm_matlab, IRI (CSIC-UPC) 2021",
+        "lag (s)": {"value": late.value, "std": late.std},
+        "hanger from tool (m)": {"value": offset.value.tolist(), "std": offset.std.tolist()},
+        "noise of a standing node (m)": {"x": spread[0], "y, normal to the cloth": spread[1], "z": spread[2]},
+        "standing nodes off the flat sheet (m, RMS)": hanging(run)[1],
+        "lean of the standing cloth along y (m)": lean(run),
+        "assumed": "areal density, bending and its damping, air density, the whole upper edge is held",
+        "not known": "fabric, mass, thickness, stiffness",
+        "repeats": "none: all 30 commands differ, also those of one range",
+    }
 
 
 def main() -> None:

@@ -122,6 +122,13 @@ def test_the_sheet_starts_where_it_is_seen(recording):
     assert np.linalg.norm(cloud[:, None] - sheet, axis=-1).min(1).mean() < 0.015
 
 
+def test_the_standing_cloth_leans(source):
+    """By 11 mm in every run: a bias that no fit of fabric should explain."""
+    found = np.array([swings.lean(run) for run in swings.runs(source).values()])
+    assert np.median(found) == pytest.approx(0.011, abs=0.002)
+    assert found.min() > 0.005
+
+
 def test_identify_takes_it(recording):
     """The whole upper edge is held, and the first frame lies before the tool moves."""
     cloth = cloth_from(recording)
@@ -148,7 +155,7 @@ def test_what_is_unknown_is_said(recording):
 
 @pytest.mark.slow
 def test_identify_finds_the_air_that_moves_along(recording):
-    """The whole run, strokes included, gives the free swings' frequency, 0.90 Hz, that nothing here was fitted to.
+    """The whole run, strokes included, gives the frequency of the free swings, 0.90 Hz, to which nothing was fitted.
 
     Reached: 0.91 Hz; three other runs 0.92 Hz. Without added mass 16.1 mm are left instead of 14.9 mm. No parameter is
     called identified, and rightly: nodes lean by 10 mm at rest already, and drag is another one at small amplitudes.

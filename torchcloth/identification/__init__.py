@@ -8,7 +8,7 @@ from .result import Identification
 from .saved import Replayed, replayed
 from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial
 from .statements import Estimate
-from .tables import print_fit
+from .tables import print_fit, print_tension
 from .tension import TensionFit, fit_tension
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "fit_tension",
     "identify",
     "print_fit",
+    "print_tension",
     "replayed",
     "rigid_carry",
 ]

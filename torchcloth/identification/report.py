@@ -82,6 +82,20 @@ def withdraw(found: Found, unknowns: Sequence[Unknown]) -> Found:
     return found._replace(parameters=parameters)
 
 
+def doubts(found: Found) -> list[str]:
+    """Which fitted parameters the data do not tell, or do not tell apart."""
+    out = []
+    for name, estimate in found.parameters.items():
+        if not estimate.identifiable and estimate.source == "data":
+            out.append(f"{name} is not identifiable from these data: its value is no estimate")
+    names = [n for n in found.correlation if found.parameters[n].source == "data"]
+    for i, a in enumerate(names):
+        for b in names[:i]:
+            if abs(found.correlation[a][b]) > CONFUSED:
+                out.append(f"{a} and {b} can hardly be told apart (correlation {found.correlation[a][b]:+.2f})")
+    return out
+
+
 def warnings_of(
     cloth: Cloth,
     episodes: Sequence[Episode],
@@ -98,14 +112,7 @@ def warnings_of(
         out.append(
             "the fitted values are farther from the points than the start: the robust cost fell, the mean did not"
         )
-    for name, estimate in found.parameters.items():
-        if not estimate.identifiable and estimate.source == "data":
-            out.append(f"{name} is not identifiable from these data: its value is no estimate")
-    names = [n for n in found.correlation if found.parameters[n].source == "data"]
-    for i, a in enumerate(names):
-        for b in names[:i]:
-            if abs(found.correlation[a][b]) > CONFUSED:
-                out.append(f"{a} and {b} can hardly be told apart (correlation {found.correlation[a][b]:+.2f})")
+    out += doubts(found)
     if "areal_density" not in found.correlation:
         out.append(
             "areal density was taken as exact: without force readings stiffness and density enter only as a ratio"

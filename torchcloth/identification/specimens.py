@@ -110,9 +110,8 @@ class Uniaxial(AbstractSpecimen):
             if float(traction.abs().max()) <= TOLERANCE * float(slope.abs().max()):
                 return free, slope
             free = free - torch.linalg.solve(slope, traction).clamp(-0.2, 0.2)
-        raise SimulationDiverged(
-            "the strip's equilibrium", got=f"none up to a strain of {float(strain.abs().max()):.3g}"
-        )
+        got = f"none at a strain of {float(strain.abs().max()):.3g}"
+        raise SimulationDiverged("the strip's equilibrium", got=got, expected="one")
 
     def _stress(
         self, material: AbstractMaterial, c: Any, angle: float, strain: Tensor, free: Tensor
@@ -143,10 +142,8 @@ class Trellis(AbstractSpecimen):
         middle = length - width
         closing = (1 + strain * length / middle) / sqrt(2)
         if float(closing.detach().max()) >= 1:
-            got = f"a strain of {float(strain.detach().max()):.3g}"
-            raise InvalidInput(
-                "a trellis", got=got, expected=f"less than {(sqrt(2) - 1) * middle / length:.3g}: yarns meet"
-            )
+            most = f"less than {(sqrt(2) - 1) * middle / length:.3g}, where yarns meet"
+            raise InvalidInput("a trellis", got=f"a strain of {float(strain.detach().max()):.3g}", expected=most)
         shear = pi / 2 - 2 * torch.acos(closing)
         rate = sqrt(2) / middle / torch.sqrt(1 - closing * closing)  # d shear / d displacement
         whole, half = width * (length - 1.5 * width), width * width  # m^2, areas that shear by g and by g / 2
@@ -172,10 +169,8 @@ def surface_of(f1: Tensor, f2: Tensor) -> Surface:
     normal = torch.linalg.cross(f1, f2)
     ratio = normal.norm(dim=-1, keepdim=True)
     n = normal / ratio
-    still = torch.zeros_like(f1)
-    return Surface(
-        f1, f2, torch.linalg.cross(f2, n), torch.linalg.cross(n, f1), n, ratio, torch.ones_like(ratio), still
-    )
+    cofactors = torch.linalg.cross(f2, n), torch.linalg.cross(n, f1)
+    return Surface(f1, f2, *cofactors, n, ratio, torch.ones_like(ratio), torch.zeros_like(f1))
 
 
 def _values(c: Any) -> Any:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 from .result import Identification
 from .statements import Estimate
+from .tension import TensionFit
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 COLUMNS = {
     "parameter": "left",
@@ -16,6 +21,7 @@ COLUMNS = {
     "unit": "left",
     "": "left",
 }
+ERRORS = ("rms_before", "rms_after", "max_after")
 REMARKS = {"prior": "measured", "derived": "= E h", "held fixed": "held fixed"}
 
 
@@ -27,14 +33,8 @@ def print_fit(fit: Identification) -> None:
 
     console = Console(highlight=False)
     console.width = max(console.width, 112)
-    table = Table(title="Parameters", title_justify="left", box=box.SIMPLE_HEAD)
-    for heading, side in COLUMNS.items():
-        table.add_column(heading, justify=side, no_wrap=True)  # type: ignore[arg-type]
     absent = [name for name, e in fit.parameters.items() if e.source == "not in the model"]
-    for name, e in fit.parameters.items():
-        if name not in absent:
-            table.add_row(name, f"{e.initial:.4g}", *_statement(e), e.unit, _remark(e))
-    console.print(table)
+    console.print(_parameters(fit.parameters))
     if absent:
         console.print(f"Not in the model, because contact was left out: {', '.join(absent)}")
     _print_nuisances(console, fit)
@@ -78,6 +78,40 @@ def _print_nuisances(console, fit: Identification) -> None:
         if own:
             numbers = [f"{name} {e.value:.2g} ± {e.std:.1g} {e.unit}" for name, e in own.items()]
             console.print(f"{episode}: {', '.join(numbers)}", markup=False)
+
+
+def print_tension(fit: TensionFit) -> None:
+    """Parameters, errors of every table and warnings, 112 columns wide or more."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    console.width = max(console.width, 112)
+    console.print(_parameters(fit.parameters))
+    table = Table(title="Errors, % of a table's largest reading", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("table", "force rms: start", "fitted", "largest", "lateral strain rms: start", "fitted", "largest"):
+        table.add_column(heading, justify="left" if heading == "table" else "right")
+    for k, errors in enumerate(fit.errors):
+        keys = [f"{kind}_{figure}" for kind in ("force", "lateral") for figure in ERRORS]
+        table.add_row(str(k), *(f"{100 * errors[key]:.1f}" if key in errors else "" for key in keys))
+    console.print(table)
+    for warning in fit.warnings:
+        console.print(f"note: {warning}", style="yellow", markup=False)
+
+
+def _parameters(estimates: dict[str, Estimate]) -> Table:
+    """What is in the model."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title="Parameters", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading, side in COLUMNS.items():
+        table.add_column(heading, justify=side, no_wrap=True)  # type: ignore[arg-type]
+    for name, e in estimates.items():
+        if e.source != "not in the model":
+            table.add_row(name, f"{e.initial:.4g}", *_statement(e), e.unit, _remark(e))
+    return table
 
 
 def _statement(e: Estimate) -> tuple[str, str, str]:

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
@@ -18,7 +19,7 @@ from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from ..recordings import ForceDisplacement
 from . import gauss_newton
-from .report import CONFUSED, estimates
+from .report import doubts, estimates
 from .result import set_identified, write_atomically
 from .specimens import AbstractSpecimen, Response, Uniaxial
 from .statements import Estimate
@@ -101,11 +102,7 @@ def fit_tension(
         SimulationDiverged: no equilibrium with the start values.
     """
     tables = [tables] if isinstance(tables, ForceDisplacement) else list(tables)
-    if not tables or iterations < 1:
-        raise InvalidInput("tables or iterations", got=f"{len(tables)}, {iterations}", expected="at least one of each")
-    for table in tables:
-        if not (table.force > table.preload).any():
-            raise InvalidInput("a table's force", got=f"none above its preload, {table.preload:g} N", expected="a pull")
+    _check(tables, iterations)
     cloth = copy.deepcopy(cloth).to(torch.float64).requires_grad_(False)
     names = _membrane(cloth) if parameters is None else list(parameters)
     unknowns = collect(cloth, names, None)
@@ -113,10 +110,28 @@ def fit_tension(
         raise InvalidInput("parameters", got="none", expected="at least one name")
     readings = _Readings(cloth, unknowns, tables, specimen or Uniaxial(), contraction)
     seen: list[Tensor] = []
-    found = gauss_newton.minimise(
-        readings.problem(), readings.start, iterations, lambda at: seen.append(at.raw) or False
-    )
+
+    def note(at: gauss_newton.Iterate) -> bool:
+        seen.append(at.raw)
+        return False
+
+    found = gauss_newton.minimise(readings.problem(), readings.start, iterations, note)
+    if readings.weigh(found.linear.value):
+        found = gauss_newton.minimise(readings.problem(), found.raw, iterations, note)
     return _statements(readings, found, len(seen) - 1)
+
+
+def _check(tables: list[ForceDisplacement], iterations: int) -> None:
+    if not tables or iterations < 1:
+        raise InvalidInput("tables or iterations", got=f"{len(tables)}, {iterations}", expected="at least one of each")
+    for k, table in enumerate(tables):
+        if not (table.force > table.preload).any():
+            got = f"none above the preload, {table.preload:g} N"
+            raise InvalidInput(f"tables[{k}].force", got=got, expected="a pull")
+        if table.lateral_strain is not None and not (np.abs(table.lateral_strain) > 0).any():
+            raise InvalidInput(
+                f"tables[{k}].lateral_strain", got="no change of width", expected="some", remedy="use None"
+            )
 
 
 def _membrane(cloth: Cloth) -> list[str]:
@@ -183,12 +198,11 @@ class _Readings:
             prior_mean=self.start,
             prior_std=torch.tensor([u.prior_std for u in self.unknowns], dtype=torch.float64),
             longest=torch.tensor([u.longest_step for u in self.unknowns], dtype=torch.float64),
-            noise=None,
+            noise=RESOLUTION,
         )
 
     def linearise(self, raw: Tensor) -> gauss_newton.Linearised:
         """Residuals and their exact derivatives."""
-
         value, slopes = self._values(raw), torch.autograd.functional.jacobian(self._rows, raw, vectorize=True)
         return gauss_newton.Linearised(value, slopes, torch.ones_like(value), self.frame, self.patch)
 
@@ -228,18 +242,7 @@ def _statements(readings: _Readings, found: gauss_newton.Iterate, iterations: in
     ]
     keys = {u.name: u.key.removesuffix(".raw") for u in readings.unknowns}
     warnings = [] if found.converged else [f"stopped after {iterations} iterations before converging"]
-    warnings += [
-        f"{name} is not identifiable from these data: its value is no estimate"
-        for name in keys
-        if not said.parameters[name].identifiable
-    ]
-    names = list(keys)
-    warnings += [
-        f"{a} and {b} can hardly be told apart (correlation {said.correlation[a][b]:+.2f})"
-        for i, a in enumerate(names)
-        for b in names[:i]
-        if abs(said.correlation[a][b]) > CONFUSED
-    ]
+    warnings += doubts(said)
     warnings += [
         f"table {k}: the law misses a force by {100 * e['force_max_after']:.0f} % of the largest; no error covers that"
         for k, e in enumerate(errors)
