@@ -88,7 +88,7 @@ class _Held:
         self.origin = CubicSpline(grip.t, grip.pose[:, :3, 3])(t)
         self.turn = RotationSpline(grip.t, Rotation.from_matrix(grip.pose[:, :3, :3]))(t).as_matrix()
         self.local = (x0[self.index] - self.origin[0]) @ self.turn[0]
-        self.slip, self.crept = grip.slip, np.zeros(3)
+        self.slip = grip.slip
         self.wrench = np.zeros((frames, 6))
         self.sum, self.count = np.zeros(6), 0
 
@@ -104,7 +104,6 @@ class _Held:
         size = np.linalg.norm(total)
         if size > self.slip.hold:
             move = self.slip.mobility * (size - self.slip.hold) * dt / size * total
-            self.crept += move
             self.local = self.local + move @ self.turn[step]
 
     def gather(self, step: int, pull: Array) -> None:
