@@ -181,7 +181,7 @@ def episode(path: Path, run: str) -> Recording:
         grasps={"hanger": GraspInfo(np.stack([edge, np.full(31, SIDE)], -1), 0.006)},
         grippers={"hanger": GripperMotion(t, position, quat, np.ones(len(t), dtype=bool))},
         points=PointClouds(seen[use], mesh[use][nodes[use]], nodes[use].sum(1)),
-        markers=Markers(seen, mesh, extra={"accepted": good}),
+        markers=Markers(seen, mesh, extra={"accepted": good, "grid": np.array([8, 8])}),
         observation_noise_std=float(noise(data)[1]),
         clock_offset=-float(late.value),
         air_density=AIR,

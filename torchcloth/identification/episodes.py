@@ -135,6 +135,7 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
     """
     if recording.markers is None:
         recording.require("points", by="identify")
+    recording = streams.without_doubles(recording)
     name = recording.path.name if recording.path else "recording"
     dtype = cloth.state(torch.as_tensor(cloth.mesh.vertices)).x.dtype
     motion = replay(recording, dtype)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -27,6 +28,12 @@ def places(times: np.ndarray, frames: np.ndarray) -> np.ndarray:
     """[N] the frame of each time; -1 where there is none."""
     near = np.abs(frames[:, None] - times).argmin(0)
     return np.where(np.abs(frames[near] - times) <= SAME, near, -1)
+
+
+def without_doubles(recording: Recording) -> Recording:
+    """Without markers that are no material points, where there are points: they would be a cloud seen twice."""
+    doubled = recording.points is not None and recording.markers is not None and recording.markers.uv is None
+    return replace(recording, markers=None) if doubled else recording
 
 
 def clouds(recording: Recording, frames: np.ndarray, dtype: torch.dtype) -> list[Tensor]:
