@@ -4,6 +4,7 @@
     recordings.write(recording, "episodes/copy")
 
 A reader refuses what it cannot trust, with a one-line `RecordingError`; a stream that is merely missing is None.
+Other formats are read by `torchcloth.recordings.formats`.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ def write(
         part.mkdir(parents=True)
         _fill(part, recording, compact, on_image)
         read_folder(Folder(part, shown=target), with_truth=True)
-        _sync_all(part)
+        _sync(part)
         _put(part, target.absolute(), overwrite)
     except RecordingError:
         raise
@@ -190,7 +190,7 @@ def _put(part: Path, target: Path, overwrite: bool) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _sync_all(root: Path) -> None:
+def _sync(root: Path) -> None:
     for folder, _, files in os.walk(root, topdown=False):
         for file in files:
             sync(Path(folder, file))

@@ -60,6 +60,7 @@ def write(
         _read_back(file, target)
         writing.sync(file)
         file.replace(target.absolute())
+        writing.sync(target.absolute().parent)
     except (OSError, ValueError, TypeError) as error:
         if isinstance(error, RecordingError | MissingDependency):
             raise
