@@ -6,6 +6,7 @@
 Readings of a tension machine are no episode: `ForceDisplacement`, `read_tension`, `write_tension`.
 
 A reader refuses what it cannot trust, with a one-line `RecordingError`; a stream that is merely missing is None.
+Other formats are read by `torchcloth.recordings.formats`.
 """
 
 from __future__ import annotations

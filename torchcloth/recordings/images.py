@@ -89,7 +89,7 @@ class ImageStream:
             return suffix, image
         grey = pixels.astype(np.uint8) * np.uint8(255) if self.kind == "mask" else pixels
         file = io.BytesIO()
-        _pillow().fromarray(grey).save(file, "PNG", compress_level=1)  # 6 takes 4 times as long for a tenth less
+        pillow().fromarray(grey).save(file, "PNG", compress_level=1)  # 6 takes 4 times as long for a tenth less
         return ".png", file.getvalue()
 
     def _decoded(self, image: Path | bytes | np.ndarray, place: str) -> np.ndarray:
@@ -106,7 +106,8 @@ class ImageStream:
         return np.any(pixels.reshape(*self.size[::-1], -1), axis=-1, keepdims=False) if self.kind == "mask" else pixels
 
 
-def _pillow() -> Any:
+def pillow() -> Any:
+    """Pillow's module Image."""
     try:
         from PIL import Image  # pyright: ignore[reportMissingImports]  (optional)
     except ImportError as error:
@@ -115,7 +116,7 @@ def _pillow() -> Any:
 
 
 def _decode(image: Path | bytes, place: str, *, rgb: bool) -> np.ndarray:
-    reader = _pillow()
+    reader = pillow()
     try:
         data = image if isinstance(image, bytes) else image.read_bytes()
         if data.startswith(PNG):

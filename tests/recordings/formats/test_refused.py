@@ -129,6 +129,25 @@ def test_redwood_images_without_times(copy):
     refuse(truth, "source.fsp is unknown")
 
 
+def test_a_folder_of_open3ds_recorder(copy):
+    """Its intrinsic file, in Open3D's own words, tells the rate and the depth scale."""
+    import open3d as o3d
+
+    truth = copy("redwood")
+    for i, file in enumerate(sorted(truth.path.rglob("*.png"))):
+        file.rename(file.with_name(f"{i % 3:05d}.png"))
+    (truth.path / "camera_intrinsic.json").unlink()
+    told = o3d.t.io.RGBDVideoMetadata()
+    told.fps, told.width, told.height, told.depth_scale = 20.0, foreign.WIDTH, foreign.HEIGHT, 4000.0
+    told.intrinsics = o3d.camera.PinholeCameraIntrinsic(foreign.WIDTH, foreign.HEIGHT, 14.0, 15.0, 7.5, 5.25)
+    (truth.path / "intrinsic.json").write_text(repr(told))
+    camera = formats.read(truth.path, scene=truth.write_scene()).cameras["cam0"]
+    np.testing.assert_array_equal(camera.depth.t, [0, 0.05, 0.1])
+    assert camera.depth_scale == 1 / 4000
+    truth.scene["source"] = {"fps": 30}
+    refuse(truth, "source.fps contradicts the file; got 30.0; expected 20")
+
+
 def test_depth_in_other_units(copy):
     truth = copy("redwood")
     truth.scene["cameras"] = {"cam0": {"depth_scale": 0.1}}
@@ -266,6 +285,15 @@ def test_kinect_calibration(copy):
     c, s = np.cos(foreign.TILT), np.sin(foreign.TILT)
     in_color = np.array([[1, 0, 0, -0.032], [0, c, -s, -0.002], [0, s, c, 0.004], [0, 0, 0, 1]]) @ in_depth
     np.testing.assert_allclose(depth.T_world_camera @ in_depth, color.T_world_camera @ in_color, atol=1e-12)
+
+
+def test_two_lenses_are_two_cameras(copy):
+    truth = copy("kinect")
+    truth.scene["source"] = {"depth": "top", "color": "top"}
+    refuse(truth, "gives both lenses one name; got top")
+    truth.scene["source"] = {"depth": "top", "color": "top_color"}
+    truth.scene["cameras"] = {"top": {"T_world_camera": foreign.POSE}}
+    assert formats.read(truth.path, scene=truth.write_scene()).cameras.keys() == {"top", "top_color"}
 
 
 def test_a_matroska_file_of_another_camera(tmp_path):

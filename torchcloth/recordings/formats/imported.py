@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ import numpy as np
 from ...errors import MissingDependency, RecordingError, TorchclothError
 from .. import checks
 from ..checks import Fields
-from ..images import ImageSource, ImageStream, Kind
+from ..images import ImageSource, ImageStream, Kind, pillow
 
 LONGEST_NAME = 60  # of a value shown in a message
 NANO = 10**9
@@ -83,15 +84,9 @@ def damaged(path: Path | str, what: str, *, remedy: str = "record or copy it aga
 
 def image_size(path: Path | bytes) -> tuple[int, int]:
     """(width, height) in the head of a PNG or JPEG file."""
-    import io
-
-    try:
-        from PIL import Image  # pyright: ignore[reportMissingImports]  (optional)
-    except ImportError as error:
-        raise MissingDependency("reading images needs Pillow", remedy="pip install pillow") from error
     place = path if isinstance(path, Path) else "an image"
     data = path if isinstance(path, bytes) else file_bytes(path)
-    with damaged(place, "image"), Image.open(io.BytesIO(data)) as image:
+    with damaged(place, "image"), pillow().open(io.BytesIO(data)) as image:
         return image.size
 
 

@@ -71,6 +71,8 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     source = scene.source
     names = {kind: source.maybe(source.text, kind) or kind for kind in TRACKS}
     nothing_left(source)
+    if len(set(names.values())) < len(names):
+        raise RecordingError(f"{source.place} gives both lenses one name", got=names["depth"], expected="two names")
     tracks, calibration = _tracks(path)
     every = packet_times(path)
     if sorted(len(t) for t in every.values()) != sorted(matroska.blocks(path).values()):

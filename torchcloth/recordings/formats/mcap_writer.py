@@ -60,6 +60,7 @@ def write(
         _read_back(file, target)
         placing.sync(file)
         file.replace(target.absolute())
+        placing.sync(target.absolute().parent)
     except (OSError, ValueError, TypeError) as error:
         if isinstance(error, RecordingError | MissingDependency):
             raise
