@@ -120,6 +120,7 @@ def test_use_is_checked(pulled, model):
         identify(model, still, ["youngs_modulus"], use=["force"])
 
 
+@pytest.mark.slow
 def test_a_point_far_from_everything_does_not_count(pulled, model):
     """A hand in the picture, half a metre off: as if it were not there."""
     p = pulled.points
