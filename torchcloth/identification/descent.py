@@ -50,9 +50,7 @@ def chamfer(objective: Objective, raw: Tensor, i: int) -> Tensor:
     return loss / len(objective.episodes)
 
 
-def quasi_newton(
-    objective: Objective, start: Tensor, iterations: int, on_iterate: OnIterate
-) -> tuple[Tensor, bool]:
+def quasi_newton(objective: Objective, start: Tensor, iterations: int, on_iterate: OnIterate) -> tuple[Tensor, bool]:
     """L-BFGS on the robust cost of all data and priors, in units of the priors' standard deviations.
 
     Returns:
