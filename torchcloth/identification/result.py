@@ -22,9 +22,9 @@ CONVENTION = (
     "where grippers hold; persistent model error is not. ci95: in "
     "the log (logit) coordinate; linear, cut at 0, for amplitudes of effects and the cone. identifiable: std below a "
     "quarter of the value (of a typical amplitude, where the amplitude is smaller), and the fit beats the null. "
-    "source 'not in the model' or 'held fixed': value, std and ci95 are those of the prior. identifiability: how far one "
-    "standard deviation of the prior and 10 % of the value move the cloth [mm] and its forces [N], rms. nuisances: what "
-    "differs from episode to episode, [m], [s], [rad] or [N]."
+    "source 'not in the model' or 'held fixed': value, std and ci95 are those of the prior. identifiability: how far "
+    "one standard deviation of the prior and 10 % of the value move the cloth [mm] and its forces [N], rms. nuisances: "
+    "what differs from episode to episode, [m], [s], [rad] or [N]."
 )
 
 
