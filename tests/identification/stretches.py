@@ -49,6 +49,9 @@ class Setting:
     initial: float = 0.2e-3  # m, more of it at every free vertex
     clock: float = 0.0  # s
     resolution: tuple[int, int] = TRUTH
+    points: int = POINTS
+    frames: int = FRAMES
+    rate: float = RATE  # 1/s
 
 
 def cloth(fabric: Fabric, resolution: tuple[int, int]) -> tc.Cloth:
@@ -76,7 +79,7 @@ def jaw(name: str) -> np.ndarray:
 
 def pull(setting: Setting) -> dict[str, rec.GripperMotion]:
     """Apart and back once, up and down twice."""
-    end = (FRAMES - 1) / RATE + 0.2
+    end = (setting.frames - 1) / setting.rate + 0.2
     t = np.arange(0.0, end, 1 / KNOTS)
     part = 0.01 + 0.5 * setting.strain * (1 - np.cos(2 * np.pi * np.clip(t, 0, 1.0)))
     lift = 0.5 * setting.heave * (1 - np.cos(2 * np.pi * 2.0 * np.clip(t, 0, 1.0)))
@@ -115,7 +118,7 @@ def record(
     motion = pull(setting)
     bare = rec.Recording(cloth=rec.ClothInfo(areal_density=1.0), provenance="synthetic: stretches.py", grippers=motion)
     knots = motion["left"].t
-    frames = np.arange(FRAMES) / RATE
+    frames = np.arange(setting.frames) / setting.rate
     times = np.union1d(knots[knots <= frames[-1] + 0.15], frames + setting.clock)
     with torch.no_grad():
         moves = replay(bare)
@@ -154,7 +157,7 @@ def _force(out, name: str, times: np.ndarray, knots: np.ndarray, rng: np.random.
 
 
 def _cloud(x: np.ndarray, setting: Setting, rng: np.random.Generator) -> np.ndarray:
-    uv = rng.random((POINTS, 2)) * [WIDTH, HEIGHT]
+    uv = rng.random((setting.points, 2)) * [WIDTH, HEIGHT]
     hidden = np.abs(uv[:, 0] / WIDTH - 0.62) < 0.5 * setting.occluded
     points = at(x, setting.resolution, uv[~hidden])
     noise = rng.standard_normal(points.shape)
@@ -179,9 +182,18 @@ def _markers(x: np.ndarray, t: np.ndarray, side: int, setting: Setting, rng: np.
     return rec.Markers(t, xyz, uv)
 
 
-def model(recording: rec.Recording, **start: float) -> tc.Cloth:
+def remeshed(recording: rec.Recording, resolution: tuple[int, int]) -> rec.Recording:
+    """The same episode on another mesh of the model: its first shape is interpolated."""
+    mesh = tc.meshes.rectangle(WIDTH, HEIGHT, resolution=resolution)
+    info = recording.cloth
+    first = at(info.initial_vertices, FIT, np.asarray(mesh.uv))
+    info = replace(info, vertices=mesh.vertices, faces=mesh.faces, uv=mesh.uv, initial_vertices=first)
+    return replace(recording, cloth=info)
+
+
+def model(recording: rec.Recording, resolution: tuple[int, int] = FIT, **start: float) -> tc.Cloth:
     """The cloth of an episode with some start values, by default wrong ones."""
-    found = cloth(Fabric(membrane=150.0, poisson=0.2, density=recording.cloth.areal_density), FIT)
+    found = cloth(Fabric(membrane=150.0, poisson=0.2, density=recording.cloth.areal_density), resolution)
     for name, value in start.items():
         found.get_submodule(available(found)[name]).set(value)
     return found

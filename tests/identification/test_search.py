@@ -1,7 +1,6 @@
 """Estimators on one interface, several starts, priors, and resuming where a search was stopped."""
 
 import pytest
-import stretches
 import torch
 import toys
 import twins
@@ -14,6 +13,7 @@ from torchcloth.identification.unknowns import collect, with_priors
 PAIR = ["youngs_modulus", "air.normal"]
 
 
+@pytest.mark.slow
 def test_lbfgs_finds_what_gauss_newton_finds(model, brief):
     """The same cost by reverse mode: the ends differ by a part of a standard error."""
     near = {"youngs_modulus": 5e4}
@@ -36,7 +36,7 @@ def test_plain_descent_goes_downhill_slowly(model, brief):
 
 def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_path):
     """Wherever it is stopped, for every estimator: the same history and values, bit by bit, and little done twice."""
-    for method in ("gauss-newton", "lbfgs", "adam"):
+    for method in ("gauss-newton", "lbfgs"):
         options = {"method": method, "iterations": 2, "guess": {"youngs_modulus": 5e4}}
         whole = identify(model, brief, PAIR, **options)
 
@@ -117,20 +117,3 @@ def test_a_prior_of_ones_own(model, brief):
 def test_wrong_priors_are_named(model, priors, said):
     with pytest.raises(InvalidInput, match=said):
         with_priors(collect(model, ["youngs_modulus"], None), priors)
-
-
-# -- what must show: minutes -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_the_start_does_not_matter_over_two_decades():
-    """Ten starts of E, full fits: at least nine within a standard error of their median."""
-    with twins.doubles():
-        recording = stretches.record(seed=5)
-    found = []
-    for share in torch.linspace(-1, 1, 10).tolist():
-        model = stretches.model(recording, youngs_modulus=6e4 * 10**share)
-        fit = identify(model, recording, ["youngs_modulus", "poisson_ratio"], nuisances={"grasp": 1e-3})
-        found.append(fit.parameters["youngs_modulus"])
-    values = torch.tensor([e.value for e in found])
-    assert int(((values - values.median()).abs() < min(e.std for e in found)).sum()) >= 9

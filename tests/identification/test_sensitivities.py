@@ -126,8 +126,10 @@ def test_secants_of_small_steps_are_tangents(short):
     model, unknowns, seen = short
     problem = Objective(model, unknowns, [seen], 0.5 * model.stable_step())
     steps = 1e-4 * torch.tensor([min(1.0, abs(u.value(u.start))) for u in unknowns])
-    exact, finite = problem.linearise(problem.start), problem.secants(problem.start, steps)
+    exact, (finite, reach) = problem.linearise(problem.start), problem.secants(problem.start, steps)
     missed = (exact.jacobian - finite.jacobian).norm(dim=0) / exact.jacobian.norm(dim=0)
+    moved = tangents(model, unknowns, problem.start, seen, 0.5 * model.stable_step())[1].x
+    torch.testing.assert_close(reach.position, moved.square().sum(-1).mean((1, 2)).sqrt(), rtol=0.02, atol=1e-9)
     assert float(missed.max()) < 1e-2
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..errors import SimulationDiverged, UnstableStep
 from .misfit import huber, noise_scale
 
-TRUSTED_GAIN = 0.5  # share of the predicted decrease above which an updated Jacobian is good enough
+TRUSTED = 0.1  # error of the predicted decrease up to which an updated Jacobian is good enough
 GATE = 5.0  # standard deviations
 WINDOW = 5  # frames within which residuals of one patch count as one observation
 
@@ -103,7 +103,7 @@ def minimise(
                 converged = True
                 break
             current = _linearise(problem, trial.raw)
-        elif gain < TRUSTED_GAIN and not stop:
+        elif abs(gain - 1) > TRUSTED and not stop:
             current = _linearise(problem, trial.raw)
     return _exact(problem, current)._replace(converged=converged)
 

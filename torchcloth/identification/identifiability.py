@@ -84,6 +84,8 @@ def combinations(unknowns: Sequence[Unknown], raw: Tensor, covariance: Tensor) -
             continue
         vector = vector / vector[vector.abs().argmax()]
         named = [k for k in vector.abs().argsort(descending=True).tolist() if abs(float(vector[k])) > SHOWN]
+        if len(named) < 2:
+            continue
         std = 1 / (float(value) ** 0.5 * size)
         out.append(Combination({unknowns[k].name: float(vector[k]) for k in named}, std, std < KNOWN))
     return out

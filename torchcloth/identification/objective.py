@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..boundaries import Grasp
 from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
@@ -22,10 +21,8 @@ from .misfit import Figures, figures, huber
 from .nuisances import AbstractNuisance, Placed, place
 from .replays import Frames, each, simulate, tangents
 from .rows import Rows, scene_of
-from .sheet import BAND, SHORTEST, sheet_of
+from .sheet import sheet_for
 from .unknowns import Unknown
-
-PER_PIECE = 12  # points that a piece of the rim should have in a frame
 
 
 class Objective:
@@ -46,7 +43,7 @@ class Objective:
     ) -> None:
         self.cloth, self.unknowns, self.episodes, self.dt = cloth, list(unknowns), list(episodes), dt
         self.nuisances, self.blocks, self.floors = list(nuisances), list(blocks), dict(floors or {})
-        self.sheet = sheet_of(cloth.mesh, _held(cloth), _piece(cloth, self.episodes))
+        self.sheet = sheet_for(cloth, self.episodes)
         self.faces = self.sheet.faces
         self.placed = place(self.nuisances, cloth, self.episodes, len(self.unknowns))
         stds = [std for own in self.placed for p in own for std in p.stds]
@@ -303,17 +300,3 @@ def _push(p: Placed, frames: Frames, moved: Frames, raw: Tensor, episode: Episod
     see = lambda f, v: p.nuisance.see(f, v, episode)  # noqa: E731
     along = lambda df, dv: torch.func.jvp(see, (frames, values), (df, dv))[1]  # noqa: E731
     return see(frames, values), torch.func.vmap(along)(moved, own)
-
-
-def _held(cloth: Cloth):
-    index = [part.index for part in cloth.boundaries.values() if isinstance(part, Grasp)]
-    return torch.cat(index).cpu().numpy() if index else None
-
-
-def _piece(cloth: Cloth, episodes: Sequence[Episode]) -> float:
-    """Length of rim [m] in whose band about ``PER_PIECE`` points lie."""
-    counts = [len(cloud) for e in episodes for cloud in e.clouds if len(cloud)]
-    if not counts:
-        return SHORTEST
-    density = sorted(counts)[len(counts) // 2] / float(cloth.mesh.area.sum())
-    return max(SHORTEST, PER_PIECE / (density * BAND))

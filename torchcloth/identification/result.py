@@ -19,10 +19,13 @@ CONVENTION = (
     "SI units. chamfer: one-sided, cloud to surface: mean over frames of the mean distance [m] from each measured "
     "point to the nearest point of the simulated triangles. rms: root mean square of the same distances over all "
     "points. null: the cloth moves rigidly with the grippers, undeformed. std: standard error of the estimate; noise "
-    "correlated within patches of the fabric and nearby frames is allowed for, persistent model error is not. ci95: in "
+    "correlated within patches of the fabric and nearby frames is allowed for, and the noise of a measured first shape "
+    "where grippers hold; persistent model error is not. ci95: in "
     "the log (logit) coordinate; linear, cut at 0, for amplitudes of effects and the cone. identifiable: std below a "
     "quarter of the value (of a typical amplitude, where the amplitude is smaller), and the fit beats the null. "
-    "source 'not in the model' or 'held fixed': value, std and ci95 are those of the prior."
+    "source 'not in the model' or 'held fixed': value, std and ci95 are those of the prior. identifiability: how far "
+    "one standard deviation of the prior and 10 % of the value move the cloth [mm] and its forces [N], rms. nuisances: "
+    "what differs from episode to episode, [m], [s], [rad] or [N]."
 )
 
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..boundaries import Grasp
+from ..cloth import Cloth
 from ..meshes import Mesh
+from .episodes import Episode
 
 BAND = 0.015  # m, along the rim, in which points tell where it is
 CORNER = 30.0  # degrees, the turn of a rim at which a piece of it ends
 SHORTEST = 0.03  # m, of a piece
+PER_PIECE = 12  # points that a piece should have in a frame
 
 
 class Rim(NamedTuple):
@@ -31,6 +36,15 @@ class Sheet(NamedTuple):
     faces: Tensor  # [F, 3] int64
     patches: Tensor  # [V] int64, part of the fabric
     rim: Rim
+
+
+def sheet_for(cloth: Cloth, episodes: Sequence[Episode]) -> Sheet:
+    """With pieces of the rim that are long enough for the episodes' points, and without what grippers hold."""
+    index = [part.index for part in cloth.boundaries.values() if isinstance(part, Grasp)]
+    held = torch.cat(index).cpu().numpy() if index else None
+    counts = sorted(len(cloud) for e in episodes for cloud in e.clouds if len(cloud))
+    density = counts[len(counts) // 2] / float(cloth.mesh.area.sum()) if counts else torch.inf
+    return sheet_of(cloth.mesh, held, max(SHORTEST, PER_PIECE / (density * BAND)))
 
 
 def sheet_of(mesh: Mesh, held: np.ndarray | None = None, length: float = SHORTEST) -> Sheet:

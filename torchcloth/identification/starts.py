@@ -25,10 +25,8 @@ class Reached(NamedTuple):
 
 def spread(unknowns: Sequence[Unknown], start: Tensor, count: int) -> list[Tensor]:
     """``count`` starts [K], the given one first, the others evenly over the range of every unknown (Sobol)."""
-    if count <= 1:
+    if count == 1:
         return [start]
-    if count <= 0:
-        return []
     share = torch.quasirandom.SobolEngine(len(unknowns), scramble=True, seed=0).draw(count - 1, dtype=torch.float64)
     out = [start]
     for row in share:
