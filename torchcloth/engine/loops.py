@@ -99,7 +99,7 @@ class Loop:
     def emit(self, handle, api) -> None:
         """Write down the instructions."""
         read = self._read()
-        api("loop")(handle, self.items, self._among, self._counted, int(self.flat), int(self.again))
+        api("loop")(handle, self.items, self._among, int(self._counted), int(self.flat), int(self.again))
         for kind, *rest in self._code:
             if kind in ("move", "lookup"):
                 api(kind)(handle, *rest)

@@ -41,10 +41,7 @@ def _found(apart: np.ndarray, corners: np.ndarray) -> Patches:
     bit = (1 << np.arange(len(order)) - np.repeat(starts[:-1], np.diff(starts))).astype(np.uint8)
     bits = np.add.reduceat(apart[np.ix_(order, order)] * bit, starts[:-1], axis=1, dtype=np.uint8)
     meet = np.logical_or.reduceat(bits != 0, starts[:-1], axis=0)
-    found = Patches(order, starts, (meet | meet.T).astype(np.uint8), bits)
-    for part in found:
-        part.setflags(write=False)
-    return found
+    return Patches(order, starts, (meet | meet.T).astype(np.uint8), bits)
 
 
 def _grown(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
