@@ -105,7 +105,7 @@ def compare(recording: recordings.Recording, values: Values) -> Distance:
         points=recordings.PointClouds(truth.t, truth.vertices.reshape(-1, 3), np.full(len(truth.t), len(uv))),
     )
     with torch.no_grad():
-        x = Replay(model)(episode(model, seen))
+        x = Replay(model)(episode(model, seen)).x
     error = np.linalg.norm(carry(model.mesh, uv, x.numpy()) - truth.vertices, axis=-1)
     faces, off = torch.as_tensor(model.mesh.faces), []
     for at, points in zip(x[::4], torch.as_tensor(truth.vertices[::4]), strict=True):

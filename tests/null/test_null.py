@@ -40,7 +40,7 @@ def test_a_model_that_is_its_own_truth_has_no_distance(study):
     values, recording = Values.true(folder), load(folder, 9)
     model = cloth(recording, values)
     with torch.no_grad():
-        x = Replay(model)(episode(model, recording)).numpy()
+        x = Replay(model)(episode(model, recording)).x.numpy()
     own = carry(model.mesh, pattern(recording), x)
     truth = replace(recording.truth, t=recording.points.t, vertices=own)
     same = replace(recording, truth=truth)
