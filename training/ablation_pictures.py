@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from torchcloth._files import atomically
+
 from .ablation_paper import CHAMFER, ENERGY
 from .ablation_scenes import LEVELS, PARAMETERS, PERTURBED, REFERENCE, Scene, Variant
-from .ablation_study import Name, Study, replace
+from .ablation_study import Name, Study
 
 COLOURS = {"E": "#1f6f8b", "nu": "#b0653a", "k": "#3d7f3d", "gamma": "#7d4f9e"}
 GREEK = {"E": "E", "nu": "ν", "k": "k", "gamma": "γ"}
@@ -25,7 +27,8 @@ def draw(
     """Write ablation.png and shapes.png into the study's folder; returns their paths."""
     figures = {"ablation.png": _comparison(distance, energy), "shapes.png": _shapes(study, scenes)}
     for name, figure in figures.items():
-        replace(study.folder / name, lambda path, f=figure: f.savefig(path, dpi=110, bbox_inches="tight"))
+        with atomically(study.folder / name) as part:
+            figure.savefig(part, dpi=110, bbox_inches="tight")
     return [study.folder / name for name in figures]
 
 

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchcloth._files import write_text
 from torchcloth.errors import InvalidInput
 
 from .ablation_measures import bidirectional_chamfer, contributions, spearman
 from .ablation_paper import CHAMFER, ENERGY
 from .ablation_scenes import LEVELS, PARAMETERS, PERTURBED, REFERENCE, Run, Variant
-from .ablation_study import Name, Study, replace
+from .ablation_study import Name, Study
 
 CONVENTION = (
     "chamfer_cm: bidirectional Chamfer distance [cm] to the reference run, the sum of both means of the distance from "
@@ -117,7 +118,7 @@ def report(study: Study, scenes: Sequence[Name], wanted: Sequence[Variant]) -> N
         | {"chamfer_mean": agreement(averaged(measured, "mean"), energy)["chamfer"]},
     }
     text = json.dumps(result, indent=1).replace("NaN", "null") + "\n"
-    replace(study.folder / "result.json", lambda path: path.write_text(text))
+    write_text(study.folder / "result.json", text)
     pictures = draw(study, list(measured), distance, energy)
     print_study(result, distance, energy, measured)
     print(f"result:   {study.folder / 'result.json'}")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -16,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from torchcloth._files import atomically, write_text
 from torchcloth.errors import InvalidInput, RecordingError, TorchclothError
 
 from .ablation_measures import WITHOUT
@@ -55,7 +54,7 @@ class Study(NamedTuple):
         """Make the folder and note the settings."""
         (self.folder / "runs").mkdir(parents=True, exist_ok=True)
         text = json.dumps(asdict(self.setup), indent=1) + "\n"
-        replace(self.folder / "study.json", lambda path: path.write_text(text))
+        write_text(self.folder / "study.json", text)
 
     def path(self, scene: Name, variant: Variant) -> Path:
         """The file of a run."""
@@ -68,7 +67,8 @@ class Study(NamedTuple):
     def write(self, scene: Name, variant: Variant, run: Run) -> None:
         """Keep a finished run; a crash leaves no half file."""
         arrays: dict[str, Any] = {"t": run.t, "x": run.x, **run.energy}
-        replace(self.path(scene, variant), lambda path: np.savez(path, **arrays))
+        with atomically(self.path(scene, variant)) as part:
+            np.savez(part, **arrays)
 
     def read(self, scene: Name, variant: Variant) -> Run:
         """A finished run.
@@ -146,18 +146,6 @@ def _prepare() -> None:
 def _work(study: Study, task: Task) -> None:
     for _ in task.work(study):
         pass
-
-
-def replace(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` make a file beside ``path``, and move it there: never half a file."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".part-", suffix=path.suffix)
-    os.close(handle)
-    try:
-        write(Path(name))
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def _unreadable(path: Path) -> RecordingError:

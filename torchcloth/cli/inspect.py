@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from .._files import write_text
 from ..errors import InvalidInput
 
 
@@ -23,7 +24,6 @@ def _inspect(options: argparse.Namespace) -> int:
     from rich.console import Console
 
     from .. import inspection, recordings
-    from ..identification.result import write_atomically
 
     if options.out is not None and options.out.exists() and not options.out.is_dir():
         raise InvalidInput("--out", got=f"{options.out}, a file", expected="a folder, new or existing")
@@ -36,7 +36,7 @@ def _inspect(options: argparse.Namespace) -> int:
         inspection.show(report)
     if options.out is not None:
         picture = inspection.draw(report, options.out)
-        path = write_atomically(options.out / "inspection.json", text)
+        path = write_text(options.out / "inspection.json", text)
         if not options.json:
             print(f"result:  {path}\npicture: {picture}")
     return 0

@@ -7,7 +7,6 @@ That holds for every estimator alike, and there is no state of a search that cou
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from .._files import atomically
 from ..errors import InvalidInput
 
 FORMAT = 1
@@ -67,9 +67,8 @@ class Journal:
         if not self.folder.exists():
             self.folder.mkdir(parents=True)
             (self.folder / "problem").write_text(self.key)
-        part = path.with_suffix(".part")
-        torch.save(answer, part)
-        os.replace(part, path)
+        with atomically(path) as part:
+            torch.save(answer, part)
 
 
 def clear(folder: Path) -> None:

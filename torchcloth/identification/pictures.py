@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._files import atomically
 from ..losses import closest
 from .episodes import Episode
 from .result import Identification
@@ -30,9 +30,8 @@ def draw(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray, fo
 
 def save_figure(figure: Any, path: Path) -> Path:
     """Write a matplotlib figure as PNG so that a crash leaves the old one or the new, never half."""
-    part = path.with_name(f".{path.name}.part.png")
-    figure.savefig(part, dpi=110, bbox_inches="tight")
-    os.replace(part, path)
+    with atomically(path) as part:
+        figure.savefig(part, dpi=110, bbox_inches="tight")
     return path
 
 

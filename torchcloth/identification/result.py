@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
+from .._files import write_text
 from ..cloth import Cloth
 from .statements import Combination, Estimate, Influence
 
@@ -83,9 +82,7 @@ class Identification:
         """Write identification.json into ``folder``, atomically; returns its path."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        return write_atomically(
-            folder / "identification.json", json.dumps(self.as_dict(), indent=1, allow_nan=False) + "\n"
-        )
+        return write_text(folder / "identification.json", json.dumps(self.as_dict(), indent=1, allow_nan=False) + "\n")
 
     def apply(self, cloth: Cloth) -> Cloth:
         """Set the fitted values in ``cloth``, leaving what is not identifiable as it is; returns it."""
@@ -98,18 +95,3 @@ def set_identified(cloth: Cloth, keys: Mapping[str, str], parameters: Mapping[st
         if parameters[name].identifiable:
             cloth.get_submodule(path).set(parameters[name].value)  # type: ignore[operator]
     return cloth
-
-
-def write_atomically(path: Path, text: str) -> Path:
-    """Write a text file so that a crash leaves the old content or the new, never half."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-    return path

@@ -14,13 +14,14 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from .._files import write_text
 from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from ..recordings import ForceDisplacement
 from . import gauss_newton
 from .report import doubts, estimates
-from .result import set_identified, write_atomically
+from .result import set_identified
 from .specimens import AbstractSpecimen, Response, Uniaxial
 from .statements import Estimate
 from .unknowns import Unknown, available, collect, needs_contact, overrides
@@ -67,7 +68,7 @@ class TensionFit:
             "warnings": self.warnings,
             "iterations": self.iterations,
         }
-        return write_atomically(folder / "tension.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+        return write_text(folder / "tension.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
 
     def apply(self, cloth: Cloth) -> Cloth:
         """Set the fitted values in ``cloth``, leaving what is not identifiable as it is; returns it."""

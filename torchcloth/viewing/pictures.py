@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from .._files import atomically
 from ..errors import InvalidInput
 from .film import Film
 from .geometry import Array
-from .saving import atomically
 from .stage import Stage
 
 RATE = 25.0  # 1/s; browsers slow a GIF of more than 50 down

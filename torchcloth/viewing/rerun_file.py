@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from .._files import atomically
 from ..errors import MissingDependency
 from .colours import colours
 from .film import Film, Solid, Trace, View
 from .geometry import Array, quaternions, vertex_normals
 from .projection import camera_for
-from .saving import atomically
 
 TIME = "time"  # the timeline, s on the motion clock
 WORLD, CURVES = "world", "curves"

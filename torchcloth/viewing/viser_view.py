@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from .._files import atomically
 from .colours import colour_map, colours
 from .film import DISTANCE, Film, View
 from .geometry import Array
 from .projection import camera_for
-from .saving import atomically
 from .viser_scene import ViserScene, viser
 
 HOST = "127.0.0.1"  # only this machine; `ssh -L` brings it elsewhere

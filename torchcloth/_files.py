@@ -16,6 +16,15 @@ def atomically(path: Path) -> Iterator[Path]:
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
     try:
         yield part
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a text file so that a crash leaves the old content or the new, never half; returns its path."""
+    with atomically(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return path
