@@ -1,10 +1,11 @@
 """Answers that are kept: found again, written whole, and never taken for those of another question or problem."""
 
+import os
+
 import pytest
 import torch
 
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import journal
 from torchcloth.identification.journal import Journal, digest
 
 POINT = torch.tensor([1.0, 2.0], dtype=torch.float64)
@@ -50,7 +51,7 @@ def test_other_files_are_not_removed(tmp_path):
 
 def test_an_interrupt_while_writing_leaves_no_answer(tmp_path, monkeypatch):
     kept = Journal(tmp_path / "j", ["a"], resume=False)
-    monkeypatch.setattr(journal.os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         kept.ask("rows", POINT, answer(1.0))
     monkeypatch.undo()

@@ -11,7 +11,7 @@ import torchcloth as tc
 from torchcloth.identification import gauss_newton, linearity, result
 from torchcloth.identification.misfit import Figures
 from torchcloth.identification.report import Found, estimates, warnings_of
-from torchcloth.identification.result import Identification, write_atomically
+from torchcloth.identification.result import Identification
 from torchcloth.identification.statements import Estimate
 from torchcloth.identification.unknowns import collect
 
@@ -160,15 +160,6 @@ def test_saving_is_atomic(tmp_path, monkeypatch):
         outcome(warnings=["new"]).save(tmp_path)
     assert path.read_text() == old
     assert [p.name for p in tmp_path.iterdir()] == ["identification.json"]
-
-
-def test_an_interrupt_while_writing_leaves_the_old_text(tmp_path, monkeypatch):
-    path = write_atomically(tmp_path / "progress.json", "old")
-    monkeypatch.setattr(result.os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        write_atomically(path, "new")
-    assert path.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["progress.json"]
 
 
 def test_what_is_not_json_is_not_written(tmp_path):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth.identification.result import write_atomically
+from torchcloth._files import write_text
 
 COLOURS = ("#c9a58f", "#b0653a", "#1f6f8b")
 ACROSS = 6  # motions side by side
@@ -50,7 +50,7 @@ def _cell(distance: dict[str, Any]) -> str:
 def write(found: dict[str, Any], motions: Sequence[str], meshes: Sequence[int], folder: Path) -> Path:
     """``folder``/null.md."""
     text = f"{table(found, motions, meshes)}\n\n{parameters(found)}\n"
-    return write_atomically(folder / "null.md", text)
+    return write_text(folder / "null.md", text)
 
 
 def draw(found: dict[str, Any], motions: Sequence[str], meshes: Sequence[int], folder: Path) -> Path:

@@ -26,8 +26,8 @@ from rich.progress import Progress
 from null import page
 from null.model import FITTED, Values, between, compare, fit, load
 from torchcloth import recordings
+from torchcloth._files import write_text
 from torchcloth.errors import TorchclothError
-from torchcloth.identification.result import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
 GENERATE = ROOT / "tests" / "independent" / "generate.py"
@@ -73,7 +73,7 @@ class Study:
             progress.update(bar, description=name)
             if name not in self.found:
                 self.found[name] = compute()
-                write_atomically(self.file, json.dumps(self.found, indent=1) + "\n")
+                write_text(self.file, json.dumps(self.found, indent=1) + "\n")
                 if not progress.console.is_terminal:
                     print(name, flush=True)
             progress.advance(bar)

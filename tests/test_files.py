@@ -1,0 +1,31 @@
+"""Files are there whole or not at all."""
+
+import os
+
+import pytest
+
+from torchcloth._files import atomically, write_text
+
+
+def test_an_interrupt_while_writing_leaves_the_old_text(tmp_path, monkeypatch):
+    path = write_text(tmp_path / "progress.json", "old")
+    monkeypatch.setattr(os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        write_text(path, "new")
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["progress.json"]
+
+
+def test_a_block_that_fails_leaves_nothing(tmp_path):
+    with pytest.raises(ValueError, match="no"), atomically(tmp_path / "new" / "a.npz") as part:
+        part.write_bytes(b"half")
+        raise ValueError("no")
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_the_suffix_is_kept(tmp_path):
+    """Libraries choose the format by it, and some add their own where there is none."""
+    with atomically(tmp_path / "a.npz") as part:
+        assert part.suffix == ".npz"
+        part.write_bytes(b"whole")
+    assert (tmp_path / "a.npz").read_bytes() == b"whole"
