@@ -8,7 +8,7 @@ import torch
 from twins import at
 
 import torchcloth as tc
-from torchcloth.identification import gauss_newton, linearity, result
+from torchcloth.identification import gauss_newton, linearity
 from torchcloth.identification.misfit import Figures
 from torchcloth.identification.report import Found, estimates, warnings_of
 from torchcloth.identification.result import Identification
@@ -155,7 +155,7 @@ def test_saving_is_atomic(tmp_path, monkeypatch):
     """A failure in the middle leaves the old file, and no part of the new one beside it."""
     path = outcome().save(tmp_path)
     old = path.read_text()
-    monkeypatch.setattr(result.os, "fsync", lambda handle: (_ for _ in ()).throw(OSError("disk full")))
+    monkeypatch.setattr("os.fsync", lambda handle: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
         outcome(warnings=["new"]).save(tmp_path)
     assert path.read_text() == old
