@@ -122,7 +122,7 @@ def turning_cylinder(fast: bool) -> Outcome:
         effect, c = model.effects["b"]
         now = Moment(x, v, functional.surface(model.geometry, x, v), model.mass)
         still = now._replace(v=torch.zeros_like(v))
-        powers.append(-float(((effect.force(c, now) - effect.force(c, still)) * state.v).sum()))
+        powers.append(-float(((effect.force(c, now) - effect.force(c, still)) * state.v).sum().detach()))
     lost = stiffness * time * (speed / radius) ** 2 * 0.06
     return Outcome(
         [
