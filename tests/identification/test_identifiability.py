@@ -57,6 +57,12 @@ def test_nuisances_are_allowed_for(unknowns):
     assert not [c for c in combinations(unknowns, start(unknowns), marginal) if c.determined]
 
 
+def test_a_singular_covariance_has_no_combinations(unknowns):
+    """As of a motion whose slopes run away: the fit must still be told."""
+    for covariance in (torch.ones(3, 3), torch.zeros(3, 3), torch.full((3, 3), torch.inf)):
+        assert combinations(unknowns, start(unknowns), covariance.double()) == []
+
+
 def test_reach_is_told_in_millimetres_and_newtons(unknowns):
     reach = Reach(torch.tensor([2e-3, 1e-3, 0.0]), torch.tensor([0.5, 0.0, 0.0]))
     known = {n: Estimate(1.0, 0.1, (0.8, 1.2), "-", 1.0, n == "youngs_modulus") for n in NAMES}

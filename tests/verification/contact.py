@@ -10,7 +10,7 @@ from torch import Tensor
 import torchcloth as tc
 
 from . import closed_forms
-from .pictures import MEASURED, OTHER, sheet
+from .pictures import MEASURED, OTHER
 from .registry import AT_LEAST, AT_MOST, Outcome, Row, absolute, case
 from .scenes import path, smooth, stacked, still, where
 
@@ -154,76 +154,6 @@ def carry(
     way[:, direction] = size / 2 * (turn.cos() - 1)
     way[:, 2] = (size / 2) * turn.sin() + height * turn / math.pi
     return path(t, way, (t >= start) & (t < release))
-
-
-def lay_over(t: Tensor, start: float, direction: int, size: float, height: float, time: float) -> tc.Trajectory:
-    """An edge lifted a little, carried low over the cloth and laid down from the inside outwards; it turns over.
-
-    An edge of two layers that did not turn would arrive with the layers crossed.
-    """
-    s = (t - start) / time
-    lift, over, down = (smooth((s - begin) / share) for begin, share in ((0.0, 0.25), (0.15, 0.6), (0.7, 0.3)))
-    turn = math.pi * smooth(s)
-    pose = torch.eye(4).repeat(len(t), 1, 1)
-    pose[:, direction, direction] = pose[:, 2, 2] = turn.cos()
-    pose[:, 2, direction], pose[:, direction, 2] = turn.sin(), -turn.sin()
-    pose[:, direction, 3] = size * (1 - 0.1 * lift - 0.74 * over - 0.16 * down)
-    pose[:, 2, 3] = 0.18 * size * (lift - down) + height * down
-    return tc.Trajectory(t, pose, (t >= start) & (t < start + time + 0.1))
-
-
-def draw_fold(figure, data) -> None:
-    names = [name for name in data if name != "faces"]
-    for k, name in enumerate(names):
-        axis = figure.add_subplot(1, len(names), k + 1, projection="3d")
-        axis.view_init(elev=18, azim=-70)
-        sheet(axis, data[name], data["faces"], name)
-
-
-def gaps(x: Tensor, n: int, axis: int) -> Tensor:
-    """Heights [m] of the upper layer's vertices over the nearest of the lower layer's, in plan, away from the fold."""
-    grid = x.unflatten(0, (n, n))
-    grid = grid if axis == 0 else grid.transpose(0, 1)
-    third = n // 3
-    lower, upper = grid[: third + 1].flatten(0, 1), grid[-third:].flatten(0, 1)
-    distance, nearest = torch.cdist(upper[:, :2], lower[:, :2]).min(-1)
-    above = distance < 0.6 * float((grid[1, 0] - grid[0, 0]).norm())
-    return (upper[:, 2] - lower[nearest, 2])[above]
-
-
-@case(
-    "fold-in-half-and-quarter",
-    "Cloth folded in half and in quarter on a table",
-    truth="matter: layers rest on each other in order, at the stated gap",
-    draw=draw_fold,
-    fast=False,
-)
-def fold_in_half_and_quarter(fast: bool) -> Outcome:
-    """One edge is carried over the opposite one, which is held meanwhile; then the same across; then all is let go."""
-    size, n, spacing = 0.12, 13, 3e-3
-    mesh = tc.meshes.rectangle(size, size, resolution=(n, n))
-    u, v = mesh.uv.T
-    edges = {"left": u < 1e-9, "right": u > size - 1e-9, "front": v < 1e-9, "back": v > size - 1e-9}
-    cloth = on_table(size, n, spacing, {name: where(edge) for name, edge in edges.items()})
-    t = torch.linspace(0, 1.6, 321)
-    hold = torch.zeros(len(t), 3)
-    motion = {
-        "left": path(t, hold, t < 0.6),
-        "right": lay_over(t, 0.0, 0, size, 1.5 * spacing, 0.5),
-        "front": path(t, hold, (t >= 0.7) & (t < 1.3)),
-        "back": lay_over(t, 0.7, 1, size, 3.0 * spacing, 0.5),
-    }
-    with torch.no_grad():
-        out = cloth(cloth.rest_state(), motion, times=[0.0, 0.25, 0.7, 0.95, 1.5])
-    rows = []
-    for name, x, axis, between in (("half", out.x[2], 0, 1), ("quarter", out.x[-1], 1, 2)):
-        gap = 1e3 * gaps(x, n, axis) / between  # in the quarter two gaps lie between vertices that meet
-        rows.append(Row(f"{name}: gap per layer, mean", float(gap.mean()), 5.0, "mm", AT_MOST))
-        rows.append(Row(f"{name}: gap per layer, least", float(gap.min()), 0.0, "mm", AT_LEAST))
-    rows.append(Row("quarter: height of the stack", 1e3 * float(out.x[-1, :, 2].max()), unit="mm", finding=True))
-    data = {f"{out.t[k]:.2f} s": out.x[k].numpy() for k in range(1, 5)}
-    note = f"{size:g} m cloth, contact spacing {1e3 * spacing:g} mm, k h = {CONTACT:g} N/m; gaps away from the folds."
-    return Outcome(rows, {**data, "faces": mesh.faces}, note)
 
 
 @case(

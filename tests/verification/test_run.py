@@ -141,7 +141,7 @@ def test_every_line_of_the_design_has_a_case():
 
     needed = {
         "force-is-minus-gradient", "rollout-gradient", "frame-indifference", "momentum", "spinning-sheet",
-        "drop-on-sheet", "fold-in-half-and-quarter", "friction-of-layers", "energy", "uniaxial-strip", "bias-strip",
+        "drop-on-sheet", "fold-half-a-metre", "friction-of-layers", "energy", "uniaxial-strip", "bias-strip",
         "hanging-strip", "small-swing", "incline", "free-fall", "drag", "cantilever", "biaxial-plastic-set",
         "convergence", "convergence-grid", "fold-and-unfold",
     }  # fmt: skip

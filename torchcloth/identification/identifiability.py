@@ -14,6 +14,7 @@ from .unknowns import Unknown
 
 TENTH = 0.1
 KNOWN = 0.25  # relative error below which a combination is called determined
+ROUNDING = 1e-10  # least eigenvalue of a correlation matrix whose inverse means something
 SHOWN, ALONE = 0.3, 0.95  # shares of a combination: named from, taken as a parameter of its own from
 
 # What determines a parameter, in the order of the first name that fits.
@@ -70,12 +71,18 @@ def influences(
 def combinations(unknowns: Sequence[Unknown], raw: Tensor, covariance: Tensor) -> list[Combination]:
     """Eigenvectors of the data's information in relative coordinates, best determined first.
 
-    Nuisances are allowed for; priors are taken out. Directions that are one parameter are left out.
+    Nuisances are allowed for; priors are taken out. Directions that are one parameter are left out. A covariance that
+    is singular to rounding, as of a motion with runaway slopes, has none.
     """
     count = len(unknowns)
     prior = torch.tensor([u.prior_std for u in unknowns], dtype=covariance.dtype)
     unit = torch.tensor([_relative(u, float(r)) for u, r in zip(unknowns, raw, strict=False)], dtype=covariance.dtype)
-    information = torch.linalg.inv(covariance[:count, :count]) - torch.diag(prior**-2)
+    within = covariance[:count, :count]
+    deviation = within.diagonal().sqrt()
+    correlation = within / deviation[:, None] / deviation
+    if not bool(correlation.isfinite().all()) or float(torch.linalg.eigvalsh(correlation)[0]) < ROUNDING:
+        return []
+    information = torch.linalg.inv(correlation) / deviation[:, None] / deviation - torch.diag(prior**-2)
     values, vectors = torch.linalg.eigh(unit[:, None] * information * unit)
     out = []
     for value, vector in zip(values.flip(0), vectors.flip(1).mT, strict=True):
