@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from importlib import resources
@@ -158,7 +159,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
 
         def advance(iteration: int, chamfer: float, values: dict[str, float]) -> None:
             shown = ", ".join(f"{name} {value:.4g}" for name, value in list(values.items())[:3])
-            text = f"Chamfer {1e3 * chamfer:.2f} mm, {shown}"
+            text = shown if math.isnan(chamfer) else f"Chamfer {1e3 * chamfer:.2f} mm, {shown}"
             progress.update(task, completed=iteration, description=text)
             if not progress.console.is_terminal:  # a log file shows a bar once, at the end
                 print(f"iteration {iteration}: {text}", flush=True)

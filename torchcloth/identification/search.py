@@ -14,6 +14,7 @@ from .objective import Objective
 
 Method = Literal["gauss-newton", "lbfgs", "adam", "gradient-descent"]
 METHODS: tuple[str, ...] = ("gauss-newton", "lbfgs", "adam", "gradient-descent")
+CHAMFER = METHODS[2:]  # those that follow the paper's distance alone
 PAPER_CHAMFER = 0.015  # m, the DiffCP paper's stop rule
 EARLY = 0.35  # share of the frames that the first stage of the fit sees
 EARLY_ITERATIONS = 10
