@@ -79,6 +79,9 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--engine", choices=["auto", "reference", "fused"], default="auto", help="default auto: fused where it can be"
     )
     parser.add_argument("--starts", type=int, default=1, metavar="N", help="starts over two decades (1)")
+    parser.add_argument(
+        "--profile", nargs="+", default=[], metavar="NAME", help="seek the interval by fitting the others beside it"
+    )
     parser.add_argument("--resume", action="store_true", help="go on where a stopped fit into DIR was")
 
 
@@ -172,6 +175,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             stop=options.stop,
             iterations=options.iterations,
             starts=options.starts,
+            profile=options.profile,
             journal=options.out / PROGRESS,
             resume=options.resume,
             dt=options.dt,

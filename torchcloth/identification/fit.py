@@ -25,8 +25,9 @@ from .misfit import figures, forces_rms
 from .nuisances import chosen, implied
 from .null import constant_force, no_force, rigid_carry
 from .objective import Objective
+from .profile import profiles
 from .replays import Frames
-from .report import estimates, nuisance_estimates, warnings_of, withdraw, worthless
+from .report import estimates, nuisance_estimates, skewed, warnings_of, with_profiles, withdraw, worthless
 from .result import Identification
 from .saved import model_of
 from .search import CHAMFER, METHODS, Method, Outcome, Progress, Search
@@ -53,6 +54,7 @@ def identify(
     priors: Mapping[str, tuple[float, float]] | None = None,
     noise: Mapping[str, float] | None = None,
     starts: int = 1,
+    profile: Sequence[str] = (),
     journal: str | Path | None = None,
     resume: bool = False,
     on_progress: Progress | None = None,
@@ -82,6 +84,8 @@ def identify(
         noise: least standard deviation by kind of data: "points", "edges", "markers" [m], "force" [N], "torque" [N m].
         starts: how many, the given one and others over two decades of every positive parameter; each is followed on the
             early frames, and the best goes on. ``fit["starts_agreeing"]`` counts those that led to the same values.
+        profile: names of fitted parameters whose interval is sought by holding them beside their estimate and fitting
+            the others anew: it may be skew, and open. Some 20 simulations for each unknown of the fit.
         journal: folder in which the fit keeps what it computed; of no use any more once the result is safe.
         resume: go on where a fit with this journal was stopped; the result is what it would have been, bit by bit.
         on_progress: called with (iteration, chamfer, values) after every iteration; chamfer is NaN if nothing was seen.
@@ -103,6 +107,7 @@ def identify(
     unknowns = with_priors(collect(cloth, names, episodes_in[0].cloth.areal_density_std), priors or {})
     if not unknowns:
         raise InvalidInput("parameters", got="none", expected="at least one name")
+    _check_profile(profile, [u.name for u in unknowns])
     blocks = blocks_for(use)
     episodes = [episode(cloth, r) for r in episodes_in]
     _check_seen(method, stop, episodes)
@@ -114,7 +119,7 @@ def identify(
     search = Search(objective, stop, on_progress)
     before = objective.seen(objective.start)
     outcome = search.run(method, start, iterations, rate, not warm_start and stop != "paper", starts)
-    found = _concluded(search, before, outcome, began)
+    found = _concluded(search, before, outcome, began, profile)
     return replace(found, model=model_of(cloth, found, episodes_in, dt))
 
 
@@ -125,6 +130,12 @@ def _check(method: str, stop: str, iterations: int, starts: int) -> None:
     for name, number in (("iterations", iterations), ("starts", starts)):
         if number < 1:
             raise InvalidInput(name, got=number, expected="at least 1")
+
+
+def _check_profile(names: Sequence[str], fitted: Sequence[str]) -> None:
+    for name in names:
+        if name not in fitted:
+            raise InvalidInput("profile", got=repr(name), expected=f"some of {', '.join(fitted)}")
 
 
 def _check_seen(method: str, stop: str, episodes: Sequence[Episode]) -> None:
@@ -155,15 +166,19 @@ def default_parameters(cloth: Cloth) -> list[str]:
     return names
 
 
-def _concluded(search: Search, start: list[Frames], outcome: Outcome, began: float) -> Identification:
+def _concluded(
+    search: Search, start: list[Frames], outcome: Outcome, began: float, profile: Sequence[str]
+) -> Identification:
     """From where a search ended to statements."""
     full = search.objective
-    final, reach, warnings = linearity.check(full, outcome.final)
+    final, reach, warnings, curved = linearity.check(full, outcome.final)
     end = full.seen(final.raw)
     before, after, null = [s.x for s in start], [s.x for s in end], [rigid_carry(e) for e in full.episodes]
     covariance = gauss_newton.covariance(full.problem(), final, full.episode_of(final.linear))
     covariance = with_first_shape(full, final, covariance)
     found = estimates(full.cloth, full.unknowns, final.raw, covariance)
+    profiled = {} if warnings else profiles(full, final, covariance, profile, search.tell)
+    found = with_profiles(found, profiled)
     fit: dict[str, Any] = _figures(full, before, after, null)
     fit |= _force_figures(full, start, end)
     fit |= {
@@ -180,6 +195,7 @@ def _concluded(search: Search, start: list[Frames], outcome: Outcome, began: flo
     if warnings or worthless(fit):  # steep chaotic slopes promise tiny errors
         found = withdraw(found, full.unknowns)
     warnings += [outcome.unfinished] if outcome.unfinished else []
+    warnings += skewed(found, [name for name in curved if name not in profiled])
     warnings += warnings_of(full.cloth, full.episodes, found, fit, after, full.faces)
     keys = {u.name: u.key.removesuffix(".raw") for u in full.unknowns}
     nuisances = nuisance_estimates(full.episodes, full.placed, final.raw, covariance)
@@ -196,6 +212,7 @@ def _concluded(search: Search, start: list[Frames], outcome: Outcome, began: flo
         nuisances,
         influences(full.unknowns, final.raw, reach, found.parameters),
         combinations(full.unknowns, final.raw, covariance),
+        profiles=profiled,
         forces_before=[s.wrench for s in start],
         forces_after=[s.wrench for s in end],
     )

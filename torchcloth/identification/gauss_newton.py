@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import SimulationDiverged, UnstableStep
-from .misfit import huber, noise_scale
+from .misfit import HUBER, huber, noise_scale
 
 TRUSTED = 0.1  # error of the predicted decrease up to which an updated Jacobian is good enough
 GATE = 5.0  # standard deviations
@@ -43,6 +43,7 @@ class Problem(NamedTuple):
     longest: Tensor  # [K], longest step
     noise: Tensor | float | None  # least standard deviation of a residual, for each block [B]
     gate: Tensor | None = None  # [B] residuals beyond it and five standard deviations do not count; None: all do
+    scales: tuple[Tensor, Tensor, Tensor] | None = None  # scale, share and gate of every iterate; None: its own
 
 
 class Iterate(NamedTuple):
@@ -156,6 +157,8 @@ def _exact(problem: Problem, at: Iterate) -> Iterate:
 
 
 def _iterate(problem: Problem, raw: Tensor, linear: Linearised, exact: bool) -> Iterate:
+    if problem.scales is not None:
+        return Iterate(raw, linear, exact, *problem.scales)
     kind = linear.kind
     count = int(kind.max()) + 1
     floor = problem.noise if isinstance(problem.noise, Tensor) else torch.full((count,), problem.noise or 0.0)
@@ -199,6 +202,13 @@ def _normal_equations(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
 def information(problem: Problem, at: Iterate) -> Tensor:
     """[K, K] of data and priors."""
     return _normal_equations(problem, at)[1]
+
+
+def curvature(problem: Problem, at: Iterate) -> Tensor:
+    """[K, K] of the robust cost itself: beyond the Huber bound residuals have a slope and no curvature."""
+    scale, factor, _ = at.rows
+    weight = factor * ((at.linear.value / scale).abs() <= HUBER) / scale**2
+    return (weight[:, None] * at.linear.jacobian).mT @ at.linear.jacobian + torch.diag(problem.prior_std**-2)
 
 
 def _is_small(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> bool:

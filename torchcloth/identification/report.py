@@ -14,7 +14,7 @@ from ..cloth import Cloth
 from ..materials import AEP
 from .episodes import Episode
 from .nuisances import Placed
-from .statements import Estimate
+from .statements import Estimate, Profile
 from .unknowns import Unknown, available, collect, needs_contact
 
 TRUSTED = 0.25  # a parameter counts as identified when its standard error is below a quarter of its value
@@ -82,6 +82,30 @@ def withdraw(found: Found, unknowns: Sequence[Unknown]) -> Found:
         thickness = found.parameters["membrane_stiffness"].value / found.parameters["youngs_modulus"].value
         parameters["membrane_stiffness"] = _times(parameters["youngs_modulus"], thickness, "N/m")
     return found._replace(parameters=parameters)
+
+
+def with_profiles(found: Found, profiles: Mapping[str, Profile]) -> Found:
+    """Intervals of the profiles that have both ends."""
+    parameters = dict(found.parameters)
+    for name, profile in profiles.items():
+        low, high = profile.ci95
+        if low is not None and high is not None:
+            parameters[name] = replace(parameters[name], ci95=(low, high))
+            if name == "youngs_modulus" and "membrane_stiffness" in parameters:
+                thickness = parameters["membrane_stiffness"].value / parameters[name].value
+                parameters["membrane_stiffness"] = _times(parameters[name], thickness, "N/m")
+    return found._replace(parameters=parameters)
+
+
+def skewed(found: Found, curved: Sequence[str]) -> list[str]:
+    """Offers a profile where the slope changes over a standard error."""
+    names = [name for name in curved if found.parameters[name].identifiable and found.parameters[name].source == "data"]
+    if not names:
+        return []
+    return [
+        f"the intervals of {', '.join(names)} may be longer to one side (their slopes change within a standard error): "
+        f"profile (--profile {' '.join(names)}) shows it"
+    ]
 
 
 def doubts(found: Found) -> list[str]:

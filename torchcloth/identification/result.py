@@ -14,7 +14,7 @@ from typing import Any
 from torch import Tensor
 
 from ..cloth import Cloth
-from .statements import Combination, Estimate, Influence
+from .statements import Combination, Estimate, Influence, Profile
 
 CONVENTION = (
     "SI units. chamfer: one-sided, cloud to surface: mean over frames of the mean distance [m] from each measured "
@@ -24,7 +24,8 @@ CONVENTION = (
     "gripper's mean reading. std: standard error of the estimate; noise "
     "correlated within patches of the fabric and nearby frames is allowed for, and the noise of a measured first shape "
     "where grippers hold; persistent model error is not. ci95: in "
-    "the log (logit) coordinate; linear, cut at 0, for amplitudes of effects and the cone. identifiable: std below a "
+    "the log (logit) coordinate; linear, cut at 0, for amplitudes of effects and the cone; the profile's where "
+    "there is one with both ends. identifiable: std below a "
     "quarter of the value (of a typical amplitude, where the amplitude is smaller), and the fit beats the null. "
     "source 'not in the model' or 'held fixed': value, std and ci95 are those of the prior. identifiability: how far "
     "one standard deviation of the prior and 10 % of the value move the cloth [mm] and its forces [N], rms. nuisances: "
@@ -46,6 +47,7 @@ class Identification:
         influences: what the data can tell of each fitted parameter, and which experiment would tell more.
         combinations: of parameters, that the data determine together or leave open.
         nuisances: by episode, estimates of what is not the fabric's: clock, camera, first shape.
+        profiles: of the parameters for which one was asked.
         forces_before, forces_after: gripper -> [T, 6] N, N m for each episode, as ``Episode.wrenches``.
         keys: module path by name of the fitted parameters.
         model: what else a repetition of the simulation needs (see ``saved``).
@@ -64,6 +66,7 @@ class Identification:
     influences: dict[str, Influence] = field(default_factory=dict)
     combinations: list[Combination] = field(default_factory=list)
     model: dict[str, Any] = field(default_factory=dict, repr=False)
+    profiles: dict[str, Profile] = field(default_factory=dict)
     forces_before: list[dict[str, Tensor]] = field(default_factory=list, repr=False)
     forces_after: list[dict[str, Tensor]] = field(default_factory=list, repr=False)
 
@@ -79,6 +82,7 @@ class Identification:
                 episode: {name: asdict(estimate) for name, estimate in own.items()}
                 for episode, own in self.nuisances.items()
             },
+            "profiles": {name: asdict(profile) for name, profile in self.profiles.items()},
             "convention": CONVENTION,
             "warnings": self.warnings,
             "history": [{name: or_none(value) for name, value in entry.items()} for entry in self.history],

@@ -74,6 +74,13 @@ class Search:
             self.on_progress(len(self.history) - 1, now.chamfer, values)
         return self.stop == "paper" and objective is self.objective and now.chamfer < PAPER_CHAMFER
 
+    def tell(self, at: gauss_newton.Iterate) -> bool:
+        """Of what is done after the search: progress, and no part of the history."""
+        if self.on_progress is not None:
+            now = self.objective.figures(at.raw).chamfer
+            self.on_progress(len(self.history) - 1, now, self.objective.values(at.raw))
+        return False
+
     def _early(self, part: Objective, start: Tensor, iterations: int) -> gauss_newton.Iterate:
         """On early frames, where a wrong start has not yet led the cloth elsewhere."""
         budget = min(EARLY_ITERATIONS, iterations)

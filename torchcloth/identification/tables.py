@@ -36,6 +36,7 @@ def print_fit(fit: Identification) -> None:
     if absent:
         console.print(f"Not in the model, because contact was left out: {', '.join(absent)}")
     _print_nuisances(console, fit)
+    _print_profiles(console, fit)
     _print_influences(console, fit)
     console.print(_distances(fit.fit))
     f = fit.fit
@@ -69,6 +70,13 @@ def _distances(f: dict[str, Any]) -> Table:
     if "force_rms" in columns.values():
         table.add_row("constant forces", "–", "–", f"{f['force_rms_constant']:.6f}")
     return table
+
+
+def _print_profiles(console, fit: Identification) -> None:
+    for name, profile in fit.profiles.items():
+        low, high = ("open" if end is None else f"{end:.3g}" for end in profile.ci95)
+        shape = "" if profile.skew is None else f", upper part {profile.skew:.2f} times the lower"
+        console.print(f"profile of {name}: {low} … {high}{shape}", markup=False)
 
 
 def _print_influences(console, fit: Identification) -> None:
