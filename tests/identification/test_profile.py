@@ -37,7 +37,7 @@ def profiled(given, clip=lambda raw: raw, names="abc"):
 
 def test_profiles_of_a_linear_problem_are_the_quadratic_intervals():
     """Up to residuals that cross the Huber bound on the way."""
-    final, covariance, found = profiled(toy())
+    _, covariance, found = profiled(toy())
     for k, name in enumerate("abc"):
         low, high = found[name].ci95
         half = 1.96 * float(covariance[k, k].sqrt())
@@ -111,7 +111,7 @@ def test_a_profile_replaces_the_interval_and_can_be_resumed(model, brief, tmp_pa
 
 
 def test_a_profile_of_what_is_not_fitted_is_refused(model, brief):
-    with pytest.raises(InvalidInput, match="profile; got 'air.normal'; expected some of youngs_modulus"):
+    with pytest.raises(InvalidInput, match=r"profile; got 'air.normal'; expected some of youngs_modulus"):
         identify(model, brief, ["youngs_modulus"], profile=["air.normal"])
 
 
