@@ -27,6 +27,7 @@ from .null import constant_force, no_force, rigid_carry
 from .objective import Objective
 from .profile import profiles
 from .replays import Frames
+from .replicates import strata_of
 from .report import estimates, nuisance_estimates, skewed, warnings_of, with_profiles, withdraw, worthless
 from .result import Identification
 from .saved import model_of
@@ -119,7 +120,7 @@ def identify(
     search = Search(objective, stop, on_progress)
     before = objective.seen(objective.start)
     outcome = search.run(method, start, iterations, rate, not warm_start and stop != "paper", starts)
-    found = _concluded(search, before, outcome, began, profile)
+    found = _concluded(search, before, outcome, began, profile, strata_of(episodes_in))
     return replace(found, model=model_of(cloth, found, episodes_in, dt))
 
 
@@ -167,14 +168,14 @@ def default_parameters(cloth: Cloth) -> list[str]:
 
 
 def _concluded(
-    search: Search, start: list[Frames], outcome: Outcome, began: float, profile: Sequence[str]
+    search: Search, start: list[Frames], outcome: Outcome, began: float, profile: Sequence[str], strata: Tensor
 ) -> Identification:
     """From where a search ended to statements."""
     full = search.objective
     final, reach, warnings, curved = linearity.check(full, outcome.final)
     end = full.seen(final.raw)
     before, after, null = [s.x for s in start], [s.x for s in end], [rigid_carry(e) for e in full.episodes]
-    covariance = gauss_newton.covariance(full.problem(), final, full.episode_of(final.linear))
+    covariance = gauss_newton.covariance(full.problem(), final, full.episode_of(final.linear), strata)
     covariance = with_first_shape(full, final, covariance)
     found = estimates(full.cloth, full.unknowns, final.raw, covariance)
     profiled = {} if warnings else profiles(full, final, covariance, profile, search.tell)
@@ -190,6 +191,8 @@ def _concluded(
         "converged": outcome.final.converged,
         **_counts(full, final),
     }
+    if bool((strata > 0).any()):
+        fit["replicates"] = int((strata > 0).sum())
     if outcome.reached is not None:
         fit |= {"starts": outcome.reached.tried, "starts_agreeing": outcome.reached.agree}
     if warnings or worthless(fit):  # steep chaotic slopes promise tiny errors
