@@ -102,6 +102,18 @@ class Objective:
             out[known[name]] = PhysicalParameter(value, parameter.unit, parameter.domain, name=name).raw.detach()
         return out
 
+    def scaled(self, raw: Tensor) -> Tensor:
+        """In units of the priors' standard deviations, from their middle."""
+        return (raw - self.middle) / self.prior_std
+
+    def unscaled(self, z: Tensor) -> Tensor:
+        """The inverse of ``scaled``."""
+        return self.middle + self.prior_std * z
+
+    def pulled(self, slope: Tensor) -> Tensor:
+        """A gradient by the scaled unknowns from one by the unknowns."""
+        return slope * self.prior_std
+
     def values(self, raw: Tensor) -> dict[str, float]:
         """Physical values of the fabric's unknowns by name."""
         return {u.name: u.value(float(r)) for u, r in zip(self.unknowns, raw, strict=False)}
