@@ -16,7 +16,6 @@ OnIterate = Callable[[Tensor, Objective], bool]
 ROUNDS = 3  # of L-BFGS, each with the noise scales of the point where it begins
 HOPELESS = 1e30  # cost of what cannot be simulated
 SETTLED = 1e-3  # decrease of the robust cost below which a round ends: a few hundredths of a standard error
-PATIENCE = 4  # iterations over which: the first of a round, along the gradient, may be tiny
 
 
 def descend(
@@ -93,6 +92,6 @@ def _round(
         values.append(float(optimiser.step(closure)))
         if on_iterate(before, objective):
             return before, used, True
-        if len(values) > PATIENCE and values[-1 - PATIENCE] - values[-1] < SETTLED:
+        if len(values) > objective.patience and values[-1 - objective.patience] - values[-1] < SETTLED:
             return before, used, False
     return objective.clip(objective.unscaled(scaled.detach())), iterations, False

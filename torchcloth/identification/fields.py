@@ -114,7 +114,11 @@ def fit_fields(
     search = Search(objective, "converged", on_progress)
     raw, done = quasi_newton(objective, objective.start, iterations, search.record)
     before, after = objective.frames(objective.start), objective.frames(raw)
-    fit: dict[str, Any] = {"iterations": len(search.history), "simulations": objective.simulations, "converged": done}
+    fit: dict[str, Any] = {
+        "iterations": len(search.history) - 1,
+        "simulations": objective.simulations,
+        "converged": done,
+    }
     for key, frames in (("before", before), ("after", after)):
         now = figures(frames, objective.episodes, objective.faces)
         fit |= {f"chamfer_{key}": now.chamfer, f"rms_{key}": now.rms}
@@ -135,6 +139,8 @@ def _field(cloth: Cloth, name: str) -> PhysicalParameter:
 
 class _Fields(Objective):
     """Fields as one vector; the search goes in coordinates in which the prior is a unit sphere."""
+
+    patience = 4  # the first of a round, along a gradient of hundreds of numbers, is tiny
 
     def __init__(
         self, cloth: Cloth, own: dict[str, PhysicalParameter], episodes: list[Episode], dt, blocks, contrast: float

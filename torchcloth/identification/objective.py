@@ -31,6 +31,8 @@ class Objective:
     The vector of unknowns holds the fabric's first, then the nuisances of one episode after the other.
     """
 
+    patience = 1  # iterations that may bring nothing, of a search by gradients
+
     def __init__(
         self,
         cloth: Cloth,
