@@ -1,6 +1,7 @@
 """What identification promises, on twins with another mesh, grid and step. Minutes each: `-m slow`; `-s` prints."""
 
 import time
+from dataclasses import replace
 
 import coverage
 import pytest
@@ -30,11 +31,29 @@ def fitted(pulled):
 
 
 def test_stretching_tells_stiffness_and_contraction(fitted):
-    """E within 2 %, Poisson's ratio within 5 % or its standard error, whichever is larger."""
+    """E within 2 %; Poisson's ratio, from 16 such clouds, only to some 10 %: the rim alone shows it, and says so."""
     p = fitted.parameters
     print({name: (p[name].value, p[name].std) for name in PAIR})
     assert p["membrane_stiffness"].value == pytest.approx(60.0, rel=0.02)
-    assert abs(p["poisson_ratio"].value - 0.3) < max(0.015, 1.5 * p["poisson_ratio"].std)
+    nu = p["poisson_ratio"]
+    assert 0.05 < nu.std / nu.value < 0.15
+    assert abs(nu.value - 0.3) < 2 * nu.std
+
+
+@pytest.mark.parametrize(
+    ("points", "frames", "rate", "markers"),
+    [(1600, 60, 59.0, 0), (1600, 16, 15.0, 5), (400, 16, 15.0, 9)],
+    ids=["60 frames per second", "25 markers", "81 markers, fewer points"],
+)
+def test_what_tells_contraction_to_five_per_cent(points, frames, rate, markers):
+    """Four times the frames, or markers: value and error bar within 5 %, stiffness within 2 %."""
+    setting = stretches.Setting(points=points, strain=0.08, frames=frames, rate=rate)
+    recording = stretches.record(seed=5, setting=setting, markers=markers)
+    p = identify(stretches.model(recording), recording, PAIR, nuisances=GRASP).parameters
+    print({name: (p[name].value, p[name].std) for name in PAIR})
+    assert p["membrane_stiffness"].value == pytest.approx(60.0, rel=0.02)
+    assert p["poisson_ratio"].value == pytest.approx(0.3, rel=0.05)
+    assert p["poisson_ratio"].std < 0.05 * p["poisson_ratio"].value
 
 
 def test_the_start_does_not_matter_over_two_decades():
@@ -86,6 +105,23 @@ def test_what_a_fit_costs():
     assert rows["gauss-newton"]["iterations"] <= 12
     assert rows["gauss-newton"]["cpu"] < 90.0
     assert rows["gauss-newton"]["chamfer_after"] < rows["gradient-descent"]["chamfer_after"]
+
+
+def test_replicates_show_what_was_held_otherwise_each_time():
+    """Four pulls, each held 2 mm elsewhere, and nothing fitted for it: their scatter widens the error, which covers."""
+    setting = stretches.Setting(frames=9, grasp=2e-3, points=150)
+    for group in range(3):
+        pulls = [stretches.record(seed=100 * group + i, setting=setting) for i in range(4)]
+        pulls = [replace(pull, split={"motion": "pull"}) for pull in pulls]
+        model, guess = stretches.model(pulls[0]), {"youngs_modulus": 6.2e4}
+        fits = [
+            identify(model, given, ["youngs_modulus"], guess=guess, warm_start=True) for given in (pulls, pulls[:1])
+        ]
+        many, one = (fit.parameters["membrane_stiffness"] for fit in fits)
+        print(f"group {group}: {many.value:.2f} +- {many.std:.2f}, one of them {one.value:.2f} +- {one.std:.2f}")
+        assert fits[0].fit["replicates"] == 4
+        assert abs(many.value - 60.0) < 2 * many.std
+        assert many.std > 0.7 * one.std  # independent noise alone would leave half
 
 
 def test_error_bars_cover(tmp_path):

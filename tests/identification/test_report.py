@@ -105,10 +105,11 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
     at_start = gauss_newton.Iterate(
         torch.zeros(1), linear(1.0), True, torch.tensor([1e-3]), torch.ones(1), torch.tensor([torch.inf])
     )
-    for secant, warned in ((1.2, False), (5.0, True)):
+    for secant, warned, bent in ((1.2, False, []), (1.4, False, ["youngs_modulus"]), (5.0, True, [])):
         fake = Fake(unknowns=[SimpleNamespace(name="youngs_modulus")], secant=secant)
-        final, _, warnings = linearity.check(fake, at_start)
+        final, _, warnings, curved = linearity.check(fake, at_start)
         assert bool(warnings) == warned
+        assert curved == bent
         assert (final.linear is not at_start.linear) == warned
     assert "tangents of youngs_modulus miss finite steps by up to 80 %" in warnings[0]
 

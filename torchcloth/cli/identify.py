@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from importlib import resources
@@ -78,6 +79,9 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--engine", choices=["auto", "reference", "fused"], default="auto", help="default auto: fused where it can be"
     )
     parser.add_argument("--starts", type=int, default=1, metavar="N", help="starts over two decades (1)")
+    parser.add_argument(
+        "--profile", nargs="+", default=[], metavar="NAME", help="seek the interval by fitting the others beside it"
+    )
     parser.add_argument("--resume", action="store_true", help="go on where a stopped fit into DIR was")
 
 
@@ -158,7 +162,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
 
         def advance(iteration: int, chamfer: float, values: dict[str, float]) -> None:
             shown = ", ".join(f"{name} {value:.4g}" for name, value in list(values.items())[:3])
-            text = f"Chamfer {1e3 * chamfer:.2f} mm, {shown}"
+            text = shown if math.isnan(chamfer) else f"Chamfer {1e3 * chamfer:.2f} mm, {shown}"
             progress.update(task, completed=iteration, description=text)
             if not progress.console.is_terminal:  # a log file shows a bar once, at the end
                 print(f"iteration {iteration}: {text}", flush=True)
@@ -171,6 +175,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             stop=options.stop,
             iterations=options.iterations,
             starts=options.starts,
+            profile=options.profile,
             journal=options.out / PROGRESS,
             resume=options.resume,
             dt=options.dt,

@@ -1,6 +1,7 @@
 """From recordings to fabric parameters with error bars."""
 
 from .episodes import Episode, cloth_from, episode
+from .fields import FieldFit, fit_fields
 from .fit import identify
 from .null import rigid_carry
 from .pictures import draw
@@ -15,6 +16,7 @@ __all__ = [
     "AbstractSpecimen",
     "Episode",
     "Estimate",
+    "FieldFit",
     "Identification",
     "Replayed",
     "Response",
@@ -24,6 +26,7 @@ __all__ = [
     "cloth_from",
     "draw",
     "episode",
+    "fit_fields",
     "fit_tension",
     "identify",
     "print_fit",

@@ -70,29 +70,28 @@ def _round(
     objective: Objective, at: gauss_newton.Iterate, start: Tensor, iterations: int, on_iterate: OnIterate, number: int
 ) -> tuple[Tensor, int, bool]:
     """(end, iterations used, whether it was stopped) with fixed noise scales."""
-    unit, middle = objective.prior_std, objective.middle
-    scaled = ((start - middle) / unit).requires_grad_()
+    scaled = objective.scaled(start).requires_grad_()
     optimiser = torch.optim.LBFGS(
         [scaled], lr=0.3, max_iter=1, max_eval=20, tolerance_change=1e-12, line_search_fn="strong_wolfe"
     )
     loss = lambda o, raw, i: o.cost(raw, i, at)  # noqa: E731
 
     def closure() -> Tensor:
-        raw = objective.clip(middle + unit * scaled.detach())
-        prior = (raw - middle) / unit
+        raw = objective.clip(objective.unscaled(scaled.detach()))
+        prior = objective.scaled(raw)
         try:
             value, slope = objective.value_and_slope(f"cost{number}", raw, loss)
         except (SimulationDiverged, UnstableStep):
             value, slope = scaled.new_tensor(HOPELESS), torch.zeros_like(raw)
-        scaled.grad = slope * unit + prior
+        scaled.grad = objective.pulled(slope) + prior
         return value + 0.5 * prior.square().sum()
 
     values: list[float] = []
     for used in range(iterations):
-        before = objective.clip(middle + unit * scaled.detach())
+        before = objective.clip(objective.unscaled(scaled.detach()))
         values.append(float(optimiser.step(closure)))
         if on_iterate(before, objective):
             return before, used, True
-        if len(values) > 1 and values[-2] - values[-1] < SETTLED:
+        if len(values) > objective.patience and values[-1 - objective.patience] - values[-1] < SETTLED:
             return before, used, False
-    return objective.clip(middle + unit * scaled.detach()), iterations, False
+    return objective.clip(objective.unscaled(scaled.detach())), iterations, False

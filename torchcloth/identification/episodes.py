@@ -130,11 +130,9 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
     """Check a recording against a cloth and turn it into tensors of the cloth's dtype.
 
     Raises:
-        RecordingError: neither points nor markers, or no motion for one of the cloth's grasps.
+        RecordingError: nothing was seen or felt, or no motion for one of the cloth's grasps.
         InvalidInput: initial vertices that do not belong to the cloth's mesh.
     """
-    if recording.markers is None:
-        recording.require("points", by="identify")
     recording = streams.without_doubles(recording)
     name = recording.path.name if recording.path else "recording"
     dtype = cloth.state(torch.as_tensor(cloth.mesh.vertices)).x.dtype
@@ -162,8 +160,17 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
 
 
 def _frame_times(name: str, recording: Recording, motion: Mapping[str, Trajectory], needed: list[str]) -> np.ndarray:
-    """Of the points and markers from the first frame on, which is the points' first where there are points."""
+    """Of the points and markers from the first frame on, which is the points' first where there are points.
+
+    Where nothing was seen, of the force readings.
+    """
     seen = [s.t + recording.clock_offset for s in (recording.points, recording.markers) if s is not None]
+    if not seen:
+        felt = streams.felt(recording, needed)
+        if not len(felt):
+            recording.require("points", by="identify")
+        start = max(float(motion[key].t[0]) for key in needed)
+        return _overlap(felt[felt >= start - streams.SAME], motion, needed)
     first = seen[0]
     if len(first) < 2:
         stream = "points" if recording.points is not None else "markers"

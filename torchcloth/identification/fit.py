@@ -18,17 +18,20 @@ from ..recordings import Recording
 from . import gauss_newton, linearity
 from .blocks import blocks_for
 from .considered import with_first_shape
-from .episodes import episode
+from .episodes import Episode, episode
 from .identifiability import combinations, influences
 from .journal import Journal
-from .misfit import figures
+from .misfit import figures, forces_rms
 from .nuisances import chosen, implied
-from .null import rigid_carry
+from .null import constant_force, no_force, rigid_carry
 from .objective import Objective
-from .report import estimates, nuisance_estimates, warnings_of, withdraw
+from .profile import profiles
+from .replays import Frames
+from .replicates import strata_of
+from .report import estimates, nuisance_estimates, skewed, warnings_of, with_profiles, withdraw, worthless
 from .result import Identification
 from .saved import model_of
-from .search import METHODS, Method, Outcome, Progress, Search
+from .search import CHAMFER, METHODS, Method, Outcome, Progress, Search
 from .unknowns import collect, with_priors
 
 PAPER_ITERATIONS = 35  # of the DiffCP paper's stop rule
@@ -52,6 +55,7 @@ def identify(
     priors: Mapping[str, tuple[float, float]] | None = None,
     noise: Mapping[str, float] | None = None,
     starts: int = 1,
+    profile: Sequence[str] = (),
     journal: str | Path | None = None,
     resume: bool = False,
     on_progress: Progress | None = None,
@@ -81,16 +85,18 @@ def identify(
         noise: least standard deviation by kind of data: "points", "edges", "markers" [m], "force" [N], "torque" [N m].
         starts: how many, the given one and others over two decades of every positive parameter; each is followed on the
             early frames, and the best goes on. ``fit["starts_agreeing"]`` counts those that led to the same values.
+        profile: names of fitted parameters whose interval is sought by holding them beside their estimate and fitting
+            the others anew: it may be skew, and open. Some 20 simulations for each unknown of the fit.
         journal: folder in which the fit keeps what it computed; of no use any more once the result is safe.
         resume: go on where a fit with this journal was stopped; the result is what it would have been, bit by bit.
-        on_progress: called with (iteration, chamfer, values) after every iteration.
+        on_progress: called with (iteration, chamfer, values) after every iteration; chamfer is NaN if nothing was seen.
 
     Returns:
         Estimates with standard errors, distances, warnings, frames.
 
     Raises:
         InvalidInput: unknown names or options.
-        RecordingError: a recording that lacks points or motion.
+        RecordingError: a recording without motion, or with nothing seen or felt.
         SimulationDiverged: the start values cannot be simulated.
     """
     _check(method, stop, iterations, starts)
@@ -102,17 +108,19 @@ def identify(
     unknowns = with_priors(collect(cloth, names, episodes_in[0].cloth.areal_density_std), priors or {})
     if not unknowns:
         raise InvalidInput("parameters", got="none", expected="at least one name")
+    _check_profile(profile, [u.name for u in unknowns])
     blocks = blocks_for(use)
     episodes = [episode(cloth, r) for r in episodes_in]
+    _check_seen(method, stop, episodes)
     own = chosen(nuisances, implied([block.name for block in blocks], episodes))
     objective = Objective(cloth, unknowns, episodes, dt, own, blocks, noise)
     start = objective.raw(guess or {})
     if journal is not None:
         objective.journal = Journal(journal, [method, stop, rate, starts, *objective.identity(), start], resume)
     search = Search(objective, stop, on_progress)
-    before = objective.frames(objective.start)
+    before = objective.seen(objective.start)
     outcome = search.run(method, start, iterations, rate, not warm_start and stop != "paper", starts)
-    found = _concluded(search, before, outcome, began)
+    found = _concluded(search, before, outcome, began, profile, strata_of(episodes_in))
     return replace(found, model=model_of(cloth, found, episodes_in, dt))
 
 
@@ -123,6 +131,24 @@ def _check(method: str, stop: str, iterations: int, starts: int) -> None:
     for name, number in (("iterations", iterations), ("starts", starts)):
         if number < 1:
             raise InvalidInput(name, got=number, expected="at least 1")
+
+
+def _check_profile(names: Sequence[str], fitted: Sequence[str]) -> None:
+    for name in names:
+        if name not in fitted:
+            raise InvalidInput("profile", got=repr(name), expected=f"some of {', '.join(fitted)}")
+
+
+def _check_seen(method: str, stop: str, episodes: Sequence[Episode]) -> None:
+    """Refuse what follows the Chamfer distance where nothing was seen."""
+    for e in episodes:
+        if (method in CHAMFER or stop == "paper") and not any(len(e.positions(t)) for t in range(len(e.times))):
+            raise InvalidInput(
+                f"{e.name}: method {method!r}, stop {stop!r}",
+                got="an episode with neither points nor markers",
+                expected="something seen, of which it takes the Chamfer distance",
+                remedy='method "gauss-newton" or "lbfgs", stop "converged"',
+            )
 
 
 def default_parameters(cloth: Cloth) -> list[str]:
@@ -141,15 +167,21 @@ def default_parameters(cloth: Cloth) -> list[str]:
     return names
 
 
-def _concluded(search: Search, before: list[Tensor], outcome: Outcome, began: float) -> Identification:
+def _concluded(
+    search: Search, start: list[Frames], outcome: Outcome, began: float, profile: Sequence[str], strata: Tensor
+) -> Identification:
     """From where a search ended to statements."""
     full = search.objective
-    final, reach, warnings = linearity.check(full, outcome.final)
-    after, null = full.frames(final.raw), [rigid_carry(e) for e in full.episodes]
-    covariance = gauss_newton.covariance(full.problem(), final, full.episode_of(final.linear))
+    final, reach, warnings, curved = linearity.check(full, outcome.final)
+    end = full.seen(final.raw)
+    before, after, null = [s.x for s in start], [s.x for s in end], [rigid_carry(e) for e in full.episodes]
+    covariance = gauss_newton.covariance(full.problem(), final, full.episode_of(final.linear), strata)
     covariance = with_first_shape(full, final, covariance)
     found = estimates(full.cloth, full.unknowns, final.raw, covariance)
+    profiled = {} if warnings else profiles(full, final, covariance, profile, search.tell)
+    found = with_profiles(found, profiled)
     fit: dict[str, Any] = _figures(full, before, after, null)
+    fit |= _force_figures(full, start, end)
     fit |= {
         "iterations": max(0, len(search.history) - 1),
         "simulations": search.simulations,
@@ -159,11 +191,14 @@ def _concluded(search: Search, before: list[Tensor], outcome: Outcome, began: fl
         "converged": outcome.final.converged,
         **_counts(full, final),
     }
+    if bool((strata > 0).any()):
+        fit["replicates"] = int((strata > 0).sum())
     if outcome.reached is not None:
         fit |= {"starts": outcome.reached.tried, "starts_agreeing": outcome.reached.agree}
-    if warnings or fit["chamfer_after"] >= fit["chamfer_null"]:  # steep chaotic slopes promise tiny errors
+    if warnings or worthless(fit):  # steep chaotic slopes promise tiny errors
         found = withdraw(found, full.unknowns)
     warnings += [outcome.unfinished] if outcome.unfinished else []
+    warnings += skewed(found, [name for name in curved if name not in profiled])
     warnings += warnings_of(full.cloth, full.episodes, found, fit, after, full.faces)
     keys = {u.name: u.key.removesuffix(".raw") for u in full.unknowns}
     nuisances = nuisance_estimates(full.episodes, full.placed, final.raw, covariance)
@@ -180,6 +215,9 @@ def _concluded(search: Search, before: list[Tensor], outcome: Outcome, began: fl
         nuisances,
         influences(full.unknowns, final.raw, reach, found.parameters),
         combinations(full.unknowns, final.raw, covariance),
+        profiles=profiled,
+        forces_before=[s.wrench for s in start],
+        forces_after=[s.wrench for s in end],
     )
 
 
@@ -188,6 +226,14 @@ def _figures(full: Objective, *frames: list[Tensor]) -> dict[str, float]:
         key: figures(x, full.episodes, full.faces) for key, x in zip(("before", "after", "null"), frames, strict=True)
     }
     return {f"{what}_{key}": getattr(f, what) for what in ("chamfer", "rms") for key, f in now.items()}
+
+
+def _force_figures(full: Objective, start: list[Frames], end: list[Frames]) -> dict[str, float]:
+    if not any(e.wrenches for e in full.episodes):
+        return {}
+    both = {"before": [s.wrench for s in start], "after": [s.wrench for s in end]}
+    nulls = {"null": [no_force(e) for e in full.episodes], "constant": [constant_force(e) for e in full.episodes]}
+    return {f"force_rms_{key}": forces_rms(wrenches, full.episodes) for key, wrenches in {**both, **nulls}.items()}
 
 
 def _counts(full: Objective, final: gauss_newton.Iterate) -> dict[str, float]:

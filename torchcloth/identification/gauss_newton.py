@@ -9,10 +9,12 @@ import torch
 from torch import Tensor
 
 from ..errors import SimulationDiverged, UnstableStep
-from .misfit import huber, noise_scale
+from .misfit import HUBER, huber, noise_scale
 
 TRUSTED = 0.1  # error of the predicted decrease up to which an updated Jacobian is good enough
 GATE = 5.0  # standard deviations
+FEWEST = 3  # episodes that show a scatter
+NORMAL = 1.95996  # the 97.5 % quantile
 WINDOW = 5  # frames within which residuals of one patch count as one observation
 
 
@@ -43,6 +45,7 @@ class Problem(NamedTuple):
     longest: Tensor  # [K], longest step
     noise: Tensor | float | None  # least standard deviation of a residual, for each block [B]
     gate: Tensor | None = None  # [B] residuals beyond it and five standard deviations do not count; None: all do
+    scales: tuple[Tensor, Tensor, Tensor] | None = None  # scale, share and gate of every iterate; None: its own
 
 
 class Iterate(NamedTuple):
@@ -156,6 +159,8 @@ def _exact(problem: Problem, at: Iterate) -> Iterate:
 
 
 def _iterate(problem: Problem, raw: Tensor, linear: Linearised, exact: bool) -> Iterate:
+    if problem.scales is not None:
+        return Iterate(raw, linear, exact, *problem.scales)
     kind = linear.kind
     count = int(kind.max()) + 1
     floor = problem.noise if isinstance(problem.noise, Tensor) else torch.full((count,), problem.noise or 0.0)
@@ -201,17 +206,25 @@ def information(problem: Problem, at: Iterate) -> Tensor:
     return _normal_equations(problem, at)[1]
 
 
+def curvature(problem: Problem, at: Iterate) -> Tensor:
+    """[K, K] of the robust cost itself: beyond the Huber bound residuals have a slope and no curvature."""
+    scale, factor, _ = at.rows
+    weight = factor * ((at.linear.value / scale).abs() <= HUBER) / scale**2
+    return (weight[:, None] * at.linear.jacobian).mT @ at.linear.jacobian + torch.diag(problem.prior_std**-2)
+
+
 def _is_small(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> bool:
     """Below ``tolerance`` standard errors in every direction."""
     _, hessian = _normal_equations(problem, at)
     return float(step @ hessian @ step) < tolerance**2
 
 
-def covariance(problem: Problem, at: Iterate, episode: Tensor | None = None) -> Tensor:
+def covariance(problem: Problem, at: Iterate, episode: Tensor | None = None, strata: Tensor | None = None) -> Tensor:
     """Covariance of the estimate [K, K]: sandwich with residuals correlated within and between nearby frames.
 
     Never smaller than what the counted independent observations would give; nor, where ``episode`` [R] names three or
-    more, than what leaving out one after the other shows. Model error that all episodes share is beyond it.
+    more, than what leaving out one after the other shows. ``strata`` [E] numbers groups of replicates, within which
+    the episodes' scatter counts. Model error that all episodes share is beyond it.
     """
     gradient, hessian = _normal_equations(problem, at)
     inverse = torch.linalg.inv(hessian)
@@ -223,21 +236,38 @@ def covariance(problem: Problem, at: Iterate, episode: Tensor | None = None) -> 
     robust = inverse @ (meat + torch.diag(problem.prior_std**-2)) @ inverse
     least = inverse.diagonal()
     if episode is not None and int(episode.max()) >= 2:
-        least = torch.maximum(least, _jackknife(at, hessian, episode))
+        strata = torch.zeros(int(episode.max()) + 1, dtype=torch.int64) if strata is None else strata
+        least = torch.maximum(least, _jackknife(at, hessian, episode, strata))
     inflate = torch.sqrt((least / robust.diagonal()).clamp(min=1.0))
     return robust * inflate[:, None] * inflate[None, :]
 
 
-def _jackknife(at: Iterate, hessian: Tensor, episode: Tensor) -> Tensor:
-    """Variances [K] from leaving out one episode after the other, each by one Newton step (Efron 1982)."""
+def _jackknife(at: Iterate, hessian: Tensor, episode: Tensor, strata: Tensor) -> Tensor:
+    """Variances [K] from leaving out one episode after the other, each by one Newton step (Efron 1982).
+
+    Widened as Student's distribution is, so that the interval of 1.96 deviations holds the truth with few episodes.
+    """
     weighted, moved = at.influence()[0][:, None] * at.linear.jacobian, []
-    count = int(episode.max()) + 1
-    for e in range(count):
+    for e in range(len(strata)):
         own = episode == e
         less = hessian - weighted[own].mT @ at.linear.jacobian[own]
         moved.append(torch.linalg.solve(less, weighted[own].mT @ at.linear.value[own]))
-    shifts = torch.stack(moved)
-    return (count - 1) / count * (shifts - shifts.mean(0)).square().sum(0)
+    shifts, total = torch.stack(moved), torch.zeros_like(hessian[0])
+    for stratum in strata.unique():
+        own = shifts[strata == stratum]
+        if len(own) < FEWEST:  # no scatter of their own: as far as each one pulls
+            total += own.square().sum(0)
+            continue
+        scatter = (len(own) - 1) / len(own) * (own - own.mean(0)).square().sum(0)
+        total += (student(len(own) - 1) / NORMAL) ** 2 * scatter
+    return total
+
+
+def student(freedom: int) -> float:
+    """The 97.5 % quantile of Student's distribution, to 3 % from two degrees of freedom on (Fisher and Cornish)."""
+    z, n = NORMAL, freedom
+    second = (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
+    return z + (z**3 + z) / (4 * n) + second + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
 
 
 def _long_run(scores: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from .identifiability import Reach
 from .objective import Objective
 
 NONLINEAR = 0.5  # relative error of the tangents over a finite step above which they are not used for errors
+CURVED = 0.2  # the same over a standard error, from which an interval is noticeably longer to one side
 SMALLEST, LARGEST = 0.005, 0.1  # finite steps, in units of the prior's standard deviation
 
 
@@ -20,6 +21,7 @@ class Checked(NamedTuple):
     final: gauss_newton.Iterate
     reach: Reach
     warnings: list[str]
+    curved: list[str]  # unknowns whose interval may be skew
 
 
 def check(objective: Objective, final: gauss_newton.Iterate) -> Checked:
@@ -35,10 +37,12 @@ def check(objective: Objective, final: gauss_newton.Iterate) -> Checked:
     moved, slope = (weight * j[:, : len(steps)] for j in (secants.jacobian, final.linear.jacobian))
     missed = (moved - slope).norm(dim=0) / moved.norm(dim=0).clamp(min=1e-12)
     if float(missed.max()) < NONLINEAR:
-        return Checked(final, reach, [])
+        over_one = missed * deviation[: len(steps)] / steps
+        curved = [u.name for u, error in zip(objective.unknowns, over_one, strict=True) if error >= CURVED]
+        return Checked(final, reach, [], curved)
     names = ", ".join(u.name for u, error in zip(objective.unknowns, missed, strict=True) if error >= NONLINEAR)
     warning = (
         f"the motion is unstable or strongly nonlinear at the solution (tangents of {names} miss finite steps "
         f"by up to {min(1000.0, 100 * float(missed.max())):.0f} %): no parameter counts as identified"
     )
-    return Checked(final._replace(linear=secants), reach, [warning])
+    return Checked(final._replace(linear=secants), reach, [warning], [])

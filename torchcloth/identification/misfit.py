@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -16,7 +17,7 @@ LEAST_SCALE = 1e-6  # m, N, N m: a perfect fit must not divide by zero
 
 
 class Figures(NamedTuple):
-    """Reported distances [m]: one-sided, cloud to surface."""
+    """Reported distances [m]: one-sided, cloud to surface. NaN where nothing was seen."""
 
     chamfer: float  # mean over frames of the mean over points
     rms: float
@@ -35,8 +36,21 @@ def figures(frames: Sequence[Tensor], episodes: Sequence[Episode], faces: Tensor
             squared = (offset * offset).sum(-1)
             mean.append(squared.sqrt().mean())
             squares, count = squares + float(squared.sum()), count + len(cloud)
+    if count == 0:
+        return Figures(math.nan, math.nan, torch.empty(0))
     per_frame = torch.stack(mean)
     return Figures(float(per_frame.mean()), (squares / count) ** 0.5, per_frame)
+
+
+def forces_rms(wrenches: Sequence[Mapping[str, Tensor]], episodes: Sequence[Episode]) -> float:
+    """Root mean square distance [N] of forces from the measured ones, over all readings; NaN without readings."""
+    missed = [
+        (own[name] - measured)[1:, :3].square().sum(-1)
+        for own, episode in zip(wrenches, episodes, strict=True)
+        for name, measured in episode.wrenches.items()
+    ]
+    seen = torch.cat(missed) if missed else torch.empty(0)
+    return float(seen[seen.isfinite()].mean().sqrt())
 
 
 def noise_scale(value: Tensor, floor: float | None) -> float:

@@ -21,6 +21,16 @@ def rigid_carry(episode: Episode) -> Tensor:
     return episode.initial @ rotation.mT + shift.unsqueeze(-2)
 
 
+def no_force(episode: Episode) -> dict[str, Tensor]:
+    """Grippers that feel nothing, as ``Episode.wrenches``."""
+    return {name: torch.zeros_like(wrench) for name, wrench in episode.wrenches.items()}
+
+
+def constant_force(episode: Episode) -> dict[str, Tensor]:
+    """Each gripper's mean reading, which a weight alone would give."""
+    return {name: wrench.nanmean(0).expand_as(wrench) for name, wrench in episode.wrenches.items()}
+
+
 def _marks(pose: Tensor) -> Tensor:
     """[T, 7, 3] m: a gripper's origin and points on its axes."""
     tips = ARM * torch.cat([torch.zeros(1, 3), torch.eye(3), -torch.eye(3)]).to(pose)

@@ -31,6 +31,8 @@ class Objective:
     The vector of unknowns holds the fabric's first, then the nuisances of one episode after the other.
     """
 
+    patience = 1  # iterations that may bring nothing, of a search by gradients
+
     def __init__(
         self,
         cloth: Cloth,
@@ -101,6 +103,18 @@ class Objective:
             parameter = self.unknowns[known[name]].parameter
             out[known[name]] = PhysicalParameter(value, parameter.unit, parameter.domain, name=name).raw.detach()
         return out
+
+    def scaled(self, raw: Tensor) -> Tensor:
+        """In units of the priors' standard deviations, from their middle."""
+        return (raw - self.middle) / self.prior_std
+
+    def unscaled(self, z: Tensor) -> Tensor:
+        """The inverse of ``scaled``."""
+        return self.middle + self.prior_std * z
+
+    def pulled(self, slope: Tensor) -> Tensor:
+        """A gradient by the scaled unknowns from one by the unknowns."""
+        return slope * self.prior_std
 
     def values(self, raw: Tensor) -> dict[str, float]:
         """Physical values of the fabric's unknowns by name."""

@@ -19,13 +19,19 @@ BEFORE, AFTER, NULL = "#b0653a", "#1f6f8b", "#888888"
 
 
 def draw(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray, folder: Path) -> list[Path]:
-    """Write fit.png, distances.png and parameters.png into ``folder``; returns their paths."""
+    """Write fit.png and distances.png, forces.png, parameters.png into ``folder``, each where it has something to show.
+
+    Returns:
+        their paths.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    return [
-        save_figure(shapes(fit, episodes[0], faces), folder / "fit.png"),
-        save_figure(distances(fit, episodes, faces), folder / "distances.png"),
-        save_figure(parameters(fit), folder / "parameters.png"),
-    ]
+    figures, seen = {}, [k for k, e in enumerate(episodes) if any(len(e.positions(t)) for t in range(len(e.times)))]
+    if seen:
+        figures = {"fit": shapes(fit, seen[0], episodes[seen[0]], faces), "distances": distances(fit, episodes, faces)}
+    if any(e.wrenches for e in episodes):
+        figures["forces"] = forces(fit, episodes)
+    figures["parameters"] = parameters(fit)
+    return [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items()]
 
 
 def save_figure(figure: Any, path: Path) -> Path:
@@ -39,8 +45,8 @@ def _distance(cloud: Tensor, vertices: Tensor, faces: Tensor) -> np.ndarray:
     return (cloud - closest(cloud, vertices, faces).on(vertices)).norm(dim=-1).numpy()
 
 
-def shapes(fit: Identification, episode: Episode, faces: np.ndarray) -> Any:
-    """Four frames: measured points coloured by their distance, over the cloth with start and with fitted values."""
+def shapes(fit: Identification, k: int, episode: Episode, faces: np.ndarray) -> Any:
+    """Four frames of the ``k``-th episode: points coloured by their distance, over the start and the fit."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
@@ -52,10 +58,10 @@ def shapes(fit: Identification, episode: Episode, faces: np.ndarray) -> Any:
     figure = Figure(figsize=(15, 7.5))
     axes = figure.subplots(2, 4, subplot_kw={"projection": "3d", "computed_zorder": False})
     figure.subplots_adjust(wspace=0.02, hspace=0.05, top=0.92, bottom=0.02, left=0.02)
-    everything = torch.cat([fit.frames_after[0][shown].reshape(-1, 3), *(clouds[i] for i in shown)]).numpy()
+    everything = torch.cat([fit.frames_after[k][shown].reshape(-1, 3), *(clouds[i] for i in shown)]).numpy()
     middle, half = (everything.max(0) + everything.min(0)) / 2, np.ptp(everything, axis=0).max() / 2
-    worst = 1e3 * max(np.quantile(_distance(clouds[i], fit.frames_before[0][i], index), 0.95) for i in shown)
-    for row, (label, frames) in enumerate((("start", fit.frames_before[0]), ("fitted", fit.frames_after[0]))):
+    worst = 1e3 * max(np.quantile(_distance(clouds[i], fit.frames_before[k][i], index), 0.95) for i in shown)
+    for row, (label, frames) in enumerate((("start", fit.frames_before[k]), ("fitted", fit.frames_after[k]))):
         for column, i in enumerate(shown):
             axis, x, cloud = axes[row, column], frames[i].numpy(), clouds[i].numpy()
             axis.plot_trisurf(
@@ -105,6 +111,36 @@ def distances(fit: Identification, episodes: Sequence[Episode], faces: np.ndarra
     over_fit.legend()
     figure.tight_layout()
     return figure
+
+
+def forces(fit: Identification, episodes: Sequence[Episode]) -> Any:
+    """Every gripper's force along its main direction, measured and simulated, one episode below the other."""
+    from matplotlib.figure import Figure
+
+    felt = [(k, e) for k, e in enumerate(episodes) if e.wrenches]
+    columns = max(len(e.wrenches) for _, e in felt)
+    figure = Figure(figsize=(6 * columns, 3 * len(felt) + 0.4))
+    axes = figure.subplots(len(felt), columns, squeeze=False)
+    for row, (k, e) in zip(axes, felt, strict=True):
+        for axis, (name, measured) in zip(row, e.wrenches.items(), strict=False):
+            force, along = _main(measured[1:, :3])
+            axis.plot(e.times[1:], force @ along, ".", color="black", markersize=4, label="measured")
+            for label, source, colour in (("start", fit.forces_before, BEFORE), ("fitted", fit.forces_after, AFTER)):
+                axis.plot(e.times[1:], source[k][name][1:, :3] @ along, color=colour, label=label)
+            axis.set(xlabel="time [s]", ylabel="force [N]")
+            axis.set_title(f"{e.name}, {name}: along ({', '.join(f'{a:.2f}' for a in along.tolist())})", fontsize=10)
+        for axis in row[len(e.wrenches) :]:
+            axis.set_axis_off()
+    axes[0, 0].legend()
+    figure.tight_layout()
+    return figure
+
+
+def _main(force: Tensor) -> tuple[Tensor, Tensor]:
+    """Readings [T, 3] and the unit vector [3] along which they are largest, towards most of them."""
+    known = force[force.isfinite().all(-1)]
+    along = torch.linalg.svd(known, full_matrices=False)[2][0]
+    return force, along * torch.sign((known @ along).sum())
 
 
 def parameters(fit: Identification) -> Any:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,11 +14,12 @@ from ..cloth import Cloth
 from ..materials import AEP
 from .episodes import Episode
 from .nuisances import Placed
-from .statements import Estimate
+from .statements import Estimate, Profile
 from .unknowns import Unknown, available, collect, needs_contact
 
 TRUSTED = 0.25  # a parameter counts as identified when its standard error is below a quarter of its value
 MISSED = 1.3  # rms over the sensor noise above which what the model misses may matter more than the noise
+STEADY = 0.9  # of the rms distance from constant forces, above which nothing but a weight was seen in them
 CONFUSED = 0.95  # correlation above which two parameters are called hard to tell apart
 
 
@@ -82,6 +84,30 @@ def withdraw(found: Found, unknowns: Sequence[Unknown]) -> Found:
     return found._replace(parameters=parameters)
 
 
+def with_profiles(found: Found, profiles: Mapping[str, Profile]) -> Found:
+    """Intervals of the profiles that have both ends."""
+    parameters = dict(found.parameters)
+    for name, profile in profiles.items():
+        low, high = profile.ci95
+        if low is not None and high is not None:
+            parameters[name] = replace(parameters[name], ci95=(low, high))
+            if name == "youngs_modulus" and "membrane_stiffness" in parameters:
+                thickness = parameters["membrane_stiffness"].value / parameters[name].value
+                parameters["membrane_stiffness"] = _times(parameters[name], thickness, "N/m")
+    return found._replace(parameters=parameters)
+
+
+def skewed(found: Found, curved: Sequence[str]) -> list[str]:
+    """Offers a profile where the slope changes over a standard error."""
+    names = [name for name in curved if found.parameters[name].identifiable and found.parameters[name].source == "data"]
+    if not names:
+        return []
+    return [
+        f"the intervals of {', '.join(names)} may be longer to one side (their slopes change within a standard error): "
+        f"profile (--profile {' '.join(names)}) shows it"
+    ]
+
+
 def doubts(found: Found) -> list[str]:
     """Which fitted parameters the data do not tell, or do not tell apart."""
     out = []
@@ -96,6 +122,12 @@ def doubts(found: Found) -> list[str]:
     return out
 
 
+def worthless(fit: Mapping[str, float]) -> bool:
+    """Whether the fit is no better than its null: by distance, or by force where nothing was seen."""
+    by = "force_rms" if math.isnan(fit["chamfer_after"]) else "chamfer"
+    return fit[f"{by}_after"] >= fit[f"{by}_null"]
+
+
 def warnings_of(
     cloth: Cloth,
     episodes: Sequence[Episode],
@@ -106,8 +138,11 @@ def warnings_of(
 ) -> list[str]:
     """What a reader must know before he uses the numbers."""
     out = []
-    if fit["chamfer_after"] >= fit["chamfer_null"]:
-        out.append("the fit is no better than cloth carried rigidly by the grippers: these data say nothing about it")
+    if worthless(fit):
+        null = "no force at all" if math.isnan(fit["chamfer_after"]) else "cloth carried rigidly by the grippers"
+        out.append(f"the fit is no better than {null}: these data say nothing about it")
+    elif math.isnan(fit["chamfer_after"]) and fit["force_rms_after"] >= STEADY * fit["force_rms_constant"]:
+        out.append("constant forces would do as well: these data weigh the cloth and say little else")
     if fit["chamfer_after"] > fit["chamfer_before"]:
         out.append(
             "the fitted values are farther from the points than the start: the robust cost fell, the mean did not"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -12,15 +13,19 @@ from torch import Tensor
 
 from .._files import write_text
 from ..cloth import Cloth
-from .statements import Combination, Estimate, Influence
+from .statements import Combination, Estimate, Influence, Profile
 
 CONVENTION = (
     "SI units. chamfer: one-sided, cloud to surface: mean over frames of the mean distance [m] from each measured "
     "point to the nearest point of the simulated triangles. rms: root mean square of the same distances over all "
-    "points. null: the cloth moves rigidly with the grippers, undeformed. std: standard error of the estimate; noise "
+    "points; both are null (JSON) where nothing was seen. null: the cloth moves rigidly with the grippers, undeformed, "
+    "and its forces are zero. force_rms: root mean square distance [N] from all force readings; constant: of each "
+    "gripper's mean reading. std: standard error of the estimate; noise "
     "correlated within patches of the fabric and nearby frames is allowed for, and the noise of a measured first shape "
-    "where grippers hold; persistent model error is not. ci95: in "
-    "the log (logit) coordinate; linear, cut at 0, for amplitudes of effects and the cone. identifiable: std below a "
+    "where grippers hold, and the scatter between three or more episodes (those that repeat each other by split.motion "
+    "or split.replicate_of, where some do), widened as Student's t; persistent model error is not. ci95: in "
+    "the log (logit) coordinate; linear, cut at 0, for amplitudes of effects and the cone; the profile's where "
+    "there is one with both ends. identifiable: std below a "
     "quarter of the value (of a typical amplitude, where the amplitude is smaller), and the fit beats the null. "
     "source 'not in the model' or 'held fixed': value, std and ci95 are those of the prior. identifiability: how far "
     "one standard deviation of the prior and 10 % of the value move the cloth [mm] and its forces [N], rms. nuisances: "
@@ -42,6 +47,8 @@ class Identification:
         influences: what the data can tell of each fitted parameter, and which experiment would tell more.
         combinations: of parameters, that the data determine together or leave open.
         nuisances: by episode, estimates of what is not the fabric's: clock, camera, first shape.
+        profiles: of the parameters for which one was asked.
+        forces_before, forces_after: gripper -> [T, 6] N, N m for each episode, as ``Episode.wrenches``.
         keys: module path by name of the fitted parameters.
         model: what else a repetition of the simulation needs (see ``saved``).
     """
@@ -59,12 +66,15 @@ class Identification:
     influences: dict[str, Influence] = field(default_factory=dict)
     combinations: list[Combination] = field(default_factory=list)
     model: dict[str, Any] = field(default_factory=dict, repr=False)
+    profiles: dict[str, Profile] = field(default_factory=dict)
+    forces_before: list[dict[str, Tensor]] = field(default_factory=list, repr=False)
+    forces_after: list[dict[str, Tensor]] = field(default_factory=list, repr=False)
 
     def as_dict(self) -> dict[str, Any]:
         """The content of identification.json."""
         return {
             "parameters": {name: asdict(estimate) for name, estimate in self.parameters.items()},
-            "fit": self.fit,
+            "fit": {name: or_none(value) for name, value in self.fit.items()},
             "correlation": self.correlation,
             "identifiability": {name: asdict(influence) for name, influence in self.influences.items()},
             "combinations": [{"of": c.text, **asdict(c)} for c in self.combinations],
@@ -72,9 +82,10 @@ class Identification:
                 episode: {name: asdict(estimate) for name, estimate in own.items()}
                 for episode, own in self.nuisances.items()
             },
+            "profiles": {name: asdict(profile) for name, profile in self.profiles.items()},
             "convention": CONVENTION,
             "warnings": self.warnings,
-            "history": self.history,
+            "history": [{name: or_none(value) for name, value in entry.items()} for entry in self.history],
             "model": self.model,
         }
 
@@ -87,6 +98,11 @@ class Identification:
     def apply(self, cloth: Cloth) -> Cloth:
         """Set the fitted values in ``cloth``, leaving what is not identifiable as it is; returns it."""
         return set_identified(cloth, self.keys, self.parameters)
+
+
+def or_none(value: float) -> float | None:
+    """What was not measured is null in JSON."""
+    return None if math.isnan(value) else value
 
 
 def set_identified(cloth: Cloth, keys: Mapping[str, str], parameters: Mapping[str, Estimate]) -> Cloth:

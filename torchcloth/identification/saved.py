@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from ..transfer import Contact
 from .episodes import Episode, cloth_from, episode
 from .misfit import figures
 from .replays import Replay
-from .result import Identification
+from .result import Identification, or_none
 from .unknowns import available
 
 RESULT = "identification.json"
@@ -55,7 +56,7 @@ def model_of(cloth: Cloth, fit: Identification, recordings: Sequence[Recording],
     episodes = []
     for recording, frames in zip(recordings, fit.frames_after, strict=True):
         chamfer = figures([frames], [episode(cloth, recording)], faces).chamfer
-        episodes.append({**_mark(recording), "chamfer": chamfer})
+        episodes.append({**_mark(recording), "chamfer": or_none(chamfer)})
     contact = None if cloth.contact is None else asdict(cloth.contact)
     return {"values": values, "contact": contact, "dt": dt, "episodes": episodes}
 
@@ -115,7 +116,10 @@ def _read(path: Path) -> _Model:
             None if model["dt"] is None else float(model["dt"]),
             [
                 {"name": str(e["name"]), **{key: int(e[key]) for key in ("frames", "points")}}
-                | {"mean": np.asarray(e["mean"], float).reshape(3), "chamfer": float(e["chamfer"])}
+                | {
+                    "mean": np.asarray(e["mean"], float).reshape(3),
+                    "chamfer": math.nan if e["chamfer"] is None else float(e["chamfer"]),
+                }
                 for e in model["episodes"]
             ],
         )
@@ -131,8 +135,12 @@ def _mark(recording: Recording) -> dict[str, Any]:
     points, markers = recording.points, recording.markers
     seen = [] if points is None else [points.xyz]
     seen += [] if markers is None else [markers.xyz[np.isfinite(markers.xyz).all(-1)]]
-    every = np.concatenate(seen) if seen else np.zeros((1, 3))
     frames = sum(len(stream.t) for stream in (points, markers) if stream is not None)
+    if not seen:
+        motions = (*recording.grippers.values(), *recording.joints.values())
+        seen = [motion.force for motion in motions if motion.force is not None]
+        frames = sum(map(len, seen))
+    every = np.concatenate(seen) if seen else np.zeros((1, 3))
     return {"name": name, "frames": frames, "points": len(every), "mean": every.mean(0).tolist()}
 
 

@@ -14,6 +14,7 @@ from .objective import Objective
 
 Method = Literal["gauss-newton", "lbfgs", "adam", "gradient-descent"]
 METHODS: tuple[str, ...] = ("gauss-newton", "lbfgs", "adam", "gradient-descent")
+CHAMFER = METHODS[2:]  # those that follow the paper's distance alone
 PAPER_CHAMFER = 0.015  # m, the DiffCP paper's stop rule
 EARLY = 0.35  # share of the frames that the first stage of the fit sees
 EARLY_ITERATIONS = 10
@@ -72,6 +73,13 @@ class Search:
         if self.on_progress is not None:
             self.on_progress(len(self.history) - 1, now.chamfer, values)
         return self.stop == "paper" and objective is self.objective and now.chamfer < PAPER_CHAMFER
+
+    def tell(self, at: gauss_newton.Iterate) -> bool:
+        """Of what is done after the search: progress, and no part of the history."""
+        if self.on_progress is not None:
+            now = self.objective.figures(at.raw).chamfer
+            self.on_progress(len(self.history) - 1, now, self.objective.values(at.raw))
+        return False
 
     def _early(self, part: Objective, start: Tensor, iterations: int) -> gauss_newton.Iterate:
         """On early frames, where a wrong start has not yet led the cloth elsewhere."""

@@ -34,6 +34,16 @@ class Influence:
 
 
 @dataclass(frozen=True)
+class Profile:
+    """How the cost of the best fit rises with one parameter."""
+
+    values: list[float]
+    rise: list[float]  # above the optimum's, scaled to the curvature of the standard error: 1.92 at an interval's end
+    ci95: tuple[float | None, float | None]  # None: open, the cost does not rise enough
+    skew: float | None  # upper over lower part of the interval, in the unconstrained coordinate; None: open
+
+
+@dataclass(frozen=True)
 class Combination:
     """A product of powers (a sum, near zero) of parameters, and the relative error that the data leave of it."""
 

@@ -12,9 +12,10 @@ from torch import Tensor
 from ..errors import InvalidInput
 from ..losses import Hits, closest
 from ..meshes import Mesh
-from ..recordings import Recording
+from ..recordings import GripperMotion, JointMotion, Recording
 
 SAME = 1e-6  # s, times nearer than this are one
+FELT_RATE = 30.0  # 1/s, of frames where there is nothing but forces: each is a mean, so no reading is lost
 OFF_PATTERN = 5e-3  # m, of a marker from the cloth's pattern
 
 
@@ -22,6 +23,16 @@ def joined(times: Sequence[np.ndarray]) -> np.ndarray:
     """All times [T] s in order, equal ones once."""
     every = np.sort(np.concatenate(times))
     return every[np.concatenate([[True], np.diff(every) > SAME])]
+
+
+def felt(recording: Recording, names: Sequence[str]) -> np.ndarray:
+    """Times [T] s of the grippers' readings, thinned to ``FELT_RATE``; empty where nothing was measured."""
+    knots = [motion.t for motion in _measuring(recording, names).values()]
+    if not knots:
+        return np.empty(0)
+    every = joined(knots)
+    bins = np.floor((every - every[0]) * FELT_RATE + SAME)
+    return every[np.concatenate([[True], np.diff(bins) > 0])]
 
 
 def places(times: np.ndarray, frames: np.ndarray) -> np.ndarray:
@@ -90,14 +101,17 @@ def wrenches(
     As in a rollout: the mean over the interval that ends at the frame. Readings are taken as linear between knots.
     """
     out = {}
-    for name in names:
-        motion = recording.grippers.get(name) or recording.joints.get(name)
-        if motion is None or (motion.force is None and motion.torque is None):
-            continue
+    for name, motion in _measuring(recording, names).items():
         nothing = np.full((len(motion.t), 3), np.nan)
         parts = [nothing if part is None else np.asarray(part) for part in (motion.force, motion.torque)]
         out[name] = torch.as_tensor(_means(np.asarray(motion.t), np.concatenate(parts, axis=1), frames), dtype=dtype)
     return out
+
+
+def _measuring(recording: Recording, names: Sequence[str]) -> dict[str, GripperMotion | JointMotion]:
+    """The motions that hold readings, by name."""
+    motions = {name: recording.grippers.get(name) or recording.joints.get(name) for name in names}
+    return {name: m for name, m in motions.items() if m is not None and not (m.force is None and m.torque is None)}
 
 
 def _means(t: np.ndarray, value: np.ndarray, frames: np.ndarray) -> np.ndarray:

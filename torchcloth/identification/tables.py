@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .result import Identification
 from .statements import Estimate
@@ -27,9 +27,7 @@ REMARKS = {"prior": "measured", "derived": "= E h", "held fixed": "held fixed"}
 
 def print_fit(fit: Identification) -> None:
     """Parameters, distances and warnings, 112 columns wide or more."""
-    from rich import box
     from rich.console import Console
-    from rich.table import Table
 
     console = Console(highlight=False)
     console.width = max(console.width, 112)
@@ -38,21 +36,47 @@ def print_fit(fit: Identification) -> None:
     if absent:
         console.print(f"Not in the model, because contact was left out: {', '.join(absent)}")
     _print_nuisances(console, fit)
+    _print_profiles(console, fit)
     _print_influences(console, fit)
-    distances = Table(title="Distance cloud to surface, one-sided, metres", title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("", "Chamfer", "rms"):
-        distances.add_column(heading, justify="right" if heading else "left")
+    console.print(_distances(fit.fit))
     f = fit.fit
-    for label, key in (("null: carried rigidly", "null"), ("start values", "before"), ("fitted values", "after")):
-        distances.add_row(label, f"{f[f'chamfer_{key}']:.6f}", f"{f[f'rms_{key}']:.6f}")
-    console.print(distances)
     end = "" if f["converged"] else " (not converged)"
+    points = f"{f['points']:.0f} points count as " if f["points"] else ""
     console.print(
         f"{f['iterations']:.0f} iterations{end}, {f['simulations']:.0f} simulations, {f['seconds']:.0f} s; "
-        f"{f['points']:.0f} points count as {f['independent_observations']:.0f} independent observations"
+        f"{points}{f['independent_observations']:.0f} independent observations"
     )
     for warning in fit.warnings:
         console.print(f"note: {warning}", style="yellow", markup=False)
+
+
+def _distances(f: dict[str, Any]) -> Table:
+    """Of the null, the start and the end; forces where there are any."""
+    from rich import box
+    from rich.table import Table
+
+    columns = {"Chamfer": "chamfer", "rms": "rms"} | ({"force rms [N]": "force_rms"} if "force_rms_after" in f else {})
+    title = "Distance cloud to surface, one-sided, metres"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("", *columns):
+        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
+    for label, key in (
+        ("null: carried rigidly, no force", "null"),
+        ("start values", "before"),
+        ("fitted values", "after"),
+    ):
+        numbers = [f[f"{what}_{key}"] for what in columns.values()]
+        table.add_row(label, *("–" if math.isnan(number) else f"{number:.6f}" for number in numbers))
+    if "force_rms" in columns.values():
+        table.add_row("constant forces", "–", "–", f"{f['force_rms_constant']:.6f}")
+    return table
+
+
+def _print_profiles(console, fit: Identification) -> None:
+    for name, profile in fit.profiles.items():
+        low, high = ("open" if end is None else f"{end:.3g}" for end in profile.ci95)
+        shape = "" if profile.skew is None else f", upper part {profile.skew:.2f} times the lower"
+        console.print(f"profile of {name}: {low} … {high}{shape}", markup=False)
 
 
 def _print_influences(console, fit: Identification) -> None:

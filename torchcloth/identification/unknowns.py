@@ -96,7 +96,11 @@ def collect(cloth: Cloth, names: Sequence[str], density_std: float | None, absen
     for name in dict.fromkeys(names):
         if name not in known:
             possible = sorted(n for n, path in known.items() if not needs_contact(cloth, path))
-            raise InvalidInput("parameter to fit", got=repr(name), expected=f"one of {', '.join(possible)}")
+            part = dict(cloth.material.named_modules()).get(name)
+            remedy = "a value for each triangle: fit_fields" if isinstance(part, PhysicalParameter) else ""
+            raise InvalidInput(
+                "parameter to fit", got=repr(name), expected=f"one of {', '.join(possible)}", remedy=remedy
+            )
         if needs_contact(cloth, known[name]) and not absent:
             raise InvalidInput(
                 "parameter to fit",

@@ -37,8 +37,8 @@ def film_of_fit(recording: Recording, fit: str | Path, *, truth: bool = False) -
     again = replayed(fit, recording)
     film = film_of(recording, truth=truth, times=again.episode.times.numpy())
     film = with_cloth(film, again.frames.numpy(), again.cloth.mesh.faces, noise=recording.observation_noise_std)
-    mean = 1e3 * float(again.chamfer.mean())
-    title = f"{film.title}: fitted, {mean:.2f} mm from the points"
+    distance = f", {1e3 * float(again.chamfer.mean()):.2f} mm from the points" if len(again.chamfer) else ""
+    title = f"{film.title}: fitted{distance}"
     return replace(film, title=title, notes=film.notes + ((again.warning,) if again.warning else ()))
 
 

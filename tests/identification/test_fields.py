@@ -1,0 +1,107 @@
+"""Fields: one value per triangle."""
+
+import json
+
+import numpy as np
+import pytest
+import stretches
+import torch
+
+import torchcloth as tc
+from torchcloth.errors import InvalidInput
+from torchcloth.identification import fit_fields, identify
+from torchcloth.identification.fields import NO_ERROR, laplacian
+
+STIFF = 4.0  # times, in the stripe
+
+
+def in_stripe(mesh):
+    """[F] whether a triangle lies in a stripe of 8 cm across the pull."""
+    u = np.asarray(mesh.uv)[np.asarray(mesh.faces)].mean(1)[:, 0]
+    return torch.as_tensor(np.abs(u - 0.2) < 0.04)
+
+
+def with_field(model, values):
+    model.material = tc.materials.AEP(values, 0.3, thickness=stretches.THICKNESS)
+    return model
+
+
+def start(recording):
+    model = stretches.model(recording)
+    return with_field(model, torch.full((len(model.mesh.faces),), 6e4))
+
+
+@pytest.fixture
+def striped(monkeypatch):
+    """A function that records a sheet with a stiff stripe on the truth's own mesh."""
+    plain = stretches.cloth
+
+    def cloth(fabric, resolution):
+        model = plain(fabric, resolution)
+        stripe = 1 + (STIFF - 1) * in_stripe(model.mesh)
+        return with_field(model, fabric.membrane / stretches.THICKNESS * stripe)
+
+    def record(**options):
+        setting = stretches.Setting(strain=0.1, heave=0.0, occluded=0.0, **options)
+        with monkeypatch.context() as patched:
+            patched.setattr(stretches, "cloth", cloth)
+            return stretches.record(stretches.Fabric(membrane=40.0), seed=5, setting=setting, markers=11)
+
+    return record
+
+
+@pytest.mark.slow
+def test_a_stiff_stripe_is_seen_from_another_mesh(striped):
+    """Markers show where it stretches less, forces how stiff that is."""
+    recording = striped(frames=5, points=600)
+    model = start(recording)
+    fit = fit_fields(model, recording, ["youngs_modulus"], iterations=90)
+    found, stripe = fit.fields["youngs_modulus"], in_stripe(model.mesh)
+    correlation = float(np.corrcoef(found.log(), stripe.double())[0, 1])
+    print(f"correlation {correlation:.3f}, {found[stripe].mean():.4g} and {found[~stripe].mean():.4g} Pa, {fit.fit}")
+    assert correlation > 0.8
+    assert float(found[stripe].median() / found[~stripe].median()) > 2.0
+
+
+def test_a_field_goes_downhill_and_says_that_it_has_no_error(striped, tmp_path):
+    recording = striped(frames=4, points=100)
+    model = start(recording)
+    before = model.material.youngs_modulus.raw.detach().clone()
+    fit = fit_fields(model, recording, ["youngs_modulus"], iterations=3, journal=tmp_path / "j")
+    assert fit.fit["chamfer_after"] < fit.fit["chamfer_before"]
+    assert torch.equal(model.material.youngs_modulus.raw, before)
+    assert not fit.fit["converged"]
+    content = json.loads(fit.save(tmp_path).read_text())
+    entry = content["fields"]["youngs_modulus"]
+    assert entry["std"] == NO_ERROR == "no error: gradient method"
+    assert entry["values"] == fit.fields["youngs_modulus"].tolist()
+    assert content["contrast"] == fit.contrast
+    assert NO_ERROR in content["warnings"][0]
+    again = fit_fields(model, recording, ["youngs_modulus"], iterations=3, journal=tmp_path / "j", resume=True)
+    assert torch.equal(again.fields["youngs_modulus"], fit.fields["youngs_modulus"])
+    assert again.history == fit.history
+    with pytest.raises(InvalidInput, match="of another fit"):
+        fit_fields(model, recording, ["youngs_modulus"], contrast=2.0, journal=tmp_path / "j", resume=True)
+
+
+@pytest.mark.parametrize("resolution", [(9, 9), (17, 13)])
+def test_the_prior_of_a_slope_does_not_depend_on_the_mesh(resolution):
+    """A field that rises by 1 across a square: its roughness is near 1, on any mesh; a constant has none."""
+    mesh = tc.meshes.rectangle(0.3, 0.3, resolution=resolution)
+    matrix = laplacian(mesh)
+    assert float((matrix @ torch.ones(len(matrix), dtype=torch.float64)).abs().max()) < 1e-9
+    rise = torch.as_tensor(np.asarray(mesh.vertices)[np.asarray(mesh.faces)].mean(1)[:, 0]) / 0.3
+    assert float(rise @ matrix @ rise) == pytest.approx(1.0, rel=0.2)
+
+
+@pytest.mark.parametrize("name", ["poisson_ratio", "cone", "nothing"])
+def test_what_is_no_field_is_refused(striped, name):
+    recording = striped(frames=4, points=50)
+    with pytest.raises(InvalidInput, match=f"field to fit; got '{name}'; expected a parameter of the material"):
+        fit_fields(start(recording), recording, [name])
+
+
+def test_identify_says_who_fits_fields(striped):
+    recording = striped(frames=4, points=50)
+    with pytest.raises(InvalidInput, match="a value for each triangle: fit_fields"):
+        identify(start(recording), recording, ["youngs_modulus"])

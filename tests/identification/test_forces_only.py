@@ -1,0 +1,96 @@
+"""Episodes of which nothing was seen: grippers felt them."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import stretches
+import torch
+import twins
+
+from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.identification import cloth_from, draw, episode, identify, print_fit, replayed, streams
+from torchcloth.identification.report import worthless
+
+STIFFNESS = ["youngs_modulus"]
+
+
+@pytest.fixture(scope="module")
+def felt():
+    with twins.doubles():
+        return replace(stretches.record(seed=5, setting=stretches.Setting(frames=9, strain=0.08)), points=None)
+
+
+@pytest.fixture(scope="module")
+def fit(felt):
+    with twins.doubles():
+        return identify(cloth_from(felt), felt, STIFFNESS, guess={"youngs_modulus": 1e5})
+
+
+def test_forces_alone_tell_stiffness(fit):
+    found = fit.parameters["membrane_stiffness"]
+    assert found.identifiable
+    assert found.value == pytest.approx(60.0, rel=0.05)
+    assert abs(found.value - 60.0) < 3 * found.std
+
+
+def test_forces_are_compared_with_their_own_nulls(fit, felt):
+    f = fit.fit
+    assert all(math.isnan(f[f"{what}_{key}"]) for what in ("chamfer", "rms") for key in ("before", "after", "null"))
+    assert f["points"] == 0
+    # two grippers, three axes of 0.02 N each; a frame's mean is over one or two readings
+    assert 0.015 < f["force_rms_after"] < 0.04
+    measured = torch.cat([w[1:, :3] for w in episode(cloth_from(felt), felt).wrenches.values()])
+    assert f["force_rms_null"] == pytest.approx(float(measured.square().sum(-1).mean().sqrt()))
+    assert f["force_rms_after"] < 0.2 * f["force_rms_constant"] < 0.2 * f["force_rms_null"]
+
+
+def test_frames_are_the_thinned_readings(felt):
+    times = episode(cloth_from(felt), felt).times.numpy()
+    knots = felt.grippers["left"].t
+    assert np.isin(times, knots).all()
+    assert times[0] == knots[0]
+    assert len(times) / (times[-1] - times[0]) == pytest.approx(streams.FELT_RATE, rel=0.1)
+    slow = {name: replace(m, t=4 * m.t) for name, m in felt.grippers.items()}
+    assert len(episode(cloth_from(felt), replace(felt, grippers=slow)).times) == len(knots)  # slow ones: all
+
+
+def test_what_was_not_seen_is_null_on_disk_and_a_dash_in_the_table(fit, felt, tmp_path, capsys):
+    path = fit.save(tmp_path)
+    content = json.loads(path.read_text())
+    assert content["fit"]["chamfer_after"] is None
+    assert {entry["chamfer"] for entry in content["history"]} == {None}
+    assert content["fit"]["force_rms_after"] == fit.fit["force_rms_after"]
+    print_fit(fit)
+    row = next(line for line in capsys.readouterr().out.splitlines() if "fitted values" in line)
+    assert row.split()[-3:] == ["–", "–", f"{fit.fit['force_rms_after']:.6f}"]
+    again = replayed(path, felt)
+    assert again.warning == ""
+    assert len(again.chamfer) == 0
+    shifted = {name: replace(m, force=m.force + 0.1) for name, m in felt.grippers.items()}
+    with pytest.raises(InvalidInput, match="a fit of another episode"):
+        replayed(path, replace(felt, grippers=shifted))
+
+
+def test_its_pictures_show_forces(fit, felt, tmp_path):
+    drawn = draw(fit, [episode(cloth_from(felt), felt)], cloth_from(felt).mesh.faces, tmp_path)
+    assert [p.name for p in drawn] == ["forces.png", "parameters.png"]
+
+
+def test_a_fit_of_forces_that_is_worthless_is_called_so(fit):
+    assert not worthless(fit.fit)
+    assert worthless({**fit.fit, "force_rms_after": fit.fit["force_rms_null"]})
+
+
+@pytest.mark.parametrize("options", [{"method": "adam"}, {"stop": "paper"}])
+def test_what_follows_the_chamfer_distance_needs_something_seen(felt, options):
+    with pytest.raises(InvalidInput, match="neither points nor markers; expected something seen"):
+        identify(cloth_from(felt), felt, STIFFNESS, **options)
+
+
+def test_nothing_seen_and_nothing_felt_is_refused(felt):
+    silent = {name: replace(m, force=None) for name, m in felt.grippers.items()}
+    with pytest.raises(RecordingError, match="has no points, which identify needs"):
+        episode(cloth_from(felt), replace(felt, grippers=silent))

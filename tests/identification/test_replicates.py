@@ -1,0 +1,100 @@
+"""Errors from the scatter between episodes, where something differs between them that was not fitted."""
+
+from pathlib import Path
+
+import pytest
+import scipy.stats
+import torch
+import toys
+
+from torchcloth import recordings as rec
+from torchcloth.identification.gauss_newton import WINDOW, covariance, minimise, student
+from torchcloth.identification.replicates import strata_of
+
+HIDDEN = 0.05  # standard deviation of what differs between episodes, in units of the unknowns
+FRAMES = 12
+
+
+def repeats(seed, count, motions=1, hidden=HIDDEN, offset=0.0):
+    """(problem of ``count`` episodes of each motion, each with values of its own; episode of each row).
+
+    The estimate is the truth and the mean of what differs: its error is known in closed form.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    jacobian, data, frame, patch, episode = [], [], [], [], []
+    for motion in range(motions):
+        own = toys.sensitivities(generator, FRAMES)
+        for _ in range(count):
+            value = toys.TRUE + hidden * torch.randn(3, generator=generator, dtype=torch.float64) + offset * motion
+            number, (t, where) = len(jacobian), toys.layout(FRAMES)
+            jacobian.append(own)
+            data.append(own @ value + 0.1 * toys.noise(generator, 0.0, FRAMES))
+            frame.append(t + number * (FRAMES + WINDOW + 1))
+            patch.append(where)
+            episode.append(torch.full_like(t, number))
+    J = torch.cat(jacobian)
+    toy = toys.Toy(lambda raw: J @ raw, torch.cat(data), torch.cat(frame), torch.cat(patch), prior_std=1e3)
+    return toy, torch.cat(episode)
+
+
+def found(seed, count, motions=1, strata=None, scatter=True, **options):
+    toy, episode = repeats(seed, count, motions, **options)
+    at = minimise(toy.problem(), toys.TRUE.clone(), 20, lambda _: False)
+    matrix = covariance(toy.problem(), at, episode if scatter else None, strata)
+    return at.raw - toys.TRUE, matrix.diagonal().sqrt()
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_intervals_cover_what_differs_between_episodes(count):
+    """95 % of 300; without the scatter far fewer, because within an episode all frames agree on a wrong value."""
+    covered, blind = [], []
+    for seed in range(100):
+        for scatter, kept in ((True, covered), (False, blind)):
+            error, std = found(seed, count, scatter=scatter)
+            kept.append((error.abs() < 1.96 * std).double())
+    assert 0.90 <= float(torch.stack(covered).mean()) <= 0.995
+    assert float(torch.stack(blind).mean()) < 0.75
+
+
+def test_errors_are_those_of_a_mean_of_episodes():
+    """Root mean square over seeds: what differs over sqrt n, widened as Student's t for so few."""
+    stds = torch.stack([found(seed, 6)[1] for seed in range(60)])
+    wanted = HIDDEN / 6**0.5 * scipy.stats.t.ppf(0.975, 5) / 1.96
+    assert float(stds.square().mean().sqrt()) == pytest.approx(wanted, rel=0.12)
+
+
+def test_only_replicates_scatter():
+    """Two motions whose values differ by far more than replicates of one: that difference is not scatter."""
+    strata, options = torch.tensor([1, 1, 1, 2, 2, 2]), {"motions": 2, "offset": 0.5}
+    within, mixed, none = (
+        torch.stack([found(seed, 3, **options, **how)[1] for seed in range(10)]).mean(0)
+        for how in ({"strata": strata}, {}, {"scatter": False})
+    )
+    assert bool((within < 1.2 * none).all())
+    assert bool((mixed > 1.5 * within).all())
+
+
+@pytest.mark.parametrize("freedom", [2, 3, 4, 9, 50])
+def test_students_quantile(freedom):
+    assert student(freedom) == pytest.approx(scipy.stats.t.ppf(0.975, freedom), rel=0.035)
+
+
+def named(name, **split):
+    path = Path("somewhere") / name if name else None
+    return rec.Recording(cloth=rec.ClothInfo(areal_density=1.0), provenance="measured", split=split, path=path)
+
+
+@pytest.mark.parametrize(
+    ("episodes", "strata"),
+    [
+        ([named("a", motion="m"), named("b", motion="m"), named("c", motion="m"), named("d")], [1, 1, 1, 0]),
+        ([named("a"), named("b", replicate_of="a"), named("c", replicate_of="b"), named("d")], [1, 1, 1, 0]),
+        ([named("b", replicate_of="a"), named("c", replicate_of="a"), named("d", replicate_of="a")], [1, 1, 1]),
+        ([named("a", motion="m"), named("b", replicate_of="a"), named("c", motion="m")], [1, 1, 1]),
+        ([named("a", replicate_of="b"), named("b", replicate_of="a"), named("c")], [0, 0, 0]),
+        ([named(None), named(None), named(None)], [0, 0, 0]),
+        ([named("a", motion="m"), named("b", motion="n"), named("c", motion="m"), named("d", motion="n")], [0] * 4),
+    ],
+)
+def test_episodes_repeat_each_other_when_they_say_so(episodes, strata):
+    assert strata_of(episodes).tolist() == strata
