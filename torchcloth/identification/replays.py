@@ -48,7 +48,7 @@ def simulate(
 ) -> Frames:
     """The episode at the unknowns ``raw`` [K]; differentiable in reverse mode when ``raw`` requires grad."""
     entries = {f"cloth.{key}": value.to(episode.initial) for key, value in overrides(unknowns, raw).items()}
-    return _frames(functional_call(Replay(cloth), entries, (episode, dt)))
+    return frames_of(functional_call(Replay(cloth), entries, (episode, dt)))
 
 
 def tangents(
@@ -71,7 +71,7 @@ def tangents(
     if modes is not None and extra:
         along = along._replace(state=_state_along(cloth, episode, modes, len(unknowns)))
     out, moved = functional_call(_Tangents(cloth), entries, (episode, along, dt))
-    return _frames(out), _frames(moved)
+    return frames_of(out), frames_of(moved)
 
 
 class _Tangents(nn.Module):
@@ -93,7 +93,8 @@ def each(frames: Frames, function: Callable[[Tensor], Tensor]) -> Frames:
     return Frames(function(frames.x), function(frames.v), wrench, function(frames.edge))
 
 
-def _frames(rollout: Rollout) -> Frames:
+def frames_of(rollout: Rollout) -> Frames:
+    """Of a simulation, or of its derivatives."""
     return Frames(rollout.x, rollout.v, rollout.wrench, rollout.x.new_zeros(rollout.x.shape[:-2]))
 
 
