@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from glob import glob
 from importlib import resources
 from pathlib import Path
@@ -61,7 +61,7 @@ def _read(patterns: Sequence[str], key: str) -> list[Recording]:
     return [recordings.read(folder) for folder in folders]
 
 
-class Deal(Sampler[int]):
+class Deal(Sampler[list[int]]):
     """One process's share of the episodes of each optimiser step.
 
     Step ``s`` takes the episodes ``s * per_step`` and on of an endless row of shuffles, which only the seed decides: a
@@ -81,13 +81,13 @@ class Deal(Sampler[int]):
         self.count, self.per_step, self.seed, self.step = count, per_step, seed, step
         self.rank, self.world = rank, world
 
-    def __iter__(self) -> Iterator[int]:
+    def __iter__(self) -> Iterator[list[int]]:
         first = self.step() * self.per_step
         places = range(first, first + self.per_step)
-        return iter([self._at(place) for place in places][self.rank :: self.world])
+        return iter([[self._at(place) for place in places][self.rank :: self.world]])
 
     def __len__(self) -> int:
-        return len(range(self.rank, self.per_step, self.world))
+        return 1
 
     def _at(self, place: int) -> int:
         shuffle, index = divmod(place, self.count)
@@ -98,7 +98,7 @@ class Deal(Sampler[int]):
 
 
 class Episodes(pl.LightningDataModule):
-    """Episodes as tensors; one epoch is one optimiser step, one batch one episode.
+    """Episodes as tensors; one epoch is one optimiser step, one batch a list of episodes.
 
     Args:
         cloth: that they are checked against.
@@ -132,7 +132,8 @@ class Episodes(pl.LightningDataModule):
     def shared(self, episodes: list[Episode]) -> DataLoader:
         """Every process has a share of its own, or all of them where there are too few: means stay exact."""
         rank, world = self._place()
-        return _loader(episodes if len(episodes) < world else episodes[rank::world])
+        own = range(len(episodes))[rank::world] if len(episodes) >= world else range(len(episodes))
+        return _loader(episodes, [list(own)])
 
     def _step(self) -> int:
         return 0 if self.trainer is None else self.trainer.global_step
@@ -141,5 +142,5 @@ class Episodes(pl.LightningDataModule):
         return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
 
 
-def _loader(episodes: list[Episode], deal: Deal | None = None) -> DataLoader:
-    return DataLoader(episodes, batch_size=None, sampler=deal, collate_fn=lambda e: e)  # type: ignore[arg-type]
+def _loader(episodes: list[Episode], batches: Iterable[list[int]]) -> DataLoader:
+    return DataLoader(episodes, batch_sampler=batches, collate_fn=list)  # type: ignore[arg-type]

@@ -95,15 +95,24 @@ class Learned(nn.Module):
                 self.parameter(name).raw.clamp_(min=0.0)
 
     @torch.no_grad()
+    def settled(self) -> dict[str, Tensor]:
+        """As ``raw``, without what is random in a network while it is trained."""
+        training = self.training
+        try:
+            return self.eval().raw()
+        finally:
+            self.train(training)
+
+    @torch.no_grad()
     def values(self) -> dict[str, Tensor]:
         """Physical values by name: scalars [], fields [F]."""
-        return {name: to_value(raw, self.parameter(name).domain).clone() for name, raw in self.raw().items()}
+        return {name: to_value(raw, self.parameter(name).domain).clone() for name, raw in self.settled().items()}
 
     @torch.no_grad()
     def baked(self) -> Cloth:
         """A copy of the cloth with everything that was learned in it."""
         cloth = deepcopy(self.cloth)
-        for name, raw in self.raw().items():
+        for name, raw in self.settled().items():
             cloth.get_submodule(self.paths[name]).raw = nn.Parameter(raw.clone())
         return cloth.requires_grad_(True)
 

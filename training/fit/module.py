@@ -42,8 +42,10 @@ class FitModule(pl.LightningModule):
         with precision(self.config.model.precision):
             self.learned = Learned(cloth, self.config.learn)
         self.loss = Loss(self.config.loss)
+        self.begun: dict[str, float] = {}  # values before the present step
         self.history: dict[int, dict[str, float]] = {}
         self.sheet: Sheet | None = None
+        self.clouded = False  # every process must log the same
 
     def now(self) -> dict[str, float]:
         """Values by name, of fields the mean."""
@@ -69,6 +71,7 @@ class FitModule(pl.LightningModule):
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         if self.sheet is None and isinstance(data, Episodes):
             self.sheet = Objective(self.learned.cloth, [], data.train).sheet
+            self.clouded = all(any(map(len, e.clouds[1:])) for e in (*data.train, *data.val))
             if data.per_step < self.trainer.world_size:
                 raise InvalidInput(
                     "processes",
@@ -78,42 +81,52 @@ class FitModule(pl.LightningModule):
 
     # -- training -------------------------------------------------------------------------------------------------
 
-    def training_step(self, episode: Episode, index: int) -> Tensor:
-        """One episode's part of the mean over all episodes of the step, in whatever shares processes have them."""
-        loss, figures = self._compared(episode, "train")
-        self.log_dict(figures, on_step=False, on_epoch=True, sync_dist=True, batch_size=1)
-        if self.config.learn.roughness:
-            loss = loss + self.config.learn.roughness * self.learned.roughness()
-        data = self.trainer.datamodule  # type: ignore[attr-defined]
-        # Lightning divides by the accumulated batches, DistributedDataParallel by the processes
-        return loss * (self.trainer.accumulate_grad_batches * self.trainer.world_size / data.per_step)
+    def training_step(self, episodes: list[Episode], index: int) -> Tensor:
+        """This process's part of the mean over all episodes of the step, one simulation's graph at a time.
 
-    def validation_step(self, episode: Episode, index: int, dataloader_idx: int = 0) -> None:
-        """Losses and distances of an episode that is only looked at."""
-        _, figures = self._compared(episode, "val")
-        self.log_dict(figures, on_epoch=True, sync_dist=True, batch_size=1)
+        Returns:
+            What has the gradient of the loss, not its value: all that optimiser and DistributedDataParallel need.
+        """
+        self.begun = self.now()
+        learned = [p for p in self.learned.parameters() if p.requires_grad]
+        data, world = self.trainer.datamodule, self.trainer.world_size  # type: ignore[attr-defined]
+        summed, figures = [torch.zeros_like(p) for p in learned], []
+        for k, episode in enumerate(episodes):
+            # what is random depends on step and episode alone: a resumed run repeats it, other processes too
+            torch.manual_seed(hash((self.config.run.seed, self.global_step, self.global_rank + k * world)))
+            loss, found = self._compared(episode, "train")
+            figures.append(found)
+            if self.config.learn.roughness:
+                loss = loss + self.config.learn.roughness * self.learned.roughness()
+            parts = torch.autograd.grad(loss * (world / data.per_step), learned, allow_unused=True)
+            summed = [s if g is None else s + g for s, g in zip(summed, parts, strict=True)]
+        self._log(figures)
+        return torch.stack([(p * g).sum() for p, g in zip(learned, summed, strict=True)]).sum()
+
+    def validation_step(self, episodes: list[Episode], index: int) -> None:
+        """Losses and distances of episodes that are only looked at."""
+        self._log([self._compared(episode, "val")[1] for episode in episodes])
+
+    def _log(self, figures: list[dict[str, Tensor]]) -> None:
+        means = {key: torch.stack([f[key] for f in figures]).mean() for key in figures[0]}
+        self.log_dict(means, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(figures))
 
     def _compared(self, episode: Episode, kind: str) -> tuple[Tensor, dict[str, Tensor]]:
         scene = self(episode)
         loss = self.loss(scene)
-        figures, distance = {f"{kind}/loss": loss.detach()}, chamfer(scene)
+        figures, distance = {f"{kind}/loss": loss.detach()}, chamfer(scene) if self.clouded else None
         if distance is not None:
             figures[f"{kind}/chamfer"] = distance.detach()
         return loss, figures
-
-    def on_train_epoch_start(self) -> None:
-        """What is random in a step depends on the step alone, so that a resumed run repeats it."""
-        torch.manual_seed(self.config.run.seed * 1_000_003 + self.global_step)
-        self._before = self.now()
 
     def on_train_epoch_end(self) -> None:
         """Remember the step: the values that it began with, and how far they were off."""
         metrics = {key: float(value) for key, value in self.trainer.callback_metrics.items()}
         if "train/loss" in metrics:
             own = {key: metrics[key] for key in metrics if key.startswith("train/")}
-            self.history[self.global_step - 1] = {**own, **self._before}
+            self.history[self.global_step - 1] = {**own, **self.begun}
             if self.logger is not None:
-                self.log_dict(self._before)
+                self.log_dict(self.begun)
 
     def configure_optimizers(self) -> dict[str, Any]:
         """Adam on the unconstrained values, each in its own unit; the rate is halved every ``half_life`` steps."""
@@ -129,7 +142,9 @@ class FitModule(pl.LightningModule):
         super().optimizer_step(*args, **kwargs)
         self.learned.clip()
 
-    def transfer_batch_to_device(self, batch: Episode, device: torch.device, dataloader_idx: int) -> Episode:
+    def transfer_batch_to_device(
+        self, batch: list[Episode], device: torch.device, dataloader_idx: int
+    ) -> list[Episode]:
         """Episodes stay on the CPU, where the engine is."""
         return batch
 

@@ -38,7 +38,7 @@ class Told(pl.Callback):
             for kind in ("train", "val")
             if (key := f"{kind}/chamfer") in metrics
         ]
-        values = pl_module.now() if isinstance(pl_module, FitModule) else {}
+        values = pl_module.begun if isinstance(pl_module, FitModule) else {}
         parts += [f"{name} {value:.4g}" for name, value in list(values.items())[:3]]
         text = ", ".join(parts)
         self.bar.update(self.task, completed=trainer.global_step, description=text)

@@ -12,6 +12,7 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.strategies import DDPStrategy
 
 from torchcloth import Cloth
 from torchcloth.errors import InvalidInput, MissingDependency
@@ -66,7 +67,7 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
     data = Episodes(cloth, train, val, config.data.per_step, config.run.seed)
     module = FitModule(asdict(config), description, _problem(config, cloth, data))
     initial = module.now()
-    trainer = _trainer(config, folder, data)
+    trainer = _trainer(config, folder)
     trainer.fit(module, datamodule=data, ckpt_path=checkpoint)
     figures = {
         "train": {"episodes": len(train), **_after(trainer, module, data, data.train)},
@@ -83,7 +84,7 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
     return module
 
 
-def _trainer(config: Config, folder: Path, data: Episodes) -> pl.Trainer:
+def _trainer(config: Config, folder: Path) -> pl.Trainer:
     for message in QUIET:
         warnings.filterwarnings("ignore", f".*{message}")
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -92,9 +93,8 @@ def _trainer(config: Config, folder: Path, data: Episodes) -> pl.Trainer:
         accelerator="cpu",
         devices=config.run.processes,
         num_nodes=config.run.nodes,
-        strategy="ddp" if world > 1 else "auto",
+        strategy=DDPStrategy(broadcast_buffers=False) if world > 1 else "auto",
         max_epochs=config.optimizer.steps,  # an epoch is a step
-        accumulate_grad_batches=-(-data.per_step // world),
         check_val_every_n_epoch=config.run.validate_every,
         num_sanity_val_steps=0,
         use_distributed_sampler=False,
