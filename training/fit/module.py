@@ -108,8 +108,12 @@ class FitModule(pl.LightningModule):
         self._log([self._compared(episode, "val")[1] for episode in episodes])
 
     def _log(self, figures: list[dict[str, Tensor]]) -> None:
-        means = {key: torch.stack([f[key] for f in figures]).mean() for key in figures[0]}
-        self.log_dict(means, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(figures))
+        """Means over the episodes of all processes (``sync_dist`` would weigh unequal shares wrongly)."""
+        own = [torch.stack([f[key] for f in figures]).sum() for key in figures[0]]
+        total = torch.stack([*own, own[0].new_tensor(len(figures))])
+        *sums, count = self.trainer.strategy.reduce(total, reduce_op="sum")
+        means = {key: value / count for key, value in zip(figures[0], sums, strict=True)}
+        self.log_dict(means, on_step=False, on_epoch=True, batch_size=1)
 
     def _compared(self, episode: Episode, kind: str) -> tuple[Tensor, dict[str, Tensor]]:
         scene = self(episode)
