@@ -37,6 +37,7 @@ from torchcloth.training.fit.data import Deal
         (["loss={markers: 0.001}"], "nothing to compare with"),
         (["learn.network={module: no.Net, gives: [poisson_ratio]}"], "config: learn.network; got no.Net (No module"),
         (["run.loggers=[wandb]"], "config: run.loggers; got 'wandb'; expected csv or tensorboard"),
+        (["run.processes=4"], "config: run.processes; got 4; expected at most 3, the episodes at a step"),
         (["--resume"], "--resume; got no "),
     ],
 )

@@ -65,6 +65,9 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
     description = described(train[0])
     cloth = built(description, config.model)
     data = Episodes(cloth, train, val, config.data.per_step, config.run.seed)
+    if config.run.processes * config.run.nodes > data.per_step:
+        got, expected = config.run.processes * config.run.nodes, f"at most {data.per_step}, the episodes at a step"
+        raise InvalidInput("config: run.processes", got=got, expected=expected)
     module = FitModule(asdict(config), description, _problem(config, cloth, data))
     initial = module.now()
     trainer = _trainer(config, folder)
