@@ -64,8 +64,12 @@ def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tenso
     Differentiable in ``vertices``. Its floor is the sensor noise, and it is blind to motion within the surface: use it
     to report, and ``residuals`` to infer.
     """
-    hits = closest(points, vertices, faces)
-    return safe_norm(points - hits.on(vertices)).mean()
+    return distances(points, vertices, closest(points, vertices, faces)).mean()
+
+
+def distances(points: Tensor, vertices: Tensor, hits: Hits) -> Tensor:
+    """[N] m, of points from the places that they hit; differentiable in ``vertices``."""
+    return safe_norm(points - hits.on(vertices)).squeeze(-1)
 
 
 def _closest(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,137 @@
+"""Runs of the fit: what they learn, and that they go on bit for bit."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("lightning")
+
+from lightning.pytorch.callbacks import Callback
+
+import torchcloth.training.fit.run as run
+from torchcloth.training.fit.command import main
+from torchcloth.training.fit.config import load
+from torchcloth.training.fit.module import FitModule
+
+sys.path.insert(0, str(Path(__file__).parent))  # the network in nets.py
+
+NETWORK = {"module": "nets.Small", "gives": ["youngs_modulus"], "arguments": {"width": 3, "drop": 0.3}}
+EVERYTHING = {"parameters": ["air.normal"], "fields": ["areal_density"], "network": NETWORK, "roughness": 0.1}
+
+
+class Stopped(Exception):
+    """Power went."""
+
+
+class Stop(Callback):
+    """In the middle of a step: after the gradients of its first episode."""
+
+    def __init__(self, step):
+        self.step = step
+
+    def on_after_backward(self, trainer, pl_module):
+        if trainer.global_step == self.step:
+            raise Stopped
+
+
+def stop_at(monkeypatch, step):
+    """The next runs end in step ``step``."""
+    whole = run._trainer
+
+    def trainer(*args):
+        made = whole(*args)
+        made.callbacks.append(Stop(step))
+        return made
+
+    monkeypatch.setattr(run, "_trainer", trainer)
+
+
+def state(folder):
+    """Weights, optimiser, schedule and history of the last checkpoint."""
+    found = torch.load(folder / "last.ckpt", weights_only=True)
+    return [found[key] for key in ("state_dict", "optimizer_states", "lr_schedulers", "history")]
+
+
+def same(one, two):
+    """Bit for bit."""
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, two)
+    if isinstance(one, dict):
+        return one.keys() == two.keys() and all(same(one[key], two[key]) for key in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(two) and all(map(same, one, two))
+    return one == two
+
+
+def test_it_learns_the_fabric(config, tmp_path):
+    """The points lie on the true sheet: E goes from 80 kPa towards 40, and loads back without the data."""
+    path = config(learn={"parameters": ["youngs_modulus"]}, optimizer={"rate": 0.15, "steps": 20, "half_life": 6})
+    assert main(["--config", path]) == 0
+    found = json.loads((tmp_path / "out" / "fit.json").read_text())
+    own = found["parameters"]["youngs_modulus"]
+    assert (own["initial"], own["unit"]) == (pytest.approx(8e4), "Pa")
+    assert own["value"] == pytest.approx(4e4, rel=0.05)
+    assert found["train"]["loss_after"] < 0.05 * found["train"]["loss_before"]
+    assert "not with error bars" in found["remark"]
+    assert f"youngs_modulus={own['value']:.6g}" in found["identify"]
+    assert [entry["step"] for entry in found["history"]] == list(range(20))
+    cloth = FitModule.load_from_checkpoint(tmp_path / "out" / "last.ckpt").cloth()
+    assert float(cloth.material.youngs_modulus.value) == own["value"]
+
+
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_resuming_is_bit_for_bit(config, episodes, tmp_path, monkeypatch, step):
+    """Stopped within any step: shuffled episodes, dropout, schedule, a scalar, a field and a network."""
+    data = {"train": str(episodes / "ep_*"), "per_step": 2}
+    path = config(learn=EVERYTHING, optimizer={"steps": 4, "half_life": 3}, data=data)
+    whole = run.fit(load(path, [f"out={tmp_path / 'whole'}"]))
+    with monkeypatch.context() as patch:
+        stop_at(patch, step)
+        with pytest.raises(Stopped):
+            run.fit(load(path))
+    assert len(torch.load(tmp_path / "out" / "last.ckpt", weights_only=True)["history"]) == step
+    resumed = run.fit(load(path), resume=True)
+    assert same(state(tmp_path / "whole"), state(tmp_path / "out"))
+    assert same(whole.learned.values(), resumed.learned.values())
+    assert not torch.equal(whole.learned.values()["areal_density"], torch.full((32,), 0.3))
+
+
+def test_more_steps_after_the_end(config, tmp_path):
+    """A finished run goes on with more steps as if it had been asked for them at once."""
+    path = config()
+    run.fit(load(path))
+    run.fit(load(path, ["optimizer.steps=4"]), resume=True)
+    run.fit(load(path, ["optimizer.steps=4", f"out={tmp_path / 'whole'}"]))
+    assert same(state(tmp_path / "whole"), state(tmp_path / "out"))
+
+
+def test_a_network_loads_back(config, tmp_path):
+    """With the field that it gives, in a cloth that simulates."""
+    learn = {"network": {**NETWORK, "arguments": {"width": 3}}}
+    module = run.fit(load(config(learn=learn)))
+    cloth = FitModule.load_from_checkpoint(tmp_path / "out" / "last.ckpt").cloth()
+    assert torch.equal(cloth.material.youngs_modulus.value, module.learned.values()["youngs_modulus"])
+    assert cloth.material.youngs_modulus.value.shape == (32,)
+    assert cloth.stable_step() > 0
+    assert (tmp_path / "out" / "fields.npz").is_file()
+
+
+def test_validation_is_held_out(config, episodes, tmp_path):
+    """By ``split.motion``; its figures are in the result and do not move the fit."""
+    everything = f"[{episodes}/*]"
+    path = config()
+    run.fit(load(path, [f"data.train={everything}", "data.val_motion=other"]))
+    held = json.loads((tmp_path / "out" / "fit.json").read_text())
+    alone = run.fit(load(path, [f"out={tmp_path / 'alone'}"]))
+    assert (held["train"]["episodes"], held["val"]["episodes"]) == (3, 1)
+    assert held["val"]["chamfer_after"] > 0
+    assert held["parameters"]["youngs_modulus"]["value"] == float(alone.learned.values()["youngs_modulus"])
+
+
+@pytest.mark.parametrize("loss", ["chamfer_to_surface", "chamfer_to_vertices"])
+def test_every_loss_has_a_gradient(config, loss):
+    module = run.fit(load(config(loss={loss: 1e-3}, optimizer={"steps": 1})))
+    assert float(module.learned.values()["youngs_modulus"]) != pytest.approx(8e4, rel=1e-3)

@@ -1,0 +1,93 @@
+"""Wrong input: one line, exit code 2, nothing written; episodes dealt without padding."""
+
+import json
+
+import pytest
+
+pytest.importorskip("lightning")
+
+from torchcloth.training.fit.command import main
+from torchcloth.training.fit.config import load
+from torchcloth.training.fit.data import Deal
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["optimizer.stepz=3"], "config: optimizer.stepz; got an unknown key; expected one of rate, steps, half_life"),
+        (["optimiser.steps=3"], "config: optimiser; got an unknown key"),
+        (["optimizer.steps=many"], "config: optimizer.steps; got 'many'; expected a whole number"),
+        (["optimizer.steps=0"], "config: optimizer.steps; got 0; expected at least 1"),
+        (["optimizer.rate=-1"], "config: optimizer.rate; got -1.0"),
+        (["steps"], "override; got 'steps'; expected KEY=VALUE"),
+        (["data.train=[]"], "config: data.train; got no episodes"),
+        (["data.train=nowhere"], "nowhere does not exist"),
+        (["data.train=nowhere/*"], "got no folder that matches nowhere/*"),
+        (["data.train=example:bimanual_swing", "data.val={held}"], "held: another cloth"),
+        (["data.val_motion=fling"], "config: data.val_motion; got 'fling'; expected one of data.train: shake"),
+        (["data.per_step=4"], "config: data.per_step; got 4; expected at most 3"),
+        (["learn.parameters=[stiffness]"], "parameter to fit; got 'stiffness'; expected one of"),
+        (["learn.parameters=[]"], "config: learn; got no name"),
+        (["learn.fields=[air.normal]", "learn.parameters=[]"], "got a field of air.normal"),
+        (["model.start.youngs=1"], "config: model.start; got 'youngs'"),
+        (["model.start.youngs_modulus=-1"], "youngs_modulus; got -1 Pa"),
+        (["model.precision=float16"], "config: model.precision; got 'float16'; expected float64 or float32"),
+        (["loss.chamfer=1"], "config: loss.chamfer; got unknown; expected one of points,"),
+        (["loss.points=0"], "config: loss.points; got 0.0; expected a scale > 0"),
+        (["loss={markers: 0.001}"], "nothing to compare with"),
+        (["learn.network={module: no.Net, gives: [poisson_ratio]}"], "config: learn.network; got no.Net (No module"),
+        (["run.loggers=[wandb]"], "config: run.loggers; got 'wandb'; expected csv or tensorboard"),
+        (["run.processes=4"], "config: run.processes; got 4; expected at most 3, the episodes at a step"),
+        (["--resume"], "--resume; got no "),
+    ],
+)
+def test_one_line(config, episodes, capsys, options, words):
+    path = config()
+    options = [option.replace("{held}", str(episodes / "held")) for option in options]
+    assert main(["--config", path, *options]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("fit: ")
+    assert words in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("content", [None, "a: [", "3", "learn: 3", "out: x"])
+def test_a_file_that_is_no_config(tmp_path, capsys, content):
+    path = tmp_path / "config.yaml"
+    if content is not None:
+        path.write_text(content)
+    assert main(["--config", str(path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert [f.name for f in tmp_path.iterdir()] in ([], ["config.yaml"])
+
+
+def test_another_problem_is_not_resumed(config, episodes, capsys):
+    path = config(optimizer={"steps": 1})
+    assert main(["--config", path]) == 0
+    for other in (["optimizer.rate=0.2"], ["model.start.youngs_modulus=5e4"], [f"data.train={episodes}/ep_0"]):
+        assert main(["--config", path, "--resume", *other]) == 2
+        assert "a checkpoint of another run" in capsys.readouterr().err
+
+
+def test_the_shipped_config_is_read():
+    config = load("demo", ["optimizer.rate=2e-1", "model.start.air.normal=1e0"])
+    assert config.data.train == ["example:bimanual_swing"]
+    assert config.optimizer.rate == 0.2
+    assert config.model.start == {"air.normal": 1.0}
+    assert json.dumps(config.loss) == '{"points": 0.001}'
+
+
+@pytest.mark.parametrize(("count", "per_step", "world"), [(5, 2, 2), (3, 3, 2), (7, 4, 3)])
+def test_episodes_are_dealt_once_each(count, per_step, world):
+    """Together the processes have what one has; every pass has every episode once; passes differ."""
+    together, alone = [], []
+    for step in range(2 * count):
+        deals = [Deal(count, per_step, 1, lambda: step, rank, world) for rank in range(world)]  # noqa: B023
+        shares = [share for deal in deals for share in deal]
+        assert max(map(len, shares)) - min(map(len, shares)) <= 1
+        together += sorted(e for share in shares for e in share)
+        alone += next(iter(Deal(count, per_step, 1, lambda: step)))  # noqa: B023
+    assert sorted(together) == sorted(alone)
+    passes = [alone[i : i + count] for i in range(0, len(alone), count)]
+    assert all(sorted(p) == list(range(count)) for p in passes)
+    assert per_step == count or len({tuple(p) for p in passes}) > 1

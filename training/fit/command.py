@@ -1,0 +1,46 @@
+"""``python -m torchcloth.training.fit``: options, messages, exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+
+from torchcloth.errors import MissingDependency, TorchclothError
+
+from .config import load
+
+NAME = "torchcloth.training.fit"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
+    options = _parser().parse_args(arguments)
+    try:
+        config = load(options.config, options.overrides)
+        if find_spec("lightning") is None:
+            raise MissingDependency("lightning is not installed", remedy='run: pip install "torchcloth[training]"')
+        from .run import fit
+
+        fit(config, options.resume)
+        return 0
+    except (TorchclothError, OSError) as error:
+        print(f"fit: {error}", file=sys.stderr)
+        return 2
+    except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
+        print("fit: stopped; the same command with --resume goes on after the last whole step", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {NAME}",
+        description="Fit what a config names to episodes, by gradient descent through the simulation.",
+        epilog="On several processes: run.processes=N, or under torchrun or srun; see docs/training.md.",
+    )
+    add = parser.add_argument
+    add("--config", required=True, metavar="FILE", help="YAML file, or the name of a shipped one: demo")
+    add("--resume", action="store_true", help="go on where the run into the config's `out` was stopped")
+    add("overrides", nargs="*", metavar="KEY=VALUE", help="instead of the config's, e.g. optimizer.steps=10 out=out/2")
+    return parser

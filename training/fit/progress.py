@@ -1,0 +1,50 @@
+"""What a person sees while a run goes on."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import lightning.pytorch as pl
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from .module import FitModule
+
+
+class Told(pl.Callback):
+    """A bar on a terminal, a line a step in a log file; only from the first process."""
+
+    def __init__(self) -> None:
+        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        self.bar = Progress(
+            *columns, TextColumn("{task.description}"), refresh_per_second=2, disable=not sys.stdout.isatty()
+        )
+        self.task: Any = None
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Begin."""
+        if trainer.is_global_zero:
+            self.bar.start()
+            self.task = self.bar.add_task("first step", total=trainer.max_epochs, completed=trainer.global_step)
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """One step further."""
+        metrics = trainer.callback_metrics
+        if self.task is None or "train/loss" not in metrics:
+            return
+        parts = [f"loss {float(metrics['train/loss']):.4g}"]
+        parts += [
+            f"{kind} {1e3 * float(metrics[key]):.2f} mm"
+            for kind in ("train", "val")
+            if (key := f"{kind}/chamfer") in metrics
+        ]
+        values = pl_module.begun if isinstance(pl_module, FitModule) else {}
+        parts += [f"{name} {value:.4g}" for name, value in list(values.items())[:3]]
+        text = ", ".join(parts)
+        self.bar.update(self.task, completed=trainer.global_step, description=text)
+        if not self.bar.console.is_terminal:
+            print(f"step {trainer.global_step}/{trainer.max_epochs}: {text}", flush=True)
+
+    def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        """Leave the terminal as it was."""
+        self.bar.stop()

@@ -1,0 +1,93 @@
+"""What a run ends with: fit.json, fields.npz, and a table."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchcloth._files import atomically, write_text
+
+from .config import Config
+from .learned import summary
+from .module import FitModule
+
+REMARK = (
+    "Gradient descent ends with values, not with error bars: nothing here says how well the data determine them. For "
+    "standard errors and what is identifiable, start `identify` from these values; of fields and networks there are "
+    "none."
+)
+CONVENTION = (
+    "SI units. chamfer: one-sided, cloud to surface: mean over frames, but the first, of the mean distance [m] from "
+    "each measured point to the nearest point of the simulated triangles; mean over the episodes. history: before each "
+    "step, values and what was seen with them; a field by its mean."
+)
+
+
+def save(
+    folder: Path,
+    config: Config,
+    module: FitModule,
+    initial: dict[str, float],
+    figures: dict[str, Any],
+    episodes: list[str],
+) -> dict[str, Any]:
+    """Write fit.json and, where fields were learned, fields.npz; returns the content of fit.json."""
+    values, fields = module.learned.values(), {}
+    parameters: dict[str, Any] = {}
+    for name, value in values.items():
+        entry = {"value": summary(value), "unit": module.learned.parameter(name).unit, "initial": initial[name]}
+        if value.ndim:
+            fields[name] = value.numpy()
+            entry |= {"field": "fields.npz", "least": float(value.min()), "largest": float(value.max())}
+        parameters[name] = entry
+    content = {
+        "parameters": parameters,
+        "remark": REMARK,
+        "identify": _command(config, episodes, {n: p["value"] for n, p in parameters.items() if "field" not in p}),
+        **figures,
+        "convention": CONVENTION,
+        "history": [{"step": step, **entry} for step, entry in sorted(module.history.items())],
+    }
+    if fields:
+        with atomically(folder / "fields.npz") as part:
+            np.savez(part, **fields)
+    write_text(folder / "fit.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+    return content
+
+
+def _command(config: Config, episodes: list[str], values: dict[str, float]) -> str:
+    """How to go on from here to error bars."""
+    starts = {**config.model.start, **values}
+    words = ["torchcloth", "identify", *episodes, "--out", f"{config.out}/identify"]
+    words += ["--start", *(f"{name}={value:.6g}" for name, value in starts.items())] if starts else []
+    words += ["--fit", *values] if values else []
+    words += ["--contact", f"{config.model.contact:g}"] if config.model.contact else []
+    return shlex.join(words)
+
+
+def show(content: dict[str, Any], folder: Path) -> None:
+    """The table for a person."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="learned", title_justify="left")
+    for column, side in (("parameter", "left"), ("unit", "left"), ("start", "right"), ("now", "right")):
+        table.add_column(column, justify=side)  # type: ignore[arg-type]
+    for name, p in content["parameters"].items():
+        now = f"{p['value']:.4g}"
+        now += f" (mean; {p['least']:.4g} to {p['largest']:.4g})" if "field" in p else ""
+        table.add_row(name, p["unit"], f"{p['initial']:.4g}", now)
+    console = Console()
+    console.print(table)
+    for kind in ("train", "val"):
+        after = content[kind].get("chamfer_after")
+        if after is not None:
+            before = content[kind].get("chamfer_before")
+            start = "" if before is None else f", {1e3 * before:.2f} mm before"
+            console.print(f"{kind}: {1e3 * after:.2f} mm from the points to the surface{start}")
+    console.print(REMARK, f"\n  {content['identify']}", style="dim", soft_wrap=True)
+    console.print(f"result:   {folder / 'fit.json'}", soft_wrap=True)

@@ -1,0 +1,136 @@
+"""One run from config to result."""
+
+from __future__ import annotations
+
+import logging
+import time
+import warnings
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.strategies import DDPStrategy
+
+from torchcloth import Cloth
+from torchcloth.errors import InvalidInput, MissingDependency
+from torchcloth.identification.journal import digest
+from torchcloth.identification.objective import Objective
+
+from . import result
+from .config import Config, Optimizer, Run
+from .data import Episodes, found
+from .described import built, described, precision
+from .module import FitModule
+from .progress import Told
+
+CHECKPOINT = "last.ckpt"
+QUIET = (
+    "does not have many workers",
+    "irectory .* exists and is not empty",
+    "treespec, LeafSpec",
+    "Total length of `list`",
+    "overridden `transfer_batch_to_device`",
+)
+
+
+def fit(config: Config, resume: bool = False) -> FitModule:
+    """Train, write checkpoints after every step, and the result; returns the module.
+
+    Args:
+        config: see ``config``.
+        resume: go on from ``out/last.ckpt``; the result is what it would have been, bit by bit.
+
+    Raises:
+        InvalidInput: a config or data that make no run; nothing to resume.
+        RecordingError: an episode that cannot be trusted.
+        SimulationDiverged: a step led where nothing can be simulated; the checkpoint before it is kept.
+    """
+    torch.set_num_threads(1)  # meshes of a thousand triangles: processes pay, threads do not
+    folder = Path(config.out)
+    checkpoint = folder / CHECKPOINT
+    if folder.exists() and not folder.is_dir():
+        raise InvalidInput("out", got=f"{folder}, a file", expected="a folder, new or existing")
+    if resume and not checkpoint.is_file():
+        raise InvalidInput("--resume", got=f"no {checkpoint}", expected="what an interrupted run left")
+    with precision(config.model.precision):
+        return _run(config, folder, checkpoint if resume else None)
+
+
+def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
+    began = time.perf_counter()
+    train, val = found(config.data)
+    description = described(train[0])
+    cloth = built(description, config.model)
+    data = Episodes(cloth, train, val, config.data.per_step, config.run.seed)
+    if config.run.processes * config.run.nodes > data.per_step:
+        got, expected = config.run.processes * config.run.nodes, f"at most {data.per_step}, the episodes at a step"
+        raise InvalidInput("config: run.processes", got=got, expected=expected)
+    module = FitModule(asdict(config), description, _problem(config, cloth, data))
+    initial = module.now()
+    trainer = _trainer(config, folder)
+    trainer.fit(module, datamodule=data, ckpt_path=checkpoint)
+    figures = {
+        "train": {"episodes": len(train), **_after(trainer, module, data, data.train)},
+        "val": {"episodes": len(val), **(_after(trainer, module, data, data.val) if val else {})},
+        "steps": trainer.global_step,
+        "seconds": time.perf_counter() - began,
+        "processes": trainer.world_size,
+    }
+    first = module.history[0]
+    figures["train"] |= {"loss_before": first["train/loss"], "chamfer_before": first.get("train/chamfer")}
+    if trainer.is_global_zero:
+        episodes = [str(r.path) for r in train]
+        result.show(result.save(folder, config, module, initial, figures, episodes), folder)
+    return module
+
+
+def _trainer(config: Config, folder: Path) -> pl.Trainer:
+    for message in QUIET:
+        warnings.filterwarnings("ignore", f".*{message}")
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    world = config.run.processes * config.run.nodes
+    return pl.Trainer(
+        accelerator="cpu",
+        devices=config.run.processes,
+        num_nodes=config.run.nodes,
+        strategy=DDPStrategy(broadcast_buffers=False) if world > 1 else "auto",
+        max_epochs=config.optimizer.steps,  # an epoch is a step
+        check_val_every_n_epoch=config.run.validate_every,
+        num_sanity_val_steps=0,
+        use_distributed_sampler=False,
+        log_every_n_steps=1,
+        logger=_loggers(config.run.loggers, folder),
+        callbacks=[
+            ModelCheckpoint(folder, Path(CHECKPOINT).stem, save_on_train_epoch_end=True, enable_version_counter=False),
+            Told(),
+        ],
+        default_root_dir=folder,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+
+
+def _loggers(names: list[str], folder: Path) -> list[Logger]:
+    out: list[Logger] = []
+    for name in names:
+        try:
+            out.append((CSVLogger if name == "csv" else TensorBoardLogger)(folder, name="log"))
+        except ModuleNotFoundError:
+            raise MissingDependency("tensorboard is not installed", remedy="run: pip install tensorboard") from None
+    return out
+
+
+def _after(trainer: pl.Trainer, module: FitModule, data: Episodes, episodes: list) -> dict[str, float]:
+    """What is left, with the final values."""
+    found = trainer.validate(module, data.shared(episodes), verbose=False)[0]
+    return {f"{key.removeprefix('val/')}_after": value for key, value in found.items()}
+
+
+def _problem(config: Config, cloth: Cloth, data: Episodes) -> str:
+    """Fingerprint of data, model and options; of what may change while a run rests, nothing."""
+    fixed = replace(config, out="", run=Run(seed=config.run.seed), data=replace(config.data, train=[], val=[]))
+    fixed = replace(fixed, optimizer=replace(config.optimizer, steps=Optimizer.steps))
+    return digest([fixed, *Objective(cloth, [], [*data.train, *data.val]).identity()])
