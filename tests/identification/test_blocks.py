@@ -68,9 +68,10 @@ def test_markers_alone_will_do(pulled, model):
     assert fit.fit["chamfer_after"] < fit.fit["chamfer_before"]
 
 
-def test_neither_points_nor_markers_is_refused(pulled, model):
+def test_neither_points_nor_markers_nor_forces_is_refused(pulled, model):
+    mute = {name: replace(motion, force=None, torque=None) for name, motion in pulled.grippers.items()}
     with pytest.raises(RecordingError, match="has no points"):
-        episode(model, replace(pulled, points=None, markers=None))
+        episode(model, replace(pulled, points=None, markers=None, grippers=mute))
 
 
 def test_means_of_a_signal_between_frames():
