@@ -164,7 +164,10 @@ def _check_grasp(recording: Recording, name: str, folder: Folder) -> None:
     if name not in recording.grippers and name not in recording.joints:
         got = sorted({*recording.grippers, *recording.joints})
         raise RecordingError(
-            f"{place} has no motion", got=got, expected=f"{name}/t in {streams.MOTION}", remedy="rename or record it"
+            f"{place} has no motion",
+            got=got,
+            expected=f"{name}/t in {streams.MOTION}",
+            remedy="rename or record it, or leave the grasp out; in a scene, say in source what moves it",
         )
     arm = recording.joints.get(name)
     if arm is not None and arm.closed is None and arm.width is None:
