@@ -78,7 +78,8 @@ def test_the_camera_matrix_is_asked_for(tum, tmp_path):
 
 
 def test_a_grasp_without_motion(tum, tmp_path):
-    with pytest.raises(RecordingError, match="leave the grasp out; in a scene, say in source what moves it"):
+    match = r"scene\.json: grasps\.left has no motion.*leave the grasp out; in a scene, say in source what moves it"
+    with pytest.raises(RecordingError, match=match):
         formats.read(tum.path, scene=scene(tmp_path, tum.scene | {"grasps": {"left": GRASP}}))
 
 
