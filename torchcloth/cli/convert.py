@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 FORMATS = ("episode", "ros2", "lerobot", "redwood", "tum", "kinect")
 MCAP = ".mcap"
+FILES = f"{MCAP} .bag .db3 .mkv .mp4 .json .npz .npy .h5 .hdf5 .parquet .csv .txt .zip .tar .gz .tgz .zst"  # no folders
 
 
 def add(verbs: Any) -> None:
@@ -39,8 +40,7 @@ def _convert(options: argparse.Namespace) -> int:
     from .. import recordings
     from ..recordings import formats
 
-    if options.target.exists() and not options.overwrite:
-        raise InvalidInput("DST exists", got=options.target, expected="a new name", remedy="or --overwrite")
+    _check_target(options)
     with Console(stderr=True).status(f"reading {options.source}"):  # silent where nobody looks
         recording = formats.read(options.source, format=options.format, scene=options.scene, episode=options.episode)
     write = formats.write_mcap if options.target.suffix == MCAP else recordings.write
@@ -49,6 +49,17 @@ def _convert(options: argparse.Namespace) -> int:
     )
     _report(recording, options.target)
     return 0
+
+
+def _check_target(options: argparse.Namespace) -> None:
+    source, target = options.source, options.target
+    if source.resolve().is_relative_to(target.resolve()):
+        raise InvalidInput("DST is SRC or holds it", got=target, expected="another name")
+    if target.suffix != MCAP and target.suffix.lower() in FILES.split():
+        expected = f"a folder's name, or a file ending {MCAP}"
+        raise InvalidInput(f"DST cannot be a {target.suffix} file", got=target, expected=expected)
+    if target.exists() and not options.overwrite:
+        raise InvalidInput("DST exists", got=target, expected="a new name", remedy="or --overwrite")
 
 
 def _streams(recording: Recording) -> list[tuple[str, str, Any]]:

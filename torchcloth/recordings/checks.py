@@ -142,6 +142,7 @@ class Fields:
         if not isinstance(value, dict):
             raise RecordingError(f"{place} is not an object of named values", got=reprlib.repr(value))
         self.place, self._joint, self.rest = place, joint, dict(value)
+        self.asked: list[str] = []  # every key that was looked for
 
     def at(self, key: str) -> str:
         """File and key, for messages."""
@@ -149,10 +150,16 @@ class Fields:
 
     def has(self, key: str) -> bool:
         """Whether the key is there and not null."""
+        self._ask(key)
         return self.rest.get(key) is not None
+
+    def _ask(self, key: str) -> None:
+        if key not in self.asked:
+            self.asked.append(key)
 
     def take(self, key: str) -> Any:
         """The raw value."""
+        self._ask(key)
         value = self.rest.pop(key, None)
         if value is None:
             raise RecordingError(f"{self.at(key)} is missing", remedy="add it, see the recording format")
@@ -209,6 +216,7 @@ class Fields:
 
     def inside(self, key: str) -> Fields:
         """The object under the key; an absent one is empty."""
+        self._ask(key)
         value = self.rest.pop(key, None)
         return Fields({} if value is None else value, self.at(key))
 

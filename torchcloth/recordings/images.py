@@ -33,6 +33,10 @@ class ImageSource(ABC):
     def __iter__(self) -> Iterator[np.ndarray | bytes]:
         """Each image: its pixels as `ImageStream.load` gives them, or the bytes of a whole PNG or JPEG file."""
 
+    def file(self, i: int) -> Path | None:
+        """The file that image ``i`` has of its own, for messages."""
+        return None
+
 
 @dataclass(frozen=True, eq=False)
 class ImageStream:
@@ -60,7 +64,7 @@ class ImageStream:
         if self.source is None:
             return self._decoded(self.paths[i], str(self.paths[i]))
         for image in islice(self.source, range(len(self))[i], None):
-            return self._decoded(image, f"{self.kind} image {i}")
+            return self._decoded(image, self._place(i, i))
         raise RecordingError(f"{self.kind} image {i} is missing", expected=f"{len(self)} images", remedy="record again")
 
     def files(self) -> Iterator[tuple[int, str, bytes]]:
@@ -68,17 +72,22 @@ class ImageStream:
 
         Pixels become PNG, which keeps every one of them; PNG and JPEG files stay as they are.
         """
-        frames = iter(self.frames.tolist())
-        for image in self.paths if self.source is None else self.source:
-            frame = next(frames, None)
-            if frame is None:
+        frames = self.frames.tolist()
+        i = -1
+        for i, image in enumerate(self.paths if self.source is None else self.source):
+            if i == len(frames):
                 raise RecordingError(f"{self.kind} images are too many", expected=f"{len(self)}, one for each time")
             if isinstance(image, Path):
-                yield frame, image.suffix, image.read_bytes()
+                yield frames[i], image.suffix, image.read_bytes()
             else:
-                yield frame, *self._file(image, f"{self.kind} image {frame}")
-        if (frame := next(frames, None)) is not None:
-            raise RecordingError(f"{self.kind} image {frame} is missing", expected="one for each time")
+                yield frames[i], *self._file(image, self._place(i, frames[i]))
+        if i + 1 < len(frames):
+            raise RecordingError(f"{self.kind} image {frames[i + 1]} is missing", expected="one for each time")
+
+    def _place(self, i: int, number: int) -> str:
+        """What image ``i`` is called in messages."""
+        file = None if self.source is None else self.source.file(i)
+        return f"{self.kind} image {number}" if file is None else f"{file}: {self.kind} image {number}"
 
     def _file(self, image: np.ndarray | bytes, place: str) -> tuple[str, bytes]:
         pixels = self._decoded(image, place)

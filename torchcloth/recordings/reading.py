@@ -88,10 +88,10 @@ def assemble(
         extra=root.left(observation_noise=noise, air=air),
         **held,
     )
-    _check_cloth(recording, folder)
+    _check_cloth(recording, root.place)
     for name in recording.grasps:
-        _check_grasp(recording, name, folder)
-    _check_robots(recording, folder)
+        _check_grasp(recording, name, root.place, folder)
+    _check_robots(recording, root.place, folder)
     _check_markers(recording, folder)
     _check_overlap(recording, folder)
     return recording
@@ -143,7 +143,7 @@ def _split(root: Fields) -> dict:
     return {**{key: value for key, value in known.items() if value is not None}, **split.rest}
 
 
-def _check_cloth(recording: Recording, folder: Folder) -> None:
+def _check_cloth(recording: Recording, told: str) -> None:
     cloth, box = recording.cloth, recording.cloth.pattern_box()
     if cloth.sheet is None or cloth.uv is None or box is None:
         return
@@ -151,20 +151,23 @@ def _check_cloth(recording: Recording, folder: Folder) -> None:
     if not np.allclose(got, cloth.sheet, rtol=0.01):
         expected = f"{list(cloth.sheet)}"
         raise RecordingError(
-            f"{folder.place(EPISODE)}: cloth.sheet is not the mesh",
+            f"{told}: cloth.sheet is not the mesh",
             got=f"a mesh of {got.tolist()}",
             expected=expected,
             remedy="drop one",
         )
 
 
-def _check_grasp(recording: Recording, name: str, folder: Folder) -> None:
-    """A grasp needs a gripper that moves and material to hold."""
-    place = f"{folder.place(EPISODE)}: grasps.{name}"
+def _check_grasp(recording: Recording, name: str, told: str, folder: Folder) -> None:
+    """A grasp needs a gripper that moves and material to hold; ``told`` is the file that names it."""
+    place = f"{told}: grasps.{name}"
     if name not in recording.grippers and name not in recording.joints:
         got = sorted({*recording.grippers, *recording.joints})
         raise RecordingError(
-            f"{place} has no motion", got=got, expected=f"{name}/t in {streams.MOTION}", remedy="rename or record it"
+            f"{place} has no motion",
+            got=got,
+            expected=f"{name}/t in {streams.MOTION}",
+            remedy="rename or record it, or leave the grasp out; in a scene, say in source what moves it",
         )
     arm = recording.joints.get(name)
     if arm is not None and arm.closed is None and arm.width is None:
@@ -210,13 +213,11 @@ def _check_held_pattern(recording: Recording, uv: np.ndarray, radius: float, pla
             )
 
 
-def _check_robots(recording: Recording, folder: Folder) -> None:
+def _check_robots(recording: Recording, told: str, folder: Folder) -> None:
     for name, robot in recording.robots.items():
         if name not in recording.joints and name not in recording.grippers:
             got = sorted({*recording.grippers, *recording.joints})
-            raise RecordingError(
-                f"{folder.place(EPISODE)}: robots.{name} is an unknown arm", got=got, expected="a name in motion.npz"
-            )
+            raise RecordingError(f"{told}: robots.{name} is an unknown arm", got=got, expected="a name in motion.npz")
         arm = recording.joints.get(name)
         if arm is not None and robot.model.startswith("rizon") and arm.q.shape[1] != RIZON_JOINTS:
             place = f"{folder.place(streams.MOTION)}: {name}/q"

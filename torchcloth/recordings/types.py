@@ -241,7 +241,10 @@ def _of_recording(key: str) -> Callable[[Recording], Any]:
 
 # What can be required, where it is found, and what to do when it is not there.
 STREAMS: dict[str, tuple[Callable[[Recording], Any], str]] = {
-    "points": (_of_recording("points"), "record segmented cloth points into points.npz"),
+    "points": (
+        _of_recording("points"),
+        "record segmented cloth points into points.npz, or cut them out of the depth images (docs/formats.md)",
+    ),
     "markers": (_of_recording("markers"), "record tracked points into markers.npz"),
     "truth": (_of_recording("truth"), "read a synthetic episode with with_truth=True"),
     "grippers": (_of_recording("grippers"), "write NAME/position, NAME/quat_wxyz and NAME/closed into motion.npz"),

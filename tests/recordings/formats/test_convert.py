@@ -56,7 +56,7 @@ def test_a_refusal_is_one_line_and_leaves_nothing(tmp_path, capsys):
     image = sorted((truth.path / "depth").iterdir())[2]
     image.write_bytes(image.read_bytes()[:-20])
     assert call(truth.path, out, "--scene", scene) == 2
-    assert "depth image 2 cannot be decoded" in capsys.readouterr().err
+    assert f"{image}: depth image 2 cannot be decoded" in capsys.readouterr().err
     assert not out.exists()
     assert not any(out.parent.glob("*"))
 
@@ -70,3 +70,20 @@ def test_nothing_is_overwritten_unasked(tmp_path, capsys, suffix):
     assert call(truth.path, out, "--scene", scene) == 2
     assert "DST exists" in capsys.readouterr().err
     assert call(truth.path, out, "--scene", scene, "--overwrite") == 0
+
+
+def test_the_target_must_be_what_is_written(tmp_path, capsys):
+    """An episode folder that looks like a bag, and an episode written over itself."""
+    truth = foreign.tum(tmp_path)
+    episode = tmp_path / "ep_0.15"  # a dot alone makes no file
+    assert call(truth.path, episode, "--scene", truth.write_scene()) == 0
+    before = sorted((p, p.stat().st_mtime_ns) for p in episode.rglob("*"))
+    for target, match in (
+        ("a.bag", "DST cannot be a .bag file"),
+        ("a.db3", "DST cannot be a .db3 file"),
+        ("ep_0.15/../ep_0.15", "DST is SRC or holds it"),
+    ):
+        assert call(episode, tmp_path / target, "--overwrite") == 2
+        assert match in capsys.readouterr().err
+    assert not (tmp_path / "a.bag").exists()
+    assert sorted((p, p.stat().st_mtime_ns) for p in episode.rglob("*")) == before

@@ -46,6 +46,8 @@ def detect(path: str | Path) -> str:
         if path.is_dir() and (path / reading.EPISODE).is_file():
             return EPISODE
         found = next((i.NAME for i in IMPORTERS if i.matches(path)), None)
+    except RecordingError:
+        raise
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path} cannot be read", got=error, expected="a recording") from error
     if found is None:

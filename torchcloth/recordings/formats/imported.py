@@ -52,6 +52,10 @@ class FileImages(ImageSource):
         for path in self.paths:
             yield file_bytes(path)
 
+    def file(self, i: int) -> Path:
+        """The file of image ``i``."""
+        return self.paths[i]
+
 
 def file_bytes(path: Path) -> bytes:
     """The bytes of a file that must be there."""
@@ -186,4 +190,5 @@ def _nearest(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def nothing_left(fields: Fields) -> None:
     """Refuse words of the mapping that nobody took: a misspelt one would be ignored."""
     for key in fields.rest:
-        raise RecordingError(f"{fields.at(key)} is unknown", expected="a word of the mapping", remedy="correct it")
+        expected = f"one of {', '.join(fields.asked)}"
+        raise RecordingError(f"{fields.at(key)} is unknown", expected=expected, remedy="correct its spelling")

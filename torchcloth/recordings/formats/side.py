@@ -13,10 +13,12 @@ from ..checks import Fields
 from ..files import Folder
 from ..images import ImageStream, Kind
 from ..types import Recording
+from . import words
 from .imported import Imported, ImportedCamera
 
 CLOTH = '"cloth": {"sheet": {"width": 0.3, "height": 0.3}, "areal_density": 0.15, "thickness": 0.0005}'
 PROVENANCE = '"provenance": "measured"'
+MATRIX = '"K": [[fx,0,cx],[0,fy,cy],[0,0,1]]'
 POSE = '"T_world_camera": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]'
 AGREE = 1e-3  # relative, or in metres and pixels: a calibration written twice differs by rounding only
 
@@ -36,6 +38,7 @@ class Scene:
         if path is None:
             return cls({}, Folder(Path()), "the scene (--scene FILE)")
         values = Folder(path.parent).json(path.name).rest
+        words.check(values, str(path))
         return cls(values, Folder(path.parent), str(path))
 
     @property
@@ -79,6 +82,7 @@ class Scene:
     def complete(self, imported: Imported, path: Path) -> Recording:
         """Put the file and the scene together into one checked recording; where both speak they must agree."""
         values = {key: value for key, value in self.values.items() if key not in ("source", "format", "version")}
+        self._refuse_strangers(imported, path)
         self._require(values, imported, path)
         values["cameras"] = self._cameras(imported.cameras)
         values["source"] = imported.notes
@@ -97,20 +101,32 @@ class Scene:
         root = Fields(values, self.name, ": ")
         return reading.assemble(root, self.folder, held, images_of)
 
+    def _refuse_strangers(self, imported: Imported, path: Path) -> None:
+        """A camera that has no images must be described in full; else its name is a mistake."""
+        cameras = self.values.get("cameras")
+        for name in cameras if isinstance(cameras, dict) and imported.cameras else ():
+            if name not in imported.cameras and not {"width", "height", "K"} <= self._item("cameras", name).keys():
+                expected = f"one of {', '.join(imported.cameras)}, as in source"
+                remedy = "rename it, or give its width, height and K"
+                what = f"{self.name}: cameras.{name} has no images in {path}"
+                raise RecordingError(what, expected=expected, remedy=remedy)
+
     def _require(self, values: dict[str, Any], imported: Imported, path: Path) -> None:
         """Say at once everything that the file cannot tell and the scene does not."""
         lacks = [text for key, text in (("cloth", CLOTH), ("provenance", PROVENANCE)) if not values.get(key)]
-        lost = [
-            name
-            for name, camera in imported.cameras.items()
-            if not camera.placed_by and "T_world_camera" not in {**camera.known, **self.camera(name)}
-        ]
+        lost = {name: said for name, c in imported.cameras.items() if (said := self._lost(name, c))}
         if lost:
-            lacks.append('"cameras": {' + ", ".join(f'"{name}": {{{POSE}}}' for name in lost) + "}")
+            lacks.append('"cameras": {' + ", ".join(f'"{name}": {{{", ".join(w)}}}' for name, w in lost.items()) + "}")
         if lacks:
             remedy = "units m, kg/m^2; or cloth.mesh with an OBJ file beside it" if "cloth" not in values else ""
             what = f"{path} does not tell everything"
             raise RecordingError(what, expected=f"{self.name} with {{{', '.join(lacks)}}}", remedy=remedy)
+
+    def _lost(self, name: str, camera: ImportedCamera) -> list[str]:
+        """What neither the file nor the scene says of a camera."""
+        said = {**camera.known, **self.camera(name)}
+        pose = [] if camera.placed_by or "T_world_camera" in said else [POSE]
+        return pose if "K" in said else [MATRIX, *pose]
 
     def _cameras(self, found: dict[str, ImportedCamera]) -> dict[str, Any]:
         """Cameras of the scene and of the file; what the file says wins, a contradiction is refused."""
