@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import torch
 from twins import TRUE, at, first, twin
 
 import torchcloth as tc
-from torchcloth.identification import identify
+from torchcloth.errors import InvalidInput
+from torchcloth.identification import cloth_from, identify
 
 PAIR = ["youngs_modulus", "air.normal"]
 STATED = 0.005  # kg/m^2, the recording's error of its areal density
@@ -235,3 +237,10 @@ def test_a_fit_repeats_bit_by_bit_and_leaves_the_cloth_as_it_was(model, brief):
     assert a.parameters["youngs_modulus"] == b.parameters["youngs_modulus"]
     assert np.array_equal(a.frames_after[0], b.frames_after[0])
     assert all(torch.equal(value, before[name]) for name, value in model.named_parameters())
+
+
+@pytest.mark.parametrize(("name", "remedy"), [("air.normal", "give air.density"), ("bending.stiffness", "give cloth")])
+def test_an_effect_that_the_episode_does_not_bring_says_how(recording, name, remedy):
+    bare = replace(recording, air_density=None, cloth=replace(recording.cloth, nominal={}))
+    with pytest.raises(InvalidInput, match=remedy):
+        identify(cloth_from(bare), bare, [name])

@@ -14,6 +14,10 @@ from ..errors import InvalidInput
 from ..parameters import PhysicalParameter, to_value
 
 DECADE = math.log(10.0)
+ABSENT = {  # effects that an episode's facts bring into the model
+    "air": "the model has no air: give air.density in episode.json",
+    "bending": "the model has no bending: give cloth.nominal.bending_stiffness in episode.json",
+}
 PRIOR_LOGIT = 1.0  # of logit(2 nu): around 0.2, 95 % of the prior between 0.04 and 0.42
 
 
@@ -97,7 +101,8 @@ def collect(cloth: Cloth, names: Sequence[str], density_std: float | None, absen
         if name not in known:
             possible = sorted(n for n, path in known.items() if not needs_contact(cloth, path))
             part = dict(cloth.material.named_modules()).get(name)
-            remedy = "a value for each triangle: fit_fields" if isinstance(part, PhysicalParameter) else ""
+            field = isinstance(part, PhysicalParameter)
+            remedy = "a value for each triangle: fit_fields" if field else ABSENT.get(name.split(".")[0], "")
             raise InvalidInput(
                 "parameter to fit", got=repr(name), expected=f"one of {', '.join(possible)}", remedy=remedy
             )
