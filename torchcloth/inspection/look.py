@@ -86,7 +86,8 @@ def inspect(recording: Recording) -> Inspection:
     if recording.markers is not None:
         seen["markers"] = frames.of_markers(recording.markers, recording.cloth)
     if recording.points is not None:
-        seen["points"], more = frames.of_clouds(recording.points, recording.cloth)
+        held = _held(recording.points.t + recording.clock_offset, moved)
+        seen["points"], more = frames.of_clouds(recording.points, recording.cloth, held)
         notes += more
     late = lag(recording, moved, {name: ~found.rejected for name, found in seen.items()})
     shift = late.value if late is not None and late.told else -recording.clock_offset
@@ -107,6 +108,11 @@ def inspect(recording: Recording) -> Inspection:
         depth,
         notes + _remarks(recording, moved, late),
     )
+
+
+def _held(t: np.ndarray, moved: dict[str, Path]) -> np.ndarray:
+    """[T, G, 3] m, where the grippers are at times on the motion clock."""
+    return np.stack([path.at(t)[0] for path in moved.values()], 1) if moved else np.zeros((len(t), 0, 3))
 
 
 def _noises(recording: Recording, moved: dict[str, Path], seen: dict[str, Frames], shift: float) -> dict[str, Noise]:
