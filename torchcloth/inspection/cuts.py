@@ -46,7 +46,7 @@ def cuts(
             there = np.abs(bound - usual) < FLAT
             if there.mean() <= 0.5:
                 continue
-            extents = [np.ptp(kept[i][:, axis]) for i in np.flatnonzero(there) if len(kept[i])]
+            extents = [np.ptp(f[:, axis]) for f, here in zip(kept, there, strict=True) if here and len(f)]
             near = (np.abs(held[there, :, axis] - usual) < HELD).any(-1)
             if near.mean() <= 0.5 and not (extents and _whole(float(np.median(extents)), cloth)):
                 found[f"{name} {sign}"] = usual

@@ -17,11 +17,16 @@ Array = np.ndarray
 class Calibration(Protocol):
     """What a recorded camera tells of itself, for example a ``recordings.Camera``."""
 
-    width: int
-    height: int
-    K: Array
-    T_world_camera: Array
-    distortion: Array
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def K(self) -> Array: ...
+    @property
+    def T_world_camera(self) -> Array: ...
+    @property
+    def distortion(self) -> Array: ...
 
 
 @dataclass(frozen=True, eq=False)
