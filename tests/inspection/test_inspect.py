@@ -233,3 +233,23 @@ def test_the_report_is_json_and_a_picture(tmp_path, capsys, needs_open3d):
     assert "rate [Hz]" in text
     assert "0.1" in text
     assert max(map(len, text.splitlines())) <= 120
+
+
+@pytest.mark.parametrize(("stamped", "stated", "moved"), [(0.2, 0.0, -0.2), (0.2, 0.2, -0.2), (0.01, 0.0, 0.0)])
+def test_observations_are_moved_by_a_lag_that_is_clear_only(stamped, stated, moved):
+    recording = replace(episode(markers=markers(lag=stamped, **GRID)), clock_offset=-stated)
+    late = inspect(recording).lag
+    assert late.told
+    assert late.differs == (stamped == 0.2 and stated == 0.0)
+    assert -late.trusted == pytest.approx(moved, abs=0.01 if late.differs else 1e-12)
+
+
+def test_coverage_and_what_was_removed_are_explained(capsys, monkeypatch, needs_open3d):
+    recording = episode(points=clouds())
+    show(inspect(recording))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "apart from the cloth" in said
+    assert "outliers not removed" not in said
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    show(inspect(recording))
+    assert "outliers not removed" in " ".join(capsys.readouterr().out.split())

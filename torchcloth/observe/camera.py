@@ -18,15 +18,29 @@ class Calibration(Protocol):
     """What a recorded camera tells of itself, for example a ``recordings.Camera``."""
 
     @property
-    def width(self) -> int: ...
+    def width(self) -> int:
+        """Pixels."""
+        ...
+
     @property
-    def height(self) -> int: ...
+    def height(self) -> int:
+        """Pixels."""
+        ...
+
     @property
-    def K(self) -> Array: ...
+    def K(self) -> Array:
+        """[3, 3] intrinsic matrix, pixels."""
+        ...
+
     @property
-    def T_world_camera(self) -> Array: ...
+    def T_world_camera(self) -> Array:
+        """[4, 4] camera to world, m."""
+        ...
+
     @property
-    def distortion(self) -> Array: ...
+    def distortion(self) -> Array:
+        """[N] coefficients in OpenCV's order."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
