@@ -80,6 +80,12 @@ def test_depth_images_are_looked_at_and_a_damaged_one_is_one_line(tmp_path, caps
     assert found["depth"]["cam0"]["middle"] == pytest.approx(1.25)
     assert found["depth"]["cam0"]["distorted"]
     assert found["streams"]["cam0/depth"]["rate"] == pytest.approx(30)
+    assert main(["inspect", str(folder), "--out", str(tmp_path / "out")]) == 0
+    with image.open(tmp_path / "out" / "inspection.png") as drawn:
+        pixels = np.asarray(drawn.convert("RGB"), int)
+    lower = pixels[pixels.shape[0] // 2 :, : pixels.shape[1] // 2]
+    assert (np.ptp(lower, axis=-1) > 40).mean() > 0.1  # the depth in colours, where points would be
+    capsys.readouterr()
     (folder / "cam0" / "depth" / "000001.png").write_bytes(b"no image")
     assert main(["inspect", str(folder)]) == 2
     assert capsys.readouterr().err.count("\n") == 1

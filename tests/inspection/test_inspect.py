@@ -15,6 +15,7 @@ from swinging import clouds, episode, markers, motion, path, pattern
 from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
 from torchcloth.inspection import draw, inspect, show
+from torchcloth.inspection.cuts import cuts
 from torchcloth.inspection.streams import ticks
 
 GRID = {"extra": {"grid": np.array([8, 8])}}
@@ -147,6 +148,46 @@ def test_clouds_outliers_crop_area_and_strangers(needs_open3d):
     assert np.median(found.coverage) < 0.85 * np.median(whole.coverage)  # 0.5 m - 0.3 m of the 0.3 m are left
 
 
+def fold(*, cut=-np.inf, frames=60):
+    """A sheet of 0.5 m lying at z = 0.1 m, whose half y > 0 a gripper at its far edge lifts and lays on the other.
+
+    The edge y = -0.25 m never moves; points with y < ``cut`` are left out.
+    """
+    rng = np.random.default_rng(0)
+    t = np.arange(frames) / 10
+    turn = np.pi * 0.95 * np.clip((t - 0.5) / 5, 0, 1)
+    clouds = []
+    for angle in turn:
+        u, v = rng.uniform(-0.25, 0.25, (2, 2000))
+        up = np.maximum(v, 0)
+        cloud = np.stack([u, np.minimum(v, 0) + up * np.cos(angle), 0.1 + up * np.sin(angle)], -1)
+        clouds.append(cloud[cloud[:, 1] > cut])
+    hand = np.stack([0 * t, 0.25 * np.cos(turn), 0.1 + 0.25 * np.sin(turn)], -1)
+    grip = rec.GripperMotion(t, hand, np.tile([1.0, 0, 0, 0], (frames, 1)), np.ones(frames, bool))
+    points = rec.PointClouds(t, np.concatenate(clouds), np.array([len(c) for c in clouds]))
+    cloth = rec.ClothInfo(areal_density=0.2, sheet=(0.5, 0.5))
+    return rec.Recording(cloth=cloth, grippers={"hand": grip}, provenance="synthetic: tests", points=points)
+
+
+def test_a_cloth_that_ends_is_not_cut_off(needs_open3d):
+    assert inspect(fold()).frames["points"].cuts == {}
+    found = inspect(fold(cut=-0.1)).frames["points"].cuts
+    assert found["y >"] == pytest.approx(-0.1, abs=1e-3)
+
+
+@pytest.mark.parametrize("why", ["held", "whole", "complete", "none"])
+def test_what_excuses_a_bound(why):
+    """A cloud of 0.2 m that swings up from y = 0; a cloth of 0.4 m, unless it is told to be small."""
+    rng = np.random.default_rng(0)
+    heights = np.linspace(0.1, 0.25 if why != "whole" else 0.19, 20)
+    clouds = [np.append(rng.uniform(0, [0.1, h, 0.1], (3000, 3)), [[0, 0, 0]], axis=0) for h in heights]
+    side = 0.15 if why == "whole" else 0.4
+    held = np.full((20, 1, 3), 0.02 if why == "held" else 0.5)
+    seen = np.full(20, 1.1 if why == "complete" else 0.6)
+    found = cuts(clouds, clouds, rec.ClothInfo(areal_density=0.2, sheet=(side, side)), seen, held)
+    assert found == ({"y >": 0.0} if why == "none" else {})
+
+
 def test_ticks_gaps_and_jitter():
     t = np.arange(50) / 10
     even = ticks("points", t)
@@ -192,3 +233,23 @@ def test_the_report_is_json_and_a_picture(tmp_path, capsys, needs_open3d):
     assert "rate [Hz]" in text
     assert "0.1" in text
     assert max(map(len, text.splitlines())) <= 120
+
+
+@pytest.mark.parametrize(("stamped", "stated", "moved"), [(0.2, 0.0, -0.2), (0.2, 0.2, -0.2), (0.01, 0.0, 0.0)])
+def test_observations_are_moved_by_a_lag_that_is_clear_only(stamped, stated, moved):
+    recording = replace(episode(markers=markers(lag=stamped, **GRID)), clock_offset=-stated)
+    late = inspect(recording).lag
+    assert late.told
+    assert late.differs == (stamped == 0.2 and stated == 0.0)
+    assert -late.trusted == pytest.approx(moved, abs=0.01 if late.differs else 1e-12)
+
+
+def test_coverage_and_what_was_removed_are_explained(capsys, monkeypatch, needs_open3d):
+    recording = episode(points=clouds())
+    show(inspect(recording))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "apart from the cloth" in said
+    assert "outliers not removed" not in said
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    show(inspect(recording))
+    assert "outliers not removed" in " ".join(capsys.readouterr().out.split())

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from torchcloth import recordings as rec
 from torchcloth import robots
@@ -47,6 +48,40 @@ def test_a_slower_stream_is_shown_all_the_time(rich):
     points = rec.PointClouds(t, np.zeros((21, 3)), np.ones(21, int))
     slow = replace(rich, points=points, markers=replace(rich.markers, t=np.array([0.1, 0.2, 0.3, 0.4])))
     assert [len(frame) for frame in film_of(slow).clouds["markers"].frames][:18] == [2] * 3 + [1] * 5 + [2] * 10
+
+
+def depth_only(tmp_path, rich):
+    """A camera 1 m above a level floor at z = 0.25 m, on which a box of 0.1 m stands; its left half is masked out."""
+    T = np.diag([1.0, -1, -1, 1])
+    T[2, 3] = 1.25
+    depth = np.full((120, 160), 1000, np.uint16)
+    depth[40:80, 60:100] = 900
+    mask = np.zeros((120, 160), np.uint8)
+    mask[:, 80:] = 255
+    streams = {}
+    for kind, image in (("depth", depth), ("mask", mask)):
+        Image.fromarray(image).save(tmp_path / f"{kind}.png")
+        paths = (tmp_path / f"{kind}.png",) * 2
+        streams[kind] = rec.ImageStream(kind, np.arange(2), np.array([0.1, 0.2]), paths, (160, 120))
+    K = np.array([[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]])
+    camera = rec.Camera(width=160, height=120, K=K, T_world_camera=T, depth_scale=0.001, **streams)
+    return replace(rich, points=None, markers=None, joints={}, cameras={"cam0": camera})
+
+
+def test_depth_is_shown_where_there_is_nothing_else(rich, tmp_path):
+    film = film_of(depth_only(tmp_path, rich))
+    (cloud,) = film.clouds.values()
+    assert [len(frame) > 500 for frame in cloud.frames] == [True, True]
+    assert len(cloud.frames[0]) <= 4000
+    x, _, z = cloud.frames[0].T
+    assert x.min() > 0  # the mask's half
+    assert sorted(set(z.round(4).tolist())) == pytest.approx([0.25, 0.35])
+    assert not any("nothing that was seen" in note for note in film.notes)
+
+
+def test_where_nothing_shows_the_cloth_it_says_so(rich):
+    film = film_of(replace(rich, points=None, markers=None, cameras={}))
+    assert any("nothing that was seen" in note for note in film.notes)
 
 
 def test_arms_stand_where_the_kinematics_say(example):

@@ -47,6 +47,21 @@ def test_the_camera_sees_everything(film, look):
     assert spread.max() > 0.6  # and it is not far away
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("part", ["gripper", "point"])
+def test_what_has_no_size_can_be_looked_at(film, part, tmp_path):
+    """A gripper that stands still, or a single point: in the middle, and not a wall of colour."""
+    trace = next(iter(film.traces.values()))
+    still = replace(trace, points=trace.points[:1].repeat(5, 0), poses=trace.poses[:1])
+    clouds = {"points": Cloud((trace.points[:1].astype(np.float32),))}
+    one = only(film, **({"traces": {"grippers/one": still}} if part == "gripper" else {"clouds": clouds}))
+    camera = camera_for(one, (400, 300))
+    np.testing.assert_allclose(camera.project(trace.points[0])[0], [199.5, 149.5], atol=30)
+    assert picture(one, tmp_path / "a.png").is_file()
+    if part == "gripper":
+        assert np.ptp(one.box(), axis=0) == pytest.approx(0.3)
+
+
 def test_lengths_are_equal_in_all_directions(film):
     """Looking along an axis, what is equally long and equally far is equally long in the picture."""
     camera = camera_for(film, (500, 300), (0.0, 0.0))

@@ -15,6 +15,7 @@ from ..losses import closest
 from .episodes import Episode
 from .result import Identification
 
+WIDE = 5.0  # ends of an axis of positive values so many times apart are shown on a logarithmic one
 BEFORE, AFTER, NULL = "#b0653a", "#1f6f8b", "#888888"
 
 
@@ -159,6 +160,9 @@ def parameters(fit: Identification) -> Any:
         axis.set_ylabel(f"{name}{note}\n[{e.unit}]", rotation=0, ha="right", va="center", fontsize=9)
         axis.set_yticks([])
         axis.spines[["left", "top", "right"]].set_visible(False)
+        ends = [*e.ci95, e.value, e.initial]
+        if min(ends) > 0 and max(ends) > WIDE * min(ends):
+            axis.set_xscale("log")
         axis.margins(x=0.1)
     figure.suptitle("estimate and 95 % interval; cross: start", fontsize=10)
     figure.tight_layout()

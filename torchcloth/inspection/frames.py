@@ -9,12 +9,12 @@ import numpy as np
 from ..errors import MissingDependency, RecordingError
 from ..observe import Segmentation, segment
 from ..recordings import ClothInfo, Markers, PointClouds
+from .cuts import cuts
 from .robust import median
 
 TOLERANCE = 0.1  # of the cloth's size
 NEIGHBOURS = 4  # of a marker, whose pattern distances are looked at
 AREA = 8  # neighbours that say how much area a point stands for
-FLAT, MOVES = 1e-3, 0.02  # m: a bound that stays within the one while the cloud moves by the other is a cut
 LINK = 3.0  # times the usual distance of neighbours, within which points belong together
 QUERIES, LARGE = 300, 20_000  # points looked at closely, and among so many
 
@@ -101,8 +101,13 @@ def _neighbours(markers: Markers) -> tuple[np.ndarray, str]:
     return median(ratio, -1)[:, None], why
 
 
-def of_clouds(clouds: PointClouds, cloth: ClothInfo) -> tuple[Frames, list[str]]:
+def of_clouds(clouds: PointClouds, cloth: ClothInfo, held: np.ndarray) -> tuple[Frames, list[str]]:
     """Frames of clouds: outliers aside, none may be wider than the cloth is long, to 10 %.
+
+    Args:
+        clouds: T frames.
+        cloth: its size.
+        held: [T, G, 3] m, where the grippers are in each frame; G may be 0.
 
     Returns:
         The frames, and notes on what could not be done.
@@ -122,7 +127,8 @@ def of_clouds(clouds: PointClouds, cloth: ClothInfo) -> tuple[Frames, list[str]]
     seen = np.array([_area(c) for c in kept]) / (area or np.nan)
     why = "larger than the cloth" if longest else "none: the cloth's size is unknown"
     rejected = np.greater(extent, (1 + TOLERANCE) * longest if longest else np.inf) | (extent == 0)
-    return Frames(rejected, why, seen, removed, _cuts(clouds)), notes
+    found = cuts([clouds.frame(i) for i in range(len(clouds))], kept, cloth, seen, held)
+    return Frames(rejected, why, seen, removed, found), notes
 
 
 def _longest(cloud: np.ndarray) -> float:
@@ -175,19 +181,3 @@ def _size(cloth: ClothInfo) -> tuple[float | None, float | None]:
     if cloth.sheet is not None:
         return float(np.hypot(*cloth.sheet)), float(np.prod(cloth.sheet))
     return None, None
-
-
-def _cuts(clouds: PointClouds) -> dict[str, float]:
-    """Bounds that frames share to 1 mm while the clouds' middles move along that axis by more than 2 cm."""
-    frames = [clouds.frame(i) for i in range(len(clouds))]
-    found = {}
-    for axis, name in enumerate("xyz"):
-        middle = [np.median(f[:, axis]) for f in frames]
-        if len(frames) < 4 or np.diff(np.quantile(middle, [0.1, 0.9]))[0] < MOVES:
-            continue
-        for sign, pick in ((">", np.min), ("<", np.max)):
-            bound = np.array([pick(f[:, axis]) for f in frames])
-            usual = np.median(bound)
-            if np.mean(np.abs(bound - usual) < FLAT) > 0.5:
-                found[f"{name} {sign}"] = float(usual)
-    return found

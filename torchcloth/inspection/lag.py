@@ -22,6 +22,7 @@ FRAMES, POINTS = 300, 1000  # looked at, at most
 BLOCKS = 10  # left out in turn
 WORST = 0.05  # s of standard error, and
 CONTRAST = 1.15  # of the usual misfit over the least, beyond which a lag is none
+CLEARLY, LEAST = 3.0, 0.02  # standard errors and s, by which a lag is another than the stated one
 CANNOT = (
     "it is what the observed cloth near the grippers does later than the grippers: delay of stamps, of the cloth's "
     "own follow-up and of a loose grip are one; of a motion at constant speed it is not told apart from an offset"
@@ -50,6 +51,16 @@ class Lag:
     misfit: float
     tried: np.ndarray
     cost: np.ndarray
+
+    @property
+    def differs(self) -> bool:
+        """Whether it is told, and clearly another than what the recording says."""
+        return self.told and abs(self.value - self.stated) > max(CLEARLY * self.std, LEAST)
+
+    @property
+    def trusted(self) -> float:
+        """s, to move observations by: the value where it differs, else what the recording says."""
+        return self.value if self.differs else self.stated
 
 
 def lag(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..identification.pictures import save_figure
+from ..observe import decode
 from .look import Inspection
 from .streams import GAP, times
 
@@ -28,6 +29,8 @@ def draw(report: Inspection, folder: str | Path) -> Path:
     _timeline(figure.add_subplot(grid[0, :2]), report)
     _clock(figure.add_subplot(grid[0, 2]), report)
     shown = _shown(report)
+    if not shown:
+        _images([figure.add_subplot(grid[1, column]) for column in (0, 1)], report)
     for column, (kind, i) in enumerate(shown):
         _frame(figure.add_subplot(grid[1, column], projection="3d"), report, kind, i)
     _quality(figure.add_subplot(grid[1, 2]), report)
@@ -39,7 +42,7 @@ def draw(report: Inspection, folder: str | Path) -> Path:
 def _timeline(axis: Any, report: Inspection) -> None:
     """A tick per frame; gaps in another colour, rejected frames too."""
     streams = times(report.recording)
-    shift = -report.lag.value if report.lag is not None and report.lag.told else report.recording.clock_offset
+    shift = _shift(report)
     for row, (name, (kind, t)) in enumerate(streams.items()):
         moved = t if kind in ("motion", "joints", "motion + joints") else t + shift
         axis.vlines(moved, row - 0.35, row + 0.35, color=GOOD, linewidth=0.6)
@@ -59,6 +62,11 @@ def _timeline(axis: Any, report: Inspection) -> None:
     axis.invert_yaxis()
 
 
+def _shift(report: Inspection) -> float:
+    """s, from the observations' clock to the motion's."""
+    return report.recording.clock_offset if report.lag is None else -report.lag.trusted
+
+
 def _clock(axis: Any, report: Inspection) -> None:
     axis.set_title("lag of the observations", fontsize=10)
     late = report.lag
@@ -70,6 +78,7 @@ def _clock(axis: Any, report: Inspection) -> None:
         axis.axvspan(late.value - 2 * late.std, late.value + 2 * late.std, color=BAD, alpha=0.25)
         axis.axvline(late.value, color=BAD, label=f"found {late.value:.3f} ± {late.std:.3f} s")
     axis.set(xlabel="lag tried [s]", ylabel="misfit of what is held [mm]")
+    axis.locator_params(axis="x", nbins=5)
     axis.legend(fontsize=8)
 
 
@@ -83,6 +92,26 @@ def _shown(report: Inspection) -> list[tuple[str, int]]:
     return []
 
 
+def _images(axes: list[Any], report: Inspection) -> None:
+    """Two depth images of a camera, where there are no frames of points to draw."""
+    seen = [
+        (name, camera.depth, camera.depth_scale)
+        for name, camera in report.recording.cameras.items()
+        if name in report.depth and camera.depth is not None and camera.depth_scale is not None
+    ]
+    for share, axis in zip((1, 2), axes, strict=True):
+        if not seen:
+            _nothing(axis, "no good frame" if report.frames else "nothing to draw: no points, no markers, no depth")
+            continue
+        name, images, scale = seen[0]
+        i = len(images) * share // 3
+        depth = decode(images.load(i), scale)
+        shown = axis.imshow(np.where(depth > 0, depth, np.nan), cmap="viridis")
+        axis.figure.colorbar(shown, ax=axis, shrink=0.6, label="depth [m]")
+        axis.set(title=f"{name}, depth image {i}", xticks=[], yticks=[])
+        axis.title.set_fontsize(10)
+
+
 def _frame(axis: Any, report: Inspection, kind: str, i: int) -> None:
     """A frame with the grippers' whole paths and places."""
     recording = report.recording
@@ -90,7 +119,7 @@ def _frame(axis: Any, report: Inspection, kind: str, i: int) -> None:
     cloud = stream.xyz[i] if kind == "markers" else stream.frame(i)
     cloud = cloud[np.isfinite(cloud[:, 0])]
     cloud = cloud[:: max(1, len(cloud) // MOST)]
-    t = stream.t[i] - (report.lag.value if report.lag is not None and report.lag.told else -recording.clock_offset)
+    t = stream.t[i] + _shift(report)
     axis.scatter(*cloud.T, s=6 if len(cloud) < 500 else 1, color=INK, depthshade=False)
     everything = [cloud]
     for name, path in report.paths.items():
@@ -103,8 +132,10 @@ def _frame(axis: Any, report: Inspection, kind: str, i: int) -> None:
     middle, half = (points.max(0) + points.min(0)) / 2, max(np.ptp(points, axis=0).max() / 2, 1e-3)
     axis.set(**{f"{a}lim": (m - half, m + half) for a, m in zip("xyz", middle, strict=True)})
     axis.set_box_aspect((1, 1, 1), zoom=1.1)
-    axis.tick_params(labelsize=6)
+    axis.tick_params(labelsize=6, pad=-2)
     axis.locator_params(nbins=4)
+    for name in "xyz":
+        getattr(axis, f"set_{name}label")(f"{name} [m]", fontsize=7, labelpad=-8)
     axis.set_title(f"{kind}, frame {i}, t = {stream.t[i]:.2f} s", fontsize=10)
 
 

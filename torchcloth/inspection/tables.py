@@ -10,6 +10,10 @@ from .frames import Frames
 from .look import Inspection
 
 WIDTH = 100
+MARKERS_SEEN = "share of the markers seen"
+AREA_SEEN = "area seen over the cloth's, to 20 %, so 1 may be exceeded; far above 1: noise, or more than the cloth"
+WITH_OUTLIERS = "outliers not removed"
+STAGES = {"outliers": "alone, far from their neighbours", "clusters": "in small pieces apart from the cloth"}
 
 
 def show(report: Inspection) -> None:
@@ -66,14 +70,18 @@ def _findings(console: Any, report: Inspection) -> None:
 
 def _frames(table: Any, name: str, found: Frames, report: Inspection) -> None:
     count = int(found.rejected.sum())
-    table.add_row(f"rejected frames, {name}", f"{100 * found.rejected.mean():.1f} %", f"{count}: {found.why}")
+    table.add_row(f"rejected frames, {name}", f"{100 * found.rejected.mean():.1f} %", f"{count}, told by: {found.why}")
     if np.isfinite(found.coverage).any():
         least, usual, most = np.nanquantile(found.coverage, [0.0, 0.5, 1.0])
-        meaning = "markers seen" if name == "markers" else "area seen over the cloth's"
+        meaning = MARKERS_SEEN if name == "markers" else AREA_SEEN if found.removed else f"{AREA_SEEN}, {WITH_OUTLIERS}"
         table.add_row(f"coverage, {name}", f"{usual:.2f}", f"{least:.2f} to {most:.2f}, {meaning}")
     points = report.recording.points
     for stage, removed in found.removed.items():
         if points is not None:
-            table.add_row(f"{stage}, {name}", f"{100 * removed / len(points.xyz):.2f} %", f"{removed} points")
+            table.add_row(
+                f"{stage}, {name}",
+                f"{100 * removed / len(points.xyz):.2f} %",
+                f"{removed} points, {STAGES.get(stage, 'left out')}",
+            )
     for bound, value in found.cuts.items():
         table.add_row(f"cut off, {name}", f"{bound} {value:.4f} m", "most frames end there")

@@ -17,11 +17,30 @@ Array = np.ndarray
 class Calibration(Protocol):
     """What a recorded camera tells of itself, for example a ``recordings.Camera``."""
 
-    width: int
-    height: int
-    K: Array
-    T_world_camera: Array
-    distortion: Array
+    @property
+    def width(self) -> int:
+        """Pixels."""
+        ...
+
+    @property
+    def height(self) -> int:
+        """Pixels."""
+        ...
+
+    @property
+    def K(self) -> Array:
+        """[3, 3] intrinsic matrix, pixels."""
+        ...
+
+    @property
+    def T_world_camera(self) -> Array:
+        """[4, 4] camera to world, m."""
+        ...
+
+    @property
+    def distortion(self) -> Array:
+        """[N] coefficients in OpenCV's order."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

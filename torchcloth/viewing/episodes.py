@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from ..boundaries.motion import interpolate
-from ..errors import RecordingError, TorchclothError
-from ..observe import solid_mesh
+from ..errors import InvalidInput, RecordingError, TorchclothError
+from ..observe import DepthCamera, decode, solid_mesh, to_points
 from ..recordings import Collider, Recording
 from ..robots import arm_of, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..types import Trajectory
@@ -29,13 +29,15 @@ from .geometry import Array, nearest
 
 RATE = 25.0  # 1/s, frames of an episode that was not observed
 MARGIN = 0.3  # m, by which a collider's plane is drawn beyond what lies over it
+FROM_DEPTH = 4000  # points of a depth image that are shown at most
 SLACK = 0.5  # of the time between two frames of the slower stream: what was seen farther away is not shown
 
 
 def film_of(recording: Recording, *, truth: bool = False, times: Array | None = None) -> Film:
     """What an episode holds: points, markers, arms, grippers' paths, colliders, cameras, forces.
 
-    A stream that was not recorded is not shown.
+    A stream that was not recorded is not shown. Depth images are shown as points where there are no other points, and
+    no markers: within their masks where there are some.
 
     Args:
         recording: an episode.
@@ -52,14 +54,18 @@ def film_of(recording: Recording, *, truth: bool = False, times: Array | None = 
     arms, paths, notes = _arms(recording, times)
     if recording.grippers:
         paths = {**replay(replace(recording, joints={})), **paths}
+    clouds, views = _clouds(recording, times), _views(recording, times)
+    if not clouds:
+        clouds, more = _depths(recording, views, times)
+        notes += more
     film = Film(
         title=recording.path.name if recording.path else "recording",
         times=times,
         sheets={"truth": _truth(recording, times)} if truth else {},
-        clouds=_clouds(recording, times),
+        clouds=clouds,
         solids=arms,
         traces={f"grippers/{name}": _trace(path, times) for name, path in paths.items()},
-        views={f"cameras/{name}": view for name, view in _views(recording, times).items()},
+        views={f"cameras/{name}": view for name, view in views.items()},
         curves=_curves(recording),
         notes=tuple(notes),
     )
@@ -104,6 +110,40 @@ def _clouds(recording: Recording, times: Array) -> dict[str, Cloud]:
         rows = [nothing if i < 0 else markers.xyz[i].astype(np.float32) for i in index]
         out["markers"] = Cloud(tuple(row[np.isfinite(row).all(axis=-1)] for row in rows), MARKERS)
     return out
+
+
+def _depths(recording: Recording, views: dict[str, View], times: Array) -> tuple[dict[str, Cloud], list[str]]:
+    """What the depth images of each camera show; what is not drawn, and why."""
+    clouds, notes = {}, []
+    for name, view in views.items():
+        try:
+            camera = DepthCamera.of(view.camera)
+        except InvalidInput as error:
+            notes.append(f"depth of {name!r} is not drawn: {error}")
+            continue
+        if view.camera.depth is not None and (scale := view.camera.depth_scale) is not None:
+            clouds[f"depth/{name}"] = _from_depth(recording, view, camera, scale, times)
+    if not clouds:
+        found = "images are not drawn" if views else "no images"
+        notes.append(f"nothing that was seen of the cloth is drawn: no points, no markers, {found}")
+    return clouds, notes
+
+
+def _from_depth(recording: Recording, view: View, camera: DepthCamera, scale: float, times: Array) -> Cloud:
+    """A camera's depth images as points, thinned."""
+    recorded, masks = view.camera, np.full(len(times), -1)
+    if recorded.mask is not None:
+        masks = _seen(recorded.mask.t + recording.clock_offset, times)
+    frames = []
+    for frame, mask in enumerate(masks):
+        raw = view.raw(frame)
+        if raw is None:
+            frames.append(np.zeros((0, 3), np.float32))
+            continue
+        inside = None if mask < 0 or recorded.mask is None else recorded.mask.load(int(mask)) > 0
+        points = to_points(camera, decode(raw, scale), inside)
+        frames.append(points[:: max(1, -(-len(points) // FROM_DEPTH))].astype(np.float32))
+    return Cloud(tuple(frames))
 
 
 def _truth(recording: Recording, times: Array) -> Sheet:

@@ -20,6 +20,7 @@ DISTANCE = "distance"  # name of the curve that belongs to the sheets' values; p
 CLOTH, TRUTH, POINTS, MARKERS = (158, 184, 206), (126, 168, 110), (30, 34, 40), (200, 40, 120)
 CELL = 0.1  # m, of the grid on a plane or floor
 FLOOR = (255, 255, 255)
+SMALLEST, ALONE = 0.01, 0.3  # m, what a film is about is at least so large; where no cloth and no points are to be seen
 ARM, COLLIDER, PATH = (206, 210, 215), (206, 196, 180), (70, 110, 190)
 
 
@@ -152,7 +153,12 @@ class Film:
         if not about:
             return np.full(3, -0.5), np.full(3, 0.5)
         points = np.concatenate(about)
-        return points.min(axis=0), points.max(axis=0)
+        low, high = points.min(axis=0), points.max(axis=0)
+        cloth = bool(self.sheets) or any(len(frame) for cloud in self.clouds.values() for frame in cloud.frames)
+        least = SMALLEST if cloth else ALONE
+        if (high - low).max() < least:  # a gripper that stands still has no size
+            low, high = (low + high - least) / 2, (low + high + least) / 2
+        return low, high
 
     def take(self, index: Array) -> Film:
         """The film of some frames [N], in their order."""

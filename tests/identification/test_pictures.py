@@ -1,0 +1,28 @@
+"""What a picture of a fit shows can be read."""
+
+from types import SimpleNamespace
+from typing import Any
+
+from torchcloth.identification.pictures import parameters, save_figure
+
+
+def estimate(value, initial, *ci95) -> Any:
+    return SimpleNamespace(value=value, initial=initial, ci95=list(ci95), source="data", identifiable=True, unit="Pa")
+
+
+def test_a_wide_interval_of_a_positive_parameter_is_logarithmic(tmp_path):
+    shown = {
+        "wide": estimate(3e5, 1e5, 3e3, 2.7e7),
+        "narrow": estimate(0.2, 0.3, 0.15, 0.25),
+        "signed": estimate(1.0, 0.1, -3.0, 5.0),
+        "far start": estimate(1.0, 100.0, 0.9, 1.1),
+    }
+    fit: Any = SimpleNamespace(parameters=shown)
+    figure = parameters(fit)
+    scales = dict(zip(shown, [axis.get_xscale() for axis in figure.axes], strict=True))
+    assert scales == {"wide": "log", "narrow": "linear", "signed": "linear", "far start": "log"}
+    low, high = figure.axes[0].get_xlim()
+    place = figure.axes[0].transData.transform([(3e5, 0)])[0, 0]
+    left, right = figure.axes[0].transData.transform([(low, 0), (high, 0)])[:, 0]
+    assert 0.3 < (place - left) / (right - left) < 0.7  # the value stands in the middle, not at the left end
+    assert save_figure(figure, tmp_path / "a.png").is_file()
