@@ -42,9 +42,9 @@ class Gap(NamedTuple):
         """The error for a distance below ``least`` [m]."""
         return InvalidInput(
             f"{self.first} comes too near to {self.second} at t = {self.time:.3g} s",
-            got=f"{max(self.distance, 0.0):.3g} m",
-            expected=f"at least {least:g} m",
-            remedy="move the grips or the path, or choose another hold",
+            got=f"{self.distance:.3g} m" if self.distance > 0 else "they touch or cross",
+            expected=f"at least {least:g} m" if least > 0 else "apart",
+            remedy="turn the grippers less (roll), change heading, grips or path, or choose another hold",
         )
 
 

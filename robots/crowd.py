@@ -57,4 +57,4 @@ def between_arms(scene: Scene, splines: Mapping[str, Spline]) -> Gap:
 
 
 def _solids(arm: Arm, name: str, q: Tensor) -> list[Named]:
-    return [Named(f"{p.link!r} of {name!r}", p) for p in arm.geometry(q)]
+    return [Named(f"{p.link} of {name}", p) for p in arm.geometry(q)]

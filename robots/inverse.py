@@ -46,6 +46,22 @@ def solve(
     return torch.stack(solved)
 
 
+@torch.no_grad()
+def reach(arm: Arm) -> tuple[Tensor, float]:
+    """The shoulder ``[3]`` m, a fixed point of the first axis, and a distance [m] from it that no pose exceeds.
+
+    The bound is the length of the links laid in a line; infinite for an arm with a prismatic joint.
+    """
+    places = torch.cat([arm._bodies(arm.home)[1:], arm(arm.home)[None]])
+    origins = places[:, :3, 3]
+    axis = places[0, :3, :3] @ arm._axis[0]
+    shoulder = origins[0] + axis * (axis @ (origins[1] - origins[0]))
+    chain = torch.cat([shoulder[None], origins[1:]])
+    if "prismatic" in arm.joint_types:
+        return shoulder, torch.inf
+    return shoulder, float(chain.diff(dim=0).norm(dim=-1).sum())
+
+
 def _approach(
     arm: Arm, target: Tensor, q: Tensor, reference: Tensor, limit: Tensor, tolerance: float, iterations: int
 ) -> tuple[Tensor, float]:

@@ -14,9 +14,11 @@ from torchcloth.errors import InvalidInput
 from torchcloth.recordings import JointMotion
 from torchcloth.types import Trajectory
 
+from .arm import Arm
 from .clearance import FAR, Gap
 from .crowd import between_arms, within_arm
 from .holds import Hold, candidates, inward
+from .inverse import reach
 from .primitives import Action
 from .scene import Scene
 from .spline import Spline
@@ -39,6 +41,13 @@ class Plan(NamedTuple):
     limiting: str  # which joint of which arm, by what limit, is nearest to its bound
     gap: Gap  # what comes nearest, fingers at the table left out
     holds: dict[str, Hold]
+
+    def __repr__(self) -> str:
+        near = f"{self.gap.first} to {self.gap.second}, " if self.gap.first else "at least "
+        return (
+            f"Plan({', '.join(self.q)}: {float(self.t[-1]):.3g} s, {self.slower:.3g} times as long as asked, "
+            f"limited by {self.limiting}; nearest: {near}{1e3 * self.gap.distance:.3g} mm)"
+        )
 
     def motion(self, scene: Scene) -> dict[str, Trajectory]:
         """The poses that the joints lead through, by gripper."""
@@ -84,6 +93,8 @@ def plan(
     for name, value in {"acceleration": acceleration, "clearance": clearance, "period": period}.items():
         if not (math.isfinite(value) and value > 0):
             raise InvalidInput(name, got=value, expected="a finite value > 0")
+    for name, path in action.motion.items():
+        _check_reach(scene[name], name, path)
     options = {
         name: _options(scene, name, action, acceleration, clearance, (holds or {}).get(name)) for name in scene.arms
     }
@@ -127,6 +138,19 @@ def _options(
     if not found:
         raise refusals[0]
     return sorted(found, key=lambda option: option[0].load.factor)
+
+
+def _check_reach(arm: Arm, name: str, path: Trajectory) -> None:
+    """Refuses at once what is farther than the arm is long; the search would take long to find that out."""
+    shoulder, longest = reach(arm)
+    distance = (path.pose[:, :3, 3].to(shoulder) - shoulder).norm(dim=-1)
+    if float(distance.max()) > longest:
+        raise InvalidInput(
+            f"the path of {name!r} leaves the reach of {arm.name!r} at t = {float(path.t[distance.argmax()]):.3g} s",
+            got=f"{float(distance.max()):.3g} m from the shoulder",
+            expected=f"less than {longest:.3g} m, the arm stretched out",
+            remedy="move the grips or the path nearer to the arm",
+        )
 
 
 def _timed(scene: Scene, action: Action, chosen: dict[str, Way], gap: Gap, slow_down: bool, period: float) -> Plan:

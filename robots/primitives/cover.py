@@ -26,7 +26,8 @@ def cover(
         heading: direction of the landing, from the world's x axis [rad].
         height: of the arch's top above the grip [m]; None: half the reach, a semicircle.
         landing: the grip's height where it opens [m].
-        roll: turn of the grippers on the way [rad]; pi lays the cloth without a twist at the grip.
+        roll: turn of the grippers on the way [rad]; pi lays the cloth without a twist at the grip, but brings an
+            arm's hand to the table: ``bimanual_rig`` can do about 0.7.
         rest: time after opening [s].
         limits: of the grippers.
 

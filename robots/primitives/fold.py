@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from .moves import Action, Grips, Limits, Move, action, along, check, lowest
+from .moves import Action, Grips, Limits, Move, action, along, check, rise_to
 
 
 def fold(
@@ -28,7 +28,8 @@ def fold(
         height: of the grips above the table while they cross [m].
         landing: the grips' height where they open [m].
         short: how far the edge stays behind its mirror image [m].
-        roll: turn of the grippers while they cross [rad]; pi lays the edge down without a twist at the grip.
+        roll: turn of the grippers while they cross [rad]; pi lays the edge down without a twist at the grip, but
+            brings an arm's hand to the table: ``bimanual_rig`` can do about 0.7.
         rest: time after opening [s].
         limits: of the grippers.
 
@@ -37,8 +38,7 @@ def fold(
     """
     reach = 2 * crease - short
     check(crease=crease, reach=reach, landing=landing, **{"height over the landing": height - landing})
-    rise = height - lowest(grips)
-    check(**{"height over the grips": rise})
+    rise = rise_to(height, grips)
     moves = [
         Move((0.0, 0.0, rise)),
         Move(along(heading, reach), roll=roll),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .moves import Action, Grips, Limits, Move, action, along, check, finite, lowest
+from .moves import Action, Grips, Limits, Move, action, along, finite, rise_to
 
 
 def hang(
@@ -27,7 +27,6 @@ def hang(
     Raises:
         InvalidInput: a value that gives no motion, or a height below the grips.
     """
-    rise = height - lowest(grips)
-    check(**{"height over the grips": rise})
+    rise = rise_to(height, grips)
     finite(carry=carry)
     return action(grips, [Move(along(heading, carry, rise))], heading, rest, limits, release=False)

@@ -104,12 +104,26 @@ def lowest(grips: Grips) -> float:
     return float(points(grips)[:, 2].min())
 
 
+def rise_to(height: float, grips: Grips) -> float:
+    """How far [m] the lowest gripper rises to a height above the table; refuses one that is not above it."""
+    start = lowest(grips)
+    if not height > start or math.isinf(height):
+        raise InvalidInput(
+            "height above the table",
+            got=f"{height:g} m",
+            expected=f"more than the grips' own: the lowest is at {start:g} m",
+            remedy="lower the grips, or ask for more height",
+        )
+    return height - start
+
+
 def points(grips: Grips) -> Tensor:
     """[G, 3] m, where the grippers hold; refuses what is no place."""
+    expected = 'three finite coordinates in metres for each gripper, as {"left": (0.5, 0.2, 0.02)}'
+    if not isinstance(grips, Mapping):
+        raise InvalidInput("grips", got=f"{grips}", expected=expected)
     if not grips or any(len(point) != 3 or not all(map(math.isfinite, point)) for point in grips.values()):
-        raise InvalidInput(
-            "grips", got=f"{dict(grips)}", expected="three finite coordinates in metres for each gripper"
-        )
+        raise InvalidInput("grips", got=f"{dict(grips)}", expected=expected)
     return torch.tensor([list(point) for point in grips.values()], dtype=torch.float64)
 
 

@@ -11,6 +11,7 @@ from torchcloth.boundaries.motion import interpolate
 from torchcloth.errors import InvalidInput
 from torchcloth.robots import Hold, plan
 from torchcloth.robots import primitives as P
+from torchcloth.robots.inverse import reach
 from torchcloth.robots.primitives.moves import PERIOD
 from torchcloth.robots.spline import Spline
 from torchcloth.types import Trajectory
@@ -184,9 +185,14 @@ def test_a_lone_arm_moves_while_the_other_stands(rig):
             {"slow_down": False},
             r"acceleration limit of 'joint\d' of '(left|right)' at t = .* rad/s\^2.*slow_down",
         ),
-        (P.hang(grips(0.5, 0.2), 1.6), {}, r"pose \d+ cannot be reached by 'rizon4'.* at t = "),
-        (P.hang(grips(0.5, 0.10, 0.02), 0.3), {}, "'.*' of 'left' comes too near to '.*' of 'right' at t = "),
-        (P.hang(grips(0.5, 0.012), 0.3), {"holds": {"left": Hold(1.5)}}, "'.*' of 'left' comes too near to the table"),
+        (P.hang(grips(0.5, 0.2), 1.1), {}, r"pose \d+ cannot be reached by 'rizon4'.* at t = "),
+        (P.hang(grips(1.6, 0.2), 0.5), {}, r"the path of 'left' leaves the reach .* from the shoulder"),
+        (P.hang(grips(0.5, 0.10, 0.02), 0.3), {}, r"\w+ of left comes too near to \w+ of right at t = .*roll"),
+        (
+            P.hang(grips(0.5, 0.012), 0.3),
+            {"holds": {"left": Hold(1.5)}},
+            r"\w+ of left comes too near to the table.*they touch or cross",
+        ),
         (P.hang({"middle": (0.5, 0.0, 0.1)}, 0.3), {}, "action moves unknown arms"),
         (P.swing(HIGH), {"acceleration": float("nan")}, "acceleration"),
     ],
@@ -195,6 +201,20 @@ def test_refusals_name_what_is_in_the_way(rig, action, options, what):
     held = {"holds": {"left": Hold(0.6), "right": Hold(0.6)}} | options
     with pytest.raises(InvalidInput, match=what):
         plan(rig, action, **held)
+
+
+def test_no_posture_is_beyond_the_reach_and_a_stretched_arm_nearly_meets_it(rig, random_q):
+    arm = rig["left"]
+    shoulder, longest = reach(arm)
+    away = (arm(random_q(arm, 5000))[:, :3, 3] - shoulder).norm(dim=-1)
+    assert 0.8 * longest < float(away.max()) < longest
+
+
+def test_a_plan_is_told_in_a_line(made):
+    _, found = made["hang"]
+    assert len(repr(found)) < 200
+    assert found.limiting in repr(found)
+    assert f"{found.slower:.3g} times" in repr(found)
 
 
 def test_paths_with_too_few_knots_are_refused(rig):

@@ -11,6 +11,7 @@ from torchcloth.boundaries.motion import interpolate
 from torchcloth.identification import cloth_from, episode
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.observe import DepthCamera, decode, to_points
+from torchcloth.parameters import PhysicalParameter
 
 SMALL = ["--triangles", "98", "--rate", "6"]
 EPISODE = "sheet_stretch"
@@ -93,6 +94,17 @@ def test_identification_takes_it(recording):
     assert set(taken.motion) == {"left", "right"}
 
 
+def test_a_fit_starts_from_the_model_that_made_it_but_for_a_stiffer_membrane(recording):
+    truth = {key.removeprefix("parameter/"): value for key, value in recording.truth.extra.items()}
+    modules = cloth_from(recording).named_modules()
+    start = {name: part.value.detach().numpy() for name, part in modules if isinstance(part, PhysicalParameter)}
+    assert truth["material.youngs_modulus"] == pytest.approx(609020.0)  # DiffCP's cotton, Pa at 1 mm
+    bending = ("effects.bending.stiffness", "effects.bending.damping_time")
+    for name in (*bending, "material.poisson_ratio", "effects.air.normal", "areal_density"):
+        assert start[name] == pytest.approx(truth[name]), name
+    assert start["material.youngs_modulus"] / truth["material.youngs_modulus"] == pytest.approx(1.5)
+
+
 def test_a_finished_episode_is_not_made_again(folder, capsys):
     made = (folder / EPISODE / "episode.json").stat().st_mtime_ns
     assert simulate(folder) == 0
@@ -102,7 +114,7 @@ def test_a_finished_episode_is_not_made_again(folder, capsys):
 
 def test_an_episode_of_another_order_is_refused(folder, capsys):
     assert simulate(folder, "--seed", "0", "--camera", "d435") == 2
-    assert "another camera" in capsys.readouterr().err
+    assert "an episode with camera azure_kinect; expected camera d435" in capsys.readouterr().err
 
 
 def test_grippers_alone_go_as_fast_as_asked(tmp_path):

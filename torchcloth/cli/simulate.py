@@ -100,16 +100,19 @@ def _finished(folder: Path, order: Order) -> bool:
     except (OSError, ValueError, AttributeError):
         found = None
     if found != order.facts():
-        changed = [
-            key for key, value in order.facts().items() if not isinstance(found, dict) or found.get(key) != value
-        ]
+        known, asked = found if isinstance(found, dict) else {}, order.facts()
+        changed = [key for key, value in asked.items() if known.get(key) != value]
         raise InvalidInput(
             f"{folder}",
-            got=f"an episode with another {', '.join(changed)}",
-            expected="the one that is asked for",
+            got=f"an episode with {_told(known, changed)}" if known else "no episode of this command",
+            expected=_told(asked, changed) if known else "none, or one",
             remedy="choose another --out, or remove it",
         )
     return True
+
+
+def _told(facts: dict[str, Any], keys: list[str]) -> str:
+    return ", ".join(f"{key} {facts.get(key)}" for key in keys)
 
 
 def _make(out: Path, order: Order) -> None:

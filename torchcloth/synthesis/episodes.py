@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ..errors import MissingDependency, SimulationDiverged
 from ..observe import capture, encode, solid_meshes
+from ..parameters import PhysicalParameter
 from ..recordings import (
     Camera,
     ClothInfo,
@@ -31,7 +33,7 @@ from ..robots import (  # pyright: ignore[reportMissingImports] - mapped from ro
     plan,
 )
 from ..types import Trajectory
-from .garments import numbers
+from .garments import data_sheet, numbers
 from .orders import Order
 from .sensors import DEPTH_SCALE, view
 from .staging import FRICTION, Staged, stage
@@ -121,6 +123,7 @@ def _recorded(
         faces=staged.mesh.faces,
         uv=staged.mesh.pattern if staged.mesh.uv is None else staged.mesh.uv,
         initial_vertices=done.x[0],
+        nominal=data_sheet(order.cloth_fabric),
     )
     truth = Truth(done.t, done.x.astype(np.float32), staged.mesh.faces.astype(np.int32), _parameters(staged))
     return Recording(
@@ -176,9 +179,13 @@ def _occluders(done: Performance) -> Callable[[int], Sequence[Any]]:
 
 
 def _parameters(staged: Staged) -> dict[str, np.ndarray]:
-    """The true parameters, for scoring."""
-    named = staged.cloth.named_parameters()
-    return {f"parameter/{name.removesuffix('.raw')}": value.detach().numpy() for name, value in named}
+    """The true parameters in SI units, for scoring."""
+    values: dict[str, Tensor] = dict(staged.cloth.named_parameters())
+    for name, module in staged.cloth.named_modules():
+        if isinstance(module, PhysicalParameter):
+            del values[f"{name}.raw"]
+            values[name] = module.value
+    return {f"parameter/{name}": value.detach().numpy() for name, value in values.items()}
 
 
 def _planned(done: Performance) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from ..meshes import Mesh
 from ..robots import primitives  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..robots.primitives import Action, Limits  # pyright: ignore[reportMissingImports]
 from ..transfer import Contact
-from .garments import GARMENTS, Garment, material, numbers, sewn
+from .garments import DAMPING, GARMENTS, Garment, material, numbers, sewn
 from .orders import Order
 
 ARMS = ("right", "left")  # who takes a garment's first and second grip: the arm at -y, the arm at +y
@@ -25,7 +25,6 @@ LAYERS = 1e-3  # m between front and back at the start
 GAP = 0.012  # m between layers that touch
 PAD = 0.026  # m, radius of what the fingers hold: a finger pad of 15 x 38 mm across its diagonal
 ABOVE = 0.015  # m, the tool's centre over the cloth that it holds on the table: fingers have a thickness
-DAMPING = 0.03  # s, of bending
 FRICTION = 0.4
 HANGING = ("fling", "swing", "shake", "stretch")
 LOWEST = 0.12  # m, over the table, of hanging cloth
