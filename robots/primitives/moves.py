@@ -119,12 +119,17 @@ def rise_to(height: float, grips: Grips) -> float:
 
 def points(grips: Grips) -> Tensor:
     """[G, 3] m, where the grippers hold; refuses what is no place."""
-    expected = 'three finite coordinates in metres for each gripper, as {"left": (0.5, 0.2, 0.02)}'
-    if not isinstance(grips, Mapping):
-        raise InvalidInput("grips", got=f"{grips}", expected=expected)
-    if not grips or any(len(point) != 3 or not all(map(math.isfinite, point)) for point in grips.values()):
-        raise InvalidInput("grips", got=f"{dict(grips)}", expected=expected)
-    return torch.tensor([list(point) for point in grips.values()], dtype=torch.float64)
+    try:
+        start = torch.tensor([list(point) for point in grips.values()], dtype=torch.float64)
+    except (AttributeError, TypeError, ValueError):
+        start = torch.empty(0)
+    if start.ndim != 2 or start.shape[1] != 3 or not bool(start.isfinite().all()):
+        raise InvalidInput(
+            "grips",
+            got=f"{grips}",
+            expected='three finite coordinates in metres for each gripper, as {"left": (0.5, 0.2, 0.02)}',
+        )
+    return start
 
 
 def check(**values: float) -> None:

@@ -209,6 +209,8 @@ def test_minimum_jerk_is_at_rest_at_both_ends():
         (lambda: drag({}, 0.3), "grips"),
         (lambda: drag({"left": (0.0, float("nan"), 0.1)}, 0.3), "grips"),
         (lambda: drag({"left": (0.0, 0.1)}, 0.3), "grips"),
+        (lambda: drag({"left": 0.5}, 0.3), "grips"),
+        (lambda: drag({"left": ("near", 0.0, 0.1)}, 0.3), "grips"),
         (lambda: drag({"left": (0.0, 0.1, -0.1)}, 0.3), "path"),
         (lambda: drag({"left": (0.0, 0.0, 0.2), "right": (0.1, 0.0, 0.1)}, 0.3, height=-0.05), "height"),
         (lambda: fling(TABLE, landing=0.1), "height over the landing"),
