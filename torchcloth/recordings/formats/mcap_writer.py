@@ -25,7 +25,7 @@ from ...errors import MissingDependency, RecordingError
 from ...meshes import obj
 from .. import images, placing, streams, writing
 from ..files import save_npz
-from ..types import Camera, Recording
+from ..types import Camera, PointClouds, Recording
 from . import embedded, mcap_checksums, ros2
 from .imported import NANO
 from .ros2_topics import WORLD
@@ -104,7 +104,7 @@ class _Bag:
             for name in {**self.recording.grippers, **self.recording.joints}:
                 self._motion(name)
             if self.recording.points is not None:
-                self._points()
+                self._points(self.recording.points)
             for name, camera in self.recording.cameras.items():
                 self._camera(name, camera)
             first = min((ns for ns, _ in self.events), default=self.epoch)
@@ -194,9 +194,7 @@ class _Bag:
 
         return self._topic(topic, kind, message, times)
 
-    def _points(self) -> None:
-        points = self.recording.points
-        assert points is not None
+    def _points(self, points: PointClouds) -> None:
         kind, times = "sensor_msgs/msg/PointCloud2", self._times(points.t)
         starts = np.concatenate([[0], np.cumsum(points.counts)])
         columns = [self._type("sensor_msgs/msg/PointField", n, 8 * k, 8, 1) for k, n in enumerate("xyz")]
