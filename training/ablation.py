@@ -41,7 +41,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m torchcloth.training.ablation",
         description=(__doc__ or "").partition("\n\n")[2],
-        epilog="The full study is 243 runs of 1500 triangles: about a day on one core. Every finished run is kept in "
+        epilog="The full study is 243 runs of 1500 triangles: hours on one core. Every finished run is kept in "
         "DIR and never repeated: stop it at will, run the same command to go on, add garments, actions or levels.",
     )
     add = parser.add_argument
