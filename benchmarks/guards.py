@@ -17,6 +17,7 @@ OTHER = (
     0.10  # of the way: another discretisation or law, 40 ms after the start; 0.004 (Newton) and 0.03 (MuJoCo) measured
 )
 DERIVATIVE = 1e-3  # relative, two float32 implementations of the same scheme over 40 ms; 2e-5 measured
+ROUNDED = 1e-2  # the same on the tiny scenes, whose sheet is hardly strained: 0.8e-3 to 2e-3 measured, by E
 
 
 def problems(case: Case, substeps: int, x: np.ndarray) -> list[str]:
@@ -62,15 +63,15 @@ def derivative_problems(arrays: list[np.ndarray]) -> list[str]:
     return found
 
 
-def disagreement(case: Case, truth: Outcome, found: Outcome, limit: float) -> list[str]:
-    """Positions farther from another run's than ``limit`` times the way; derivatives too where both have them."""
+def disagreement(case: Case, truth: Outcome, found: Outcome, limit: float, derivative: float = DERIVATIVE) -> list[str]:
+    """Positions farther from another run's than ``limit`` times the way; derivatives, by ``derivative``."""
     distance, way = apart(truth.x, found.x), apart(truth.x, case.mesh.vertices)
     wrong = (
         [] if distance <= limit * way else [f"{1e3 * distance:.2g} mm from the expected, of {1e3 * way:.2g} mm moved"]
     )
     if limit <= SAME and truth.by_x is not None and found.by_x is not None:
         errors = {"positions": _relative(truth.by_x, found.by_x), "E": _relative(truth.by_youngs, found.by_youngs)}
-        wrong += [f"derivative by {k} {e:.1e} from the expected" for k, e in errors.items() if not e <= DERIVATIVE]
+        wrong += [f"derivative by {k} {e:.1e} from the expected" for k, e in errors.items() if not e <= derivative]
     return wrong
 
 

@@ -158,7 +158,8 @@ class Bench:
             first = outcome if first is None else first
             if entry.task.substeps <= COMPARED and not wrong:
                 truth, limit = self._truth(entry.task, name, first)
-                wrong = guards.disagreement(case, truth, outcome, limit)
+                derivative = guards.ROUNDED if entry.task.small else guards.DERIVATIVE
+                wrong = guards.disagreement(case, truth, outcome, limit, derivative)
             if wrong:
                 self.notes[key] = "not counted: " + "; ".join(wrong)
                 continue
