@@ -81,7 +81,7 @@ def capture(view: View, x: Array, faces: Array, occluders: Sequence[Mesh] = (), 
 def encode(depth: Array, depth_scale: float = 0.001) -> Array:
     """A depth image [H, W] m as a camera writes it: uint16 [H, W] in units of ``depth_scale`` m, 0 = invalid.
 
-    What lies beyond the largest number becomes invalid.
+    A pixel without a reading (NaN), and what lies beyond the largest number, is invalid: 0 says so in this format.
 
     Raises:
         InvalidInput: a scale that is not positive.
