@@ -1,5 +1,7 @@
 """Estimators on one interface, several starts, priors, and resuming where a search was stopped."""
 
+import contextlib
+
 import pytest
 import torch
 import toys
@@ -8,6 +10,7 @@ from test_gauss_newton import solve
 
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import gauss_newton, identify, starts
+from torchcloth.identification.journal import Journal
 from torchcloth.identification.unknowns import collect, with_priors
 
 PAIR = ["youngs_modulus", "air.normal"]
@@ -34,25 +37,29 @@ def test_plain_descent_goes_downhill_slowly(model, brief):
     assert not fit.fit["converged"]
 
 
-def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_path):
-    """Wherever it is stopped, for every estimator: the same history and values, bit by bit, and little done twice."""
+def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_path, monkeypatch):
+    """Stopped after every single answer, for every estimator: same history, values and count of simulations."""
+
+    class Stop(Exception):
+        pass
+
+    def write(*args):
+        kept(*args)
+        raise Stop
+
+    kept = Journal._write
     for method in ("gauss-newton", "lbfgs"):
         options = {"method": method, "iterations": 2, "guess": {"youngs_modulus": 5e4}}
-        whole = identify(model, brief, PAIR, **options)
-
-        class Stop(Exception):
-            pass
-
-        def stop(iteration, *_):
-            if iteration == 1:
-                raise Stop
-
-        folder = tmp_path / method
-        with pytest.raises(Stop):
-            identify(model, brief, PAIR, journal=folder, on_progress=stop, **options)
-        resumed = identify(model, brief, PAIR, journal=folder, resume=True, **options)
+        whole, folder, resumed, stops = identify(model, brief, PAIR, **options), tmp_path / method, None, 0
+        while resumed is None:
+            with monkeypatch.context() as patch, contextlib.suppress(Stop):
+                patch.setattr(Journal, "_write", write)
+                resumed = identify(model, brief, PAIR, journal=folder, resume=stops > 0, **options)
+            stops += resumed is None
+        assert stops > 5
         assert resumed.history == whole.history
         assert resumed.parameters == whole.parameters
+        assert {**resumed.fit, "seconds": 0} == {**whole.fit, "seconds": 0}
         assert torch.equal(resumed.frames_after[0], whole.frames_after[0])
         with pytest.raises(InvalidInput, match="of another fit"):
             identify(model, brief, PAIR[:1], journal=folder, resume=True, **options)

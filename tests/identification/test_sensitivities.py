@@ -111,7 +111,9 @@ def test_rows_keep_their_order_and_leave_the_first_frame_out(short):
     problem = Objective(model, unknowns, [seen])
     linear = problem.linearise(problem.start)
     value, patch = problem.evaluate(problem.start)
-    assert torch.equal(value, linear.value)
+    off = (value - linear.value).abs()  # m: two kernels, last digits differ, and a point between two triangles may turn
+    assert float(off.max()) < 1e-4
+    assert float((off < 1e-9).double().mean()) > 0.98
     assert torch.equal(patch, linear.patch)
     points = linear.block == 0
     counts = [len(cloud) for cloud in seen.clouds]
@@ -143,7 +145,7 @@ def test_frames_are_remembered_and_simulations_counted(short):
     problem.linearise(problem.start)
     assert problem.simulations == 2 + 2 * len(unknowns)
     for k in range(5):
-        problem.remember(problem.start + k, first)
+        problem.seen(problem.start + 0.01 * k)
     assert len(problem._recent) == 4  # frames are large
 
 

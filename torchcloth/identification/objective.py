@@ -54,6 +54,7 @@ class Objective:
         self.middle = torch.tensor([*(u.middle for u in unknowns), *(0.0 for _ in stds)], dtype=torch.float64)
         self.journal: Journal | None = None
         self.simulations = 0
+        self._met: set[tuple[float, ...]] = set()
         self._recent: dict[tuple[float, ...], list[Frames]] = {}
 
     def part(self, share: float) -> Objective:
@@ -151,13 +152,21 @@ class Objective:
 
     def seen(self, raw: Tensor) -> list[Frames]:
         """What is seen and felt of every episode; the last few points are remembered."""
+        self._meet(raw)
         key = tuple(raw.tolist())
         if key not in self._recent:
             with torch.no_grad():
-                found = [self.simulate(raw, i) for i in range(len(self.episodes))]
-            self.simulations += len(self.episodes)
-            self.remember(raw, found)
+                self._recent[key] = [self.simulate(raw, i) for i in range(len(self.episodes))]
+            while len(self._recent) > 4:
+                del self._recent[next(iter(self._recent))]
         return self._recent[key]
+
+    def _meet(self, raw: Tensor) -> None:
+        """Count a point once, whether its answer is computed or found in the journal: a resumed fit counts the same."""
+        key = tuple(raw.tolist())
+        if key not in self._met:
+            self._met.add(key)
+            self.simulations += len(self.episodes)
 
     def simulate(self, raw: Tensor, i: int) -> Frames:
         """One episode; differentiable in reverse mode when ``raw`` requires grad."""
@@ -166,12 +175,6 @@ class Objective:
         for p in self.placed[i]:
             frames = p.nuisance.see(frames, raw[p.where].to(frames.x), self.episodes[i])
         return frames
-
-    def remember(self, raw: Tensor, found: list[Frames]) -> None:
-        """Keep what was simulated elsewhere."""
-        self._recent[tuple(raw.tolist())] = found
-        while len(self._recent) > 4:
-            del self._recent[next(iter(self._recent))]
 
     def _modes(self, i: int) -> list[tuple[slice, Tensor]]:
         found = ((p.where, p.nuisance.modes(self.cloth, self.episodes[i])) for p in self.placed[i])
@@ -206,22 +209,24 @@ class Objective:
 
     def evaluate_all(self, raw: Tensor) -> gauss_newton.Linearised:
         """Residual rows without derivatives."""
+        self._meet(raw)
         work = lambda: self._rows([(frames, None) for frames in self.seen(raw)])  # noqa: E731
         return gauss_newton.Linearised(*self._ask("evaluate", raw, work))
 
     def linearise(self, raw: Tensor) -> gauss_newton.Linearised:
-        """Residual rows with exact sensitivities, by forward mode through the whole simulation."""
+        """Residual rows with exact sensitivities, by forward mode through the whole simulation.
 
-        def work() -> gauss_newton.Linearised:
-            both = [self._tangents(raw, i) for i in range(len(self.episodes))]
-            self.remember(raw, [frames for frames, _ in both])
-            return self._rows(both)
-
+        Its frames are not remembered: their last digits are not those of a simulation alone, and a resumed fit, which
+        recalls either, would then differ in the last digit.
+        """
+        work = lambda: self._rows([self._tangents(raw, i) for i in range(len(self.episodes))])  # noqa: E731
+        self._meet(raw)
         self.simulations += len(self.unknowns) * len(self.episodes)
         return gauss_newton.Linearised(*self._ask("linearise", raw, work))
 
     def figures(self, raw: Tensor) -> Figures:
         """Distances at a point."""
+        self._meet(raw)
         chamfer, rms, per_frame = self._ask("figures", raw, lambda: self._figures(raw))
         return Figures(float(chamfer), float(rms), per_frame)
 
