@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from torchcloth.materials import AEP
-from torchcloth.training import ablation, ablation_study
-from torchcloth.training.ablation_measures import (
+from torchcloth.training.ablation import command
+from torchcloth.training.ablation import study as studies
+from torchcloth.training.ablation.measures import (
     energies,
     scaled_poisson,
 )
-from torchcloth.training.ablation_scenes import (
+from torchcloth.training.ablation.scenes import (
     COROTATED,
     GARMENTS,
     LEVELS,
@@ -86,7 +87,7 @@ SMALL = ["--triangles", "60", "--garments", "dress", "--actions", "drag", "--pac
 
 
 def call(out, *more):
-    return ablation.main(["--out", str(out), *SMALL, *more])
+    return command.main(["--out", str(out), *SMALL, *more])
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +192,7 @@ def test_a_folder_with_other_settings_is_refused(finished, tmp_path, capsys):
 
 
 def test_a_damaged_run_is_named(finished, tmp_path, capsys):
-    study = ablation_study.Study(tmp_path, Setup(triangles=60, pace=8.0))
+    study = studies.Study(tmp_path, Setup(triangles=60, pace=8.0))
     study.begin()
     (tmp_path / "runs" / "dress-drag-reference.npz").write_bytes(b"half")
     assert call(tmp_path, "--report") == 2
@@ -209,7 +210,7 @@ def test_two_processes_do_the_same(finished, tmp_path):
 @pytest.mark.slow
 def test_the_fast_study(tmp_path):
     """All nine scenes: E leads where chaos lets it, and its membrane holds most of the energy, as in the paper."""
-    assert ablation.main(["--out", str(tmp_path), "--fast"]) == 0
+    assert command.main(["--out", str(tmp_path), "--fast"]) == 0
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["runs"] == {"finished": 99, "of": 99}
     for action, row in result["actions"].items():

@@ -9,7 +9,7 @@ import torch
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
 from torchcloth.materials import AEP
-from torchcloth.training.ablation_measures import (
+from torchcloth.training.ablation.measures import (
     bidirectional_chamfer,
     bounded,
     contributions,
@@ -18,8 +18,8 @@ from torchcloth.training.ablation_measures import (
     spearman,
     unbounded,
 )
-from torchcloth.training.ablation_paper import CHAMFER, ENERGY
-from torchcloth.training.ablation_scenes import (
+from torchcloth.training.ablation.paper import CHAMFER, ENERGY
+from torchcloth.training.ablation.scenes import (
     LEVELS,
     PARAMETERS,
 )

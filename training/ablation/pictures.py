@@ -10,9 +10,9 @@ import numpy as np
 
 from torchcloth._files import atomically
 
-from .ablation_paper import CHAMFER, ENERGY
-from .ablation_scenes import LEVELS, PARAMETERS, PERTURBED, REFERENCE, Scene, Variant
-from .ablation_study import Name, Study
+from .paper import CHAMFER, ENERGY
+from .scenes import LEVELS, PARAMETERS, PERTURBED, REFERENCE, Scene, Variant
+from .study import Name, Study
 
 COLOURS = {"E": "#1f6f8b", "nu": "#b0653a", "k": "#3d7f3d", "gamma": "#7d4f9e"}
 GREEK = {"E": "E", "nu": "ν", "k": "k", "gamma": "γ"}

@@ -16,8 +16,8 @@ import torch
 
 from torchcloth.errors import InvalidInput, TorchclothError
 
-from .ablation_scenes import ACTIONS, ASSUMED, GARMENTS, LEVELS, Scene, Setup, Variant, variants
-from .ablation_study import Name, Study, Task, missing, simulate
+from .scenes import ACTIONS, ASSUMED, GARMENTS, LEVELS, Scene, Setup, Variant, variants
+from .study import Name, Study, Task, missing, simulate
 
 FAST = {"triangles": 150, "pace": 3.0, "levels": [25, 175]}
 
@@ -66,7 +66,7 @@ def _list(names: Sequence | dict) -> str:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from .ablation_report import report
+    from .report import report
 
     for name in ("jobs", "batch"):
         if getattr(options, name) is not None and getattr(options, name) < 1:
@@ -119,7 +119,3 @@ def _simulate(study: Study, tasks: list[Task], jobs: int) -> None:
                 print(f"{told}/{len(tasks)} batches, about {left / 60:.1f} min left: {text}", flush=True)
 
         simulate(study, tasks, jobs, advance)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

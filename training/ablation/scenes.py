@@ -29,7 +29,7 @@ from torchcloth.robots.primitives import (  # pyright: ignore[reportMissingImpor
 from torchcloth.transfer import Contact
 from torchcloth.transfer.contact import GAP, SPARSEST
 
-from .ablation_measures import energies, scaled_poisson
+from .measures import energies, scaled_poisson
 
 LEVELS = (25, 50, 75, 125, 150, 175)  # % of the reference
 PARAMETERS = {"E": "youngs_modulus", "nu": "poisson_ratio", "k": "contact_stiffness", "gamma": "shear_stiffness"}

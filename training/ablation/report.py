@@ -13,10 +13,10 @@ import torch
 from torchcloth._files import write_text
 from torchcloth.errors import InvalidInput
 
-from .ablation_measures import bidirectional_chamfer, contributions, spearman
-from .ablation_paper import CHAMFER, ENERGY
-from .ablation_scenes import LEVELS, PARAMETERS, PERTURBED, REFERENCE, Run, Variant
-from .ablation_study import Name, Study
+from .measures import bidirectional_chamfer, contributions, spearman
+from .paper import CHAMFER, ENERGY
+from .scenes import LEVELS, PARAMETERS, PERTURBED, REFERENCE, Run, Variant
+from .study import Name, Study
 
 CONVENTION = (
     "chamfer_cm: bidirectional Chamfer distance [cm] to the reference run, the sum of both means of the distance from "
@@ -100,8 +100,8 @@ def report(study: Study, scenes: Sequence[Name], wanted: Sequence[Variant]) -> N
     Raises:
         InvalidInput: no scene has its reference run yet.
     """
-    from .ablation_pictures import draw
-    from .ablation_tables import print_study
+    from .pictures import draw
+    from .tables import print_study
 
     measured = measure(study, scenes, wanted)
     if not measured:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from .ablation_measures import WITHOUT
-from .ablation_paper import CHAMFER, ENERGY
-from .ablation_report import CHAOS
-from .ablation_scenes import COROTATED, LEVELS, PARAMETERS, PERTURBED, Variant
-from .ablation_study import Name
+from .measures import WITHOUT
+from .paper import CHAMFER, ENERGY
+from .report import CHAOS
+from .scenes import COROTATED, LEVELS, PARAMETERS, PERTURBED, Variant
+from .study import Name
 
 INERT = 1e-9  # cm, rounding
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -14,11 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from torchcloth._files import atomically, write_text
-from torchcloth.errors import InvalidInput, RecordingError, TorchclothError
+from torchcloth._files import atomically
+from torchcloth.errors import TorchclothError
 
-from .ablation_measures import WITHOUT
-from .ablation_scenes import Run, Scene, Setup, Variant
+from ..kept import check_settings, unreadable, write_settings
+from .measures import WITHOUT
+from .scenes import Run, Scene, Setup, Variant
 
 TRIANGLES_AT_ONCE = 6000  # of all runs that one process simulates together; fewer leave it idle, more leave the cache
 Name = tuple[str, str]  # of a scene: garment, action
@@ -32,29 +32,12 @@ class Study(NamedTuple):
 
     def check(self) -> None:
         """Raises InvalidInput where the folder cannot hold this study's runs."""
-        if self.folder.exists() and not self.folder.is_dir():
-            raise InvalidInput("--out", got=f"{self.folder}, a file", expected="a folder, new or existing")
-        try:
-            found = json.loads((self.folder / "study.json").read_text())
-        except FileNotFoundError:
-            return
-        except ValueError:
-            raise _unreadable(self.folder / "study.json") from None
-        own = asdict(self.setup)
-        other = {key: found.get(key) for key in own if found.get(key) != own[key]}
-        if other:
-            raise InvalidInput(
-                "--out",
-                got=f"a study with {', '.join(f'{key} {value}' for key, value in other.items())}",
-                expected=", ".join(f"{key} {own[key]}" for key in other),
-                remedy="use the same settings, or another folder",
-            )
+        check_settings(self.folder, asdict(self.setup))
 
     def begin(self) -> None:
         """Make the folder and note the settings."""
-        (self.folder / "runs").mkdir(parents=True, exist_ok=True)
-        text = json.dumps(asdict(self.setup), indent=1) + "\n"
-        write_text(self.folder / "study.json", text)
+        write_settings(self.folder, asdict(self.setup))
+        (self.folder / "runs").mkdir(exist_ok=True)
 
     def path(self, scene: Name, variant: Variant) -> Path:
         """The file of a run."""
@@ -81,7 +64,7 @@ class Study(NamedTuple):
             with np.load(path) as found:
                 return Run(found["t"], found["x"], {key: found[key] for key in ("total", *WITHOUT)})
         except (ValueError, KeyError, EOFError, zipfile.BadZipFile):
-            raise _unreadable(path) from None
+            raise unreadable(path) from None
 
 
 class Task(NamedTuple):
@@ -146,7 +129,3 @@ def _prepare() -> None:
 def _work(study: Study, task: Task) -> None:
     for _ in task.work(study):
         pass
-
-
-def _unreadable(path: Path) -> RecordingError:
-    return RecordingError(f"{path}: unreadable", remedy="delete it; it is made again")

@@ -1,0 +1,7 @@
+"""``python -m torchcloth.training.ablation``."""
+
+import sys
+
+from .command import main
+
+sys.exit(main())

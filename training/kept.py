@@ -1,0 +1,108 @@
+"""Studies on disk: finished cases are files, so that a study can be stopped at any time, continued and extended."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from torchcloth._files import write_text
+from torchcloth.errors import InvalidInput, RecordingError
+
+Case = Callable[[], dict[str, Any]]
+
+
+class Kept:
+    """A folder of finished cases, one JSON file each; nothing is written before the first is finished.
+
+    Args:
+        folder: new, or one that holds a study of the same settings.
+        settings: what all cases depend on; plain JSON.
+
+    Raises:
+        InvalidInput: the folder holds a study of other settings, or is a file.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        self.folder, self.settings = folder, dict(settings)
+        check_settings(folder, self.settings)
+
+    def find(self, name: str) -> dict[str, Any] | None:
+        """A finished case, or None.
+
+        Raises:
+            RecordingError: its file is damaged.
+        """
+        path = self._path(name)
+        try:
+            return json.loads(path.read_text())
+        except FileNotFoundError:
+            return None
+        except ValueError:
+            raise unreadable(path) from None
+
+    def keep(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a finished case; a crash leaves no half file."""
+        if not self.folder.exists() or not (self.folder / "study.json").exists():
+            write_settings(self.folder, self.settings)
+        self._path(name).parent.mkdir(exist_ok=True)
+        write_text(self._path(name), json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+    def run(self, cases: Mapping[str, Case]) -> dict[str, dict[str, Any]]:
+        """All cases by name, the missing ones computed in turn, with progress."""
+        missing = [name for name in cases if self.find(name) is None]
+        if missing:
+            self._compute({name: cases[name] for name in missing}, len(cases))
+        return {name: found for name in cases if (found := self.find(name)) is not None}
+
+    def _compute(self, cases: Mapping[str, Case], total: int) -> None:
+        from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        columns = (MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+        begun, terminal = time.monotonic(), sys.stdout.isatty()
+        with Progress(*columns, refresh_per_second=2, disable=not terminal) as bar:
+            shown = bar.add_task("", total=total, completed=total - len(cases))
+            for done, (name, work) in enumerate(cases.items(), 1):
+                bar.update(shown, description=name)
+                self.keep(name, work())
+                bar.advance(shown)
+                if not terminal:  # a log file gets lines, not a bar
+                    left = (time.monotonic() - begun) / done * (len(cases) - done) / 60
+                    print(f"{total - len(cases) + done}/{total} {name}, about {left:.1f} min left", flush=True)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / "cases" / f"{name}.json"
+
+
+def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Raises InvalidInput where the folder cannot hold a study of these settings."""
+    if folder.exists() and not folder.is_dir():
+        raise InvalidInput("--out", got=f"{folder}, a file", expected="a folder, new or existing")
+    try:
+        found = json.loads((folder / "study.json").read_text())
+    except FileNotFoundError:
+        return
+    except ValueError:
+        raise unreadable(folder / "study.json") from None
+    other = {key: found.get(key) for key in settings if found.get(key) != settings[key]}
+    if other:
+        raise InvalidInput(
+            "--out",
+            got=f"a study with {', '.join(f'{key} {value}' for key, value in other.items())}",
+            expected=", ".join(f"{key} {settings[key]}" for key in other),
+            remedy="use the same settings, or another folder",
+        )
+
+
+def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Make the folder and note the settings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / "study.json", json.dumps(dict(settings), indent=1) + "\n")
+
+
+def unreadable(path: Path) -> RecordingError:
+    """The error for a damaged file of a study."""
+    return RecordingError(f"{path}: unreadable", remedy="delete it; it is made again")

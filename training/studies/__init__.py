@@ -1,0 +1,1 @@
+"""The paper's experiments with its tables beside ours: ``python -m torchcloth.training.studies NAME``."""

@@ -1,0 +1,7 @@
+"""``python -m torchcloth.training.studies``."""
+
+import sys
+
+from .command import main
+
+sys.exit(main())
