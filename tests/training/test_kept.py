@@ -29,7 +29,7 @@ def test_a_stopped_study_goes_on_where_it_was(tmp_path, capsys):
 
 def test_nothing_is_written_before_a_case_is_finished(tmp_path):
     assert Kept(tmp_path / "s", {}).find("a") is None
-    with pytest.raises(ValueError, match="NaN|nan|JSON"):
+    with pytest.raises(ValueError, match=r"NaN|nan|JSON"):
         Kept(tmp_path / "s", {}).keep("a", {"value": float("nan")})
     assert Kept(tmp_path / "s", {}).find("a") is None
 
