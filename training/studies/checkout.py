@@ -20,7 +20,10 @@ def folder(name: str) -> Path:
     """
     if not (TESTS / name).is_dir():
         raise InvalidInput(
-            "studies", got=f"no {TESTS / name}", expected="a checkout of the repository", remedy="git clone, make install"
+            "studies",
+            got=f"no {TESTS / name}",
+            expected="a checkout of the repository",
+            remedy="git clone, make install",
         )
     return TESTS / name
 
