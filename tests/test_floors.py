@@ -27,7 +27,8 @@ FLOORS = (
     ("initial", "intervals"),
     ("sensitivities",),
     ("cloth", "robots"),
-    ("identification", "diagnosis", "plan", "testing"),
+    ("identification", "plan", "testing"),
+    ("diagnosis",),
     ("inspection", "synthesis", "viewing"),
     ("",),  # torchcloth/__init__.py: the names a user sees
     ("training", "benchmarks", "demo"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cmath
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +22,9 @@ class Stencils(NamedTuple):
     first: np.ndarray  # [V, N, 2] 1/m, along w, f
 
 
+@lru_cache(maxsize=8)  # of the last meshes: variants of a model share theirs
 def curvature_stencils(mesh: Mesh) -> Stencils:
-    """First and second derivatives at every vertex.
+    """First and second derivatives at every vertex; not to be written to.
 
     They come from a least-squares quadratic through the
     vertex over its ring, weighted by 1 / distance^4 (residuals count as the curvature they make); the ring grows by the

@@ -1,0 +1,151 @@
+"""Noise, screening, classes and comparison on linear toys: against theory, and against what must not matter."""
+
+import linear_toys as toys
+import pytest
+import torch
+
+from torchcloth.diagnosis.classes import alike, correlations
+from torchcloth.diagnosis.comparison import compare, predict
+from torchcloth.diagnosis.noise import fit_noise, floor_of, whitened
+from torchcloth.diagnosis.screening import screen
+
+NAMES = ["a", "b", "c"]
+SLOPES = toys.smooth(1, 6)  # two parameters, three hypotheses, one nuisance
+
+
+def asked(truth, seed=0, slopes=SLOPES, **options):
+    return toys.fitted(toys.evidence(slopes, 2, NAMES, torch.tensor(truth).double(), seed), **options)
+
+
+def row(found, name):
+    return next(r for r in screen(found) if r.hypothesis.name == name)
+
+
+def test_a_planted_amplitude_is_found_within_its_error():
+    z = []
+    for seed in range(60):
+        r = row(asked([0.0, 0.0, 0.0, 0.7, 0.0], seed), "b")
+        z.append((r.amplitude - 0.7) / r.std)
+    z = torch.tensor(z)
+    assert abs(float(z.mean())) < 3 / 60**0.5
+    assert 0.75 < float(z.std()) < 1.25
+
+
+def test_without_noise_it_is_exact_and_parameters_do_not_matter():
+    """r = -J_j a asks for a; what fitted parameters of any size do is not mistaken for a hypothesis."""
+    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 0)
+    for shift in (0.0, 0.3):
+        truth = torch.tensor([shift, -shift, 0.0, 0.7, 0.0]).double()
+        cells = [c._replace(value=-c.jacobian[:, :5] @ truth) for c in ev.cells]
+        found = toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.stds, ev.numerics), std=1e6)
+        fitted_out = {r.hypothesis.name: r for r in screen(found)}
+        joint = torch.linalg.lstsq(
+            torch.cat([c.jacobian[:, [0, 1, 3]] for c in cells]), torch.cat([c.value for c in cells])[:, None]
+        ).solution
+        assert float(-joint[2, 0]) == pytest.approx(0.7, rel=1e-9)
+        assert fitted_out["b"].amplitude == pytest.approx(0.7, rel=1e-6)
+
+
+def test_scores_do_not_depend_on_how_parameters_are_written():
+    """Another coordinate of the parameters (J_n A, precision to match) leaves every amplitude as it is."""
+    mixed = SLOPES.clone()
+    mixed[..., :2] = SLOPES[..., :2] @ torch.tensor([[2.0, 1.0], [0.5, -1.0]]).double()
+    a, b = (screen(asked([0.0, 0.0, 0.4, 0.0, 0.0], 3, s, std=1e6)) for s in (SLOPES, mixed))
+    first, second = ({r.hypothesis.name: (r.amplitude, r.gain) for r in rows} for rows in (a, b))
+    for name in NAMES:
+        assert first[name] == pytest.approx(second[name], rel=1e-6)
+
+
+def test_a_nuisance_of_one_episode_is_no_cause():
+    """Three standard deviations of every episode's own nuisance leave all hypotheses below notice."""
+    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 5)
+    cells = [c._replace(value=c.value + 3 * toys.STD * c.jacobian[:, -1] * (-1) ** k) for k, c in enumerate(ev.cells)]
+    rows = screen(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.stds, ev.numerics)))
+    assert max(abs(r.amplitude) / r.std for r in rows) < 4
+    assert not any(r.decision == "present" for r in rows)
+
+
+def test_independent_noise_would_raise_false_alarms():
+    """The ablation that must hurt: with slow errors taken for white ones, nulls look like effects."""
+    wrong = right = 0
+    for seed in range(40):
+        ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), seed)
+        wrong += sum(abs(r.amplitude) > 2.58 * r.std for r in screen(toys.fitted(ev, level=1e-9)))
+        right += sum(abs(r.amplitude) > 2.58 * r.std for r in screen(toys.fitted(ev)))
+    assert right <= 5  # of 120 at 1 %: more than 5 has a chance of 1 in 300
+    assert wrong > 5 * max(right, 1)
+
+
+def test_the_level_of_slow_errors_is_found_also_beside_a_strong_effect():
+    for truth in ([0.0] * 5, [0.0, 0.0, 0.0, 3.0, 0.0]):
+        noise = fit_noise(toys.evidence(SLOPES, 2, NAMES, torch.tensor(truth).double(), 7))
+        assert float(noise.level[0]) == pytest.approx(toys.SLOW, rel=0.35)
+
+
+def test_whitened_noise_is_white():
+    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 11)
+    white = whitened(ev, fit_noise(ev)).value
+    assert float(white.square().mean()) == pytest.approx(1.0, rel=0.2)
+    assert abs(float((white[1:] * white[:-1]).mean())) < 4 / len(white) ** 0.5
+
+
+def test_small_effects_are_absent_and_large_ones_present():
+    assert row(asked([0.0, 0.0, 0.1, 0.0, 0.0]), "a").decision == "absent"  # 0.4 is the smallest of interest
+    assert row(asked([0.0, 0.0, 1.0, 0.0, 0.0]), "a").decision == "present"
+
+
+def test_what_cannot_be_seen_is_not_called_absent():
+    faint = SLOPES.clone()
+    faint[..., 4] *= 0.01  # a typical amplitude moves the cloth by 0.03 mm
+    assert row(asked([0.0] * 5, slopes=faint), "c").decision == "unresolvable"
+
+
+def test_numerics_widen_the_error():
+    ev = toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.0, 0.6, 0.0]).double(), 2)
+    shifted = [-3 * 0.5 * c.jacobian[:, 3] for c in ev.cells]  # the coarser mesh errs like b at 1.5
+    plain = row(toys.fitted(ev), "b")
+    wide = row(toys.fitted(ev.__class__(ev.cells, 2, ev.hypotheses, ev.stds, shifted)), "b")
+    assert wide.bias == pytest.approx(0.5, rel=0.1)
+    assert plain.decision == "present"
+    assert wide.decision != "present"
+
+
+def test_twins_form_a_class_and_strangers_do_not():
+    same = SLOPES.clone()
+    same[..., 3] = 1.5 * same[..., 2] + 1e-4 * same[..., 4]  # b is a, but for a trifle
+    found = asked([0.0, 0.0, 1.0, 0.0, 0.0], slopes=same)
+    rows = {r.hypothesis.name: r for r in screen(found)}
+    assert float(correlations(found)[0, 1]) > 0.99
+    assert [r.hypothesis.name for r in alike(found, rows["a"], [rows["b"], rows["c"]])] == ["b"]
+
+
+def test_a_true_cause_predicts_motions_that_were_held_out():
+    """The gain is what the effect did; a model without it predicts them no better than itself."""
+    truth = torch.tensor([0.2, 0.0, 0.0, 1.0, 0.0]).double()
+    ev = toys.evidence(SLOPES, 2, NAMES, truth, 4)
+    groups = ["x", "y", "x", "y"]
+    without = predict(toys.fitted(ev), groups)
+    with_b = ev.__class__(
+        [c._replace(jacobian=c.jacobian[:, [0, 1, 3, 2, 4, 5]]) for c in ev.cells], 3, ev.hypotheses[:1] + ev.hypotheses[2:],
+        ev.stds, ev.numerics,
+    )  # fmt: skip
+    after = predict(toys.fitted(with_b, std=2.0), groups)
+    floor = floor_of(ev, toys.fitted(ev).noise)
+    gain = compare(without, after, floor)
+    assert gain.ci95[0] > 0
+    assert gain.after < 0.6 * gain.before
+    assert gain.explained > 0.8
+    same = compare(without, without, floor)
+    assert same.density == 0.0
+    assert same.explained == 0.0
+
+
+def test_a_wrong_cause_does_not_predict_them():
+    """With nothing to explain, one more number predicts worse, if anything."""
+    gains = []
+    for seed in range(12):
+        ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 50 + seed)
+        more = ev.__class__(ev.cells, 3, ev.hypotheses[1:], ev.stds, ev.numerics)
+        groups = ["x", "y", "x", "y"]
+        gains.append(compare(predict(toys.fitted(ev), groups), predict(toys.fitted(more), groups), 1e-3).ci95[0] > 0)
+    assert sum(gains) <= 1

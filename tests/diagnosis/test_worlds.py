@@ -1,0 +1,143 @@
+"""Hypotheses as changes of a world: nothing at zero, continuous from there, and of the stated sign and size."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import torchcloth as tc
+from torchcloth import recordings as rec
+from torchcloth.diagnosis import air, fabric, grip, observer
+from torchcloth.diagnosis.base_model import base_model
+from torchcloth.diagnosis.catalogue import catalogue, register
+from torchcloth.diagnosis.evidence import gather, setting_of
+from torchcloth.diagnosis.refined import refined
+from torchcloth.diagnosis.world import Hypothesis
+
+SIDE, SPEED = 0.2, 0.6  # m, m/s
+
+
+def episode(seed: int = 0, shift: float = 0.0) -> rec.Recording:
+    """A light sheet of 5 x 5 vertices in two grippers that start to move; its points lie on the first shape."""
+    mesh = tc.meshes.rectangle(SIDE, SIDE, resolution=(5, 5))
+    rng, t = np.random.default_rng(seed), np.linspace(0.0, 0.3, 16)
+    first = np.c_[mesh.uv[:, 0], np.zeros(25), mesh.uv[:, 1]] + [0.0, 0.0, 1.0]
+    grippers, grasps = {}, {}
+    for name, u in (("left", 0.0), ("right", SIDE)):
+        path = np.c_[np.full(16, u), SPEED * t**2 / 0.6, np.full(16, 1.0 + SIDE)]
+        grippers[name] = rec.GripperMotion(t, path, np.tile([1.0, 0, 0, 0], (16, 1)), np.ones(16, bool))
+        grasps[name] = rec.GraspInfo(np.array([[u, SIDE]]), 0.06)
+    points = first[rng.integers(0, 25, (7, 40))] + [0.0, shift, 0.0] + 1e-3 * rng.standard_normal((7, 40, 3))
+    info = rec.ClothInfo(
+        areal_density=0.2, areal_density_std=0.004, thickness=1e-3, vertices=np.c_[mesh.uv, np.zeros(25)],
+        faces=mesh.faces, uv=mesh.uv, initial_vertices=first,
+        nominal={"membrane_stiffness": 60.0, "poisson_ratio": 0.3, "bending_stiffness": 3e-5},
+    )  # fmt: skip
+    return rec.Recording(
+        cloth=info, provenance="synthetic: test_worlds.py", grasps=grasps, grippers=grippers,
+        points=rec.PointClouds(np.arange(7) * 0.05, points.reshape(-1, 3), np.full(7, 40)), observation_noise_std=1e-3,
+    )  # fmt: skip
+
+
+RECORDING = episode()
+
+
+@pytest.fixture(scope="module")
+def made():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    model = base_model(RECORDING)
+    yield model, setting_of(model, [RECORDING])
+    torch.set_default_dtype(before)
+
+
+EVERY = [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES]
+NAMES = [h.name for h in EVERY if not h.needs_table]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_at_zero_and_twice_as_much_at_twice(made, name):
+    """A thousandth of a typical amplitude moves the cloth by about a thousandth, and half of it by half."""
+    model, setting = made
+    h = next(h for h in catalogue(model, [RECORDING]) if h.name == name)
+    e = setting.episodes[0]
+    base = model.world().frames(e)
+    assert torch.equal(model.world([(h, 0.0)]).frames(e).x, base.x)
+    if h.effect in ("grip.width", "robot.regrasp", "air.wind"):  # whole vertices are held; wind brings its drag along
+        return
+    share = (0.05, 0.1)
+    moved = [(model.world([(h, s * h.typical)]).frames(e), s) for s in share]
+    small, twice = ((f.x - base.x).norm() + (f.edge - base.edge).norm() for f, _ in moved)
+    if float(twice) > 1e-9:
+        assert float(twice / small) == pytest.approx(2.0, rel=0.15)
+
+
+def test_air_and_hem_do_what_their_names_say(made):
+    model, setting = made
+    e, by = setting.episodes[0], {h.name: h for h in catalogue(model, [RECORDING])}
+    last = lambda name, a: model.world([(by[name], a)]).frames(e).x[-1]  # noqa: E731
+    base = model.world().frames(e).x[-1]
+    free = base[:, 2] < 1.1
+    assert float((last("air.drag_n", 5.0) - base)[free, 1].mean()) < -1e-5  # it lags behind the grippers
+    assert float((last("air.wind[y]", 1.0) - last("air.drag_n", 1.2))[free, 1].mean()) > 1e-5
+    assert float((last("mass.hem", 0.1) - base)[free, 2].mean()) < -1e-5
+    assert float((last("env.gravity_tilt[y]", 0.2) - base)[free, 1].mean()) > 1e-5
+    assert float((last("env.gravity_tilt[x]", 0.2) - base)[free, 0].mean()) > 1e-5
+    assert float((last("rest.shrink[weft]", 0.05) - base)[free, 2].mean()) > 1e-3
+    torch.testing.assert_close(last("obs.extrinsic[x]", 0.004) - base, torch.tensor([0.004, 0.0, 0.0]).expand_as(base))
+
+
+def test_two_effects_in_one_part_keep_both(made):
+    model, _ = made
+    by = {h.name: h for h in catalogue(model, [RECORDING])}
+    world = model.world([(by["air.drag_n"], 0.8), (by["air.wind[x]"], 0.3), (by["air.drag_t"], 0.02)])
+    air = world.cloth.effects["air"]
+    assert (float(air.normal.value), float(air.tangential.value)) == pytest.approx((0.8, 0.02))
+    assert air.wind.tolist() == pytest.approx([0.3, 0.0, 0.0])
+    rest = model.world([(by["rest.shrink[warp]"], 0.02), (by["rest.skew"], 0.01)]).cloth.effects["rest_shape"]
+    assert (float(rest.shrink_warp.value), float(rest.skew.value)) == pytest.approx((0.02, 0.01))
+    woven = model.world([(by["elas.ortho"], 0.5), (by["elas.shear"], -0.4)]).cloth.material
+    assert float(woven.weft_modulus.value / woven.youngs_modulus.value) == pytest.approx(0.5)
+    assert float(woven.shear_modulus.value * 2 * 1.3 / woven.youngs_modulus.value) == pytest.approx(0.6)
+
+
+def test_the_base_is_in_vacuum_and_left_alone(made):
+    model, _ = made
+    assert set(model.base.cloth.effects) == {"gravity", "bending"}
+    with_air = replace(RECORDING, air_density=1.2)
+    assert set(base_model(with_air).base.cloth.effects) == {"gravity", "bending"}
+    before = {name: value.clone() for name, value in model.base.cloth.state_dict().items()}
+    model.at(model.point + 0.3).world([(h, h.typical) for h in catalogue(model, [RECORDING])[:5]])
+    for name, value in model.base.cloth.state_dict().items():
+        assert torch.equal(value, before[name]), name
+
+
+def test_a_finer_mesh_is_the_same_cloth(made):
+    model, _ = made
+    finer, (recording,) = refined(model, [RECORDING])
+    a, b = model.base.cloth.mesh, finer.base.cloth.mesh
+    assert len(b.faces) == 4 * len(a.faces)
+    assert b.area.sum() == pytest.approx(a.area.sum(), rel=1e-12)
+    np.testing.assert_array_equal(recording.cloth.initial_vertices[:25], RECORDING.cloth.initial_vertices)
+    assert recording.cloth.initial_vertices[25:].mean(0) == pytest.approx(
+        RECORDING.cloth.initial_vertices.mean(0), abs=0.01
+    )
+
+
+def test_slopes_are_those_of_finite_steps(made):
+    model, setting = made
+    found = gather(model, setting, [h for h in catalogue(model, [RECORDING]) if h.name == "obs.extrinsic[y]"])
+    points = found.cells[0].block == 0
+    slope = found.cells[0].jacobian[points, found.own]
+    assert float(slope.abs().median()) == pytest.approx(1.0, abs=0.05)  # the sheet faces y
+
+
+def test_a_hypothesis_of_ones_own_joins_the_search(made):
+    model, _ = made
+    own = register(Hypothesis("user.sag", "m", 0.01, lambda world, a: world.with_view(lambda f, _: f)))
+    assert own in catalogue(model, [RECORDING])
+    assert own not in catalogue(model.plus(own, 0.01), [RECORDING])
+    from torchcloth.diagnosis import catalogue as module
+
+    module._registered.clear()

@@ -1,0 +1,1 @@
+"""What a simulation gets wrong, why, and what mending it gains."""

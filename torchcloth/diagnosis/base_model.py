@@ -1,0 +1,53 @@
+"""What a diagnosis starts from: A-EP and bending at the data sheet's values, gravity, grasps, table; no air."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+from ..cloth import Cloth
+from ..identification.episodes import cloth_from
+from ..parameters import PhysicalParameter
+from ..recordings import Recording
+from .world import Model, Parameter, World
+
+WRONG_BY = 2.5  # factor that a data sheet may be wrong by: two standard deviations
+LOGIT = 0.8  # standard deviation of logit(2 nu)
+
+
+def base_model(recording: Recording) -> Model:
+    """From what an episode says of its cloth."""
+    cloth = cloth_from(replace(recording, air_density=None)).requires_grad_(False)
+    return Model(World(cloth), (found := tuple(_parameters(cloth, recording))), torch.zeros(len(found)).double())
+
+
+def _parameters(cloth: Cloth, recording: Recording) -> list[Parameter]:
+    spread = 0.5 * math.log(WRONG_BY)
+    found = [_log(cloth, "material.youngs_modulus", 0.05, spread)]
+    nu = float(cloth.material.poisson_ratio.value)  # type: ignore[attr-defined,union-attr]
+    middle = math.log(2 * nu / (1 - 2 * nu))
+    found.append(_of(cloth, "material.poisson_ratio", 0.2, LOGIT, lambda c: 0.5 / (1 + math.exp(-middle - c))))
+    if "bending" in cloth.effects:
+        found.append(_log(cloth, "effects.bending.stiffness", 0.1, spread))
+    std = recording.cloth.areal_density_std
+    if std:
+        found.append(_log(cloth, "areal_density", 0.02, std / recording.cloth.areal_density))
+    return found
+
+
+def _log(cloth: Cloth, path: str, step: float, std: float) -> Parameter:
+    start = float(_part(cloth, path).value)
+    return _of(cloth, path, step, std, lambda c: start * math.exp(c))
+
+
+def _of(cloth: Cloth, path: str, step: float, std: float, value: Callable[[float], float]) -> Parameter:
+    head, _, tail = path.partition(".")
+    name = tail if head in ("material", "effects") else path
+    return Parameter(name, _part(cloth, path).unit, step, std, lambda c, x: _part(c, path).set(value(x)), value)
+
+
+def _part(cloth: Cloth, path: str) -> PhysicalParameter:
+    return cloth.get_submodule(path)  # type: ignore[return-value]

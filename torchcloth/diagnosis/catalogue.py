@@ -1,0 +1,30 @@
+"""The known causes, each as one number that changes a world. Amplitude 0 is the world as it is.
+
+Typical amplitudes: design notes' table of published magnitudes (KES for friction, flat plates for air, laundering
+standards for shrinkage). What a user registers joins the search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ..recordings import Recording
+from . import air, fabric, grip, observer
+from .world import Hypothesis, Model
+
+_registered: list[Hypothesis] = []
+
+
+def register(hypothesis: Hypothesis) -> Hypothesis:
+    """Let a hypothesis of one's own join every search; one of the same name is replaced."""
+    _registered[:] = [h for h in _registered if h.name != hypothesis.name]
+    _registered.append(hypothesis)
+    return hypothesis
+
+
+def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]:
+    """All hypotheses that the recordings could say something about."""
+    known = [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES, *_registered]
+    table = any(r.colliders for r in recordings)
+    taken = {h.name for h in model.accepted}
+    return [h for h in known if h.name not in taken and (table or not h.needs_table)]

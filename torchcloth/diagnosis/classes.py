@@ -1,0 +1,36 @@
+"""Hypotheses that these data cannot tell from each other.
+
+D_ij = a_i^2 V_ii (1 - rho_ij^2) is the chi^2 by which i at amplitude a_i can be told from j at its best amplitude.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from .fitting import Fitted
+from .screening import Row, projection
+
+TOLD = 9.0  # chi^2, three standard deviations
+ALIKE = 0.99  # correlation
+
+
+def correlations(found: Fitted) -> Tensor:
+    """[hypotheses, hypotheses] of the efficient scores."""
+    asked = projection(found)(found.white.jacobian[:, found.evidence.own :])
+    norm = asked.norm(dim=0).clamp(min=1e-12)
+    return (asked.mT @ asked) / (norm[:, None] * norm)
+
+
+def alike(found: Fitted, row: Row, others: Sequence[Row]) -> list[Row]:
+    """Those of ``others`` that cannot be told from ``row`` at its amplitude, of other effects."""
+    index = {h.name: k for k, h in enumerate(found.evidence.hypotheses)}
+    rho = correlations(found)[index[row.hypothesis.name]]
+    out = []
+    for other in others:
+        r = float(rho[index[other.hypothesis.name]])
+        told = row.gain * (1 - r * r)
+        if other.hypothesis.effect != row.hypothesis.effect and (abs(r) > ALIKE or told < TOLD):
+            out.append(other)
+    return out

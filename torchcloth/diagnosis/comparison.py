@@ -1,0 +1,128 @@
+"""Fitted models on motions that they were not fitted to.
+
+Each group of motions is predicted by what the others determine: the solution of all data is moved by one linear step
+to that of the others, and the prediction with it. Nothing of a predicted episode but its own nuisances, within their
+priors, is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .evidence import aligned
+from .fitting import Fitted, prior_precision
+
+BLOCK = 2  # windows of cells that are resampled together
+DRAWS = 2000
+FREEDOM = 5  # degrees of the t-distribution by which single cells are judged
+
+
+class Predicted(NamedTuple):
+    """Held-out residuals of one model; cells of all episodes."""
+
+    value: Tensor  # [C] as predicted from the other motions, without what the episode's nuisances explain
+    white: Tensor  # [C] the same, whitened
+    key: Tensor  # [C]
+    episode: Tensor  # [C]
+    window: Tensor  # [C]
+    seen: Tensor  # [C] bool, a position and not a force
+
+
+class Gain(NamedTuple):
+    """Of one model over another, on motions held out."""
+
+    before: float  # m RMS, whole residual of positions
+    after: float
+    density: float  # log predictive density, second minus first
+    ci95: tuple[float, float]  # of the density's difference
+    explained: float  # share of before^2 - floor^2
+    explained_ci95: tuple[float, float]
+
+
+def predict(found: Fitted, groups: Sequence[str]) -> Predicted:
+    """Residuals of every episode when its group of motions is left out of the fit."""
+    white, count = found.white, found.evidence.own
+    precision = torch.diag(prior_precision(found.model))
+    own, point = white.jacobian[:, :count], found.model.point
+    whitened = white.value.clone()
+    names = np.array(groups)
+    for group in sorted(set(groups)):
+        inside = torch.as_tensor(np.isin(white.episode.numpy(), np.flatnonzero(names == group)))
+        rest, r = own[~inside], white.value[~inside]
+        step = -torch.linalg.solve(rest.mT @ rest + precision, rest.mT @ r + precision @ point)
+        whitened[inside] += own[inside] @ step
+    cells = found.evidence.cells
+    join = lambda name: torch.cat([getattr(c, name) for c in cells])  # noqa: E731
+    value = torch.cat([_adjusted(found, k, whitened[white.episode == k]) for k in range(len(cells))])
+    return Predicted(value, whitened, join("key"), white.episode, join("window"), join("block") < 3)
+
+
+def _adjusted(found: Fitted, k: int, white: Tensor) -> Tensor:
+    """[C_k] residuals less the likeliest nuisances: S K^-1 r, with S the covariance without them."""
+    cells, none = found.evidence.cells[k], torch.zeros(0, dtype=white.dtype)
+    slow = found.noise.covariance(cells, cells.jacobian[:, :0], none)
+    return slow @ torch.linalg.solve_triangular(found.white.roots[k].mT, white[:, None], upper=True)[:, 0]
+
+
+def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) -> Gain:
+    """How much better the second predicts; intervals by resampling episodes and, inside them, stretches of time."""
+    blocks = _blocks(first, second)
+    density = np.array([b[:, 0].sum() for b in blocks])
+    squares = np.array([b[:, 1:].sum(0) for b in blocks])  # before^2, after^2, count
+    owner = np.array(_owners(first))
+    rng = np.random.default_rng(seed)
+    drawn = [_draw(owner, rng) for _ in range(DRAWS)]
+    sums = np.array([density[d].sum() for d in drawn])
+    shares = np.array([_share(squares[d].sum(0), floor) for d in drawn])
+    before, after, n = squares.sum(0)
+    low, high = (float(np.quantile(sums, q)) for q in (0.025, 0.975))
+    few = 2.0 if len(set(owner.tolist())) < 8 else 1.0  # few episodes show too little of their spread
+    total = float(density.sum())
+    interval = (total - few * (total - low), total + few * (high - total))
+    share = _share(squares.sum(0), floor)
+    ends = tuple(share + few * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
+    return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, interval, share, ends)  # type: ignore[arg-type]
+
+
+def _share(squares: np.ndarray, floor: float) -> float:
+    before, after, n = squares
+    return float((before - after) / max(before - n * floor**2, 1e-12))
+
+
+def _log_t(white: Tensor) -> Tensor:
+    """Of a t-distribution scaled to the Gaussian's curvature, up to a constant: one wild cell decides nothing."""
+    return -0.5 * (FREEDOM + 1) * torch.log1p(white**2 / FREEDOM)
+
+
+def _groups(p: Predicted) -> Tensor:
+    return p.episode * 1000 + p.window // BLOCK
+
+
+def _owners(p: Predicted) -> list[int]:
+    return [int(g) // 1000 for g in _groups(p).unique()]
+
+
+def _blocks(first: Predicted, second: Predicted) -> list[np.ndarray]:
+    """Per stretch [cells, 4]: difference of density, squares before and after (positions only), count."""
+    key = lambda p: p.episode * 10**9 + p.key  # noqa: E731
+    other = aligned(
+        key(first), key(second), torch.stack([second.value, second.white, torch.ones_like(second.value)], 1)
+    )
+    both = other[:, 2] > 0
+    gain = torch.where(both, _log_t(other[:, 1]) - _log_t(first.white), 0.0)
+    counted = (both & first.seen).double()
+    rows = torch.stack([gain, counted * first.value**2, counted * other[:, 0] ** 2, counted], 1)
+    group = _groups(first)
+    return [rows[group == g].numpy() for g in group.unique()]
+
+
+def _draw(owner: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Indices of blocks: episodes with replacement, then their blocks with replacement."""
+    own = {e: np.flatnonzero(owner == e) for e in np.unique(owner)}
+    chosen = rng.choice(list(own), len(own))
+    return np.concatenate([rng.choice(own[e], len(own[e])) for e in chosen])

@@ -1,0 +1,104 @@
+"""What the fabric may be beyond an isotropic sheet of its stated size and mass."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..effects import Bending, Gravity, LineMass, RestShape
+from ..materials import OrthotropicAEP
+from ..meshes import Mesh
+from .world import Hypothesis, World
+
+MIDDLE = 1e-6  # m
+
+
+def _moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffening: float = 0.0) -> World:
+    """Shares by which the weft falls short of the warp, and shear exceeds the isotropic value; c of stiffening."""
+    own = world.cloth.material
+    nu, warp = float(own.poisson_ratio.value), float(own.youngs_modulus.value)  # type: ignore[union-attr,arg-type]
+    if isinstance(own, OrthotropicAEP):
+        e2, g = float(own.weft_modulus.value), float(own.shear_modulus.value)
+        c = float(own.warp_stiffening.value)
+    else:
+        e2, g, c = warp, warp / (2 * (1 + nu)), 0.0
+    e2, g, c = e2 * (1 - weft), g * (1 + shear), c + stiffening
+    new = OrthotropicAEP(
+        warp,
+        e2,
+        g,
+        nu,
+        warp_stiffening=c,
+        weft_stiffening=c,
+        thickness=own.thickness,  # type: ignore[union-attr,arg-type]
+    )
+    return world.with_cloth(material=new.requires_grad_(False))
+
+
+def _bending(world: World, **changes: float) -> World:
+    """Further curl [1/m]; weft stiffness as a share beyond the warp's."""
+    own: Bending = world.cloth.effects["bending"]  # type: ignore[assignment]
+    number = lambda name: 0.0 if getattr(own, name) is None else float(getattr(own, name).value)  # noqa: E731
+    options = {
+        "curl_warp": number("curl_warp") + changes.get("curl_warp", 0.0),
+        "curl_weft": number("curl_weft") + changes.get("curl_weft", 0.0),
+    }
+    kept = {name: value for name, value in options.items() if value}
+    ratio = (number("weft_ratio") or 1.0) * (1 + changes.get("weft", 0.0))
+    if ratio != 1.0:
+        kept |= {"weft_ratio": ratio, "twist_ratio": ratio**0.5}
+    new = Bending(number("stiffness"), number("damping_time") or None, own.poisson, **kept)  # type: ignore[arg-type]
+    return world.with_cloth({"bending": new.requires_grad_(False)})
+
+
+def _rest(world: World, name: str, amount: float) -> World:
+    effects = dict(world.cloth.effects.items())
+    own: RestShape | None = effects.get("rest_shape")  # type: ignore[assignment]
+    values = {n: 0.0 if own is None else float(getattr(own, n).value) for n in ("shrink_warp", "shrink_weft", "skew")}
+    values[name] += amount
+    return world.with_cloth({"rest_shape": RestShape(**values)})
+
+
+def _density(world: World, share: float) -> World:
+    new = world.with_cloth()
+    new.cloth.areal_density.set(new.cloth.areal_density.value.item() * (1 + share))
+    return new
+
+
+def _middle(mesh: Mesh) -> np.ndarray:
+    """[N, 2] edges of the mesh along v that are nearest to half the width."""
+    uv = mesh.vertices[:, :2] if mesh.uv is None else mesh.uv
+    u, sides = uv[:, 0], np.unique(np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    upright = np.abs(np.diff(u[sides], axis=1)[:, 0]) < MIDDLE
+    off = np.abs(u[sides].mean(1) - 0.5 * (u.min() + u.max()))
+    return sides[upright & (off < off[upright].min() + MIDDLE)] if upright.any() else sides[:0]
+
+
+def _seam(world: World, mass: float) -> World:
+    edges = _middle(world.cloth.mesh)
+    return world.with_cloth({"seam": LineMass(mass, edges)}) if len(edges) else world
+
+
+def _tilt(axis: int, world: World, angle: float) -> World:
+    """Gravity leans towards +x (0) or +y (1)."""
+    own: Gravity = world.cloth.effects["gravity"]  # type: ignore[assignment]
+    tilt = own.tilt.tolist()
+    tilt[1 - axis] += angle if axis == 1 else -angle  # about the other axis, by the right hand, with g along -z
+    return world.with_cloth({"gravity": Gravity(own.acceleration.tolist(), tilt).requires_grad_(False)})
+
+
+HYPOTHESES = (
+    Hypothesis("bend.aniso", "-", -0.6, lambda w, a: _bending(w, weft=a), signed=True),
+    Hypothesis("elas.ortho", "-", 0.5, lambda w, a: _moduli(w, weft=a), signed=True),
+    Hypothesis("elas.shear", "-", -0.6, lambda w, a: _moduli(w, shear=a), signed=True),
+    Hypothesis("elas.stiffen", "-", 10.0, lambda w, a: _moduli(w, stiffening=a)),
+    Hypothesis("rest.curl[warp]", "1/m", 3.0, lambda w, a: _bending(w, curl_warp=a), signed=True),
+    Hypothesis("rest.curl[weft]", "1/m", 3.0, lambda w, a: _bending(w, curl_weft=a), signed=True),
+    Hypothesis("rest.shrink[warp]", "-", 0.03, lambda w, a: _rest(w, "shrink_warp", a), signed=True),
+    Hypothesis("rest.shrink[weft]", "-", 0.03, lambda w, a: _rest(w, "shrink_weft", a), signed=True),
+    Hypothesis("rest.skew", "rad", 0.03, lambda w, a: _rest(w, "skew", a), signed=True),
+    Hypothesis("mass.density", "-", 0.08, _density, signed=True),
+    Hypothesis("mass.hem", "kg/m", 0.02, lambda w, a: w.with_cloth({"hem": LineMass(a)})),
+    Hypothesis("mass.seam", "kg/m", 0.02, _seam),
+    Hypothesis("env.gravity_tilt[x]", "rad", 0.01, lambda w, a: _tilt(0, w, a), signed=True),
+    Hypothesis("env.gravity_tilt[y]", "rad", 0.01, lambda w, a: _tilt(1, w, a), signed=True),
+)

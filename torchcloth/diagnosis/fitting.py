@@ -1,0 +1,77 @@
+"""Gauss-Newton on whitened cells: parameters within their priors, amplitudes of accepted hypotheses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .evidence import Evidence, Progress, Setting, gather
+from .noise import Noise, Whitened, fit_noise, whitened
+from .world import Hypothesis, Model
+
+SMALL = 0.1  # standard errors, of a step that ends the search
+LONGEST = 1.0  # prior standard deviations, of a step
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A model where the data want it.
+
+    Attributes:
+        model: at the solution.
+        evidence: at the solution, with the slopes along the hypotheses that were asked about.
+        noise: as estimated there.
+        white: evidence, whitened.
+        covariance: [P + A, P + A] of the model's coordinates.
+    """
+
+    model: Model
+    evidence: Evidence
+    noise: Noise
+    white: Whitened
+    covariance: Tensor
+
+
+def prior_precision(model: Model) -> Tensor:
+    """[P + A] of the coordinates; amplitudes are known to a few times their typical size."""
+    stds = [*(p.std for p in model.parameters), *(2.0 * abs(h.typical) for h in model.accepted)]
+    return torch.tensor(stds, dtype=torch.float64) ** -2
+
+
+def fit(
+    model: Model,
+    setting: Setting,
+    hypotheses: Sequence[Hypothesis] = (),
+    iterations: int = 4,
+    progress: Progress = lambda _: None,
+    like: Fitted | None = None,
+) -> Fitted:
+    """Fit the model's parameters and amplitudes, then ask about the hypotheses there.
+
+    Noise and the nuisances' slopes are those of ``like`` where that is given, so that fits can be compared.
+    """
+    precision, noise = prior_precision(model), None if like is None else like.noise
+    before = None if like is None else like.evidence
+    for _ in range(iterations):
+        evidence = gather(model, setting, (), progress, before)
+        before = before or evidence
+        white = whitened(evidence, noise or fit_noise(evidence))
+        step, covariance = _step(white, model.point, precision)
+        limit = LONGEST * precision.rsqrt()
+        model = model.at(model.point + step.clamp(-limit, limit))
+        if float((step / covariance.diagonal().sqrt()).abs().max()) < SMALL:
+            break
+    evidence = gather(model, setting, hypotheses, progress, like.evidence if like else None)
+    noise = noise or fit_noise(evidence)
+    white = whitened(evidence, noise)
+    _, covariance = _step(white, model.point, precision)
+    return Fitted(model, evidence, noise, white, covariance)
+
+
+def _step(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+    own = white.jacobian[:, : len(point)]
+    covariance = torch.linalg.inv(own.mT @ own + torch.diag(precision))
+    return -covariance @ (own.mT @ white.value + precision * point), covariance

@@ -1,0 +1,121 @@
+"""How residuals of a true model err together: sensor, slow errors, and what differs from episode to episode.
+
+    K = diag(spread^2 / n) + level^2 R + N P N'
+
+R falls with distance on the fabric and with time; N are the slopes along clock, camera, grasp, rim and tare, and P
+their variances, so that these are neither fixed nor free. The levels, one for each kind of data, come from restricted
+maximum likelihood after everything that is asked about is projected out: an effect must not pass as noise.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .cells import NAMES, Cells
+from .evidence import Evidence
+
+REACH, MEMORY = 0.1, 0.3  # m, s, over which slow errors agree
+FLOOR = {"points": 1e-4, "edges": 3e-4, "markers": 1e-4, "force": 5e-3, "torque": 5e-4}  # m, N, N m: of one cell
+RANK = 1e-9  # relative, of directions that count in the likelihood
+
+
+class Noise(NamedTuple):
+    """Levels of slow errors by kind of data."""
+
+    level: Tensor  # [blocks], in the data's units
+
+    def covariance(self, cells: Cells, nuisance: Tensor, std: Tensor) -> Tensor:
+        """[C, C] of one episode; ``nuisance`` [C, N] slopes, ``std`` [N]."""
+        moved = nuisance * std
+        slow = self.level[cells.block] ** 2
+        return torch.diag(_white(cells)) + slow[:, None] * _together(cells) + moved @ moved.mT
+
+
+class Whitened(NamedTuple):
+    """All episodes' cells in units in which a true model's are independent and of variance one."""
+
+    value: Tensor  # [C]
+    jacobian: Tensor  # [C, own + hypotheses]
+    episode: Tensor  # [C] int64
+    log_determinant: Tensor  # [E], of each covariance
+    roots: list[Tensor]  # Cholesky factors
+
+
+def whitened(evidence: Evidence, noise: Noise) -> Whitened:
+    """Cells and slopes by the inverse Cholesky factor of every episode's covariance."""
+    values, slopes, index, logs, roots = [], [], [], [], []
+    count = evidence.own + len(evidence.hypotheses)
+    for k, (cells, std) in enumerate(zip(evidence.cells, evidence.stds, strict=True)):
+        root = torch.linalg.cholesky(noise.covariance(cells, cells.jacobian[:, count:], std))
+        both = torch.cat([cells.value[:, None], cells.jacobian[:, :count]], 1)
+        both = torch.linalg.solve_triangular(root, both, upper=False)
+        values.append(both[:, 0])
+        slopes.append(both[:, 1:])
+        index.append(torch.full((len(cells.value),), k))
+        logs.append(2 * root.diagonal().log().sum())
+        roots.append(root)
+    return Whitened(torch.cat(values), torch.cat(slopes), torch.cat(index), torch.stack(logs), roots)
+
+
+def fit_noise(evidence: Evidence, sweeps: int = 2) -> Noise:
+    """Levels by restricted maximum likelihood, one kind of data after the other on a grid of factors."""
+    level = torch.tensor([FLOOR[name] for name in NAMES], dtype=torch.float64)
+    present = torch.cat([c.block for c in evidence.cells]).unique().tolist()
+    factors = 10 ** torch.linspace(-0.5, 1.75, 10, dtype=torch.float64)
+    for sweep in range(sweeps):
+        for b in present:
+            tried = [*(FLOOR[NAMES[b]] * factors)] if sweep == 0 else [*(level[b] * factors[:4] ** 0.3), level[b]]
+            best = max(tried, key=lambda v: _likelihood(evidence, _with(level, b, v)))
+            level = _with(level, b, best)
+    return Noise(level)
+
+
+def _with(level: Tensor, block: int, value: Tensor) -> Tensor:
+    out = level.clone()
+    out[block] = value
+    return out
+
+
+def _likelihood(evidence: Evidence, level: Tensor) -> float:
+    """Restricted log-likelihood, all that is asked about projected out."""
+    found = whitened(evidence, Noise(level))
+    scale = found.jacobian.norm(dim=0).clamp(min=1e-12)
+    u, s, _ = torch.linalg.svd(found.jacobian / scale, full_matrices=False)
+    u, s = u[:, s > RANK * s[0]], s[s > RANK * s[0]]
+    left = found.value - u @ (u.mT @ found.value)
+    restricted = 2 * (s.log().sum() + scale.log().sum())
+    return float(-0.5 * (found.log_determinant.sum() + restricted + left @ left))
+
+
+def _white(cells: Cells) -> Tensor:
+    """[C] variance of each mean by what rows of a cell differ by, pooled over a kind of data."""
+    out = torch.zeros_like(cells.value)
+    for b in cells.block.unique():
+        own = cells.block == b
+        out[own] = cells.spread[own].square().median() / cells.count[own]
+    return out + 1e-14
+
+
+def _together(cells: Cells) -> Tensor:
+    """[C, C] correlation of slow errors."""
+    same = cells.block[:, None] == cells.block
+    spatial = cells.place.norm(dim=1) > 0
+    where = torch.where(
+        spatial[:, None] & spatial, torch.cdist(cells.place, cells.place).square() / (2 * REACH**2), 0.0
+    )
+    alike = spatial[:, None] & spatial | (cells.patch[:, None] == cells.patch)
+    apart = (cells.time[:, None] - cells.time).abs() / MEMORY
+    return torch.where(same & alike, torch.exp(-where - apart), 0.0)
+
+
+def floor_of(evidence: Evidence, noise: Noise) -> float:
+    """RMS [m] of a position cell that a true model would leave, once an episode's nuisances are taken out."""
+    total, count = 0.0, 0
+    for cells in evidence.cells:
+        own = cells.block < 3
+        variance = (_white(cells) + noise.level[cells.block] ** 2)[own]
+        total, count = total + float(variance.sum()), count + int(own.sum())
+    return (total / count) ** 0.5

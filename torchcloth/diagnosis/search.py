@@ -1,0 +1,115 @@
+"""Stepwise search for causes: screen, fit the likeliest anew, compare on motions held out, accept, and again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from ..errors import SimulationDiverged, UnstableStep
+from .comparison import Gain, Predicted, compare, predict
+from .evidence import Progress, Setting
+from .fitting import Fitted, fit
+from .noise import floor_of
+from .screening import Row, screen
+from .world import Hypothesis, Model
+
+MOST = 4  # causes
+TRIED = 4  # hypotheses that are fitted at each step
+CLEAR = 4.0  # log density below which two models predict alike
+WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of what can be explained, of a cause that is worth naming
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A hypothesis that was fitted."""
+
+    row: Row  # as screened
+    fitted: Fitted
+    predicted: Predicted
+    gain: Gain  # over the model without it
+
+    @property
+    def hypothesis(self) -> Hypothesis:
+        """What was added."""
+        return self.row.hypothesis
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One accepted cause with what cannot be told from it."""
+
+    best: Candidate
+    rivals: list[Candidate]
+    screened: list[Row]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The end of a search."""
+
+    start: Fitted
+    end: Fitted
+    steps: list[Step]
+    screened: list[Row]  # at the end
+    whole: Gain | None  # of all causes together
+    floor: float  # m, of a cell
+    notes: list[str] = field(default_factory=list)
+
+
+def search(
+    model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
+) -> Found:
+    """Causes one after the other, until none is both present and useful on motions held out."""
+    current = start = fit(model, setting, hypotheses, progress=progress)
+    steps: list[Step] = []
+    first = predict(start, setting.names)
+    while True:
+        screened = screen(current)
+        present = [row for row in screened if row.decision == "present"]
+        if not present or len(steps) == MOST:
+            break
+        step = _step(current, setting, present, screened, progress)
+        if step is None:
+            break
+        steps.append(step)
+        left = [h for h in hypotheses if h.name not in {a.name for a in step.best.fitted.model.accepted}]
+        current = fit(step.best.fitted.model, setting, left, 0, progress, like=start)
+    floor = floor_of(start.evidence, start.noise)
+    whole = compare(first, predict(current, setting.names), floor) if steps else None
+    return Found(start, current, steps, screened, whole, floor)
+
+
+def _step(
+    current: Fitted, setting: Setting, present: Sequence[Row], screened: list[Row], progress: Progress
+) -> Step | None:
+    before, floor = predict(current, setting.names), floor_of(current.evidence, current.noise)
+    tried: list[Candidate] = []
+    for row in present[:TRIED]:
+        progress(f"fitting {row.hypothesis.name}")
+        begun = current.model.plus(row.hypothesis, row.amplitude)
+        try:
+            found = fit(begun, setting, (), 2, progress, like=current)
+        except (SimulationDiverged, UnstableStep):
+            continue
+        predicted = predict(found, setting.names)
+        tried.append(Candidate(row, found, predicted, compare(before, predicted, floor)))
+    useful = [c for c in tried if _useful(c)]
+    if not useful:
+        return None
+    best = max(useful, key=lambda c: c.gain.density)
+    rivals = [c for c in tried if c is not best and _rival(c, best)]
+    return Step(best, rivals, screened)
+
+
+def _useful(c: Candidate) -> bool:
+    worth = c.gain.before - c.gain.after > WORTH_MM or c.gain.explained > WORTH_SHARE
+    amplitude = abs(c.fitted.model.amplitudes[-1])
+    return worth and c.gain.ci95[0] > 0 and amplitude > abs(c.hypothesis.smallest)
+
+
+def _rival(c: Candidate, best: Candidate) -> bool:
+    """Predicts about as well: the paired difference is not clear."""
+    if c.hypothesis.effect == best.hypothesis.effect:
+        return False
+    over = compare(c.predicted, best.predicted, 0.0)
+    return over.density < CLEAR or over.ci95[0] < 0

@@ -1,0 +1,178 @@
+"""Everything between a robot's commands and a sensor's readings, and hypotheses that change it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ..boundaries import AbstractBoundary
+from ..cloth import Cloth
+from ..effects import AbstractEffect
+from ..identification.episodes import Episode
+from ..identification.replays import Frames, Replay, frames_of
+from ..materials import AbstractMaterial
+from ..meshes import Mesh
+
+Motion = Callable[[Episode], Episode]  # what the robot really does, from what it says
+View = Callable[[Frames, Episode], Frames]  # what is seen, from what is there
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A cloth, what the robot really does with it, and how it is looked at."""
+
+    cloth: Cloth
+    motions: tuple[Motion, ...] = ()
+    views: tuple[View, ...] = ()
+
+    def frames(self, episode: Episode, dt: float | None = None) -> Frames:
+        """What an observer has of the episode, simulated without derivatives."""
+        driven = episode
+        for motion in self.motions:
+            driven = motion(driven)
+        with torch.no_grad():
+            found = frames_of(Replay(self.cloth)(driven, dt))
+        for view in self.views:
+            found = view(found, episode)
+        return found
+
+    def with_motion(self, motion: Motion) -> World:
+        """The same with one more error of the robot."""
+        return replace(self, motions=(*self.motions, motion))
+
+    def with_view(self, view: View) -> World:
+        """The same with one more error of the observer."""
+        return replace(self, views=(*self.views, view))
+
+    def with_cloth(
+        self,
+        effects: Mapping[str, AbstractEffect] | None = None,
+        material: AbstractMaterial | None = None,
+        boundaries: Mapping[str, AbstractBoundary] | None = None,
+    ) -> World:
+        """The same with other or more parts of the cloth, by name."""
+        return replace(self, cloth=rebuilt(self.cloth, effects or {}, material, boundaries or {}))
+
+
+def copied(cloth: Cloth) -> Cloth:
+    """A cloth of its own on the same mesh, which nobody changes."""
+    return copy.deepcopy(cloth, {id(cloth.mesh): cloth.mesh})
+
+
+def rebuilt(
+    cloth: Cloth,
+    effects: Mapping[str, AbstractEffect],
+    material: AbstractMaterial | None,
+    boundaries: Mapping[str, AbstractBoundary],
+    mesh: Mesh | None = None,
+) -> Cloth:
+    """A new cloth with some parts replaced or added; nothing but the mesh is shared with the old one."""
+    kept = copied(cloth)
+    return Cloth(
+        mesh or kept.mesh,
+        material or kept.material,
+        kept.areal_density.value.detach().clone(),
+        {**dict(kept.effects.items()), **effects},  # type: ignore[dict-item]
+        {**dict(kept.boundaries.items()), **boundaries},  # type: ignore[dict-item]
+        kept.contact,
+        kept.transfer,
+        kept.engine,
+    )
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One number that changes a world; 0 is the world as it is.
+
+    Attributes:
+        name: e.g. "air.drag_n"; what errs alike along several axes shares it up to a bracket: "env.gravity_tilt[x]".
+        unit: of the amplitude.
+        typical: an amplitude that real recordings have.
+        apply: (world, amplitude) -> world.
+        signed: negative amplitudes make sense.
+        share: smallest amplitude of interest, as a share of the typical one.
+        needs_table: only where cloth touches something.
+        kin: names that no experiment of this kind can tell from it, by structure.
+    """
+
+    name: str
+    unit: str
+    typical: float
+    apply: Callable[[World, float], World]
+    signed: bool = False
+    share: float = 0.4
+    needs_table: bool = False
+    kin: tuple[str, ...] = ()
+
+    @property
+    def effect(self) -> str:
+        """The name without its axis."""
+        return self.name.partition("[")[0]
+
+    @property
+    def smallest(self) -> float:
+        """Of interest."""
+        return self.share * self.typical
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of the base model that is always fitted: log or plain, with a Gaussian prior around the data sheet.
+
+    Attributes:
+        name: public name of the parameter.
+        step: finite step for derivatives, in the coordinate.
+        std: of the prior, in the coordinate.
+        set: (cloth, coordinate) -> None; 0 is the data sheet's value.
+        value: coordinate -> physical value.
+    """
+
+    name: str
+    unit: str
+    step: float
+    std: float
+    set: Callable[[Cloth, float], None]
+    value: Callable[[float], float]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A base world, values of its parameters, and amplitudes of the hypotheses that it has accepted."""
+
+    base: World
+    parameters: tuple[Parameter, ...]
+    values: Tensor  # [P], coordinates
+    accepted: tuple[Hypothesis, ...] = ()
+    amplitudes: tuple[float, ...] = ()
+
+    def world(self, extra: Sequence[tuple[Hypothesis, float]] = ()) -> World:
+        """The world at these numbers, with further hypotheses at given amplitudes."""
+        cloth = copied(self.base.cloth)
+        for parameter, coordinate in zip(self.parameters, self.values.tolist(), strict=True):
+            parameter.set(cloth, coordinate)
+        world = replace(self.base, cloth=cloth)
+        own = zip(self.accepted, self.amplitudes, strict=True)
+        for hypothesis, amplitude in (*own, *extra):
+            if amplitude:
+                world = hypothesis.apply(world, amplitude)
+        return world
+
+    @property
+    def point(self) -> Tensor:
+        """[P + A] coordinates of the parameters, then amplitudes."""
+        return torch.cat([self.values, torch.tensor(self.amplitudes, dtype=self.values.dtype)])
+
+    def at(self, point: Tensor) -> Model:
+        """The same model elsewhere; amplitudes that make no sense below zero stop there."""
+        count = len(self.parameters)
+        found = zip(self.accepted, point[count:].tolist(), strict=True)
+        amplitudes = tuple(a if h.signed else max(a, 0.0) for h, a in found)
+        return replace(self, values=point[:count].clone(), amplitudes=amplitudes)
+
+    def plus(self, hypothesis: Hypothesis, amplitude: float = 0.0) -> Model:
+        """With one more accepted hypothesis."""
+        return replace(self, accepted=(*self.accepted, hypothesis), amplitudes=(*self.amplitudes, amplitude))
