@@ -12,8 +12,10 @@ from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import base_model
 from torchcloth.diagnosis.catalogue import catalogue, register
 from torchcloth.diagnosis.evidence import gather, setting_of
+from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
 from torchcloth.diagnosis.world import Hypothesis
+from torchcloth.errors import InvalidInput, RecordingError
 
 SIDE, SPEED = 0.2, 0.6  # m, m/s
 
@@ -141,3 +143,25 @@ def test_a_hypothesis_of_ones_own_joins_the_search(made):
     from torchcloth.diagnosis import catalogue as module
 
     module._registered.clear()
+
+
+def test_a_model_file_gives_the_same_world(made, tmp_path):
+    model, setting = made
+    by = {h.name: h for h in catalogue(model, [RECORDING])}
+    extended = model.at(model.point + 0.1).plus(by["air.drag_n"], 0.9).plus(by["rest.shrink[warp]"], -0.02)
+    again = load_model(save_model(tmp_path / "m.tcm", extended, RECORDING))
+    assert torch.equal(again.world().frames(setting.episodes[0]).x, extended.world().frames(setting.episodes[0]).x)
+    assert [h.name for h in again.accepted] == ["air.drag_n", "rest.shrink[warp]"]
+
+
+def test_model_files_that_cannot_be_read_are_refused(made, tmp_path):
+    model, _ = made
+    with pytest.raises(InvalidInput, match="no file"):
+        load_model(tmp_path / "nothing.tcm")
+    (tmp_path / "bad.tcm").write_text("no zip")
+    with pytest.raises(RecordingError, match="unreadable"):
+        load_model(tmp_path / "bad.tcm")
+    stranger = Hypothesis("user.unknown", "-", 1.0, lambda world, _: world)
+    path = save_model(tmp_path / "m.tcm", model.plus(stranger, 1.0), RECORDING)
+    with pytest.raises(InvalidInput, match=r"'user.unknown'.*register"):
+        load_model(path)

@@ -1,1 +1,43 @@
-"""What a simulation gets wrong, why, and what mending it gains."""
+"""What a simulation gets wrong, why, and what mending it gains.
+
+``diagnose`` runs all stages; each can be called alone: ``base_model``, ``setting_of``, ``gather``, ``fit_noise``,
+``fit``, ``screen``, ``predict``, ``compare``, ``search``, ``judge``. Read ``search.py`` first.
+"""
+
+from .base_model import base_model
+from .catalogue import catalogue, register
+from .comparison import Gain, compare, predict
+from .evidence import gather, setting_of
+from .fitting import Fitted, fit
+from .model_file import load_model, save_model
+from .noise import fit_noise
+from .run import diagnose, write_diagnosis
+from .screening import screen
+from .search import search
+from .verdict import Diagnosis, judge
+from .world import Hypothesis, Model, World
+
+__all__ = [
+    "Diagnosis",
+    "Fitted",
+    "Gain",
+    "Hypothesis",
+    "Model",
+    "World",
+    "base_model",
+    "catalogue",
+    "compare",
+    "diagnose",
+    "fit",
+    "fit_noise",
+    "gather",
+    "judge",
+    "load_model",
+    "predict",
+    "register",
+    "save_model",
+    "screen",
+    "search",
+    "setting_of",
+    "write_diagnosis",
+]

@@ -22,9 +22,13 @@ def register(hypothesis: Hypothesis) -> Hypothesis:
     return hypothesis
 
 
+def known() -> list[Hypothesis]:
+    """All hypotheses, the user's last."""
+    return [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES, *_registered]
+
+
 def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]:
     """All hypotheses that the recordings could say something about."""
-    known = [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES, *_registered]
     table = any(r.colliders for r in recordings)
     taken = {h.name for h in model.accepted}
-    return [h for h in known if h.name not in taken and (table or not h.needs_table)]
+    return [h for h in known() if h.name not in taken and (table or not h.needs_table)]

@@ -19,6 +19,7 @@ from .fitting import Fitted, prior_precision
 
 BLOCK = 2  # windows of cells that are resampled together
 DRAWS = 2000
+FEW = 8  # episodes, below which they show too little of their own spread: the share's interval is doubled
 FREEDOM = 5  # degrees of the t-distribution by which single cells are judged
 
 
@@ -70,7 +71,7 @@ def _adjusted(found: Fitted, k: int, white: Tensor) -> Tensor:
 
 
 def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) -> Gain:
-    """How much better the second predicts; intervals by resampling episodes and, inside them, stretches of time."""
+    """How much better the second predicts; intervals by resampling stretches of time."""
     blocks = _blocks(first, second)
     density = np.array([b[:, 0].sum() for b in blocks])
     squares = np.array([b[:, 1:].sum(0) for b in blocks])  # before^2, after^2, count
@@ -81,12 +82,10 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     shares = np.array([_share(squares[d].sum(0), floor) for d in drawn])
     before, after, n = squares.sum(0)
     low, high = (float(np.quantile(sums, q)) for q in (0.025, 0.975))
-    few = 2.0 if len(set(owner.tolist())) < 8 else 1.0  # few episodes show too little of their spread
-    total = float(density.sum())
-    interval = (total - few * (total - low), total + few * (high - total))
-    share = _share(squares.sum(0), floor)
-    ends = tuple(share + few * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
-    return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, interval, share, ends)  # type: ignore[arg-type]
+    total, share = float(density.sum()), _share(squares.sum(0), floor)
+    few = 2.0 if len(set(owner.tolist())) < FEW else 1.0
+    left, right = (share + few * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
+    return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, (low, high), share, (left, right))
 
 
 def _share(squares: np.ndarray, floor: float) -> float:
@@ -122,7 +121,9 @@ def _blocks(first: Predicted, second: Predicted) -> list[np.ndarray]:
 
 
 def _draw(owner: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Indices of blocks: episodes with replacement, then their blocks with replacement."""
-    own = {e: np.flatnonzero(owner == e) for e in np.unique(owner)}
-    chosen = rng.choice(list(own), len(own))
-    return np.concatenate([rng.choice(own[e], len(own[e])) for e in chosen])
+    """Indices of blocks: each episode's own, with replacement.
+
+    Episodes themselves are not resampled: they are different motions, of which one may be the only one that tells.
+    """
+    own = (np.flatnonzero(owner == e) for e in np.unique(owner))
+    return np.concatenate([rng.choice(blocks, len(blocks)) for blocks in own])

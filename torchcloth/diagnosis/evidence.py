@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -20,6 +23,8 @@ from .world import Hypothesis, Model, World
 
 CLOCK, SHIFT, TURN, GRASP, RIM, TARE = 0.01, 0.002, 0.005, 0.0015, 0.002, 0.1  # standard deviations, by episode
 Progress = Callable[[str], None]
+T = TypeVar("T")
+U = TypeVar("U")
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,18 +119,27 @@ def _simulable(
     model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
 ) -> list[dict[str, Frames]]:
     """Per episode, frames with each hypothesis that can be simulated in all of them."""
-    possible, found = list(hypotheses), []
+    found: list[dict[str, Frames]] = []
+    possible = list(hypotheses)
     for e in setting.episodes:
-        own = {}
-        for h in possible:
-            progress(f"{e.name}: {h.name}")
-            try:
-                own[h.name] = model.world([(h, h.typical)]).frames(e, setting.dt)
-            except (SimulationDiverged, UnstableStep):
-                continue
-        possible = [h for h in possible if h.name in own]
-        found.append(own)
+        progress(f"{e.name}: {len(possible)} hypotheses")
+        trials = side_by_side(lambda h, e=e: _tried(model, h, e, setting.dt), possible)
+        found.append({h.name: frames for h, frames in zip(possible, trials, strict=True) if frames is not None})
+        possible = [h for h in possible if h.name in found[-1]]
     return [{h.name: own[h.name] for h in possible} for own in found]
+
+
+def _tried(model: Model, h: Hypothesis, e: Episode, dt: float | None) -> Frames | None:
+    try:
+        return model.world([(h, h.typical)]).frames(e, dt)
+    except (SimulationDiverged, UnstableStep):
+        return None
+
+
+def side_by_side(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
+    """Results in order, on all cores: simulations are independent, and the engine leaves Python alone meanwhile."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(work, items))
 
 
 def aligned(key: Tensor, other: Tensor, columns: Tensor) -> Tensor:
@@ -143,7 +157,8 @@ def finer_residuals(model: Model, setting: Setting) -> list[Cells]:
         raise ValueError("a setting without a finer one")
     finer = setting.finer
     world = replace(model, base=finer.base).world()
-    return [cells_of(world.frames(e, finer.dt), None, e, finer.sheet, finer.rest) for e in finer.episodes]
+    seen = side_by_side(lambda e: world.frames(e, finer.dt), finer.episodes)
+    return [cells_of(f, None, e, finer.sheet, finer.rest) for f, e in zip(seen, finer.episodes, strict=True)]
 
 
 def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
@@ -157,15 +172,14 @@ def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
 
 def _own(model: Model, e: Episode, dt: float | None) -> tuple[Frames, list[Frames], list[float]]:
     """(at the point, beside it, steps) along the model's own coordinates."""
-    base = model.world().frames(e, dt)
-    point, shifted, steps = model.point, [], []
+    point, worlds, steps, count = model.point, [model.world()], [], len(model.parameters)
     for k in range(len(point)):
-        count = len(model.parameters)
         step = model.parameters[k].step if k < count else 0.1 * model.accepted[k - count].typical
         beside = point.clone()
         beside[k] += step
-        shifted.append(model.at(beside).world().frames(e, dt))
+        worlds.append(model.at(beside).world())
         steps.append(step)
+    base, *shifted = side_by_side(lambda world: world.frames(e, dt), worlds)
     return base, shifted, steps
 
 
@@ -182,11 +196,10 @@ def _nuisances(model: Model, base: Frames, e: Episode, dt: float | None) -> tupl
             shifted.append(kind.see(base, values, e))
             steps.append(0.5 * own)
             stds.append(own)
-    for mode in Held().modes(cloth, e):
-        off = replace(e, initial=e.initial + GRASP * mode, settles=True)
-        shifted.append(world.frames(off, dt))
-        steps.append(GRASP)
-        stds.append(GRASP)
+    moved = [replace(e, initial=e.initial + GRASP * mode, settles=True) for mode in Held().modes(cloth, e)]
+    shifted += side_by_side(lambda off: world.frames(off, dt), moved)
+    steps += [GRASP] * len(moved)
+    stds += [GRASP] * len(moved)
     return directions(base, shifted, steps), torch.tensor(stds, dtype=torch.float64)
 
 

@@ -45,7 +45,7 @@ def fit(
     model: Model,
     setting: Setting,
     hypotheses: Sequence[Hypothesis] = (),
-    iterations: int = 4,
+    iterations: int = 2,
     progress: Progress = lambda _: None,
     like: Fitted | None = None,
 ) -> Fitted:

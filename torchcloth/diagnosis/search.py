@@ -88,7 +88,7 @@ def _step(
         progress(f"fitting {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
-            found = fit(begun, setting, (), 2, progress, like=current)
+            found = fit(begun, setting, (), 1, progress, like=current)
         except (SimulationDiverged, UnstableStep):
             continue
         predicted = predict(found, setting.names)

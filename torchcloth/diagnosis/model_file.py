@@ -1,0 +1,133 @@
+"""``*.tcm``: a base model, its fitted parameters and the causes it was extended by, as JSON and arrays in one zip file.
+
+Nothing is pickled: a model is what its episode said of the cloth, plus numbers by name.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .._files import atomically
+from ..errors import InvalidInput, RecordingError
+from ..recordings import ClothInfo, Collider, GraspInfo, Recording
+from .base_model import base_model
+from .catalogue import known
+from .world import Model
+
+FORMAT = 1
+MESH = ("vertices", "faces", "uv")
+
+
+def save_model(path: Path, model: Model, recording: Recording, covariance: Tensor | None = None) -> Path:
+    """Write a model whose base is that of ``recording``; returns the path."""
+    cloth = recording.cloth
+    facts: dict[str, Any] = {
+        "areal_density": cloth.areal_density,
+        "areal_density_std": cloth.areal_density_std,
+        "thickness": cloth.thickness,
+        "sheet": None if cloth.sheet is None else list(cloth.sheet),
+        "nominal": cloth.nominal,
+        "gravity": recording.gravity.tolist(),
+        "grasps": {name: _grasp(g) for name, g in recording.grasps.items()},
+        "colliders": {
+            name: {"point": c.point.tolist(), "normal": c.normal.tolist(), "friction": c.friction}
+            for name, c in recording.colliders.items()
+        },
+    }
+    values = zip(model.parameters, model.values.tolist(), strict=True)
+    causes = zip(model.accepted, model.amplitudes, strict=True)
+    content = {
+        "format": FORMAT,
+        "torchcloth": metadata.version("torchcloth"),
+        "cloth": facts,
+        "parameters": {p.name: {"coordinate": c, "value": p.value(c), "unit": p.unit} for p, c in values},
+        "causes": [{"effect": h.name, "amplitude": a, "unit": h.unit} for h, a in causes],
+        "covariance": None if covariance is None else covariance.tolist(),
+    }
+    arrays = {name: getattr(cloth, name) for name in MESH if getattr(cloth, name) is not None}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    with atomically(Path(path)) as part, zipfile.ZipFile(part, "w") as file:
+        file.writestr("model.json", json.dumps(content, indent=1, allow_nan=False))
+        file.writestr("mesh.npz", buffer.getvalue())
+    return Path(path)
+
+
+def load_model(path: str | Path) -> Model:
+    """A model that was written by ``save_model``.
+
+    Raises:
+        InvalidInput: no such file, or a cause that is not in the catalogue.
+        RecordingError: a file that is damaged or no model.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InvalidInput("model", got=f"no file {path}", expected="a .tcm file of `torchcloth diagnose`")
+    try:
+        with zipfile.ZipFile(path) as file:
+            content = json.loads(file.read("model.json"))
+            with np.load(io.BytesIO(file.read("mesh.npz"))) as arrays:
+                mesh = {name: arrays[name] for name in arrays.files}
+        if content["format"] != FORMAT:
+            raise RecordingError(
+                f"{path}: format {content['format']}", expected=f"{FORMAT}", remedy="update torchcloth"
+            )
+        model = base_model(_recording(content["cloth"], mesh))
+        coordinates = {name: float(p["coordinate"]) for name, p in content["parameters"].items()}
+        causes = [(str(c["effect"]), float(c["amplitude"])) for c in content["causes"]]
+    except (zipfile.BadZipFile, KeyError, TypeError, ValueError, OSError) as error:
+        raise RecordingError(f"{path}: unreadable", got=repr(error), expected="a model of torchcloth") from None
+    values = torch.tensor([coordinates[p.name] for p in model.parameters], dtype=torch.float64)
+    model = Model(model.base, model.parameters, values)
+    return _extended(path, model, causes)
+
+
+def _extended(path: Path, model: Model, causes: Sequence[tuple[str, float]]) -> Model:
+    by_name = {h.name: h for h in known()}
+    for name, amplitude in causes:
+        if name not in by_name:
+            raise InvalidInput(
+                f"{path}: effect {name!r}", got="not in the catalogue", remedy="register it (diagnosis.register) first"
+            )
+        model = model.plus(by_name[name], amplitude)
+    return model
+
+
+def _grasp(grasp: GraspInfo) -> dict[str, Any]:
+    lists = {name: None if (v := getattr(grasp, name)) is None else v.tolist() for name in ("uv", "vertices")}
+    return {**lists, "radius": grasp.radius}
+
+
+def _recording(facts: dict[str, Any], mesh: dict[str, np.ndarray]) -> Recording:
+    array = lambda v: None if v is None else np.asarray(v)  # noqa: E731
+    cloth = ClothInfo(
+        areal_density=facts["areal_density"],
+        areal_density_std=facts["areal_density_std"],
+        thickness=facts["thickness"],
+        sheet=None if facts["sheet"] is None else tuple(facts["sheet"]),
+        nominal=facts["nominal"],
+        vertices=mesh.get("vertices"),
+        faces=mesh.get("faces"),
+        uv=mesh.get("uv"),
+    )
+    grasps = {
+        name: GraspInfo(uv=array(g["uv"]), radius=g["radius"], vertices=array(g["vertices"]))
+        for name, g in facts["grasps"].items()
+    }
+    colliders = {
+        name: Collider(np.asarray(c["point"]), np.asarray(c["normal"]), c["friction"])
+        for name, c in facts["colliders"].items()
+    }
+    return Recording(
+        cloth=cloth, provenance="model file", grasps=grasps, colliders=colliders, gravity=np.asarray(facts["gravity"])
+    )

@@ -1,0 +1,84 @@
+"""report.html: one file that says what was found and shows why."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from pathlib import Path
+from typing import Any
+
+from .._files import write_text
+from . import pictures
+from .comparison import predict
+from .screening import Row
+from .verdict import Diagnosis
+
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem } img { max-width: 100% }
+table { border-collapse: collapse; font-size: 0.9rem } td, th { padding: 0.15rem 0.7rem; text-align: right }
+th { border-bottom: 1px solid #999 } td:first-child, th:first-child { text-align: left } .verdict { font-size: 1.3rem }
+"""
+
+
+def write_report(answer: Diagnosis, folder: Path) -> Path:
+    """Write report.html into ``folder``; returns its path."""
+    found, motions = answer.found, answer.content["motions"]
+    before = predict(found.start, motions)
+    after = predict(found.end, motions) if found.steps else None
+    parts = [
+        f'<p class="verdict">Verdict: <b>{answer.verdict}</b></p>',
+        *(f"<p>{html.escape(line)}</p>" for line in answer.summary().splitlines()),
+        "<h2>Where and when</h2>",
+        _image(pictures.residual_maps(answer)),
+        "<h2>Motions held out</h2>",
+        _image(pictures.courses(answer, before, after)),
+        "<h2>What the residuals of the base model ask for</h2>",
+        _image(pictures.screening(found.steps[0].screened if found.steps else found.screened)),
+        "<h2>What is left</h2>" if found.steps else "<h2>All hypotheses</h2>",
+        _table(found.screened),
+        "<h2>What these motions can tell apart</h2>",
+        _image(pictures.isolability(answer)),
+        "<h2>Parameters of the model</h2>",
+        _parameters(answer.content["parameters"]),
+    ]
+    title = "What the simulation gets wrong"
+    page = f"<!doctype html><html><head><meta charset='utf-8'><title>{title}</title><style>{STYLE}</style></head>"
+    return write_text(folder / "report.html", f"{page}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")
+
+
+def _image(figure: Any) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return f'<img src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
+
+
+def _table(rows: list[Row]) -> str:
+    head = [
+        "hypothesis",
+        "unit",
+        "amplitude",
+        "std. error",
+        "of numerics",
+        "typical",
+        "moves, mm",
+        "detectable",
+        "decision",
+    ]
+    body = []
+    for r in rows:
+        numbers = (r.amplitude, r.std, r.bias, r.hypothesis.typical, 1e3 * r.size, r.detectable)
+        cells = [r.hypothesis.name, r.hypothesis.unit, *(f"{x:.3g}" for x in numbers), r.decision]
+        body.append("".join(f"<td>{html.escape(c)}</td>" for c in cells))
+    heads = "".join(f"<th>{h}</th>" for h in head)
+    return f"<table><tr>{heads}</tr>{''.join(f'<tr>{row}</tr>' for row in body)}</table>"
+
+
+def _parameters(found: dict[str, Any]) -> str:
+    rows = "".join(
+        f"<tr><td>{name}</td><td>{p['value']:.4g}</td><td>{p['ci95'][0]:.4g} to {p['ci95'][1]:.4g}</td>"
+        f"<td>{p['unit']}</td></tr>"
+        for name, p in found.items()
+    )
+    return f"<table><tr><th>parameter</th><th>value</th><th>95 %</th><th>unit</th></tr>{rows}</table>"

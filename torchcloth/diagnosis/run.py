@@ -1,0 +1,66 @@
+"""``diagnose``: all stages in order."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from .._files import write_text
+from ..errors import InvalidInput
+from ..recordings import Recording
+from .base_model import base_model
+from .catalogue import catalogue
+from .evidence import Progress, setting_of
+from .model_file import save_model
+from .report import write_report
+from .search import search
+from .verdict import Diagnosis, judge
+from .world import Hypothesis, Model
+
+RESULT, EXTENDED = "diagnosis.json", "extended.tcm"
+
+
+def diagnose(
+    recordings: Sequence[Recording],
+    model: Model | None = None,
+    hypotheses: Sequence[Hypothesis] | None = None,
+    progress: Progress = lambda _: None,
+) -> Diagnosis:
+    """What a simulation of these episodes gets wrong, and what mending it gains.
+
+    Args:
+        recordings: episodes of one cloth, at least two, of different motions (``split["motion"]``).
+        model: where to start; None: the base model of the first episode, in vacuum.
+        hypotheses: what to look for; None: the catalogue.
+        progress: called with one line for each thing that is simulated.
+
+    Raises:
+        InvalidInput: fewer than two episodes, or too few motions to hold one out.
+        RecordingError: an episode that lacks what is needed.
+        SimulationDiverged: the base model cannot be simulated.
+    """
+    names = [str(r.split.get("motion") or f"episode {k}") for k, r in enumerate(recordings)]
+    if len(set(names)) < 2:
+        raise InvalidInput(
+            "episodes",
+            got=f"{len(recordings)} with motion {', '.join(sorted(set(names))) or 'none'}",
+            expected="at least two motions: one is held out while the other is fitted",
+            remedy="record another motion, or name them apart (split.motion in episode.json)",
+        )
+    model = model or base_model(recordings[0])
+    asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
+    plan = hashlib.sha256(json.dumps([[h.name, h.typical, h.share] for h in asked]).encode()).hexdigest()[:16]
+    setting = setting_of(model, recordings)
+    answer = judge(search(model, setting, asked, progress), setting.names)
+    return replace(answer, content=answer.content | {"plan_hash": plan, "model": EXTENDED})
+
+
+def write_diagnosis(answer: Diagnosis, recording: Recording, folder: Path) -> Path:
+    """diagnosis.json, report.html and the extended model into ``folder``; returns the first's path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    save_model(folder / EXTENDED, answer.model, recording, answer.found.end.covariance)
+    write_report(answer, folder)
+    return write_text(folder / RESULT, json.dumps(answer.content, indent=1, allow_nan=False) + "\n")

@@ -1,0 +1,193 @@
+"""From a search to an answer in words and numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from .classes import alike
+from .evidence import Evidence
+from .search import Found, Step
+from .world import Model
+
+Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics"]
+NORMAL = 1.96
+ROUGH = 5e-4  # m: slow errors of position cells beyond this, and beyond twice what numerics leaves, are a lack of fit
+OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What the simulation gets wrong.
+
+    Attributes:
+        verdict: "identified" (each cause stands alone), "ambiguous" (some cannot be told from others), "unexplained"
+            (the fit is lacking and nothing known mends it), "adequate" (nothing known is wrong), "inconclusive"
+            (these data cannot say), "numerics" (the mesh errs more than anything else).
+        content: all of it, as diagnosis.json has it.
+        model: the base model with its fitted parameters and the accepted causes.
+        found: the search, for pictures and for those who want to know.
+    """
+
+    verdict: Verdict
+    content: dict[str, Any]
+    model: Model
+    found: Found
+
+    def summary(self) -> str:
+        """Plain language."""
+        return "\n".join(_sentences(self.verdict, self.content))
+
+
+def judge(found: Found, names: Sequence[str]) -> Diagnosis:
+    """The answer of a search over episodes with these motions."""
+    causes = [_cause(found, step) for step in found.steps]
+    rows = found.screened
+    lacking = _lack_of_fit(found)
+    verdict = _verdict(found, causes, lacking)
+    content = {
+        "verdict": verdict,
+        "causes": causes,
+        "ruled_out": [r.hypothesis.name for r in rows if r.decision == "absent"],
+        "undecided": [r.hypothesis.name for r in rows if r.decision in ("inconclusive", "present")],
+        "unresolvable": [
+            {"effect": r.hypothesis.name, "smallest_detectable": _finite(r.detectable), "unit": r.hypothesis.unit}
+            for r in rows
+            if r.decision == "unresolvable"
+        ],
+        "gain": _gain(found),
+        "also_unexplained": bool(causes) and lacking,
+        "lack_of_fit": {"slow_errors": _slow(found), "numerics": _numerics(found.end.evidence), "unit": "m"},
+        "next_experiment": None,
+        "parameters": _parameters(found),
+        "warnings": _warnings(found, names),
+        "motions": list(names),
+    }
+    return Diagnosis(verdict, content, found.end.model, found)
+
+
+def _verdict(found: Found, causes: Sequence[dict[str, Any]], lacking: bool) -> Verdict:
+    if causes:
+        return "identified" if all(not c["rivals"] and len(c["class"]) == 1 for c in causes) else "ambiguous"
+    if _numerics(found.end.evidence) > max(ROUGH, found.floor):
+        return "numerics"
+    if lacking:
+        return "unexplained"
+    undecided = [r for r in found.screened if r.decision == "present"]
+    return "inconclusive" if undecided else "adequate"
+
+
+def _cause(found: Found, step: Step) -> dict[str, Any]:
+    best, place = step.best, found.steps.index(step)
+    h, count = best.hypothesis, len(found.end.model.parameters)
+    amplitude = found.end.model.amplitudes[place]
+    std = float(found.end.covariance[count + place, count + place].sqrt())
+    std = (std**2 + best.row.bias**2) ** 0.5
+    before = found.start if place == 0 else found.steps[place - 1].best.fitted
+    kin = [r.hypothesis.name for r in alike(before, best.row, [r for r in step.screened if r.gain > 0])]
+    return {
+        "effect": h.name,
+        "amplitude": amplitude,
+        "unit": h.unit,
+        "ci95": [amplitude - NORMAL * std, amplitude + NORMAL * std],
+        "class": sorted({h.name, *kin, *h.kin}),
+        "rivals": [
+            {"effect": c.hypothesis.name, "amplitude": c.fitted.model.amplitudes[-1], "unit": c.hypothesis.unit}
+            for c in step.rivals
+        ],
+        "gain_mm": 1e3 * (best.gain.before - best.gain.after),
+        "share_of_explainable": best.gain.explained,
+    }
+
+
+def _gain(found: Found) -> dict[str, Any] | None:
+    if found.whole is None:
+        return None
+    g = found.whole
+    return {
+        "rms_before": g.before,
+        "rms_after": g.after,
+        "floor": found.floor,
+        "unit": "m",
+        "explained_fraction": g.explained,
+        "ci95": list(g.explained_ci95),
+        "log_density": g.density,
+        "log_density_ci95": list(g.ci95),
+    }
+
+
+def _parameters(found: Found) -> dict[str, Any]:
+    model, std = found.end.model, found.end.covariance.diagonal().sqrt().tolist()
+    return {
+        p.name: {
+            "value": p.value(c),
+            "ci95": sorted([p.value(c - NORMAL * s), p.value(c + NORMAL * s)]),
+            "unit": p.unit,
+        }
+        for p, c, s in zip(model.parameters, model.values.tolist(), std, strict=False)
+    }
+
+
+def _slow(found: Found) -> float:
+    return float(found.end.noise.level[0])
+
+
+def _numerics(evidence: Evidence) -> float:
+    """m, RMS that the finer mesh is expected to leave of the difference between both."""
+    squares = [n[c.block < 3].square().sum() for n, c in zip(evidence.numerics, evidence.cells, strict=True)]
+    count = sum(int((c.block < 3).sum()) for c in evidence.cells)
+    return float(sum(squares) / count) ** 0.5 / 3
+
+
+def _lack_of_fit(found: Found) -> bool:
+    return _slow(found) > max(ROUGH, 2 * _numerics(found.end.evidence))
+
+
+def _warnings(found: Found, names: Sequence[str]) -> list[str]:
+    out = []
+    for p, c in zip(found.end.model.parameters, found.end.model.values.tolist(), strict=True):
+        if abs(c) > OFTEN * p.std:
+            out.append(
+                f"{p.name} is {abs(c) / p.std:.1f} standard deviations from its data sheet: it does another's job"
+            )
+    if len(set(names)) < 3:
+        out.append(f"{len(set(names))} kind(s) of motion: many causes look alike in them")
+    if len(names) < 8:
+        out.append(f"{len(names)} episodes show little of their own spread: intervals of the gain are doubled")
+    return out
+
+
+def _finite(value: float) -> float | None:
+    return value if value < float("inf") else None
+
+
+def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
+    gain, out = content["gain"], []
+    if gain:
+        out.append(
+            f"On motions held out the simulation is {1e3 * gain['rms_before']:.2f} mm RMS off, "
+            f"{1e3 * gain['rms_after']:.2f} mm with the causes below; {1e3 * gain['floor']:.2f} mm would be expected."
+        )
+    for c in content["causes"]:
+        low, high = c["ci95"]
+        out.append(f"Cause: {c['effect']} = {c['amplitude']:.4g} {c['unit']} (95 %: {low:.4g} to {high:.4g}).")
+        others = [name for name in c["class"] if name != c["effect"]] + [r["effect"] for r in c["rivals"]]
+        if others:
+            out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
+    words = {
+        "adequate": "Nothing known is wrong beyond what matters.",
+        "unexplained": "The fit is lacking, and no known cause mends it.",
+        "inconclusive": "Something may be wrong; these data cannot say what.",
+        "numerics": "The mesh errs more than anything else: use a finer one.",
+    }
+    if verdict in words:
+        out.append(words[verdict])
+    if content["also_unexplained"]:
+        out.append("Something beyond these causes remains unexplained.")
+    for label, key in (("Ruled out", "ruled_out"), ("Undecided", "undecided")):
+        if content[key]:
+            out.append(f"{label}: {', '.join(content[key])}.")
+    if content["unresolvable"]:
+        out.append(f"Cannot be seen in these data: {', '.join(r['effect'] for r in content['unresolvable'])}.")
+    return [*out, *(f"Warning: {text}." for text in content["warnings"])]
