@@ -10,8 +10,8 @@ import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import base_model
-from torchcloth.diagnosis.catalogue import catalogue, register
 from torchcloth.diagnosis.evidence import gather, setting_of
+from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
 from torchcloth.diagnosis.world import Hypothesis
@@ -140,9 +140,8 @@ def test_a_hypothesis_of_ones_own_joins_the_search(made):
     own = register(Hypothesis("user.sag", "m", 0.01, lambda world, a: world.with_view(lambda f, _: f)))
     assert own in catalogue(model, [RECORDING])
     assert own not in catalogue(model.plus(own, 0.01), [RECORDING])
-    from torchcloth.diagnosis import catalogue as module
-
-    module._registered.clear()
+    forget("user.sag")
+    assert own not in catalogue(model, [RECORDING])
 
 
 def test_a_model_file_gives_the_same_world(made, tmp_path):

@@ -1,19 +1,19 @@
 """What a simulation gets wrong, why, and what mending it gains.
 
 ``diagnose`` runs all stages; each can be called alone: ``base_model``, ``setting_of``, ``gather``, ``fit_noise``,
-``fit``, ``screen``, ``predict``, ``compare``, ``search``, ``judge``. Read ``search.py`` first.
+``fit``, ``screen``, ``predict``, ``compare``, ``search``, ``judge``. Read ``stepwise.py`` first.
 """
 
 from .base_model import base_model
-from .catalogue import catalogue, register
 from .comparison import Gain, compare, predict
 from .evidence import gather, setting_of
 from .fitting import Fitted, fit
+from .hypotheses import catalogue, register
 from .model_file import load_model, save_model
 from .noise import fit_noise
 from .run import diagnose, write_diagnosis
 from .screening import screen
-from .search import search
+from .stepwise import search
 from .verdict import Diagnosis, judge
 from .world import Hypothesis, Model, World
 

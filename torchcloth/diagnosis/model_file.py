@@ -21,7 +21,7 @@ from .._files import atomically
 from ..errors import InvalidInput, RecordingError
 from ..recordings import ClothInfo, Collider, GraspInfo, Recording
 from .base_model import base_model
-from .catalogue import known
+from .hypotheses import known
 from .world import Model
 
 FORMAT = 1

@@ -12,11 +12,11 @@ from .._files import write_text
 from ..errors import InvalidInput
 from ..recordings import Recording
 from .base_model import base_model
-from .catalogue import catalogue
 from .evidence import Progress, setting_of
+from .hypotheses import catalogue
 from .model_file import save_model
 from .report import write_report
-from .search import search
+from .stepwise import search
 from .verdict import Diagnosis, judge
 from .world import Hypothesis, Model
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from .classes import alike
 from .evidence import Evidence
-from .search import Found, Step
+from .stepwise import Found, Step
 from .world import Model
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics"]

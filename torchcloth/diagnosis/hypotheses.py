@@ -17,9 +17,14 @@ _registered: list[Hypothesis] = []
 
 def register(hypothesis: Hypothesis) -> Hypothesis:
     """Let a hypothesis of one's own join every search; one of the same name is replaced."""
-    _registered[:] = [h for h in _registered if h.name != hypothesis.name]
+    forget(hypothesis.name)
     _registered.append(hypothesis)
     return hypothesis
+
+
+def forget(name: str) -> None:
+    """Take a registered hypothesis out again."""
+    _registered[:] = [h for h in _registered if h.name != name]
 
 
 def known() -> list[Hypothesis]:
