@@ -22,6 +22,7 @@ STRETCH = 0.2  # s
 OUTLIER = 5.0  # robust standard deviations within a cell
 FEWEST = 3  # rows, of a cell of many
 NAMES = tuple(block.name for block in BLOCKS)
+SEEN = NAMES.index("force")  # kinds before it are positions
 
 
 class Cells(NamedTuple):
@@ -32,7 +33,7 @@ class Cells(NamedTuple):
     count: Tensor  # [C] rows
     spread: Tensor  # [C] standard deviation of a row within the cell
     block: Tensor  # [C] int64, kind of data
-    patch: Tensor  # [C] int64
+    patch: Tensor  # [C] int64, three times the part of the fabric, piece of the rim or gripper, plus the axis
     window: Tensor  # [C] int64
     place: Tensor  # [C, 3] m, where on the fabric at rest; zero where that makes no sense
     time: Tensor  # [C] s
@@ -40,7 +41,7 @@ class Cells(NamedTuple):
     @property
     def key(self) -> Tensor:
         """[C] the same for the same cell of another model."""
-        return (self.block * 1000 + self.patch) * 1000 + self.window
+        return (self.block * 10_000 + self.patch) * 1000 + self.window
 
 
 def cells_of(frames: Frames, moved: Frames | None, episode: Episode, sheet: Sheet, rest: Tensor) -> Cells:
@@ -50,7 +51,7 @@ def cells_of(frames: Frames, moved: Frames | None, episode: Episode, sheet: Shee
     for b, block in enumerate(BLOCKS):
         rows = block.rows(scene)
         if rows is not None and len(rows.value):
-            parts.append(_averaged(rows, b, episode, _places(block.name, rows, sheet, rest)))
+            parts.append(_averaged(_grouped(block.name, rows, episode, sheet), b, episode, sheet, rest))
     return Cells(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
@@ -64,7 +65,18 @@ def directions(base: Frames, shifted: Sequence[Frames], steps: Sequence[float]) 
     return Frames(slope(lambda f: f.x), slope(lambda f: f.v), wrench, slope(lambda f: f.edge))
 
 
-def _averaged(rows: Rows, block: int, episode: Episode, place: Tensor) -> Cells:
+def _grouped(name: str, rows: Rows, episode: Episode, sheet: Sheet) -> Rows:
+    """Rows whose patches tell axes apart; single markers join the part of the fabric that they are on."""
+    patch = rows.patch
+    if name == "markers" and episode.places is not None:
+        patch = 3 * sheet.patches[episode.places.corners[rows.patch // 3, 0]] + rows.patch % 3
+    elif name in ("points", "edges"):
+        patch = 3 * rows.patch
+    return rows._replace(patch=patch)
+
+
+def _averaged(rows: Rows, block: int, episode: Episode, sheet: Sheet, rest: Tensor) -> Cells:
+    place = _places(NAMES[block], sheet, rest)[rows.patch // 3]
     times = episode.times.to(rows.value)
     window = ((times - times[0]) / STRETCH).floor().long()[rows.frame]
     group, index = torch.unique(rows.patch * 1000 + window, return_inverse=True)
@@ -104,15 +116,15 @@ def _inliers(value: Tensor, index: Tensor, size: int) -> Tensor:
     return off <= OUTLIER * usual[index]
 
 
-def _places(name: str, rows: Rows, sheet: Sheet, rest: Tensor) -> Tensor:
-    """[R, 3] m, the middle of each row's patch on the pattern."""
-    if name == "points":
-        total = torch.zeros(int(sheet.patches.max()) + 1, 3, dtype=rest.dtype).index_add(0, sheet.patches, rest)
-        count = torch.bincount(sheet.patches, minlength=len(total)).clamp(min=1)
-        return (total / count[:, None])[rows.patch]
+def _places(name: str, sheet: Sheet, rest: Tensor) -> Tensor:
+    """[patches, 3] m, the middle of each on the pattern; zero for what is felt."""
+    if name in ("points", "markers"):
+        return _middles(sheet.patches, rest)
     if name == "edges":
-        middle = 0.5 * (rest[sheet.rim.edges[:, 0]] + rest[sheet.rim.edges[:, 1]])
-        total = torch.zeros(sheet.rim.count, 3, dtype=rest.dtype).index_add(0, sheet.rim.piece, middle)
-        count = torch.bincount(sheet.rim.piece, minlength=sheet.rim.count).clamp(min=1)
-        return (total / count[:, None])[rows.patch]
-    return torch.zeros(len(rows.value), 3, dtype=rest.dtype)
+        return _middles(sheet.rim.piece, 0.5 * (rest[sheet.rim.edges[:, 0]] + rest[sheet.rim.edges[:, 1]]))
+    return torch.zeros(1000, 3, dtype=rest.dtype)
+
+
+def _middles(index: Tensor, place: Tensor) -> Tensor:
+    total = torch.zeros(int(index.max()) + 1, 3, dtype=place.dtype).index_add(0, index, place)
+    return total / torch.bincount(index).clamp(min=1)[:, None]

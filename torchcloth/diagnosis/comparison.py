@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .cells import SEEN
 from .evidence import aligned
 from .fitting import Fitted, prior_precision
 
@@ -60,7 +61,7 @@ def predict(found: Fitted, groups: Sequence[str]) -> Predicted:
     cells = found.evidence.cells
     join = lambda name: torch.cat([getattr(c, name) for c in cells])  # noqa: E731
     value = torch.cat([_adjusted(found, k, whitened[white.episode == k]) for k in range(len(cells))])
-    return Predicted(value, whitened, join("key"), white.episode, join("window"), join("block") < 3)
+    return Predicted(value, whitened, join("key"), white.episode, join("window"), join("block") < SEEN)
 
 
 def _adjusted(found: Fitted, k: int, white: Tensor) -> Tensor:

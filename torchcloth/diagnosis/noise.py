@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .cells import NAMES, Cells
+from .cells import NAMES, SEEN, Cells
 from .evidence import Evidence
 
 REACH, MEMORY = 0.1, 0.3  # m, s, over which slow errors agree
@@ -101,12 +101,11 @@ def _white(cells: Cells) -> Tensor:
 
 def _together(cells: Cells) -> Tensor:
     """[C, C] correlation of slow errors."""
-    same = cells.block[:, None] == cells.block
-    spatial = cells.place.norm(dim=1) > 0
-    where = torch.where(
-        spatial[:, None] & spatial, torch.cdist(cells.place, cells.place).square() / (2 * REACH**2), 0.0
-    )
-    alike = spatial[:, None] & spatial | (cells.patch[:, None] == cells.patch)
+    same = (cells.block[:, None] == cells.block) & (cells.patch[:, None] % 3 == cells.patch % 3)
+    seen = cells.block < SEEN
+    there = seen[:, None] & seen
+    where = torch.where(there, torch.cdist(cells.place, cells.place).square() / (2 * REACH**2), 0.0)
+    alike = there | (cells.patch[:, None] == cells.patch)
     apart = (cells.time[:, None] - cells.time).abs() / MEMORY
     return torch.where(same & alike, torch.exp(-where - apart), 0.0)
 
@@ -115,7 +114,7 @@ def floor_of(evidence: Evidence, noise: Noise) -> float:
     """RMS [m] of a position cell that a true model would leave, once an episode's nuisances are taken out."""
     total, count = 0.0, 0
     for cells in evidence.cells:
-        own = cells.block < 3
+        own = cells.block < SEEN
         variance = (_white(cells) + noise.level[cells.block] ** 2)[own]
         total, count = total + float(variance.sum()), count + int(own.sum())
     return (total / count) ** 0.5

@@ -114,7 +114,7 @@ def _maps(evidence: Evidence) -> list[np.ndarray]:
     out = []
     for cells in evidence.cells:
         own = cells.block == 0
-        patch, window = cells.patch[own].numpy(), cells.window[own].numpy()
+        patch, window = cells.patch[own].numpy() // 3, cells.window[own].numpy()
         field = np.full((patch.max() + 1, window.max() + 1), np.nan)
         field[patch, window] = 1e3 * cells.value[own].numpy()
         out.append(field)

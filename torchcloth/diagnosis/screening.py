@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from .cells import SEEN
 from .fitting import Fitted, prior_precision
 from .world import Hypothesis
 
@@ -120,7 +121,7 @@ def _sizes(found: Fitted) -> Tensor:
     typical = torch.tensor([h.typical for h in found.evidence.hypotheses], dtype=torch.float64)
     moved = []
     for cells in found.evidence.cells:
-        seen = cells.block < 3
+        seen = cells.block < SEEN
         moved.append(cells.jacobian[seen, : own + count])
     stacked = torch.cat(moved)
     fitted = torch.linalg.lstsq(stacked[:, :own], stacked[:, own:]).solution

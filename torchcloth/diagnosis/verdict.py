@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from .cells import SEEN
 from .classes import alike
 from .evidence import Evidence
 from .stepwise import Found, Step
@@ -135,8 +136,8 @@ def _slow(found: Found) -> float:
 
 def _numerics(evidence: Evidence) -> float:
     """m, RMS that the finer mesh is expected to leave of the difference between both."""
-    squares = [n[c.block < 3].square().sum() for n, c in zip(evidence.numerics, evidence.cells, strict=True)]
-    count = sum(int((c.block < 3).sum()) for c in evidence.cells)
+    squares = [n[c.block < SEEN].square().sum() for n, c in zip(evidence.numerics, evidence.cells, strict=True)]
+    count = sum(int((c.block < SEEN).sum()) for c in evidence.cells)
     return float(sum(squares) / count) ** 0.5 / 3
 
 
