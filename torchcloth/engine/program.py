@@ -14,6 +14,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from functools import cached_property
 from itertools import count
+from threading import Lock
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -43,6 +44,7 @@ class Program:
         self._stages: list[Loop | Stencil | Sieve | Layers | PerMass] = []
         self._lists = 0
         self._written: list[tuple[str, tuple]] = []
+        self._running = Lock()
 
     def __del__(self) -> None:
         if self._handle is not None:
@@ -162,12 +164,13 @@ class Program:
         for stage in self._stages:
             stage.emit(self._handle, self._api)
         key = self._key()
-        known = _KEPT.setdefault(key, self)
-        _KEPT.move_to_end(key)
-        if known is self:
-            self._hand_over()
-            while len(_KEPT) > MOST_KEPT:
-                _KEPT.popitem(last=False)
+        with _KEEPING:  # nobody may run a program that another thread is still handing over
+            known = _KEPT.setdefault(key, self)
+            _KEPT.move_to_end(key)
+            if known is self:
+                self._hand_over()
+                while len(_KEPT) > MOST_KEPT:
+                    _KEPT.popitem(last=False)
         self._written.clear()
         return known
 
@@ -190,8 +193,10 @@ class Program:
         return self._call("records", substeps, every)
 
     def run(self, call, mode: int) -> None:
-        """0: values, 1: adjoint, 2: tangents."""
-        _check(self._call("run", ctypes.byref(call), mode))
+        """0: values, 1: adjoint, 2: tangents. One call at a time: the engine's work space belongs to the program."""
+        with self._running:
+            code = self._call("run", ctypes.byref(call), mode)
+        _check(code)
 
     def _api(self, name: str) -> Callable[..., int]:
         """Stands for a function of the library: what it is called with (numbers and arrays) is written down."""
@@ -224,6 +229,7 @@ MOST_KEPT = 64  # programs that wait for the next call, besides those that are i
 _KEPT: OrderedDict[bytes, Program] = OrderedDict()
 _KNOWN: WeakValueDictionary[int, Program] = WeakValueDictionary()
 _NUMBERS = count()
+_KEEPING = Lock()
 
 
 def _for_c(value: Any) -> Any:
