@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import sheets
 import torch
 
-import torchcloth as tc
-from torchcloth import recordings as rec
 from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import base_model
 from torchcloth.diagnosis.evidence import gather, setting_of
@@ -17,32 +16,7 @@ from torchcloth.diagnosis.refined import refined
 from torchcloth.diagnosis.world import Hypothesis
 from torchcloth.errors import InvalidInput, RecordingError
 
-SIDE, SPEED = 0.2, 0.6  # m, m/s
-
-
-def episode(seed: int = 0, shift: float = 0.0) -> rec.Recording:
-    """A light sheet of 5 x 5 vertices in two grippers that start to move; its points lie on the first shape."""
-    mesh = tc.meshes.rectangle(SIDE, SIDE, resolution=(5, 5))
-    rng, t = np.random.default_rng(seed), np.linspace(0.0, 0.3, 16)
-    first = np.c_[mesh.uv[:, 0], np.zeros(25), mesh.uv[:, 1]] + [0.0, 0.0, 1.0]
-    grippers, grasps = {}, {}
-    for name, u in (("left", 0.0), ("right", SIDE)):
-        path = np.c_[np.full(16, u), SPEED * t**2 / 0.6, np.full(16, 1.0 + SIDE)]
-        grippers[name] = rec.GripperMotion(t, path, np.tile([1.0, 0, 0, 0], (16, 1)), np.ones(16, bool))
-        grasps[name] = rec.GraspInfo(np.array([[u, SIDE]]), 0.06)
-    points = first[rng.integers(0, 25, (7, 40))] + [0.0, shift, 0.0] + 1e-3 * rng.standard_normal((7, 40, 3))
-    info = rec.ClothInfo(
-        areal_density=0.2, areal_density_std=0.004, thickness=1e-3, vertices=np.c_[mesh.uv, np.zeros(25)],
-        faces=mesh.faces, uv=mesh.uv, initial_vertices=first,
-        nominal={"membrane_stiffness": 60.0, "poisson_ratio": 0.3, "bending_stiffness": 3e-5},
-    )  # fmt: skip
-    return rec.Recording(
-        cloth=info, provenance="synthetic: test_worlds.py", grasps=grasps, grippers=grippers,
-        points=rec.PointClouds(np.arange(7) * 0.05, points.reshape(-1, 3), np.full(7, 40)), observation_noise_std=1e-3,
-    )  # fmt: skip
-
-
-RECORDING = episode()
+RECORDING = sheets.episode()
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +95,7 @@ def test_a_finer_mesh_is_the_same_cloth(made):
     a, b = model.base.cloth.mesh, finer.base.cloth.mesh
     assert len(b.faces) == 4 * len(a.faces)
     assert b.area.sum() == pytest.approx(a.area.sum(), rel=1e-12)
-    np.testing.assert_array_equal(recording.cloth.initial_vertices[:25], RECORDING.cloth.initial_vertices)
+    np.testing.assert_array_equal(recording.cloth.initial_vertices[: len(a.vertices)], RECORDING.cloth.initial_vertices)
     assert recording.cloth.initial_vertices[25:].mean(0) == pytest.approx(
         RECORDING.cloth.initial_vertices.mean(0), abs=0.01
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -47,14 +47,14 @@ def fit(
     hypotheses: Sequence[Hypothesis] = (),
     iterations: int = 2,
     progress: Progress = lambda _: None,
-    like: Fitted | None = None,
+    noise: Noise | None = None,
+    before: Evidence | None = None,
 ) -> Fitted:
     """Fit the model's parameters and amplitudes, then ask about the hypotheses there.
 
-    Noise and the nuisances' slopes are those of ``like`` where that is given, so that fits can be compared.
+    Fits are compared with the same ``noise``; None: estimated. The nuisances' slopes are those of ``before``, if given.
     """
-    precision, noise = prior_precision(model), None if like is None else like.noise
-    before = None if like is None else like.evidence
+    precision = prior_precision(model)
     for _ in range(iterations):
         evidence = gather(model, setting, (), progress, before)
         before = before or evidence
@@ -64,11 +64,16 @@ def fit(
         model = model.at(model.point + step.clamp(-limit, limit))
         if float((step / covariance.diagonal().sqrt()).abs().max()) < SMALL:
             break
-    evidence = gather(model, setting, hypotheses, progress, like.evidence if like else None)
+    evidence = gather(model, setting, hypotheses, progress, before)
     noise = noise or fit_noise(evidence)
     white = whitened(evidence, noise)
     _, covariance = _step(white, model.point, precision)
     return Fitted(model, evidence, noise, white, covariance)
+
+
+def renoised(found: Fitted, noise: Noise) -> Fitted:
+    """The same with residuals weighed by another noise."""
+    return replace(found, noise=noise, white=whitened(found.evidence, noise))
 
 
 def _step(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:

@@ -103,7 +103,7 @@ def courses(answer: Diagnosis, before: Predicted, after: Predicted | None) -> An
         axis.axhline(1e3 * answer.found.floor, color="#888888", ls=":", label="expected")
         axis.set_title(names[k], fontsize=9)
         axis.set_xlabel("time, s")
-        axis.set_ylim(bottom=0)
+    axes[0].set_ylim(bottom=0)
     axes[0].set_ylabel("held out, mm RMS")
     axes[0].legend(fontsize=8)
     return figure

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from ..errors import SimulationDiverged, UnstableStep
 from .comparison import Gain, Predicted, compare, predict
 from .evidence import Progress, Setting
-from .fitting import Fitted, fit
+from .fitting import Fitted, fit, renoised
 from .noise import floor_of
 from .screening import Row, screen
 from .world import Hypothesis, Model
@@ -16,7 +16,7 @@ from .world import Hypothesis, Model
 MOST = 4  # causes
 TRIED = 4  # hypotheses that are fitted at each step
 CLEAR = 4.0  # log density below which two models predict alike
-WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of what can be explained, of a cause that is worth naming
+WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +39,7 @@ class Step:
     """One accepted cause with what cannot be told from it."""
 
     best: Candidate
+    tried: list[Candidate]  # best among them
     rivals: list[Candidate]
     screened: list[Row]
 
@@ -62,7 +63,6 @@ def search(
     """Causes one after the other, until none is both present and useful on motions held out."""
     current = start = fit(model, setting, hypotheses, progress=progress)
     steps: list[Step] = []
-    first = predict(start, setting.names)
     while True:
         screened = screen(current)
         present = [row for row in screened if row.decision == "present"]
@@ -73,8 +73,9 @@ def search(
             break
         steps.append(step)
         left = [h for h in hypotheses if h.name not in {a.name for a in step.best.fitted.model.accepted}]
-        current = fit(step.best.fitted.model, setting, left, 0, progress, like=start)
-    floor = floor_of(start.evidence, start.noise)
+        current = fit(step.best.fitted.model, setting, left, 1, progress, before=start.evidence)
+    floor = floor_of(current.evidence, current.noise)
+    first = predict(renoised(start, current.noise), setting.names)
     whole = compare(first, predict(current, setting.names), floor) if steps else None
     return Found(start, current, steps, screened, whole, floor)
 
@@ -82,23 +83,23 @@ def search(
 def _step(
     current: Fitted, setting: Setting, present: Sequence[Row], screened: list[Row], progress: Progress
 ) -> Step | None:
-    before, floor = predict(current, setting.names), floor_of(current.evidence, current.noise)
+    before = predict(current, setting.names)
     tried: list[Candidate] = []
     for row in present[:TRIED]:
         progress(f"fitting {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
-            found = fit(begun, setting, (), 1, progress, like=current)
+            found = fit(begun, setting, (), 1, progress, current.noise, current.evidence)
         except (SimulationDiverged, UnstableStep):
             continue
         predicted = predict(found, setting.names)
-        tried.append(Candidate(row, found, predicted, compare(before, predicted, floor)))
+        tried.append(Candidate(row, found, predicted, compare(before, predicted, 0.0)))
     useful = [c for c in tried if _useful(c)]
     if not useful:
         return None
     best = max(useful, key=lambda c: c.gain.density)
-    rivals = [c for c in tried if c is not best and _rival(c, best)]
-    return Step(best, rivals, screened)
+    rivals = [c for c in useful if c is not best and _rival(c, best)]
+    return Step(best, tried, rivals, screened)
 
 
 def _useful(c: Candidate) -> bool:

@@ -8,13 +8,14 @@ from typing import Any, Literal
 
 from .cells import SEEN
 from .classes import alike
+from .comparison import Gain
 from .evidence import Evidence
 from .stepwise import Found, Step
 from .world import Model
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics"]
 NORMAL = 1.96
-ROUGH = 5e-4  # m: slow errors of position cells beyond this, and beyond twice what numerics leaves, are a lack of fit
+ROUGH = 5e-4  # m: slow errors of position cells beyond this are a lack of fit
 OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
 
 
@@ -71,10 +72,8 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
 def _verdict(found: Found, causes: Sequence[dict[str, Any]], lacking: bool) -> Verdict:
     if causes:
         return "identified" if all(not c["rivals"] and len(c["class"]) == 1 for c in causes) else "ambiguous"
-    if _numerics(found.end.evidence) > max(ROUGH, found.floor):
-        return "numerics"
     if lacking:
-        return "unexplained"
+        return "numerics" if _numerics(found.end.evidence) > 0.5 * _slow(found) else "unexplained"
     undecided = [r for r in found.screened if r.decision == "present"]
     return "inconclusive" if undecided else "adequate"
 
@@ -86,7 +85,9 @@ def _cause(found: Found, step: Step) -> dict[str, Any]:
     std = float(found.end.covariance[count + place, count + place].sqrt())
     std = (std**2 + best.row.bias**2) ** 0.5
     before = found.start if place == 0 else found.steps[place - 1].best.fitted
-    kin = [r.hypothesis.name for r in alike(before, best.row, [r for r in step.screened if r.gain > 0])]
+    beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
+    others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in beaten]
+    kin = [r.hypothesis.name for r in alike(before, best.row, others)]
     return {
         "effect": h.name,
         "amplitude": amplitude,
@@ -98,8 +99,14 @@ def _cause(found: Found, step: Step) -> dict[str, Any]:
             for c in step.rivals
         ],
         "gain_mm": 1e3 * (best.gain.before - best.gain.after),
-        "share_of_explainable": best.gain.explained,
+        "share_of_explainable": _share(found, best.gain),
     }
+
+
+def _share(found: Found, gain: Gain) -> float | None:
+    """Of what all causes explain together, by what each adds to the predictive density."""
+    every = sum(step.best.gain.density for step in found.steps)
+    return None if found.whole is None else found.whole.explained * gain.density / every
 
 
 def _gain(found: Found) -> dict[str, Any] | None:
@@ -142,7 +149,7 @@ def _numerics(evidence: Evidence) -> float:
 
 
 def _lack_of_fit(found: Found) -> bool:
-    return _slow(found) > max(ROUGH, 2 * _numerics(found.end.evidence))
+    return _slow(found) > ROUGH
 
 
 def _warnings(found: Found, names: Sequence[str]) -> list[str]:

@@ -1,0 +1,83 @@
+"""From recordings to an answer: one hidden effect, none, and input that cannot be used."""
+
+import json
+
+import pytest
+import sheets
+import torch
+
+from torchcloth import recordings as rec
+from torchcloth.cli import main
+from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, write_diagnosis
+from torchcloth.errors import InvalidInput
+
+ASKED = ("air.drag_n", "air.linear", "mass.hem", "rest.shrink[weft]", "obs.extrinsic[y]")
+
+
+def episodes(change, seed=0):
+    return [sheets.recorded(motion, change, seed + k) for k, motion in enumerate(sheets.MOTIONS)]
+
+
+def asked(recordings):
+    return [h for h in catalogue(base_model(recordings[0]), recordings) if h.name in ASKED]
+
+
+@pytest.fixture(scope="module")
+def with_drag():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    hidden = next(h for h in catalogue(base_model(sheets.episode()), []) if h.name == "air.drag_n")
+    recordings = episodes(lambda world: hidden.apply(world, 1.5))
+    yield recordings, diagnose(recordings, hypotheses=asked(recordings))
+    torch.set_default_dtype(before)
+
+
+def test_hidden_drag_is_named(with_drag):
+    _, answer = with_drag
+    (cause,) = answer.content["causes"]
+    assert cause["effect"] == "air.drag_n"
+    assert cause["amplitude"] == pytest.approx(1.5, rel=0.15)
+    assert cause["ci95"][0] < cause["amplitude"] < cause["ci95"][1]
+    gain = answer.content["gain"]
+    assert gain["rms_after"] < 0.5 * gain["rms_before"]
+    assert gain["explained_fraction"] > 0.9
+    assert "Cause: air.drag_n" in answer.summary()
+
+
+def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
+    recordings, answer = with_drag
+    content = json.loads(write_diagnosis(answer, recordings[0], tmp_path).read_text())
+    assert {"verdict", "causes", "ruled_out", "unresolvable", "gain", "next_experiment", "model", "warnings"} <= set(
+        content
+    )
+    assert content["plan_hash"]
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 4
+    assert "http" not in page  # self-contained
+    world = load_model(tmp_path / content["model"]).world()
+    assert float(world.cloth.effects["air"].normal.value) == pytest.approx(content["causes"][0]["amplitude"])
+
+
+def test_where_nothing_is_hidden_nothing_is_named():
+    recordings = episodes(lambda world: world, seed=10)
+    answer = diagnose(recordings, hypotheses=asked(recordings))
+    assert answer.content["causes"] == []
+    assert answer.verdict in ("adequate", "inconclusive")
+    assert answer.content["gain"] is None
+
+
+def test_one_motion_is_refused(tmp_path, capsys):
+    only = [sheets.episode(), sheets.episode()]
+    with pytest.raises(InvalidInput, match="at least two motions"):
+        diagnose(only)
+    folder = rec.write(only[0], tmp_path / "a")
+    assert main(["diagnose", str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert "at least two motions" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_is_none_is_refused(tmp_path, capsys):
+    folder = rec.write(sheets.episode(), tmp_path / "a")
+    (tmp_path / "m.tcm").write_text("x")
+    assert main(["diagnose", str(folder), "--model", str(tmp_path / "m.tcm"), "--out", str(tmp_path / "out")]) == 2
+    assert "m.tcm: unreadable" in capsys.readouterr().err
