@@ -33,6 +33,7 @@ REACHED = 1.5  # of those a round may move at most
 NEAR = 2.5  # of those within which simulations of earlier rounds count
 SETTLED = 0.5  # standard errors of a step that ends the search
 WORSE, HALVINGS = 1.25, 4  # a step that makes the distance larger by more is halved, at most so often
+SEEN = 1.5  # mean square of a slope over that of its errors, from which it is one
 SPARE = 4  # pairs of simulations beyond those that the slopes need
 
 
@@ -125,7 +126,7 @@ def _settle(
         around.add(raw, spread)
         near, left = around.near(raw, spread), left - 1
         found = line(near, raw, around.rows)
-        at = gauss_newton.judged(problem, raw, found.linear)
+        at = _seen_only(problem, gauss_newton.judged(problem, raw, found.linear))
         gradient, hessian = gauss_newton.normal_equations(problem, at)
         step = torch.linalg.solve(hessian, -gradient).clamp(-REACHED * spread, REACHED * spread)
         moved = _downhill(objective, problem, raw, step)
@@ -135,11 +136,20 @@ def _settle(
         small = bool(((moved - raw).abs() <= SETTLED * deviation)[:fabric].all())
         on_round(moved)
         if small or not left:
-            linear = found.linear._replace(value=found.linear.value + found.linear.jacobian @ (moved - raw))
+            linear = at.linear._replace(value=at.linear.value + at.linear.jacobian @ (moved - raw))
             final = gauss_newton.judged(problem, moved, linear)._replace(converged=small)
             made = len(around.samples) * len(objective.episodes)
             return Settled(final, _reach(objective, near, raw), covariance, made)
         raw, spread = moved, torch.minimum(torch.maximum(deviation, NARROW * problem.longest), widest)
+
+
+def _seen_only(problem: gauss_newton.Problem, at: Iterate) -> Iterate:
+    """Without slopes that are no larger than their own errors: those of unknowns that ripples hide."""
+    weight, linear = at.influence()[0], at.linear
+    size = weight @ linear.jacobian.square()
+    error = (weight * linear.wobble).sum() * linear.blur.diagonal()
+    jacobian = torch.where(size > SEEN * error, linear.jacobian, 0.0)
+    return gauss_newton.judged(problem, at.raw, linear._replace(jacobian=jacobian))
 
 
 def _downhill(objective: Objective, problem: gauss_newton.Problem, raw: Tensor, step: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor
 from ..errors import SimulationDiverged, UnstableStep
 from .misfit import HUBER, huber, noise_scale
 
+MISLED = 0.1, 4  # gains below it, so many in a row, show tangents that say nothing of finite steps
 TRUSTED = 0.1  # error of the predicted decrease up to which an updated Jacobian is good enough
 GATE = 5.0  # standard deviations
 FEWEST = 3  # episodes that show a scatter
@@ -87,10 +88,11 @@ def minimise(
 
     Between exact linearisations the Jacobian is updated by Broyden's rank-one formula as long as the linear model
     predicts the steps. Scale and correlation of the residuals are re-estimated at every accepted point. The returned
-    point is linearised exactly.
+    point is linearised exactly. Steps that bring a small part of what the tangents promise, one after the other, end
+    the search without convergence.
     """
     current = _linearise(problem, start)
-    stop, converged, damping = on_iterate(current), False, 1e-3
+    stop, converged, damping, misled = on_iterate(current), False, 1e-3, 0
     for _ in range(iterations):
         if stop:
             break
@@ -102,7 +104,8 @@ def minimise(
             current = _linearise(problem, current.raw)
             continue
         before, current = current, trial
-        stop = on_iterate(current)
+        misled = misled + 1 if gain < MISLED[0] else 0
+        stop = on_iterate(current) or misled == MISLED[1]
         if _is_small(problem, before, trial.raw - before.raw, tolerance):
             if before.exact:
                 converged = True
@@ -209,8 +212,9 @@ def _told(at: Iterate, weighted: Tensor) -> Tensor:
     found = weighted.mT @ at.linear.jacobian
     if at.linear.wobble is None or at.linear.blur is None:
         return found
-    unit = found.diagonal().clamp(min=1e-300).sqrt()
-    less = found - (at.influence()[0] * at.linear.wobble).sum() * at.linear.blur
+    told = (found.diagonal() > 0).to(found)
+    unit = found.diagonal().sqrt() + (1 - told)
+    less = found - (at.influence()[0] * at.linear.wobble).sum() * at.linear.blur * told[:, None] * told
     values, vectors = torch.linalg.eigh(less / unit[:, None] / unit)
     return unit[:, None] * (vectors * values.clamp(min=0.0)) @ vectors.mT * unit
 

@@ -13,7 +13,7 @@ from .objective import Objective
 
 NONLINEAR = 0.5  # relative error of the tangents over a finite step above which they are not used for errors
 CURVED = 0.2  # the same over a standard error, from which an interval is noticeably longer to one side
-RUNAWAY = 3.0  # sizes of the cloth
+RUNAWAY = 1.0  # sizes of the cloth
 SMALLEST, LARGEST = 0.005, 0.1  # finite steps, in units of the prior's standard deviation
 
 
