@@ -71,7 +71,7 @@ def identify(
             "adam" or "gradient-descent" (the paper's Chamfer distance to vertices, reverse mode), for comparison.
         stop: "converged", or "paper": as soon as Chamfer (one-sided, cloud to surface) is below 1.5 cm.
         iterations: at most this many with all frames, and at most 10 with the early ones before.
-        rate: of "adam" and "gradient-descent", in unconstrained units (0.1: about 10 % a step).
+        rate: of "adam" and "gradient-descent": 0.1 is about 10 % a step, of an amplitude's typical size.
         guess: values by name to start the search from, e.g. of an interrupted fit; the cloth's values stay the start
             that the result is compared with.
         warm_start: the guess is near the solution (an interrupted fit): skip the stage on the early frames.
@@ -89,7 +89,8 @@ def identify(
             the others anew: it may be skew, and open. Some 20 simulations for each unknown of the fit.
         journal: folder in which the fit keeps what it computed; of no use any more once the result is safe.
         resume: go on where a fit with this journal was stopped; the result is what it would have been, bit by bit.
-        on_progress: called with (iteration, chamfer, values) after every iteration; chamfer is NaN if nothing was seen.
+        on_progress: called with (iteration, chamfer, values, share of the frames that were used) after every iteration;
+            chamfer is NaN if nothing was seen.
 
     Returns:
         Estimates with standard errors, distances, warnings, frames.

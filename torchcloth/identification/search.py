@@ -20,7 +20,7 @@ PAPER_CHAMFER = 0.015  # m, the DiffCP paper's stop rule
 EARLY = 0.35  # share of the frames that the first stage of the fit sees
 EARLY_ITERATIONS = 10
 
-Progress = Callable[[int, float, dict[str, float]], None]
+Progress = Callable[[int, float, dict[str, float], float], None]  # iteration, Chamfer, values, share of the frames
 
 
 class Outcome(NamedTuple):
@@ -100,14 +100,14 @@ class Search:
         entry = {"iteration": len(self.history), "frames": share, "chamfer": now.chamfer, "rms": now.rms}
         self.history.append({**entry, **values})
         if self.on_progress is not None:
-            self.on_progress(len(self.history) - 1, now.chamfer, values)
+            self.on_progress(len(self.history) - 1, now.chamfer, values, share)
         return self.stop == "paper" and objective is self.objective and now.chamfer < PAPER_CHAMFER
 
     def tell(self, at: gauss_newton.Iterate) -> bool:
         """Of what is done after the search: progress, and no part of the history."""
         if self.on_progress is not None:
             now = self.objective.figures(at.raw).chamfer
-            self.on_progress(len(self.history) - 1, now, self.objective.values(at.raw))
+            self.on_progress(len(self.history) - 1, now, self.objective.values(at.raw), 1.0)
         return False
 
     def _early(self, part: Objective, start: Tensor, iterations: int) -> gauss_newton.Iterate:
