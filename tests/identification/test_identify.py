@@ -71,6 +71,7 @@ def test_progress_and_history_tell_the_same(fitted):
     assert [c[0] for c in calls] == [h["iteration"] for h in fit.history] == list(range(len(calls)))
     assert [c[1] for c in calls] == [h["chamfer"] for h in fit.history]
     assert all(c[2].items() <= h.items() for c, h in zip(calls, fit.history, strict=True))
+    assert [c[3] for c in calls] == [h["frames"] for h in fit.history]
     assert fit.history[0]["youngs_modulus"] == pytest.approx(8e4)
     assert fit.history[0]["frames"] < 1 == fit.history[-1]["frames"]
     assert fit.history[-1]["chamfer"] == pytest.approx(fit.fit["chamfer_after"])

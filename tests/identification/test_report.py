@@ -106,12 +106,20 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
         torch.zeros(1), linear(1.0), True, torch.tensor([1e-3]), torch.ones(1), torch.tensor([torch.inf])
     )
     for secant, warned, bent in ((1.2, False, []), (1.4, False, ["youngs_modulus"]), (5.0, True, [])):
-        fake = Fake(unknowns=[SimpleNamespace(name="youngs_modulus")], secant=secant)
-        final, _, warnings, curved = linearity.check(fake, at_start)
-        assert bool(warnings) == warned
-        assert curved == bent
-        assert (final.linear is not at_start.linear) == warned
-    assert "tangents of youngs_modulus miss finite steps by up to 80 %" in warnings[0]
+        fake = Fake(
+            unknowns=[SimpleNamespace(name="youngs_modulus")],
+            blocks=[SimpleNamespace(unit="m")],
+            cloth=SimpleNamespace(mesh=SimpleNamespace(extent=1.0)),
+            secant=secant,
+        )
+        checked = linearity.check(fake, at_start)
+        assert bool(checked.warnings) == checked.withdrawn == warned
+        assert checked.curved == bent
+        assert (checked.final.linear is not at_start.linear) == warned
+    assert "tangents of youngs_modulus miss finite steps by up to 80 %" in checked.warnings[0]
+    away = at_start._replace(linear=linear(1e4))
+    assert linearity.runaway(fake, away)
+    assert not linearity.runaway(fake, at_start)
 
 
 # -- estimates -------------------------------------------------------------------------------------------------------

@@ -9,8 +9,11 @@ import twins
 from test_gauss_newton import solve
 
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import gauss_newton, identify, starts
+from torchcloth.identification import episode, gauss_newton, identify, starts
+from torchcloth.identification.descent import descend
 from torchcloth.identification.journal import Journal
+from torchcloth.identification.nuisances import chosen
+from torchcloth.identification.objective import Objective
 from torchcloth.identification.unknowns import collect, with_priors
 
 PAIR = ["youngs_modulus", "air.normal"]
@@ -35,6 +38,23 @@ def test_plain_descent_goes_downhill_slowly(model, brief):
     first = torch.tensor([fit.history[1][n] - fit.history[0][n] for n in PAIR])
     assert float(first.abs().max()) > 0.0
     assert not fit.fit["converged"]
+
+
+@pytest.mark.parametrize("adam", [True, False])
+def test_descent_steps_by_each_unknowns_own_size(model, brief, adam):
+    """A bowl with its bottom at twice the start: bending, of 1e-5 N m, gets as near as stiffness and drag do."""
+    names = ["youngs_modulus", "air.normal", "bending.stiffness"]
+    objective = Objective(model, collect(model, names, None), [episode(model, brief)], nuisances=chosen([], ["rim"]))
+    bottom = objective.start + 0.5 * objective.sizes
+
+    def value_and_slope(question, raw, loss):
+        away = (raw - bottom) / objective.sizes
+        return away.square().sum(), 2 * away / objective.sizes
+
+    objective.value_and_slope = value_and_slope
+    end = descend(objective, objective.start, 40, 0.1, lambda raw, o: False, adam=adam)
+    assert torch.allclose(objective.sizes[:3], torch.tensor([1.0, 1.2, 1e-5], dtype=torch.float64), rtol=0.2)
+    assert float(((end - bottom) / objective.sizes).abs().max()) < 0.1
 
 
 def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_path, monkeypatch):

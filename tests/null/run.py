@@ -103,7 +103,7 @@ class Study:
         folders = [self._episode(name, TRUTH) for name in FIT_TO]
         print(f"fitting {', '.join(FITTED)} to {' and '.join(FIT_TO)}", flush=True)
         start = Values.true(folders[0])
-        found = fit(folders, MESHES[0], start, lambda k, d, v: print(f"  {k}: {1e3 * d:.2f} mm", flush=True))
+        found = fit(folders, MESHES[0], start, lambda k, d, v, share: print(f"  {k}: {1e3 * d:.2f} mm", flush=True))
         errors = {name: estimate.std for name, estimate in found.parameters.items()}
         return {"values": vars(Values.of(found)), "true": vars(start), "errors": errors, "rms": found.fit["rms_after"]}
 

@@ -160,9 +160,11 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
     with Progress(*columns, refresh_per_second=2, disable=not sys.stdout.isatty()) as progress:
         task = progress.add_task("simulating with the start values", total=None)
 
-        def advance(iteration: int, chamfer: float, values: dict[str, float]) -> None:
+        def advance(iteration: int, chamfer: float, values: dict[str, float], share: float) -> None:
             shown = ", ".join(f"{name} {value:.4g}" for name, value in list(values.items())[:3])
+            used = "all frames" if share == 1 else f"first {100 * share:.0f} % of the frames"
             text = shown if math.isnan(chamfer) else f"Chamfer {1e3 * chamfer:.2f} mm, {shown}"
+            text = f"{used}, {text}"
             progress.update(task, completed=iteration, description=text)
             if not progress.console.is_terminal:  # a log file shows a bar once, at the end
                 print(f"iteration {iteration}: {text}", flush=True)

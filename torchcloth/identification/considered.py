@@ -11,26 +11,28 @@ from torch import Tensor
 
 from ..boundaries import Grasp
 from . import gauss_newton
+from .linearity import Checked
 from .nuisances import Held
 from .objective import Objective
+
+
+def covariance_of(objective: Objective, checked: Checked, strata: Tensor | None = None) -> Tensor:
+    """[K, K] of a solution, held places included; ``strata`` [E] as in ``gauss_newton.covariance``."""
+    if checked.covariance is not None:
+        return checked.covariance
+    final = checked.final
+    own = gauss_newton.covariance(objective.problem(), final, objective.episode_of(final.linear), strata)
+    return with_first_shape(objective, final, own)
 
 
 def with_first_shape(objective: Objective, final: gauss_newton.Iterate, covariance: Tensor) -> Tensor:
     """The covariance [K, K] widened by the noise of the held places, as a considered parameter (Schmidt 1966).
 
-    Each held vertex is taken to carry the noise of one point. Nothing is added where the offset was fitted, or where
-    the first shape or its noise are not measured.
+    Nothing is added where the offset was fitted, or where the first shape or its noise are not measured.
     """
-    fitted = any(nuisance.name == Held.name for nuisance in objective.nuisances)
-    held = [len(part.index) for part in objective.cloth.boundaries.values() if isinstance(part, Grasp)]
-    noises = [e.noise if e.settles and e.noise else 0.0 for e in objective.episodes]
-    if fitted or not held or max(noises) == 0.0:
+    wider, considered = with_held_places(objective)
+    if wider is objective:
         return covariance
-    wider = objective.beside([*objective.nuisances, Held(max(noises) / min(held) ** 0.5)])
-    considered = torch.zeros(len(wider.start), dtype=torch.bool)
-    for own in wider.placed:
-        for p in own:
-            considered[p.where] = p.nuisance.name == Held.name
     raw = wider.start.clone()
     raw[~considered] = final.raw
     slopes = wider.linearise(raw).jacobian[:, considered]
@@ -38,3 +40,22 @@ def with_first_shape(objective: Objective, final: gauss_newton.Iterate, covarian
     moved = torch.linalg.solve(gauss_newton.information(objective.problem(), final), weighted.mT @ slopes)
     moved = moved * wider.prior_std[considered]
     return covariance + moved @ moved.mT
+
+
+def with_held_places(objective: Objective) -> tuple[Objective, Tensor]:
+    """The same with offsets of the held places among the unknowns, and which of those [K] these are.
+
+    Each held vertex is taken to carry the noise of one point. The objective itself where the offset is fitted, or where
+    the first shape or its noise are not measured.
+    """
+    fitted = any(nuisance.name == Held.name for nuisance in objective.nuisances)
+    held = [len(part.index) for part in objective.cloth.boundaries.values() if isinstance(part, Grasp)]
+    noises = [e.noise if e.settles and e.noise else 0.0 for e in objective.episodes]
+    if fitted or not held or max(noises) == 0.0:
+        return objective, torch.zeros(len(objective.start), dtype=torch.bool)
+    wider = objective.beside([*objective.nuisances, Held(max(noises) / min(held) ** 0.5)])
+    considered = torch.zeros(len(wider.start), dtype=torch.bool)
+    for own in wider.placed:
+        for p in own:
+            considered[p.where] = p.nuisance.name == Held.name
+    return wider, considered

@@ -21,25 +21,27 @@ SETTLED = 1e-3  # decrease of the robust cost below which a round ends: a few hu
 def descend(
     objective: Objective, start: Tensor, iterations: int, rate: float, on_iterate: OnIterate, adam: bool = True
 ) -> Tensor:
-    """Adam, or plain descent, on the unconstrained unknowns [K]; ``on_iterate(raw, objective)`` returns True to stop.
+    """Adam, or plain descent, on the unknowns [K] over their sizes; ``on_iterate(raw, objective)``: True to stop.
 
     The loss is the DiffCP paper's one-sided Chamfer distance, cloud to nearest vertex. Plain descent divides by the
     first gradient's length, so that its first step is ``rate`` long.
     """
-    raw, seen = start.clone().requires_grad_(), start
-    optimiser = torch.optim.Adam([raw], lr=rate) if adam else torch.optim.SGD([raw], lr=rate)
-    size = 0.0
+    sizes = objective.sizes  # drag moves by tenths, bending by millionths: one rate for both would stall or leap
+    scaled, seen = (start / sizes).requires_grad_(), start
+    optimiser = torch.optim.Adam([scaled], lr=rate) if adam else torch.optim.SGD([scaled], lr=rate)
+    length = 0.0
     for _ in range(iterations):
-        _, raw.grad = objective.value_and_slope("chamfer", raw.detach(), chamfer)
-        seen = raw.detach().clone()
+        seen = objective.clip(scaled.detach() * sizes)
+        _, slope = objective.value_and_slope("chamfer", seen, chamfer)
         if on_iterate(seen, objective):
             break
+        scaled.grad = slope * sizes
         if not adam:
-            size = size or max(float(raw.grad.norm()), 1e-30)
-            raw.grad = raw.grad / size
+            length = length or max(float(scaled.grad.norm()), 1e-30)
+            scaled.grad = scaled.grad / length
         optimiser.step()
         with torch.no_grad():
-            raw.copy_(objective.clip(raw))
+            scaled.copy_(objective.clip(scaled * sizes) / sizes)
     return seen
 
 

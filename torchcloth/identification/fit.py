@@ -15,9 +15,9 @@ from ..effects import AbstractEffect
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
-from . import gauss_newton, linearity
+from . import gauss_newton
 from .blocks import blocks_for
-from .considered import with_first_shape
+from .considered import covariance_of
 from .episodes import Episode, episode
 from .identifiability import combinations, influences
 from .journal import Journal
@@ -71,7 +71,7 @@ def identify(
             "adam" or "gradient-descent" (the paper's Chamfer distance to vertices, reverse mode), for comparison.
         stop: "converged", or "paper": as soon as Chamfer (one-sided, cloud to surface) is below 1.5 cm.
         iterations: at most this many with all frames, and at most 10 with the early ones before.
-        rate: of "adam" and "gradient-descent", in unconstrained units (0.1: about 10 % a step).
+        rate: of "adam" and "gradient-descent": 0.1 is about 10 % a step, of an amplitude's typical size.
         guess: values by name to start the search from, e.g. of an interrupted fit; the cloth's values stay the start
             that the result is compared with.
         warm_start: the guess is near the solution (an interrupted fit): skip the stage on the early frames.
@@ -89,7 +89,8 @@ def identify(
             the others anew: it may be skew, and open. Some 20 simulations for each unknown of the fit.
         journal: folder in which the fit keeps what it computed; of no use any more once the result is safe.
         resume: go on where a fit with this journal was stopped; the result is what it would have been, bit by bit.
-        on_progress: called with (iteration, chamfer, values) after every iteration; chamfer is NaN if nothing was seen.
+        on_progress: called with (iteration, chamfer, values, share of the frames that were used) after every iteration;
+            chamfer is NaN if nothing was seen.
 
     Returns:
         Estimates with standard errors, distances, warnings, frames.
@@ -171,14 +172,13 @@ def _concluded(
     search: Search, start: list[Frames], outcome: Outcome, began: float, profile: Sequence[str], strata: Tensor
 ) -> Identification:
     """From where a search ended to statements."""
-    full = search.objective
-    final, reach, warnings, curved = linearity.check(full, outcome.final)
+    full, told, checked = search.objective, outcome.objective, outcome.checked
+    final, warnings = checked.final, list(checked.warnings)
     end = full.seen(final.raw)
     before, after, null = [s.x for s in start], [s.x for s in end], [rigid_carry(e) for e in full.episodes]
-    covariance = gauss_newton.covariance(full.problem(), final, full.episode_of(final.linear), strata)
-    covariance = with_first_shape(full, final, covariance)
+    covariance = covariance_of(told, checked, strata)
     found = estimates(full.cloth, full.unknowns, final.raw, covariance)
-    profiled = {} if warnings else profiles(full, final, covariance, profile, search.tell)
+    profiled = {} if warnings else profiles(told, final, covariance, profile, search.tell)
     found = with_profiles(found, profiled)
     fit: dict[str, Any] = _figures(full, before, after, null)
     fit |= _force_figures(full, start, end)
@@ -188,18 +188,20 @@ def _concluded(
         "seconds": time.perf_counter() - began,
         "points": sum(len(c) for e in full.episodes for c in e.clouds),
         "stable_step": full.cloth.stable_step(),
-        "converged": outcome.final.converged,
-        **_counts(full, final),
+        "converged": final.converged,
+        **_counts(told, final),
     }
     if bool((strata > 0).any()):
         fit["replicates"] = int((strata > 0).sum())
     if outcome.reached is not None:
         fit |= {"starts": outcome.reached.tried, "starts_agreeing": outcome.reached.agree}
-    if warnings or worthless(fit):  # steep chaotic slopes promise tiny errors
+    if checked.withdrawn or worthless(fit):  # steep chaotic slopes promise tiny errors
         found = withdraw(found, full.unknowns)
     warnings += [outcome.unfinished] if outcome.unfinished else []
-    warnings += skewed(found, [name for name in curved if name not in profiled])
-    warnings += warnings_of(full.cloth, full.episodes, found, fit, after, full.faces)
+    warnings += skewed(found, [name for name in checked.curved if name not in profiled])
+    used = [x[: len(e.times)] for x, e in zip(after, told.episodes, strict=True)]
+    rms = figures(used, told.episodes, full.faces).rms
+    warnings += warnings_of(full.cloth, full.episodes, found, {**fit, "rms_after": rms}, after, full.faces)
     keys = {u.name: u.key.removesuffix(".raw") for u in full.unknowns}
     nuisances = nuisance_estimates(full.episodes, full.placed, final.raw, covariance)
     return Identification(
@@ -213,7 +215,7 @@ def _concluded(
         null,
         keys,
         nuisances,
-        influences(full.unknowns, final.raw, reach, found.parameters),
+        influences(full.unknowns, final.raw, checked.reach, found.parameters),
         combinations(full.unknowns, final.raw, covariance),
         profiles=profiled,
         forces_before=[s.wrench for s in start],

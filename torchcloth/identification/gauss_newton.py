@@ -11,6 +11,7 @@ from torch import Tensor
 from ..errors import SimulationDiverged, UnstableStep
 from .misfit import HUBER, huber, noise_scale
 
+MISLED = 0.1, 4  # gains below it, so many in a row, show tangents that say nothing of finite steps
 TRUSTED = 0.1  # error of the predicted decrease up to which an updated Jacobian is good enough
 GATE = 5.0  # standard deviations
 FEWEST = 3  # episodes that show a scatter
@@ -27,6 +28,8 @@ class Linearised(NamedTuple):
     frame: Tensor  # [R] int64, counted through all episodes
     patch: Tensor  # [R] int64, what errs together
     block: Tensor | None = None  # [R] int64, kind of data: each has noise of its own. None: all alike
+    wobble: Tensor | None = None  # [R] variance of one simulation's value, of slopes by regression; None: exact ones
+    blur: Tensor | None = None  # [K, K] covariance of such slopes, for each unit of ``wobble``
 
     @property
     def kind(self) -> Tensor:
@@ -85,10 +88,11 @@ def minimise(
 
     Between exact linearisations the Jacobian is updated by Broyden's rank-one formula as long as the linear model
     predicts the steps. Scale and correlation of the residuals are re-estimated at every accepted point. The returned
-    point is linearised exactly.
+    point is linearised exactly. Steps that bring a small part of what the tangents promise, one after the other, end
+    the search without convergence.
     """
     current = _linearise(problem, start)
-    stop, converged, damping = on_iterate(current), False, 1e-3
+    stop, converged, damping, misled = on_iterate(current), False, 1e-3, 0
     for _ in range(iterations):
         if stop:
             break
@@ -100,7 +104,8 @@ def minimise(
             current = _linearise(problem, current.raw)
             continue
         before, current = current, trial
-        stop = on_iterate(current)
+        misled = misled + 1 if gain < MISLED[0] else 0
+        stop = on_iterate(current) or misled == MISLED[1]
         if _is_small(problem, before, trial.raw - before.raw, tolerance):
             if before.exact:
                 converged = True
@@ -113,7 +118,7 @@ def minimise(
 
 def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None, float, float]:
     """(accepted point or None, actual over predicted decrease, next damping)."""
-    gradient, hessian = _normal_equations(problem, at)
+    gradient, hessian = normal_equations(problem, at)
     now = cost(problem, at, at.raw, at.linear.value)
     for _ in range(6):
         step = torch.linalg.solve(hessian + damping * torch.diag(hessian.diagonal()), -gradient)
@@ -195,15 +200,28 @@ def cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
     return float((factor * huber(value / scale, gate)[0]).sum() + 0.5 * prior)
 
 
-def _normal_equations(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
+def normal_equations(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
+    """(gradient [K], approximate Hessian [K, K]) of the robust cost with its priors."""
     weighted = at.influence()[0][:, None] * at.linear.jacobian
     gradient = weighted.mT @ at.linear.value + (at.raw - problem.prior_mean) / problem.prior_std**2
-    return gradient, weighted.mT @ at.linear.jacobian + torch.diag(problem.prior_std**-2)
+    return gradient, _told(at, weighted) + torch.diag(problem.prior_std**-2)
+
+
+def _told(at: Iterate, weighted: Tensor) -> Tensor:
+    """[K, K], information of the data; less what errors of the slopes pretend to add."""
+    found = weighted.mT @ at.linear.jacobian
+    if at.linear.wobble is None or at.linear.blur is None:
+        return found
+    told = (found.diagonal() > 0).to(found)
+    unit = found.diagonal().sqrt() + (1 - told)
+    less = found - (at.influence()[0] * at.linear.wobble).sum() * at.linear.blur * told[:, None] * told
+    values, vectors = torch.linalg.eigh(less / unit[:, None] / unit)
+    return unit[:, None] * (vectors * values.clamp(min=0.0)) @ vectors.mT * unit
 
 
 def information(problem: Problem, at: Iterate) -> Tensor:
     """[K, K] of data and priors."""
-    return _normal_equations(problem, at)[1]
+    return normal_equations(problem, at)[1]
 
 
 def curvature(problem: Problem, at: Iterate) -> Tensor:
@@ -215,7 +233,7 @@ def curvature(problem: Problem, at: Iterate) -> Tensor:
 
 def _is_small(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> bool:
     """Below ``tolerance`` standard errors in every direction."""
-    _, hessian = _normal_equations(problem, at)
+    _, hessian = normal_equations(problem, at)
     return float(step @ hessian @ step) < tolerance**2
 
 
@@ -226,7 +244,7 @@ def covariance(problem: Problem, at: Iterate, episode: Tensor | None = None, str
     more, than what leaving out one after the other shows. ``strata`` [E] numbers groups of replicates, within which
     the episodes' scatter counts. Model error that all episodes share is beyond it.
     """
-    gradient, hessian = _normal_equations(problem, at)
+    gradient, hessian = normal_equations(problem, at)
     inverse = torch.linalg.inv(hessian)
     scores = (at.influence()[0] * at.linear.value)[:, None] * at.linear.jacobian
     count = int(at.linear.frame.max()) + 1
@@ -238,8 +256,13 @@ def covariance(problem: Problem, at: Iterate, episode: Tensor | None = None, str
     if episode is not None and int(episode.max()) >= 2:
         strata = torch.zeros(int(episode.max()) + 1, dtype=torch.int64) if strata is None else strata
         least = torch.maximum(least, _jackknife(at, hessian, episode, strata))
-    inflate = torch.sqrt((least / robust.diagonal()).clamp(min=1.0))
-    return robust * inflate[:, None] * inflate[None, :]
+    return at_least(robust, least)
+
+
+def at_least(covariance: Tensor, variances: Tensor) -> Tensor:
+    """A covariance [K, K] with variances not below these [K]; correlations stay."""
+    inflate = torch.sqrt((variances / covariance.diagonal()).clamp(min=1.0))
+    return covariance * inflate[:, None] * inflate[None, :]
 
 
 def _jackknife(at: Iterate, hessian: Tensor, episode: Tensor, strata: Tensor) -> Tensor:

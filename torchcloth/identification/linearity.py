@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from . import gauss_newton
 from .identifiability import Reach
@@ -12,6 +13,7 @@ from .objective import Objective
 
 NONLINEAR = 0.5  # relative error of the tangents over a finite step above which they are not used for errors
 CURVED = 0.2  # the same over a standard error, from which an interval is noticeably longer to one side
+RUNAWAY = 1.0  # sizes of the cloth
 SMALLEST, LARGEST = 0.005, 0.1  # finite steps, in units of the prior's standard deviation
 
 
@@ -22,6 +24,13 @@ class Checked(NamedTuple):
     reach: Reach
     warnings: list[str]
     curved: list[str]  # unknowns whose interval may be skew
+    reason: str = ""  # why tangents are of no use here; empty where they are
+    covariance: Tensor | None = None  # [K, K] of the estimate, where it is not that of the tangents
+
+    @property
+    def withdrawn(self) -> bool:
+        """Whether no parameter counts as identified."""
+        return bool(self.reason)
 
 
 def check(objective: Objective, final: gauss_newton.Iterate) -> Checked:
@@ -29,20 +38,35 @@ def check(objective: Objective, final: gauss_newton.Iterate) -> Checked:
 
     Tangents are exact, but where the motion is unstable they describe a neighbourhood too small to matter.
     """
-    deviation = gauss_newton.covariance(objective.problem(), final).diagonal().sqrt()
     prior = objective.problem().prior_std
+    deviation = torch.zeros_like(prior)
+    if not runaway(objective, final):  # else their covariance is none
+        deviation = gauss_newton.covariance(objective.problem(), final).diagonal().sqrt().nan_to_num(0.0)
     steps = torch.minimum(torch.maximum(deviation, SMALLEST * prior), LARGEST * prior)[: len(objective.unknowns)]
     secants, reach = objective.secants(final.raw, steps)
     weight = final.influence()[0].sqrt()[:, None]
     moved, slope = (weight * j[:, : len(steps)] for j in (secants.jacobian, final.linear.jacobian))
     missed = (moved - slope).norm(dim=0) / moved.norm(dim=0).clamp(min=1e-12)
+    missed = missed.nan_to_num(torch.inf)
     if float(missed.max()) < NONLINEAR:
         over_one = missed * deviation[: len(steps)] / steps
         curved = [u.name for u, error in zip(objective.unknowns, over_one, strict=True) if error >= CURVED]
         return Checked(final, reach, [], curved)
     names = ", ".join(u.name for u, error in zip(objective.unknowns, missed, strict=True) if error >= NONLINEAR)
-    warning = (
+    reason = (
         f"the motion is unstable or strongly nonlinear at the solution (tangents of {names} miss finite steps "
-        f"by up to {min(1000.0, 100 * float(missed.max())):.0f} %): no parameter counts as identified"
+        f"by up to {min(1000.0, 100 * float(missed.max())):.0f} %)"
     )
-    return Checked(final._replace(linear=secants), reach, [warning], [])
+    warning = f"{reason}: no parameter counts as identified"
+    return Checked(final._replace(linear=secants), reach, [warning], [], reason)
+
+
+def runaway(objective: Objective, at: gauss_newton.Iterate) -> bool:
+    """Whether tangents are so long that they describe no motion: a longest step by many times the cloth's size."""
+    seen = torch.tensor([block.unit == "m" for block in objective.blocks])[at.linear.kind]
+    rows = at.linear.jacobian[seen][:, : len(objective.unknowns)]
+    longest = objective.problem().longest[: len(objective.unknowns)]
+    return (
+        bool(len(rows))
+        and not float((rows * longest).square().mean(0).sqrt().max()) <= RUNAWAY * objective.cloth.mesh.extent
+    )

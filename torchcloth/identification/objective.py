@@ -50,6 +50,7 @@ class Objective:
         self.placed = place(self.nuisances, cloth, self.episodes, len(self.unknowns))
         stds = [std for own in self.placed for p in own for std in p.stds]
         self.prior_std = torch.tensor([*(u.prior_std for u in unknowns), *stds], dtype=torch.float64)
+        self.sizes = torch.tensor([*(u.size for u in unknowns), *stds], dtype=torch.float64)
         self.start = torch.tensor([*(u.start for u in unknowns), *(0.0 for _ in stds)], dtype=torch.float64)
         self.middle = torch.tensor([*(u.middle for u in unknowns), *(0.0 for _ in stds)], dtype=torch.float64)
         self.journal: Journal | None = None

@@ -12,8 +12,11 @@ from torch import Tensor
 
 from ..cloth import Cloth
 from ..materials import AEP
+from .considered import covariance_of
 from .episodes import Episode
+from .linearity import Checked
 from .nuisances import Placed
+from .objective import Objective
 from .statements import Estimate, Profile
 from .unknowns import Unknown, available, collect, needs_contact
 
@@ -49,6 +52,12 @@ def estimates(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, covariance
     names = [u.name for u in unknowns]
     correlation = {a: {b: float(matrix[i, j]) for j, b in enumerate(names)} for i, a in enumerate(names)}
     return Found(parameters, correlation)
+
+
+def undecided(objective: Objective, checked: Checked) -> list[str]:
+    """Fitted parameters that a solution leaves open."""
+    found = estimates(objective.cloth, objective.unknowns, checked.final.raw, covariance_of(objective, checked))
+    return [u.name for u in objective.unknowns if not (u.measured or found.parameters[u.name].identifiable)]
 
 
 def nuisance_estimates(

@@ -8,9 +8,10 @@ from typing import Any, Literal, NamedTuple
 from torch import Tensor
 
 from ..errors import SimulationDiverged, UnstableStep
-from . import gauss_newton, starts
+from . import ensemble, gauss_newton, horizon, linearity, starts
 from .descent import descend, quasi_newton
 from .objective import Objective
+from .report import undecided
 
 Method = Literal["gauss-newton", "lbfgs", "adam", "gradient-descent"]
 METHODS: tuple[str, ...] = ("gauss-newton", "lbfgs", "adam", "gradient-descent")
@@ -19,13 +20,14 @@ PAPER_CHAMFER = 0.015  # m, the DiffCP paper's stop rule
 EARLY = 0.35  # share of the frames that the first stage of the fit sees
 EARLY_ITERATIONS = 10
 
-Progress = Callable[[int, float, dict[str, float]], None]
+Progress = Callable[[int, float, dict[str, float], float], None]  # iteration, Chamfer, values, share of the frames
 
 
 class Outcome(NamedTuple):
     """Where a search ended."""
 
-    final: gauss_newton.Iterate
+    objective: Objective  # of the frames that told it
+    checked: linearity.Checked
     unfinished: str  # why the end may not be the optimum; empty where it is
     reached: starts.Reached | None  # with several starts
 
@@ -53,16 +55,43 @@ class Search:
             part = full.part(EARLY)
             start = self._early(part, start, iterations).raw
             self.elsewhere += part.simulations
+        final = self._to_the_end(method, start, iterations, rate)
+        checked = linearity.check(full, final)
+        if checked.withdrawn and method not in CHAMFER and self.stop != "paper":
+            told, checked = self._resolve(checked, start, iterations)
+        else:
+            told = full
+        if checked.final.converged:
+            return Outcome(told, checked, "", reached)
+        why = self._undecided(iterations) if method in CHAMFER else self._why(iterations)
+        return Outcome(told, checked, why, reached)
+
+    def _resolve(
+        self, failed: linearity.Checked, start: Tensor, iterations: int
+    ) -> tuple[Objective, linearity.Checked]:
+        """Where tangents fail: what the beginning tells, and of the rest what is told by simulations spread around."""
+        full = self.objective
+        found = horizon.within(full, failed, start, self._judge)
+        if found is not None and not undecided(found.objective, found.checked):
+            return found.objective, found.checked
+        wide = ensemble.resolved(full, failed, found, iterations, lambda raw: self.record(raw, full))
+        if wide is None:
+            return (full, failed) if found is None else (found.objective, found.checked)
+        return full, wide
+
+    def _to_the_end(self, method: str, start: Tensor, iterations: int, rate: float) -> gauss_newton.Iterate:
+        full = self.objective
         if method == "gauss-newton":
-            final = gauss_newton.minimise(full.problem(), start, iterations, lambda it: self.record(it.raw, full))
-            return Outcome(final, "" if final.converged else self._why(iterations), reached)
+            return gauss_newton.minimise(full.problem(), start, iterations, lambda it: self._judge(it, full))
         if method == "lbfgs":
             raw, done = quasi_newton(full, start, iterations, self.record)
         else:
             raw, done = descend(full, start, iterations, rate, self.record, adam=method == "adam"), False
-        final = gauss_newton.minimise(full.problem(), raw, 0, lambda _: True)._replace(converged=done)
-        unfinished = self._why(iterations) if method == "lbfgs" else self._undecided(iterations)
-        return Outcome(final, "" if done else unfinished, reached)
+        return gauss_newton.minimise(full.problem(), raw, 0, lambda _: True)._replace(converged=done)
+
+    def _judge(self, at: gauss_newton.Iterate, objective: Objective) -> bool:
+        """One more iteration; whether to stop, which tangents that run away are a reason for as well."""
+        return self.record(at.raw, objective) or (at.exact and linearity.runaway(objective, at))
 
     def record(self, raw: Tensor, objective: Objective) -> bool:
         """One more iteration; whether the search may stop here."""
@@ -71,20 +100,20 @@ class Search:
         entry = {"iteration": len(self.history), "frames": share, "chamfer": now.chamfer, "rms": now.rms}
         self.history.append({**entry, **values})
         if self.on_progress is not None:
-            self.on_progress(len(self.history) - 1, now.chamfer, values)
+            self.on_progress(len(self.history) - 1, now.chamfer, values, share)
         return self.stop == "paper" and objective is self.objective and now.chamfer < PAPER_CHAMFER
 
     def tell(self, at: gauss_newton.Iterate) -> bool:
         """Of what is done after the search: progress, and no part of the history."""
         if self.on_progress is not None:
             now = self.objective.figures(at.raw).chamfer
-            self.on_progress(len(self.history) - 1, now, self.objective.values(at.raw))
+            self.on_progress(len(self.history) - 1, now, self.objective.values(at.raw), 1.0)
         return False
 
     def _early(self, part: Objective, start: Tensor, iterations: int) -> gauss_newton.Iterate:
         """On early frames, where a wrong start has not yet led the cloth elsewhere."""
         budget = min(EARLY_ITERATIONS, iterations)
-        return gauss_newton.minimise(part.problem(), start, budget, lambda it: self.record(it.raw, part), tolerance=1.0)
+        return gauss_newton.minimise(part.problem(), start, budget, lambda it: self._judge(it, part), tolerance=1.0)
 
     def _from_several(self, start: Tensor, count: int, iterations: int) -> starts.Reached:
         part, found = self.objective.part(EARLY), []

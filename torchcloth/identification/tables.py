@@ -91,9 +91,13 @@ def _print_influences(console, fit: Identification) -> None:
         table.add_row(name, f"{i.tenth_mm:.2g} mm", f"{i.tenth_newton:.2g} N", i.experiment)
     if fit.influences:
         console.print(table)
-    for c in fit.combinations:
-        if c.determined:
-            console.print(f"known together: {c.text}, to {100 * c.std:.2g} %", markup=False)
+    known = [c for c in fit.combinations if c.determined]
+    if known:
+        console.print(
+            "Known together: the data show the product to so many per cent; each of its factors may be less certain."
+        )
+    for c in known:
+        console.print(f"known together: {c.text}, to {100 * c.std:.2g} %", markup=False)
 
 
 def _print_nuisances(console, fit: Identification) -> None:

@@ -58,6 +58,11 @@ class Unknown:
         """Amplitudes may be zero: they are judged against their typical size (half their prior)."""
         return 0.5 * self.prior_std if self.parameter.domain in ("nonnegative", "real") else 0.0
 
+    @property
+    def size(self) -> float:
+        """Of a change that matters: a factor of e of a log parameter, the typical size of an amplitude."""
+        return self.typical or 1.0
+
     def value(self, raw: float) -> float:
         """Physical value of an unconstrained one."""
         return float(to_value(torch.tensor(raw, dtype=torch.float64), self.parameter.domain))

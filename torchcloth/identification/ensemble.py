@@ -1,0 +1,281 @@
+"""Slopes where the motion is chaotic: by regression over simulations around a point, not by tangents.
+
+Light cloth that buckles forgets small differences: a change by a thousandth of its stiffness, and half a second later
+its ripples lie elsewhere. Tangents describe that exactly and grow without bound (some 10 to 100 times in 0.3 s), while
+the ripples themselves stay millimetres high. What a parameter does to the cloth as a whole is seen over finite steps,
+beyond the ripples. So simulations are spread around the point, as wide as the answer is uncertain; the straight line
+through their residuals is the slope (statistical linearisation, as in iterative ensemble smoothers: Chen and Oliver
+2013), and their scatter about it is what ripples contribute, which the measured cloth has as well: noise by which rows
+are weighted, and by which the errors are widened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import SimulationDiverged, UnstableStep
+from . import gauss_newton
+from .considered import covariance_of, with_held_places
+from .gauss_newton import Iterate, Linearised
+from .horizon import Within
+from .identifiability import Reach
+from .linearity import Checked
+from .misfit import noise_scale
+from .objective import Objective
+
+ROUNDS = 8
+WIDE, NARROW = 0.4, 0.2  # of a longest step: standard deviations of the simulations around a point
+REACHED = 1.5  # of those a round may move at most
+NEAR = 2.5  # of those within which simulations of earlier rounds count
+SETTLED = 0.5  # standard errors of a step that ends the search
+WORSE, HALVINGS = 1.25, 4  # a step that makes the distance larger by more is halved, at most so often
+SEEN = 1.5  # mean square of a slope over that of its errors, from which it is one
+SPARE = 4  # pairs of simulations beyond those that the slopes need
+
+
+class Sample(NamedTuple):
+    """One simulation."""
+
+    raw: Tensor  # [K]
+    value: Tensor  # [R], residuals
+    x: Tensor  # [F, V, 3] m, frames of all episodes
+    force: Tensor  # [F, 3] N, of all grippers
+
+
+class Line(NamedTuple):
+    """What runs straight through a cloud, and the scatter about it, in rows of equal noise."""
+
+    linear: Linearised
+    scatter: Tensor  # [N, R], of each simulation
+    freedom: int
+
+
+class Settled(NamedTuple):
+    """Where the search ended."""
+
+    final: Iterate
+    reach: Reach
+    covariance: Tensor  # [K, K]
+    simulations: int
+
+
+def resolved(
+    objective: Objective, failed: Checked, known: Within | None, rounds: int, on_round: Callable[[Tensor], object]
+) -> Checked | None:
+    """All frames by simulations spread around the solution; None where they cannot be had.
+
+    Args:
+        objective: of all frames.
+        failed: what tangents made of them.
+        known: what the beginning told; it becomes the prior of what the other frames tell.
+        rounds: at most so many.
+        on_round: called with every point the search comes to.
+    """
+    before, problem = objective.simulations, objective.problem()
+    raw, mask, note = failed.final.raw, None, ""
+    if known is not None:
+        own = covariance_of(known.objective, known.checked).diagonal().sqrt()
+        raw, mask = known.checked.final.raw, later(objective, known.objective)
+        problem = problem._replace(prior_mean=raw, prior_std=torch.minimum(own, problem.prior_std))
+        note = f" after the first {known.until:.2f} s"
+    try:
+        found = _settle(Around(objective, mask), problem, raw, rounds, on_round)
+    except SimulationDiverged:
+        return None
+    objective.simulations = before + found.simulations
+    warning = (
+        f"{failed.reason}: slopes and errors{note} were taken from {found.simulations} simulations around the "
+        "solution, and what moves the cloth less than its ripples do is not identifiable"
+    )
+    return Checked(found.final, found.reach, [warning], [], covariance=found.covariance)
+
+
+def later(objective: Objective, part: Objective) -> Callable[[Linearised], Tensor]:
+    """Which rows of the whole belong to no frame of its beginning."""
+
+    def mask(linear: Linearised) -> Tensor:
+        episode = objective.episode_of(linear)
+        length = torch.tensor([len(e.times) + gauss_newton.WINDOW for e in objective.episodes])
+        seen = torch.tensor([len(e.times) for e in part.episodes])
+        return linear.frame - (length.cumsum(0) - length)[episode] >= seen[episode]
+
+    return mask
+
+
+def _settle(
+    around: Around,
+    problem: gauss_newton.Problem,
+    start: Tensor,
+    rounds: int,
+    on_round: Callable[[Tensor], object],
+) -> Settled:
+    """Gauss-Newton on slopes by regression, from ``start`` [K].
+
+    Raises:
+        SimulationDiverged: too few simulations around a point go well.
+    """
+    objective, raw = around.objective, problem.clip(start)
+    widest = WIDE * problem.longest
+    spread = torch.minimum(torch.maximum(problem.prior_std, NARROW * problem.longest), widest)
+    left = min(ROUNDS, max(1, rounds))
+    while True:
+        around.add(raw, spread)
+        near, left = around.near(raw, spread), left - 1
+        found = line(near, raw, around.rows)
+        at = _seen_only(problem, gauss_newton.judged(problem, raw, found.linear))
+        gradient, hessian = gauss_newton.normal_equations(problem, at)
+        step = torch.linalg.solve(hessian, -gradient).clamp(-REACHED * spread, REACHED * spread)
+        moved = _downhill(objective, problem, raw, step)
+        ripples = _by_ripples(problem, at, found)
+        covariance = gauss_newton.at_least(gauss_newton.covariance(problem, at), ripples.diagonal())
+        deviation, fabric = covariance.diagonal().sqrt(), len(objective.unknowns)
+        small = bool(((moved - raw).abs() <= SETTLED * deviation)[:fabric].all())
+        on_round(moved)
+        if small or not left:
+            linear = at.linear._replace(value=at.linear.value + at.linear.jacobian @ (moved - raw))
+            final = gauss_newton.judged(problem, moved, linear)._replace(converged=small)
+            made = len(around.samples) * len(objective.episodes)
+            return Settled(final, _reach(objective, near, raw), covariance, made)
+        raw, spread = moved, torch.minimum(torch.maximum(deviation, NARROW * problem.longest), widest)
+
+
+def _seen_only(problem: gauss_newton.Problem, at: Iterate) -> Iterate:
+    """Without slopes that are no larger than their own errors: those of unknowns that ripples hide."""
+    weight, linear = at.influence()[0], at.linear
+    size = weight @ linear.jacobian.square()
+    error = (weight * linear.wobble).sum() * linear.blur.diagonal()
+    jacobian = torch.where(size > SEEN * error, linear.jacobian, 0.0)
+    return gauss_newton.judged(problem, at.raw, linear._replace(jacobian=jacobian))
+
+
+def _downhill(objective: Objective, problem: gauss_newton.Problem, raw: Tensor, step: Tensor) -> Tensor:
+    """As far along a step as the cloth does not come to lie farther off than ripples put it."""
+    now = objective.figures(raw).chamfer
+    for _ in range(HALVINGS):
+        moved = problem.clip(raw + step)
+        try:
+            if not objective.figures(moved).chamfer > WORSE * now:
+                return moved
+        except (SimulationDiverged, UnstableStep):
+            pass
+        step = 0.5 * step
+    return raw
+
+
+class Around:
+    """Makes simulations around points of an objective, and keeps them.
+
+    Offsets of held places that are not fitted are drawn by their noise: they scatter, as what is not known does.
+    """
+
+    def __init__(self, objective: Objective, mask: Callable[[Linearised], Tensor] | None) -> None:
+        self.objective, self.mask = objective, mask
+        self.wider, self.drawn = with_held_places(objective)
+        self.samples: list[Sample] = []
+        self.rows: Linearised  # what rows mean, from the first simulation on
+
+    def add(self, raw: Tensor, spread: Tensor) -> None:
+        """Pairs on both sides of ``raw`` [K]; ``spread`` [K]: their standard deviations."""
+        count = len(raw)
+        for offset in _offsets(count, int(self.drawn.sum()), len(self.samples)):
+            near = self.objective.clip(raw + spread * offset[:count])
+            point = self.wider.start.clone()
+            point[~self.drawn], point[self.drawn] = near, offset[count:] * self.wider.prior_std[self.drawn]
+            try:
+                self.rows, seen = self.wider.evaluate_all(point), self.wider.seen(point)
+            except (SimulationDiverged, UnstableStep):
+                continue
+            forces = [w[1:, :3] for frames in seen for w in frames.wrench.values()]
+            force = torch.cat(forces) if forces else raw.new_zeros(0, 3)
+            value = self.rows.value if self.mask is None else self.rows.value * self.mask(self.rows)
+            self.samples.append(Sample(near, value, torch.cat([frames.x for frames in seen]), force))
+
+    def near(self, raw: Tensor, spread: Tensor) -> list[Sample]:
+        """Those that count at a point.
+
+        Raises:
+            SimulationDiverged: too few.
+        """
+        found = [s for s in self.samples if bool(((s.raw - raw).abs() <= NEAR * spread).all())]
+        if len(found) < len(raw) + SPARE:
+            raise SimulationDiverged(
+                f"only {len(found)} simulations around the solution went well",
+                remedy="start nearer, or with a smaller dt",
+            )
+        return found
+
+
+def line(near: Sequence[Sample], raw: Tensor, like: Linearised) -> Line:
+    """By least squares about ``raw``; rows are divided by their noise, that of the ripples and of the data."""
+    design, value = _design(near, raw), torch.stack([s.value for s in near])
+    solved = torch.linalg.lstsq(design, value).solution
+    scatter = value - design @ solved
+    freedom = len(design) - design.shape[1]
+    wobble = _pooled(scatter.square().sum(0) / freedom, like)
+    weight = _weight(solved[0], wobble, like.kind)
+    inverse = torch.linalg.inv(design.mT @ design)[1:, 1:]
+    linear = like._replace(
+        value=weight * solved[0], jacobian=weight[:, None] * solved[1:].mT, wobble=weight**2 * wobble, blur=inverse
+    )
+    return Line(linear, weight * scatter, freedom)
+
+
+def _weight(data: Tensor, wobble: Tensor, kind: Tensor) -> Tensor:
+    """[R], so that rows of a kind have equal noise; in its mean it stays as it is."""
+    weight = torch.ones_like(data)
+    for b in kind.unique():
+        own = (kind == b) & (data != 0)
+        if int(own.sum()) > 1:
+            calm = wobble[own] <= wobble[own].median()  # what ripples leave alone shows the sensor's noise
+            floor = noise_scale(data[own][calm], None) ** 2
+            noise = (floor + wobble[own]).sqrt()
+            weight[own] = noise.square().mean().sqrt() / noise
+    return weight
+
+
+def _offsets(count: int, beside: int, seed: int) -> Tensor:
+    """[N, K + others] in standard deviations: pairs, and columns that are orthogonal among the unknowns."""
+    pairs = count + SPARE
+    draw = torch.randn(pairs, count + beside, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    straight = torch.linalg.qr(draw[:, :count])[0] * pairs**0.5
+    half = torch.cat([straight, draw[:, count:]], 1)
+    return torch.cat([half, -half])
+
+
+def _design(near: Sequence[Sample], raw: Tensor) -> Tensor:
+    moved = torch.stack([s.raw for s in near]) - raw
+    return torch.cat([torch.ones(len(moved), 1, dtype=moved.dtype), moved], 1)
+
+
+def _pooled(variance: Tensor, like: Linearised) -> Tensor:
+    """[R], means over rows of one kind, frame and patch: each alone is known to little better than a factor of two."""
+    patches = int(like.patch.max()) + 1
+    group = (like.kind * (int(like.frame.max()) + 1) + like.frame) * patches + like.patch
+    total, count = variance.new_zeros(2, int(group.max()) + 1).index_add(
+        1, group, torch.stack([variance, torch.ones_like(variance)])
+    )
+    return (total / count.clamp(min=1))[group]
+
+
+def _by_ripples(problem: gauss_newton.Problem, at: Iterate, found: Line) -> Tensor:
+    """[K, K]: the measured cloth ripples as one more simulation does; so much each of them moves the estimate."""
+    inverse = torch.linalg.inv(gauss_newton.information(problem, at))
+    moved = found.scatter @ (at.influence()[0][:, None] * at.linear.jacobian) @ inverse
+    student = gauss_newton.student(found.freedom) / gauss_newton.NORMAL
+    return student**2 * moved.mT @ moved / found.freedom + inverse @ torch.diag(problem.prior_std**-2) @ inverse
+
+
+def _reach(objective: Objective, near: Sequence[Sample], raw: Tensor) -> Reach:
+    """By regression of the frames and of the forces."""
+    design, count = _design(near, raw), len(objective.unknowns)
+
+    def size(parts: list[Tensor]) -> Tensor:
+        many = torch.stack(parts).to(design).flatten(1)
+        slope = torch.linalg.lstsq(design, many).solution[1 : count + 1].unflatten(1, (-1, 3))
+        return slope.square().sum(-1).mean(1).sqrt().nan_to_num(0.0)
+
+    return Reach(size([s.x for s in near]), size([s.force for s in near]))
