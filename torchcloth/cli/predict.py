@@ -53,10 +53,10 @@ def _predict(options: argparse.Namespace) -> int:
     if not known:
         raise InvalidInput("FIT", got=options.fit, expected=f"{TENSION} or {RESULT}, or the folder that holds it")
     of_table = options.angle is not None or (options.seen is not None and (options.seen / TABLE).is_file())
-    name = TENSION if of_table or known == [TENSION] else RESULT
+    name = TENSION if of_table or (options.seen is None and known == [TENSION]) else RESULT
     if name not in known:
-        got, expected = f"{known[0]} with a strip to predict", f"{TENSION}, which fit_tension saves"
-        raise InvalidInput("FIT", got=got, expected=expected)
+        what = "a strip" if of_table else "an episode"
+        raise InvalidInput("FIT", got=f"{known[0]} with {what} to predict", expected=name)
     return (_of_strip if name == TENSION else _of_episode)(folder / name, out, options)
 
 

@@ -29,9 +29,9 @@ SPECIMENS = {kind.__name__: kind for kind in (Uniaxial, Trellis)}
 class Pulled:
     """One fitted table: its specimen, and how far the law is from its readings.
 
-    ``missed``: root mean square error of the force over that of its rise above the preload, and of the lateral strain
-    over its own; None where not measured. ``left_out``: of the law fitted to the other tables, without what the errors
-    of its numbers explain; None where that was not tried.
+    ``missed``: root mean square error of the force, over the root of mean times largest rise above the preload; and of
+    the lateral strain, over the root of its mean times largest size; None where not measured. ``left_out``: of the law
+    fitted to the other tables, without what the errors of its numbers explain; None where that was not tried.
     """
 
     angle: float  # rad
@@ -117,7 +117,8 @@ def missed(table: ForceDisplacement, curve: Response, known: tuple[Tensor, Tenso
         square = (curve[k].detach().numpy()[rows] - seen[rows]) ** 2
         if known is not None:
             square = square - known[k].numpy()[rows] ** 2
-        out[kind] = math.sqrt(max(0.0, square.mean()) / ((seen[rows] - base) ** 2).mean())
+        rise = np.abs(seen[rows] - base)
+        out[kind] = math.sqrt(max(0.0, square.mean()) / (rise.mean() * rise.max()))
     return out
 
 
@@ -178,7 +179,9 @@ def _model(kept: dict[str, Any]) -> TensionModel:
     for name in names:
         if not isinstance(getattr(material, name), PhysicalParameter):
             raise ValueError(f"{name} is no parameter")
-    covariance = torch.tensor(kept["covariance"], dtype=torch.float64).reshape(len(names), len(names))
+    covariance = torch.tensor(kept["covariance"], dtype=torch.float64)
+    if covariance.shape != (len(names), len(names)):
+        raise ValueError(f"a covariance of shape {tuple(covariance.shape)}")
     tables = [Pulled(**table) for table in kept["tables"]]
     if not tables or not bool(covariance.isfinite().all()):
         raise ValueError("no tables, or a covariance that is not finite")

@@ -17,16 +17,17 @@ from .tension import TensionFit, fit_tension
 from .tension_model import Pulled, TensionModel, missed, with_left_out
 
 ROWS = 41
+SAME = 0.01  # rad, within which an angle is one that was fitted
 SLACK = 1.02  # of the largest fitted strain, beyond which a curve is said to be extrapolated
 CONVENTION = (
-    "SI units, angle in degrees from the warp. parameters: standard error that the fit's covariance gives (delta "
-    "method); it allows for errors correlated along a curve. law: standard deviation of what the law misses, a share "
-    "of the force's rise above the preload and of the lateral strain: the root mean square over fitted tables, each "
-    "left out of the fit and predicted (tables between other tables' angles, where the angle is between fitted ones); "
-    "without tables left out, over fitted ones. setup: of a preload that was not given: it is then the force at the "
-    "mean strain at which fitted tables began, within their scatter. std: all parts, as independent. ci95: 1.96 std. "
-    "lateral strain: null where "
-    "no fitted table had it. measured: errors as shares of the largest reading; covered: share of readings inside ci95."
+    "SI units, angle in degrees from the warp. std_parameters: standard error that the fit's covariance gives (delta "
+    "method); it allows for errors correlated along a curve. std_law: standard deviation of what the law misses; its "
+    "square grows in proportion to the force's rise above the preload, or to the lateral strain. At fitted angles it "
+    "is what is missed of all fitted tables; at others what is missed of tables that were left out of the fit (those "
+    "between other tables' angles, where the angle is between fitted ones), less what the errors of the parameters "
+    "explain. std_setup: of a preload that was not given: it is then the force at the mean strain at which fitted "
+    "tables began, within their scatter. std: all parts, as independent. ci95: 1.96 std. lateral_strain: null where "
+    "no fitted table had it. measured: errors as shares of the largest reading; covered: share of readings in ci95."
 )
 
 
@@ -131,18 +132,26 @@ def predict_tension(model: TensionModel, table: ForceDisplacement, preload_std: 
     """
     found, *stds = model.curve(table)
     other = model.curve(replace(table, preload=table.preload + preload_std))[0] if preload_std else found
+    longest = max(t.strain for t in model.tables)
+    whole = model.curve(_until(table, longest))[0]
     chosen, law_from, warnings = _law_from(model.tables, table.angle)
-    if table.strain.max() > SLACK * max(t.strain for t in model.tables):
+    if table.strain.max() > SLACK * longest:
         warnings.append("the curve goes beyond the largest strain that was fitted: no error covers that")
     bands = []
-    for kind, value, std, shifted, base in zip(
-        ("force", "lateral"), found, stds, other, (table.preload, 0.0), strict=True
+    for kind, value, std, shifted, end, base in zip(
+        ("force", "lateral"), found, stds, other, whole, (table.preload, 0.0), strict=True
     ):
         share, value = _share(chosen, kind), value.numpy()
-        law = np.abs(value - base) * (share or 0.0)
+        law = (share or 0.0) * np.sqrt(np.abs(value - base) * abs(float(end[-1]) - base))
         known = share is not None
         bands.append(Band(value, std.numpy(), law, np.abs(shifted.numpy() - value)) if known else None)
     return TensionPrediction(table, bands[0], bands[1], law_from, warnings)
+
+
+def _until(table: ForceDisplacement, strain: float) -> ForceDisplacement:
+    """The specimen at its first reading and at a strain."""
+    ends = np.array([0.0, strain * table.length])
+    return replace(table, displacement=ends, force=np.full(2, np.nan), lateral_strain=None, repeat=None)
 
 
 def specimen_like(
@@ -167,9 +176,11 @@ def specimen_like(
         "width": _common(model.tables, "width", width),
         "strain": max(t.strain for t in model.tables) if strain is None else strain,
     }
-    for name, number in {**size, "rows": rows - 1}.items():
+    for name, number in size.items():
         if not 0 < number < math.inf:
-            raise InvalidInput(name, got=number, expected="a number > 0, at least two rows")
+            raise InvalidInput(name, got=number, expected="a number > 0")
+    if rows < 2:
+        raise InvalidInput("rows", got=rows, expected="at least 2")
     if not abs(angle) <= math.pi:
         raise InvalidInput("angle", got=f"{math.degrees(angle):g} degrees", expected="-180 to 180")
     if preload is not None and not 0 <= preload < math.inf:
@@ -222,6 +233,8 @@ def excess(model: TensionModel, table: ForceDisplacement) -> dict[str, float | N
 
 def _law_from(tables: list[Pulled], angle: float) -> tuple[list[dict[str, float | None]], str, list[str]]:
     """The shares to take the law's misfit from, where from in words, warnings."""
+    if any(abs(_folded(t.angle) - _folded(angle)) < SAME for t in tables):
+        return [t.missed for t in tables], "fitted tables, of which one has this angle", []
     tried = [t for t in tables if t.left_out is not None]
     if not tried:
         note = "the law's part is of fitted tables: a direction that was not fitted may be missed by more"
