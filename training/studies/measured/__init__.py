@@ -84,7 +84,9 @@ def _knits(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, A
 
 def _swings(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
     fitted, held = swings.split(source, options.fast)
-    fits = kept.run({f"swings-{part}": partial(_fit, source, fitted, part, options.out) for part in swings.PARTS})
+    fits = kept.run(
+        {f"swings-{part}": partial(_fit, source, fitted, part, options.out, options.fast) for part in swings.PARTS}
+    )
     values = {part: fits[f"swings-{part}"]["values"] for part in swings.PARTS}
     models = {"vacuum": dict.fromkeys(swings.NAMES, 0.0), "textbook": swings.START, **values}
     cases = kept.run({f"swing-{name}": partial(swing_predictions.predict, source, name, models) for name in held})
@@ -100,10 +102,10 @@ def _swings(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, 
     return found
 
 
-def _fit(source: Path, names: list[str], part: str, out: Path) -> dict[str, Any]:
+def _fit(source: Path, names: list[str], part: str, out: Path, fast: bool) -> dict[str, Any]:
     """A fit of many runs as a case; its journal lasts until it is kept."""
     journal = out / "progress" / part
-    fit = swings.fit(source, names, part, journal)
+    fit = swings.fit(source, names, part, journal, fast)
     fit.save(out / f"swings-{part}")
     content = fit.as_dict()
     clear(journal)
