@@ -41,24 +41,20 @@ def nylon(found: dict[str, Any], folder: Path) -> None:
         left = found["left_out"][angle]
         own, other = fitted["measured"]["force"], left["measured"]["force"]
         numbers = [_percent(own["rms"]), _percent(own["max"]), _percent(other["rms"]), _percent(other["max"])]
-        note = left["law_from"].replace("tables at ", "").replace(", each left out of the fit", "")
-        outside = "; outside of the fitted angles" if any("outside" in w for w in left["warnings"]) else ""
-        table.add_row(f"{angle}°", *numbers, f"{100 * other['covered']:.0f} %", note + outside)
+        notes = [left["law_from"].replace("tables at ", "").replace(", each left out of the fit", "")]
+        notes += ["outside of the fitted angles"] if any("outside" in w for w in left["warnings"]) else []
+        notes += [f"{name} not identifiable" for name in left["not_identifiable"]]
+        table.add_row(f"{angle}°", *numbers, f"{100 * other['covered']:.0f} %", "; ".join(notes))
     console.print(table)
-    table = _table(
-        "Nylon at angles that were not measured here: force [N] ± by parameters ± by the law ± by the preload"
-    )
-    rows = next(iter(found["between"].values()))
-    table.add_column("angle", justify="right")
-    for row in rows:
-        table.add_column(f"strain {100 * row['strain']:.0f} %")
-        table.add_column("95 % interval")
+    table = _table("Nylon at angles that were not measured here: force [N], and the standard deviation's parts")
+    for heading in ("angle", "strain", "force", "by parameters", "by the law", "by the preload", "95 % interval"):
+        table.add_column(heading, justify="right")
     for angle, curve in found["between"].items():
-        cells = [f"{angle}°"]
-        for r in curve:
-            cells += [f"{r['force']:.2f} ± {r['parameters']:.2f} ± {r['law']:.2f} ± {r['setup']:.2f}"]
-            cells += [f"{r['low']:.2f} … {r['high']:.2f}"]
-        table.add_row(*cells)
+        for k, r in enumerate(curve):
+            parts = [f"± {r[part]:.2f}" for part in ("parameters", "law", "setup")]
+            interval = f"{r['low']:.2f} … {r['high']:.2f}"
+            strain = f"{100 * r['strain']:.0f} %"
+            table.add_row("" if k else f"{angle}°", strain, f"{r['force']:.2f}", *parts, interval)
     console.print(table)
     console.print(f"any other angle: torchcloth predict {folder} --angle DEGREES", markup=False)
 

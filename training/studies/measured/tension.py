@@ -37,7 +37,8 @@ def nylon(source: Path, out: Path, fast: bool) -> dict[str, Any]:
     left_out = {}
     for k, (angle, part) in enumerate(zip(tables, parts, strict=True)):
         model = with_left_out(part.model, [shares[i] for i in range(len(shares)) if i != k])
-        left_out[str(angle)] = predict_tension(model, tables[angle]).as_dict()
+        unknown = [name for name in names if not part.parameters[name].identifiable]
+        left_out[str(angle)] = predict_tension(model, tables[angle]).as_dict() | {"not_identifiable": unknown}
     return {
         "parameters": {name: asdict(fit.parameters[name]) for name in names},
         "fitted": {str(angle): predict_tension(whole.model, t).as_dict() for angle, t in tables.items()},
