@@ -10,7 +10,7 @@ import twins
 from torchcloth import recordings
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import cloth_from, identify, replayed
-from torchcloth.identification.saved import _read
+from torchcloth.identification.saved import read_saved
 from torchcloth.transfer import Contact
 
 
@@ -25,7 +25,7 @@ def test_the_frames_of_the_fit_come_back(pair, recording, tmp_path):
 def test_start_values_that_were_not_fitted_are_kept(pair, tmp_path):
     """`pair` fits stiffness and air; the rest is the data sheet's."""
     pair.save(tmp_path)
-    values = _read(tmp_path / "identification.json").values
+    values = read_saved(tmp_path / "identification.json").values
     assert values["poisson_ratio"] == pytest.approx(twins.NOMINAL.poisson)
     assert values["bending.damping_time"] == pytest.approx(twins.NOMINAL.damping_time)
     assert values["youngs_modulus"] == pair.parameters["youngs_modulus"].value != pytest.approx(2e4)

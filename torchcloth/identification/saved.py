@@ -72,11 +72,10 @@ def replayed(path: str | Path, recording: Recording) -> Replayed:
         InvalidInput: there is no such file, or the fit is of another episode or model.
         RecordingError: the file cannot be read, or does not hold what is needed.
     """
-    path = Path(path)
-    path = path / RESULT if path.is_dir() else path
-    model = _read(path)
+    path = result_file(path)
+    model = read_saved(path)
     kept = _same(path, model.episodes, recording)
-    cloth = _rebuilt(path, model, recording)
+    cloth = rebuilt(path, model, recording)
     data = episode(cloth, recording)
     with torch.no_grad():
         frames = Replay(cloth)(data, model.dt).x
@@ -91,7 +90,7 @@ def replayed(path: str | Path, recording: Recording) -> Replayed:
 
 
 @dataclass(frozen=True)
-class _Model:
+class SavedModel:
     """The entry "model" of identification.json."""
 
     values: dict[str, float]
@@ -100,7 +99,19 @@ class _Model:
     episodes: list[dict[str, Any]]
 
 
-def _read(path: Path) -> _Model:
+def result_file(path: str | Path) -> Path:
+    """identification.json, given itself or by the folder that holds it."""
+    path = Path(path)
+    return path / RESULT if path.is_dir() else path
+
+
+def read_saved(path: Path) -> SavedModel:
+    """The entry "model" of identification.json.
+
+    Raises:
+        InvalidInput: there is no such file.
+        RecordingError: it cannot be read, or does not hold what is needed.
+    """
     again = "run `torchcloth identify` again"
     try:
         content = json.loads(path.read_text())
@@ -110,7 +121,7 @@ def _read(path: Path) -> _Model:
         raise RecordingError(f"{path}: unreadable", got=error, remedy=again) from None
     try:
         model = content["model"]
-        return _Model(
+        return SavedModel(
             {str(name): float(value) for name, value in model["values"].items()},
             None if model["contact"] is None else Contact(**model["contact"]),
             None if model["dt"] is None else float(model["dt"]),
@@ -158,7 +169,12 @@ def _same(path: Path, episodes: Sequence[dict[str, Any]], recording: Recording) 
     )
 
 
-def _rebuilt(path: Path, model: _Model, recording: Recording) -> Cloth:
+def rebuilt(path: Path, model: SavedModel, recording: Recording) -> Cloth:
+    """The cloth that an episode describes, at the fitted values.
+
+    Raises:
+        InvalidInput: it has other parameters than the fitted one.
+    """
     cloth = cloth_from(recording, contact=model.contact)
     names = available(cloth)
     if other := model.values.keys() ^ names.keys():

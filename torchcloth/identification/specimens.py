@@ -9,11 +9,13 @@ tests/identification.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from math import pi, sqrt
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.func import functional_call
 
 from ..errors import InvalidInput, SimulationDiverged
 from ..materials import AbstractMaterial
@@ -51,10 +53,16 @@ class AbstractSpecimen(ABC):
         strain = torch.as_tensor(table.strain).to(c[0].dtype)
         if not table.preload:
             return self.respond(material, c, table, strain)
-        taut = self._taut(material, c, table)
+        taut = self._taut(material, c, table)  # differentiable
         found = self.respond(material, c, table, torch.cat([taut, (1 + taut) * (1 + strain) - 1]))
         wide = 1 + found.lateral_strain
         return Response(found.force[1:], wide[1:] / wide[:1] - 1)
+
+    def taut(self, material: AbstractMaterial, table: ForceDisplacement) -> float:
+        """Strain of the specimen under its preload, from the unloaded state."""
+        if not table.preload:
+            return 0.0
+        return float(self._taut(material, material.coefficients(), table).detach())
 
     def _taut(self, material: AbstractMaterial, c: Any, table: ForceDisplacement) -> Tensor:
         """Strain [1] under the preload: Newton's method on values, then one step that carries the derivatives."""
@@ -163,6 +171,29 @@ class Trellis(AbstractSpecimen):
         p1, p2 = material.membrane_stress(c, surface_of(f1, f2))
         turn1, turn2 = torch.stack([-sin, cos, zero], dim=-1), torch.stack([cos, -sin, zero], dim=-1)
         return 0.5 * (p1 * turn1 + p2 * turn2).sum(-1)
+
+
+class _Law(nn.Module):
+    """A material under the name that it has in a cloth."""
+
+    def __init__(self, material: AbstractMaterial) -> None:
+        super().__init__()
+        self.material = material
+
+    def forward(self, specimen: AbstractSpecimen, tables: Sequence[ForceDisplacement]) -> list[Response]:
+        """One response per table."""
+        return [specimen.curve(self.material, table) for table in tables]
+
+
+def curves(
+    material: AbstractMaterial,
+    entries: Mapping[str, Tensor],
+    specimen: AbstractSpecimen,
+    tables: Sequence[ForceDisplacement],
+) -> list[Response]:
+    """Responses with some stored tensors replaced, by their names in a cloth's state; differentiable in these."""
+    own = {key: value for key, value in entries.items() if key.startswith("material.")}
+    return functional_call(_Law(material), own, (specimen, tables))
 
 
 def surface_of(f1: Tensor, f2: Tensor) -> Surface:

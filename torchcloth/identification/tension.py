@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-from torch.func import functional_call
+from torch import Tensor
 
 from .._files import write_text
 from ..cloth import Cloth
@@ -22,8 +21,9 @@ from ..recordings import ForceDisplacement
 from . import gauss_newton
 from .report import doubts, estimates
 from .result import set_identified
-from .specimens import AbstractSpecimen, Response, Uniaxial
+from .specimens import AbstractSpecimen, Response, Uniaxial, curves
 from .statements import Estimate
+from .tension_model import RESULT, TensionModel, pulled
 from .unknowns import Unknown, available, collect, needs_contact, overrides
 
 RESOLUTION = 1e-3  # of a table's largest reading: no kind of reading is taken to be better
@@ -46,6 +46,8 @@ class TensionFit:
         curves: what the fitted law reads, one `Response` per table.
         warnings: what to mistrust, in sentences.
         iterations: accepted steps.
+        keys: module path by name of the fitted parameters.
+        model: the fitted law with its covariance, which predicts other specimens (see ``predict_tension``).
     """
 
     parameters: dict[str, Estimate]
@@ -54,7 +56,8 @@ class TensionFit:
     curves: list[Response] = field(repr=False)
     warnings: list[str]
     iterations: int
-    keys: dict[str, str] = field(default_factory=dict, repr=False)
+    keys: dict[str, str]
+    model: TensionModel = field(repr=False)
 
     def save(self, folder: str | Path) -> Path:
         """Write tension.json into ``folder``, atomically; returns its path."""
@@ -67,8 +70,9 @@ class TensionFit:
             "convention": CONVENTION,
             "warnings": self.warnings,
             "iterations": self.iterations,
+            "model": self.model.as_dict(),
         }
-        return write_text(folder / "tension.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+        return write_text(folder / RESULT, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
     def apply(self, cloth: Cloth) -> Cloth:
         """Set the fitted values in ``cloth``, leaving what is not identifiable as it is; returns it."""
@@ -143,18 +147,6 @@ def _membrane(cloth: Cloth) -> list[str]:
     return [n for n, m in modules.items() if isinstance(m, PhysicalParameter) and bool(m.value) and n not in director]
 
 
-class _Curves(nn.Module):
-    """The cloth's law in the machine."""
-
-    def __init__(self, cloth: Cloth) -> None:
-        super().__init__()
-        self.cloth = cloth
-
-    def forward(self, specimen: AbstractSpecimen, tables: list[ForceDisplacement]) -> list[Response]:
-        """One response per table."""
-        return [specimen.curve(self.cloth.material, table) for table in tables]  # type: ignore[arg-type]
-
-
 class _Readings:
     """Tables as the residuals that Gauss-Newton works on: shares of each table's largest reading."""
 
@@ -187,8 +179,7 @@ class _Readings:
 
     def curves(self, raw: Tensor) -> list[Response]:
         """Responses at the unknowns ``raw`` [K]."""
-        entries = {f"cloth.{key}": value for key, value in overrides(self.unknowns, raw).items()}
-        return functional_call(_Curves(self.cloth), entries, (self.specimen, self.tables))
+        return curves(self.cloth.material, overrides(self.unknowns, raw), self.specimen, self.tables)  # type: ignore
 
     def problem(self) -> gauss_newton.Problem:
         """The callbacks of Gauss-Newton."""
@@ -249,7 +240,20 @@ def _statements(readings: _Readings, found: gauss_newton.Iterate, iterations: in
         for k, e in enumerate(errors)
         if e["force_max_after"] > MISSED
     ]
-    return TensionFit(said.parameters, said.correlation, errors, after, warnings, iterations, keys)
+    model = _model(readings, found, covariance)
+    return TensionFit(said.parameters, said.correlation, errors, after, warnings, iterations, keys, model)
+
+
+def _model(readings: _Readings, found: gauss_newton.Iterate, covariance: Tensor) -> TensionModel:
+    """The law with its fitted values, and what is known of its errors."""
+    cloth = copy.deepcopy(readings.cloth)
+    own = [k for k, u in enumerate(readings.unknowns) if u.key.startswith("material.")]
+    for unknown, raw in zip(readings.unknowns, found.raw, strict=True):
+        cloth.get_submodule(unknown.key.removesuffix(".raw")).set(unknown.value(float(raw)))  # type: ignore
+    with torch.no_grad():
+        tables = pulled(readings.tables, readings.curves(found.raw))
+    names = [readings.unknowns[k].key.removeprefix("material.").removesuffix(".raw") for k in own]
+    return TensionModel(cloth.material, readings.specimen, names, covariance[own][:, own], tables)  # type: ignore
 
 
 def misses(table: ForceDisplacement, curve: Response) -> dict[str, float]:

@@ -1,0 +1,75 @@
+"""An episode that was not fitted, predicted: where the truth lies, how sure that is said to be, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+import twins
+
+from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.identification import episode, predict_episode
+from torchcloth.identification.replays import simulate
+from torchcloth.identification.unknowns import collect
+
+
+@pytest.fixture(scope="module")
+def other():
+    """The same fabric, shaken faster and less far."""
+    with twins.doubles():
+        return twins.first(twins.twin(seed=3, amplitude=0.05, rate=3.5), 8)
+
+
+@pytest.fixture(scope="module")
+def found(pair, other, tmp_path_factory):
+    with twins.doubles():
+        return predict_episode(pair.save(tmp_path_factory.mktemp("fit")), other)
+
+
+def test_what_was_not_fitted_is_as_near_as_what_was(found, pair):
+    """Noise of 1 mm; the null is far off."""
+    assert found.figures["rms"] < 1.2 * pair.fit["rms_after"]
+    assert found.figures["rms"] < 0.3 * found.figures["rms_null"]
+    assert found.law == pair.fit["rms_after"]
+
+
+def test_the_error_is_that_of_finite_steps(found, pair, other):
+    """A tenth of a standard error of each parameter, with their correlation, through whole simulations."""
+    cloth = found.cloth
+    unknowns = collect(cloth, list(pair.correlation), None)
+    raw = torch.tensor([u.start for u in unknowns])
+    std = torch.tensor([pair.parameters[u.name].std / u.slope(u.start) for u in unknowns])
+    data = episode(cloth, other)
+    with torch.no_grad():
+        centre = simulate(cloth, unknowns, raw, data).x
+        steps = 0.1 * torch.diag(std)
+        moved = torch.stack([simulate(cloth, unknowns, raw + step, data).x - centre for step in steps]) / 0.1
+    matrix = torch.tensor([[pair.correlation[a.name][b.name] for b in unknowns] for a in unknowns])
+    expected = torch.einsum("ktvc,kl,ltvc->tv", moved, matrix, moved).sqrt()
+    assert found.std.shape == expected.shape
+    assert float((found.std - expected).abs().max()) < 0.02 * float(expected.max())
+    assert float(found.std[0].max()) < float(found.std.max())
+
+
+def test_what_it_says_is_json(found):
+    content = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert content["frames"] == 8
+    assert 0 < content["std_parameters"]["rms"] <= content["std_parameters"]["max"]
+
+
+def test_an_episode_of_which_nothing_is_to_be_compared_has_forces_or_is_refused(pair, other, tmp_path):
+    with pytest.raises(RecordingError, match="points"):
+        predict_episode(pair.save(tmp_path), replace(other, points=None))
+
+
+def test_another_model_is_refused(pair, other, tmp_path):
+    airless = replace(other, air_density=None)
+    with pytest.raises(InvalidInput, match="a fit of another model; got air"):
+        predict_episode(pair.save(tmp_path), airless)
+    with pytest.raises(InvalidInput, match=r"got no .*identification.json"):
+        predict_episode(tmp_path / "nothing", other)
+    path = pair.save(tmp_path)
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "correlation": {"youngs_modulus": {}}}))
+    with pytest.raises(RecordingError, match="is not complete"):
+        predict_episode(path, other)

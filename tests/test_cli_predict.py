@@ -1,0 +1,107 @@
+"""``torchcloth predict`` as a user meets it."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent / "identification"))
+
+import offaxis
+import twins
+
+from torchcloth import recordings
+from torchcloth.cli import main
+from torchcloth.identification import fit_tension, identify
+
+
+@pytest.fixture(scope="module")
+def strips(tmp_path_factory):
+    """Folder of a fit of three directions."""
+    torch.set_default_dtype(torch.float64)
+    draw = np.random.default_rng(0)
+    tables = [offaxis.readings(a, 0.02, draw, count=12) for a in (0, 45, 90)]
+    folder = tmp_path_factory.mktemp("fits") / "strips"
+    fit_tension(offaxis.cloth(), tables, offaxis.NAMES).save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def swing(tmp_path_factory):
+    """Folder of a fit of an episode, and another episode on disk."""
+    folder = tmp_path_factory.mktemp("episodes")
+    with twins.doubles():
+        fitted = twins.first(twins.twin(), 6)
+        identify(twins.at(fitted), fitted, ["youngs_modulus"], iterations=2).save(folder / "fit")
+        other = recordings.write(twins.first(twins.twin(seed=1, amplitude=0.05), 6), folder / "other")
+    return folder / "fit", other
+
+
+def test_a_strip_at_any_angle(strips, tmp_path, capsys):
+    """The table, the JSON and the picture; the closed form is inside."""
+    out = tmp_path / "out"
+    assert main(["predict", str(strips), "--angle", "30", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    for word in ("Strip at 30 degrees", "by parameters", "by the law", "95 % interval", "note: the law's part"):
+        assert word in printed
+    content = json.loads((out / "prediction.json").read_text())
+    low, high = np.array(content["force"]["ci95"])
+    truth = offaxis.modulus(30) * offaxis.H * 0.02 * np.array(content["strain"])
+    assert ((low <= truth) & (truth <= high)).all()
+    assert content["measured"] == {}
+    assert (out / "prediction.png").stat().st_size > 5000
+
+
+def test_a_table_is_predicted_and_compared_with(strips, tmp_path, capsys):
+    table = offaxis.readings(60, 0.02, np.random.default_rng(1), count=12)
+    place = recordings.write_tension(table, tmp_path / "table")
+    assert main(["predict", str(strips / "tension.json"), str(place)]) == 0
+    assert "of the readings inside" in capsys.readouterr().out
+    content = json.loads((strips / "prediction" / "prediction.json").read_text())
+    assert content["specimen"]["angle"] == pytest.approx(60)
+    assert content["measured"]["force"]["rms"] < 0.05
+
+
+def test_another_episode(swing, tmp_path, capsys):
+    fit, other = swing
+    out = tmp_path / "out"
+    assert main(["predict", str(fit), str(other), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    for word in ("by parameters", "null: carried rigidly", "predicted"):
+        assert word in printed
+    content = json.loads((out / "prediction.json").read_text())
+    assert content["measured"]["rms"] < 0.5 * content["measured"]["rms_null"]
+    with np.load(out / "prediction.npz") as file:
+        assert file["vertices"].shape == (6, 49, 3)
+        assert file["std"].shape == (6, 49)
+    assert (out / "prediction.png").exists()
+
+
+def test_wrong_input_is_one_line(strips, swing, tmp_path, capsys):
+    fit, other = swing
+    (tmp_path / "file").write_text("")
+    table = recordings.write_tension(offaxis.readings(60, 0.0, np.random.default_rng(1)), tmp_path / "table")
+    wrong = {
+        ("nothing", "--angle", "30"): "FIT; got .*nothing; expected tension.json or identification.json",
+        (strips,): "--angle; got none; expected degrees",
+        (strips, "--angle", "1000"): "angle; got 1000 degrees; expected -180 to 180",
+        (strips, "--angle", "30", "--length", "-1"): "length; got -1.0",
+        (strips, table, "--angle", "30"): "SEEN; got a table and a strip's numbers; expected one of them",
+        (strips, other): "FIT; got tension.json with an episode to predict; expected identification.json",
+        (fit, "--angle", "30"): "FIT; got identification.json with a strip to predict; expected tension.json",
+        (fit,): "SEEN; got none; expected an episode",
+        (fit, tmp_path / "no"): "no",
+    }
+    for k, (arguments, said) in enumerate(wrong.items()):
+        out = tmp_path / f"out{k}"
+        assert main(["predict", *map(str, arguments), "--out", str(out)]) == 2, arguments
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert "Traceback" not in error
+        assert re.search(said, error), error
+        assert not out.exists()
+    assert main(["predict", str(strips), "--angle", "3", "--out", str(tmp_path / "file")]) == 2

@@ -1,0 +1,136 @@
+"""The study of measured cloth: its fast version on the data, and refusals without them."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from torchcloth.errors import InvalidInput
+from torchcloth.identification import read_model
+from torchcloth.recordings import ForceDisplacement
+from torchcloth.training.studies.checkout import module
+from torchcloth.training.studies.command import main
+from torchcloth.training.studies.measured import find, swing_predictions, swings, tension
+
+
+def _source(realdata, name):
+    """The folder of a source; skips where it is absent."""
+    if not (realdata / name).is_dir():
+        pytest.skip(f"{realdata / name} is absent")
+    return realdata / name
+
+
+@pytest.mark.slow
+@pytest.mark.realdata
+def test_fast_study(realdata, tmp_path):
+    """About a minute on one core: every source has its table and its numbers, and a second run computes nothing."""
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "torchcloth.training.studies", "measured", "--fast", "--out", str(out)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "160", "TORCHCLOTH_REALDATA": str(realdata)}
+    first, again = (
+        subprocess.run(command, capture_output=True, text=True, timeout=900, env=environment) for _ in range(2)
+    )
+    assert first.returncode == again.returncode == 0, first.stderr
+    assert "about 0.0 min left" in first.stdout
+    assert "min left" not in again.stdout, "nothing is computed twice"
+    result = json.loads((out / "measured.json").read_text())
+    if "nylon" in result:
+        _check_nylon(result["nylon"], first.stdout, out)
+    if "knits" in result:
+        [fabric] = result["knits"].values()
+        force = fabric["directions"]["X"]["prediction"]["measured"]["force"]
+        assert 0 < force["rms"] < 0.2
+        assert "repeats differ" in first.stdout
+    if "swings" in result:
+        predicted = result["swings"]["predicted"]
+        assert predicted["whole"]["rms"] < predicted["null"]["rms"]
+        assert 1.0 < predicted["vacuum"]["frequency"] < 1.2
+        assert "Only ratios to the areal density are identifiable" in first.stdout
+    if "sample" in result:
+        assert "vertices to cloud" in first.stdout
+        distances = result["sample"]["distances"]
+        assert distances["fitted"]["cloud to surface"] <= distances["fitted"]["cloud to vertices"]
+    assert not list(out.glob("progress/*")), "journals last until a fit is kept"
+
+
+def _check_nylon(found, printed, out):
+    inner = [found["left_out"][angle]["measured"]["force"] for angle in ("30", "45")]
+    assert all(one["max"] < 0.15 and one["covered"] > 0.8 for one in inner)
+    assert max(one["measured"]["force"]["max"] for one in found["fitted"].values()) < 0.07
+    assert "any other angle: torchcloth predict" in printed
+    assert (out / "nylon" / "tension.json").is_file()
+    assert (out / "nylon.png").is_file()
+
+
+@pytest.mark.realdata
+def test_runs_are_split_and_thinned(realdata):
+    """Twenty fitted, ten others predicted; the free part keeps the first frame and what comes after the stop."""
+    source = _source(realdata, "iri_cloth_swings")
+    fitted, held = swings.split(source, fast=False)
+    assert (len(fitted), len(held)) == (20, 10)
+    assert not set(fitted) & set(held)
+    every, whole, free = (swings.recording(source, held[0], part).points for part in ("all", "whole", "free"))
+    assert len(whole) == -(-len(every) // 2)
+    stop = module("realdata", "swings").stop(module("realdata", "swings").runs(source)[held[0]])
+    assert free.t[0] == every.t[0]
+    assert (free.t[1:] > stop + 0.3).all()
+    assert 8 < len(free) < 0.4 * len(every)
+
+
+@pytest.mark.realdata
+def test_a_knits_third_pull(realdata, tmp_path):
+    """Near the floor in force; the fit on disk predicts any angle."""
+    found = tension.knit(_source(realdata, "knit_tension"), tmp_path, "Pearlized_Cotton_Seed")
+    for one in found["directions"].values():
+        force = one["prediction"]["measured"]["force"]
+        assert one["floor"]["force"] / 2 < force["rms"] < one["floor"]["force"] + 0.06
+        assert force["covered"] > 0.7
+    assert "poisson_ratio" in read_model(tmp_path).fitted
+
+
+def test_without_data_the_study_says_what_it_needs(tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("TORCHCLOTH_REALDATA", raising=False)
+    assert main(["measured", "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "--source; got none; expected a folder with some of nylon_offaxis_tension" in said
+    assert "set TORCHCLOTH_REALDATA" in said
+    with pytest.raises(InvalidInput, match=r"--source; got .*; expected a folder with some of"):
+        find(tmp_path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_floor_is_the_third_pulls_distance_from_the_mean_of_the_others():
+    """Three straight lines of slopes 1, 2 and 3: the third is 1.5 above the mean of the others at strain 1."""
+    u = np.linspace(0, 1, 101)
+    table = ForceDisplacement(
+        length=1.0,
+        width=1.0,
+        angle=0.0,
+        displacement=np.tile(u, 3),
+        force=np.concatenate([u, 2 * u, 3 * u]),
+        lateral_strain=np.tile(-0.1 * u, 3),
+        repeat=np.repeat([1, 2, 3], len(u)),
+    )
+    floor = tension.floor(table)
+    assert floor["force"] == pytest.approx(1.5 * np.sqrt((u**2).mean()) / 3)
+    assert floor["lateral"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_frequency_and_decay_are_found_with_their_spread():
+    """Swings of 0.9 Hz and B = 30 1/(m s) with noise; drawn again, they differ by what the noise makes of them."""
+    free = module("realdata", "free_swing")
+    draw, t = np.random.default_rng(0), np.linspace(0, 2.5, 26)
+    rows = []
+    for size in (0.05, 0.07, 0.06, 0.08):
+        q = free.waves(t, 0.9, 30.0, size, 0.02) + 1e-3 * draw.normal(size=len(t))
+        rows.append({"swing_t": t.tolist(), "swing_q": q.tolist(), "squares": 4.0, "count": 100, "median": 0.1})
+    runs = {str(k): {"measured": row, "null": row, "still": row, "model": row} for k, row in enumerate(rows)}
+    found = swing_predictions.summary(runs, ["model"], draws=5)
+    assert found["measured"]["frequency"] == pytest.approx(0.9, abs=0.005)
+    assert found["measured"]["decay"] == pytest.approx(30.0, rel=0.05)
+    assert 0 < found["model"]["decay_std"] < 3
+    assert found["null"]["rms"] == pytest.approx(0.2)

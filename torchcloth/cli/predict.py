@@ -1,0 +1,105 @@
+"""``torchcloth predict``: what a saved fit says of a specimen or an episode that it was not fitted to."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from .._files import write_text
+from ..errors import InvalidInput
+
+TABLE = "table.json"  # of a folder with readings of a tension machine
+
+
+def add(verbs: Any) -> None:
+    """The verb and its options."""
+    predict = verbs.add_parser(
+        "predict",
+        help="what a fit says of a direction or an episode that it was not fitted to",
+        description="With a tension fit (tension.json): the curve of force and lateral strain of a strip cut at any "
+        "angle, with its 95 % interval. With a fit of episodes (identification.json): where the cloth goes in another "
+        "episode, how sure that is, and how far it is from what was seen.",
+    )
+    add = predict.add_argument
+    add("fit", type=Path, metavar="FIT", help="tension.json or identification.json, or the folder that holds it")
+    add("seen", type=Path, nargs="?", metavar="SEEN", help="a tension table or an episode: to predict and compare with")
+    add("--out", type=Path, metavar="DIR", help="folder for prediction.json and pictures (FIT's folder/prediction)")
+    add("--angle", type=float, metavar="DEGREES", help="of the strip, from the warp")
+    add("--length", type=float, metavar="M", help="of the strip (as fitted)")
+    add("--width", type=float, metavar="M", help="of the cloth that carries the force (as fitted)")
+    add("--preload", type=float, metavar="N", help="at displacement 0 (taut by the same strain as the fitted strips)")
+    add("--strain", type=float, metavar="X", help="at the curve's end (the largest fitted one)")
+    predict.set_defaults(run=_predict)
+
+
+def _predict(options: argparse.Namespace) -> int:
+    import torch
+
+    from ..identification.saved import RESULT
+    from ..identification.tension_model import RESULT as TENSION
+
+    torch.set_default_dtype(torch.float64)
+    torch.set_num_threads(1)
+    folder = options.fit if options.fit.is_dir() else options.fit.parent
+    out = folder / "prediction" if options.out is None else options.out
+    if out.exists() and not out.is_dir():
+        raise InvalidInput("--out", got=f"{out}, a file", expected="a folder, new or existing")
+    known = [name for name in (TENSION, RESULT) if (folder / name).is_file()]
+    if options.fit.name in (TENSION, RESULT):
+        known = [options.fit.name] if options.fit.is_file() else []
+    if not known:
+        raise InvalidInput("FIT", got=options.fit, expected=f"{TENSION} or {RESULT}, or the folder that holds it")
+    of_table = options.angle is not None or (options.seen is not None and (options.seen / TABLE).is_file())
+    name = TENSION if of_table or (options.seen is None and known == [TENSION]) else RESULT
+    if name not in known:
+        what = "a strip" if of_table else "an episode"
+        raise InvalidInput("FIT", got=f"{known[0]} with {what} to predict", expected=name)
+    return (_of_strip if name == TENSION else _of_episode)(folder / name, out, options)
+
+
+def _of_strip(fit: Path, out: Path, options: argparse.Namespace) -> int:
+    from ..identification import pictures, predict_tension, prediction_report, read_model, specimen_like
+    from ..recordings import read_tension
+
+    model, given = read_model(fit), (options.length, options.width, options.preload, options.strain)
+    if options.seen is not None:
+        if options.angle is not None or any(number is not None for number in given):
+            raise InvalidInput("SEEN", got="a table and a strip's numbers", expected="one of them")
+        prediction = predict_tension(model, read_tension(options.seen))
+    elif options.angle is None:
+        raise InvalidInput("--angle", got="none", expected="degrees from the warp, or the folder of a table")
+    else:
+        size = dict(zip(("length", "width", "preload", "strain"), given, strict=True))
+        prediction = predict_tension(model, *specimen_like(model, math.radians(options.angle), **size))
+    path = _write(out, prediction.as_dict())
+    picture = pictures.save_figure(prediction_report.strip(prediction), out / "prediction.png")
+    prediction_report.print_strip(prediction)
+    print(f"result:   {path}\npicture:  {picture}")
+    return 0
+
+
+def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
+    import numpy as np
+
+    from .. import recordings
+    from .._files import atomically
+    from ..identification import pictures, predict_episode, prediction_report
+
+    if options.seen is None:
+        raise InvalidInput("SEEN", got="none", expected="an episode whose motion is to be predicted")
+    found = predict_episode(fit, recordings.read(options.seen))
+    path = _write(out, found.as_dict())
+    with atomically(out / "prediction.npz") as file:
+        t, vertices, std = (part.numpy() for part in (found.episode.times, found.frames.x, found.std))
+        np.savez_compressed(file, t=t, vertices=vertices, std=std, faces=found.cloth.mesh.faces)
+    picture = pictures.save_figure(prediction_report.predicted(found), out / "prediction.png")
+    prediction_report.print_predicted(found)
+    print(f"result:   {path}\nframes:   {out / 'prediction.npz'}\npicture:  {picture}")
+    return 0
+
+
+def _write(out: Path, content: dict[str, Any]) -> Path:
+    return write_text(out / "prediction.json", json.dumps(content, indent=1, allow_nan=False) + "\n")

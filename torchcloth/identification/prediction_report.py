@@ -1,0 +1,122 @@
+"""Predictions as tables for a terminal and as pictures."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from .episode_prediction import EpisodePrediction
+from .pictures import AFTER, BEFORE, NULL
+from .tension_prediction import Band, TensionPrediction
+
+SHOWN = 9  # rows of a curve
+
+
+def print_strip(found: TensionPrediction) -> None:
+    """A curve with its interval, and which part of it is which."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    console.width = max(console.width, 112)
+    t, lateral = found.table, found.lateral_strain
+    size = f"{1e3 * t.length:g} mm x {1e3 * t.width:g} mm, preload {t.preload:.3g} N"
+    title = f"Strip at {math.degrees(t.angle):g} degrees to the warp, {size}"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    columns = ["mm", "strain", "force N", "by parameters", "by the law", "by the setup", "95 % interval"]
+    for heading in columns + (["lateral strain", "95 % interval"] if lateral else []):
+        table.add_column(heading, justify="right")
+    order, least = np.argsort(t.displacement, kind="stable"), 1e-6 * np.abs(found.force.value).max()
+    for i in order[np.linspace(0, len(t) - 1, min(SHOWN, len(t))).round().astype(int)]:
+        f = found.force
+        parts = [f"± {part[i] if part[i] > least else 0:.2g}" for part in (f.parameters, f.law, f.setup)]
+        cells = [f"{1e3 * t.displacement[i]:.3g}", f"{t.strain[i]:.4f}", f"{f.value[i]:.4g}", *parts, _interval(f, i)]
+        if lateral:
+            cells += [f"{lateral.value[i]:.4f}", _interval(lateral, i)]
+        table.add_row(*cells)
+    console.print(table)
+    console.print(f"by the law: what it misses of a curve, from {found.law_from}", markup=False)
+    for kind, e in found.judged().items():
+        numbers = f"rms {100 * e['rms']:.1f} %, largest {100 * e['max']:.1f} % of the largest reading"
+        console.print(f"measured {kind}: {numbers}; {100 * e['covered']:.0f} % of the readings inside", markup=False)
+    for warning in found.warnings:
+        console.print(f"note: {warning}", style="yellow", markup=False)
+
+
+def _interval(band: Band, i: int) -> str:
+    low, high = (end[i] for end in band.ci95)
+    return f"{low:.3g} … {high:.3g}"
+
+
+def strip(found: TensionPrediction) -> Any:
+    """The curve with the interval by parameters inside the whole one, and readings where there are any."""
+    from matplotlib.figure import Figure
+
+    t = found.table
+    kinds: list[tuple[str, Band, np.ndarray | None]] = [("force [N]", found.force, t.force)]
+    if found.lateral_strain is not None:
+        kinds.append(("lateral strain", found.lateral_strain, t.lateral_strain))
+    figure = Figure(figsize=(6.5 * len(kinds), 4.5), layout="constrained")
+    order = np.argsort(t.strain, kind="stable")
+    for axis, (label, band, seen) in zip(figure.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):
+        draw_band(axis, 100 * t.strain[order], band, order)
+        if seen is not None and np.isfinite(seen).any():
+            axis.plot(100 * t.strain, seen, ".", color="black", markersize=3, label="measured")
+        axis.set(xlabel="strain [%]", ylabel=label)
+    figure.axes[0].legend()
+    figure.suptitle(f"strip at {math.degrees(t.angle):g} degrees to the warp, 95 % intervals", fontsize=11)
+    return figure
+
+
+def draw_band(axis: Any, x: np.ndarray, band: Band, order: np.ndarray | slice = slice(None)) -> None:
+    """A curve and its intervals."""
+    low, high = band.ci95
+    axis.fill_between(x, low[order], high[order], color=AFTER, alpha=0.18, linewidth=0, label="all parts")
+    inner = 1.96 * band.parameters
+    ends = ((band.value - inner)[order], (band.value + inner)[order])
+    axis.fill_between(x, *ends, color=AFTER, alpha=0.45, linewidth=0, label="by parameters")
+    axis.plot(x, band.value[order], color=AFTER, label="predicted")
+
+
+def print_predicted(found: EpisodePrediction) -> None:
+    """How sure the prediction is, and how far it is from what was seen."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console, f, content = Console(highlight=False), found.figures, found.as_dict()
+    own = content["std_parameters"]
+    print(f"{found.episode.name}: {content['frames']} frames, {len(found.cloth.mesh.faces)} triangles")
+    print(f"by parameters: a vertex is known to {1e3 * own['rms']:.2g} mm (rms; at most {1e3 * own['max']:.2g} mm)")
+    if math.isfinite(found.law):
+        print(f"by the law:    the fit left {1e3 * found.law:.2g} mm rms in its own episodes, noise included")
+    table = Table(title="Against what was seen", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("", "rms mm", "Chamfer mm", *(["force rms N"] if "force_rms" in f else [])):
+        table.add_column(heading, justify="right" if heading else "left")
+    for label, end in (("null: carried rigidly, no force", "_null"), ("predicted", "")):
+        cells = [f"{1e3 * f[name + end]:.2f}" for name in ("rms", "chamfer")]
+        table.add_row(label, *cells, *([f"{f['force_rms' + end]:.3g}"] if "force_rms" in f else []))
+    seen = any(math.isfinite(number) for number in f.values())
+    console.print(table if seen else "nothing was seen or felt in this episode to compare with")
+
+
+def predicted(found: EpisodePrediction) -> Any:
+    """Over time: the mean distance of what was seen, and the standard error by the parameters."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.5, 4), layout="constrained")
+    axis, e = figure.subplots(), found.episode
+    shown = [t for t in range(len(e.times)) if len(e.positions(t))]
+    std = 1e3 * found.std.square().mean(-1).sqrt()
+    axis.plot(e.times, std, color=AFTER, label="standard error by the parameters")
+    if shown:
+        axis.plot(e.times[shown], 1e3 * found.per_frame, color=BEFORE, label="seen: mean distance from the prediction")
+    if math.isfinite(found.law):
+        axis.axhline(1e3 * found.law, color=NULL, linestyle="--", label="rms that the fit left in its own episodes")
+    axis.set(xlabel="time [s]", ylabel="mm", title=f"{e.name}, predicted")
+    axis.set_ylim(bottom=0)
+    axis.legend()
+    return figure

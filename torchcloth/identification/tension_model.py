@@ -1,0 +1,200 @@
+"""What tension.json keeps beside the estimates: the law, the errors of its numbers, and how far it misses forces."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInput, RecordingError
+from ..materials import AEP, AbstractMaterial, OrthotropicAEP
+from ..parameters import PhysicalParameter
+from ..recordings import ForceDisplacement
+from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial, curves
+
+RESULT = "tension.json"
+LAWS = {law.__name__: law for law in (AEP, OrthotropicAEP)}
+SPECIMENS = {kind.__name__: kind for kind in (Uniaxial, Trellis)}
+
+
+@dataclass(frozen=True)
+class Pulled:
+    """One fitted table: its specimen, and how far the law is from its readings.
+
+    ``missed``: root mean square error of the force, over the root of mean times largest rise above the preload; and of
+    the lateral strain, over the root of its mean times largest size; None where not measured. ``left_out``: of the law
+    fitted to the other tables, without what the errors of its numbers explain; None where that was not tried.
+    """
+
+    angle: float  # rad
+    length: float  # m
+    width: float  # m
+    preload: float  # N
+    strain: float  # largest
+    missed: dict[str, float | None]
+    left_out: dict[str, float | None] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TensionModel:
+    """A fitted law with the covariance of its unconstrained numbers.
+
+    Attributes:
+        material: at the fitted values.
+        specimen: how specimens deform.
+        fitted: names of the fitted parameters, all of the material.
+        covariance: [K, K] of their unconstrained values.
+        tables: what they were fitted to.
+    """
+
+    material: AbstractMaterial
+    specimen: AbstractSpecimen
+    fitted: list[str]
+    covariance: Tensor
+    tables: list[Pulled]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry "model" of tension.json; empty for laws and specimens that cannot be written as numbers."""
+        law, kind = type(self.material).__name__, type(self.specimen).__name__
+        if LAWS.get(law) is not type(self.material) or SPECIMENS.get(kind) is not type(self.specimen):
+            return {}
+        values = {name: _plain(getattr(self.material, name)) for name in _arguments(type(self.material))}
+        if None in values.values():
+            return {}
+        return {
+            "material": law,
+            "values": values,
+            "specimen": kind,
+            "fitted": self.fitted,
+            "covariance": self.covariance.tolist(),
+            "tables": [asdict(table) for table in self.tables],
+        }
+
+    def curve(self, table: ForceDisplacement) -> tuple[Response, Tensor, Tensor]:
+        """What the law reads at a table's displacements; standard errors [N] of force and strain by the covariance."""
+        start = torch.stack([self.material.get_submodule(name).raw.detach() for name in self.fitted])  # type: ignore
+
+        def rows(raw: Tensor) -> Tensor:
+            entries = {f"material.{name}.raw": raw[k] for k, name in enumerate(self.fitted)}
+            return torch.stack(curves(self.material, entries, self.specimen, [table])[0])
+
+        slopes = torch.autograd.functional.jacobian(rows, start, vectorize=True)  # [2, N, K]
+        variance = torch.einsum("rnk,kl,rnl->rn", slopes, self.covariance, slopes)
+        with torch.no_grad():
+            value = Response(*rows(start))
+        force, lateral = variance.clamp(min=0).sqrt()
+        return value, force, lateral
+
+    def preload(self, table: ForceDisplacement) -> tuple[float, float]:
+        """N, of a specimen that was clamped as the fitted ones were, taut by the same strain; and its deviation."""
+        strains = [self.specimen.taut(self.material, table_of(t)) for t in self.tables]
+        mean, spread = float(np.mean(strains)), float(np.std(strains, ddof=1)) if len(strains) > 1 else 0.0
+        if mean == 0:
+            return 0.0, 0.0
+        with torch.no_grad():
+            at = torch.tensor([mean, mean + spread], dtype=torch.float64)
+            low, high = self.specimen.respond(self.material, self.material.coefficients(), table, at).force.tolist()
+        return low, high - low
+
+
+def missed(table: ForceDisplacement, curve: Response, known: tuple[Tensor, Tensor] | None = None) -> dict[str, Any]:
+    """``Pulled.missed`` of a curve; ``known``: standard errors [N] of force and strain whose share is taken off."""
+    out: dict[str, Any] = {"force": None, "lateral": None}
+    for k, (kind, seen, base) in enumerate(
+        (("force", table.force, table.preload), ("lateral", table.lateral_strain, 0.0))
+    ):
+        if seen is None:
+            continue
+        rows = np.isfinite(seen)
+        square = (curve[k].detach().numpy()[rows] - seen[rows]) ** 2
+        if known is not None:
+            square = square - known[k].numpy()[rows] ** 2
+        rise = np.abs(seen[rows] - base)
+        out[kind] = math.sqrt(max(0.0, square.mean()) / (rise.mean() * rise.max()))
+    return out
+
+
+def table_of(kept: Pulled) -> ForceDisplacement:
+    """The specimen of a fitted table, without its readings."""
+    ends = np.array([0.0, kept.strain * kept.length])
+    return ForceDisplacement(
+        length=kept.length,
+        width=kept.width,
+        angle=kept.angle,
+        preload=kept.preload,
+        displacement=ends,
+        force=np.full(2, np.nan),
+    )
+
+
+def pulled(tables: Sequence[ForceDisplacement], found: Sequence[Response]) -> list[Pulled]:
+    """Entries of fitted tables."""
+    return [
+        Pulled(float(t.angle), t.length, t.width, t.preload, float(t.strain.max()), missed(t, c))
+        for t, c in zip(tables, found, strict=True)
+    ]
+
+
+def with_left_out(model: TensionModel, left_out: Sequence[dict[str, float | None]]) -> TensionModel:
+    """With what was missed of each table when it was not fitted."""
+    return replace(model, tables=[replace(t, left_out=m) for t, m in zip(model.tables, left_out, strict=True)])
+
+
+def read_model(path: str | Path) -> TensionModel:
+    """The model of a saved fit: tension.json, or the folder that holds it.
+
+    Raises:
+        InvalidInput: there is no such file.
+        RecordingError: it cannot be read, or does not hold what is needed.
+    """
+    path = Path(path)
+    path = path / RESULT if path.is_dir() else path
+    again = "fit again with fit_tension and save"
+    try:
+        content = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise InvalidInput("fit", got=f"no {path}", expected=f"{RESULT}, or the folder that holds it") from None
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path}: unreadable", got=error, remedy=again) from None
+    try:
+        return _model(content["model"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        expected = f"a law among {', '.join(LAWS)} with its numbers"
+        raise RecordingError(
+            f"{path}: does not say which law was fitted", got=repr(error), expected=expected, remedy=again
+        ) from None
+
+
+def _model(kept: dict[str, Any]) -> TensionModel:
+    names = [str(name) for name in kept["fitted"]]
+    material = LAWS[kept["material"]](**kept["values"]).to(torch.float64)
+    for name in names:
+        if not isinstance(getattr(material, name), PhysicalParameter):
+            raise ValueError(f"{name} is no parameter")
+    covariance = torch.tensor(kept["covariance"], dtype=torch.float64)
+    if covariance.shape != (len(names), len(names)):
+        raise ValueError(f"a covariance of shape {tuple(covariance.shape)}")
+    tables = [Pulled(**table) for table in kept["tables"]]
+    if not tables or not bool(covariance.isfinite().all()):
+        raise ValueError("no tables, or a covariance that is not finite")
+    return TensionModel(material, SPECIMENS[kept["specimen"]](), names, covariance, tables)
+
+
+def _arguments(law: type[AbstractMaterial]) -> list[str]:
+    """Of the constructor; a lasting set is refused by specimens anyway."""
+    return [name for name in inspect.signature(law).parameters if name != "plastic"]
+
+
+def _plain(value: Any) -> float | str | None:
+    """As JSON; None for a value per triangle."""
+    if isinstance(value, PhysicalParameter):
+        return float(value.value) if value.raw.ndim == 0 else None
+    return value

@@ -1,0 +1,126 @@
+"""Measured cloth: fits of some measurements predict the others, each with its null and its interval.
+
+Nylon at angles that were not fitted; the third pull of knits from the first two; 10 swings in air from 20 others; the
+sample that the paper's authors released. The data are not shipped: name their folder with --source.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from torchcloth._files import write_text
+from torchcloth.errors import InvalidInput
+from torchcloth.identification.journal import clear
+
+from ...kept import Kept
+from . import pictures, sample, swing_predictions, swings, tables, tension
+
+VARIABLE = "TORCHCLOTH_REALDATA"
+SOURCES = (tension.NYLON, tension.KNITS, swings.SOURCE, sample.SOURCE)
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Options."""
+    parser.add_argument("--source", type=Path, metavar="DIR", help=f"folder of measured data (${VARIABLE})")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Compute what is missing, then print and draw everything."""
+    source = find(options.source)
+    kept = Kept(options.out, {"study": "measured", "fast": options.fast})
+    there = [name for name in SOURCES if (source / name).is_dir()]
+    result: dict[str, Any] = {}
+    if tension.NYLON in there:
+        result["nylon"] = _nylon(kept, source / tension.NYLON, options)
+    if tension.KNITS in there:
+        result["knits"] = _knits(kept, source / tension.KNITS, options)
+    if swings.SOURCE in there:
+        result["swings"] = _swings(kept, source / swings.SOURCE, options)
+    if sample.SOURCE in there:
+        result["sample"] = _sample(kept, source / sample.SOURCE, options)
+    for name in set(SOURCES) - set(there):
+        print(f"{source / name} is absent: left out")
+    path = write_text(options.out / "measured.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
+    drawn = ", ".join(str(p) for p in sorted(options.out.glob("*.png")))
+    print(f"result:   {path}\npictures: {drawn}")
+
+
+def find(given: Path | None) -> Path:
+    """The folder of measured data.
+
+    Raises:
+        InvalidInput: none was named, or it holds none of the sources.
+    """
+    expected = f"a folder with some of {', '.join(SOURCES)}"
+    if given is None and not os.environ.get(VARIABLE):
+        raise InvalidInput("--source", got="none", expected=expected, remedy=f"name it, or set {VARIABLE}")
+    source = Path(os.environ[VARIABLE]) if given is None else given
+    if not any((source / name).is_dir() for name in SOURCES):
+        raise InvalidInput("--source", got=source, expected=expected)
+    return source
+
+
+def _nylon(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
+    cases = {"nylon": partial(tension.nylon, source, options.out / "nylon", options.fast)}
+    found = kept.run(cases)["nylon"]
+    tables.nylon(found, options.out / "nylon")
+    pictures.nylon(found, source, options.out / "nylon.png")
+    return found
+
+
+def _knits(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
+    names = tension.fabrics(source, options.fast)
+    cases = {f"knit-{name}": partial(tension.knit, source, options.out / "knits" / name, name) for name in names}
+    found = dict(zip(names, kept.run(cases).values(), strict=True))
+    tables.knits(found)
+    pictures.knits(found, source, options.out / "knits.png")
+    return found
+
+
+def _swings(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
+    fitted, held = swings.split(source, options.fast)
+    fits = kept.run(
+        {f"swings-{part}": partial(_fit, source, fitted, part, options.out, options.fast) for part in swings.PARTS}
+    )
+    values = {part: fits[f"swings-{part}"]["values"] for part in swings.PARTS}
+    models = {"vacuum": dict.fromkeys(swings.NAMES, 0.0), "textbook": swings.START, **values}
+    cases = kept.run({f"swing-{name}": partial(swing_predictions.predict, source, name, models) for name in held})
+    runs = dict(zip(held, cases.values(), strict=True))
+    found = {
+        "fitted_runs": fitted,
+        "predicted_runs": held,
+        "fits": {part: fits[f"swings-{part}"] for part in swings.PARTS},
+        "predicted": swing_predictions.summary(runs, list(models)),
+    }
+    tables.swings(found)
+    pictures.swings(found, runs, options.out / "swings.png")
+    return found
+
+
+def _fit(source: Path, names: list[str], part: str, out: Path, fast: bool) -> dict[str, Any]:
+    """A fit of many runs as a case; its journal lasts until it is kept."""
+    journal = out / "progress" / part
+    fit = swings.fit(source, names, part, journal, fast)
+    fit.save(out / f"swings-{part}")
+    content = fit.as_dict()
+    clear(journal)
+    return {
+        "ratios": swings.ratios(content["parameters"]),
+        "values": {name: fit.parameters[name].value for name in swings.NAMES},
+        "fit": content["fit"],
+        "warnings": fit.warnings,
+    }
+
+
+def _sample(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
+    journal = options.out / "progress" / "sample"
+    work = partial(sample.run, source, options.out / "sample", journal, options.fast)
+    found = kept.run({"sample": work})["sample"]
+    clear(journal)
+    tables.sample(found)
+    return found

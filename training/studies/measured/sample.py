@@ -1,0 +1,62 @@
+"""The sample that the DiffCP paper's authors released: null, start and fit, Chamfer in both directions.
+
+248 points of 8 clouds; what the simulation assumes is in the adapter (tests/realdata/diffcp_sample.py).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcloth.identification import cloth_from, episode, identify
+from torchcloth.losses import chamfer_to_surface, chamfer_to_vertices
+from torchcloth.recordings import Recording
+
+from ..checkout import module
+
+SOURCE = "diffcp_sample"
+NAMES = ["youngs_modulus"]
+ITERATIONS = 3
+CLOUDS = {True: 3, False: None}  # fast: the first ones
+
+
+def recording(source: Path, fast: bool) -> Recording:
+    """The episode."""
+    return module("realdata", "diffcp_sample").convert(source, count=CLOUDS[fast])
+
+
+def run(source: Path, out: Path, journal: Path, fast: bool) -> dict[str, Any]:
+    """Fit the membrane stiffness; distances of every model."""
+    given = recording(source, fast)
+    cloth = cloth_from(given)
+    resume = (journal / "problem").exists()
+    fit = identify(cloth, given, NAMES, iterations=1 if fast else ITERATIONS, journal=journal, resume=resume)
+    fit.save(out)
+    data, faces = episode(cloth, given), torch.as_tensor(cloth.mesh.faces)
+    still = data.initial.expand(len(data.times), -1, -1)
+    models = {
+        "left where it lay": still,
+        "null: carried rigidly": fit.frames_null[0],
+        "start: 300 N/m": fit.frames_before[0],
+        "fitted": fit.frames_after[0],
+    }
+    kept = {key: fit.parameters["membrane_stiffness"].__dict__[key] for key in ("value", "std", "ci95", "identifiable")}
+    return {
+        "distances": {name: distances(x, data.clouds, faces) for name, x in models.items()},
+        "stiffness": kept,
+        "warnings": fit.warnings,
+        "points": int(sum(map(len, data.clouds))),
+    }
+
+
+def distances(frames: Tensor, clouds: list[Tensor], faces: Tensor) -> dict[str, float]:
+    """Means over the frames [m]: cloud to surface, cloud to the nearest vertex, vertices to the nearest point."""
+    pairs = [(cloud, x) for cloud, x in zip(clouds, frames, strict=True) if len(cloud)]
+    there = [float(chamfer_to_surface(cloud, x, faces)) for cloud, x in pairs]
+    vertex = [float(chamfer_to_vertices(cloud, x)) for cloud, x in pairs]
+    back = [float(chamfer_to_vertices(x, cloud)) for cloud, x in pairs]
+    mean = lambda numbers: sum(numbers) / len(numbers)  # noqa: E731
+    return {"cloud to surface": mean(there), "cloud to vertices": mean(vertex), "vertices to cloud": mean(back)}

@@ -1,0 +1,119 @@
+"""IRI swings: 10 runs that were not fitted, predicted, beside the null, vacuum and textbook air.
+
+A predicted run is used for three things only: its tool's path, its lag (upper edge against tool), and where its nodes
+hang before the tool moves, which is taken off all models alike.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchcloth.cloth import Cloth
+from torchcloth.identification import episode, rigid_carry
+from torchcloth.identification.replays import Replay
+from torchcloth.identification.streams import on_pattern
+from torchcloth.losses import Hits
+from torchcloth.recordings import Recording
+
+from ..checkout import module
+from .swings import START, cloth_of, recording
+
+Run = dict[str, np.ndarray]
+
+
+def predict(source: Path, name: str, models: dict[str, dict[str, float]]) -> dict[str, Any]:
+    """One run by every model: squares of the nodes' distances, and its free swing as the camera sees it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # rows of a frame that the camera did not see at all
+        return _predict(source, name, models)
+
+
+def _predict(source: Path, name: str, models: dict[str, dict[str, float]]) -> dict[str, Any]:
+    swings, free = module("realdata", "swings"), module("realdata", "free_swing")
+    run, data = recording(source, name, "all"), swings.runs(source)[name]
+    t = run.require("points", by="the study").t
+    rows = np.flatnonzero(np.isin(data["t_mesh_s"], t))
+    seen = data["mesh_base_m"].reshape(len(data["t_mesh_s"]), -1, 3)[rows]
+    moving = t - swings.lag(data).value > swings.start(data)
+    out: dict[str, Any] = {"t": t.tolist(), "measured": _swing(free.swing(name, data))}
+    for model, values in {"null": None, **models}.items():
+        nodes = _nodes(run, values)
+        off = seen - nodes
+        off = off - np.nanmedian(off[~moving], axis=0)
+        out[model] = _distances(off[moving])
+        if values is not None:
+            out[model] |= _swing(free.swing(name, _as_seen(data, rows, nodes)))
+            out[model]["lower_edge"] = _lower_edge(nodes)
+        out["still"] = _distances(off[~moving])
+    shift = np.nanmedian((seen - nodes)[~moving], axis=0)
+    return out | {"lower_edge": _lower_edge(seen - shift)}
+
+
+def _distances(off: np.ndarray) -> dict[str, float]:
+    """Of nodes [F, 64, 3] m."""
+    length = np.linalg.norm(off, axis=-1)
+    known = length[np.isfinite(length)]
+    return {"squares": float((known**2).sum()), "count": len(known), "median": float(np.median(known))}
+
+
+def _lower_edge(nodes: np.ndarray) -> list[float | None]:
+    """[F] m, along the stroke; None where it was not seen."""
+    y = np.nanmedian(nodes.reshape(-1, 8, 8, 3)[:, :, 0, 1], axis=1)
+    return [float(one) if np.isfinite(one) else None for one in y]
+
+
+def _nodes(run: Recording, values: dict[str, float] | None) -> np.ndarray:
+    """[F, 64, 3] m of a model at the run's frames; None: carried rigidly."""
+    cloth = cloth_of(run, values or START)
+    data = episode(cloth, run)
+    with torch.no_grad():
+        x = rigid_carry(data) if values is None else Replay(cloth)(data).x
+    return _hits(cloth).on(x).numpy()
+
+
+def _hits(cloth: Cloth) -> Hits:
+    """Where the camera's 8 x 8 nodes are on the sheet."""
+    u = np.linspace(0, module("realdata", "swings").SIDE, 8)
+    return on_pattern(cloth.mesh, np.stack(np.meshgrid(u, u, indexing="ij"), -1).reshape(-1, 2))
+
+
+def _as_seen(data: Run, rows: np.ndarray, nodes: np.ndarray) -> Run:
+    """The run with a model's nodes in the frames that are used and nothing in the others."""
+    mesh = np.full_like(data["mesh_base_m"], np.nan)
+    mesh[rows] = nodes.reshape(-1, 8, 8, 3)
+    return {**data, "mesh_base_m": mesh}
+
+
+def _swing(swing: Any) -> dict[str, list[float]]:
+    return {"swing_t": swing.t.tolist(), "swing_q": swing.q.tolist()}
+
+
+def summary(runs: dict[str, dict[str, Any]], models: Sequence[str], draws: int = 20) -> dict[str, Any]:
+    """Over the predicted runs: node RMS, frequency and decay of every model; errors by drawing runs again."""
+    draw, count = np.random.default_rng(0), len(runs)
+    chosen = [np.arange(count), *(draw.integers(0, count, count) for _ in range(draws))]
+    out: dict[str, Any] = {}
+    for model in ("still", "null", *models):
+        rows = [run[model] for run in runs.values()]
+        rms = [np.sqrt(sum(rows[i]["squares"] for i in d) / sum(rows[i]["count"] for i in d)) for d in chosen]
+        median = float(np.mean([row["median"] for row in rows]))
+        out[model] = {"rms": float(rms[0]), "rms_std": float(np.std(rms[1:])), "median": median}
+    for model in ("measured", *models):
+        out.setdefault(model, {}).update(_frequency_and_decay([run[model] for run in runs.values()], chosen))
+    return out
+
+
+def _frequency_and_decay(rows: list[dict[str, Any]], chosen: list[np.ndarray]) -> dict[str, float]:
+    """Of all runs, and their standard deviations over draws of runs."""
+    free = module("realdata", "free_swing")
+    swings = [free.Swing("", np.array(row["swing_t"]), np.array(row["swing_q"]), 0.0, 0.0) for row in rows]
+    found = np.array([free.fit([swings[i] for i in d])[:2] for d in chosen])
+    std = found[1:].std(0)
+    value = dict(zip(("frequency", "decay"), found[0].tolist(), strict=True))
+    return value | {"frequency_std": float(std[0]), "decay_std": float(std[1])}

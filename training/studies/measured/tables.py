@@ -1,0 +1,160 @@
+"""What the study found, one readable table a source."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .swings import DENSITY, PARTS
+from .tension import LIGHT
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+MODELS = {
+    "measured": "measured",
+    "still": "nodes before the motion: noise",
+    "null": "null: carried rigidly",
+    "vacuum": "vacuum",
+    "textbook": "textbook air: C_n 1.2, depth 0.377 L",
+    "whole": "fitted to whole runs",
+    "free": "fitted to the free swings only",
+}
+
+
+def nylon(found: dict[str, Any], folder: Path) -> None:
+    """Four angles fitted, each predicted from the other three, and angles between."""
+    console = _console()
+    table = _table("Nylon in tension: error of the force, % of the curve's largest reading")
+    for heading in (
+        "angle",
+        "fitted: rms",
+        "max",
+        "from the other three: rms",
+        "max",
+        "readings inside 95 %",
+        "the law's part from",
+    ):
+        table.add_column(heading, justify="left" if heading.startswith("the") else "right")
+    for angle, fitted in found["fitted"].items():
+        left = found["left_out"][angle]
+        own, other = fitted["measured"]["force"], left["measured"]["force"]
+        numbers = [_percent(own["rms"]), _percent(own["max"]), _percent(other["rms"]), _percent(other["max"])]
+        notes = [left["law_from"].replace("tables at ", "").replace(", each left out of the fit", "")]
+        notes += ["outside of the fitted angles"] if any("outside" in w for w in left["warnings"]) else []
+        notes += [f"{name} not identifiable" for name in left["not_identifiable"]]
+        table.add_row(f"{angle}°", *numbers, f"{100 * other['covered']:.0f} %", "; ".join(notes))
+    console.print(table)
+    table = _table("Nylon at angles that were not measured here: force [N], and the standard deviation's parts")
+    for heading in ("angle", "strain", "force", "by parameters", "by the law", "by the preload", "95 % interval"):
+        table.add_column(heading, justify="right")
+    for angle, curve in found["between"].items():
+        for k, r in enumerate(curve):
+            parts = [f"± {r[part]:.2f}" for part in ("parameters", "law", "setup")]
+            interval = f"{r['low']:.2f} … {r['high']:.2f}"
+            strain = f"{100 * r['strain']:.0f} %"
+            table.add_row("" if k else f"{angle}°", strain, f"{r['force']:.2f}", *parts, interval)
+    console.print(table)
+    console.print(f"any other angle: torchcloth predict {folder} --angle DEGREES", markup=False)
+
+
+def knits(found: dict[str, Any]) -> None:
+    """Third pulls from the first two, beside how far pulls are from each other."""
+    title = f"Knits up to {LIGHT:g} N: third pull from the first two, rms in % of its largest reading"
+    table = _table(title)
+    for heading in (
+        "fabric",
+        "pulled along",
+        "force",
+        "repeats differ",
+        "inside 95 %",
+        "lateral strain",
+        "repeats differ",
+        "inside 95 %",
+        "Poisson's ratio",
+    ):
+        table.add_column(heading, justify="left" if heading in ("fabric",) else "right")
+    for name, fabric in found.items():
+        nu = fabric["poisson_ratio"]
+        for label, one in fabric["directions"].items():
+            judged, floor = one["prediction"]["measured"], one["floor"]
+            cells = []
+            for kind in ("force", "lateral"):
+                own = judged[kind]
+                cells += [_percent(own["rms"]), _percent(floor[kind]), f"{100 * own['covered']:.0f} %"]
+            ratio = f"{nu['value']:.3f} ± {nu['std']:.3f}" if nu["identifiable"] else "not identifiable"
+            table.add_row(name.replace("_", " ") if label == "X" else "", label, *cells, ratio if label == "X" else "")
+    console = _console()
+    console.print(table)
+    console.print(
+        "repeats differ: third pull from the mean of the first two, which no law that knows these can beat by much"
+    )
+
+
+def swings(found: dict[str, Any]) -> None:
+    """Ratios to the areal density, then what they predict."""
+    console = _console()
+    title = f"IRI swings: {len(found['fitted_runs'])} runs fitted. Only ratios to the areal density are identifiable"
+    table = _table(title)
+    for heading in ("", *(PARTS[part] for part in found["fits"]), "unit"):
+        table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
+    for name, first in found["fits"]["whole"]["ratios"].items():
+        cells = [_estimate(fit["ratios"][name]) for fit in found["fits"].values()]
+        table.add_row(name, *cells, first["unit"])
+    console.print(table)
+    console.print(
+        f"C_n, the air's depth and the density itself cannot be told apart (density set to {DENSITY:g} kg/m^2): drag "
+        "is rho C_n / rho_A, added mass rho depth / rho_A. ±: runs left out one after the other"
+    )
+    predicted = found["predicted"]
+    table = _table(f"IRI swings: {len(found['predicted_runs'])} runs predicted; ± by drawing these runs again")
+    for heading in ("", "node rms mm", "median mm", "swing Hz", "decay 1/(m s)"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for key, label in MODELS.items():
+        p = predicted[key]
+        near = (
+            [f"{1e3 * p['rms']:.1f} ± {1e3 * p['rms_std']:.1f}", f"{1e3 * p['median']:.1f}"] if "rms" in p else ["", ""]
+        )
+        swing = [f"{p[k]:.{d}f} ± {p[k + '_std']:.{d}f}" if k in p else "" for k, d in (("frequency", 3), ("decay", 1))]
+        table.add_row(label, *near, *swing)
+    console.print(table)
+    console.print("decay: B of A' = -B A^2, the fall of the amplitude A under quadratic drag")
+
+
+def sample(found: dict[str, Any]) -> None:
+    """Distances of all models in both directions."""
+    console, e = _console(), found["stiffness"]
+    table = _table(f"The paper's sample: {found['points']} points, mean distances in mm")
+    for heading in ("", "cloud to surface", "cloud to vertices", "vertices to cloud"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for name, row in found["distances"].items():
+        table.add_row(name, *(f"{1e3 * value:.1f}" for value in row.values()))
+    console.print(table)
+    stated = f"{e['value']:.0f} ± {e['std']:.0f} N/m" if e["identifiable"] else "not identifiable from these points"
+    console.print(f"membrane stiffness E h: {stated} (95 % {e['ci95'][0]:.3g} … {e['ci95'][1]:.3g} N/m)", markup=False)
+    console.print("vertices to cloud: floored by the clouds' 31 points, which leave most of the dress unseen")
+
+
+def _estimate(e: dict[str, Any]) -> str:
+    interval = f"({e['low']:.3g} … {e['high']:.3g})"
+    return f"{e['value']:.3g} ± {e['std']:.2g} {interval}" if e["identifiable"] else f"not identifiable {interval}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}"
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    console.width = max(console.width, 132)
+    return console
+
+
+def _table(title: str) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    return Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)

@@ -1,0 +1,103 @@
+"""Tension: nylon at angles that were not fitted, and the third pull of knits from the first two."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from math import radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchcloth.identification import cross_validated, fit_tension, predict_tension, specimen_like
+from torchcloth.identification.tension_model import TensionModel, with_left_out
+from torchcloth.recordings import ForceDisplacement
+
+from ..checkout import module
+
+NYLON, KNITS = "nylon_offaxis_tension", "knit_tension"
+LIGHT = 5.0  # N, over 0.07 to 0.15 m of knit: what a robot pulls with
+BETWEEN = (15, 60, 75)  # degrees, that were not measured here
+STRAINS = (0.01, 0.02, 0.04)
+EVERY = {True: 8, False: 2}  # rows of nylon; fast, whole
+
+
+def nylon(source: Path, out: Path, fast: bool) -> dict[str, Any]:
+    """The four angles together, each from the other three, and angles between; saves the fit for `torchcloth predict`.
+
+    The interval of an angle that was left out takes the law's part from the other angles left out, not from its own.
+    """
+    adapter = module("realdata", "nylon")
+    tables = {angle: t.rows(slice(None, None, EVERY[fast])) for angle, t in adapter.tables(source).items()}
+    pulls, names = list(tables.values()), adapter.NAMES
+    fit = fit_tension(adapter.start(), pulls, names)
+    *parts, whole = cross_validated(fit, adapter.start(), pulls)
+    whole.save(out)
+    shares = [t.left_out or {} for t in whole.model.tables]
+    left_out = {}
+    for k, (angle, part) in enumerate(zip(tables, parts, strict=True)):
+        model = with_left_out(part.model, [shares[i] for i in range(len(shares)) if i != k])
+        unknown = [name for name in names if not part.parameters[name].identifiable]
+        left_out[str(angle)] = predict_tension(model, tables[angle]).as_dict() | {"not_identifiable": unknown}
+    return {
+        "parameters": {name: asdict(fit.parameters[name]) for name in names},
+        "fitted": {str(angle): predict_tension(whole.model, t).as_dict() for angle, t in tables.items()},
+        "left_out": left_out,
+        "between": {str(angle): at_strains(whole.model, angle) for angle in BETWEEN},
+        "warnings": fit.warnings,
+    }
+
+
+def at_strains(model: TensionModel, angle: float) -> list[dict[str, float]]:
+    """Force of a strip at an angle [degrees] and some strains, with the parts of its error."""
+    table, std = specimen_like(model, radians(angle), strain=max(STRAINS), rows=101)
+    found = predict_tension(model, table, std).force
+    low, high = found.ci95
+    rows = [int(np.abs(table.strain - strain).argmin()) for strain in STRAINS]
+    parts = {"force": found.value, "parameters": found.parameters, "law": found.law, "setup": found.setup}
+    parts |= {"low": low, "high": high, "strain": table.strain}
+    return [{key: float(value[i]) for key, value in parts.items()} for i in rows]
+
+
+def fabrics(source: Path, fast: bool) -> list[str]:
+    """Names of the knits; fast: one."""
+    found = sorted(module("realdata", "knits").fabrics(source))
+    return found[-1:] if fast else found
+
+
+def knit(source: Path, out: Path, name: str) -> dict[str, Any]:
+    """One fabric, both directions: fit of repeats 1 and 2, prediction of 3, and how far repeats are from each other."""
+    adapter = module("realdata", "knits")
+    light = [table.rows(table.force < LIGHT) for table in adapter.fabrics(source)[name]]
+    fit = fit_tension(adapter.start(), [table.repeats(1, 2) for table in light], adapter.NAMES)
+    fit.save(out)
+    third = [table.repeats(3) for table in light]
+    return {
+        "poisson_ratio": asdict(fit.parameters["poisson_ratio"]),
+        "directions": {
+            label: {"prediction": predict_tension(fit.model, seen).as_dict(), "floor": floor(table)}
+            for label, seen, table in zip("XY", third, light, strict=True)
+        },
+        "warnings": fit.warnings,
+    }
+
+
+def floor(table: ForceDisplacement) -> dict[str, float]:
+    """RMS of the third pull from the mean of the first two at the same displacement, as shares of its largest reading.
+
+    No law that knows only these two pulls can be expected to come nearer.
+    """
+    third, out = table.repeats(3), {}
+    for kind in ("force", "lateral_strain"):
+        both = []
+        for k in (1, 2):
+            pull = table.repeats(k)
+            order = np.argsort(pull.displacement)
+            values = getattr(pull, kind)[order]
+            at = pull.displacement[order]
+            both.append(np.interp(third.displacement, at, values, left=np.nan, right=np.nan))
+        seen = getattr(third, kind)
+        off = seen - np.mean(both, axis=0)
+        known = np.isfinite(off)
+        out[kind.split("_")[0]] = float(np.sqrt((off[known] ** 2).mean()) / np.abs(seen[np.isfinite(seen)]).max())
+    return out
