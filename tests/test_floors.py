@@ -28,6 +28,7 @@ FLOORS = (
     ("sensitivities",),
     ("cloth", "robots"),
     ("identification", "diagnosis", "plan", "testing"),
+    ("pose",),
     ("inspection", "synthesis", "viewing"),
     ("",),  # torchcloth/__init__.py: the names a user sees
     ("training", "benchmarks", "demo"),

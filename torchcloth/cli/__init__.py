@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from importlib import metadata
 
 from ..errors import TorchclothError
-from . import bench, convert, doctor, identify, inspect, simulate, view
+from . import bench, convert, doctor, identify, inspect, pose, simulate, view
 
-VERBS = (identify, inspect, view, convert, simulate, doctor, bench)  # each has add(verbs)
+VERBS = (identify, pose, inspect, view, convert, simulate, doctor, bench)  # each has add(verbs)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

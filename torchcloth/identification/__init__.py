@@ -6,7 +6,7 @@ from .fit import identify
 from .null import rigid_carry
 from .pictures import draw
 from .result import Identification
-from .saved import Replayed, replayed
+from .saved import Replayed, fitted, replayed
 from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial
 from .statements import Estimate
 from .tables import print_fit, print_tension
@@ -28,6 +28,7 @@ __all__ = [
     "episode",
     "fit_fields",
     "fit_tension",
+    "fitted",
     "identify",
     "print_fit",
     "print_tension",
