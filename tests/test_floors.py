@@ -28,7 +28,7 @@ FLOORS = (
     ("sensitivities",),
     ("cloth", "robots"),
     ("identification", "plan", "testing"),
-    ("diagnosis",),
+    ("diagnosis", "pose"),
     ("inspection", "synthesis", "viewing"),
     ("",),  # torchcloth/__init__.py: the names a user sees
     ("training", "benchmarks", "demo"),

@@ -1,7 +1,8 @@
 """torchcloth: a differentiable cloth layer for robotics.
 
 ``tc.Cloth`` is the layer; ``tc.meshes``, ``tc.materials``, ``tc.effects``, ``tc.boundaries`` are its parts;
-``tc.robots`` gives end-effector poses, ``tc.recordings`` episodes, ``tc.identify`` parameters with errors.
+``tc.robots`` gives end-effector poses, ``tc.recordings`` episodes, ``tc.identify`` parameters with errors,
+``tc.estimate_pose`` the mesh over time.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from .transfer import Contact
 from .types import ClothState, Rollout, Trajectory
 
 if TYPE_CHECKING:
-    from . import identification, observe, recordings, robots
+    from . import identification, observe, pose, recordings, robots
     from .identification import identify
+    from .pose import estimate_pose
 
 __version__ = "0.1.0"
 __all__ = [
@@ -32,6 +34,7 @@ __all__ = [
     "boundaries",
     "effects",
     "errors",
+    "estimate_pose",
     "functional",
     "identification",
     "identify",
@@ -39,6 +42,7 @@ __all__ = [
     "materials",
     "meshes",
     "observe",
+    "pose",
     "recordings",
     "robots",
 ]
@@ -50,8 +54,10 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str):
     """Rooms that are opened when they are first asked for: importing the layer stays cheap."""
-    if name in ("identification", "observe", "recordings", "robots"):
+    if name in ("identification", "observe", "pose", "recordings", "robots"):
         return import_module(f".{name}", __name__)
     if name == "identify":
         return import_module(".identification", __name__).identify
+    if name == "estimate_pose":
+        return import_module(".pose", __name__).estimate_pose
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

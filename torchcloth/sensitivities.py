@@ -85,7 +85,9 @@ class _Walk:
         return values, tangents
 
     def _within(self, k: int, work: Callable[[Model], Any]) -> Any:
-        """``work`` on the model, dual along direction k of the parameters."""
+        """``work`` on the model, dual along direction k of the parameters; nothing where none of them changes."""
+        if not any(bool(tangent[k].any()) for tangent in self.along.parameters.values()):
+            return {}
         values = dict(self.cloth.named_parameters())
         with forward_ad.dual_level(), real_tangents():
             entries = {

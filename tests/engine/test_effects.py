@@ -60,6 +60,8 @@ EFFECTS = {
     "shear friction": lambda: E.ShearFriction(5.0, threshold=0.02),
     "kelvin voigt": lambda: E.KelvinVoigt(field(0.1, 0.3)),
     "added mass": lambda: E.AddedMass(field(0.1, 0.3)),
+    "body force": lambda: E.BodyForce(torch.tensor([[0.5, -1.0, 2.0]])),
+    "body force of vertices": lambda: E.BodyForce(torch.sin(torch.arange(72.0)).reshape(24, 3)),
 }
 
 

@@ -75,6 +75,22 @@ def test_equal_reverse_mode():
         assert abs(float(forward - reverse)) < 1e-8 * abs(float(reverse))
 
 
+def test_directions_that_leave_the_parameters_alone():
+    """Beside others that change them: each is what it would be by itself."""
+    cloth = sheet("fused")
+    state, motion, times = start(cloth), opening(END), (0.0, END)
+    along = directions(cloth, state, motion)
+    some = {name: tangent.clone() for name, tangent in along.parameters.items()}
+    for tangent in some.values():
+        tangent[1] = 0
+    _, mixed = cloth.sensitivities(state, motion, times, along=along._replace(parameters=some))
+    _, whole = cloth.sensitivities(state, motion, times, along=along)
+    _, without = cloth.sensitivities(state, motion, times, along=along._replace(parameters={}))
+    for name in parts(mixed):
+        torch.testing.assert_close(parts(mixed)[name][[0, 2]], parts(whole)[name][[0, 2]], rtol=0, atol=0)
+        close(parts(mixed)[name][1], parts(without)[name][1], 1e-12, name)
+
+
 def test_fields_and_boundary_free_cloth():
     """A field per triangle; no motion at all."""
     found = []

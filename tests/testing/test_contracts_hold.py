@@ -77,6 +77,17 @@ class TestMassDamping(EffectContract):
         return tc.effects.MassDamping(amplitude)
 
 
+class TestBodyForce(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.BodyForce(amplitude * torch.tensor([[0.6, 0.0, -0.8]]))
+
+
+class TestBodyForceOfVertices(EffectContract):
+    def make(self, amplitude):
+        vertices = len(self.mesh().vertices)
+        return tc.effects.BodyForce(amplitude * torch.linspace(0.5, 1.5, 3 * vertices).reshape(vertices, 3))
+
+
 class TestBending(EffectContract):
     def make(self, amplitude):
         return tc.effects.Bending(amplitude, damping_time=0.01)

@@ -116,14 +116,15 @@ def _cloth(options: argparse.Namespace, recording: Recording) -> Cloth:
     cloth = cloth_from(recording, contact=None if options.contact is None else Contact(options.contact))
     cloth.engine = options.engine
     names = available(cloth)
-    for name, value in _assignments(options.start).items():
+    for name, value in assignments(options.start).items():
         if name not in names:
             raise InvalidInput("--start", got=repr(name), expected=f"one of {', '.join(sorted(names))}")
         cloth.get_submodule(names[name]).set(value)  # type: ignore[operator]
     return cloth
 
 
-def _assignments(pairs: Sequence[str], option: str = "--start") -> dict[str, float]:
+def assignments(pairs: Sequence[str], option: str = "--start") -> dict[str, float]:
+    """NAME=NUMBER pairs of an option."""
     out = {}
     for pair in pairs:
         name, _, value = pair.partition("=")
@@ -134,9 +135,10 @@ def _assignments(pairs: Sequence[str], option: str = "--start") -> dict[str, flo
     return out
 
 
-def _nuisances(given: Sequence[str]) -> dict[str, float | None]:
+def nuisances_of(given: Sequence[str]) -> dict[str, float | None]:
+    """NAME or NAME=STD, None where no deviation is given."""
     plain = dict.fromkeys(name for name in given if "=" not in name)
-    return plain | _assignments([pair for pair in given if "=" in pair], "--nuisance")
+    return plain | assignments([pair for pair in given if "=" in pair], "--nuisance")
 
 
 def _priors(pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -182,7 +184,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             resume=options.resume,
             dt=options.dt,
             use=options.use,
-            nuisances=_nuisances(options.nuisance),
+            nuisances=nuisances_of(options.nuisance),
             priors=_priors(options.prior),
             on_progress=advance,
         )

@@ -4,6 +4,7 @@ from .added_mass import AddedMass
 from .air import AirDrag
 from .base import AbstractEffect, Amplitude
 from .bending import Bending
+from .body_force import BodyForce
 from .crease import CreasingBending
 from .damping import MassDamping
 from .friction import BendingFriction, ShearFriction
@@ -21,6 +22,7 @@ __all__ = [
     "Amplitude",
     "Bending",
     "BendingFriction",
+    "BodyForce",
     "CreasingBending",
     "Gravity",
     "GripSlip",

@@ -27,7 +27,8 @@ class FusedTangents:
 
     Args:
         fused: without parts in torch.
-        within: calls a function with the model that is dual along direction k, in a level of forward mode.
+        within: calls a function with the model that is dual along direction k, in a level of forward mode; its answer
+            may be empty where the parameters do not change along k.
         count: K.
     """
 
@@ -73,8 +74,8 @@ class FusedTangents:
                 return {f: forward_ad.unpack_dual(t).tangent for f, t in found.items()}
 
             every = [self.within(k, found_in) for k in range(self.count)]
-            moved = [f for f in inputs if any(found[f] is not None for found in every)]
-            full = {f: [_or_zero(found[f], inputs[f]) for found in every] for f in moved}
+            moved = [f for f in inputs if any(found.get(f) is not None for found in every)]
+            full = {f: [_or_zero(found.get(f), inputs[f]) for found in every] for f in moved}
             self._known = {f: torch.stack(tangents) for f, tangents in full.items()}
         return self._known
 

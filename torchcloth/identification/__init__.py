@@ -7,7 +7,7 @@ from .fit import identify
 from .null import rigid_carry
 from .pictures import draw
 from .result import Identification
-from .saved import Replayed, replayed
+from .saved import Replayed, fitted, replayed
 from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial
 from .statements import Estimate
 from .tables import print_fit, print_tension
@@ -36,6 +36,7 @@ __all__ = [
     "episode",
     "fit_fields",
     "fit_tension",
+    "fitted",
     "identify",
     "predict_episode",
     "predict_tension",

@@ -198,7 +198,7 @@ class Objective:
         index = [*range(len(self.unknowns)), *(k for where, _ in own for k in range(where.start, where.stop))]
         moved = each(few, lambda d: d.new_zeros(len(raw), *d.shape[1:]).index_copy(0, torch.tensor(index), d))
         for p in self.placed[i]:
-            frames, moved = _push(p, frames, moved, raw, self.episodes[i])
+            frames, moved = pushed(p, frames, moved, raw, self.episodes[i])
         return frames, moved
 
     # -- residuals ------------------------------------------------------------------------------------------------
@@ -312,7 +312,7 @@ class Objective:
         )
 
 
-def _push(p: Placed, frames: Frames, moved: Frames, raw: Tensor, episode: Episode) -> tuple[Frames, Frames]:
+def pushed(p: Placed, frames: Frames, moved: Frames, raw: Tensor, episode: Episode) -> tuple[Frames, Frames]:
     """A nuisance's view of the frames, and the derivatives through it."""
     values = raw[p.where].to(frames.x)
     own = values.new_zeros(len(raw), len(values))

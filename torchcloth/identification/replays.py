@@ -69,7 +69,7 @@ def tangents(
     entries = {f"cloth.{key}": v for key, v in overrides(unknowns, value).items()}
     along = Directions(overrides(unknowns, eye))
     if modes is not None and extra:
-        along = along._replace(state=_state_along(cloth, episode, modes, len(unknowns)))
+        along = along._replace(state=state_along(cloth, episode, modes, len(unknowns)))
     out, moved = functional_call(_Tangents(cloth), entries, (episode, along, dt))
     return frames_of(out), frames_of(moved)
 
@@ -98,7 +98,7 @@ def frames_of(rollout: Rollout) -> Frames:
     return Frames(rollout.x, rollout.v, rollout.wrench, rollout.x.new_zeros(rollout.x.shape[:-2]))
 
 
-def _state_along(cloth: Cloth, episode: Episode, modes: Tensor, before: int) -> ClothState:
+def state_along(cloth: Cloth, episode: Episode, modes: Tensor, before: int) -> ClothState:
     """Tangents of the first state: ``before`` directions that leave it alone, then the modes."""
     rest = cloth.state(episode.initial)
     moved = []
@@ -108,7 +108,7 @@ def _state_along(cloth: Cloth, episode: Episode, modes: Tensor, before: int) -> 
                 state = cloth.state(forward_ad.make_dual(rest.x, mode.to(rest.x).contiguous()))
                 moved.append(state.map(_tangent))
     still = rest.map(lambda field: field.new_zeros(before, *field.shape))
-    join = lambda a, *b: torch.cat([a, torch.stack(b)])  # noqa: E731
+    join = lambda a, *b: torch.cat([a, *(t.unsqueeze(0) for t in b)])  # noqa: E731
     memory = {name: join(value, *(m.memory[name] for m in moved)) for name, value in still.memory.items()}
     x, v, d3 = (join(getattr(still, n), *(getattr(m, n) for m in moved)) for n in ("x", "v", "d3"))
     return ClothState(x, v, d3, memory)

@@ -89,11 +89,38 @@ def replayed(path: str | Path, recording: Recording) -> Replayed:
     return Replayed(cloth, data, frames, found.per_frame, warning)
 
 
+def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
+    """The cloth of any episode with a fit's values, and what the fit leaves open of them.
+
+    Args:
+        path: identification.json, or the folder that holds it.
+        recording: an episode of the same cloth, fitted or not.
+
+    Returns:
+        The cloth, and by name of every identified parameter (value, spread) as the ``priors`` of ``identify`` take it.
+
+    Raises:
+        InvalidInput: there is no such file, or the fit is of another model.
+        RecordingError: the file cannot be read, or does not hold what is needed.
+    """
+    path = Path(path)
+    path = path / RESULT if path.is_dir() else path
+    model = _read(path)
+    cloth = _rebuilt(path, model, recording)
+    names, out = available(cloth), {}
+    for name, (value, std) in model.identified.items():
+        positive = name in names and _parameter(cloth, names[name]).domain == "positive"
+        if name in names and std > 0:
+            out[name] = (value, math.exp(std / value) if positive else std)
+    return cloth, out
+
+
 @dataclass(frozen=True)
 class SavedModel:
     """The entry "model" of identification.json."""
 
     values: dict[str, float]
+    identified: dict[str, tuple[float, float]]  # (value, standard error)
     contact: Contact | None
     dt: float | None
     episodes: list[dict[str, Any]]
@@ -123,6 +150,11 @@ def read_saved(path: Path) -> SavedModel:
         model = content["model"]
         return SavedModel(
             {str(name): float(value) for name, value in model["values"].items()},
+            {
+                str(name): (float(e["value"]), float(e["std"]))
+                for name, e in content.get("parameters", {}).items()
+                if e["identifiable"] and e["source"] == "data"
+            },
             None if model["contact"] is None else Contact(**model["contact"]),
             None if model["dt"] is None else float(model["dt"]),
             [

@@ -8,6 +8,7 @@ from .distances import film_of_fit, with_cloth
 from .episodes import film_of
 from .film import Cloud, Curve, Film, Plane, Sheet, Solid, Trace, View
 from .pictures import RATE, animate, picture
+from .poses import film_of_pose
 from .rerun_file import write_rrd
 from .viser_view import Viewer, write_viser
 
@@ -25,6 +26,7 @@ __all__ = [
     "animate",
     "film_of",
     "film_of_fit",
+    "film_of_pose",
     "picture",
     "with_cloth",
     "write_rrd",

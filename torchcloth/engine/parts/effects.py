@@ -11,6 +11,7 @@ from ...effects import (
     AirDrag,
     Bending,
     BendingFriction,
+    BodyForce,
     CreasingBending,
     Gravity,
     GripSlip,
@@ -33,7 +34,7 @@ def lower(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
     part(low, name, effect, c)
 
 
-def _gravity(low: Lowering, name: str, effect: Gravity, c: Any) -> None:
+def _weight(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
     low.pull("weight", low.mass, low.parameter(c))
 
 
@@ -78,8 +79,9 @@ _EFFECTS: dict[type, Callable[[Lowering, str, Any, Any], None]] = {
     AirDrag: _air_drag,
     Bending: bending.plate,
     BendingFriction: bending.friction,
+    BodyForce: _weight,
     CreasingBending: bending.creasing,
-    Gravity: _gravity,
+    Gravity: _weight,
     GripSlip: _nothing,
     KelvinVoigt: _kelvin_voigt,
     LineMass: _nothing,

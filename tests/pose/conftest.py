@@ -1,0 +1,37 @@
+"""One occluded twin episode, and estimates from it, for all tests of this folder."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))  # its twins
+sys.path.insert(0, str(Path(__file__).parent))
+
+import occluded
+import twins
+
+from torchcloth.pose import estimate_pose
+
+SMALL = {"modes": 4, "window": 0.18}
+
+
+@pytest.fixture(scope="session")
+def scene():
+    """The recording, and where the fit's vertices truly were [T, V, 3] m."""
+    with twins.doubles():
+        return occluded.twin()
+
+
+@pytest.fixture(scope="session")
+def right(scene):
+    """With the true values."""
+    with twins.doubles():
+        return estimate_pose(occluded.model(scene, twins.TRUE), scene.recording, **SMALL)
+
+
+@pytest.fixture(scope="session")
+def wrong(scene):
+    """Half the stiffness and half the drag, taken as exact."""
+    with twins.doubles():
+        return estimate_pose(occluded.model(scene, occluded.WRONG), scene.recording, **SMALL)

@@ -1,0 +1,73 @@
+"""``torchcloth pose``: files, table, refusals."""
+
+import json
+
+import numpy as np
+import pytest
+import twins
+
+from torchcloth import recordings
+from torchcloth.cli import main
+from torchcloth.identification import fitted, identify
+
+
+@pytest.fixture(scope="module")
+def folder(scene, tmp_path_factory):
+    return recordings.write(twins.first(scene.recording, 5), tmp_path_factory.mktemp("pose") / "episode")
+
+
+def test_writes_what_it_found(folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["pose", str(folder), "--out", str(out), "--modes", "2", "--uncertain", "youngs_modulus=2"]) == 0
+    arrays, words = np.load(out / "pose.npz"), json.loads((out / "pose.json").read_text())
+    assert arrays["x"].shape == arrays["std"].shape == (5, 49, 3)
+    assert arrays["seen"].shape == (5, 49)
+    assert arrays["seen"].dtype == bool
+    assert len(words["shares"]) == len(arrays["windows"]) == len(arrays["acceleration"])
+    assert words["parameters"]["youngs_modulus"]["unit"] == "Pa"
+    assert (out / "pose.png").stat().st_size > 10_000
+    assert sorted(file.name for file in out.iterdir()) == ["pose.json", "pose.npz", "pose.png"]
+    printed = capsys.readouterr().out
+    assert "corrective force" in printed
+    assert "hidden" in printed
+
+
+def test_takes_a_fit(scene, folder, tmp_path):
+    short = twins.first(scene.recording, 5)
+    fit = identify(twins.at(short), short, ["youngs_modulus"], iterations=2)
+    fit.save(tmp_path)
+    other = twins.first(scene.recording, 7)  # not the fitted episode
+    cloth, uncertain = fitted(tmp_path, other)
+    found = fit.parameters["youngs_modulus"]
+    assert cloth.material.youngs_modulus.value.item() == pytest.approx(found.value)
+    assert found.identifiable
+    assert set(uncertain) == {"youngs_modulus"}
+    value, factor = uncertain["youngs_modulus"]
+    assert value * (factor - 1) == pytest.approx(found.std, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ["--fit", "nowhere"],
+        ["--uncertain", "colour=2"],
+        ["--uncertain", "youngs_modulus=0.5"],
+        ["--modes", "0"],
+        ["--window", "-1"],
+        ["--truth"],
+    ],
+    ids=lambda more: more[0],
+)
+def test_refusals(folder, tmp_path, capsys, more):
+    out = tmp_path / "out"
+    assert main(["pose", str(folder), "--out", str(out), *more]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    assert not out.exists()
+
+
+def test_out_is_a_file(folder, tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    assert main(["pose", str(folder), "--out", str(tmp_path / "file")]) == 2
+    assert (tmp_path / "file").read_text() == "mine"

@@ -1,0 +1,112 @@
+"""The whole: against truth, with right and wrong models, as one continuous motion."""
+
+import pytest
+import torch
+import twins
+from occluded import WRONG, model
+
+from torchcloth.effects import BodyForce
+from torchcloth.errors import InvalidInput
+from torchcloth.identification import episode
+from torchcloth.identification.misfit import figures
+from torchcloth.pose import estimate_pose
+from torchcloth.types import ClothState
+
+
+def rms(x, scene, where):
+    return float((x - scene.truth).square().sum(-1)[where].mean().sqrt())
+
+
+def coverage(estimate, scene):
+    free = estimate.std.amax((0, 2)) > 1e-6  # held vertices are where the grippers are
+    inside = (estimate.x - scene.truth).abs() < 1.96 * estimate.std
+    return float(inside[:, free].double().mean()), float(inside[scene.hidden & free].double().mean())
+
+
+def test_with_the_true_values_little_is_left_to_correct(scene, right):
+    everywhere = torch.ones_like(scene.hidden)
+    for where in (everywhere, scene.hidden):
+        assert rms(right.x, scene, where) < 0.95 * rms(right.alone, scene, where) < 1.5e-3
+    assert right.fit["force_share"] < 0.06
+    assert right.fit["converged"]
+    assert right.warnings == []
+
+
+def test_intervals_cover_the_truth(scene, right):
+    everywhere, hidden = coverage(right, scene)
+    assert 0.88 <= everywhere <= 1.0
+    assert 0.88 <= hidden <= 1.0
+    assert right.fit["std_rms"] < 2e-3  # and not because they are wide
+
+
+def test_a_wrong_model_says_so_and_is_still_better_than_itself(scene, wrong):
+    assert rms(wrong.x, scene, scene.hidden) < 0.7 * rms(wrong.alone, scene, scene.hidden)
+    assert wrong.fit["force_share"] > 0.2
+    assert any("the model is wrong" in warning for warning in wrong.warnings)
+    assert any("off the estimate" in warning for warning in wrong.warnings)
+    assert coverage(wrong, scene)[0] > 0.88
+    assert wrong.fit["std_rms"] > 5e-3
+
+
+def test_stated_uncertainty_is_used(scene, right):
+    """The same wrong values, known to within a factor of two: the fabric is corrected, not the force."""
+    uncertain = {"youngs_modulus": (WRONG.membrane / twins.THICKNESS, 2.0), "air.normal": (WRONG.drag, 0.6)}
+    found = estimate_pose(model(scene, WRONG), scene.recording, uncertain=uncertain, modes=4, window=0.18)
+    assert rms(found.x, scene, scene.hidden) < 1.2 * rms(right.x, scene, scene.hidden)
+    assert found.fit["force_share"] < 0.06
+    assert found.parameters["youngs_modulus"].value == pytest.approx(twins.TRUE.membrane / twins.THICKNESS, rel=0.05)
+
+
+def test_one_continuous_motion(scene, wrong):
+    """Every window goes on from the state that the one before left: simulated in one piece it is the same motion."""
+    cloth = model(scene, WRONG)
+    cloth.effects["push"] = BodyForce(torch.zeros_like(wrong.x[0]))
+    motion = episode(cloth, scene.recording).motion
+    for w in range(1, len(wrong.windows)):
+        first, last = ((wrong.times - t).abs().argmin() for t in wrong.windows[w])
+        cloth.effects["push"].acceleration.set(wrong.acceleration[w])
+        with torch.no_grad():
+            out = cloth(cloth.state(wrong.x[first], wrong.v[first]), motion, wrong.times[first : last + 1])
+        torch.testing.assert_close(out.x, wrong.x[first : last + 1], rtol=0, atol=1e-9)
+        torch.testing.assert_close(out.v, wrong.v[first : last + 1], rtol=0, atol=1e-7)
+    torch.testing.assert_close(wrong.last.x, wrong.x[-1])
+
+
+def test_shares_are_those_of_the_weight(wrong, scene):
+    cloth = model(scene, WRONG)
+    held = torch.cat([part.index for part in cloth.boundaries.values()])
+    mass = cloth.model().mass.detach()[:, 0]
+    mass[held] = 0
+    expected = ((wrong.acceleration.square().sum(-1) * mass).sum(-1) / mass.sum()).sqrt() / 9.81
+    torch.testing.assert_close(wrong.shares, expected)
+
+
+def test_distances_are_those_of_the_room_next_door(scene, right):
+    cloth = model(scene, twins.TRUE)
+    again = figures([right.x], [episode(cloth, scene.recording)], right.faces)
+    assert right.fit["chamfer_after"] == pytest.approx(again.chamfer)
+
+
+def test_the_last_state_goes_on(scene, right):
+    assert isinstance(right.last, ClothState)
+    cloth = model(scene, twins.TRUE)
+    x = right.last.x.clone().requires_grad_()
+    out = cloth(right.last._replace(x=x), episode(cloth, scene.recording).motion, [0.70, 0.71])
+    out.x[-1, :, 2].mean().backward()
+    assert float(x.grad.norm()) > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"window": 0.0}, "window"),
+        ({"modes": 0}, "modes"),
+        ({"uncertain": {"colour": (1.0, 2.0)}}, "colour"),
+        ({"uncertain": {"air.normal": (1.0, -1.0)}}, "air.normal"),
+        ({"nuisances": ["weather"]}, "nuisance"),
+        ({"use": ["sound"]}, "use"),
+    ],
+)
+def test_bad_options(scene, options, match):
+    with pytest.raises(InvalidInput, match=match):
+        estimate_pose(model(scene, twins.TRUE), scene.recording, **options)

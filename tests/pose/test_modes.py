@@ -1,0 +1,39 @@
+"""Smooth fields over a cloth, against the closed form for a rectangle, and over a seam."""
+
+import math
+
+import pytest
+import torch
+
+import torchcloth as tc
+from torchcloth.errors import InvalidInput
+from torchcloth.pose.modes import modes_of
+
+
+def test_a_rectangle_has_cosines():
+    mesh = tc.meshes.rectangle(0.6, 0.4, resolution=(31, 21))
+    modes = modes_of(mesh, 4)
+    exact = [0.0, math.pi / 0.6, math.pi / 0.4, math.hypot(math.pi / 0.6, math.pi / 0.4)]
+    torch.testing.assert_close(modes.wave, torch.tensor(exact), rtol=0.005, atol=1e-6)
+    shape = torch.cos(math.pi * torch.as_tensor(mesh.uv)[:, 0] / 0.6)
+    assert abs(float(torch.corrcoef(torch.stack([modes.fields[1], shape]))[0, 1])) > 0.999
+
+
+def test_unit_mean_square_and_orthogonal():
+    mesh = tc.meshes.shirt(triangles=240)
+    modes = modes_of(mesh, 8)
+    share = torch.as_tensor(mesh.vertex_area)
+    product = (modes.fields * share) @ modes.fields.mT / share.sum()
+    torch.testing.assert_close(product, torch.eye(8), rtol=0, atol=1e-8)
+    torch.testing.assert_close(modes.fields[0], torch.ones(len(mesh.vertices)), rtol=0, atol=1e-6)
+
+
+def test_every_mode_of_a_mesh():
+    mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(4, 4))
+    assert modes_of(mesh).fields.shape == (16, 16)
+
+
+@pytest.mark.parametrize("count", [0, 17])
+def test_too_many(count):
+    with pytest.raises(InvalidInput, match="modes"):
+        modes_of(tc.meshes.rectangle(0.3, 0.3, resolution=(4, 4)), count)

@@ -1,0 +1,79 @@
+"""The windows: their derivatives, and that nothing is lost between them."""
+
+from itertools import pairwise
+
+import pytest
+import torch
+import twins
+from occluded import model
+
+from torchcloth.identification import episode
+from torchcloth.identification.blocks import blocks_for
+from torchcloth.identification.nuisances import chosen
+from torchcloth.identification.replays import Replay
+from torchcloth.identification.unknowns import collect
+from torchcloth.pose.modes import modes_of
+from torchcloth.pose.objective import Corrected, Correction, pushable, windows_of
+
+
+@pytest.fixture
+def objective(scene):
+    cloth = model(scene, twins.TRUE)
+    data = episode(cloth, twins.first(scene.recording, 6))
+    correction = Correction(windows_of(data.times, 0.1), modes_of(cloth.mesh, 2).fields, torch.full((2,), 0.5))
+    nuisances = chosen(["clock", "grasp", "shape"], ["rim"])
+    unknowns = collect(cloth, ["youngs_modulus"], None)
+    return Corrected(pushable(cloth), unknowns, data, correction, None, nuisances, blocks_for(None))
+
+
+def test_without_force_it_is_the_simulation(objective, scene):
+    frames = objective.frames(objective.start)[0]
+    with torch.no_grad():
+        whole = Replay(model(scene, twins.TRUE))(objective.episodes[0]).x
+    torch.testing.assert_close(frames, whole, rtol=0, atol=1e-12)
+
+
+def test_tangents_are_the_slopes(objective):
+    """Of each kind of unknown along one direction, against central differences."""
+    raw = objective.start + 0.3 * objective.prior_std * torch.sin(torch.arange(len(objective.start)).double())
+    frames, moved = objective.tangents(raw)
+    torch.testing.assert_close(frames.x, objective.frames(raw)[0], rtol=0, atol=1e-10)
+    for part in (slice(0, 1), *(p.where for p in objective.placed[0]), objective.pushes):
+        along = torch.zeros_like(raw)
+        along[part] = 1e-5 * torch.cos(torch.arange(len(along[part])).double()) * objective.prior_std[part]
+        ahead, behind = (objective.frames(raw + sign * along)[0] for sign in (1, -1))
+        slope = torch.einsum("k,ktvc->tvc", along, moved.x)
+        torch.testing.assert_close(slope, (ahead - behind) / 2, rtol=0, atol=2e-4 * float(slope.abs().max()) + 1e-12)
+
+
+def test_reverse_mode_agrees(objective):
+    """Frames are torch tensors of the unknowns: a loss of one's own has a gradient."""
+    raw = objective.start.clone().requires_grad_()
+    frames = objective.simulate(raw, 0).x
+    weights = torch.sin(torch.arange(frames.numel()).double()).reshape(frames.shape)
+    (weights * frames).sum().backward()
+    forward = (objective.tangents(raw.detach())[1].x * weights).sum((1, 2, 3))
+    torch.testing.assert_close(raw.grad, forward, rtol=1e-6, atol=1e-9 * float(forward.abs().max()))
+
+
+def test_a_later_force_moves_nothing_before(objective):
+    _, moved = objective.tangents(objective.start)
+    each = objective.correction.each
+    for w, (first, _) in enumerate(objective.correction.windows):
+        own = moved.x[objective.pushes.start + w * each : objective.pushes.start + (w + 1) * each]
+        assert float(own[:, : first + 1].abs().max()) == 0.0 or w == 0  # the first acts while the cloth settles
+        assert float(own[:, first + 1].abs().max()) > 0
+
+
+@pytest.mark.parametrize(("times", "length"), [(torch.arange(10) / 30, 0.1), (torch.arange(3) * 0.5, 0.1)])
+def test_windows_cover_all_frames(times, length):
+    windows = windows_of(times, length)
+    assert windows[0][0] == 0
+    assert windows[-1][1] == len(times) - 1
+    assert all(before[1] == after[0] for before, after in pairwise(windows))
+
+
+def test_a_part_has_the_same_unknowns(objective):
+    part = objective.part(0.5)
+    assert len(part.start) == len(objective.start)
+    assert len(part.frames(part.start)[0]) == 4

@@ -1,0 +1,105 @@
+"""``torchcloth pose``: the full mesh over time from a recording that shows a part of it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InvalidInput
+from .identify import assignments, nuisances_of
+
+if TYPE_CHECKING:
+    from ..cloth import Cloth
+    from ..pose import PoseEstimate
+    from ..recordings import Recording
+
+
+def add(verbs: Any) -> None:
+    """The verb and its options."""
+    pose = verbs.add_parser("pose", help="estimate the full mesh over time from partial clouds")
+    pose.add_argument("episode", metavar="EPISODE", help="folder of a recording")
+    pose.add_argument("--fit", type=Path, metavar="RESULT", help="identification.json or its folder: take its values")
+    pose.add_argument(
+        "--uncertain",
+        nargs="+",
+        default=[],
+        metavar="NAME=SPREAD",
+        help="fabric values known with an error: SPREAD is a factor for positive ones, else a standard deviation",
+    )
+    pose.add_argument("--window", type=float, default=0.15, metavar="SECONDS", help="of a constant force (0.15)")
+    pose.add_argument("--modes", type=int, default=8, metavar="N", help="smooth fields of the force (8)")
+    pose.add_argument("--nuisance", nargs="+", default=[], metavar="NAME[=STD]", help="as of identify")
+    pose.add_argument("--use", nargs="+", choices=["points", "markers", "force"], help="kinds of data (default: all)")
+    pose.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
+    pose.add_argument("--truth", action="store_true", help="show the true cloth of a synthetic episode in the picture")
+    pose.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result and the picture")
+    pose.set_defaults(run=_pose)
+
+
+def _pose(options: argparse.Namespace) -> int:
+    import torch
+
+    from .. import recordings, viewing
+    from ..pose.tables import print_pose
+
+    torch.set_default_dtype(torch.float64)
+    torch.set_num_threads(1)
+    if options.out.exists() and not options.out.is_dir():
+        raise InvalidInput("--out", got=f"{options.out}, a file", expected="a folder, new or existing")
+    recording = recordings.read(options.episode, with_truth=options.truth)
+    if options.truth:
+        recording.require("truth", by="--truth")
+    cloth, uncertain = _model(options, recording)
+    estimate = _estimate(options, cloth, uncertain, recording)
+    files = estimate.save(options.out)
+    film = viewing.film_of_pose(recording, estimate, truth=options.truth)
+    picture = viewing.picture(film, options.out / "pose.png")
+    print_pose(estimate)
+    print("result: " + ", ".join(str(path) for path in (*files, picture)))
+    return 0
+
+
+def _model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
+    """The cloth, and what is uncertain of its values."""
+    from ..identification import cloth_from, fitted
+    from ..identification.unknowns import available
+
+    cloth, uncertain = (cloth_from(recording), {}) if options.fit is None else fitted(options.fit, recording)
+    names = available(cloth)
+    for name, spread in assignments(options.uncertain, "--uncertain").items():
+        if name not in names:
+            raise InvalidInput("--uncertain", got=repr(name), expected=f"one of {', '.join(sorted(names))}")
+        uncertain[name] = (cloth.get_submodule(names[name]).value.item(), spread)  # type: ignore[union-attr]
+    return cloth, uncertain
+
+
+def _estimate(
+    options: argparse.Namespace, cloth: Cloth, uncertain: dict[str, tuple[float, float]], recording: Recording
+) -> PoseEstimate:
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    from ..pose import estimate_pose
+
+    columns = (SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, refresh_per_second=2, disable=not sys.stdout.isatty()) as progress:
+        task = progress.add_task("reading", total=None)
+
+        def advance(stage: str, share: float) -> None:
+            text = f"{stage}: corrective force {100 * share:.1f} % of the weight"
+            progress.update(task, description=text)
+            if not progress.console.is_terminal:
+                print(text, flush=True)
+
+        return estimate_pose(
+            cloth,
+            recording,
+            uncertain=uncertain,
+            window=options.window,
+            modes=options.modes,
+            nuisances=nuisances_of(options.nuisance),
+            use=options.use,
+            dt=options.dt,
+            on_progress=advance,
+        )

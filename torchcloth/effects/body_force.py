@@ -1,0 +1,39 @@
+"""A force of unknown origin."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ..errors import InvalidInput
+from ..parameters import PhysicalParameter
+from ..types import Moment
+from .base import AbstractEffect, Amplitude
+
+
+class BodyForce(AbstractEffect):
+    """A given acceleration in world axes, f = m a: what pushes the cloth and has no name.
+
+    ``tc.estimate_pose`` finds the one that a recording needs beside the model; where it is large, the model is wrong.
+
+    Args:
+        acceleration: [..., V, 3] m/s^2, one for each vertex, or [..., 1, 3], the same everywhere. Learnable.
+
+    Raises:
+        InvalidInput: another shape, or a number that is not finite.
+    """
+
+    amplitudes = {"acceleration": Amplitude("m/s^2", 1.0, 0.05, ("gravity.acceleration", "air.wind"))}
+
+    def __init__(self, acceleration: Tensor) -> None:
+        super().__init__()
+        if acceleration.ndim < 2 or acceleration.shape[-1] != 3:
+            raise InvalidInput("acceleration", got=f"shape {tuple(acceleration.shape)}", expected="[V or 1, 3] m/s^2")
+        self.acceleration = PhysicalParameter(acceleration, "m/s^2", "real", name="acceleration of a body force")
+
+    def coefficients(self) -> Tensor:
+        """[..., V or 1, 3] m/s^2."""
+        return self.acceleration.value
+
+    def force(self, c: Tensor, now: Moment) -> Tensor:
+        """m a on each vertex."""
+        return now.mass * c

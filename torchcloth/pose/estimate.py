@@ -1,0 +1,170 @@
+"""``estimate_pose``: the full mesh over time from a recording that shows a part of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..boundaries import Grasp
+from ..cloth import Cloth
+from ..errors import InvalidInput
+from ..identification.blocks import blocks_for
+from ..identification.episodes import episode
+from ..identification.misfit import figures
+from ..identification.nuisances import chosen, implied
+from ..identification.null import rigid_carry
+from ..identification.report import estimates, nuisance_estimates
+from ..identification.unknowns import collect, with_priors
+from ..recordings import Recording
+from .local import unexplained
+from .modes import Modes, modes_of
+from .objective import Corrected, Correction, pushable, windows_of
+from .result import PoseEstimate
+from .seen import seen_vertices
+from .smoothing import Smoothed, smooth
+from .warn import warnings_of
+
+FIRST_GUESS = 0.5  # m/s^2, of the corrective force; its size is then learnt from the recording
+
+Progress = Callable[[str, float], None]
+
+
+def estimate_pose(
+    cloth: Cloth,
+    recording: Recording,
+    *,
+    uncertain: Mapping[str, tuple[float, float]] | None = None,
+    window: float = 0.15,
+    modes: int = 8,
+    nuisances: Mapping[str, float | None] | Sequence[str] = (),
+    use: Sequence[str] | None = None,
+    noise: Mapping[str, float] | None = None,
+    dt: float | None = None,
+    on_progress: Progress | None = None,
+) -> PoseEstimate:
+    """Where every vertex of a cloth was at every frame of a recording, hidden ones included, with standard errors.
+
+    The cloth is simulated along the recorded motion and pushed by a small extra force: constant within each window of
+    time, smooth over the fabric, world axes. All windows' forces are found together by Gauss-Newton on the residuals
+    that ``identify`` uses, against a prior whose size is learnt from the recording: a smoother in the sense of weak-
+    constraint variational assimilation (Tremolet 2006). The result is one continuous motion: position, velocity and
+    memory go from window to window as the simulation leaves them. In the first window the force also acts while the
+    cloth comes to rest before the first frame.
+
+    Args:
+        cloth: the model, with fitted (``Identification.apply``) or nominal values; left unchanged.
+        recording: one episode of it.
+        uncertain: fabric parameters that are known with an error, (value, factor) for positive ones, (value, standard
+            deviation) for others, as the priors of ``identify``: they are corrected beside the force, and their
+            errors are part of the result's.
+        window: of time [s] in which the force is constant.
+        modes: smooth fields over the fabric for each axis of the force.
+        nuisances: as in ``identify``: "clock", "camera", "grasp", "shape".
+        use: kinds of data, some of "points", "markers" and "force"; None: all that the recording has.
+        noise: least standard deviation by kind of data, as in ``identify``.
+        dt: largest substep [s]; None: the stable one.
+        on_progress: called with (stage, share of the corrective force so far).
+
+    Returns:
+        Frames with standard errors, visibility, forces, warnings.
+
+    Raises:
+        InvalidInput: options out of range.
+        RecordingError: a recording without motion, or with nothing seen or felt.
+        SimulationDiverged: the cloth cannot be simulated with these values.
+    """
+    began = time.perf_counter()
+    if not (math.isfinite(window) and window > 0):
+        raise InvalidInput("window", got=window, expected="a time > 0 in s")
+    data, fields = episode(cloth, recording), modes_of(cloth.mesh)
+    coarse = modes_of(cloth.mesh, modes).fields.to(data.initial)
+    density = recording.cloth.areal_density_std if uncertain else None
+    unknowns = with_priors(collect(cloth, list(uncertain or {}), density), uncertain or {})
+    blocks = blocks_for(use)
+    own = chosen(nuisances, implied([block.name for block in blocks], [data]))
+    correction = Correction(windows_of(data.times, window), coarse, torch.full((modes,), FIRST_GUESS))
+    objective = Corrected(pushable(cloth), unknowns, data, correction, dt, own, blocks, noise)
+    gravity = float(torch.as_tensor(recording.gravity).norm()) or 9.81
+
+    def told(stage: str, raw: Tensor) -> None:
+        if on_progress is not None:
+            on_progress(stage, float(_shares(objective, raw, gravity).square().mean().sqrt()))
+
+    found = smooth(objective, told)
+    return _concluded(objective, found, fields, gravity, began)
+
+
+def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: float, began: float) -> PoseEstimate:
+    data, cloth, raw = objective.episodes[0], objective.cloth, found.raw
+    with torch.no_grad():
+        frames, moved = objective.tangents(raw)
+        alone, null = objective.frames(objective.start)[0], rigid_carry(data)
+        std = _errors(objective, found, frames.x, moved.x, fields)
+        last = objective.last_state(raw)
+    seen = seen_vertices(frames.x, data, cloth.mesh)
+    shares = _shares(objective, raw, gravity)
+    names = {"after": frames.x, "alone": alone, "null": null}
+    distances = {key: figures([x], [data], objective.faces) for key, x in names.items()}
+    fit: dict[str, Any] = {f"{what}_{k}": getattr(f, what) for what in ("chamfer", "rms") for k, f in distances.items()}
+    fit |= {
+        "force_share": float(shares.square().mean().sqrt()),
+        "force_share_max": float(shares.max()),
+        "seen_share": float(seen.double().mean()),
+        "std_rms": float(std.square().sum(-1).mean().sqrt()),
+        "point_noise": float(found.final.scale[0]) if any(len(c) for c in data.clouds) else math.nan,
+        "converged": found.converged,
+        "unknowns": len(raw),
+        "simulations": objective.simulations,
+        "seconds": time.perf_counter() - began,
+    }
+    return PoseEstimate(
+        times=data.times,
+        x=frames.x,
+        v=frames.v,
+        std=std,
+        seen=seen,
+        faces=objective.faces,
+        windows=torch.stack([data.times[list(w)] for w in objective.correction.windows]),
+        acceleration=objective.correction.field(raw[objective.pushes]),
+        shares=shares,
+        alone=alone,
+        null=null,
+        last=last,
+        parameters={
+            name: e
+            for name, e in estimates(cloth, objective.unknowns, raw, found.covariance).parameters.items()
+            if name in {u.name for u in objective.unknowns}
+        },
+        nuisances=next(iter(nuisance_estimates([data], objective.placed, raw, found.covariance).values())),
+        fit=fit,
+        warnings=warnings_of(fit, shares, seen, data, objective.correction),
+    )
+
+
+def _errors(objective: Corrected, found: Smoothed, x: Tensor, moved: Tensor, fields: Modes) -> Tensor:
+    """[T, V, 3] m, of what was estimated, and of what is finer than it."""
+    root = torch.linalg.cholesky(found.covariance).to(moved)
+    variance = torch.stack([(root.mT @ frame.flatten(1)).square().sum(0) for frame in moved.unbind(1)])
+    held = _held(objective.cloth)
+    noise = objective.episodes[0].noise or objective.blocks[0].floor
+    coarse = len(objective.correction.modes)
+    finer = unexplained(x, objective.episodes[0], objective.faces, fields, coarse, held, noise)
+    return (variance.reshape(x.shape) + finer.square().unsqueeze(-1)).sqrt()
+
+
+def _held(cloth: Cloth) -> Tensor:
+    index = [part.index for part in cloth.boundaries.values() if isinstance(part, Grasp)]
+    return torch.cat(index) if index else torch.zeros(0, dtype=torch.int64)
+
+
+def _shares(objective: Corrected, raw: Tensor, gravity: float) -> Tensor:
+    """[W] of the force in the weight, rms by mass over the cloth that is not held."""
+    squared = objective.correction.field(raw[objective.pushes]).square().sum(-1)
+    mass = objective.cloth.model().mass.detach().squeeze(-1).to(squared).clone()
+    mass[_held(objective.cloth)] = 0.0
+    return ((squared * mass).sum(-1) / mass.sum()).sqrt() / gravity

@@ -1,0 +1,126 @@
+"""What no force of the coarse modes explains: how far the cloth is off its estimate, frame by frame.
+
+The residuals of a frame are taken as noise and a smooth random field without the coarse modes, those being the forces'.
+Its size is the mean over its likelihood, frame by frame; the noise is that of all frames. The field widens the standard
+errors and moves nothing: moved by it, hidden vertices came out worse in every scene that was tried (docs/pose.md).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .._math import cross, dot
+from ..identification.episodes import Episode
+from ..losses import closest
+from .modes import Modes
+
+FAINT = 1e-3  # of the coarsest field's variance, below which finer ones are left out
+SIZES = torch.cat([torch.zeros(1), torch.logspace(-4, -1.5, 26)])  # m, standard deviations that are tried
+OUTLIER = 5.0  # standard deviations
+FARTHEST = 2.0  # standard deviations of the field that residuals may claim
+FEWEST = 20  # points of a frame that tell a field from noise
+
+
+class _Frame(NamedTuple):
+    rows: Tensor  # [N, J] field at each point per unit of the field's numbers
+    value: Tensor  # [N] m
+
+
+def unexplained(
+    x: Tensor, episode: Episode, faces: Tensor, modes: Modes, coarse: int, held: Tensor, noise: float
+) -> Tensor:
+    """[T, V] m, root mean square of the field given the residuals: large where they show it, or where none are.
+
+    Args:
+        x: [T, V, 3] m, the estimate.
+        episode: its clouds.
+        faces: [F, 3].
+        modes: all of the mesh.
+        coarse: how many of them are the forces'.
+        held: [H] vertices that lie where the grippers are.
+        noise: least standard deviation of a point [m].
+    """
+    basis = _basis(modes, coarse, held).to(x)
+    frames = [_rows(cloud, x[t], faces, basis, noise) for t, cloud in enumerate(episode.clouds)]
+    noise = max(noise, _noise(frames))
+    sizes = _smoothed(torch.tensor([_size(frame, noise) for frame in frames]).to(x))
+    return torch.stack([_left(frame, size * basis, size, noise) for frame, size in zip(frames, sizes, strict=True)])
+
+
+def _left(frame: _Frame | None, field: Tensor, size: Tensor, noise: float) -> Tensor:
+    """[V] m, of one frame."""
+    mean, covariance = field.new_zeros(len(field)), torch.eye(len(field)).to(field)
+    if frame is not None:
+        rows = size * frame.rows / noise
+        covariance = torch.linalg.inv(covariance + rows.mT @ rows)
+        mean = covariance @ (rows.mT @ frame.value) / noise
+    squared, prior = (mean @ field).square(), field.square().sum(0)
+    squared = torch.minimum(squared, FARTHEST**2 * prior)  # a wrong match is extrapolated without bounds
+    return (squared + ((covariance @ field) * field).sum(0)).clamp(min=0).sqrt()
+
+
+def _basis(modes: Modes, coarse: int, held: Tensor) -> Tensor:
+    """[J, V] fields of a random field of unit mean square that vanishes where the cloth is held."""
+    if coarse >= len(modes.wave):
+        return modes.fields.new_zeros(0, modes.fields.shape[1])
+    first = modes.wave[coarse]
+    weight = torch.exp(-0.5 * ((modes.wave[coarse:] / first) ** 2 - 1))  # neighbours agree over half a coarse mode
+    kept = weight > FAINT
+    fields = modes.fields[coarse:][kept] * weight[kept].sqrt()[:, None]
+    if len(held):
+        _, sizes, vectors = torch.linalg.svd(fields[:, held].mT)
+        rank = int((sizes > 1e-9 * sizes.max()).sum())
+        fields = vectors[rank:] @ fields
+    return fields / fields.square().sum(0).mean().sqrt()
+
+
+def _rows(cloud: Tensor, x: Tensor, faces: Tensor, basis: Tensor, noise: float) -> _Frame | None:
+    if len(cloud) < FEWEST or not len(basis):
+        return None
+    hits = closest(cloud, x, faces)
+    a, b, c = x[hits.corners].unbind(1)
+    normal = torch.nn.functional.normalize(cross(b - a, c - a), dim=-1)
+    value = dot(normal, cloud - hits.on(x)).squeeze(-1)
+    spread = max(noise, 1.4826 * float(value.abs().median()))
+    good = (value.abs() < OUTLIER * spread) & ~hits.beyond
+    if int(good.sum()) < FEWEST:
+        return None
+    rows = (hits.weights.unsqueeze(-1) * basis.mT[hits.corners]).sum(1)
+    return _Frame(rows[good], value[good])
+
+
+def _noise(frames: list[_Frame | None]) -> float:
+    """Of a point [m]: what no smooth field explains, over all frames."""
+    left, freedom = 0.0, 0
+    for frame in frames:
+        if frame is not None and len(frame.value) > 2 * frame.rows.shape[1]:
+            fit = torch.linalg.lstsq(frame.rows, frame.value[:, None]).solution
+            left += float((frame.value - (frame.rows @ fit)[:, 0]).square().sum())
+            freedom += len(frame.value) - frame.rows.shape[1]
+    return (left / freedom) ** 0.5 if freedom else 0.0
+
+
+def _size(frame: _Frame | None, noise: float) -> float:
+    """Root mean square of the field's standard deviation over its likelihood [m]; NaN where nothing tells it."""
+    if frame is None:
+        return torch.nan
+    values, vectors = torch.linalg.eigh(frame.rows.mT @ frame.rows)
+    values = values.clamp(min=1e-12)
+    along = (vectors.mT @ (frame.rows.mT @ frame.value)).square() / values  # squared residual along each direction
+    variance = SIZES.to(values)[:, None] ** 2 * values + noise**2
+    likelihood = torch.softmax(-0.5 * (variance.log() + along / variance).sum(1), 0)
+    squared = float((likelihood * SIZES.to(values) ** 2).sum())
+    return min(squared, float(frame.value.square().mean())) ** 0.5  # sparse points leave it open upwards
+
+
+def _smoothed(size: Tensor) -> Tensor:
+    """Root mean square over three frames; what nothing tells is the mean of all."""
+    known = size.isfinite()
+    if not bool(known.any()):
+        return torch.zeros_like(size)
+    squared = torch.where(known, size.square(), size[known].square().mean())
+    padded = torch.cat([squared[:1], squared, squared[-1:]])
+    return padded.unfold(0, 3, 1).mean(-1).sqrt()

@@ -1,0 +1,45 @@
+"""Smooth fields over a cloth, the coarsest first."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInput
+from ..meshes import Mesh
+
+
+class Modes(NamedTuple):
+    """Vibration shapes of a membrane with a free rim, at rest."""
+
+    fields: Tensor  # [M, V] -, each of unit mean square over the area; the first is constant
+    wave: Tensor  # [M] 1/m, wave numbers, ascending
+
+
+def modes_of(mesh: Mesh, count: int | None = None) -> Modes:
+    """The ``count`` coarsest; None: as many as there are vertices.
+
+    Eigenvectors of the rest shape's Laplacian (linear triangles, lumped area): they follow the fabric through seams, so
+    that a sleeve's front and back are neighbours only around its side.
+
+    Raises:
+        InvalidInput: fewer than one, or more than the mesh has vertices.
+    """
+    size = len(mesh.vertices)
+    count = size if count is None else count
+    if not 1 <= count <= size:
+        raise InvalidInput("modes", got=count, expected=f"1 to {size}, the mesh's vertices")
+    rest, faces = torch.as_tensor(mesh.rest).double(), torch.as_tensor(mesh.faces)
+    edges = torch.stack([rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0]], dim=-1)
+    two = torch.linalg.inv(edges)  # rows: gradients of the second and third corner's hat functions
+    gradient = torch.cat([-two.sum(1, keepdim=True), two], dim=1)
+    local = torch.as_tensor(mesh.area).double()[:, None, None] * (gradient @ gradient.mT)
+    places = (faces[:, :, None] * size + faces[:, None, :]).flatten()
+    stiffness = torch.zeros(size * size, dtype=torch.float64).index_add(0, places, local.flatten()).reshape(size, size)
+    root = torch.as_tensor(mesh.vertex_area).double().sqrt()
+    squared, vectors = torch.linalg.eigh(stiffness / root[:, None] / root[None, :])
+    fields = vectors[:, :count].mT / root * root.square().sum().sqrt()
+    largest = fields.gather(1, fields.abs().argmax(1, keepdim=True))
+    return Modes(fields * largest.sign(), squared[:count].clamp(min=0).sqrt())  # eigh leaves the signs open

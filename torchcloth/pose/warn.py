@@ -1,0 +1,48 @@
+"""What to mistrust in a pose estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..identification.episodes import Episode
+from .objective import Correction
+
+LARGE = 0.1  # of the weight, from which a corrective force says that the model is wrong
+MISSED = 1.3  # rms over the stated noise
+BLIND = 0.3  # s without anything seen
+
+
+def warnings_of(fit: Mapping[str, Any], shares: Tensor, seen: Tensor, data: Episode, correction: Correction):
+    """Sentences."""
+    out = []
+    if fit["force_share"] > LARGE:
+        first, last = (float(data.times[k]) for k in correction.windows[int(shares.argmax())])
+        out.append(
+            f"the model is wrong: it takes a corrective force of {100 * fit['force_share']:.0f} % of the weight (rms; "
+            f"{100 * fit['force_share_max']:.0f} % in {first:.2f}-{last:.2f} s) to follow what was seen: identify the "
+            "fabric, or state how uncertain its values are; the standard errors are at their least"
+        )
+    if data.noise and fit["point_noise"] > MISSED * data.noise:
+        out.append(
+            f"seen points are {1e3 * fit['point_noise']:.1f} mm off the estimate, {1e3 * data.noise:.1f} mm would be "
+            "noise: shapes finer than the correction's modes are missed"
+        )
+    if fit["chamfer_after"] >= fit["chamfer_null"]:
+        out.append("no better than a cloth that is carried rigidly: do not use this estimate")
+    if not fit["converged"]:
+        out.append("the search did not converge: another estimate may fit as well")
+    blind = _longest_gap(data.times, seen.any(1))
+    if blind > BLIND:
+        out.append(f"nothing was seen for {blind:.2f} s: there the estimate is simulation alone")
+    return out
+
+
+def _longest_gap(times: Tensor, any_seen: Tensor) -> float:
+    """[s] between frames in which something was seen."""
+    at = times[any_seen | (torch.arange(len(times)) == 0)]
+    ends = torch.cat([at, times[-1:]])
+    return float((ends[1:] - ends[:-1]).max())
