@@ -105,8 +105,8 @@ def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tup
     """
     path = Path(path)
     path = path / RESULT if path.is_dir() else path
-    model = _read(path)
-    cloth = _rebuilt(path, model, recording)
+    model = read_saved(path)
+    cloth = rebuilt(path, model, recording)
     names, out = available(cloth), {}
     for name, (value, std) in model.identified.items():
         positive = name in names and _parameter(cloth, names[name]).domain == "positive"
