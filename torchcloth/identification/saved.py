@@ -103,8 +103,7 @@ def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tup
         InvalidInput: there is no such file, or the fit is of another model.
         RecordingError: the file cannot be read, or does not hold what is needed.
     """
-    path = Path(path)
-    path = path / RESULT if path.is_dir() else path
+    path = result_file(path)
     model = read_saved(path)
     cloth = rebuilt(path, model, recording)
     names, out = available(cloth), {}
