@@ -102,9 +102,11 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
             assert 0.005 <= float(steps[0]) <= 0.1
             return linear(self.secant), None
 
-    at_start = gauss_newton.Iterate(
-        torch.zeros(1), linear(1.0), True, torch.tensor([1e-3]), torch.ones(1), torch.tensor([torch.inf])
-    )
+    def at_slope(slope):
+        size, own = torch.tensor([1e-3]), torch.ones(1)
+        return gauss_newton.Iterate(torch.zeros(1), linear(slope), True, size, own, torch.tensor([torch.inf]))
+
+    at_start = at_slope(1.0)
     for secant, warned, bent in ((1.2, False, []), (1.4, False, ["youngs_modulus"]), (5.0, True, [])):
         fake = Fake(unknowns=[SimpleNamespace(name="youngs_modulus")], secant=secant)
         final, _, warnings, curved = linearity.check(fake, at_start)
@@ -112,6 +114,12 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
         assert curved == bent
         assert (final.linear is not at_start.linear) == warned
     assert "tangents of youngs_modulus miss finite steps by up to 80 %" in warnings[0]
+    for slope, warned in (
+        (1e-3, False),
+        (1.0, True),
+    ):  # what no reading notices can mislead none; tangents that run off can
+        fake = Fake(unknowns=[SimpleNamespace(name="density")], secant=5e-3)
+        assert bool(linearity.check(fake, at_slope(slope)).warnings) == warned
 
 
 # -- estimates -------------------------------------------------------------------------------------------------------
