@@ -38,6 +38,8 @@ def _places(axis: Any, trials: Sequence[Any], fabrics: Sequence[str]) -> None:
             bars = [t.error[1] for t in own] * poisson * (0.5 - poisson) / 0.5
             axis.errorbar(stiffness, poisson, bars, fmt="o", ms=3, color=colour, label=FABRICS[name])
     axis.set(xscale="log", xlabel="E [kPa]", ylabel="ν", ylim=(0, 0.5), title="identified, with standard errors of ν")
+    axis.set_xticks([200, 500, 1000, 2000, 4000], ["200", "500", "1000", "2000", "4000"])
+    axis.minorticks_off()
     axis.legend(fontsize=8)
 
 
@@ -48,6 +50,6 @@ def _matrix(axis: Any, title: str, result: Mapping[str, Any]) -> None:
     for (i, j), count in np.ndenumerate(counts):
         axis.text(j, i, f"{count}" if count else "·", ha="center", va="center")
     short = [FABRICS[name].partition(" (")[0] for name in names]
-    axis.set(xlabel="assigned", title=f"{title}: {result['right']} of {result['trials']} right")
+    axis.set(xlabel="assigned", ylabel="is in truth", title=f"{title}: {result['right']} of {result['trials']} right")
     axis.set_xticks(range(len(names)), short, rotation=30, ha="right")
     axis.set_yticks(range(len(names)), short)

@@ -12,7 +12,8 @@ import torch
 
 from torchcloth.errors import TorchclothError
 
-STUDIES: tuple[str, ...] = ("fabrics", "classify")  # modules of this package; ``add(parser)`` declares options, ``run(options)`` does it
+# Modules of this package; ``add(parser)`` declares options, ``run(options)`` does it.
+STUDIES: tuple[str, ...] = ("fabrics", "classify")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -16,7 +16,14 @@ from .paper_fabrics import COV, FABRICS, SYMBOLS
 from .stretching import Pull
 
 COLOURS = {"x": "#1f6f8b", "y": "#b0653a", "45": "#3d7f3d", "press": "#1f6f8b", "elsewhere": "#b0653a"}
-TITLES = {"press": "plates where the model has them", "elsewhere": "plates elsewhere in the grid"}
+KINDS = {
+    "band": "the paper's CoV",
+    "x": "pulled along x",
+    "y": "along y",
+    "45": "at 45°",
+    "press": "pressed",
+    "elsewhere": "pressed elsewhere in the grid",
+}
 
 
 def draw(folder: Path, scale: Scale, cases: Mapping[str, Mapping[str, Any]]) -> list[Path]:
@@ -39,7 +46,7 @@ def _experiment(scale: Scale) -> Any:
         _trial(axis, scale, pull)
         axis.set_title(f"{FABRICS[scale.fabrics[0]]}, pulled along {direction if direction != '45' else '45°'}")
     axes[0].set_ylabel("y [m]")
-    axes[0].legend(loc="upper left", fontsize=7, framealpha=0.9)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     return figure
 
 
@@ -50,8 +57,7 @@ def _trial(axis: Any, scale: Scale, pull: Pull) -> None:
     if points is None or markers is None:
         raise RuntimeError("a trial without points")  # what record always gives
     last = len(points.t) - 1
-    start = markers.xyz[0] + (markers.xyz[last] - markers.xyz[0])
-    way = start - markers.xyz[0]
+    way = markers.xyz[last] - markers.xyz[0]
     axis.plot(*points.frame(last)[:, :2].T, ".", ms=3, color="#9db8c4", label="points of the last frame")
     axis.quiver(*markers.xyz[0][:, :2].T, *way[:, :2].T, angles="xy", scale_units="xy", scale=1, width=2.5e-3)
     axis.plot(*markers.xyz[0][:, :2].T, ".", ms=2, color="black", label="markers, and how far they go")
@@ -79,29 +85,20 @@ def _errors(scale: Scale, cases: Mapping[str, Mapping[str, Any]]) -> Any:
         axis.axhline(0.0, color="black", lw=0.8)
         axis.set(xticks=range(len(scale.fabrics)), ylabel=f"{symbol}: off by [%]")
         axis.set_xticklabels([FABRICS[name] for name in scale.fabrics])
+        axis.margins(y=0.25)
         axis.legend(fontsize=7, loc="upper right", ncols=4)
-        if parameter == "contact_stiffness":
-            axis.set_yscale("symlog", linthresh=1.0)
     return figure
 
 
 def _once(axis: Any, kind: str) -> str | None:
-    labels = {
-        "band": "the paper's CoV",
-        "x": "pulled along x",
-        "y": "along y",
-        "45": "at 45°",
-        "press": "pressed",
-        "elsewhere": "pressed elsewhere in the grid",
-    }
+    """A label for the legend, the first time."""
     drawn = axis.get_legend_handles_labels()[1]
-    return None if labels[kind] in drawn else labels[kind]
+    return None if KINDS[kind] in drawn else KINDS[kind]
 
 
 def _points(axis: Any, place: int, name: str, parameter: str, cases: Mapping[str, Mapping[str, Any]]) -> None:
-    own = [c for key, c in cases.items() if key.startswith(name) and _kind(key) and parameter in c["parameters"]]
-    kinds = [key for key, c in cases.items() if key.startswith(name) and _kind(key) and parameter in c["parameters"]]
-    for i, (key, case) in enumerate(zip(kinds, own, strict=True)):
+    own = {key: c for key, c in cases.items() if key.startswith(name) and _kind(key) and parameter in c["parameters"]}
+    for i, (key, case) in enumerate(own.items()):
         e, kind = case["parameters"][parameter], case.get("direction", _kind(key))
         if not e["identifiable"]:
             continue

@@ -9,6 +9,7 @@ from .paper_fabrics import FABRICS, SYMBOLS
 
 KPA = 1e3
 NOTHING = "–"
+_LAYERS = ("k", "γ", "c_F")  # what shows between layers
 
 
 def show(result: Mapping[str, Any]) -> None:
@@ -22,6 +23,7 @@ def show(result: Mapping[str, Any]) -> None:
     for line in _silent(result):
         console.print(line, markup=False)
     console.print(_pressed(result))
+    console.print(_place(result), markup=False)
     for line in _marks(result):
         console.print(line, markup=False)
 
@@ -39,17 +41,17 @@ def table(title: str, *headings: str, left: int = 2):
 
 def _stretched(result: Mapping[str, Any]):
     out = table(
-        f"Stretching, {result['trials']} trials a fabric (E, k, γ in kPa)",
+        f"Stretching, {result['trials']} trials a fabric (E, k, γ in kPa; the truth is the paper's mean)",
         "fabric",
         "",
-        "truth = paper's mean",
+        "truth",
         "grand mean",
         "off by",
         "CoV",
-        "the paper's CoV",
-        "std. error",
+        "paper's CoV",
+        "std. err.",
         "95 % covers",
-        "identified in",
+        "identified",
     )
     for name, own in result["fabrics"].items():
         for symbol in SYMBOLS:
@@ -86,19 +88,29 @@ def _pressed(result: Mapping[str, Any]):
         "mean",
         "off by",
         "CoV",
-        "the paper's CoV",
-        "std. error",
+        "paper's CoV",
+        "std. err.",
         "elsewhere: off by",
         "CoV",
     )
     for name, own in result["fabrics"].items():
-        for symbol in ("k", "γ", "c_F"):
+        for symbol in _LAYERS:
             f, p, e = own[symbol], own[symbol]["press"], own[symbol]["elsewhere"]
             first = [FABRICS[name] if symbol == "k" else "", symbol, number(f["truth"], symbol)]
             here = percent(p["error"], "+"), percent(p["cov"]), percent(f["paper_cov"]), percent(p["std"])
             mean = NOTHING if p["mean"] is None else number(p["mean"], symbol)
             out.add_row(*first, mean, *here, percent(e["error"], "+"), percent(e["cov"]))
     return out
+
+
+def _place(result: Mapping[str, Any]) -> str:
+    """What the error bars of the press do not know."""
+    worst = {s: max(abs(own[s]["elsewhere"]["worst"] or 0.0) for own in result["fabrics"].values()) for s in _LAYERS}
+    off = ", ".join(f"{symbol} is off by up to {percent(share)}" for symbol, share in worst.items())
+    return (
+        "These errors know the sensors only. Pressed to the same distance elsewhere in the contact's grid, layers give "
+        f"another force: {off}. k and γ are numbers of the grid as much as of the fabric; c_F is not.\n"
+    )
 
 
 def _marks(result: Mapping[str, Any]) -> list[str]:

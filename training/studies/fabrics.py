@@ -23,7 +23,6 @@ LABEL = (
     "mesh, step, first shape and density, and the sensors' errors (Kinect depth, 30 % hidden, forces). The truth is "
     "the paper's means, read as kPa at 1 mm."
 )
-PLACE = "the truth's plates elsewhere in the contact's grid"
 
 
 def add(parser: argparse.ArgumentParser) -> None:

@@ -49,9 +49,9 @@ class Plates(NamedTuple):
 def stack(layer: Layer, plates: Plates) -> tc.Cloth:
     """Two layers, each held by a plate in all its vertices."""
     sheet = tc.meshes.rectangle(SIDE, SIDE, resolution=(plates.cells + 1, plates.cells + 1))
-    count = len(sheet.vertices)
+    count, up = len(sheet.vertices), np.array([0.0, 0.0, APART * plates.spacing])
     mesh = tc.meshes.Mesh.build(
-        np.concatenate([sheet.vertices, sheet.vertices + [0.0, 0.0, APART * plates.spacing]]) + plates.offset,
+        np.concatenate([sheet.vertices, sheet.vertices + up]) + plates.offset,
         np.concatenate([sheet.faces, sheet.faces + count]),
     )
     material = tc.materials.AEP(**{k: v for k, v in layer._asdict().items() if k != "density"})
@@ -98,4 +98,5 @@ def on_model(recording: rec.Recording, cloth: tc.Cloth) -> rec.Recording:
     moved = recording.grippers["above"].position[::4] - recording.grippers["above"].position[0]
     seen = cloth.mesh.vertices[corner] + moved
     info = replace(recording.cloth, vertices=cloth.mesh.vertices, faces=cloth.mesh.faces, thickness=1e-3)
-    return replace(recording, cloth=info, points=rec.PointClouds(t, seen, np.ones(len(t), int)), observation_noise_std=1e-3)
+    points = rec.PointClouds(t, seen, np.ones(len(t), int))
+    return replace(recording, cloth=info, points=points, observation_noise_std=1e-3)

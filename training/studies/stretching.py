@@ -135,14 +135,22 @@ def record(fabric: Fabric, pull: Pull, seed: int, detail: Detail) -> rec.Recordi
     )
 
 
-def sheet(recording: rec.Recording, fabric: Fabric, contact: tc.Contact | None = None, **director: float) -> tc.Cloth:
-    """The recording's cloth, of a fabric; the density is the recording's."""
+def sheet(
+    recording: rec.Recording,
+    fabric: Fabric,
+    contact: tc.Contact | None = None,
+    contact_stiffness: float = 1e6,
+    shear_stiffness: float = 2.5e5,
+) -> tc.Cloth:
+    """The recording's cloth, of a fabric; the density is the recording's. k and gamma [Pa] act with contact only."""
     effects = {
         "gravity": tc.effects.Gravity(),
         "bending": tc.effects.Bending(BENDING, BENDING_TIME),
         "air": tc.effects.AirDrag(DRAG),
     }
-    material = tc.materials.AEP(fabric.membrane / THICKNESS, fabric.poisson, thickness=THICKNESS, **director)
+    material = tc.materials.AEP(
+        fabric.membrane / THICKNESS, fabric.poisson, contact_stiffness, shear_stiffness, thickness=THICKNESS
+    )
     return cloth_from(recording, material, effects, contact)
 
 
@@ -208,7 +216,7 @@ def _look(
     """Clouds, markers and the depth's standard deviation [m] of a Kinect above, with a bar in its way."""
     resolution, noise = detail.truth(pull), DepthNoise()
     middle, depth = x[0].mean(0), float(noise.sigma(np.array(EYE)))
-    eye = middle + [0.0, -SIDEWAYS, EYE]
+    eye = middle + np.array([0.0, -SIDEWAYS, EYE])
     camera = DepthCamera.azure_kinect_nfov(look_at(eye, middle, up=np.array([0.0, 1.0, 0.0])))
     view, faces = View(camera, noise, points=detail.points), tc.meshes.rectangle(1.0, 1.0, resolution=resolution).faces
     bar = _bar(x[0], eye)
