@@ -109,7 +109,7 @@ def _place(result: Mapping[str, Any]) -> str:
     off = ", ".join(f"{symbol} is off by up to {percent(share)}" for symbol, share in worst.items())
     return (
         "These errors know the sensors only. Pressed to the same distance elsewhere in the contact's grid, layers give "
-        f"another force: {off}. k and γ are numbers of the grid as much as of the fabric; c_F is not.\n"
+        f"another force: {off}. k and γ are numbers of the grid as much as of the fabric.\n"
     )
 
 

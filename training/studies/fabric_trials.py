@@ -110,7 +110,7 @@ def stretch(name: str, pull: Pull, detail: Detail) -> dict[str, Any]:
     recording = stretching.record(fabric(name), pull, seed_of(name, PULLS.index(pull)), detail)
     start = fabric(name)._replace(membrane=START * fabric(name).membrane, poisson=START_POISSON)
     model, began = stretching.sheet(recording, start), time.perf_counter()
-    fit = identify(model, recording, PAIR, nuisances=HELD, warm_start=True)
+    fit = identify(model, recording, PAIR, nuisances=HELD)
     facts = {"direction": pull.direction, "clamps": pull.clamps, "strain": stretching.strain(fabric(name), pull)}
     return {"fabric": name, **facts, **told(fit, PAIR), "seconds": time.perf_counter() - began}
 
