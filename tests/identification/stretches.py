@@ -14,6 +14,7 @@ import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.identification.unknowns import available
 from torchcloth.robots import replay
+from torchcloth.training.studies.twins import on_grid, readings
 
 WIDTH, HEIGHT = 0.30, 0.20  # m, between the jaws and along them
 THICKNESS = 1e-3  # m
@@ -99,13 +100,7 @@ def flat(mesh: tc.meshes.Mesh) -> torch.Tensor:
 
 def at(x: np.ndarray, shape: tuple[int, int], uv: np.ndarray) -> np.ndarray:
     """Positions [N, 3] m of material points on a grid of vertices."""
-    columns, rows = shape
-    place = np.clip(uv / [WIDTH, HEIGHT], 0, 1) * [columns - 1, rows - 1]
-    cell = np.minimum(place.astype(int), [columns - 2, rows - 2])
-    a, b = (place - cell).T[:, :, None]
-    first = cell[:, 0] * rows + cell[:, 1]
-    low, high = ((1 - b) * x[first + skip] + b * x[first + skip + 1] for skip in (0, rows))
-    return (1 - a) * low + a * high
+    return on_grid(x, shape, uv / [WIDTH, HEIGHT])
 
 
 def record(
@@ -124,7 +119,7 @@ def record(
         moves = replay(bare)
         state = truth.settle(truth.state(flat(truth.mesh)), moves, duration=0.6)
         out = truth(state, moves, times.tolist(), dt=0.6 * truth.stable_step())
-    forces = {name: _force(out, name, times, knots, rng) for name in motion}
+    forces = {name: readings(out, name, knots, FORCE_NOISE, rng) for name in motion}
     x = out.x[np.searchsorted(times, frames + setting.clock)].numpy()
     clouds = [_cloud(frame, setting, rng) for frame in x]
     first = at(out.x[0].numpy(), setting.resolution, np.asarray(mesh.uv))
@@ -146,14 +141,6 @@ def record(
         observation_noise_std=setting.depth,
         air_density=1.204,
     )
-
-
-def _force(out, name: str, times: np.ndarray, knots: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """[K, 3] N at the knots: a rollout gives means over intervals, so between two of them."""
-    mean = out.wrench[name][1:, :3].numpy()
-    middle = 0.5 * (times[1:] + times[:-1])
-    at_knots = np.stack([np.interp(knots, middle, column) for column in mean.T], axis=1)
-    return at_knots + FORCE_NOISE * rng.standard_normal(at_knots.shape)
 
 
 def _cloud(x: np.ndarray, setting: Setting, rng: np.random.Generator) -> np.ndarray:

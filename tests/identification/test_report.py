@@ -102,16 +102,17 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
             assert 0.005 <= float(steps[0]) <= 0.1
             return linear(self.secant), None
 
-    at_start = gauss_newton.Iterate(
-        torch.zeros(1), linear(1.0), True, torch.tensor([1e-3]), torch.ones(1), torch.tensor([torch.inf])
-    )
+    def at_slope(slope):
+        size, own = torch.tensor([1e-3]), torch.ones(1)
+        return gauss_newton.Iterate(torch.zeros(1), linear(slope), True, size, own, torch.tensor([torch.inf]))
+
+    def made(name, secant):
+        cloth, blocks = SimpleNamespace(mesh=SimpleNamespace(extent=1.0)), [SimpleNamespace(unit="m")]
+        return Fake(unknowns=[SimpleNamespace(name=name)], blocks=blocks, cloth=cloth, secant=secant)
+
+    at_start = at_slope(1.0)
     for secant, warned, bent in ((1.2, False, []), (1.4, False, ["youngs_modulus"]), (5.0, True, [])):
-        fake = Fake(
-            unknowns=[SimpleNamespace(name="youngs_modulus")],
-            blocks=[SimpleNamespace(unit="m")],
-            cloth=SimpleNamespace(mesh=SimpleNamespace(extent=1.0)),
-            secant=secant,
-        )
+        fake = made("youngs_modulus", secant)
         checked = linearity.check(fake, at_start)
         assert bool(checked.warnings) == checked.withdrawn == warned
         assert checked.curved == bent
@@ -120,6 +121,9 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
     away = at_start._replace(linear=linear(1e4))
     assert linearity.runaway(fake, away)
     assert not linearity.runaway(fake, at_start)
+    for slope, warned in ((1e-3, False), (1.0, True)):  # what no reading notices misleads none; runaway tangents do
+        fake = made("density", 5e-3)
+        assert bool(linearity.check(fake, at_slope(slope)).warnings) == warned
 
 
 # -- estimates -------------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from .objective import Objective
 NONLINEAR = 0.5  # relative error of the tangents over a finite step above which they are not used for errors
 CURVED = 0.2  # the same over a standard error, from which an interval is noticeably longer to one side
 RUNAWAY = 1.0  # sizes of the cloth
+NOTICED = 0.3  # standard deviations of all data together: what moves them less can mislead no error bar
 SMALLEST, LARGEST = 0.005, 0.1  # finite steps, in units of the prior's standard deviation
 
 
@@ -47,7 +48,8 @@ def check(objective: Objective, final: gauss_newton.Iterate) -> Checked:
     weight = final.influence()[0].sqrt()[:, None]
     moved, slope = (weight * j[:, : len(steps)] for j in (secants.jacobian, final.linear.jacobian))
     missed = (moved - slope).norm(dim=0) / moved.norm(dim=0).clamp(min=1e-12)
-    missed = missed.nan_to_num(torch.inf)
+    noticed = torch.maximum(moved.norm(dim=0), slope.norm(dim=0)) * steps >= NOTICED
+    missed = torch.where(noticed, missed.nan_to_num(torch.inf), 0.0)
     if float(missed.max()) < NONLINEAR:
         over_one = missed * deviation[: len(steps)] / steps
         curved = [u.name for u, error in zip(objective.unknowns, over_one, strict=True) if error >= CURVED]

@@ -13,8 +13,10 @@ import torch
 from torchcloth.errors import TorchclothError
 
 STUDIES: tuple[str, ...] = (
+    "classify",
+    "fabrics",
     "measured",
-)  # modules of this package; ``add(parser)`` declares options, ``run(options)`` does it
+)  # modules of this package, with ``add(parser)`` and ``run(options)``
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
