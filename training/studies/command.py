@@ -12,7 +12,7 @@ import torch
 
 from torchcloth.errors import TorchclothError
 
-STUDIES: tuple[str, ...] = ()  # modules of this package; ``add(parser)`` declares options, ``run(options)`` does it
+STUDIES: tuple[str, ...] = ("garments", "chamfer", "factors")  # modules; ``add`` declares options, ``run`` does it
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
