@@ -114,6 +114,33 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
     assert "tangents of youngs_modulus miss finite steps by up to 80 %" in warnings[0]
 
 
+def test_a_parameter_without_effect_makes_no_motion_unstable():
+    """Found with the stiffness of a contact that never happens: a finite step moves rounding errors, the tangent is 0."""
+    rows, one = 60, torch.ones(60)
+    spread = torch.linspace(-1, 1, rows)
+
+    def linear(rounding):
+        jacobian = torch.stack([1e-2 * spread, rounding * spread.flip(0)], dim=1)
+        return gauss_newton.Linearised(
+            1e-3 * spread.sign(), jacobian, one, torch.arange(rows) % 6, torch.arange(rows) % 4
+        )
+
+    class Fake(SimpleNamespace):
+        def problem(self):
+            one = torch.ones(2)
+            return gauss_newton.Problem(None, None, None, prior_mean=0 * one, prior_std=one, longest=one, noise=1e-3)
+
+        def secants(self, raw, steps):
+            return linear(self.rounding), None
+
+    scale = torch.tensor([1e-3])
+    at = gauss_newton.Iterate(torch.zeros(2), linear(0.0), True, scale, torch.ones(1), torch.tensor([torch.inf]))
+    names = [SimpleNamespace(name="youngs_modulus"), SimpleNamespace(name="contact_stiffness")]
+    for rounding, warned in ((1e-12, False), (1e-2, True)):
+        _, _, warnings, _ = linearity.check(Fake(unknowns=names, rounding=rounding), at)
+        assert bool(warnings) == warned
+
+
 # -- estimates -------------------------------------------------------------------------------------------------------
 
 

@@ -13,6 +13,7 @@ from .objective import Objective
 NONLINEAR = 0.5  # relative error of the tangents over a finite step above which they are not used for errors
 CURVED = 0.2  # the same over a standard error, from which an interval is noticeably longer to one side
 SMALLEST, LARGEST = 0.005, 0.1  # finite steps, in units of the prior's standard deviation
+UNSEEN = 0.01  # error over a finite step, in standard deviations of all data together, below which nobody sees it
 
 
 class Checked(NamedTuple):
@@ -35,7 +36,9 @@ def check(objective: Objective, final: gauss_newton.Iterate) -> Checked:
     secants, reach = objective.secants(final.raw, steps)
     weight = final.influence()[0].sqrt()[:, None]
     moved, slope = (weight * j[:, : len(steps)] for j in (secants.jacobian, final.linear.jacobian))
-    missed = (moved - slope).norm(dim=0) / moved.norm(dim=0).clamp(min=1e-12)
+    apart = (moved - slope).norm(dim=0)
+    seen = apart * steps > UNSEEN  # else of a parameter without effect, whose finite step moves the last digits only
+    missed = torch.where(seen, apart / moved.norm(dim=0).clamp(min=1e-12), 0.0)
     if float(missed.max()) < NONLINEAR:
         over_one = missed * deviation[: len(steps)] / steps
         curved = [u.name for u, error in zip(objective.unknowns, over_one, strict=True) if error >= CURVED]

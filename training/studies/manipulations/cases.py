@@ -36,12 +36,12 @@ class Setup:
         iterations: of a fit, at most.
     """
 
-    triangles: int = 200
-    gap: float = 0.04
+    triangles: int = 150
+    gap: float = 0.05
     rate: float = 12.0
-    points: int = 250
+    points: int = 200
     share: float = 0.5
-    iterations: int = 8
+    iterations: int = 5
 
     @property
     def fit(self) -> Discretisation:

@@ -22,9 +22,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     option(
         "--garments", nargs="+", choices=WORN, default=list(WORN), metavar="NAME", help=f"among {', '.join(WORN)} (all)"
     )
-    option("--count", type=int, metavar="N", help="manipulations of each garment (10; --fast: 1)")
-    option("--triangles", type=int, metavar="N", help="of each garment in the fit, about (200; the paper's: 1500)")
-    option("--gap", type=float, metavar="M", help="between layers that touch [m] (0.04; a real one asks for 0.005)")
+    option(
+        "--count", type=int, metavar="N", help="manipulations of each garment (10; --fast: one, of another action each)"
+    )
+    option("--triangles", type=int, metavar="N", help="of each garment in the fit, about (150; the paper's: 1500)")
+    option("--gap", type=float, metavar="M", help="between layers that touch [m] (0.05; a real one asks for 0.005)")
     option("--report", action="store_true", help="only report on the cases that are finished")
 
 
@@ -46,11 +48,13 @@ def cases(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
 
 def chosen(options: argparse.Namespace) -> tuple[Setup, list[Manipulation]]:
     """Settings, and the manipulations, one of every garment after the other so that a part of them is of use."""
-    setup, count = (FAST, 1) if options.fast else (Setup(), 10)
+    setup, count = FAST if options.fast else Setup(), 10 if options.count is None else options.count
     changes = {key: getattr(options, key) for key in ("triangles", "gap") if getattr(options, key) is not None}
-    count = count if options.count is None else options.count
     for key, value in {**changes, "count": count}.items():
         if not 0 < value < float("inf"):
             raise InvalidInput(f"--{key}", got=value, expected="a number > 0")
+    setup = replace(setup, **changes)
+    if options.fast and options.count is None:  # an action each
+        return setup, [manipulations(garment)[i] for i, garment in enumerate(options.garments)]
     each = [manipulations(garment, count) for garment in options.garments]
-    return replace(setup, **changes), [what for row in zip(*each, strict=True) for what in row]
+    return setup, [what for row in zip(*each, strict=True) for what in row]
