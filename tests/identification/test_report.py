@@ -115,7 +115,7 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
 
 
 def test_a_parameter_without_effect_makes_no_motion_unstable():
-    """Found with the stiffness of a contact that never happens: a finite step moves rounding errors, the tangent is 0."""
+    """Found with the stiffness of a contact that never happens: finite steps move rounding errors, the tangent is 0."""
     rows, one = 60, torch.ones(60)
     spread = torch.linspace(-1, 1, rows)
 

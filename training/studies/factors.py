@@ -13,6 +13,7 @@ from .manipulations.scenes import GRIPS, POSTURES, SPEEDS
 
 FACTORS = {"speed": SPEEDS, "grip": GRIPS, "posture": POSTURES}
 CONVENTIONS = ("vertices", "surface")
+LEAST = 3  # values before a mean is shown
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +26,7 @@ def run(chosen: argparse.Namespace) -> None:
     found = options.cases(chosen)
     seen = {factor: {c: distances(found, factor, c) for c in CONVENTIONS} for factor in FACTORS}
     values = {factor: {name: estimates(found, factor, name) for name in SOUGHT} for factor in FACTORS}
-    show(_distance_table(seen), _parameter_table(values), *NOTES)
+    show(_distance_table(seen), _parameter_table(values), *_notes(len(found)))
     write(
         chosen.out / "factors.json",
         {"distance": _plain(seen), "parameters_over_truth": _plain(values), "cases": len(found)},
@@ -58,31 +59,45 @@ def _by_level(found: dict[str, dict[str, Any]], factor: str, value: Any) -> Pool
 
 
 def _distance_table(seen: dict[str, dict[str, Pooled]]):
-    title = "Chamfer distance of the fitted garments over the levels of a factor"
     table = heading_table(
-        title, "factor", "convention", "grand mean [mm]", "pooled variance [m²]", "share between levels",
-        "levels [mm]", "| paper: grand mean [mm]", "pooled variance",
+        "Chamfer distance of the fitted garments over the levels of a factor", "factor", "to", "mean [mm]",
+        "variance [m²]", "between levels", "levels [mm]", "| paper: mean [mm]", "variance [m²]",
     )  # fmt: skip
     for factor, conventions in seen.items():
         mean, variance = paper.FACTORS[factor]
         for convention, p in conventions.items():
-            levels = ", ".join(f"{level} {mm(own.mean)}" for level, own in p.levels.items())
+            levels = " / ".join(mm(p.levels[level].mean) if level in p.levels else "–" for level in FACTORS[factor])
             theirs = [mm(mean), f"{variance:.2e}"] if convention == "vertices" else ["", ""]
-            table.add_row(factor, convention, mm(p.mean), f"{p.pooled:.2e}", _share(p), levels, *theirs)
+            cells = [mm(p.mean), number(p.pooled, 3), _share(p), levels]
+            table.add_row(factor, convention, *cells, *theirs, end_section=convention == CONVENTIONS[-1])
     return table
 
 
 def _parameter_table(values: dict[str, dict[str, Pooled]]):
-    title = "Identified parameters, over their truth (1 is right)"
-    table = heading_table(
-        title, "factor", "parameter", "grand mean", "pooled variance", "share between levels", "cases"
-    )
+    title = "Identified parameters over their truth (1 is right)"
+    table = heading_table(title, "factor", "parameter", "mean", "variance", "between levels", "levels", "cases")
     for factor, names in values.items():
         for name, p in names.items():
             count = sum(own.count for own in p.levels.values())
-            cells = [number(p.mean), number(p.pooled), _share(p)] if count > 1 else ["not identifiable", "", ""]
-            table.add_row(factor, name, *cells, str(count))
+            levels = " / ".join(
+                number(p.levels[level].mean, 3) if level in p.levels else "–" for level in FACTORS[factor]
+            )
+            cells = [number(p.mean, 3), number(p.pooled, 3), _share(p), levels]
+            shown = cells if count >= LEAST else ["not identifiable", "", "", ""]
+            table.add_row(factor, name, *shown, str(count), end_section=name == SOUGHT[-1])
     return table
+
+
+def _notes(cases: int) -> list[str]:
+    """What the numbers are worth."""
+    levels = "; ".join(f"{factor}: {' / '.join(names)}" for factor, names in FACTORS.items())
+    chance = f"{200 / (cases - 1):.0f} %" if cases > 1 else "all"
+    return [
+        f"Levels: {levels}. vertices: cloud to the nearest vertex (the paper's); surface: cloud to surface (ours).",
+        "The paper's pooled variance adds the variances within and between the levels, which gives that of all values: "
+        "of the same cases it is the same for every factor. What a factor does is the share between its levels; without "
+        f"any effect that is {chance} on average, with these {cases} cases.",
+    ]
 
 
 def _share(p: Pooled) -> str:
@@ -97,10 +112,3 @@ def _plain(values: dict[str, dict[str, Pooled]]) -> dict[str, Any]:
         }
         for factor, own in values.items()
     }
-
-
-NOTES = (
-    "The paper's pooled variance (within the levels plus between them) is the variance of all values, so with the same "
-    "cases it cannot differ between factors: the share between the levels is what a factor does. With three levels and "
-    "no effect at all it is about 2 / (n - 1): 7 % of 30 cases.",
-)

@@ -11,7 +11,14 @@ from .manipulations.measures import spread
 from .manipulations.printing import heading_table, number, percent, show, write
 
 LEAST = 3  # cases that identify a parameter before a mean is given
-SHORT = {"youngs_modulus": "E", "poisson_ratio": "nu", "contact_stiffness": "k", "shear_stiffness": "gamma"}
+SHOWN = {  # symbol, unit, SI units in one of these
+    "youngs_modulus": ("E", "[kPa]", 1e3),
+    "poisson_ratio": ("nu", "", 1.0),
+    "contact_stiffness": ("k", "[kPa]", 1e3),
+    "shear_stiffness": ("gamma", "[kPa]", 1e3),
+    "bending.stiffness": ("bending", "[uN m]", 1e-6),
+    "air.normal": ("air C_n", "", 1.0),
+}
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -63,33 +70,24 @@ def _garment(own: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _table(result: dict[str, dict[str, Any]]):
     table = heading_table(
-        "Parameters of garments: ours (mean of the manipulations that identify it) | the paper's",
-        "garment",
-        "parameter",
-        "truth",
-        "grand mean",
-        "error",
-        "CoV",
-        "identified",
-        "95 % holds truth",
-        "10 % moves",
-        "| paper",
-        "CoV",
-    )
+        "Parameters of garments: mean of the manipulations that identify them | the paper's", "garment", "parameter",
+        "truth", "mean", "error", "CoV", "cases", "in 95 %", "10 % moves [mm]", "| paper", "CoV",
+    )  # fmt: skip
     for garment, rows in result.items():
         for name, r in rows.items():
+            symbol, unit, scale = SHOWN[name]
             mean, cov = paper.PARAMETERS.get(name, {}).get(garment, (None, None))
             known = r["mean"] is not None
             table.add_row(
                 garment,
-                SHORT.get(name, name),
-                number(r["truth"]),
-                number(r["mean"]) if known else "not identifiable",
+                f"{symbol} {unit}",
+                number(r["truth"] / scale),
+                number(r["mean"] / scale) if known else "not identifiable",
                 f"{100 * (r['mean'] / r['truth'] - 1):+.0f} %" if known else "",
-                percent(r["cov"]),
+                percent(r["cov"]) if known else "",
                 f"{r['identified']} of {r['of']}",
                 f"{r['covered']} of {r['identified']}" if r["identified"] else "",
-                "" if r["moves_mm"] is None else f"{r['moves_mm']:.2g} mm",
+                number(r["moves_mm"]) if r["moves_mm"] is None or r["moves_mm"] >= 1e-3 else "none",
                 "" if mean is None else number(mean),
                 "" if cov is None else f"{cov:.1f} %",
                 end_section=name == FREE[-1],

@@ -19,7 +19,7 @@ class Spread(NamedTuple):
 
 def spread(values: Sequence[float]) -> Spread:
     """Mean and coefficient of variation (of the sample: n - 1); NaN where there is nothing to take them of."""
-    if not values:
+    if not len(values):
         return Spread(math.nan, math.nan, 0)
     mean = float(np.mean(values))
     return Spread(mean, float(np.std(values, ddof=1)) / mean if len(values) > 1 else math.nan, len(values))

@@ -30,10 +30,10 @@ def show(*parts: Any) -> None:
     """Print tables and notes, 132 columns wide or more."""
     from rich.console import Console
 
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     console.width = max(console.width, WIDTH)
     for part in parts:
-        console.print(part, markup=False) if isinstance(part, str) else console.print(part)
+        console.print(part)
 
 
 def write(path: Path, result: dict[str, Any]) -> None:
@@ -41,9 +41,9 @@ def write(path: Path, result: dict[str, Any]) -> None:
     write_text(path, json.dumps(_finite(result), indent=1, allow_nan=False) + "\n")
 
 
-def number(value: float | None) -> str:
-    """Four digits."""
-    return "–" if value is None or math.isnan(value) else f"{value:.4g}"
+def number(value: float | None, digits: int = 4) -> str:
+    """With so many digits."""
+    return "–" if value is None or math.isnan(value) else f"{value:.{digits}g}"
 
 
 def percent(share: float | None) -> str:
