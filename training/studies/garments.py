@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from .manipulations import cost, options, paper, pictures
+from .manipulations import cost, joint, options, paper, pictures
 from .manipulations.cases import FREE, SOUGHT
 from .manipulations.measures import spread
 from .manipulations.printing import heading_table, number, percent, show, write
@@ -25,12 +25,15 @@ def add(parser: argparse.ArgumentParser) -> None:
     """Options."""
     options.add(parser)
     cost.add(parser)
+    joint.add(parser)
 
 
 def run(chosen: argparse.Namespace) -> None:
-    """All cases, or the comparison of cost; then tables, result and pictures."""
+    """All cases, or what is done instead; then tables, result and pictures."""
     if chosen.cost:
         return cost.run(chosen)
+    if chosen.joint:
+        return joint.run(chosen)
     found = options.cases(chosen)
     result = {garment: _garment(own) for garment, own in _by_garment(found).items()}
     show(_table(result), *_notes(found))

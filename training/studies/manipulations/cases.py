@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,6 +76,24 @@ def solve(setup: Setup, what: Manipulation) -> dict[str, Any]:
         return case | stated(fit) | {"distance": _distances(setup, model, data, fit)}
     except (SimulationDiverged, UnstableStep) as error:
         return case | {"failed": str(error)}
+
+
+def solve_together(setup: Setup, whats: Sequence[Manipulation]) -> dict[str, Any]:
+    """One fit to the first halves of several manipulations of a garment that is held at the same places; as ``solve``.
+
+    Without "distance": nothing is predicted.
+    """
+    both = [seen(setup, what) for what in whats]
+    model, true = both[0][0], Fabric.true(whats[0].garment)
+    case = {"manipulations": [what.facts() for what in whats], "truth": true.named()}
+    recordings = [data.until(setup.share).recording for _, data in both]
+    try:
+        fit = identify(
+            model.cloth(true.start()), recordings, [*SOUGHT, *FREE], iterations=setup.iterations, warm_start=True
+        )
+    except (SimulationDiverged, UnstableStep) as error:
+        return case | {"failed": str(error)}
+    return case | stated(fit)
 
 
 def stated(fit: Identification) -> dict[str, Any]:

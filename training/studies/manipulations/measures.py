@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +34,7 @@ class Pooled(NamedTuple):
     levels: dict[str, Spread]
 
 
-def pooled(groups: dict[str, Sequence[float]]) -> Pooled:
+def pooled(groups: Mapping[str, Sequence[float]]) -> Pooled:
     """The paper's formula: sum over levels of N_i V_i + N_i (a_i - a)^2, by the number of all values.
 
     Its two parts add up to the variance of all values, whatever the levels: only the second knows the factor.

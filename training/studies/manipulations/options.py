@@ -27,6 +27,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     option("--triangles", type=int, metavar="N", help="of each garment in the fit, about (150; the paper's: 1500)")
     option("--gap", type=float, metavar="M", help="between layers that touch [m] (0.05; a real one asks for 0.005)")
+    option("--share", type=float, metavar="X", help="of the frames that are fitted, the early ones (0.5)")
     option("--report", action="store_true", help="only report on the cases that are finished")
 
 
@@ -49,11 +50,13 @@ def cases(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
 def chosen(options: argparse.Namespace) -> tuple[Setup, list[Manipulation]]:
     """Settings, and the manipulations, one of every garment after the other so that a part of them is of use."""
     setup, count = FAST if options.fast else Setup(), 10 if options.count is None else options.count
-    changes = {key: getattr(options, key) for key in ("triangles", "gap") if getattr(options, key) is not None}
+    changes = {key: getattr(options, key) for key in ("triangles", "gap", "share") if getattr(options, key) is not None}
     for key, value in {**changes, "count": count}.items():
         if not 0 < value < float("inf"):
             raise InvalidInput(f"--{key}", got=value, expected="a number > 0")
     setup = replace(setup, **changes)
+    if setup.share > 1:
+        raise InvalidInput("--share", got=setup.share, expected="a number in (0, 1]")
     if options.fast and options.count is None:  # an action each
         return setup, [manipulations(garment)[i] for i, garment in enumerate(options.garments)]
     each = [manipulations(garment, count) for garment in options.garments]

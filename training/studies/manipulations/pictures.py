@@ -49,7 +49,9 @@ def _estimate(axis: Any, case: dict[str, Any], name: str, place: float) -> None:
 
 
 def distances(result: dict[str, dict[str, Any]], path: Path) -> None:
-    """Both Chamfer conventions by action and by garment, with the paper's bars beside its own convention."""
+    """Both Chamfer conventions by action and by garment, with the paper's means; nothing where nothing was finished."""
+    if not any(result.values()):
+        return
     figure, axes = _figure(2, 3.8)
     for axis, (by, names) in zip(axes, (("action", ACTIONS), ("garment", WORN)), strict=True):
         rows = {name: result[by][name] for name in names if name in result[by]}
@@ -68,7 +70,9 @@ def distances(result: dict[str, dict[str, Any]], path: Path) -> None:
 
 
 def levels(factors: Mapping[str, Pooled], path: Path) -> None:
-    """Mean and standard deviation of the distance at every level."""
+    """Mean and standard deviation of the distance at every level; nothing where nothing was finished."""
+    if not any(p.levels for p in factors.values()):
+        return
     figure, axes = _figure(len(factors), 3.2)
     for axis, (factor, p) in zip(axes, factors.items(), strict=True):
         names = list(p.levels)
