@@ -95,8 +95,8 @@ def _notes(cases: int) -> list[str]:
     return [
         f"Levels: {levels}. vertices: cloud to the nearest vertex (the paper's); surface: cloud to surface (ours).",
         "The paper's pooled variance adds the variances within and between the levels, which gives that of all values: "
-        "of the same cases it is the same for every factor. What a factor does is the share between its levels; without "
-        f"any effect that is {chance} on average, with these {cases} cases.",
+        "of the same cases it is the same for every factor. What a factor does is the share between its levels; "
+        f"without any effect that is {chance} on average, with these {cases} cases.",
     ]
 
 
