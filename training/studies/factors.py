@@ -13,7 +13,7 @@ from .manipulations.scenes import GRIPS, POSTURES, SPEEDS
 
 FACTORS = {"speed": SPEEDS, "grip": GRIPS, "posture": POSTURES}
 CONVENTIONS = ("vertices", "surface")
-LEAST = 3  # values before a mean is shown
+LEAST = 3  # values before their variance is shown
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -83,7 +83,8 @@ def _parameter_table(values: dict[str, dict[str, Pooled]]):
                 number(p.levels[level].mean, 3) if level in p.levels else "–" for level in FACTORS[factor]
             )
             cells = [number(p.mean, 3), number(p.pooled, 3), _share(p), levels]
-            shown = cells if count >= LEAST else ["not identifiable", "", "", ""]
+            none = ["too few" if count else "not identifiable", "", "", ""]
+            shown = cells if count >= LEAST else none
             table.add_row(factor, name, *shown, str(count), end_section=name == SOUGHT[-1])
     return table
 

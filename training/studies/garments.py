@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+import numpy as np
+
 from .manipulations import cost, joint, options, paper, pictures
 from .manipulations.cases import FREE, SOUGHT
 from .manipulations.measures import spread
 from .manipulations.printing import heading_table, number, percent, show, write
 
-LEAST = 3  # cases that identify a parameter before a mean is given
+LEAST = 3  # cases that identify a parameter before their scatter is given
 SHOWN = {  # symbol, unit, SI units in one of these
     "youngs_modulus": ("E", "[kPa]", 1e3),
     "poisson_ratio": ("nu", "", 1.0),
@@ -49,7 +51,7 @@ def _by_garment(found: dict[str, dict[str, Any]]) -> dict[str, list[dict[str, An
 
 
 def _garment(own: list[dict[str, Any]]) -> dict[str, Any]:
-    """Parameter -> truth, mean and CoV of the cases that identify it, how many those are, and how far 10 % moves."""
+    """Parameter -> truth, mean and CoV of the cases that identify it, how many, and how far 10 % moves (median)."""
     out = {}
     for name in (*SOUGHT, *FREE):
         fits = [case for case in own if "found" in case]
@@ -57,16 +59,15 @@ def _garment(own: list[dict[str, Any]]) -> dict[str, Any]:
         over = spread([e["value"] for e in known])
         truth = own[0]["truth"][name]
         covered = sum(e["ci95"][0] <= truth <= e["ci95"][1] for e in known)
-        enough = over.count >= LEAST
         out[name] = {
             "truth": truth,
-            "mean": over.mean if enough else None,
-            "cov": over.cov if enough else None,
+            "mean": over.mean if known else None,
+            "cov": over.cov if over.count >= LEAST else None,
             "identified": over.count,
             "covered": covered,
             "of": len(own),
             "values": [e["value"] for e in known],
-            "moves_mm": spread([fit["moves_mm"][name] for fit in fits]).mean if fits else None,
+            "moves_mm": float(np.median([fit["moves_mm"][name] for fit in fits])) if fits else None,
         }
     return out
 

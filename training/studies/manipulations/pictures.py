@@ -15,27 +15,29 @@ from .scenes import ACTIONS, WORN
 
 COLOURS = {"cover": "#1f6f8b", "fling": "#b0653a", "drag": "#3d7f3d"}
 LABELS = {"youngs_modulus": "E", "poisson_ratio": "ν", "contact_stiffness": "k", "shear_stiffness": "γ"}
+WORDS = {"null": "rigid carry", "start": "not fitted", "fit": "fitted"}
 STATES = {"null": "#bbbbbb", "start": "#8fb8c8", "fit": "#1f6f8b"}
 
 
 def estimates(found: dict[str, dict[str, Any]], path: Path) -> None:
     """Every estimate over its truth with its 95 % interval, by garment; hollow and grey: not identifiable."""
-    figure, axes = _figure(len(SOUGHT), 3.6)
+    cases = [case for case in found.values() if "found" in case]
+    worn = [name for name in WORN if any(c["manipulation"]["garment"] == name for c in cases)]
+    if not worn:
+        return
+    figure, axes = _figure(len(SOUGHT), 1.6 + 1.0 * len(worn))
     for axis, name in zip(axes, SOUGHT, strict=True):
-        for row, garment in enumerate(WORN):
-            own = [c for c in found.values() if c["manipulation"]["garment"] == garment and "found" in c]
+        for row, garment in enumerate(worn):
+            own = [c for c in cases if c["manipulation"]["garment"] == garment]
             for i, case in enumerate(own):
-                _estimate(axis, case, name, row + 0.7 * (i / max(1, len(own) - 1) - 0.5 if len(own) > 1 else 0.0))
+                _estimate(axis, case, name, row + (0.75 * (i / (len(own) - 1) - 0.5) if len(own) > 1 else 0.0))
         axis.axvline(1.0, color="black", linewidth=0.8)
-        axis.set(
-            title=LABELS[name], xscale="log", xlim=(0.05, 20), yticks=range(len(WORN)), ylim=(len(WORN) - 0.5, -0.5)
-        )
-        axis.set(yticklabels=WORN if name == SOUGHT[0] else [])
-        axis.set_xlabel("estimate / truth")
+        axis.set(title=LABELS[name], xscale="log", xlim=(0.05, 20), xlabel="estimate / truth")
+        axis.set(yticks=range(len(worn)), ylim=(len(worn) - 0.5, -0.5), yticklabels=worn if axis is axes[0] else [])
     for action, colour in COLOURS.items():
-        axes[0].plot([], [], "o", color=colour, label=action)
-    axes[0].plot([], [], "o", color="#bbbbbb", markerfacecolor="none", label="not identifiable")
-    axes[0].legend(fontsize=7, loc="lower left")
+        axes[0].plot([], [], "o-", color=colour, label=f"{action}, with 95 % interval")
+    axes[0].plot([], [], "o-", color="#bbbbbb", markerfacecolor="none", label="not identifiable")
+    figure.legend(fontsize=8, loc="outside lower center", ncols=4)
     _save(figure, path)
 
 
@@ -58,14 +60,16 @@ def distances(result: dict[str, dict[str, Any]], path: Path) -> None:
         for i, (name, conventions) in enumerate(rows.items()):
             for j, (convention, hatch) in enumerate((("surface", ""), ("vertices", "//"))):
                 for k, (state, colour) in enumerate(STATES.items()):
-                    label = f"{state}, to {convention}" if i == 0 else None
+                    label = f"{WORDS[state]}, to {convention}" if i == 0 else None
                     value = 1e3 * conventions[convention][state]["mean"]
                     place = i + 0.12 * (3 * j + k - 3)
                     axis.bar(place, value, 0.11, color=colour, hatch=hatch, edgecolor="white", label=label)
-            axis.plot(i + 0.42, 1e3 * paper.CHAMFER[name][0], "D", color="#b0653a", label="paper" if i == 0 else None)
-        axis.set(title=f"by {by}", xticks=range(len(rows)), xticklabels=list(rows), yscale="log")
+            axis.plot(i + 0.43, 1e3 * paper.CHAMFER[name][0], "D", color="#b0653a", label="paper" if i == 0 else None)
+        axis.set(title=f"by {by}", xticks=range(len(rows)), xticklabels=list(rows), yscale="log", ylim=(0.8, 200))
+        axis.set(yticks=(1, 3, 10, 30, 100), yticklabels=(1, 3, 10, 30, 100))
+        axis.minorticks_off()
     axes[0].set_ylabel("mean Chamfer distance [mm]")
-    axes[1].legend(fontsize=7, ncols=2)
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4)
     _save(figure, path)
 
 
