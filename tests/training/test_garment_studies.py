@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchcloth.training.studies import command
-from torchcloth.training.studies.manipulations import cases, options, paper
+from torchcloth.training.studies.manipulations import cases, joint, options, paper
 from torchcloth.training.studies.manipulations.measures import pooled, spread
 from torchcloth.training.studies.manipulations.scenes import (
     ACTIONS,
@@ -184,6 +184,7 @@ def test_a_failed_case_is_counted_and_no_number(solved, tmp_path, monkeypatch, c
         (["--count", "0"], "--count"),
         (["--triangles", "-3"], "--triangles"),
         (["--gap", "nan"], "--gap"),
+        (["--share", "1.5"], "--share"),
         (["--report"], "no finished case"),
     ],
 )
@@ -201,6 +202,28 @@ def test_another_setting_needs_another_folder(solved, tmp_path, monkeypatch, cap
     assert call("garments", tmp_path, "--garments", "dress") == 0
     assert call("chamfer", tmp_path, "--garments", "dress", "--gap", "0.07") == 2
     assert "gap" in capsys.readouterr().err
+
+
+def test_a_joint_fit_takes_what_is_held_alike_and_calm(solved, tmp_path, monkeypatch, capsys):
+    asked = {}
+
+    def solve_together(setup, whats):
+        asked[whats[0].garment] = [what.number for what in whats]
+        return {**pretended(solved, 0.9)(setup, whats[0]), "manipulations": [what.facts() for what in whats]}
+
+    monkeypatch.setattr(joint, "solve_together", solve_together)
+    assert call("garments", tmp_path, "--joint", "--count", "10", "--garments", "dress") == 0
+    assert asked == {"dress": [0, 5, 9]}, "covers and drags at the corners"
+    printed = capsys.readouterr().out
+    assert "0.81 … 0.99" in printed
+    assert "3 episodes" in printed
+
+
+def test_two_manipulations_can_be_fitted_at_once():
+    together = cases.solve_together(SMALL, [manipulations("dress")[i] for i in (2, 2)])
+    assert set(together["found"]) == {*cases.SOUGHT, *cases.FREE}
+    assert len(together["manipulations"]) == 2
+    json.dumps(together, allow_nan=False)
 
 
 @pytest.mark.slow

@@ -68,29 +68,30 @@ def _measure(setup: Setup, garment: str, method: Any, steps: int) -> dict[str, A
 
 def _table(found: dict[str, dict[str, Any]]):
     table = heading_table(
-        "Cost of a fit of E, nu, k and gamma to all frames", "garment", "method", "triangles", "motion", "iterations",
-        "simulations", "clock", "processor", "Chamfer before", "after [mm]", "E over truth",
+        "Cost of a fit of E, nu, k and gamma to all frames of a drag", "garment", "method", "triangles", "motion",
+        "iterations", "simulations", "clock", "processor", "start [mm]", "end [mm]", "E / truth",
     )  # fmt: skip
     for row in found.values():
-        end = "" if row["converged"] else ", not converged"
+        end = "" if row["converged"] else " *"
         table.add_row(
             row["garment"],
-            row["method"] + end,
+            row["method"],
             str(row["triangles"]),
             f"{row['length']:.2f} s",
-            f"{row['iterations']:.0f}",
+            f"{row['iterations']:.0f}{end}",
             f"{row['simulations']:.0f}",
             f"{row['seconds']:.0f} s",
             f"{row['processor']:.0f} s",
             mm(row["chamfer_before"]),
             mm(row["chamfer_after"]),
-            number(row["values"]["youngs_modulus"]),
+            number(row["values"]["youngs_modulus"], 3),
         )
     return table
 
 
 NOTE = (
-    "Chamfer: one-sided, cloud to surface. Clock: with whatever else ran; processor: of this process alone. "
-    "Gauss-Newton counts each of its tangents as a simulation, and ends with error bars; gradient descent follows the "
-    "paper's loss (cloud to nearest vertex), in logarithms, and has no test of convergence."
+    "*: stopped there, not converged. Distances: Chamfer, one-sided, cloud to surface. Clock: with whatever else ran; "
+    "processor: of this process alone. Gauss-Newton counts each of its tangents as a simulation, and ends with error "
+    "bars; gradient descent follows the paper's loss (cloud to nearest vertex), in logarithms, and has no test of "
+    "convergence."
 )
