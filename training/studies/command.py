@@ -12,11 +12,8 @@ import torch
 
 from torchcloth.errors import TorchclothError
 
-STUDIES: tuple[str, ...] = (
-    "classify",
-    "fabrics",
-    "measured",
-)  # modules of this package, with ``add(parser)`` and ``run(options)``
+# Modules of this package; ``add(parser)`` declares options, ``run(options)`` does it.
+STUDIES: tuple[str, ...] = ("fabrics", "garments", "chamfer", "factors", "classify", "measured")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
