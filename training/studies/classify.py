@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"result:  {options.out / 'classify.json'}\npicture: {picture}")
 
 
-def _trials(cases: Sequence[Mapping[str, Any]] | Any, names: Sequence[str]) -> list[Trial]:
+def _trials(cases: Iterable[Mapping[str, Any]], names: Sequence[str]) -> list[Trial]:
     """Of the cases that know all the parameters."""
     out = []
     for case in cases:

@@ -119,6 +119,11 @@ def _marks(result: Mapping[str, Any]) -> list[str]:
         judged = {name: value for name, value in kept.items() if value is not None}
         missed = ", ".join(FABRICS[name] for name, value in judged.items() if not value)
         lines.append(f"{promise}: {sum(judged.values())} of {len(judged)}" + (f"; not {missed}" if missed else ""))
+    counts = []
+    for symbol in ("E", "ν"):
+        own = [fabric[symbol]["stretched"] for fabric in result["fabrics"].values()]
+        counts.append(f"{sum(s.get('covered') or 0 for s in own)} of {sum(s['identifiable'] for s in own)} of {symbol}")
+    lines.append(f"95 % intervals hold the truth in {', '.join(counts)}: the model's coarser mesh is in no error bar")
     return [*lines, f"{result['seconds']:.0f} s a fit (median)"]
 
 

@@ -143,7 +143,7 @@ def press(name: str, index: int, scale: Scale, elsewhere: bool) -> dict[str, Any
 
 
 def told(fit: Identification, names: tuple[str, ...]) -> dict[str, Any]:
-    """What a fit says of some parameters; errors also in the unconstrained coordinate, in which they are normal."""
+    """What a fit says of some parameters."""
     out: dict[str, Any] = {}
     for name in names:
         e, i = fit.parameters[name], fit.influences[name]

@@ -77,7 +77,7 @@ def record(layer: Layer, plates: Plates, seed: int) -> rec.Recording:
     cloth, paths = stack(layer, plates), motion(plates)
     recording = rec.Recording(
         cloth=rec.ClothInfo(areal_density=layer.density),
-        provenance="synthetic: torchcloth, the same law on another mesh, with another step, elsewhere in the grid",
+        provenance="synthetic: torchcloth, the same law on another mesh, with another step",
         grippers=paths,
     )
     knots = paths["above"].t
