@@ -69,7 +69,7 @@ def _measure(setup: Setup, garment: str, method: Any, steps: int) -> dict[str, A
 def _table(found: dict[str, dict[str, Any]]):
     table = heading_table(
         "Cost of a fit of E, nu, k and gamma to all frames of a drag", "garment", "method", "triangles", "motion",
-        "iterations", "simulations", "clock", "processor", "start [mm]", "end [mm]", "E / truth",
+        "iterations", "simulations", "clock", "processor", "Chamfer [mm]", "E / truth",
     )  # fmt: skip
     for row in found.values():
         end = "" if row["converged"] else " *"
@@ -82,8 +82,7 @@ def _table(found: dict[str, dict[str, Any]]):
             f"{row['simulations']:.0f}",
             f"{row['seconds']:.0f} s",
             f"{row['processor']:.0f} s",
-            mm(row["chamfer_before"]),
-            mm(row["chamfer_after"]),
+            f"{mm(row['chamfer_before'])} > {mm(row['chamfer_after'])}",
             number(row["values"]["youngs_modulus"], 3),
         )
     return table
