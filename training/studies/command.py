@@ -12,7 +12,9 @@ import torch
 
 from torchcloth.errors import TorchclothError
 
-STUDIES: tuple[str, ...] = ()  # modules of this package; ``add(parser)`` declares options, ``run(options)`` does it
+STUDIES: tuple[str, ...] = (
+    "pose",
+)  # modules of this package; ``add(parser)`` declares options, ``run(options)`` does it
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
