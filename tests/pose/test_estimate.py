@@ -1,10 +1,14 @@
 """The whole: against truth, with right and wrong models, as one continuous motion."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 import twins
 from occluded import WRONG, model
 
+from torchcloth import recordings as rec
 from torchcloth.effects import BodyForce
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import episode
@@ -94,6 +98,29 @@ def test_the_last_state_goes_on(scene, right):
     out = cloth(right.last._replace(x=x), episode(cloth, scene.recording).motion, [0.70, 0.71])
     out.x[-1, :, 2].mean().backward()
     assert float(x.grad.norm()) > 0
+
+
+def test_another_effect_of_that_name_is_not_overwritten(scene):
+    cloth = model(scene, twins.TRUE)
+    cloth.effects["correction"] = BodyForce(torch.zeros(1, 3))
+    with pytest.raises(InvalidInput, match="correction"):
+        estimate_pose(cloth, scene.recording)
+
+
+def test_markers_alone(scene):
+    """The full mesh from a few material points that are seen now and then."""
+    uv = np.array([[0.1, 0.1], [0.2, 0.05], [0.1, 0.2], [0.2, 0.25], [0.15, 0.15]])
+    mesh = model(scene, twins.TRUE).mesh
+    xyz = np.stack([twins.bilinear(x, twins.FIT, uv) for x in scene.truth.numpy()])
+    xyz[::3, :2] = np.nan
+    times = scene.recording.points.t
+    recording = replace(scene.recording, points=None, markers=rec.Markers(times, xyz, uv))
+    found = estimate_pose(model(scene, WRONG), recording, modes=4, window=0.18)
+    assert np.isfinite(found.std.numpy()).all()
+    assert rms(found.x, scene, scene.hidden) < 0.6 * rms(found.alone, scene, scene.hidden)
+    assert any("no points" in warning for warning in found.warnings)
+    assert 0 < float(found.seen.double().mean()) < 1
+    assert len(mesh.vertices) == found.x.shape[1]
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from occluded import model
 from torchcloth.identification import episode
 from torchcloth.identification.blocks import blocks_for
 from torchcloth.identification.nuisances import chosen
+from torchcloth.identification.objective import Objective
 from torchcloth.identification.replays import Replay
 from torchcloth.identification.unknowns import collect
 from torchcloth.pose.modes import modes_of
@@ -73,7 +74,15 @@ def test_windows_cover_all_frames(times, length):
     assert all(before[1] == after[0] for before, after in pairwise(windows))
 
 
-def test_a_part_has_the_same_unknowns(objective):
-    part = objective.part(0.5)
-    assert len(part.start) == len(objective.start)
-    assert len(part.frames(part.start)[0]) == 4
+def test_a_part_is_the_beginning_of_the_same_motion(objective):
+    part, raw = objective.part(0.5), objective.start + 0.3 * objective.prior_std
+    torch.testing.assert_close(part.frames(raw)[0][:3], objective.frames(raw)[0][:3])  # the last has no end to lean on
+
+
+def test_the_early_frames_of_a_fit_are_the_beginning_of_the_same_motion(scene):
+    """``identify`` never sets velocity or rest shape anew: what it begins with is a prefix."""
+    cloth = model(scene, twins.TRUE)
+    data = episode(cloth, twins.first(scene.recording, 8))
+    whole = Objective(cloth, collect(cloth, ["youngs_modulus"], None), [data])
+    raw = whole.start + 0.1
+    torch.testing.assert_close(whole.part(0.5).frames(raw)[0], whole.frames(raw)[0][:4], rtol=0, atol=1e-12)

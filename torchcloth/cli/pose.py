@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from ..pose import PoseEstimate
     from ..recordings import Recording
 
+PICTURE = (520, 440)  # pixels of each of four moments
+
 
 def add(verbs: Any) -> None:
     """The verb and its options."""
@@ -55,7 +57,7 @@ def _pose(options: argparse.Namespace) -> int:
     estimate = _estimate(options, cloth, uncertain, recording)
     files = estimate.save(options.out)
     film = viewing.film_of_pose(recording, estimate, truth=options.truth)
-    picture = viewing.picture(film, options.out / "pose.png")
+    picture = viewing.picture(film, options.out / "pose.png", size=PICTURE)
     print_pose(estimate)
     print("result: " + ", ".join(str(path) for path in (*files, picture)))
     return 0

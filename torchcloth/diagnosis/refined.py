@@ -31,7 +31,7 @@ def refined(model: Model, recordings: Sequence[Recording]) -> tuple[Model, list[
             vertices=finer.vertices,
             faces=finer.faces,
             uv=finer.uv,
-            initial_vertices=None if first is None else between(first),
+            initial_vertices=between(first) if first is not None and first.ndim == 2 else first,  # or a sheet's grid
         )
         found.append(replace(recording, cloth=info))
     return replace(model, base=World(cloth, model.base.motions, model.base.views)), found

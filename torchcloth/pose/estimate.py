@@ -74,7 +74,7 @@ def estimate_pose(
         Frames with standard errors, visibility, forces, warnings.
 
     Raises:
-        InvalidInput: options out of range.
+        InvalidInput: options out of range, or a cloth that has an effect "correction" already.
         RecordingError: a recording without motion, or with nothing seen or felt.
         SimulationDiverged: the cloth cannot be simulated with these values.
     """
@@ -106,11 +106,8 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         alone, null = objective.frames(objective.start)[0], rigid_carry(data)
         std = _errors(objective, found, frames.x, moved.x, fields)
         last = objective.last_state(raw)
-    seen = seen_vertices(frames.x, data, cloth.mesh)
-    shares = _shares(objective, raw, gravity)
-    names = {"after": frames.x, "alone": alone, "null": null}
-    distances = {key: figures([x], [data], objective.faces) for key, x in names.items()}
-    fit: dict[str, Any] = {f"{what}_{k}": getattr(f, what) for what in ("chamfer", "rms") for k, f in distances.items()}
+    seen, shares = seen_vertices(frames.x, data, cloth.mesh), _shares(objective, raw, gravity)
+    fit = _distances(objective, {"after": frames.x, "alone": alone, "null": null})
     fit |= {
         "force_share": float(shares.square().mean().sqrt()),
         "force_share_max": float(shares.max()),
@@ -119,9 +116,9 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         "point_noise": float(found.final.scale[0]) if any(len(c) for c in data.clouds) else math.nan,
         "converged": found.converged,
         "unknowns": len(raw),
-        "simulations": objective.simulations,
         "seconds": time.perf_counter() - began,
     }
+    fabric = estimates(cloth, objective.unknowns, raw, found.covariance).parameters
     return PoseEstimate(
         times=data.times,
         x=frames.x,
@@ -135,15 +132,16 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         alone=alone,
         null=null,
         last=last,
-        parameters={
-            name: e
-            for name, e in estimates(cloth, objective.unknowns, raw, found.covariance).parameters.items()
-            if name in {u.name for u in objective.unknowns}
-        },
+        parameters={u.name: fabric[u.name] for u in objective.unknowns},
         nuisances=next(iter(nuisance_estimates([data], objective.placed, raw, found.covariance).values())),
         fit=fit,
         warnings=warnings_of(fit, shares, seen, data, objective.correction),
     )
+
+
+def _distances(objective: Corrected, frames: Mapping[str, Tensor]) -> dict[str, Any]:
+    found = {key: figures([x], objective.episodes, objective.faces) for key, x in frames.items()}
+    return {f"{what}_{key}": getattr(f, what) for what in ("chamfer", "rms") for key, f in found.items()}
 
 
 def _errors(objective: Corrected, found: Smoothed, x: Tensor, moved: Tensor, fields: Modes) -> Tensor:

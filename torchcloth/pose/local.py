@@ -2,7 +2,7 @@
 
 The residuals of a frame are taken as noise and a smooth random field without the coarse modes, those being the forces'.
 Its size is the mean over its likelihood, frame by frame; the noise is that of all frames. The field widens the standard
-errors and moves nothing: moved by it, hidden vertices came out worse in every scene that was tried (docs/pose.md).
+errors and moves nothing: moved by it, hidden vertices came out worse where it was tried (docs/pose.md).
 """
 
 from __future__ import annotations

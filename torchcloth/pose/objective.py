@@ -13,6 +13,7 @@ from torch.func import functional_call
 
 from ..cloth import Cloth
 from ..effects import BodyForce
+from ..errors import InvalidInput
 from ..identification import gauss_newton
 from ..identification.blocks import Block
 from ..identification.episodes import Episode
@@ -63,7 +64,13 @@ def windows_of(times: Tensor, length: float) -> list[tuple[int, int]]:
 
 
 def pushable(cloth: Cloth) -> Cloth:
-    """A copy of a cloth with one effect more, a body force of zero."""
+    """A copy of a cloth with one effect more, a body force of zero.
+
+    Raises:
+        InvalidInput: it has an effect of this name already.
+    """
+    if CORRECTION in cloth.effects:
+        raise InvalidInput("effects of the cloth", got=repr(CORRECTION), expected="another name: the estimate needs it")
     own = copy.deepcopy(cloth)
     own.effects[CORRECTION] = BodyForce(torch.zeros_like(own.rest_state().x)).bind(own.mesh)
     return own

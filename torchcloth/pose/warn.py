@@ -16,7 +16,9 @@ MISSED = 1.3  # rms over the stated noise
 BLIND = 0.3  # s without anything seen
 
 
-def warnings_of(fit: Mapping[str, Any], shares: Tensor, seen: Tensor, data: Episode, correction: Correction):
+def warnings_of(
+    fit: Mapping[str, Any], shares: Tensor, seen: Tensor, data: Episode, correction: Correction
+) -> list[str]:
     """Sentences."""
     out = []
     if fit["force_share"] > LARGE:
@@ -35,6 +37,8 @@ def warnings_of(fit: Mapping[str, Any], shares: Tensor, seen: Tensor, data: Epis
         out.append("no better than a cloth that is carried rigidly: do not use this estimate")
     if not fit["converged"]:
         out.append("the search did not converge: another estimate may fit as well")
+    if not any(len(cloud) for cloud in data.clouds):
+        out.append("no points were seen: shapes finer than the correction's modes are in no standard error")
     blind = _longest_gap(data.times, seen.any(1))
     if blind > BLIND:
         out.append(f"nothing was seen for {blind:.2f} s: there the estimate is simulation alone")

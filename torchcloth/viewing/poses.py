@@ -1,4 +1,4 @@
-"""A pose estimate beside what was measured, coloured by its standard error."""
+"""A pose estimate beside what was measured; what was hidden is coloured by its standard error."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ import numpy as np
 from ..pose import PoseEstimate
 from ..recordings import Recording
 from .episodes import film_of
-from .film import Cloud, Film, Sheet
+from .film import Film, Sheet
 
-HIDDEN = (214, 40, 140)
 LEAST = 2.0  # mm, that the colour bar spans at least
-QUANTILE = 0.95  # of the errors, is dark red
+QUANTILE = 0.95  # of the hidden vertices' errors, is dark red
 
 
 def film_of_pose(recording: Recording, estimate: PoseEstimate, *, truth: bool = False) -> Film:
-    """An episode and its estimate; vertices that nothing was seen of are dots.
+    """An episode and its estimate: grey where the cloth was seen.
 
     Args:
         recording: the one that was estimated from.
@@ -27,14 +26,12 @@ def film_of_pose(recording: Recording, estimate: PoseEstimate, *, truth: bool = 
     film = film_of(recording, truth=truth, times=estimate.times.numpy())
     x, seen = estimate.x.numpy().astype(np.float32), estimate.seen.numpy()
     error = 1e3 * estimate.std.square().sum(-1).sqrt().numpy().astype(np.float32)
-    worst = max(LEAST, float(np.ceil(np.quantile(error, QUANTILE))))
-    dots = Cloud(tuple(frame[~own] for frame, own in zip(x, seen, strict=True)), HIDDEN)
+    worst = max(LEAST, float(np.ceil(np.quantile(error[~seen], QUANTILE)))) if not seen.all() else LEAST
     nets = {name: replace(sheet, net=True) for name, sheet in film.sheets.items()}
     return replace(
         film,
         title=f"{film.title}: pose, corrective force {100 * estimate.fit['force_share']:.1f} % of the weight",
-        sheets={**nets, "cloth": Sheet(x, estimate.faces.numpy(), error)},
-        clouds={**film.clouds, "hidden": dots},
+        sheets={**nets, "cloth": Sheet(x, estimate.faces.numpy(), np.where(seen, np.nan, error))},
         worst=worst,
-        legend="standard error of a vertex",
+        legend="standard error, hidden vertices",
     )

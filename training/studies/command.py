@@ -13,7 +13,7 @@ import torch
 from torchcloth.errors import TorchclothError
 
 # Modules of this package; ``add(parser)`` declares options, ``run(options)`` does it.
-STUDIES: tuple[str, ...] = ("fabrics", "garments", "chamfer", "factors", "classify", "measured")
+STUDIES: tuple[str, ...] = ("fabrics", "garments", "chamfer", "factors", "classify", "measured", "pose")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
