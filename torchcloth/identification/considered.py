@@ -27,6 +27,10 @@ def covariance_of(objective: Objective, checked: Checked, strata: Tensor | None 
     if count >= FEWEST:
         strata = torch.zeros(count, dtype=torch.int64) if strata is None else strata
         own = gauss_newton.at_least(own, scatter(problem, final, objective.episode_of(final.linear), strata))
+    if not final.converged:  # the answer of a search that was cut short is as uncertain as the way that is left
+        gradient, hessian = gauss_newton.normal_equations(problem, final)
+        left = torch.linalg.solve(hessian, gradient)
+        own = gauss_newton.at_least(own, own.diagonal() + left.square())
     return with_first_shape(objective, final, own)
 
 

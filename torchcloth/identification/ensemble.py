@@ -146,6 +146,8 @@ def _settle(
 def _seen_only(problem: gauss_newton.Problem, at: Iterate) -> Iterate:
     """Without slopes that are no larger than their own errors: those of unknowns that ripples hide."""
     weight, linear = at.influence()[0], at.linear
+    if linear.wobble is None or linear.blur is None:
+        return at
     size = weight @ linear.jacobian.square()
     error = (weight * linear.wobble).sum() * linear.blur.diagonal()
     jacobian = torch.where(size > SEEN * error, linear.jacobian, 0.0)
