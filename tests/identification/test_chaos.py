@@ -151,6 +151,9 @@ def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
     """Each search begins where the last ended; a failure after a success ends the growth, two halvings refine it."""
     asked = []
 
+    def motion(frames):
+        return SimpleNamespace(times=torch.arange(frames) / 10.0, observed=frames)
+
     def solved(objective, share, start, on_iterate):
         asked.append((share, float(start)))
         part = SimpleNamespace(
@@ -160,7 +163,7 @@ def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
         return (part, checked) if 0.12 < share < 0.45 else None
 
     monkeypatch.setattr(horizon, "_solved", solved)
-    whole = SimpleNamespace(episodes=[SimpleNamespace(times=torch.arange(100) / 10.0, observed=100)])
+    whole = SimpleNamespace(episodes=[motion(100)])
     found = horizon.within(whole, FAILED, torch.tensor(0.0), lambda it, o: False)
     shares = [share for share, _ in asked]
     assert shares == pytest.approx([0.1, 0.15, 0.22, 0.33, 0.5, 0.415, 0.4575])

@@ -27,6 +27,8 @@ def covariance_of(objective: Objective, checked: Checked, strata: Tensor | None 
     if count >= FEWEST:
         strata = torch.zeros(count, dtype=torch.int64) if strata is None else strata
         own = gauss_newton.at_least(own, scatter(problem, final, objective.episode_of(final.linear), strata))
+    if checked.withdrawn:  # nothing of it will be used
+        return own
     if not final.converged:  # the answer of a search that was cut short is as uncertain as the way that is left
         gradient, hessian = gauss_newton.normal_equations(problem, final)
         left = torch.linalg.solve(hessian, gradient)
