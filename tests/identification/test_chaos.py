@@ -35,10 +35,10 @@ def swung(tmp_path_factory):
     return replace(made, points=points, observation_noise_std=None)  # its first shape is exact
 
 
-def test_a_light_sheet_that_buckles_is_identified_from_what_can_be_predicted(swung):
-    """Started half as stiff again: stiffness and drag to a few per cent, with errors that hold the truth."""
-    model = cloth_from(swung)
-    fit = identify(model, swung, list(TRUE), iterations=5)  # tangents of the whole lead nowhere
+def test_a_light_sheet_that_buckles_is_identified_from_what_can_be_predicted(swung, tmp_path):
+    """Started half as stiff again: stiffness and drag to a few per cent, with errors that hold the truth; resumable."""
+    model, options = cloth_from(swung), {"iterations": 5, "journal": tmp_path / "journal"}
+    fit = identify(model, swung, list(TRUE), **options)  # few iterations: tangents of the whole lead nowhere
     for name, truth in TRUE.items():
         found = fit.parameters[name]
         assert found.identifiable
@@ -48,6 +48,10 @@ def test_a_light_sheet_that_buckles_is_identified_from_what_can_be_predicted(swu
     assert "derivatives hold for the first 0." in fit.warnings[0]
     assert "of 20, were used" in fit.warnings[0]
     assert not any("model misses something" in warning for warning in fit.warnings)
+    again = identify(model, swung, list(TRUE), resume=True, **options)
+    assert again.history == fit.history
+    assert again.parameters == fit.parameters
+    assert {**again.fit, "seconds": 0} == {**fit.fit, "seconds": 0}
 
 
 def test_tangents_of_a_light_sheet_run_away_and_those_of_its_beginning_do_not(swung):
@@ -147,14 +151,19 @@ def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
     """Each search begins where the last ended; a failure after a success ends the growth, two halvings refine it."""
     asked = []
 
+    def motion(frames):
+        return SimpleNamespace(times=torch.arange(frames) / 10.0, observed=frames)
+
     def solved(objective, share, start, on_iterate):
         asked.append((share, float(start)))
-        part = SimpleNamespace(episodes=[SimpleNamespace(times=torch.arange(round(100 * share)) / 10.0)])
+        part = SimpleNamespace(
+            episodes=[SimpleNamespace(times=torch.arange(round(100 * share)) / 10.0, observed=round(100 * share))]
+        )
         checked = linearity.Checked(SimpleNamespace(raw=torch.tensor(share)), None, [], [])
         return (part, checked) if 0.12 < share < 0.45 else None
 
     monkeypatch.setattr(horizon, "_solved", solved)
-    whole = SimpleNamespace(episodes=[SimpleNamespace(times=torch.arange(100) / 10.0)])
+    whole = SimpleNamespace(episodes=[motion(100)])
     found = horizon.within(whole, FAILED, torch.tensor(0.0), lambda it, o: False)
     shares = [share for share, _ in asked]
     assert shares == pytest.approx([0.1, 0.15, 0.22, 0.33, 0.5, 0.415, 0.4575])

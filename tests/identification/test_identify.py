@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from twins import TRUE, at, first, twin
+from twins import THICKNESS, TRUE, at, first, twin
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
@@ -200,6 +200,17 @@ def test_the_papers_stop_rule_ends_a_fit_that_is_good_enough(model, brief, metho
     assert not fit.fit["converged"]
     assert fit.parameters["youngs_modulus"].value == pytest.approx(8e4)
     assert fit.fit["chamfer_after"] == pytest.approx(fit.fit["chamfer_before"], rel=1e-12)
+
+
+@pytest.mark.parametrize("options", [{"stop": "paper"}, {"method": "adam", "stop": "paper"}])
+def test_no_search_that_never_moved_presents_its_start_as_the_answer(model, brief, options):
+    """DiffCloth, issue 24: the start value came back as the result. Here the way that is left is in the error."""
+    fit = identify(model, brief, ["youngs_modulus"], **options)
+    found = fit.parameters["youngs_modulus"]
+    assert found.value == pytest.approx(found.initial)  # twice the truth
+    assert not found.identifiable
+    assert found.ci95[0] < TRUE.membrane / THICKNESS < found.ci95[1]
+    assert fit.apply(at(brief)).material.youngs_modulus.value.item() == pytest.approx(8e4)  # as the data sheet has it
 
 
 def test_iterations_are_at_most_what_was_asked(model, brief):

@@ -1,5 +1,7 @@
 """What differs from episode to episode: derivatives, recovery, and that it is kept apart from the fabric."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import stretches
@@ -10,6 +12,7 @@ from torchcloth.errors import InvalidInput
 from torchcloth.identification import episode, identify
 from torchcloth.identification.nuisances import KINDS, chosen
 from torchcloth.identification.objective import Objective
+from torchcloth.identification.replays import simulate
 from torchcloth.identification.unknowns import collect
 
 EVERY = ("clock", "camera", "tare", "grasp", "shape")
@@ -68,9 +71,27 @@ def test_a_late_clock_is_found(pulled):
     assert "clock" not in fit.parameters
 
 
-def test_a_shifted_camera_is_found_and_the_fabric_stays(pulled):
-    from dataclasses import replace
+def test_a_late_clock_sees_what_comes_after_the_last_frame(pulled):
+    """Against a simulation at the later times; without more frames the cloth would stand still at the last."""
+    model = stretches.model(pulled)
+    seen = episode(model, pulled)
+    longer, late = seen.beyond(0.09), 0.05
+    assert longer.observed == len(seen.times)
+    assert float(longer.times[-1]) == pytest.approx(float(seen.times[-1]) + 0.09)
+    assert [len(longer.clouds[t]) for t in range(len(seen.times), len(longer.times))] == [0, 0]
+    assert not bool(longer.markers[len(seen.times) :].isfinite().any())
+    own = collect(model, ["youngs_modulus"], None)
+    raw = torch.tensor([own[0].start])
+    truth = simulate(model, own, raw, replace(seen, times=torch.cat([seen.times, seen.times[-1:] + late]))).x[-1]
+    clock = KINDS["clock"]()
+    errors = []
+    for given in (longer, seen):
+        frames = clock.see(simulate(model, own, raw, given), torch.tensor([late]), given)
+        errors.append((frames.x[len(seen.times) - 1] - truth).norm(dim=-1).max().item())
+    assert errors[0] < 0.1 * errors[1]
 
+
+def test_a_shifted_camera_is_found_and_the_fabric_stays(pulled):
     points, markers = pulled.points, pulled.markers
     shift = np.array([0.002, -0.003, 0.004])
     moved = replace(

@@ -8,7 +8,8 @@ import torch
 import toys
 
 from torchcloth import recordings as rec
-from torchcloth.identification.gauss_newton import WINDOW, covariance, minimise, student
+from torchcloth.identification import replicates
+from torchcloth.identification.gauss_newton import WINDOW, at_least, covariance, minimise, student
 from torchcloth.identification.replicates import strata_of
 
 HIDDEN = 0.05  # standard deviation of what differs between episodes, in units of the unknowns
@@ -40,7 +41,10 @@ def repeats(seed, count, motions=1, hidden=HIDDEN, offset=0.0):
 def found(seed, count, motions=1, strata=None, scatter=True, **options):
     toy, episode = repeats(seed, count, motions, **options)
     at = minimise(toy.problem(), toys.TRUE.clone(), 20, lambda _: False)
-    matrix = covariance(toy.problem(), at, episode if scatter else None, strata)
+    matrix = covariance(toy.problem(), at)
+    if scatter:
+        strata = torch.zeros(count * motions, dtype=torch.int64) if strata is None else strata
+        matrix = at_least(matrix, replicates.scatter(toy.problem(), at, episode, strata))
     return at.raw - toys.TRUE, matrix.diagonal().sqrt()
 
 
@@ -61,6 +65,19 @@ def test_errors_are_those_of_a_mean_of_episodes():
     stds = torch.stack([found(seed, 6)[1] for seed in range(60)])
     wanted = HIDDEN / 6**0.5 * scipy.stats.t.ppf(0.975, 5) / 1.96
     assert float(stds.square().mean().sqrt()) == pytest.approx(wanted, rel=0.12)
+
+
+def test_leaving_out_an_episode_moves_the_estimate_as_a_fit_without_it_does():
+    """Episodes that differ much: what was an outlier among all is none without the one that made the others small."""
+    toy, episode = repeats(1, 3, hidden=0.5)
+    whole = minimise(toy.problem(), toys.TRUE.clone(), 20, lambda _: False)
+    for e in range(3):
+        kept = episode != e
+        J = torch.func.jacfwd(toy.model)(toys.TRUE)[kept]
+        alone = toys.Toy(lambda raw, J=J: J @ raw, toy.data[kept], toy.frame[kept], toy.patch[kept], prior_std=1e3)
+        wanted = minimise(alone.problem(), toys.TRUE.clone(), 20, lambda _: False).raw - whole.raw
+        moved = replicates._without(toy.problem(), whole, ~kept)
+        assert float((moved - wanted).norm()) < 0.1 * float(wanted.norm())
 
 
 def test_only_replicates_scatter():

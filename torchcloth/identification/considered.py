@@ -14,14 +14,25 @@ from . import gauss_newton
 from .linearity import Checked
 from .nuisances import Held
 from .objective import Objective
+from .replicates import FEWEST, scatter
 
 
 def covariance_of(objective: Objective, checked: Checked, strata: Tensor | None = None) -> Tensor:
-    """[K, K] of a solution, held places included; ``strata`` [E] as in ``gauss_newton.covariance``."""
+    """[K, K] of a solution, held places and episodes' scatter included; ``strata`` [E]: ``replicates.strata_of``."""
     if checked.covariance is not None:
         return checked.covariance
     final = checked.final
-    own = gauss_newton.covariance(objective.problem(), final, objective.episode_of(final.linear), strata)
+    problem, count = objective.problem(), len(objective.episodes)
+    own = gauss_newton.covariance(problem, final)
+    if count >= FEWEST:
+        strata = torch.zeros(count, dtype=torch.int64) if strata is None else strata
+        own = gauss_newton.at_least(own, scatter(problem, final, objective.episode_of(final.linear), strata))
+    if checked.withdrawn:  # nothing of it will be used
+        return own
+    if not final.converged:  # the answer of a search that was cut short is as uncertain as the way that is left
+        gradient, hessian = gauss_newton.normal_equations(problem, final)
+        left = torch.linalg.solve(hessian, gradient)
+        own = gauss_newton.at_least(own, own.diagonal() + left.square())
     return with_first_shape(objective, final, own)
 
 

@@ -46,6 +46,7 @@ class Episode:
         places: where the markers are on the mesh.
         wrenches: gripper -> [T, 6] N, N m, what the cloth exerts on it about its origin: mean over the interval that
             ends at the frame, NaN where not measured.
+        unseen: frames at the end that are simulated and not observed.
     """
 
     name: str
@@ -58,16 +59,46 @@ class Episode:
     markers: Tensor | None = None
     places: Hits | None = None
     wrenches: Mapping[str, Tensor] = field(default_factory=dict)
+    unseen: int = 0
+
+    @property
+    def observed(self) -> int:
+        """Frames of which there may be data."""
+        return len(self.times) - self.unseen
+
+    def beyond(self, reach: float) -> Episode:
+        """With frames after the last, for ``reach`` [s] or as long as the motion goes on: a late clock sees them."""
+        step = float(self.times.diff().median())
+        end = min((float(m.t[-1]) for m in self.motion.values()), default=torch.inf)
+        last = min(float(self.times[-1]) + reach, end)
+        more = torch.arange(1, 1 + int((last - float(self.times[-1])) / step + 1e-6), dtype=self.times.dtype)
+        times = torch.cat([self.times, self.times[-1] + step * more])
+        if last - float(times[-1]) > streams.SAME:
+            times = torch.cat([times, times.new_tensor([last])])
+        extra = len(times) - len(self.times)
+
+        def padded(data: Tensor) -> Tensor:
+            return torch.cat([data, data.new_full((extra, *data.shape[1:]), torch.nan)])
+
+        return replace(
+            self,
+            times=times,
+            clouds=[*self.clouds, *(self.initial.new_zeros(0, 3) for _ in range(extra))],
+            markers=None if self.markers is None else padded(self.markers),
+            wrenches={name: padded(wrench) for name, wrench in self.wrenches.items()},
+            unseen=self.unseen + extra,
+        )
 
     def until(self, share: float) -> Episode:
         """The first ``share`` of the frames, at least four."""
-        count = max(4, round(share * len(self.clouds)))
+        count = max(4, round(share * self.observed))
         return replace(
             self,
             times=self.times[:count],
             clouds=self.clouds[:count],
             markers=None if self.markers is None else self.markers[:count],
             wrenches={name: wrench[:count] for name, wrench in self.wrenches.items()},
+            unseen=0,
         )
 
     def positions(self, frame: int) -> Tensor:

@@ -22,7 +22,7 @@ from .episodes import Episode, episode
 from .identifiability import combinations, influences
 from .journal import Journal
 from .misfit import figures, forces_rms
-from .nuisances import chosen, implied
+from .nuisances import Clock, chosen, implied
 from .null import constant_force, no_force, rigid_carry
 from .objective import Objective
 from .profile import profiles
@@ -34,6 +34,7 @@ from .saved import model_of
 from .search import CHAMFER, METHODS, Method, Outcome, Progress, Search
 from .unknowns import collect, with_priors
 
+LATEST = 2.0  # standard deviations of a clock's prior, for which the simulation goes on after the last frame
 PAPER_ITERATIONS = 35  # of the DiffCP paper's stop rule
 ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
 
@@ -115,6 +116,8 @@ def identify(
     episodes = [episode(cloth, r) for r in episodes_in]
     _check_seen(method, stop, episodes)
     own = chosen(nuisances, implied([block.name for block in blocks], episodes))
+    late = LATEST * max((n.std for n in own if isinstance(n, Clock)), default=0.0)
+    episodes = [e.beyond(late) for e in episodes] if late else episodes
     objective = Objective(cloth, unknowns, episodes, dt, own, blocks, noise)
     start = objective.raw(guess or {})
     if journal is not None:
@@ -211,17 +214,26 @@ def _concluded(
         found.correlation,
         warnings,
         search.history,
-        before,
-        after,
-        null,
+        _observed(before, full),
+        _observed(after, full),
+        _observed(null, full),
         keys,
         nuisances,
         influences(full.unknowns, final.raw, checked.reach, found.parameters),
         combinations(full.unknowns, final.raw, covariance),
         profiles=profiled,
-        forces_before=[s.wrench for s in start],
-        forces_after=[s.wrench for s in end],
+        forces_before=[_observed_forces(s.wrench, e) for s, e in zip(start, full.episodes, strict=True)],
+        forces_after=[_observed_forces(s.wrench, e) for s, e in zip(end, full.episodes, strict=True)],
     )
+
+
+def _observed(frames: Sequence[Tensor], full: Objective) -> list[Tensor]:
+    """Without the frames after the last observation."""
+    return [x[: e.observed] for x, e in zip(frames, full.episodes, strict=True)]
+
+
+def _observed_forces(wrench: Mapping[str, Tensor], episode: Episode) -> dict[str, Tensor]:
+    return {name: w[: episode.observed] for name, w in wrench.items()}
 
 
 def _figures(full: Objective, *frames: list[Tensor]) -> dict[str, float]:

@@ -14,7 +14,6 @@ from .misfit import HUBER, huber, noise_scale
 MISLED = 0.1, 4  # gains below it, so many in a row, show tangents that say nothing of finite steps
 TRUSTED = 0.1  # error of the predicted decrease up to which an updated Jacobian is good enough
 GATE = 5.0  # standard deviations
-FEWEST = 3  # episodes that show a scatter
 NORMAL = 1.95996  # the 97.5 % quantile
 WINDOW = 5  # frames within which residuals of one patch count as one observation
 
@@ -237,12 +236,10 @@ def _is_small(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> 
     return float(step @ hessian @ step) < tolerance**2
 
 
-def covariance(problem: Problem, at: Iterate, episode: Tensor | None = None, strata: Tensor | None = None) -> Tensor:
+def covariance(problem: Problem, at: Iterate) -> Tensor:
     """Covariance of the estimate [K, K]: sandwich with residuals correlated within and between nearby frames.
 
-    Never smaller than what the counted independent observations would give; nor, where ``episode`` [R] names three or
-    more, than what leaving out one after the other shows. ``strata`` [E] numbers groups of replicates, within which
-    the episodes' scatter counts. Model error that all episodes share is beyond it.
+    Never smaller than what the counted independent observations would give. Model error that lasts is beyond it.
     """
     gradient, hessian = normal_equations(problem, at)
     inverse = torch.linalg.inv(hessian)
@@ -252,38 +249,13 @@ def covariance(problem: Problem, at: Iterate, episode: Tensor | None = None, str
     summed = summed[summed.abs().sum(1) > 0]
     meat = _long_run(summed) * len(summed) / max(1, len(summed) - len(gradient))
     robust = inverse @ (meat + torch.diag(problem.prior_std**-2)) @ inverse
-    least = inverse.diagonal()
-    if episode is not None and int(episode.max()) >= 2:
-        strata = torch.zeros(int(episode.max()) + 1, dtype=torch.int64) if strata is None else strata
-        least = torch.maximum(least, _jackknife(at, hessian, episode, strata))
-    return at_least(robust, least)
+    return at_least(robust, inverse.diagonal())
 
 
 def at_least(covariance: Tensor, variances: Tensor) -> Tensor:
     """A covariance [K, K] with variances not below these [K]; correlations stay."""
     inflate = torch.sqrt((variances / covariance.diagonal()).clamp(min=1.0))
     return covariance * inflate[:, None] * inflate[None, :]
-
-
-def _jackknife(at: Iterate, hessian: Tensor, episode: Tensor, strata: Tensor) -> Tensor:
-    """Variances [K] from leaving out one episode after the other, each by one Newton step (Efron 1982).
-
-    Widened as Student's distribution is, so that the interval of 1.96 deviations holds the truth with few episodes.
-    """
-    weighted, moved = at.influence()[0][:, None] * at.linear.jacobian, []
-    for e in range(len(strata)):
-        own = episode == e
-        less = hessian - weighted[own].mT @ at.linear.jacobian[own]
-        moved.append(torch.linalg.solve(less, weighted[own].mT @ at.linear.value[own]))
-    shifts, total = torch.stack(moved), torch.zeros_like(hessian[0])
-    for stratum in strata.unique():
-        own = shifts[strata == stratum]
-        if len(own) < FEWEST:  # no scatter of their own: as far as each one pulls
-            total += own.square().sum(0)
-            continue
-        scatter = (len(own) - 1) / len(own) * (own - own.mean(0)).square().sum(0)
-        total += (student(len(own) - 1) / NORMAL) ** 2 * scatter
-    return total
 
 
 def student(freedom: int) -> float:

@@ -78,7 +78,7 @@ def _solved(
 
 
 def _told(objective: Objective, failed: Checked, part: Objective, checked: Checked) -> Within:
-    frames, count = (max(len(e.times) for e in o.episodes) for o in (part, objective))
+    frames, count = (max(e.observed for e in o.episodes) for o in (part, objective))
     until = max(float(e.times[-1] - e.times[0]) for e in part.episodes)
     warning = (
         f"{failed.reason}: derivatives hold for the first {until:.2f} s only, and only those frames, "

@@ -96,7 +96,7 @@ class Search:
     def record(self, raw: Tensor, objective: Objective) -> bool:
         """One more iteration; whether the search may stop here."""
         now, values = objective.figures(raw), objective.values(raw)
-        share = len(objective.episodes[0].clouds) / len(self.objective.episodes[0].clouds)
+        share = objective.episodes[0].observed / self.objective.episodes[0].observed
         entry = {"iteration": len(self.history), "frames": share, "chamfer": now.chamfer, "rms": now.rms}
         self.history.append({**entry, **values})
         if self.on_progress is not None:
