@@ -21,7 +21,7 @@ from .cells import Cells, cells_of, directions
 from .refined import refined
 from .world import Hypothesis, Model, World
 
-CLOCK, SHIFT, TURN, GRASP, RIM, TARE = 0.01, 0.002, 0.005, 0.0015, 0.002, 0.1  # standard deviations, by episode
+CLOCK, SHIFT, TURN, GRASP, RIM, TARE = 3e-3, 5e-4, 1e-3, 1.5e-3, 2e-3, 0.1  # standard deviations between episodes
 Progress = Callable[[str], None]
 T = TypeVar("T")
 U = TypeVar("U")
