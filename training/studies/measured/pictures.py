@@ -31,9 +31,11 @@ def nylon(found: dict[str, Any], source: Path, path: Path) -> Path:
         table = tables[int(angle)]
         axis.plot(100 * table.strain, table.force, ".", color="black", markersize=3, label="measured")
         draw_band(axis, 100 * np.array(kept["strain"]), band(kept["force"]))
-        note = " (outside)" if any("outside" in w for w in kept["warnings"]) else ""
-        axis.set(title=f"{angle}° from the other three{note}", xlabel="strain [%]")
-        axis.set_ylim(0, 2 * table.force.max())
+        notes = ["outside of the fitted angles"] if any("outside" in w for w in kept["warnings"]) else []
+        notes = [f"{name} not identifiable" for name in kept["not_identifiable"]] or notes
+        axis.set_title("\n".join([f"{angle}° from the other three", *notes]), fontsize=10)
+        axis.set_xlabel("strain [%]")
+        axis.set_ylim(0, 1.4 * table.force.max())
     axes[0, 0].set_ylabel("force [N]")
     axes[0, 0].legend(fontsize=8)
     figure.suptitle("nylon, 95 % intervals")

@@ -61,20 +61,19 @@ def nylon(found: dict[str, Any], folder: Path) -> None:
 
 def knits(found: dict[str, Any]) -> None:
     """Third pulls from the first two, beside how far pulls are from each other."""
-    title = f"Knits up to {LIGHT:g} N: third pull from the first two, rms in % of its largest reading"
-    table = _table(title)
+    table = _table(f"Knits up to {LIGHT:g} N: third pull from the first two, rms in % of its largest reading")
     for heading in (
         "fabric",
-        "pulled along",
+        "along",
         "force",
         "repeats differ",
-        "inside 95 %",
-        "lateral strain",
+        "in 95 %",
+        "lateral",
         "repeats differ",
-        "inside 95 %",
-        "Poisson's ratio",
+        "in 95 %",
+        "nu",
     ):
-        table.add_column(heading, justify="left" if heading in ("fabric",) else "right")
+        table.add_column(heading, justify="left" if heading == "fabric" else "right", no_wrap=True)
     for name, fabric in found.items():
         nu = fabric["poisson_ratio"]
         for label, one in fabric["directions"].items():
@@ -84,11 +83,17 @@ def knits(found: dict[str, Any]) -> None:
                 own = judged[kind]
                 cells += [_percent(own["rms"]), _percent(floor[kind]), f"{100 * own['covered']:.0f} %"]
             ratio = f"{nu['value']:.3f} ± {nu['std']:.3f}" if nu["identifiable"] else "not identifiable"
-            table.add_row(name.replace("_", " ") if label == "X" else "", label, *cells, ratio if label == "X" else "")
+            table.add_row(
+                name.replace("_Yarn", "").replace("_", " ") if label == "X" else "",
+                label,
+                *cells,
+                ratio if label == "X" else "",
+            )
     console = _console()
     console.print(table)
     console.print(
-        "repeats differ: third pull from the mean of the first two, which no law that knows these can beat by much"
+        "repeats differ: third pull from the mean of the first two, which no law that knows these can beat by much. "
+        "in 95 %: share of readings in the interval. nu: symmetric Poisson's ratio"
     )
 
 
