@@ -79,7 +79,7 @@ def swings(found: dict[str, Any], runs: dict[str, dict[str, Any]], path: Path) -
         )
     axes[0, 0].plot(t, seen, ".", color="black", markersize=4, label="measured")
     axes[0, 0].set(title=f"{name}, predicted: lower edge", xlabel="time [s]", ylabel="y along the stroke [m]")
-    axes[0, 0].legend(fontsize=7)
+    axes[0, 0].legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, columnspacing=1)
     for axis, key, label in zip(axes[0, 1:], ("frequency", "decay"), ("swing [Hz]", "decay B [1/(m s)]"), strict=True):
         shown = {m: p for m, p in found["predicted"].items() if key in p}
         for k, (model, p) in enumerate(shown.items()):
