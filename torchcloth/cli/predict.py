@@ -31,7 +31,7 @@ def add(verbs: Any) -> None:
     add("--length", type=float, metavar="M", help="of the strip (as fitted)")
     add("--width", type=float, metavar="M", help="of the cloth that carries the force (as fitted)")
     add("--preload", type=float, metavar="N", help="at displacement 0 (taut by the same strain as the fitted strips)")
-    add("--strain", type=float, metavar="X", help="at the curve's end (the largest fitted one)")
+    add("--strain", type=float, metavar="X", help="at the curve's end (the largest fitted near this angle)")
     predict.set_defaults(run=_predict)
 
 

@@ -132,11 +132,11 @@ def predict_tension(model: TensionModel, table: ForceDisplacement, preload_std: 
     """
     found, *stds = model.curve(table)
     other = model.curve(replace(table, preload=table.preload + preload_std))[0] if preload_std else found
-    longest = max(t.strain for t in model.tables)
+    longest = _nearest(model.tables, table.angle).strain
     whole = model.curve(_until(table, longest))[0]
     chosen, law_from, warnings = _law_from(model.tables, table.angle)
     if table.strain.max() > SLACK * longest:
-        warnings.append("the curve goes beyond the largest strain that was fitted: no error covers that")
+        warnings.append("the curve goes beyond the strains that were fitted near this angle: no error covers that")
     bands = []
     for kind, value, std, shifted, end, base in zip(
         ("force", "lateral"), found, stds, other, whole, (table.preload, 0.0), strict=True
@@ -166,7 +166,8 @@ def specimen_like(
 ) -> tuple[ForceDisplacement, float]:
     """A specimen [angle in rad] that was not pulled, and the standard deviation of its preload [N].
 
-    Length, width and largest strain are by default those of the fitted tables; the preload as ``TensionModel.preload``.
+    Length and width are by default those of the fitted tables, the largest strain that of the table nearest in angle,
+    the preload as ``TensionModel.preload``.
 
     Raises:
         InvalidInput: a number out of its range, or not given while the fitted tables differ.
@@ -174,7 +175,7 @@ def specimen_like(
     size = {
         "length": _common(model.tables, "length", length),
         "width": _common(model.tables, "width", width),
-        "strain": max(t.strain for t in model.tables) if strain is None else strain,
+        "strain": _nearest(model.tables, angle).strain if strain is None else strain,
     }
     for name, number in size.items():
         if not 0 < number < math.inf:
@@ -258,6 +259,11 @@ def _share(chosen: list[dict[str, float | None]], kind: str) -> float | None:
     """Root mean square over tables; None where none was measured."""
     known = [share for one in chosen if (share := one[kind]) is not None]
     return math.sqrt(sum(share**2 for share in known) / len(known)) if known else None
+
+
+def _nearest(tables: list[Pulled], angle: float) -> Pulled:
+    """In angle."""
+    return min(tables, key=lambda t: abs(_folded(t.angle) - _folded(angle)))
 
 
 def _folded(angle: float) -> float:

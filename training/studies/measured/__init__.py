@@ -18,7 +18,7 @@ from torchcloth.errors import InvalidInput
 from torchcloth.identification.journal import clear
 
 from ...kept import Kept
-from . import pictures, sample, swing_predictions, swings, tables, tension
+from . import free_swings, pictures, sample, swing_predictions, swings, tables, tension
 
 VARIABLE = "TORCHCLOTH_REALDATA"
 SOURCES = (tension.NYLON, tension.KNITS, swings.SOURCE, sample.SOURCE)
@@ -84,17 +84,21 @@ def _knits(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, A
 
 def _swings(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
     fitted, held = swings.split(source, options.fast)
-    fits = kept.run(
-        {f"swings-{part}": partial(_fit, source, fitted, part, options.out, options.fast) for part in swings.PARTS}
+    found = kept.run(
+        {
+            "swings-whole": partial(_fit, source, fitted, options.out, options.fast),
+            "swings-free": partial(free_swings.match, source, fitted, options.fast),
+        }
     )
-    values = {part: fits[f"swings-{part}"]["values"] for part in swings.PARTS}
-    models = {"vacuum": dict.fromkeys(swings.NAMES, 0.0), "textbook": swings.START, **values}
+    fits = {part.removeprefix("swings-"): content for part, content in found.items()}
+    models = {"vacuum": dict.fromkeys(swings.NAMES, 0.0), "textbook": swings.START}
+    models |= {part: content["values"] for part, content in fits.items()}
     cases = kept.run({f"swing-{name}": partial(swing_predictions.predict, source, name, models) for name in held})
     runs = dict(zip(held, cases.values(), strict=True))
     found = {
         "fitted_runs": fitted,
         "predicted_runs": held,
-        "fits": {part: fits[f"swings-{part}"] for part in swings.PARTS},
+        "fits": fits,
         "predicted": swing_predictions.summary(runs, list(models)),
     }
     tables.swings(found)
@@ -102,11 +106,11 @@ def _swings(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, 
     return found
 
 
-def _fit(source: Path, names: list[str], part: str, out: Path, fast: bool) -> dict[str, Any]:
+def _fit(source: Path, names: list[str], out: Path, fast: bool) -> dict[str, Any]:
     """A fit of many runs as a case; its journal lasts until it is kept."""
-    journal = out / "progress" / part
-    fit = swings.fit(source, names, part, journal, fast)
-    fit.save(out / f"swings-{part}")
+    journal = out / "progress" / "whole"
+    fit = swings.fit(source, names, journal, fast)
+    fit.save(out / "swings")
     content = fit.as_dict()
     clear(journal)
     return {

@@ -31,9 +31,11 @@ def nylon(found: dict[str, Any], source: Path, path: Path) -> Path:
         table = tables[int(angle)]
         axis.plot(100 * table.strain, table.force, ".", color="black", markersize=3, label="measured")
         draw_band(axis, 100 * np.array(kept["strain"]), band(kept["force"]))
-        note = " (outside)" if any("outside" in w for w in kept["warnings"]) else ""
-        axis.set(title=f"{angle}° from the other three{note}", xlabel="strain [%]")
-        axis.set_ylim(0, 2 * table.force.max())
+        notes = ["outside of the fitted angles"] if any("outside" in w for w in kept["warnings"]) else []
+        notes = [f"{name} not identifiable" for name in kept["not_identifiable"]] or notes
+        axis.set_title("\n".join([f"{angle}° from the other three", *notes]), fontsize=10)
+        axis.set_xlabel("strain [%]")
+        axis.set_ylim(0, 1.4 * table.force.max())
     axes[0, 0].set_ylabel("force [N]")
     axes[0, 0].legend(fontsize=8)
     figure.suptitle("nylon, 95 % intervals")
@@ -77,7 +79,7 @@ def swings(found: dict[str, Any], runs: dict[str, dict[str, Any]], path: Path) -
         )
     axes[0, 0].plot(t, seen, ".", color="black", markersize=4, label="measured")
     axes[0, 0].set(title=f"{name}, predicted: lower edge", xlabel="time [s]", ylabel="y along the stroke [m]")
-    axes[0, 0].legend(fontsize=7)
+    axes[0, 0].legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, columnspacing=1)
     for axis, key, label in zip(axes[0, 1:], ("frequency", "decay"), ("swing [Hz]", "decay B [1/(m s)]"), strict=True):
         shown = {m: p for m, p in found["predicted"].items() if key in p}
         for k, (model, p) in enumerate(shown.items()):

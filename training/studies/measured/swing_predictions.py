@@ -36,7 +36,7 @@ def predict(source: Path, name: str, models: dict[str, dict[str, float]]) -> dic
 
 def _predict(source: Path, name: str, models: dict[str, dict[str, float]]) -> dict[str, Any]:
     swings, free = module("realdata", "swings"), module("realdata", "free_swing")
-    run, data = recording(source, name, "all"), swings.runs(source)[name]
+    run, data = recording(source, name), swings.runs(source)[name]
     t = run.require("points", by="the study").t
     rows = np.flatnonzero(np.isin(data["t_mesh_s"], t))
     seen = data["mesh_base_m"].reshape(len(data["t_mesh_s"]), -1, 3)[rows]
@@ -96,8 +96,7 @@ def _swing(swing: Any) -> dict[str, list[float]]:
 
 def summary(runs: dict[str, dict[str, Any]], models: Sequence[str], draws: int = 20) -> dict[str, Any]:
     """Over the predicted runs: node RMS, frequency and decay of every model; errors by drawing runs again."""
-    draw, count = np.random.default_rng(0), len(runs)
-    chosen = [np.arange(count), *(draw.integers(0, count, count) for _ in range(draws))]
+    chosen = drawn(len(runs), draws)
     out: dict[str, Any] = {}
     for model in ("still", "null", *models):
         rows = [run[model] for run in runs.values()]
@@ -105,11 +104,17 @@ def summary(runs: dict[str, dict[str, Any]], models: Sequence[str], draws: int =
         median = float(np.mean([row["median"] for row in rows]))
         out[model] = {"rms": float(rms[0]), "rms_std": float(np.std(rms[1:])), "median": median}
     for model in ("measured", *models):
-        out.setdefault(model, {}).update(_frequency_and_decay([run[model] for run in runs.values()], chosen))
+        out.setdefault(model, {}).update(frequency_and_decay([run[model] for run in runs.values()], chosen))
     return out
 
 
-def _frequency_and_decay(rows: list[dict[str, Any]], chosen: list[np.ndarray]) -> dict[str, float]:
+def drawn(count: int, draws: int) -> list[np.ndarray]:
+    """All of them once, then with replacement (bootstrap)."""
+    draw = np.random.default_rng(0)
+    return [np.arange(count), *(draw.integers(0, count, count) for _ in range(draws))]
+
+
+def frequency_and_decay(rows: Sequence[dict[str, Any]], chosen: Sequence[np.ndarray]) -> dict[str, float]:
     """Of all runs, and their standard deviations over draws of runs."""
     free = module("realdata", "free_swing")
     swings = [free.Swing("", np.array(row["swing_t"]), np.array(row["swing_q"]), 0.0, 0.0) for row in rows]

@@ -29,7 +29,7 @@ NAMES = ["air.normal", "added.length", "damping.rate"]
 START = {"air.normal": 1.2, "added.length": 0.113, "damping.rate": 0.0}  # plate across a stream; ideal fluid, 0.377 L
 PRIORS = {"air.normal": (1.2, 10.0)}  # wide: a plate shaken over a fraction of its width has ten times the drag
 NUISANCES = {"clock": 0.03, "camera": 0.02}
-PARTS = {"whole": "whole runs", "free": "free swings only"}
+EFFECTS = {"drag per areal density": "1/m", "added mass per areal density": "-", "damping rate": "1/s"}
 
 
 def split(source: Path, fast: bool) -> tuple[list[str], list[str]]:
@@ -40,8 +40,8 @@ def split(source: Path, fast: bool) -> tuple[list[str], list[str]]:
     return (fitted[::10], held[4:5]) if fast else (fitted, held)
 
 
-def recording(source: Path, name: str, part: str) -> recordings.Recording:
-    """One run on the study's mesh; ``part`` "whole" thins its frames, "free" keeps the first and the free swing."""
+def recording(source: Path, name: str, every: int = 1) -> recordings.Recording:
+    """One run on the study's mesh, with some of its frames."""
     swings, mesh = module("realdata", "swings"), _mesh()
     found = swings.episode(source, name)
     cloth = replace(
@@ -54,14 +54,7 @@ def recording(source: Path, name: str, part: str) -> recordings.Recording:
         areal_density=DENSITY,
         areal_density_std=None,
     )
-    chosen = np.arange(len(found.points)) % EVERY == 0
-    if part == "free":
-        _, free, _ = module("realdata", "free_swing").window(swings.runs(source)[name], 0.3)
-        seen = swings.runs(source)[name]["t_mesh_s"]
-        chosen = np.isin(found.points.t, seen[free])
-        chosen[0] = True
-    elif part == "all":
-        chosen = np.ones(len(found.points), dtype=bool)
+    chosen = np.arange(len(found.points)) % every == 0
     return replace(found, cloth=cloth, points=_some(found.points, chosen), path=Path(name))
 
 
@@ -89,9 +82,9 @@ def cloth_of(run: recordings.Recording, values: dict[str, float]) -> Cloth:
     return cloth_from(run, materials.AEP(STIFFNESS / 1e-3, POISSON, thickness=1e-3), parts)
 
 
-def fit(source: Path, names: Sequence[str], part: str, journal: Path, fast: bool) -> Identification:
+def fit(source: Path, names: Sequence[str], journal: Path, fast: bool) -> Identification:
     """Drag, added mass and damping from these runs; goes on where a stopped fit was. Fast: two steps, all frames."""
-    runs = [recording(source, name, part) for name in names]
+    runs = [recording(source, name, EVERY) for name in names]
     cloth = cloth_of(runs[0], START)
     resume = (journal / "problem").exists()
     brief = {"iterations": 2, "warm_start": True} if fast else {}
@@ -101,18 +94,10 @@ def fit(source: Path, names: Sequence[str], part: str, journal: Path, fast: bool
 def ratios(fit: dict[str, Any]) -> dict[str, dict[str, float | bool]]:
     """What is identifiable, from the parameters of identification.json: ratios to the areal density, and the rate."""
     air, out = module("realdata", "swings").AIR, {}
-    for name, key, factor in (
-        ("drag per areal density", "air.normal", air / DENSITY),
-        ("added mass per areal density", "added.length", air / DENSITY),
-        ("damping rate", "damping.rate", 1.0),
-    ):
+    for effect, key, factor in zip(EFFECTS, NAMES, (air / DENSITY, air / DENSITY, 1.0), strict=True):
         found = fit[key]
-        out[name] = {
-            "value": factor * found["value"],
-            "std": factor * found["std"],
-            "low": factor * found["ci95"][0],
-            "high": factor * found["ci95"][1],
-            "identifiable": found["identifiable"],
-            "unit": {"air.normal": "1/m", "added.length": "-", "damping.rate": "1/s"}[key],
-        }
+        low, high = found["ci95"]
+        numbers = {"value": found["value"], "std": found["std"], "low": low, "high": high}
+        scaled = {name: factor * number for name, number in numbers.items()}
+        out[effect] = {**scaled, "identifiable": found["identifiable"]}
     return out

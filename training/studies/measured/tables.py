@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .swings import DENSITY, PARTS
+from .swings import DENSITY, EFFECTS
 from .tension import LIGHT
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ MODELS = {
     "vacuum": "vacuum",
     "textbook": "textbook air: C_n 1.2, depth 0.377 L",
     "whole": "fitted to whole runs",
-    "free": "fitted to the free swings only",
+    "free": "matched to the free swings",
 }
 
 
@@ -61,20 +61,19 @@ def nylon(found: dict[str, Any], folder: Path) -> None:
 
 def knits(found: dict[str, Any]) -> None:
     """Third pulls from the first two, beside how far pulls are from each other."""
-    title = f"Knits up to {LIGHT:g} N: third pull from the first two, rms in % of its largest reading"
-    table = _table(title)
+    table = _table(f"Knits up to {LIGHT:g} N: third pull from the first two, rms in % of its largest reading")
     for heading in (
         "fabric",
-        "pulled along",
+        "along",
         "force",
         "repeats differ",
-        "inside 95 %",
-        "lateral strain",
+        "in 95 %",
+        "lateral",
         "repeats differ",
-        "inside 95 %",
-        "Poisson's ratio",
+        "in 95 %",
+        "nu",
     ):
-        table.add_column(heading, justify="left" if heading in ("fabric",) else "right")
+        table.add_column(heading, justify="left" if heading == "fabric" else "right", no_wrap=True)
     for name, fabric in found.items():
         nu = fabric["poisson_ratio"]
         for label, one in fabric["directions"].items():
@@ -84,11 +83,17 @@ def knits(found: dict[str, Any]) -> None:
                 own = judged[kind]
                 cells += [_percent(own["rms"]), _percent(floor[kind]), f"{100 * own['covered']:.0f} %"]
             ratio = f"{nu['value']:.3f} ± {nu['std']:.3f}" if nu["identifiable"] else "not identifiable"
-            table.add_row(name.replace("_", " ") if label == "X" else "", label, *cells, ratio if label == "X" else "")
+            table.add_row(
+                name.replace("_Yarn", "").replace("_", " ") if label == "X" else "",
+                label,
+                *cells,
+                ratio if label == "X" else "",
+            )
     console = _console()
     console.print(table)
     console.print(
-        "repeats differ: third pull from the mean of the first two, which no law that knows these can beat by much"
+        "repeats differ: third pull from the mean of the first two, which no law that knows these can beat by much. "
+        "in 95 %: share of readings in the interval. nu: symmetric Poisson's ratio"
     )
 
 
@@ -97,15 +102,15 @@ def swings(found: dict[str, Any]) -> None:
     console = _console()
     title = f"IRI swings: {len(found['fitted_runs'])} runs fitted. Only ratios to the areal density are identifiable"
     table = _table(title)
-    for heading in ("", *(PARTS[part] for part in found["fits"]), "unit"):
+    for heading in ("", "whole runs, by identify", "frequency and decay of the free swings", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
-    for name, first in found["fits"]["whole"]["ratios"].items():
-        cells = [_estimate(fit["ratios"][name]) for fit in found["fits"].values()]
-        table.add_row(name, *cells, first["unit"])
+    for name, unit in EFFECTS.items():
+        cells = [_estimate(fit["ratios"].get(name)) for fit in found["fits"].values()]
+        table.add_row(name, *cells, unit)
     console.print(table)
     console.print(
         f"C_n, the air's depth and the density itself cannot be told apart (density set to {DENSITY:g} kg/m^2): drag "
-        "is rho C_n / rho_A, added mass rho depth / rho_A. ±: runs left out one after the other"
+        "is rho C_n / rho_A, added mass rho depth / rho_A. ±: by leaving runs out, and by drawing them again"
     )
     predicted = found["predicted"]
     table = _table(f"IRI swings: {len(found['predicted_runs'])} runs predicted; ± by drawing these runs again")
@@ -136,7 +141,9 @@ def sample(found: dict[str, Any]) -> None:
     console.print("vertices to cloud: floored by the clouds' 31 points, which leave most of the dress unseen")
 
 
-def _estimate(e: dict[str, Any]) -> str:
+def _estimate(e: dict[str, Any] | None) -> str:
+    if e is None:
+        return "left out"
     interval = f"({e['low']:.3g} … {e['high']:.3g})"
     return f"{e['value']:.3g} ± {e['std']:.2g} {interval}" if e["identifiable"] else f"not identifiable {interval}"
 
