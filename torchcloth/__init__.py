@@ -2,7 +2,7 @@
 
 ``tc.Cloth`` is the layer; ``tc.meshes``, ``tc.materials``, ``tc.effects``, ``tc.boundaries`` are its parts;
 ``tc.robots`` gives end-effector poses, ``tc.recordings`` episodes, ``tc.identify`` parameters with errors,
-``tc.estimate_pose`` the mesh over time.
+``tc.estimate_pose`` the mesh over time, ``tc.diagnose`` what a simulation of episodes gets wrong.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from .transfer import Contact
 from .types import ClothState, Rollout, Trajectory
 
 if TYPE_CHECKING:
-    from . import identification, observe, pose, recordings, robots
+    from . import diagnosis, identification, observe, pose, recordings, robots
+    from .diagnosis import diagnose
     from .identification import identify
     from .pose import estimate_pose
 
@@ -32,6 +33,8 @@ __all__ = [
     "Rollout",
     "Trajectory",
     "boundaries",
+    "diagnose",
+    "diagnosis",
     "effects",
     "errors",
     "estimate_pose",
@@ -47,6 +50,9 @@ __all__ = [
     "robots",
 ]
 
+ROOMS = ("diagnosis", "identification", "observe", "pose", "recordings", "robots")
+VERBS = {"diagnose": "diagnosis", "estimate_pose": "pose", "identify": "identification"}  # function: its room
+
 
 def __dir__() -> list[str]:
     return sorted([*globals(), *__all__])
@@ -54,10 +60,8 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str):
     """Rooms that are opened when they are first asked for: importing the layer stays cheap."""
-    if name in ("identification", "observe", "pose", "recordings", "robots"):
+    if name in ROOMS:
         return import_module(f".{name}", __name__)
-    if name == "identify":
-        return import_module(".identification", __name__).identify
-    if name == "estimate_pose":
-        return import_module(".pose", __name__).estimate_pose
+    if name in VERBS:
+        return getattr(import_module(f".{VERBS[name]}", __name__), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
