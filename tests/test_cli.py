@@ -239,7 +239,10 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(folder, tmp_path,
     """SIGINT after some work: the second run ends where an undisturbed one does, to the last bit."""
     out = tmp_path / "out"
     command = [*COMMAND, "identify", str(folder), "--out", str(out), "--start", "youngs_modulus=5e4", *QUICK]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background jobs ignore it
+    )  # fmt: skip
     deadline = time.monotonic() + 120
     while len(list(out.glob("progress/*.pt"))) < 3 and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.02)

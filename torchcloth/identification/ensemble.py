@@ -272,12 +272,15 @@ def _by_ripples(problem: gauss_newton.Problem, at: Iterate, found: Line) -> Tens
 
 
 def _reach(objective: Objective, near: Sequence[Sample], raw: Tensor) -> Reach:
-    """By regression of the frames and of the forces."""
+    """By regression of the frames and of the forces, less what ripples alone would show."""
     design, count = _design(near, raw), len(objective.unknowns)
+    error = torch.linalg.pinv(design.mT @ design).diagonal()[1 : count + 1]
 
     def size(parts: list[Tensor]) -> Tensor:
         many = torch.stack(parts).to(design).flatten(1)
-        slope = torch.linalg.lstsq(design, many).solution[1 : count + 1].unflatten(1, (-1, 3))
-        return slope.square().sum(-1).mean(1).sqrt().nan_to_num(0.0)
+        found = torch.linalg.lstsq(design, many).solution
+        slope = found[1 : count + 1].unflatten(1, (-1, 3)).square().sum(-1).mean(1)
+        ripples = 3 * (many - design @ found).square().sum(0).mean() / (len(design) - design.shape[1])
+        return torch.where(slope > SEEN * error * ripples, slope - error * ripples, 0.0).sqrt().nan_to_num(0.0)
 
     return Reach(size([s.x for s in near]), size([s.force for s in near]))
