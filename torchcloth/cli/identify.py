@@ -82,6 +82,9 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--profile", nargs="+", default=[], metavar="NAME", help="seek the interval by fitting the others beside it"
     )
+    parser.add_argument(
+        "--refine", action="store_true", help="correct for the coarseness of the mesh (one run on a mesh twice as fine)"
+    )
     parser.add_argument("--resume", action="store_true", help="go on where a stopped fit into DIR was")
 
 
@@ -187,6 +190,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             nuisances=nuisances_of(options.nuisance),
             priors=_priors(options.prior),
             on_progress=advance,
+            refine=options.refine,
         )
 
 

@@ -15,7 +15,6 @@ from ..effects import AbstractEffect
 from ..identification.episodes import Episode
 from ..identification.replays import Frames, Replay, frames_of
 from ..materials import AbstractMaterial
-from ..meshes import Mesh
 
 Motion = Callable[[Episode], Episode]  # what the robot really does, from what it says
 View = Callable[[Frames, Episode], Frames]  # what is seen, from what is there
@@ -68,12 +67,11 @@ def rebuilt(
     effects: Mapping[str, AbstractEffect],
     material: AbstractMaterial | None,
     boundaries: Mapping[str, AbstractBoundary],
-    mesh: Mesh | None = None,
 ) -> Cloth:
     """A new cloth with some parts replaced or added; nothing but the mesh is shared with the old one."""
     kept = copied(cloth)
     return Cloth(
-        mesh or kept.mesh,
+        kept.mesh,
         material or kept.material,
         kept.areal_density.value.detach().clone(),
         {**dict(kept.effects.items()), **effects},  # type: ignore[dict-item]

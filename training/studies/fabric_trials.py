@@ -57,7 +57,7 @@ class Scale(NamedTuple):
 
     def settings(self) -> dict[str, Any]:
         """What a kept case depends on, besides its name; fabrics and pulls may be added later."""
-        return {"detail": list(self.detail), "cells": list(self.cells)}
+        return {"detail": list(self.detail), "cells": list(self.cells), "refined": True}
 
 
 FULL = Scale(tuple(FABRICS), PULLS, Detail(), 3, (6, 4))
@@ -110,7 +110,7 @@ def stretch(name: str, pull: Pull, detail: Detail) -> dict[str, Any]:
     recording = stretching.record(fabric(name), pull, seed_of(name, PULLS.index(pull)), detail)
     start = fabric(name)._replace(membrane=START * fabric(name).membrane, poisson=START_POISSON)
     model, began = stretching.sheet(recording, start), time.perf_counter()
-    fit = identify(model, recording, PAIR, nuisances=HELD)
+    fit = identify(model, recording, PAIR, nuisances=HELD, refine=True)
     facts = {"direction": pull.direction, "clamps": pull.clamps, "strain": stretching.strain(fabric(name), pull)}
     return {"fabric": name, **facts, **told(fit, PAIR), "seconds": time.perf_counter() - began}
 

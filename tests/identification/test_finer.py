@@ -1,0 +1,68 @@
+"""A fit on a coarse mesh, corrected by one simulation on a finer one."""
+
+import numpy as np
+import pytest
+import torch
+import twins
+
+import torchcloth as tc
+from torchcloth.boundaries import Grasp
+from torchcloth.errors import InvalidInput
+from torchcloth.identification import identify
+from torchcloth.identification.finer import finer_cloth, finer_recording
+
+PAIR = ["youngs_modulus", "air.normal"]
+
+
+def test_the_finer_mesh_is_the_same_cloth(model, recording):
+    fine = finer_cloth(model)
+    assert len(fine.mesh.faces) == 4 * len(model.mesh.faces)
+    assert fine.mesh.area.sum() == pytest.approx(model.mesh.area.sum(), rel=1e-12)
+    assert float(fine.material.youngs_modulus.value) == float(model.material.youngs_modulus.value)
+    episode = finer_recording(recording, model.mesh, fine.mesh)
+    first, coarse = episode.cloth.initial_vertices, recording.cloth.initial_vertices
+    np.testing.assert_array_equal(first[: len(coarse)], coarse)
+    assert np.abs(first).max() <= np.abs(coarse).max()
+
+
+def test_a_grip_holds_the_new_vertices_between_those_it_held():
+    mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3))
+    sheet = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, boundaries={"bar": Grasp([0, 1, 2])}, contact=None)
+    fine = finer_cloth(sheet)
+    held = np.asarray(fine.mesh.uv)[fine.boundaries["bar"].index]
+    assert sorted(held[:, 1].round(6).tolist()) == [0.0, 0.05, 0.1, 0.15, 0.2]
+    assert (held[:, 0] == 0).all()
+
+
+def test_fields_are_refused(model):
+    model.material.youngs_modulus.raw.data = model.material.youngs_modulus.raw.data.expand(
+        len(model.mesh.faces)
+    ).clone()
+    with pytest.raises(InvalidInput, match=r"finer mesh: material.youngs_modulus.*one number for all triangles"):
+        finer_cloth(model)
+
+
+def test_it_moves_towards_what_a_finer_mesh_finds(recording, model):
+    """The truth has 11 x 11 vertices, the model 7 x 7; a fit on 13 x 13, which costs eight times as much, judges."""
+    plain = identify(model, recording, PAIR)
+    moved = identify(model, recording, PAIR, refine=True)
+    fine = finer_cloth(model)
+    judge = identify(fine, finer_recording(recording, model.mesh, fine.mesh), PAIR)
+    for name in PAIR:
+        a, b, c = (fit.parameters[name].value for fit in (plain, moved, judge))
+        assert abs(b - c) < max(0.7 * abs(a - c), 0.3 * judge.parameters[name].std), name
+        assert moved.parameters[name].std >= 0.999 * plain.parameters[name].std * b / a
+    assert moved.fit["mesh_step"] > 0
+    assert "mesh_step" not in plain.fit
+    assert torch.equal(plain.frames_before[0], moved.frames_before[0])
+
+
+def test_a_mesh_that_is_fine_already_is_hardly_corrected(recording):
+    """With the truth's own spacing halved the step is below half a standard error."""
+    fine = finer_cloth(twins.at(recording))
+    episode = finer_recording(recording, twins.at(recording).mesh, fine.mesh)
+    coarse, finer = (
+        identify(c, r, PAIR, refine=True).fit["mesh_step"]
+        for c, r in ((twins.at(recording), recording), (fine, episode))
+    )
+    assert finer < 0.6 * coarse
