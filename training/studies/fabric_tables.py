@@ -123,7 +123,7 @@ def _marks(result: Mapping[str, Any]) -> list[str]:
     for symbol in ("E", "ν"):
         own = [fabric[symbol]["stretched"] for fabric in result["fabrics"].values()]
         counts.append(f"{sum(s.get('covered') or 0 for s in own)} of {sum(s['identifiable'] for s in own)} of {symbol}")
-    lines.append(f"95 % intervals hold the truth in {', '.join(counts)}: the model's coarser mesh is in no error bar")
+    lines.append(f"95 % intervals hold the truth in {', '.join(counts)}: fits corrected for their mesh")
     return [*lines, f"{result['seconds']:.0f} s a fit (median)"]
 
 
