@@ -259,3 +259,10 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(folder, tmp_path,
     assert parts["history"] == whole["history"]
     assert parts["parameters"] == whole["parameters"]
     assert {**parts["fit"], "seconds": 0} == {**whole["fit"], "seconds": 0}
+
+
+@pytest.mark.parametrize("verb", ["identify", "pose", "diagnose", "inspect"])
+def test_a_folder_below_a_file_is_refused_at_once(verb, folder, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main([verb, str(folder), "--out", str(tmp_path / "file" / "sub")]) == 2
+    assert "file, a file; expected a folder" in one_line(capsys.readouterr().err)

@@ -114,7 +114,7 @@ def test_rows_keep_their_order_and_leave_the_first_frame_out(short):
     off = (value - linear.value).abs()  # m: two kernels, last digits differ, and a point between two triangles may turn
     assert float(off.max()) < 1e-4
     assert float((off < 1e-9).double().mean()) > 0.98
-    assert torch.equal(patch, linear.patch)
+    assert float((patch == linear.patch).double().mean()) > 0.98
     points = linear.block == 0
     counts = [len(cloud) for cloud in seen.clouds]
     assert torch.bincount(linear.frame[points]).tolist() == [0, *counts[1:]]

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ..errors import InvalidInput
+from .folders import check_folder
 
 
 def add(verbs: Any) -> None:
@@ -26,10 +26,10 @@ def _diagnose(options: argparse.Namespace) -> int:
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
-    if options.out.exists() and not options.out.is_dir():
-        raise InvalidInput("--out", got=f"{options.out}, a file", expected="a folder, new or existing")
+    check_folder(options.out)
     model = None if options.model is None else diagnosis.load_model(options.model)
     episodes = [recordings.read(path) for path in options.episodes]
+    print(f"{len(episodes)} episodes: about a minute each on one core", flush=True)
     answer = diagnosis.diagnose(episodes, model, progress=_progress())
     path = diagnosis.write_diagnosis(answer, episodes[0], options.out)
     print(f"verdict: {answer.verdict}")
@@ -39,9 +39,9 @@ def _diagnose(options: argparse.Namespace) -> int:
 
 
 def _progress():
-    """One line that changes on a terminal; nothing in a log."""
+    """One line that changes on a terminal; in a log, a line for every stage."""
     if not sys.stderr.isatty():
-        return lambda _: None
+        return lambda text: None if text.endswith("slopes") else print(text, flush=True)
     from rich.console import Console
 
     status = Console(stderr=True).status("")

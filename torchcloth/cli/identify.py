@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
+from .folders import check_folder
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -101,8 +102,7 @@ def _identify(options: argparse.Namespace) -> int:
 
     torch.set_default_dtype(torch.float64)  # sensitivities lose digits over thousands of substeps in float32
     torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
-    if options.out.exists() and not options.out.is_dir():
-        raise InvalidInput("--out", got=f"{options.out}, a file", expected="a folder, new or existing")
+    check_folder(options.out)
     episodes = [recordings.read(path) for path in options.episodes]
     cloth = _cloth(options, episodes[0])
     size = f"{len(episodes)} episode(s), {len(cloth.mesh.faces)} triangles"

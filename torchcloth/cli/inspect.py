@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .._files import write_text
-from ..errors import InvalidInput
+from .folders import check_folder
 
 
 def add(verbs: Any) -> None:
@@ -25,8 +25,8 @@ def _inspect(options: argparse.Namespace) -> int:
 
     from .. import inspection, recordings
 
-    if options.out is not None and options.out.exists() and not options.out.is_dir():
-        raise InvalidInput("--out", got=f"{options.out}, a file", expected="a folder, new or existing")
+    if options.out is not None:
+        check_folder(options.out)
     with Console(stderr=True).status(f"looking at {options.episode}"):
         report = inspection.inspect(recordings.read(options.episode))
     text = json.dumps(report.as_dict(), indent=1, allow_nan=False) + "\n"

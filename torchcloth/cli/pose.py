@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
+from .folders import check_folder
 from .identify import assignments, nuisances_of
 
 if TYPE_CHECKING:
@@ -48,8 +49,7 @@ def _pose(options: argparse.Namespace) -> int:
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
-    if options.out.exists() and not options.out.is_dir():
-        raise InvalidInput("--out", got=f"{options.out}, a file", expected="a folder, new or existing")
+    check_folder(options.out)
     recording = recordings.read(options.episode, with_truth=options.truth)
     if options.truth:
         recording.require("truth", by="--truth")

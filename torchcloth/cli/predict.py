@@ -10,6 +10,7 @@ from typing import Any
 
 from .._files import write_text
 from ..errors import InvalidInput
+from .folders import check_folder
 
 TABLE = "table.json"  # of a folder with readings of a tension machine
 
@@ -45,8 +46,7 @@ def _predict(options: argparse.Namespace) -> int:
     torch.set_num_threads(1)
     folder = options.fit if options.fit.is_dir() else options.fit.parent
     out = folder / "prediction" if options.out is None else options.out
-    if out.exists() and not out.is_dir():
-        raise InvalidInput("--out", got=f"{out}, a file", expected="a folder, new or existing")
+    check_folder(out)
     known = [name for name in (TENSION, RESULT) if (folder / name).is_file()]
     if options.fit.name in (TENSION, RESULT):
         known = [options.fit.name] if options.fit.is_file() else []

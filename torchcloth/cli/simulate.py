@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput, TorchclothError
+from .folders import check_folder
 
 if TYPE_CHECKING:
     from ..recordings import Recording
@@ -55,8 +56,7 @@ def _simulate(options: argparse.Namespace) -> int:
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
     out: Path = options.out
-    if out.exists() and not out.is_dir():
-        raise InvalidInput("--out", got=f"{out}, a file", expected="a folder, new or existing")
+    check_folder(out)
     orders = _orders(options)
     finished = {order.name: _finished(out / order.name, order) for order in orders}
     rows = []

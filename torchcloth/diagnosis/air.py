@@ -25,7 +25,7 @@ def _drag(world: World) -> tuple[float, float, list[float], float]:
     if DRAG not in effects:
         return 0.0, 0.0, [0.0] * 3, DENSITY
     own: AirDrag = effects[DRAG]  # type: ignore[assignment]
-    return float(own.normal.value), float(own.tangential.value), own.wind.tolist(), own.density
+    return own.normal.value.item(), own.tangential.value.item(), own.wind.tolist(), own.density
 
 
 def _with_drag(world: World, normal: float = 0.0, tangential: float = 0.0) -> World:
@@ -45,14 +45,14 @@ def _added(name: str, make: type[AbstractEffect], world: World, amplitude: float
 
 
 def _viscosity(world: World, time: float) -> World:
-    stiffness = float(world.cloth.material.membrane_stiffness)  # type: ignore[union-attr,arg-type]
+    stiffness = world.cloth.material.membrane_stiffness.item()  # type: ignore[union-attr,operator]
     return world.with_cloth({"viscosity": KelvinVoigt(time * stiffness)})
 
 
 def _bending_damping(world: World, time: float) -> World:
     own: Bending = world.cloth.effects["bending"]  # type: ignore[assignment]
-    before = 0.0 if own.damping_time is None else float(own.damping_time.value)
-    return world.with_cloth({"bending": Bending(float(own.stiffness.value), before + time)})
+    before = 0.0 if own.damping_time is None else own.damping_time.value.item()
+    return world.with_cloth({"bending": Bending(own.stiffness.value.item(), before + time)})
 
 
 HYPOTHESES = (

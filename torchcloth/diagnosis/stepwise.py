@@ -9,7 +9,7 @@ from ..errors import SimulationDiverged, UnstableStep
 from .comparison import Gain, Predicted, compare, predict
 from .evidence import Progress, Setting
 from .fitting import Fitted, fit, renoised
-from .noise import floor_of
+from .noise import Noise, fit_noise, floor_of
 from .screening import Row, screen
 from .world import Hypothesis, Model
 
@@ -83,23 +83,35 @@ def search(
 def _step(
     current: Fitted, setting: Setting, present: Sequence[Row], screened: list[Row], progress: Progress
 ) -> Step | None:
-    before = predict(current, setting.names)
-    tried: list[Candidate] = []
+    fits: list[tuple[Row, Fitted]] = []
     for row in present[:TRIED]:
         progress(f"fitting {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
-            found = fit(begun, setting, (), 1, progress, current.noise, current.evidence)
+            fits.append((row, fit(begun, setting, (), 1, progress, current.noise, current.evidence)))
         except (SimulationDiverged, UnstableStep):
             continue
-        predicted = predict(found, setting.names)
-        tried.append(Candidate(row, found, predicted, compare(before, predicted, 0.0)))
+    if not fits:
+        return None
+    tried = _compared(current, fits, setting.names, current.noise)
+    likely = max(tried, key=lambda c: c.gain.density)
+    # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
+    tried = _compared(current, fits, setting.names, fit_noise(likely.fitted.evidence))
     useful = [c for c in tried if _useful(c)]
     if not useful:
         return None
     best = max(useful, key=lambda c: c.gain.density)
     rivals = [c for c in useful if c is not best and _rival(c, best)]
     return Step(best, tried, rivals, screened)
+
+
+def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise) -> list[Candidate]:
+    """Each fit beside the model without it, on motions held out."""
+    before, out = predict(renoised(current, noise), names), []
+    for row, found in fits:
+        predicted = predict(renoised(found, noise), names)
+        out.append(Candidate(row, found, predicted, compare(before, predicted, 0.0)))
+    return out
 
 
 def _useful(c: Candidate) -> bool:

@@ -26,7 +26,7 @@ class Diagnosis:
     Attributes:
         verdict: "identified" (each cause stands alone), "ambiguous" (some cannot be told from others), "unexplained"
             (the fit is lacking and nothing known mends it), "adequate" (nothing known is wrong), "inconclusive"
-            (these data cannot say), "numerics" (the mesh errs more than anything else).
+            (these data cannot say), "numerics" (another mesh changes more than a cause would).
         content: all of it, as diagnosis.json has it.
         model: the base model with its fitted parameters and the accepted causes.
         found: the search, for pictures and for those who want to know.
@@ -187,13 +187,16 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
         "adequate": "Nothing known is wrong beyond what matters.",
         "unexplained": "The fit is lacking, and no known cause mends it.",
         "inconclusive": "Something may be wrong; these data cannot say what.",
-        "numerics": "The mesh errs more than anything else: use a finer one.",
+        "numerics": "Another mesh changes the motion by more than would be noticed of a cause: use a finer one.",
     }
     if verdict in words:
         out.append(words[verdict])
     if content["also_unexplained"]:
         out.append("Something beyond these causes remains unexplained.")
-    for label, key in (("Ruled out", "ruled_out"), ("Undecided", "undecided")):
+    for label, key in (
+        ("Too small to matter, or of a sign that makes no sense", "ruled_out"),
+        ("Undecided", "undecided"),
+    ):
         if content[key]:
             out.append(f"{label}: {', '.join(content[key])}.")
     if content["unresolvable"]:
