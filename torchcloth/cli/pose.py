@@ -45,6 +45,7 @@ def _pose(options: argparse.Namespace) -> int:
     import torch
 
     from .. import recordings, viewing
+    from ..identification import is_fitted
     from ..pose.tables import print_pose
 
     torch.set_default_dtype(torch.float64)
@@ -59,6 +60,8 @@ def _pose(options: argparse.Namespace) -> int:
     film = viewing.film_of_pose(recording, estimate, truth=options.truth)
     picture = viewing.picture(film, options.out / "pose.png", size=PICTURE)
     print_pose(estimate)
+    if options.fit is not None and is_fitted(options.fit, recording):
+        print("note: the fit used this episode: it counts twice, and the errors of the fabric's values are too small")
     print("result: " + ", ".join(str(path) for path in (*files, picture)))
     return 0
 

@@ -86,17 +86,20 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
 
     from .. import recordings
     from .._files import atomically
-    from ..identification import pictures, predict_episode, prediction_report
+    from ..identification import is_fitted, pictures, predict_episode, prediction_report
 
     if options.seen is None:
         raise InvalidInput("SEEN", got="none", expected="an episode whose motion is to be predicted")
-    found = predict_episode(fit, recordings.read(options.seen))
+    recording = recordings.read(options.seen)
+    found = predict_episode(fit, recording)
     path = _write(out, found.as_dict())
     with atomically(out / "prediction.npz") as file:
         t, vertices, std = (part.numpy() for part in (found.episode.times, found.frames.x, found.std))
         np.savez_compressed(file, t=t, vertices=vertices, std=std, faces=found.cloth.mesh.faces)
     picture = pictures.save_figure(prediction_report.predicted(found), out / "prediction.png")
     prediction_report.print_predicted(found)
+    if is_fitted(fit, recording):
+        print("note: this episode was fitted: its distances are residuals, not errors of a prediction")
     print(f"result:   {path}\nframes:   {out / 'prediction.npz'}\npicture:  {picture}")
     return 0
 

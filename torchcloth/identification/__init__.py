@@ -7,7 +7,7 @@ from .fit import identify
 from .null import rigid_carry
 from .pictures import draw
 from .result import Identification
-from .saved import Replayed, fitted, replayed
+from .saved import Replayed, fitted, is_fitted, replayed
 from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial
 from .statements import Estimate
 from .tables import print_fit, print_tension
@@ -38,6 +38,7 @@ __all__ = [
     "fit_tension",
     "fitted",
     "identify",
+    "is_fitted",
     "predict_episode",
     "predict_tension",
     "print_fit",

@@ -186,11 +186,20 @@ def _mark(recording: Recording) -> dict[str, Any]:
     return {"name": name, "frames": frames, "points": len(every), "mean": every.mean(0).tolist()}
 
 
+def is_fitted(path: str | Path, recording: Recording) -> bool:
+    """Whether the fit used this episode: then nothing about it is a prediction, nor new."""
+    return any(_alike(kept, _mark(recording)) for kept in read_saved(result_file(path)).episodes)
+
+
+def _alike(kept: dict[str, Any], own: dict[str, Any]) -> bool:
+    counts = all(kept[key] == own[key] for key in ("frames", "points"))
+    return counts and bool(np.abs(np.subtract(kept["mean"], own["mean"])).max() < SAME)
+
+
 def _same(path: Path, episodes: Sequence[dict[str, Any]], recording: Recording) -> dict[str, Any]:
     own = _mark(recording)
     for kept in episodes:
-        alike = all(kept[key] == own[key] for key in ("frames", "points"))
-        if alike and np.abs(np.subtract(kept["mean"], own["mean"])).max() < SAME:
+        if _alike(kept, own):
             return kept
     raise InvalidInput(
         f"{path}: a fit of another episode",
