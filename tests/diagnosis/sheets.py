@@ -16,7 +16,7 @@ from torchcloth.identification.replays import Frames
 
 SIDE = 0.2  # m
 TRUTH, FIT = (13, 13), (7, 7)
-NOMINAL = {"membrane_stiffness": 60.0, "poisson_ratio": 0.3, "bending_stiffness": 6e-5, "bending_damping_time": 0.01}
+NOMINAL = {"membrane_stiffness": 60.0, "poisson_ratio": 0.3, "bending_stiffness": 2e-4, "bending_damping_time": 0.01}
 FRAMES, RATE, POINTS, NOISE = 16, 20.0, 80, 5e-4  # -, Hz, a frame, m
 
 

@@ -45,7 +45,7 @@ def test_nothing_at_zero_and_twice_as_much_at_twice(made, name):
     share = (0.05, 0.1)
     moved = [(model.world([(h, s * h.typical)]).frames(e), s) for s in share]
     small, twice = ((f.x - base.x).norm() + (f.edge - base.edge).norm() for f, _ in moved)
-    if float(twice) > 1e-9:
+    if float(twice) > 1e-4:  # m, of all vertices and frames together: else the substep, chosen anew, shows
         assert float(twice / small) == pytest.approx(2.0, rel=0.15)
 
 
