@@ -1,7 +1,7 @@
 """The known causes, each as one number that changes a world. Amplitude 0 is the world as it is.
 
-Typical amplitudes: design notes' table of published magnitudes (KES for friction, flat plates for air, laundering
-standards for shrinkage). What a user registers joins the search.
+Typical amplitudes are published magnitudes (KES for friction, flat plates for air, laundering standards for shrinkage).
+What a user registers joins the search.
 """
 
 from __future__ import annotations
