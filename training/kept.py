@@ -9,8 +9,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from torchcloth._files import write_text
-from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.errors import InvalidInput, RecordingError, TorchclothError
 
 Case = Callable[[], dict[str, Any]]
 
@@ -75,6 +77,27 @@ class Kept:
 
     def _path(self, name: str) -> Path:
         return self.folder / "cases" / f"{name}.json"
+
+
+def guarded(name: str, what: str, work: Callable[[], object]) -> int:
+    """Do a study's work in one thread and float64; the command's exit code, errors said in one line.
+
+    Args:
+        name: of the command.
+        what: it keeps when it is stopped, e.g. "finished cases".
+        work: to be done.
+    """
+    torch.set_default_dtype(torch.float64)
+    torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
+    try:
+        work()
+        return 0
+    except (TorchclothError, OSError) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"{name}: stopped; the same command continues, {what} are kept", file=sys.stderr)
+        return 130
 
 
 def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,8 @@ def _diagnose(options: argparse.Namespace) -> int:
     model = None if options.model is None else diagnosis.load_model(options.model)
     episodes = [recordings.read(path) for path in options.episodes]
     print(f"{len(episodes)} episodes: about a minute each on one core", flush=True)
-    answer = diagnosis.diagnose(episodes, model, progress=_progress())
+    with _progress() as progress:
+        answer = diagnosis.diagnose(episodes, model, progress=progress)
     path = diagnosis.write_diagnosis(answer, episodes[0], options.out)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())
@@ -38,12 +41,13 @@ def _diagnose(options: argparse.Namespace) -> int:
     return 0
 
 
-def _progress():
+@contextmanager
+def _progress() -> Iterator[Callable[[str], None]]:
     """One line that changes on a terminal; in a log, a line for every stage."""
     if not sys.stderr.isatty():
-        return lambda text: None if text.endswith("slopes") else print(text, flush=True)
+        yield lambda text: None if text.endswith("slopes") else print(text, flush=True)
+        return
     from rich.console import Console
 
-    status = Console(stderr=True).status("")
-    status.start()
-    return lambda text: status.update(text)
+    with Console(stderr=True).status("") as status:
+        yield status.update

@@ -90,12 +90,12 @@ def gather(
 
     The nuisances' slopes, which hardly depend on the point, are taken from ``before`` where that is given.
     """
-    asked = _simulable(model, setting, hypotheses, progress)
+    asked, trials = _simulable(model, setting, hypotheses, progress)
     cells, stds, numerics = [], [], []
     for k, (e, fine) in enumerate(zip(setting.episodes, finer_residuals(model, setting), strict=True)):
         progress(f"{e.name}: slopes")
         base, own, steps = _own(model, e, setting.dt)
-        moved = directions(base, [*own, *asked[k].values()], [*steps, *(h.typical for h in _kept(hypotheses, asked))])
+        moved = directions(base, [*own, *trials[k]], [*steps, *(h.typical for h in asked)])
         if before is None:
             other, std = _nuisances(model, base, e, setting.dt)
             moved = _joined(moved, other)
@@ -108,17 +108,13 @@ def gather(
         cells.append(kept)
         numerics.append(difference)
         stds.append(std)
-    return Evidence(cells, len(model.point), _kept(hypotheses, asked), stds, numerics)
-
-
-def _kept(hypotheses: Sequence[Hypothesis], asked: list[dict[str, Frames]]) -> list[Hypothesis]:
-    return [h for h in hypotheses if all(h.name in own for own in asked)]
+    return Evidence(cells, len(model.point), asked, stds, numerics)
 
 
 def _simulable(
     model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
-) -> list[dict[str, Frames]]:
-    """Per episode, frames with each hypothesis that can be simulated in all of them."""
+) -> tuple[list[Hypothesis], list[list[Frames]]]:
+    """(hypotheses that can be simulated in all episodes; per episode, the frames with each of them)."""
     found: list[dict[str, Frames]] = []
     possible = list(hypotheses)
     for e in setting.episodes:
@@ -126,7 +122,7 @@ def _simulable(
         trials = side_by_side(lambda h, e=e: _tried(model, h, e, setting.dt), possible)
         found.append({h.name: frames for h, frames in zip(possible, trials, strict=True) if frames is not None})
         possible = [h for h in possible if h.name in found[-1]]
-    return [{h.name: own[h.name] for h in possible} for own in found]
+    return possible, [[own[h.name] for h in possible] for own in found]
 
 
 def _tried(model: Model, h: Hypothesis, e: Episode, dt: float | None) -> Frames | None:

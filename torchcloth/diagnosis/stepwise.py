@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from ..errors import SimulationDiverged, UnstableStep
 from .comparison import Gain, Predicted, compare, predict
@@ -54,7 +54,6 @@ class Found:
     screened: list[Row]  # at the end
     whole: Gain | None  # of all causes together
     floor: float  # m, of a cell
-    notes: list[str] = field(default_factory=list)
 
 
 def search(

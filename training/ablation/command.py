@@ -12,10 +12,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
+from torchcloth.errors import InvalidInput
 
-from torchcloth.errors import InvalidInput, TorchclothError
-
+from ..kept import guarded
 from .scenes import ACTIONS, ASSUMED, GARMENTS, LEVELS, Scene, Setup, Variant, variants
 from .study import Name, Study, Task, missing, simulate
 
@@ -25,16 +24,7 @@ FAST = {"triangles": 150, "pace": 3.0, "levels": [25, 175]}
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
     options = _parser().parse_args(arguments)
-    torch.set_default_dtype(torch.float64)
-    torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
-    try:
-        return _run(options)
-    except (TorchclothError, OSError) as error:
-        print(f"ablation: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("ablation: stopped; the same command continues, finished runs are kept", file=sys.stderr)
-        return 130
+    return guarded("ablation", "finished runs", lambda: _run(options))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -65,7 +55,7 @@ def _list(names: Sequence | dict) -> str:
     return f"among {', '.join(map(str, names))} (all)"
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> None:
     from .report import report
 
     for name in ("jobs", "batch"):
@@ -84,7 +74,6 @@ def _run(options: argparse.Namespace) -> int:
         if tasks:
             _simulate(study, tasks, options.jobs)
     report(study, scenes, wanted)
-    return 0
 
 
 def _announce(study: Study, scenes: list[Name], wanted: list[Variant], tasks: list[Task]) -> None:

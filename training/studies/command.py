@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-import torch
-
-from torchcloth.errors import TorchclothError
+from ..kept import guarded
 
 # Modules of this package; ``add(parser)`` declares options, ``run(options)`` does it.
 STUDIES: tuple[str, ...] = ("fabrics", "garments", "chamfer", "factors", "classify", "measured", "pose")
@@ -19,17 +16,8 @@ STUDIES: tuple[str, ...] = ("fabrics", "garments", "chamfer", "factors", "classi
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
     options = _parser().parse_args(arguments)
-    torch.set_default_dtype(torch.float64)
-    torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
-    try:
-        import_module(f".{options.study}", __package__).run(options)
-        return 0
-    except (TorchclothError, OSError) as error:
-        print(f"studies: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("studies: stopped; the same command continues, finished cases are kept", file=sys.stderr)
-        return 130
+    study = import_module(f".{options.study}", __package__)
+    return guarded("studies", "finished cases", lambda: study.run(options))
 
 
 def _parser() -> argparse.ArgumentParser:
