@@ -39,7 +39,7 @@ REST = 0.12  # s, after the grippers open
 
 @dataclass(frozen=True)
 class Manipulation:
-    """One way to move a garment; ``number`` seeds the sensor's errors."""
+    """One way to move a garment; ``number`` seeds the sensor's errors, ``slower`` divides the grippers' speed."""
 
     garment: str
     number: int
@@ -47,6 +47,7 @@ class Manipulation:
     speed: str
     grip: str
     posture: str
+    slower: float = 1.0
 
     @property
     def name(self) -> str:
@@ -179,7 +180,7 @@ class Scene:
 
     def _action(self, grips: dict[str, tuple[float, ...]]) -> Action:
         """Away for cover and fling, towards the arms for drag."""
-        speed = SPEEDS[self.what.speed]
+        speed = SPEEDS[self.what.speed] / self.what.slower
         limits = Limits(speed, 8.0 * speed**2)
         if self.what.action == "fling":
             return primitives.fling(grips, 0.12, heading=0.0, pull=0.15, landing=0.05, rest=REST, limits=limits)
