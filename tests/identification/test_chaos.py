@@ -162,7 +162,8 @@ def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
         part = SimpleNamespace(
             episodes=[SimpleNamespace(times=torch.arange(round(100 * share)) / 10.0, observed=round(100 * share))]
         )
-        checked = linearity.Checked(SimpleNamespace(raw=torch.tensor(share)), None, [], [])
+        final = gauss_newton.Iterate(torch.tensor(share), *[None] * 5)
+        checked = linearity.Checked(final, None, [], [])
         return (part, checked) if 0.12 < share < 0.45 else None
 
     monkeypatch.setattr(horizon, "_solved", solved)
