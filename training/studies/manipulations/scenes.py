@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -188,3 +188,15 @@ class Scene:
             return primitives.drag(grips, 0.15, heading=math.pi, landing=0.02, rest=REST, limits=limits)
         reach = 0.75 * self.length
         return primitives.cover(grips, reach, heading=0.0, landing=2 * self.fine.gap, rest=REST, limits=limits)
+
+
+def slowed(what: Manipulation, length: float, fine: Discretisation) -> Manipulation:
+    """The same with grippers so slow that it takes ``length`` seconds.
+
+    Raises:
+        InvalidInput: it takes longer as it is.
+    """
+    lasts = min(float(path.t[-1]) for path in Scene(what, fine).action.motion.values())
+    if length < lasts:
+        raise InvalidInput("--length", got=f"{length:g} s", expected=f"{lasts:.2f} s or more")
+    return replace(what, slower=what.slower * (length - REST) / (lasts - REST))
