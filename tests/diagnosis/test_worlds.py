@@ -29,7 +29,7 @@ def made():
 
 
 EVERY = [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES]
-NAMES = [h.name for h in EVERY if not h.needs_table]
+NAMES = [h.name for h in EVERY if h.needs(RECORDING)]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -62,6 +62,15 @@ def test_air_and_hem_do_what_their_names_say(made):
     assert float((last("env.gravity_tilt[x]", 0.2) - base)[free, 0].mean()) > 1e-5
     assert float((last("rest.shrink[weft]", 0.05) - base)[free, 2].mean()) > 1e-3
     torch.testing.assert_close(last("obs.extrinsic[x]", 0.004) - base, torch.tensor([0.004, 0.0, 0.0]).expand_as(base))
+    depth = lambda x: (x - torch.as_tensor(sheets.EYE)).norm(dim=-1)  # noqa: E731
+    torch.testing.assert_close(depth(last("obs.depth_scale", 0.015)), 1.015 * depth(base))
+    torch.testing.assert_close(depth(last("obs.depth_bias", 5e-3)), depth(base) + 5e-3)
+
+
+def test_what_a_recording_cannot_show_is_not_asked(made):
+    model, _ = made
+    asked = {h.name for h in catalogue(model, [replace(RECORDING, cameras={})])}
+    assert asked.isdisjoint({"obs.depth_scale", "obs.depth_bias", "contact.mu"})
 
 
 def test_two_effects_in_one_part_keep_both(made):

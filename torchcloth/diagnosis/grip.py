@@ -49,5 +49,5 @@ HYPOTHESES = (
     Hypothesis("grip.slip", "m/(N s)", 0.05, _slip),
     Hypothesis("grip.width", "m", 0.02, lambda w, a: _regrasped(w, wider=a)),
     Hypothesis("robot.regrasp", "m", 0.017, lambda w, a: _regrasped(w, along=a), signed=True),
-    Hypothesis("contact.mu", "-", 0.2, _friction, signed=True, needs_table=True),
+    Hypothesis("contact.mu", "-", 0.2, _friction, signed=True, needs=lambda r: bool(r.colliders)),
 )

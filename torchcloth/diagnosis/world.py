@@ -15,6 +15,7 @@ from ..effects import AbstractEffect
 from ..identification.episodes import Episode
 from ..identification.replays import Frames, Replay, frames_of
 from ..materials import AbstractMaterial
+from ..recordings import Recording
 
 Motion = Callable[[Episode], Episode]  # what the robot really does, from what it says
 View = Callable[[Frames, Episode], Frames]  # what is seen, from what is there
@@ -93,7 +94,7 @@ class Hypothesis:
         apply: (world, amplitude) -> world.
         signed: negative amplitudes make sense.
         share: smallest amplitude of interest, as a share of the typical one.
-        needs_table: only where cloth touches something.
+        needs: what a recording must have for it to mean anything.
         kin: names that no experiment of this kind can tell from it, by structure.
     """
 
@@ -103,7 +104,7 @@ class Hypothesis:
     apply: Callable[[World, float], World]
     signed: bool = False
     share: float = 0.4
-    needs_table: bool = False
+    needs: Callable[[Recording], bool] = lambda recording: True
     kin: tuple[str, ...] = ()
 
     @property
