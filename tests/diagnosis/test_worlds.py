@@ -7,6 +7,7 @@ import pytest
 import sheets
 import torch
 
+from torchcloth import recordings as rec
 from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import base_model
 from torchcloth.diagnosis.evidence import gather, setting_of
@@ -67,6 +68,15 @@ def test_air_and_hem_do_what_their_names_say(made):
     torch.testing.assert_close(depth(last("obs.depth_bias", 5e-3)), depth(base) + 5e-3)
 
 
+def test_a_table_may_rub_more_and_otherwise_along_x():
+    table = replace(RECORDING, colliders={"table": rec.Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.4)})
+    model = base_model(table)
+    by = {h.name: h for h in catalogue(model, [table])}
+    law = model.world([(by["contact.aniso"], -0.5), (by["contact.mu"], 0.2)]).cloth.boundaries["table"].friction
+    assert float(law.value) == pytest.approx(0.4)  # (0.4 / 2) + 0.2 along x
+    assert float(law.ratio.value) == pytest.approx(2.0)
+
+
 def test_what_a_recording_cannot_show_is_not_asked(made):
     model, _ = made
     asked = {h.name for h in catalogue(model, [replace(RECORDING, cameras={})])}
@@ -80,6 +90,11 @@ def test_two_effects_in_one_part_keep_both(made):
     air = world.cloth.effects["air"]
     assert (float(air.normal.value), float(air.tangential.value)) == pytest.approx((0.8, 0.02))
     assert air.wind.tolist() == pytest.approx([0.3, 0.0, 0.0])
+    bending = model.world(
+        [(by[name], by[name].typical) for name in ("rest.curl[weft]", "plast.crease", "damp.bend", "bend.aniso")]
+    ).cloth.effects["bending"]
+    found = [float(getattr(bending, name).value) for name in ("curl_weft", "mobility", "damping_time", "weft_ratio")]
+    assert found == pytest.approx([3.0, 5.0, 0.06, 0.4])
     rest = model.world([(by["rest.shrink[warp]"], 0.02), (by["rest.skew"], 0.01)]).cloth.effects["rest_shape"]
     assert (float(rest.shrink_warp.value), float(rest.skew.value)) == pytest.approx((0.02, 0.01))
     woven = model.world([(by["elas.ortho"], 0.5), (by["elas.shear"], -0.4)]).cloth.material
