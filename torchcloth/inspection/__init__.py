@@ -11,7 +11,7 @@ from .lag import Lag
 from .look import Inspection, inspect
 from .noise import Noise
 from .pictures import draw
-from .streams import Stream
+from ..recordings.ticks import Stream
 from .tables import show
 
 __all__ = ["Depth", "Frames", "Inspection", "Lag", "Noise", "Stream", "draw", "inspect", "show"]
