@@ -31,14 +31,21 @@ class World:
 
     def frames(self, episode: Episode, dt: float | None = None) -> Frames:
         """What an observer has of the episode, simulated without derivatives."""
+        return self.seen(self.simulated(episode, dt), episode)
+
+    def simulated(self, episode: Episode, dt: float | None = None) -> Frames:
+        """What happens, whoever looks on."""
         driven = episode
         for motion in self.motions:
             driven = motion(driven)
         with torch.no_grad():
-            found = frames_of(Replay(self.cloth)(driven, dt))
+            return frames_of(Replay(self.cloth)(driven, dt))
+
+    def seen(self, frames: Frames, episode: Episode) -> Frames:
+        """What an observer has of what happens."""
         for view in self.views:
-            found = view(found, episode)
-        return found
+            frames = view(frames, episode)
+        return frames
 
     def with_motion(self, motion: Motion) -> World:
         """The same with one more error of the robot."""
@@ -175,3 +182,8 @@ class Model:
     def plus(self, hypothesis: Hypothesis, amplitude: float = 0.0) -> Model:
         """With one more accepted hypothesis."""
         return replace(self, accepted=(*self.accepted, hypothesis), amplitudes=(*self.amplitudes, amplitude))
+
+    def without(self, name: str) -> Model:
+        """Less one accepted hypothesis."""
+        kept = [(h, a) for h, a in zip(self.accepted, self.amplitudes, strict=True) if h.name != name]
+        return replace(self, accepted=tuple(h for h, _ in kept), amplitudes=tuple(a for _, a in kept))
