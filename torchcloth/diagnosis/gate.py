@@ -83,8 +83,8 @@ def same_cloth(recordings: Sequence[Recording]) -> None:
     """Raises InvalidInput where the episodes do not describe one cloth, held at the same places."""
     first = recordings[0]
     for k, other in enumerate(recordings[1:], 1):
-        for what, read in _DESCRIBED.items():
-            a, b = read(first), read(other)
+        for what, of in _DESCRIBED.items():
+            a, b = of(first), of(other)
             if not _equal(a, b):
                 raise InvalidInput(
                     f"{name_of(other, k)}: another {what} than in {name_of(first, 0)}",

@@ -17,13 +17,14 @@ from ..recordings import Recording
 from ..recordings.extents import longest, size
 from ..robots.paths import Path, paths  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
-TOO_LONG, TOO_SHORT = 1.3, 0.12  # of the cloth's length: half of the clouds, nine tenths of them
+TOO_WIDE, TOO_NARROW = 0.65, 0.03  # of the cloth's length: half of the points lie within so much of their middle
 FAR = 0.1  # m, of the first points from the first shape, half of them
 STRAY, REACH = 0.1, 1.1  # share of points, and lengths of the cloth from a gripper that holds it
 AWAY = 0.05  # m, of held places from their grippers: another order that halves it is the right one
 FOLLOW, BETTER = 0.06, 0.4  # m by which the cloud leaves the grippers; share of it that a mirrored cloud leaves
 NEAREST = 5  # points, whose mean distance from a gripper is looked at
 FIRST = 3  # frames
+SURELY = 1.5  # factor within which a unit is recognised
 LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
 SOME = 400  # points of a frame that are looked at
 
@@ -41,6 +42,7 @@ class Seen:
 
     @cached_property
     def cloth(self) -> Cloth:
+        """As the episode describes it."""
         return cloth_from(self.recording)
 
     @cached_property
@@ -50,6 +52,7 @@ class Seen:
 
     @cached_property
     def length(self) -> float:
+        """m, of the cloth from corner to corner."""
         return size(self.recording.cloth)[0] or float(longest(self.first.numpy()))
 
     def off(self, clouds: Sequence[np.ndarray]) -> float:
@@ -90,14 +93,16 @@ def _nearest(cloud: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def units(seen: Seen) -> Iterator[tuple[str, str]]:
-    extents = np.array([longest(c) for c in seen.clouds if len(c)])
-    if not len(extents):
+    """A cloud that no cloth of this size could show."""
+    clouds = [c for c in seen.clouds if len(c)]
+    if not clouds:
         return
-    usual, most = (float(np.quantile(extents, q)) / seen.length for q in (0.5, 0.9))
-    if usual > TOO_LONG or most < TOO_SHORT:
-        factor = usual if usual > TOO_LONG else most
+    spreads = [float(np.median(np.linalg.norm(c - np.median(c, axis=0), axis=1))) for c in clouds]
+    wide, narrow = (float(np.quantile(spreads, q)) / seen.length for q in (0.5, 0.9))
+    if wide > TOO_WIDE or narrow < TOO_NARROW:
+        factor = float(np.median([longest(c) for c in clouds])) / seen.length
         unit = min(LENGTHS, key=lambda name: abs(np.log(factor * LENGTHS[name])))
-        guess = f", as if in {unit}" if abs(np.log(factor * LENGTHS[unit])) < np.log(TOO_LONG) else ""
+        guess = f", as if in {unit}" if abs(np.log(factor * LENGTHS[unit])) < np.log(SURELY) else ""
         yield (
             f"the cloud is {factor:.3g} times as long as the cloth{guess}",
             "check the unit of points, of depth (depth_scale) and of the cloth's mesh, and leave out what is no cloth",
@@ -105,6 +110,7 @@ def units(seen: Seen) -> Iterator[tuple[str, str]]:
 
 
 def places(seen: Seen) -> Iterator[tuple[str, str]]:
+    """Grippers, cloth and cloud that are not where each other says."""
     yield from _swapped(seen)
     if not any(len(c) for c in seen.clouds[:FIRST]):
         return
@@ -149,7 +155,7 @@ def _swapped(seen: Seen) -> Iterator[tuple[str, str]]:
     if own > AWAY and orders[best] < 0.5 * own:
         pairs = ", ".join(f"{names[i]} holds what {names[k]} should" for k, i in enumerate(best) if i != k)
         yield (
-            f"the grippers are swapped: {pairs} ({100 * own:.0f} cm from their places, {100 * orders[best]:.0f} cm then)",
+            f"the grippers are swapped: {pairs} ({100 * own:.0f} cm from its place, {100 * orders[best]:.0f} cm then)",
             "exchange their names in motion.npz or in grasps",
         )
 
