@@ -175,7 +175,7 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
     if missing:
         raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=f"motion of {sorted(motion)}")
     times = _frame_times(name, recording, motion, needed)
-    initial = _initial(name, cloth, recording).to(dtype)
+    initial = first_shape(name, cloth, recording).to(dtype)
     _check_place(name, cloth, motion, initial, times[0])
     markers = streams.markers(recording, times, dtype)
     return Episode(
@@ -220,7 +220,12 @@ def _frame_times(name: str, recording: Recording, motion: Mapping[str, Trajector
     return _overlap(times[times >= first[0] - streams.SAME], motion, needed)
 
 
-def _initial(name: str, cloth: Cloth, recording: Recording) -> Tensor:
+def first_shape(name: str, cloth: Cloth, recording: Recording) -> Tensor:
+    """[V, 3] m, where the vertices are at the first frame.
+
+    Raises:
+        InvalidInput: they do not belong to the cloth's mesh.
+    """
     initial = recording.cloth.initial_vertices
     if initial is not None and initial.ndim == 3 and cloth.mesh.uv is not None:
         initial = recording.cloth.initial_at(cloth.mesh.uv)
