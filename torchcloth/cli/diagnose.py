@@ -37,7 +37,7 @@ def _diagnose(options: argparse.Namespace) -> int:
         print(f"{len(episodes)} episodes: about a minute each on one core", flush=True)
         with _progress() as progress:
             answer = diagnosis.diagnose(episodes, model, progress=progress)
-    path = diagnosis.write_diagnosis(answer, episodes[0] if episodes else None, options.out)
+    path = diagnosis.write_diagnosis(answer, episodes, options.out)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())
     written = (path.name, "report.html", answer.content["model"])
