@@ -12,7 +12,8 @@ from .evidence import Evidence, Progress, Setting, gather
 from .noise import Noise, Whitened, fit_noise, whitened
 from .world import Hypothesis, Model
 
-SMALL = 0.1  # standard errors, of a step that ends the search
+ENOUGH = 2.0  # log density that a further step is expected to gain, below which the search ends
+ITERATIONS = 3  # at most
 LONGEST = 1.0  # prior standard deviations, of a step
 
 
@@ -45,7 +46,7 @@ def fit(
     model: Model,
     setting: Setting,
     hypotheses: Sequence[Hypothesis] = (),
-    iterations: int = 2,
+    iterations: int = ITERATIONS,
     progress: Progress = lambda _: None,
     noise: Noise | None = None,
     before: Evidence | None = None,
@@ -60,10 +61,10 @@ def fit(
         before = before or evidence
         white = whitened(evidence, noise or fit_noise(evidence))
         step, covariance = _step(white, model.point, precision)
+        if 0.5 * float(step @ torch.linalg.solve(covariance, step)) < ENOUGH:
+            break
         limit = LONGEST * precision.rsqrt()
         model = model.at(model.point + step.clamp(-limit, limit))
-        if float((step / covariance.diagonal().sqrt()).abs().max()) < SMALL:
-            break
     evidence = gather(model, setting, hypotheses, progress, before)
     noise = noise or fit_noise(evidence)
     white = whitened(evidence, noise)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..errors import SimulationDiverged, UnstableStep
+from .approach import approach
 from .comparison import Gain, Predicted, compare, predict
 from .evidence import Progress, Setting
 from .fitting import Fitted, fit, renoised
@@ -60,7 +61,8 @@ def search(
     model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
 ) -> Found:
     """Causes one after the other, until none is both present and useful on motions held out."""
-    current = start = fit(model, setting, hypotheses, progress=progress)
+    near, before = approach(model, setting, progress)
+    current = start = fit(near, setting, hypotheses, progress=progress, before=before)
     steps: list[Step] = []
     while True:
         screened = screen(current)
