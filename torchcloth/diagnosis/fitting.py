@@ -27,6 +27,7 @@ class Fitted:
         noise: as estimated there.
         white: evidence, whitened.
         covariance: [P + A, P + A] of the model's coordinates.
+        ahead: log density that a further step is expected to gain.
     """
 
     model: Model
@@ -34,6 +35,7 @@ class Fitted:
     noise: Noise
     white: Whitened
     covariance: Tensor
+    ahead: float
 
 
 def prior_precision(model: Model) -> Tensor:
@@ -50,26 +52,28 @@ def fit(
     progress: Progress = lambda _: None,
     noise: Noise | None = None,
     before: Evidence | None = None,
+    here: Evidence | None = None,
 ) -> Fitted:
     """Fit the model's parameters and amplitudes, then ask about the hypotheses there.
 
     Fits are compared with the same ``noise``; None: estimated. The nuisances' slopes are those of ``before``, if given.
+    ``here`` is the evidence at the model's point, where that is known already.
     """
     precision = prior_precision(model)
     for _ in range(iterations):
-        evidence = gather(model, setting, (), progress, before)
-        before = before or evidence
-        white = whitened(evidence, noise or fit_noise(evidence))
-        step, covariance = _step(white, model.point, precision)
-        if 0.5 * float(step @ torch.linalg.solve(covariance, step)) < ENOUGH:
+        here = here or gather(model, setting, (), progress, before)
+        before = before or here
+        step, _, ahead = _step(whitened(here, noise or fit_noise(here)), model.point, precision)
+        if ahead < ENOUGH:
             break
         limit = LONGEST * precision.rsqrt()
-        model = model.at(model.point + step.clamp(-limit, limit))
-    evidence = gather(model, setting, hypotheses, progress, before)
-    noise = noise or fit_noise(evidence)
-    white = whitened(evidence, noise)
-    _, covariance = _step(white, model.point, precision)
-    return Fitted(model, evidence, noise, white, covariance)
+        model, here = model.at(model.point + step.clamp(-limit, limit)), None
+    if here is None or hypotheses:
+        here = gather(model, setting, hypotheses, progress, before)
+    noise = noise or fit_noise(here)
+    white = whitened(here, noise)
+    _, covariance, ahead = _step(white, model.point, precision)
+    return Fitted(model, here, noise, white, covariance, ahead)
 
 
 def renoised(found: Fitted, noise: Noise) -> Fitted:
@@ -77,7 +81,10 @@ def renoised(found: Fitted, noise: Noise) -> Fitted:
     return replace(found, noise=noise, white=whitened(found.evidence, noise))
 
 
-def _step(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+def _step(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, float]:
+    """(step, covariance, log density that the step is expected to gain)."""
     own = white.jacobian[:, : len(point)]
     covariance = torch.linalg.inv(own.mT @ own + torch.diag(precision))
-    return -covariance @ (own.mT @ white.value + precision * point), covariance
+    uphill = own.mT @ white.value + precision * point
+    step = -covariance @ uphill
+    return step, covariance, -0.5 * float(step @ uphill)
