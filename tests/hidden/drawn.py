@@ -143,15 +143,13 @@ def case(seed: int, size: Size = REDUCED) -> Case:
 
 
 def sealed(secret: int, count: int) -> list[int]:
-    """``count`` sealed numbers in an order that tells nothing; every twenty hold the families at their shares."""
+    """``count`` sealed numbers; every twenty hold the families at their shares, in an order that tells nothing."""
     rng = np.random.default_rng([secret, 11])
-    rounds = -(-count // len(ROUND))
-    turns = rng.choice(10**9, rounds, replace=False)
-    found = [SEALED + int(t) * len(ROUND) + k for t in turns for k in range(len(ROUND))]
-    # a last round that is not full holds what comes first in a shuffled one
-    last = rng.permutation(len(ROUND))[: count - (rounds - 1) * len(ROUND)] + (rounds - 1) * len(ROUND)
-    kept = [*range((rounds - 1) * len(ROUND)), *last.tolist()]
-    return [found[k] for k in rng.permutation(kept)]
+    found: list[int] = []
+    while len(found) < count:  # as many as asked for, or more: the first are the same
+        turn = int(rng.integers(10**9))
+        found += [SEALED + turn * len(ROUND) + int(k) for k in rng.permutation(len(ROUND))]
+    return found[:count]
 
 
 def _plans(size: Size, rng: np.random.Generator) -> tuple[Plan, ...]:
