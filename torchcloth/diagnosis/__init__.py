@@ -8,17 +8,19 @@ from .base_model import base_model
 from .comparison import Gain, compare, predict
 from .evidence import gather, setting_of
 from .fitting import Fitted, fit
+from .gate import Fault, check, read_episodes
 from .hypotheses import catalogue, register
 from .model_file import load_model, save_model
 from .noise import fit_noise
 from .run import diagnose, write_diagnosis
 from .screening import screen
 from .stepwise import search
-from .verdict import Diagnosis, judge
+from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model, World
 
 __all__ = [
     "Diagnosis",
+    "Fault",
     "Fitted",
     "Gain",
     "Hypothesis",
@@ -26,6 +28,7 @@ __all__ = [
     "World",
     "base_model",
     "catalogue",
+    "check",
     "compare",
     "diagnose",
     "fit",
@@ -34,6 +37,8 @@ __all__ = [
     "judge",
     "load_model",
     "predict",
+    "read_episodes",
+    "refused",
     "register",
     "save_model",
     "screen",

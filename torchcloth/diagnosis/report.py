@@ -24,12 +24,22 @@ th { border-bottom: 1px solid #999 } td:first-child, th:first-child { text-align
 
 def write_report(answer: Diagnosis, folder: Path) -> Path:
     """Write report.html into ``folder``; returns its path."""
+    verdict = [
+        f'<p class="verdict">Verdict: <b>{answer.verdict}</b></p>',
+        *(f"<p>{html.escape(line)}</p>" for line in answer.summary().splitlines()),
+    ]
+    parts = verdict if answer.searched is None else verdict + _evidence(answer)
+    title = "What the simulation gets wrong"
+    page = f"<!doctype html><html><head><meta charset='utf-8'><title>{title}</title><style>{STYLE}</style></head>"
+    return write_text(folder / "report.html", f"{page}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")
+
+
+def _evidence(answer: Diagnosis) -> list[str]:
+    """Pictures and tables of a search."""
     found, motions = answer.found, answer.content["motions"]
     before = predict(found.start, motions)
     after = predict(found.end, motions) if found.steps else None
-    parts = [
-        f'<p class="verdict">Verdict: <b>{answer.verdict}</b></p>',
-        *(f"<p>{html.escape(line)}</p>" for line in answer.summary().splitlines()),
+    return [
         "<h2>Where and when</h2>",
         _image(pictures.residual_maps(answer)),
         "<h2>Motions held out</h2>",
@@ -43,9 +53,6 @@ def write_report(answer: Diagnosis, folder: Path) -> Path:
         "<h2>Parameters of the model</h2>",
         _parameters(answer.content["parameters"]),
     ]
-    title = "What the simulation gets wrong"
-    page = f"<!doctype html><html><head><meta charset='utf-8'><title>{title}</title><style>{STYLE}</style></head>"
-    return write_text(folder / "report.html", f"{page}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")
 
 
 def _image(figure: Any) -> str:

@@ -6,14 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from ..errors import InvalidInput
 from .cells import SEEN
 from .classes import alike
 from .comparison import Gain
 from .evidence import Evidence
+from .gate import Fault
 from .stepwise import Found, Step
 from .world import Model
 
-Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics"]
+Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 NORMAL = 1.96
 ROUGH = 5e-4  # m: slow errors of position cells beyond this are a lack of fit
 OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
@@ -26,16 +28,31 @@ class Diagnosis:
     Attributes:
         verdict: "identified" (each cause stands alone), "ambiguous" (some cannot be told from others), "unexplained"
             (the fit is lacking and nothing known mends it), "adequate" (nothing known is wrong), "inconclusive"
-            (these data cannot say), "numerics" (another mesh changes more than a cause would).
+            (these data cannot say), "numerics" (another mesh changes more than a cause would), "invalid_data" (an
+            episode cannot be believed, and nothing was simulated).
         content: all of it, as diagnosis.json has it.
-        model: the base model with its fitted parameters and the accepted causes.
-        found: the search, for pictures and for those who want to know.
+        searched: the search; None of invalid data.
     """
 
     verdict: Verdict
     content: dict[str, Any]
-    model: Model
-    found: Found
+    searched: Found | None
+
+    @property
+    def found(self) -> Found:
+        """The search, for pictures and for those who want to know.
+
+        Raises:
+            InvalidInput: the data were invalid.
+        """
+        if self.searched is None:
+            raise InvalidInput("found", got="a diagnosis of invalid data", expected="episodes that can be believed")
+        return self.searched
+
+    @property
+    def model(self) -> Model:
+        """The base model with its fitted parameters and the accepted causes; raises as ``found``."""
+        return self.found.end.model
 
     def summary(self) -> str:
         """Plain language."""
@@ -66,7 +83,16 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
         "warnings": _warnings(found, names),
         "motions": list(names),
     }
-    return Diagnosis(verdict, content, found.end.model, found)
+    return Diagnosis(verdict, content, found)
+
+
+def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
+    """The answer where episodes cannot be believed: what is wrong with them."""
+    lists: dict[str, Any] = {key: [] for key in ("causes", "ruled_out", "undecided", "unresolvable", "warnings")}
+    none = dict.fromkeys(("gain", "lack_of_fit", "next_experiment", "model"))
+    said = [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults]
+    content = {**lists, **none, "verdict": "invalid_data", "also_unexplained": False, "parameters": {}}
+    return Diagnosis("invalid_data", {**content, "faults": said, "motions": list(names)}, None)
 
 
 def _verdict(found: Found, causes: Sequence[dict[str, Any]], lacking: bool) -> Verdict:
@@ -188,9 +214,11 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
         "unexplained": "The fit is lacking, and no known cause mends it.",
         "inconclusive": "Something may be wrong; these data cannot say what.",
         "numerics": "Another mesh changes the motion by more than would be noticed of a cause: use a finer one.",
+        "invalid_data": "These episodes cannot be believed; nothing was simulated.",
     }
     if verdict in words:
         out.append(words[verdict])
+    out += [f"{f['episode']}: {f['what']}. To do: {f['remedy']}." for f in content.get("faults", ())]
     if content["also_unexplained"]:
         out.append("Something beyond these causes remains unexplained.")
     for label, key in (
