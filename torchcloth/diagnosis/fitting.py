@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .evidence import Evidence, Progress, Setting, gather
+from .evidence import Evidence, Progress, Setting, gather, staged
 from .noise import Noise, Whitened, fit_noise, whitened
 from .world import Hypothesis, Model
 
@@ -55,8 +55,8 @@ def fit(
     Fits are compared with the same ``noise``; None: estimated. The nuisances' slopes are those of ``before``, if given.
     """
     precision = prior_precision(model)
-    for _ in range(iterations):
-        evidence = gather(model, setting, (), progress, before)
+    for k in range(iterations):
+        evidence = gather(model, setting, (), staged(progress, f"fit {k + 1}"), before)
         before = before or evidence
         white = whitened(evidence, noise or fit_noise(evidence))
         step, covariance = _step(white, model.point, precision)
@@ -64,7 +64,8 @@ def fit(
         model = model.at(model.point + step.clamp(-limit, limit))
         if float((step / covariance.diagonal().sqrt()).abs().max()) < SMALL:
             break
-    evidence = gather(model, setting, hypotheses, progress, before)
+    about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
+    evidence = gather(model, setting, hypotheses, staged(progress, about), before)
     noise = noise or fit_noise(evidence)
     white = whitened(evidence, noise)
     _, covariance = _step(white, model.point, precision)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ..errors import SimulationDiverged, UnstableStep
 from .comparison import Gain, Predicted, compare, predict
-from .evidence import Progress, Setting
+from .evidence import Progress, Setting, staged
 from .fitting import Fitted, fit, renoised
 from .noise import Noise, fit_noise, floor_of
 from .screening import Row, screen
@@ -60,7 +60,7 @@ def search(
     model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
 ) -> Found:
     """Causes one after the other, until none is both present and useful on motions held out."""
-    current = start = fit(model, setting, hypotheses, progress=progress)
+    current = start = fit(model, setting, hypotheses, progress=staged(progress, "base model"))
     steps: list[Step] = []
     while True:
         screened = screen(current)
@@ -72,7 +72,8 @@ def search(
             break
         steps.append(step)
         left = [h for h in hypotheses if h.name not in {a.name for a in step.best.fitted.model.accepted}]
-        current = fit(step.best.fitted.model, setting, left, 1, progress, before=start.evidence)
+        now = staged(progress, f"with {step.best.hypothesis.name}")
+        current = fit(step.best.fitted.model, setting, left, 1, now, before=start.evidence)
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     screened = screen(current)
     floor = floor_of(current.evidence, current.noise)
@@ -87,8 +88,8 @@ def _pruned(
     """Less the causes that the later ones have made needless; the last one has just been tried."""
     for step in steps[:-1]:
         name = step.best.hypothesis.name
-        progress(f"without {name}")
-        less = fit(current.model.without(name), setting, (), 1, progress, current.noise, current.evidence)
+        without = staged(progress, f"without {name}")
+        less = fit(current.model.without(name), setting, (), 1, without, current.noise, current.evidence)
         gain = compare(predict(less, setting.names), predict(current, setting.names), 0.0)
         if _worthwhile(gain):
             continue
@@ -103,10 +104,10 @@ def _step(
 ) -> Step | None:
     fits: list[tuple[Row, Fitted]] = []
     for row in present[:TRIED]:
-        progress(f"fitting {row.hypothesis.name}")
+        trial = staged(progress, f"trying {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
-            fits.append((row, fit(begun, setting, (), 1, progress, current.noise, current.evidence)))
+            fits.append((row, fit(begun, setting, (), 1, trial, current.noise, current.evidence)))
         except (SimulationDiverged, UnstableStep):
             continue
     if not fits:
