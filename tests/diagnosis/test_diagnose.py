@@ -46,7 +46,7 @@ def test_hidden_drag_is_named(with_drag):
 
 def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
     recordings, answer = with_drag
-    content = json.loads(write_diagnosis(answer, recordings[0], tmp_path).read_text())
+    content = json.loads(write_diagnosis(answer, recordings, tmp_path).read_text())
     assert {"verdict", "causes", "ruled_out", "unresolvable", "gain", "next_experiment", "model", "warnings"} <= set(
         content
     )

@@ -7,15 +7,15 @@ import pytest
 import sheets
 import torch
 
-from torchcloth import recordings as rec
 from torchcloth.diagnosis import air, fabric, grip, observer
-from torchcloth.diagnosis.base_model import base_model
+from torchcloth.diagnosis.base_model import base_model, together
 from torchcloth.diagnosis.evidence import gather, setting_of
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
 from torchcloth.diagnosis.world import Hypothesis
 from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.recordings import Collider
 
 RECORDING = sheets.episode()
 
@@ -69,7 +69,7 @@ def test_air_and_hem_do_what_their_names_say(made):
 
 
 def test_a_table_may_rub_more_and_otherwise_along_x():
-    table = replace(RECORDING, colliders={"table": rec.Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.4)})
+    table = replace(RECORDING, colliders={"table": Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.4)})
     model = base_model(table)
     by = {h.name: h for h in catalogue(model, [table])}
     law = model.world([(by["contact.aniso"], -0.5), (by["contact.mu"], 0.2)]).cloth.boundaries["table"].friction
@@ -162,3 +162,12 @@ def test_model_files_that_cannot_be_read_are_refused(made, tmp_path):
     path = save_model(tmp_path / "m.tcm", model.plus(stranger, 1.0), RECORDING)
     with pytest.raises(InvalidInput, match=r"'user.unknown'.*register"):
         load_model(path)
+
+
+def test_a_table_that_one_episode_names_is_there_in_all():
+    plane = Collider(np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, 1.0]), 0.4)
+    with_table = replace(RECORDING, colliders={"table": plane})
+    assert list(together([RECORDING, with_table]).colliders) == ["table"]
+    high = replace(RECORDING, colliders={"table": replace(plane, point=np.array([0.0, 0.0, 1.1]))})
+    with pytest.raises(InvalidInput, match=r"inside 'table', which only other episodes have"):
+        together([RECORDING, high])

@@ -42,7 +42,7 @@ def _diagnose(options: argparse.Namespace) -> int:
             answer = diagnosis.diagnose(
                 episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume
             )
-    path = diagnosis.write_diagnosis(answer, episodes[0] if episodes else None, options.out)
+    path = diagnosis.write_diagnosis(answer, episodes, options.out)
     clear(options.out / PROGRESS)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())

@@ -11,7 +11,7 @@ from pathlib import Path
 from .._files import write_text
 from ..errors import InvalidInput
 from ..recordings import Recording
-from .base_model import base_model
+from .base_model import base_model, together
 from .evidence import Progress, setting_of
 from .gate import check
 from .hypotheses import catalogue
@@ -58,7 +58,7 @@ def diagnose(
         )
     if faults := check(recordings):
         return refused(faults, names)
-    model = model or base_model(recordings[0])
+    model = model or base_model(together(recordings))
     asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
     plan = hashlib.sha256(json.dumps([[h.name, h.typical, h.share] for h in asked]).encode()).hexdigest()[:16]
     setting = setting_of(model, recordings)
@@ -68,13 +68,13 @@ def diagnose(
     return replace(answer, content=answer.content | {"plan_hash": plan, "model": EXTENDED})
 
 
-def write_diagnosis(answer: Diagnosis, recording: Recording | None, folder: Path) -> Path:
+def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Path:
     """Write diagnosis.json, report.html and, unless data are invalid, the extended model; returns the first's path.
 
-    ``recording`` is one of the episodes, which says what the base model is of.
+    ``recordings`` are the episodes, which say what the base model is of.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if answer.searched is not None and recording is not None:
-        save_model(folder / EXTENDED, answer.model, recording, answer.found.end.covariance)
+    if answer.searched is not None:
+        save_model(folder / EXTENDED, answer.model, together(recordings), answer.found.end.covariance)
     write_report(answer, folder)
     return write_text(folder / RESULT, json.dumps(answer.content, indent=1, allow_nan=False) + "\n")
