@@ -153,7 +153,7 @@ def _piece(
     model: Model, setting: Setting, k: int, hypotheses: Sequence[Hypothesis], known: Sequence[Tensor] | None
 ) -> Piece:
     """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
-    e, world, steps = setting.episodes[k], model.world(), _steps(model)
+    e, world, steps = setting.episodes[k], model.world(), step_sizes(model)
     runs = _runs(model, world, setting, k, hypotheses, with_held=known is None)
     able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
     typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
@@ -240,14 +240,14 @@ def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
     return kept._replace(value=fine.value[place], spread=fine.spread[place]), kept.value - fine.value[place]
 
 
-def _steps(model: Model) -> list[float]:
+def step_sizes(model: Model) -> list[float]:
     """Along each of the model's own coordinates."""
     return [*(p.step for p in model.parameters), *(0.1 * h.typical for h in model.accepted)]
 
 
 def _beside(model: Model) -> list[World]:
     """One step along each coordinate."""
-    along = torch.diag(torch.tensor(_steps(model), dtype=model.point.dtype))
+    along = torch.diag(torch.tensor(step_sizes(model), dtype=model.point.dtype))
     return [model.at(model.point + step).world() for step in along]
 
 

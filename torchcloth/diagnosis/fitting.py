@@ -59,7 +59,7 @@ def fit(
         evidence = gather(model, setting, (), staged(progress, f"fit {k + 1}"), before)
         before = before or evidence
         white = whitened(evidence, noise or fit_noise(evidence))
-        step, covariance = _step(white, model.point, precision)
+        step, covariance = step_of(white, model.point, precision)
         limit = LONGEST * precision.rsqrt()
         model = model.at(model.point + step.clamp(-limit, limit))
         if float((step / covariance.diagonal().sqrt()).abs().max()) < SMALL:
@@ -68,7 +68,7 @@ def fit(
     evidence = gather(model, setting, hypotheses, staged(progress, about), before)
     noise = noise or fit_noise(evidence)
     white = whitened(evidence, noise)
-    _, covariance = _step(white, model.point, precision)
+    _, covariance = step_of(white, model.point, precision)
     return Fitted(model, evidence, noise, white, covariance)
 
 
@@ -77,7 +77,8 @@ def renoised(found: Fitted, noise: Noise) -> Fitted:
     return replace(found, noise=noise, white=whitened(found.evidence, noise))
 
 
-def _step(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+def step_of(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+    """(Gauss-Newton step, covariance) of the model's coordinates."""
     own = white.jacobian[:, : len(point)]
     covariance = torch.linalg.inv(own.mT @ own + torch.diag(precision))
     return -covariance @ (own.mT @ white.value + precision * point), covariance

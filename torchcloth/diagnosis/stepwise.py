@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ..errors import SimulationDiverged, UnstableStep
+from .branches import unstable, without
 from .comparison import Gain, Predicted, compare, predict
 from .evidence import Progress, Setting, staged
 from .fitting import Fitted, fit, renoised
 from .noise import Noise, fit_noise, floor_of
+from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
 from .world import Hypothesis, Model
 
@@ -53,7 +55,10 @@ class Found:
     steps: list[Step]
     screened: list[Row]  # at the end
     whole: Gain | None  # of all causes together
-    floor: float  # m, of a cell
+    floor: float  # m, of a cell: what repetitions differ by, else what the sensor does
+    sensor: float  # m, of a cell: noise and slow errors
+    repeats: Repeats | None  # None: no episode repeats another
+    left_out: float  # share of cells that jump between shapes
 
 
 def search(
@@ -61,6 +66,11 @@ def search(
 ) -> Found:
     """Causes one after the other, until none is both present and useful on motions held out."""
     current = start = fit(model, setting, hypotheses, progress=staged(progress, "base model"))
+    jumping = unstable(start, setting, staged(progress, "folds that turn over"))
+    left_out = sum(map(len, jumping)) / len(start.white.value)
+    if left_out:
+        setting, current = replace(setting, unstable=jumping), without(start, jumping)
+        start = current
     steps: list[Step] = []
     while True:
         screened = screen(current)
@@ -76,10 +86,12 @@ def search(
         current = fit(step.best.fitted.model, setting, left, 1, now, before=start.evidence)
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     screened = screen(current)
-    floor = floor_of(current.evidence, current.noise)
+    last, sensor = predict(current, setting.names), floor_of(current.evidence, current.noise)
+    repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
+    floor = sensor if repeated is None else repeated.rms
     first = predict(renoised(start, current.noise), setting.names)
-    whole = compare(first, predict(current, setting.names), floor) if steps else None
-    return Found(start, current, steps, screened, whole, floor)
+    whole = compare(first, last, floor) if steps else None
+    return Found(start, current, steps, screened, whole, floor, sensor, repeated, left_out)
 
 
 def _pruned(
