@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ..errors import SimulationDiverged, UnstableStep
 from .approach import approach
+from .branches import unstable, without
 from .comparison import Gain, Predicted, compare, predict
-from .evidence import Progress, Setting
+from .evidence import Progress, Setting, staged
 from .fitting import Fitted, fit, renoised
 from .noise import Noise, fit_noise, floor_of
+from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
 from .world import Hypothesis, Model
 
@@ -56,15 +58,23 @@ class Found:
     steps: list[Step]
     screened: list[Row]  # at the end
     whole: Gain | None  # of all causes together
-    floor: float  # m, of a cell
+    floor: float  # m, of a cell: what repetitions differ by, else what the sensor does
+    sensor: float  # m, of a cell: noise and slow errors
+    repeats: Repeats | None  # None: no episode repeats another
+    left_out: float  # share of cells that jump between shapes
 
 
 def search(
     model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
 ) -> Found:
     """Causes one after the other, until none is both present and useful on motions held out."""
-    near, before = approach(model, setting, progress)
-    current = start = fit(near, setting, hypotheses, progress=progress, before=before)
+    near, before = approach(model, setting, staged(progress, "data sheet"))
+    current = start = fit(near, setting, hypotheses, progress=staged(progress, "base model"), before=before)
+    jumping = unstable(start, setting, staged(progress, "folds that turn over"))
+    left_out = sum(map(len, jumping)) / len(start.white.value)
+    if left_out:
+        setting, current = replace(setting, unstable=jumping), without(start, jumping)
+        start = current
     steps: list[Step] = []
     while True:
         screened = screen(current)
@@ -76,13 +86,16 @@ def search(
             break
         steps.append(step)
         left = [h for h in hypotheses if h.name not in {a.name for a in step.best.fitted.model.accepted}]
-        current = fit(step.best.fitted.model, setting, left, 1, progress, before=start.evidence)
+        now = staged(progress, f"with {step.best.hypothesis.name}")
+        current = fit(step.best.fitted.model, setting, left, 1, now, before=start.evidence)
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     screened = screen(current)
-    floor = floor_of(current.evidence, current.noise)
+    last, sensor = predict(current, setting.names), floor_of(current.evidence, current.noise)
+    repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
+    floor = sensor if repeated is None else repeated.rms
     first = predict(renoised(start, current.noise), setting.names)
-    whole = compare(first, predict(current, setting.names), floor) if steps else None
-    return Found(start, current, steps, screened, whole, floor)
+    whole = compare(first, last, floor) if steps else None
+    return Found(start, current, steps, screened, whole, floor, sensor, repeated, left_out)
 
 
 def _likely(current: Fitted, screened: Sequence[Row]) -> list[Row]:
@@ -102,8 +115,8 @@ def _pruned(
     """Less the causes that the later ones have made needless; the last one has just been tried."""
     for step in steps[:-1]:
         name = step.best.hypothesis.name
-        progress(f"without {name}")
-        less = fit(current.model.without(name), setting, (), 1, progress, current.noise, current.evidence)
+        without = staged(progress, f"without {name}")
+        less = fit(current.model.without(name), setting, (), 1, without, current.noise, current.evidence)
         gain = compare(predict(less, setting.names), predict(current, setting.names), 0.0)
         if _worthwhile(gain):
             continue
@@ -118,10 +131,10 @@ def _step(
 ) -> Step | None:
     fits: list[tuple[Row, Fitted]] = []
     for row in likely[:TRIED]:
-        progress(f"fitting {row.hypothesis.name}")
+        trial = staged(progress, f"trying {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
-            fits.append((row, fit(begun, setting, (), 1, progress, current.noise, current.evidence)))
+            fits.append((row, fit(begun, setting, (), 1, trial, current.noise, current.evidence)))
         except (SimulationDiverged, UnstableStep):
             continue
     if not fits:
