@@ -11,7 +11,7 @@ from .branches import unstable, without
 from .comparison import Gain, Predicted, compare, predict
 from .evidence import Progress, Setting, staged
 from .fitting import Fitted, fit, renoised
-from .noise import Noise, fit_noise, floor_of
+from .noise import Noise, fit_noise, floor_of, unfitted
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
 from .world import Hypothesis, Model
@@ -134,7 +134,7 @@ def _step(
         trial = staged(progress, f"trying {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
-            fits.append((row, fit(begun, setting, (), 1, trial, current.noise, current.evidence)))
+            fits.append((row, fit(begun, setting, (), 1, trial, unfitted(), current.evidence)))
         except (SimulationDiverged, UnstableStep):
             continue
     if not fits:
@@ -160,7 +160,7 @@ def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> li
         found = c.fitted
         if c.gain.density > enough and found.ahead > CLEAR:
             progress(f"fitting {c.hypothesis.name} further")
-            found = fit(found.model, setting, (), FURTHER, progress, found.noise, found.evidence, found.evidence)
+            found = fit(found.model, setting, (), FURTHER, progress, unfitted(), found.evidence, found.evidence)
         out.append((c.row, found))
     return out
 
