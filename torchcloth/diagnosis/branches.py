@@ -32,7 +32,9 @@ def unstable(found: Fitted, setting: Setting, progress: Progress = lambda _: Non
     """
     rng = torch.Generator().manual_seed(seed)
     point = found.model.point
-    sizes = torch.maximum(found.covariance.diagonal().sqrt(), torch.tensor(step_sizes(found.model)).abs().to(point))
+    sizes = torch.maximum(
+        found.covariance.diagonal().sqrt(), torch.tensor([abs(step) for _, step in step_sizes(found.model)]).to(point)
+    )
     drawn = torch.randn(DIRECTIONS, len(point), generator=rng, dtype=point.dtype)
     steps = drawn / drawn.norm(dim=1, keepdim=True) * sizes
     steps = torch.cat([steps, -steps])
@@ -53,8 +55,8 @@ def without(found: Fitted, keys: Sequence[Tensor]) -> Fitted:
     numerics = [n[s] for n, s in zip(found.evidence.numerics, stable, strict=True)]
     evidence = replace(found.evidence, cells=cells, numerics=numerics)
     white = whitened(evidence, noise := fit_noise(evidence))
-    _, covariance = step_of(white, found.model.point, prior_precision(found.model))
-    return Fitted(found.model, evidence, noise, white, covariance)
+    _, covariance, ahead = step_of(white, found.model.point, prior_precision(found.model))
+    return Fitted(found.model, evidence, noise, white, covariance, ahead)
 
 
 def _cells(world: World, setting: Setting, k: int) -> Cells | None:

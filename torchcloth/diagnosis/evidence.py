@@ -95,19 +95,22 @@ def gather(
     hypotheses: Sequence[Hypothesis] = (),
     progress: Progress = lambda _: None,
     before: Evidence | None = None,
+    shifts: Sequence[tuple[int, float]] | None = None,
 ) -> Evidence:
     """Simulate every episode at the model's point, beside it, and with each hypothesis at its typical amplitude.
 
     The nuisances' slopes, which hardly depend on the point, are taken from ``before`` where that is given. Hypotheses
-    that cannot be simulated in one of the episodes are left out.
+    that cannot be simulated in one of the episodes are left out. ``shifts`` are (coordinate, step) of the points
+    beside; None: a small step along each coordinate.
     """
-    own, possible, pieces, began = len(model.point), list(hypotheses), [], time.monotonic()
+    shifts = step_sizes(model) if shifts is None else list(shifts)
+    own, possible, pieces, began = len(shifts), list(hypotheses), [], time.monotonic()
     for k, e in enumerate(setting.episodes):
         progress(f"{e.name}, {k + 1} of {len(setting.episodes)}{_left(began, k, len(setting.episodes))}")
         slopes = None if before is None else _known_slopes(before, k)
         asked = [(h.name, h.typical) for h in possible]
-        question = [k, [h.name for h in model.accepted], asked, *(slopes or ())]
-        work = partial(_piece, model, setting, k, possible, slopes)
+        question = [k, [h.name for h in model.accepted], asked, shifts, *(slopes or ())]
+        work = partial(_piece, model, setting, k, possible, slopes, shifts)
         piece = setting.kept(question, model.point, work)
         pieces.append((piece, possible))
         possible = [h for h, able in zip(possible, piece.able.tolist(), strict=True) if able]
@@ -150,11 +153,17 @@ def _known_slopes(before: Evidence, k: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _piece(
-    model: Model, setting: Setting, k: int, hypotheses: Sequence[Hypothesis], known: Sequence[Tensor] | None
+    model: Model,
+    setting: Setting,
+    k: int,
+    hypotheses: Sequence[Hypothesis],
+    known: Sequence[Tensor] | None,
+    shifts: Sequence[tuple[int, float]],
 ) -> Piece:
     """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
-    e, world, steps = setting.episodes[k], model.world(), step_sizes(model)
-    runs = _runs(model, world, setting, k, hypotheses, with_held=known is None)
+    e, world, steps = setting.episodes[k], model.world(), [step for _, step in shifts]
+    beside = [_shifted(model, coordinate, step).world() for coordinate, step in shifts]
+    runs = _runs(model, world, setting, k, hypotheses, beside, with_held=known is None)
     able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
     typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
     base = world.seen(runs.plain, e)
@@ -182,10 +191,16 @@ class _Runs(NamedTuple):
 
 
 def _runs(
-    model: Model, world: World, setting: Setting, k: int, hypotheses: Sequence[Hypothesis], with_held: bool
+    model: Model,
+    world: World,
+    setting: Setting,
+    k: int,
+    hypotheses: Sequence[Hypothesis],
+    shifted: Sequence[World],
+    with_held: bool,
 ) -> _Runs:
     e, dt = setting.episodes[k], setting.dt
-    beside = [partial(w.frames, e, dt) for w in _beside(model)]
+    beside = [partial(w.frames, e, dt) for w in shifted]
     modes = Held().modes(world.cloth, e) if with_held else ()
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m, settles=True), dt) for m in modes]
     changed = [h.apply(world, h.typical) for h in hypotheses]
@@ -240,15 +255,15 @@ def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
     return kept._replace(value=fine.value[place], spread=fine.spread[place]), kept.value - fine.value[place]
 
 
-def step_sizes(model: Model) -> list[float]:
-    """Along each of the model's own coordinates."""
-    return [*(p.step for p in model.parameters), *(0.1 * h.typical for h in model.accepted)]
+def step_sizes(model: Model) -> list[tuple[int, float]]:
+    """(coordinate, small step) along each of the model's own."""
+    return list(enumerate([*(p.step for p in model.parameters), *(0.1 * h.typical for h in model.accepted)]))
 
 
-def _beside(model: Model) -> list[World]:
-    """One step along each coordinate."""
-    along = torch.diag(torch.tensor(step_sizes(model), dtype=model.point.dtype))
-    return [model.at(model.point + step).world() for step in along]
+def _shifted(model: Model, coordinate: int, step: float) -> Model:
+    beside = model.point
+    beside[coordinate] += step
+    return model.at(beside)
 
 
 def _nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:
