@@ -69,7 +69,7 @@ def search(
     model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
 ) -> Found:
     """Causes one after the other, until none is both present and useful on motions held out."""
-    near, before = approach(model, setting, staged(progress, "data sheet"))
+    near, before = approach(model, setting, staged(progress, "from the data sheet"))
     current = start = fit(near, setting, hypotheses, progress=staged(progress, "base model"), before=before)
     jumping = unstable(start, setting, staged(progress, "folds that turn over"))
     left_out = sum(map(len, jumping)) / len(start.white.value)
@@ -160,8 +160,8 @@ def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> li
     for c in tried:
         found = c.fitted
         if c.gain.density > enough and found.ahead > CLEAR:
-            progress(f"fitting {c.hypothesis.name} further")
-            found = fit(found.model, setting, (), FURTHER, progress, unfitted(), found.evidence, found.evidence)
+            further = staged(progress, f"trying {c.hypothesis.name} further")
+            found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
         out.append((c.row, found))
     return out
 
