@@ -9,6 +9,8 @@ from .comparison import Gain, compare, predict
 from .evidence import gather, setting_of
 from .fitting import Fitted, fit
 from .hypotheses import catalogue, register
+from .lacking import lack_of_fit
+from .missing import MissingForce, missing_force
 from .model_file import load_model, save_model
 from .noise import fit_noise
 from .run import diagnose, write_diagnosis
@@ -22,6 +24,7 @@ __all__ = [
     "Fitted",
     "Gain",
     "Hypothesis",
+    "MissingForce",
     "Model",
     "World",
     "base_model",
@@ -32,7 +35,9 @@ __all__ = [
     "fit_noise",
     "gather",
     "judge",
+    "lack_of_fit",
     "load_model",
+    "missing_force",
     "predict",
     "register",
     "save_model",

@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from .cells import SEEN
 from .classes import alike
 from .comparison import Gain
-from .evidence import Evidence
+from .lacking import Left, lack_of_fit
 from .stepwise import Found, Step
 from .world import Model
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics"]
 NORMAL = 1.96
-ROUGH = 5e-4  # m: slow errors of position cells beyond this are a lack of fit
+COARSE = 2e-3  # m, that the finer mesh leaves of the difference between both: causes hide behind more
 OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
 
 
@@ -46,8 +45,9 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
     """The answer of a search over episodes with these motions."""
     causes = [_cause(found, step) for step in found.steps]
     rows = found.screened
-    lacking = _lack_of_fit(found)
-    verdict = _verdict(found, causes, lacking)
+    left = lack_of_fit(found.end, names)
+    lacking = any(row.lacking for row in left)
+    verdict = _verdict(found, causes, left)
     content = {
         "verdict": verdict,
         "causes": causes,
@@ -60,7 +60,7 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
         ],
         "gain": _gain(found),
         "also_unexplained": bool(causes) and lacking,
-        "lack_of_fit": {"slow_errors": _slow(found), "numerics": _numerics(found.end.evidence), "unit": "m"},
+        "lack_of_fit": [row.as_dict() for row in left],
         "next_experiment": None,
         "parameters": _parameters(found),
         "warnings": _warnings(found, names),
@@ -69,11 +69,13 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
     return Diagnosis(verdict, content, found.end.model, found)
 
 
-def _verdict(found: Found, causes: Sequence[dict[str, Any]], lacking: bool) -> Verdict:
+def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left]) -> Verdict:
     if causes:
         return "identified" if all(not c["rivals"] and len(c["class"]) == 1 for c in causes) else "ambiguous"
-    if lacking:
-        return "numerics" if _numerics(found.end.evidence) > 0.5 * _slow(found) else "unexplained"
+    if any(row.lacking for row in left):
+        return "unexplained"
+    if max((row.numerics for row in left if row.unit == "m"), default=0.0) > COARSE:
+        return "numerics"
     undecided = [r for r in found.screened if r.decision == "present"]
     return "inconclusive" if undecided else "adequate"
 
@@ -135,21 +137,6 @@ def _parameters(found: Found) -> dict[str, Any]:
         }
         for p, c, s in zip(model.parameters, model.values.tolist(), std, strict=False)
     }
-
-
-def _slow(found: Found) -> float:
-    return float(found.end.noise.level[0])
-
-
-def _numerics(evidence: Evidence) -> float:
-    """m, RMS that the finer mesh is expected to leave of the difference between both."""
-    squares = [n[c.block < SEEN].square().sum() for n, c in zip(evidence.numerics, evidence.cells, strict=True)]
-    count = sum(int((c.block < SEEN).sum()) for c in evidence.cells)
-    return float(sum(squares) / count) ** 0.5 / 3
-
-
-def _lack_of_fit(found: Found) -> bool:
-    return _slow(found) > ROUGH
 
 
 def _warnings(found: Found, names: Sequence[str]) -> list[str]:
