@@ -18,6 +18,7 @@ from torchcloth.identification.replays import Frames
 SIDE = 0.2  # m
 TRUTH, FIT = (13, 13), (7, 7)
 NOMINAL = {"membrane_stiffness": 60.0, "poisson_ratio": 0.3, "bending_stiffness": 2e-4, "bending_damping_time": 0.01}
+EYE = (0.1, -1.2, 1.1)  # m, of the camera
 FRAMES, RATE, POINTS, NOISE = 16, 20.0, 80, 5e-4  # -, Hz, a frame, m
 
 
@@ -64,8 +65,15 @@ def episode(motion: str = "slow", resolution: tuple[int, int] = FIT, duration: f
         grippers=grippers,
         points=rec.PointClouds(np.arange(frames) / RATE, points.reshape(-1, 3), np.full(frames, 40)),
         observation_noise_std=1e-3,
+        cameras={"camera": rec.Camera(width=640, height=480, K=np.eye(3), T_world_camera=_at(EYE))},
         split={"motion": motion},
     )
+
+
+def _at(place: tuple[float, float, float]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    return pose
 
 
 def recorded(

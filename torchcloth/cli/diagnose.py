@@ -24,20 +24,24 @@ def add(verbs: Any) -> None:
 def _diagnose(options: argparse.Namespace) -> int:
     import torch
 
-    from .. import diagnosis, recordings
+    from .. import diagnosis
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
     check_folder(options.out)
     model = None if options.model is None else diagnosis.load_model(options.model)
-    episodes = [recordings.read(path) for path in options.episodes]
-    print(f"{len(episodes)} episodes: about a minute each on one core", flush=True)
-    with _progress() as progress:
-        answer = diagnosis.diagnose(episodes, model, progress=progress)
-    path = diagnosis.write_diagnosis(answer, episodes[0], options.out)
+    episodes, faults = diagnosis.read_episodes(options.episodes)
+    if faults:
+        answer = diagnosis.refused(faults)
+    else:
+        print(f"{len(episodes)} episodes: about a minute each on one core", flush=True)
+        with _progress() as progress:
+            answer = diagnosis.diagnose(episodes, model, progress=progress)
+    path = diagnosis.write_diagnosis(answer, episodes, options.out)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())
-    print("\n".join(str(path.parent / name) for name in (path.name, "report.html", answer.content["model"])))
+    written = (path.name, "report.html", answer.content["model"])
+    print("\n".join(str(path.parent / name) for name in written if name))
     return 0
 
 

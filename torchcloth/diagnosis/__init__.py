@@ -8,6 +8,7 @@ from .base_model import base_model
 from .comparison import Gain, compare, predict
 from .evidence import gather, setting_of
 from .fitting import Fitted, fit
+from .gate import Fault, check, read_episodes
 from .hypotheses import catalogue, register
 from .lacking import lack_of_fit
 from .missing import MissingForce, missing_force
@@ -16,11 +17,12 @@ from .noise import fit_noise
 from .run import diagnose, write_diagnosis
 from .screening import screen
 from .stepwise import search
-from .verdict import Diagnosis, judge
+from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model, World
 
 __all__ = [
     "Diagnosis",
+    "Fault",
     "Fitted",
     "Gain",
     "Hypothesis",
@@ -29,6 +31,7 @@ __all__ = [
     "World",
     "base_model",
     "catalogue",
+    "check",
     "compare",
     "diagnose",
     "fit",
@@ -39,6 +42,8 @@ __all__ = [
     "load_model",
     "missing_force",
     "predict",
+    "read_episodes",
+    "refused",
     "register",
     "save_model",
     "screen",

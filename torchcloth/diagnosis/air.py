@@ -8,7 +8,6 @@ from ..effects import (
     AbstractEffect,
     AddedMass,
     AirDrag,
-    Bending,
     BendingFriction,
     KelvinVoigt,
     MassDamping,
@@ -49,12 +48,6 @@ def _viscosity(world: World, time: float) -> World:
     return world.with_cloth({"viscosity": KelvinVoigt(time * stiffness)})
 
 
-def _bending_damping(world: World, time: float) -> World:
-    own: Bending = world.cloth.effects["bending"]  # type: ignore[assignment]
-    before = 0.0 if own.damping_time is None else own.damping_time.value.item()
-    return world.with_cloth({"bending": Bending(own.stiffness.value.item(), before + time)})
-
-
 HYPOTHESES = (
     Hypothesis("air.drag_n", "-", 1.2, lambda w, a: _with_drag(w, normal=a)),
     Hypothesis("air.drag_t", "-", 0.016, lambda w, a: _with_drag(w, tangential=a)),
@@ -63,7 +56,6 @@ HYPOTHESES = (
     Hypothesis("air.wind[x]", "m/s", 0.3, partial(_with_wind, 0), signed=True),
     Hypothesis("air.wind[y]", "m/s", 0.3, partial(_with_wind, 1), signed=True),
     Hypothesis("damp.kv", "s", 5e-3, _viscosity),
-    Hypothesis("damp.bend", "s", 0.05, _bending_damping),
     Hypothesis("fric.internal_bend", "N", 3e-4, partial(_added, "bending_friction", BendingFriction)),
     Hypothesis("fric.internal_shear", "N/m", 1.0, partial(_added, "shear_friction", ShearFriction)),
 )

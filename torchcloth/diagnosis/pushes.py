@@ -33,10 +33,7 @@ class Pushes(NamedTuple):
 
 def pushed(world: World, episode: Episode, pushes: Pushes, dt: float | None = None) -> tuple[Frames, Frames]:
     """(what an observer has of the episode, its derivatives along the K pushes)."""
-    driven = episode
-    for motion in world.motions:
-        driven = motion(driven)
-    frames, moved = _tangents(pushable(world.cloth), driven, pushes, dt)
+    frames, moved = _tangents(pushable(world.cloth), world.driven(episode), pushes, dt)
     for view in world.views:
         frames, moved = _viewed(view, frames, moved, episode)
     return frames, moved

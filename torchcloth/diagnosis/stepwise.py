@@ -73,10 +73,29 @@ def search(
         steps.append(step)
         left = [h for h in hypotheses if h.name not in {a.name for a in step.best.fitted.model.accepted}]
         current = fit(step.best.fitted.model, setting, left, 1, progress, before=start.evidence)
+    current, steps = _pruned(current, steps, setting, hypotheses, progress)
+    screened = screen(current)
     floor = floor_of(current.evidence, current.noise)
     first = predict(renoised(start, current.noise), setting.names)
     whole = compare(first, predict(current, setting.names), floor) if steps else None
     return Found(start, current, steps, screened, whole, floor)
+
+
+def _pruned(
+    current: Fitted, steps: list[Step], setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
+) -> tuple[Fitted, list[Step]]:
+    """Less the causes that the later ones have made needless; the last one has just been tried."""
+    for step in steps[:-1]:
+        name = step.best.hypothesis.name
+        progress(f"without {name}")
+        less = fit(current.model.without(name), setting, (), 1, progress, current.noise, current.evidence)
+        gain = compare(predict(less, setting.names), predict(current, setting.names), 0.0)
+        if _worthwhile(gain):
+            continue
+        steps = [s for s in steps if s is not step]
+        left = [h for h in hypotheses if h.name not in {a.name for a in less.model.accepted}]
+        current = fit(less.model, setting, left, 1, progress, before=current.evidence)
+    return current, steps
 
 
 def _step(
@@ -114,9 +133,12 @@ def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str],
 
 
 def _useful(c: Candidate) -> bool:
-    worth = c.gain.before - c.gain.after > WORTH_MM or c.gain.explained > WORTH_SHARE
-    amplitude = abs(c.fitted.model.amplitudes[-1])
-    return worth and c.gain.ci95[0] > 0 and amplitude > abs(c.hypothesis.smallest)
+    return _worthwhile(c.gain) and abs(c.fitted.model.amplitudes[-1]) > abs(c.hypothesis.smallest)
+
+
+def _worthwhile(gain: Gain) -> bool:
+    worth = gain.before - gain.after > WORTH_MM or gain.explained > WORTH_SHARE
+    return worth and gain.ci95[0] > 0
 
 
 def _rival(c: Candidate, best: Candidate) -> bool:

@@ -6,15 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from ..errors import InvalidInput
 from .classes import alike
 from .comparison import Gain
+from .gate import Fault
 from .lacking import Left, lack_of_fit
+from .missing import MissingForce
 from .stepwise import Found, Step
 from .world import Model
 
-Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics"]
+Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 NORMAL = 1.96
-COARSE = 2e-3  # m, that the finer mesh leaves of the difference between both: causes hide behind more
+COARSE = 3e-3  # m, that the finer mesh leaves of the difference between both: causes hide behind more
 OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
 
 
@@ -25,16 +28,33 @@ class Diagnosis:
     Attributes:
         verdict: "identified" (each cause stands alone), "ambiguous" (some cannot be told from others), "unexplained"
             (the fit is lacking and nothing known mends it), "adequate" (nothing known is wrong), "inconclusive"
-            (these data cannot say), "numerics" (another mesh changes more than a cause would).
+            (these data cannot say), "numerics" (another mesh changes more than a cause would), "invalid_data" (an
+            episode cannot be believed, and nothing was simulated).
         content: all of it, as diagnosis.json has it.
-        model: the base model with its fitted parameters and the accepted causes.
-        found: the search, for pictures and for those who want to know.
+        searched: the search; None of invalid data.
+        missing: the force that is missing, where the fit is lacking.
     """
 
     verdict: Verdict
     content: dict[str, Any]
-    model: Model
-    found: Found
+    searched: Found | None
+    missing: MissingForce | None = None
+
+    @property
+    def found(self) -> Found:
+        """The search, for pictures and for those who want to know.
+
+        Raises:
+            InvalidInput: the data were invalid.
+        """
+        if self.searched is None:
+            raise InvalidInput("found", got="a diagnosis of invalid data", expected="episodes that can be believed")
+        return self.searched
+
+    @property
+    def model(self) -> Model:
+        """The base model with its fitted parameters and the accepted causes; raises as ``found``."""
+        return self.found.end.model
 
     def summary(self) -> str:
         """Plain language."""
@@ -61,12 +81,24 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
         "gain": _gain(found),
         "also_unexplained": bool(causes) and lacking,
         "lack_of_fit": [row.as_dict() for row in left],
+        "missing_force": None,
         "next_experiment": None,
         "parameters": _parameters(found),
         "warnings": _warnings(found, names),
         "motions": list(names),
     }
-    return Diagnosis(verdict, content, found.end.model, found)
+    return Diagnosis(verdict, content, found)
+
+
+def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
+    """The answer where episodes cannot be believed: what is wrong with them."""
+    lists: dict[str, Any] = {
+        key: [] for key in ("causes", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "warnings")
+    }
+    none = dict.fromkeys(("gain", "missing_force", "next_experiment", "model"))
+    said = [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults]
+    content = {**lists, **none, "verdict": "invalid_data", "also_unexplained": False, "parameters": {}}
+    return Diagnosis("invalid_data", {**content, "faults": said, "motions": list(names)}, None)
 
 
 def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left]) -> Verdict:
@@ -175,11 +207,14 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
         "unexplained": "The fit is lacking, and no known cause mends it.",
         "inconclusive": "Something may be wrong; these data cannot say what.",
         "numerics": "Another mesh changes the motion by more than would be noticed of a cause: use a finer one.",
+        "invalid_data": "These episodes cannot be believed; nothing was simulated.",
     }
     if verdict in words:
         out.append(words[verdict])
+    out += [f"{f['episode']}: {f['what']}. To do: {f['remedy']}." for f in content.get("faults", ())]
     if content["also_unexplained"]:
         out.append("Something beyond these causes remains unexplained.")
+    out += _lacking(content)
     for label, key in (
         ("Too small to matter, or of a sign that makes no sense", "ruled_out"),
         ("Undecided", "undecided"),
@@ -189,3 +224,21 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
     if content["unresolvable"]:
         out.append(f"Cannot be seen in these data: {', '.join(r['effect'] for r in content['unresolvable'])}.")
     return [*out, *(f"Warning: {text}." for text in content["warnings"])]
+
+
+def _lacking(content: dict[str, Any]) -> list[str]:
+    """Where the fit is lacking, and what force would mend it."""
+    rows = [row for row in content["lack_of_fit"] if row["lacking"]]
+    if not rows:
+        return []
+    seen = ", ".join(f"{r['kind']} of {r['motion']} ({r['ratio']:.1f} times what is expected)" for r in rows)
+    out = [f"Lacking: {seen}."]
+    missing = content["missing_force"] or {"motions": []}
+    for m in (m for m in missing["motions"] if m["sure"]):
+        where = ", ".join(f"{1e3 * c:.0f}" for c in m["at"])
+        size = sum(c * c for c in m["pressure"]) ** 0.5 / missing["weight"]
+        out.append(
+            f"  A force of {100 * size:.0f} % of the weight is missing in {m['motion']}, the surest about "
+            f"({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
+        )
+    return out
