@@ -14,6 +14,7 @@ from .lacking import lack_of_fit
 from .missing import MissingForce, missing_force
 from .model_file import load_model, save_model
 from .noise import fit_noise
+from .residual import Residual, learn_residual
 from .run import diagnose, write_diagnosis
 from .screening import screen
 from .stepwise import search
@@ -28,6 +29,7 @@ __all__ = [
     "Hypothesis",
     "MissingForce",
     "Model",
+    "Residual",
     "World",
     "base_model",
     "catalogue",
@@ -39,6 +41,7 @@ __all__ = [
     "gather",
     "judge",
     "lack_of_fit",
+    "learn_residual",
     "load_model",
     "missing_force",
     "predict",

@@ -57,9 +57,16 @@ class Found:
 
 
 def search(
-    model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
+    model: Model,
+    setting: Setting,
+    hypotheses: Sequence[Hypothesis],
+    progress: Progress = lambda _: None,
+    tried: int = TRIED,
 ) -> Found:
-    """Causes one after the other, until none is both present and useful on motions held out."""
+    """Causes one after the other, until none is both present and useful on motions held out.
+
+    The ``tried`` likeliest are fitted at each step.
+    """
     current = start = fit(model, setting, hypotheses, progress=progress)
     steps: list[Step] = []
     while True:
@@ -67,7 +74,7 @@ def search(
         present = [row for row in screened if row.decision == "present"]
         if not present or len(steps) == MOST:
             break
-        step = _step(current, setting, present, screened, progress)
+        step = _step(current, setting, present[:tried], screened, progress)
         if step is None:
             break
         steps.append(step)
@@ -102,7 +109,7 @@ def _step(
     current: Fitted, setting: Setting, present: Sequence[Row], screened: list[Row], progress: Progress
 ) -> Step | None:
     fits: list[tuple[Row, Fitted]] = []
-    for row in present[:TRIED]:
+    for row in present:
         progress(f"fitting {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:

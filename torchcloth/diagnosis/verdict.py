@@ -12,6 +12,7 @@ from .comparison import Gain
 from .gate import Fault
 from .lacking import Left, lack_of_fit
 from .missing import MissingForce
+from .residual import Residual
 from .stepwise import Found, Step
 from .world import Model
 
@@ -33,12 +34,14 @@ class Diagnosis:
         content: all of it, as diagnosis.json has it.
         searched: the search; None of invalid data.
         missing: the force that is missing, where the fit is lacking.
+        residual: a force that was learned for what stays unexplained.
     """
 
     verdict: Verdict
     content: dict[str, Any]
     searched: Found | None
     missing: MissingForce | None = None
+    residual: Residual | None = None
 
     @property
     def found(self) -> Found:
@@ -82,6 +85,7 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
         "also_unexplained": bool(causes) and lacking,
         "lack_of_fit": [row.as_dict() for row in left],
         "missing_force": None,
+        "residual": None,
         "next_experiment": None,
         "parameters": _parameters(found),
         "warnings": _warnings(found, names),
@@ -95,7 +99,7 @@ def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
     lists: dict[str, Any] = {
         key: [] for key in ("causes", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "warnings")
     }
-    none = dict.fromkeys(("gain", "missing_force", "next_experiment", "model"))
+    none = dict.fromkeys(("gain", "missing_force", "residual", "next_experiment", "model"))
     said = [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults]
     content = {**lists, **none, "verdict": "invalid_data", "also_unexplained": False, "parameters": {}}
     return Diagnosis("invalid_data", {**content, "faults": said, "motions": list(names)}, None)
@@ -241,4 +245,14 @@ def _lacking(content: dict[str, Any]) -> list[str]:
             f"  A force of {100 * size:.0f} % of the weight is missing in {m['motion']}, the surest about "
             f"({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
         )
-    return out
+    return out + _residual(content["residual"])
+
+
+def _residual(found: dict[str, Any] | None) -> list[str]:
+    """What a learned force does; no cause."""
+    if found is None or not found["terms"]:
+        return []
+    gain, terms = found["gain"], found["terms"]
+    told = "; ".join(f"{t['told']} ({abs(t['coefficient']):.2g} {t['unit']})" for t in terms)
+    before, after = 1e3 * gain["rms_before"], 1e3 * gain["rms_after"]
+    return [f"  A force that {told} would mend {before:.2f} to {after:.2f} mm on motions held out. It names no cause."]
