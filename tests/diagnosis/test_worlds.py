@@ -68,6 +68,14 @@ def test_air_and_hem_do_what_their_names_say(made):
     torch.testing.assert_close(depth(last("obs.depth_bias", 5e-3)), depth(base) + 5e-3)
 
 
+@pytest.mark.parametrize("first", ["elas.ortho", "plast.crease", "air.drag_n", "rest.skew", "grip.width"])
+def test_whatever_was_accepted_all_others_still_apply(made, first):
+    model, _ = made
+    by = {h.name: h for h in catalogue(model, [RECORDING])}
+    for h in by.values():
+        model.world([(by[first], by[first].typical), (h, h.typical)])
+
+
 def test_a_table_may_rub_more_and_otherwise_along_x():
     table = replace(RECORDING, colliders={"table": Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.4)})
     model = base_model(table)

@@ -50,6 +50,7 @@ _COMMON: tuple[Plan, ...] = (
 REDUCED = Size(21, 13, (*_COMMON, ("shake", 0.0, 1.5)), (*_COMMON, ("drag-fast", 0.0, 1.0)))
 _FEW: tuple[Plan, ...] = (("swing-fast", 0.0, 1.2), ("turn", 0.0, 2.5))
 SMALL = Size(15, 9, (*_FEW, ("stretch", 90.0, 2.0)), (*_FEW, ("drag-fast", 0.0, 1.2)))
+FOLDING = 1.3  # speed
 UNSEEN: Plan = ("swing", 45.0, 1.4)  # of no case
 
 
@@ -143,19 +144,25 @@ def case(seed: int, size: Size = REDUCED) -> Case:
 
 
 def sealed(secret: int, count: int) -> list[int]:
-    """``count`` sealed numbers in an order that tells nothing; every twenty hold the families at their shares."""
+    """``count`` sealed numbers; every twenty hold the families at their shares, in an order that tells nothing."""
     rng = np.random.default_rng([secret, 11])
-    rounds = -(-count // len(ROUND))
-    turns = rng.choice(10**9, rounds, replace=False)
-    found = [SEALED + int(t) * len(ROUND) + k for t in turns for k in range(len(ROUND))]
-    # a last round that is not full holds what comes first in a shuffled one
-    last = rng.permutation(len(ROUND))[: count - (rounds - 1) * len(ROUND)] + (rounds - 1) * len(ROUND)
-    kept = [*range((rounds - 1) * len(ROUND)), *last.tolist()]
-    return [found[k] for k in rng.permutation(kept)]
+    found: list[int] = []
+    while len(found) < count:  # as many as asked for, or more: the first are the same
+        turn = int(rng.integers(10**9))
+        found += [SEALED + turn * len(ROUND) + int(k) for k in rng.permutation(len(ROUND))]
+    return found[:count]
 
 
 def _plans(size: Size, rng: np.random.Generator) -> tuple[Plan, ...]:
     return size.table if rng.random() < 0.5 else size.free
+
+
+def _where(size: Size, rng: np.random.Generator, *names: str) -> tuple[Plan, ...]:
+    """Motions in which the effects show."""
+    partners = [(SINGLES | OUTSIDE)[name] for name in names]
+    special = tuple((p.motion, 0.0, FOLDING) for p in partners if p.motion)
+    plans = size.table if any(p.table for p in partners) else _plans(size, rng)
+    return (*plans[: len(plans) - len(special)], *special)
 
 
 def _take(plan: Plan, regrasp: float, rng: np.random.Generator) -> Take:
@@ -211,23 +218,21 @@ def _hard(rng, turn, slot, size):
         "diagonals": str(rng.choice(["alternating", "parallel"])),
     }
     trouble = {"bias": 0.7e-3, "occlusion": 0.2, "regrasp": 4e-3}
-    plans = size.table if SINGLES[name].table else _plans(size, rng)
-    return {"kind": f"{name} too small to matter", "effects": small, "said": said, "plans": plans, **mesh, **trouble}
+    found = {"effects": small, "said": said, "plans": _where(size, rng, name)}
+    return {"kind": f"{name} too small to matter", **found, **mesh, **trouble}
 
 
 def _single(rng, turn, slot, size):
     """Twelve numbers in a row of a family run through the amplitudes; effects through the catalogue."""
     share = (HALF, FULL, MORE)[slot % 3]
     name = list(SINGLES)[(6 * turn + slot + turn // len(SINGLES)) % len(SINGLES)]
-    plans = size.table if SINGLES[name].table else _plans(size, rng)
-    return {"kind": f"{share:g}", "effects": _hide(name, share, rng, SINGLES), "plans": plans}
+    return {"kind": f"{share:g}", "effects": _hide(name, share, rng, SINGLES), "plans": _where(size, rng, name)}
 
 
 def _double(rng, turn, slot, size):
     pair = PAIRS[(2 * turn + slot) % len(PAIRS)]
     effects = tuple(h for name in pair for h in _hide(name, FULL, rng, SINGLES))
-    plans = size.table if any(SINGLES[name].table for name in pair) else _plans(size, rng)
-    return {"kind": "two", "effects": effects, "plans": plans}
+    return {"kind": "two", "effects": effects, "plans": _where(size, rng, *pair)}
 
 
 def _confounded(rng, turn, slot, size):
@@ -252,8 +257,7 @@ def _confounded(rng, turn, slot, size):
 def _outside(rng, turn, slot, size):
     name = list(OUTSIDE)[(2 * turn + slot) % len(OUTSIDE)]
     share = FULL if rng.random() < 0.5 else MORE
-    plans = size.table if OUTSIDE[name].table else _plans(size, rng)
-    return {"kind": f"{share:g}", "effects": _hide(name, share, rng, OUTSIDE), "plans": plans}
+    return {"kind": f"{share:g}", "effects": _hide(name, share, rng, OUTSIDE), "plans": _where(size, rng, name)}
 
 
 def _fault(rng, turn, slot, size):

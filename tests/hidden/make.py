@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import beside  # noqa: F401
+import numpy as np
 from drawn import REDUCED, SMALL, UNSEEN, Case, Hidden, Take, case
 from effects import hide
 from faults import FAULTS
@@ -65,7 +66,8 @@ def episode(found: Case, take: Take, number: int) -> recordings.Recording:
     made = record(true, moved, result, take.motion, [found.seed, number], found.size.fit, said=said)
     if not found.forces:
         made = replace(made, grippers={k: replace(g, force=None, torque=None) for k, g in made.grippers.items()})
-    return FAULTS[found.fault](replace(made, truth=None, provenance=SAID_BY))
+    wrong = np.random.default_rng([found.seed, 13])  # the same in all episodes
+    return FAULTS[found.fault](replace(made, truth=None, provenance=SAID_BY), wrong)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -44,7 +44,8 @@ def _added(name: str, make: type[AbstractEffect], world: World, amplitude: float
 
 
 def _viscosity(world: World, time: float) -> World:
-    stiffness = world.cloth.material.membrane_stiffness.item()  # type: ignore[union-attr,operator]
+    own = world.cloth.material
+    stiffness = float(own.youngs_modulus.value) * float(own.thickness)  # type: ignore[union-attr,arg-type]
     return world.with_cloth({"viscosity": KelvinVoigt(time * stiffness)})
 
 

@@ -85,17 +85,20 @@ def gather(
     hypotheses: Sequence[Hypothesis] = (),
     progress: Progress = lambda _: None,
     before: Evidence | None = None,
+    shifts: Sequence[tuple[int, float]] | None = None,
 ) -> Evidence:
     """Simulate every episode at the model's point, beside it, and with each hypothesis at its typical amplitude.
 
-    The nuisances' slopes, which hardly depend on the point, are taken from ``before`` where that is given.
+    The nuisances' slopes, which hardly depend on the point, are taken from ``before`` where that is given. ``shifts``
+    are (coordinate, step) of the points beside; None: a small step along each coordinate.
     """
+    shifts = _steps(model) if shifts is None else shifts
     asked, trials = _simulable(model, setting, hypotheses, progress)
     cells, stds, numerics = [], [], []
     for k, (e, fine) in enumerate(zip(setting.episodes, finer_residuals(model, setting), strict=True)):
         progress(f"{e.name}: slopes")
-        base, own, steps = _own(model, e, setting.dt)
-        moved = directions(base, [*own, *trials[k]], [*steps, *(h.typical for h in asked)])
+        base, own = _own(model, e, setting.dt, shifts)
+        moved = directions(base, [*own, *trials[k]], [*(s for _, s in shifts), *(h.typical for h in asked)])
         if before is None:
             other, std = _nuisances(model, base, e, setting.dt)
             moved = _joined(moved, other)
@@ -108,7 +111,7 @@ def gather(
         cells.append(kept)
         numerics.append(difference)
         stds.append(std)
-    return Evidence(cells, len(model.point), asked, stds, numerics)
+    return Evidence(cells, len(shifts), asked, stds, numerics)
 
 
 def _simulable(
@@ -171,17 +174,22 @@ def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
     return kept._replace(value=fine.value[place], spread=fine.spread[place]), kept.value - fine.value[place]
 
 
-def _own(model: Model, e: Episode, dt: float | None) -> tuple[Frames, list[Frames], list[float]]:
-    """(at the point, beside it, steps) along the model's own coordinates."""
-    point, worlds, steps, count = model.point, [model.world()], [], len(model.parameters)
-    for k in range(len(point)):
-        step = model.parameters[k].step if k < count else 0.1 * model.accepted[k - count].typical
-        beside = point.clone()
-        beside[k] += step
+def _steps(model: Model) -> list[tuple[int, float]]:
+    own = [*(p.step for p in model.parameters), *(0.1 * h.typical for h in model.accepted)]
+    return list(enumerate(own))
+
+
+def _own(
+    model: Model, e: Episode, dt: float | None, shifts: Sequence[tuple[int, float]]
+) -> tuple[Frames, list[Frames]]:
+    """(at the point, beside it) along the model's own coordinates."""
+    worlds = [model.world()]
+    for coordinate, step in shifts:
+        beside = model.point
+        beside[coordinate] += step
         worlds.append(model.at(beside).world())
-        steps.append(step)
     base, *shifted = side_by_side(lambda world: world.frames(e, dt), worlds)
-    return base, shifted, steps
+    return base, shifted
 
 
 def _nuisances(model: Model, base: Frames, e: Episode, dt: float | None) -> tuple[Frames, Tensor]:

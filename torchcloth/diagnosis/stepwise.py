@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..errors import SimulationDiverged, UnstableStep
+from .approach import approach
 from .comparison import Gain, Predicted, compare, predict
 from .evidence import Progress, Setting
 from .fitting import Fitted, fit, renoised
@@ -15,7 +16,9 @@ from .world import Hypothesis, Model
 
 MOST = 4  # causes
 TRIED = 4  # hypotheses that are fitted at each step
+FURTHER = 2  # steps of the likelier ones among them
 CLEAR = 4.0  # log density below which two models predict alike
+LACKING = 1e-3  # m: slow errors beyond this are not only a sensor's
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 
 
@@ -67,14 +70,15 @@ def search(
 
     The ``tried`` likeliest are fitted at each step.
     """
-    current = start = fit(model, setting, hypotheses, progress=progress)
+    near, before = approach(model, setting, progress)
+    current = start = fit(near, setting, hypotheses, progress=progress, before=before)
     steps: list[Step] = []
     while True:
         screened = screen(current)
-        present = [row for row in screened if row.decision == "present"]
-        if not present or len(steps) == MOST:
+        likely = _likely(current, screened)
+        if not likely or len(steps) == MOST:
             break
-        step = _step(current, setting, present[:tried], screened, progress)
+        step = _step(current, setting, likely[:tried], screened, progress)
         if step is None:
             break
         steps.append(step)
@@ -86,6 +90,17 @@ def search(
     first = predict(renoised(start, current.noise), setting.names)
     whole = compare(first, predict(current, setting.names), floor) if steps else None
     return Found(start, current, steps, screened, whole, floor)
+
+
+def _likely(current: Fitted, screened: Sequence[Row]) -> list[Row]:
+    """What is present by slopes; where the fit is lacking and nothing is, all that could matter.
+
+    A large effect bends the fitted parameters so far that slopes there no longer ask for it.
+    """
+    present = [row for row in screened if row.decision == "present"]
+    if present or float(current.noise.level[0]) < LACKING:
+        return present
+    return [row for row in screened if row.decision != "unresolvable" and row.forward > 0]
 
 
 def _pruned(
@@ -106,10 +121,10 @@ def _pruned(
 
 
 def _step(
-    current: Fitted, setting: Setting, present: Sequence[Row], screened: list[Row], progress: Progress
+    current: Fitted, setting: Setting, likely: Sequence[Row], screened: list[Row], progress: Progress
 ) -> Step | None:
     fits: list[tuple[Row, Fitted]] = []
-    for row in present:
+    for row in likely:
         progress(f"fitting {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
@@ -118,16 +133,30 @@ def _step(
             continue
     if not fits:
         return None
+    fits = _settled(_compared(current, fits, setting.names, current.noise), setting, progress)
     tried = _compared(current, fits, setting.names, current.noise)
-    likely = max(tried, key=lambda c: c.gain.density)
+    first = max(tried, key=lambda c: c.gain.density)
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
-    tried = _compared(current, fits, setting.names, fit_noise(likely.fitted.evidence))
+    tried = _compared(current, fits, setting.names, fit_noise(first.fitted.evidence))
     useful = [c for c in tried if _useful(c)]
     if not useful:
         return None
     best = max(useful, key=lambda c: c.gain.density)
     rivals = [c for c in useful if c is not best and _rival(c, best)]
     return Step(best, tried, rivals, screened)
+
+
+def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> list[tuple[Row, Fitted]]:
+    """The better ones where further steps lead: one step does for small effects only."""
+    enough = max(0.0, 0.5 * max(c.gain.density for c in tried))
+    out = []
+    for c in tried:
+        found = c.fitted
+        if c.gain.density > enough and found.ahead > CLEAR:
+            progress(f"fitting {c.hypothesis.name} further")
+            found = fit(found.model, setting, (), FURTHER, progress, found.noise, found.evidence, found.evidence)
+        out.append((c.row, found))
+    return out
 
 
 def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise) -> list[Candidate]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from ..kept import guarded
 
 # Modules of this package; ``add(parser)`` declares options, ``run(options)`` does it.
-STUDIES: tuple[str, ...] = ("fabrics", "garments", "chamfer", "factors", "classify", "measured", "pose")
+STUDIES: tuple[str, ...] = ("fabrics", "garments", "chamfer", "factors", "classify", "measured", "pose", "hidden")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
