@@ -16,7 +16,7 @@ def learned(change, seed=0):
     model = base_model(recordings[0])
     setting = setting_of(model, recordings)
     fitted = fit(model, setting)
-    return recordings[0], fitted.model, learn_residual(fitted.model, setting)
+    return recordings[0], fitted.model, learn_residual(fitted, setting)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,8 @@ from ..effects import ResidualForce
 from ..effects.residual import LAWS, PLACES, describe
 from .comparison import Gain
 from .evidence import Progress, Setting
-from .stepwise import Found, search
+from .fitting import Fitted, fit
+from .stepwise import Found, extend
 from .world import Hypothesis, Model, World
 
 RESIDUAL = "residual"
@@ -96,13 +97,15 @@ def is_residual(hypothesis: Hypothesis) -> bool:
     return hypothesis.name.startswith(f"{RESIDUAL}.")
 
 
-def learn_residual(model: Model, setting: Setting, progress: Progress = lambda _: None) -> Residual:
+def learn_residual(found: Fitted, setting: Setting, progress: Progress = lambda _: None) -> Residual:
     """Local laws that mend what a model with its causes leaves, if any does.
 
     Args:
-        model: at its solution.
+        found: a model at its solution.
         setting: the episodes that it was fitted to.
         progress: called with one line for each thing that is simulated.
     """
-    taken = {h.name for h in model.accepted}
-    return Residual(search(model, setting, [t for t in TERMS if t.name not in taken], progress, TRIED))
+    taken = {h.name for h in found.model.accepted}
+    laws = [t for t in TERMS if t.name not in taken]
+    start = fit(found.model, setting, laws, 1, progress, before=found.evidence)
+    return Residual(extend(start, setting, laws, progress, TRIED))

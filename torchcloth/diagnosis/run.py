@@ -68,7 +68,7 @@ def diagnose(
 def _beyond(answer: Diagnosis, setting: Setting, progress: Progress) -> Diagnosis:
     """With what can be said of what no known cause explains."""
     missing = missing_force(answer.found.end, setting, progress=progress)
-    residual = learn_residual(answer.model, setting, progress)
+    residual = learn_residual(answer.found.end, setting, progress)
     content = answer.content | {"missing_force": missing.as_dict(), "residual": residual.as_dict()}
     return replace(answer, content=content, missing=missing, residual=residual)
 

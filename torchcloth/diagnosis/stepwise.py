@@ -60,18 +60,23 @@ class Found:
 
 
 def search(
-    model: Model,
+    model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
+) -> Found:
+    """Causes one after the other, until none is both present and useful on motions held out."""
+    near, before = approach(model, setting, progress)
+    start = fit(near, setting, hypotheses, progress=progress, before=before)
+    return extend(start, setting, hypotheses, progress)
+
+
+def extend(
+    start: Fitted,
     setting: Setting,
     hypotheses: Sequence[Hypothesis],
     progress: Progress = lambda _: None,
     tried: int = TRIED,
 ) -> Found:
-    """Causes one after the other, until none is both present and useful on motions held out.
-
-    The ``tried`` likeliest are fitted at each step.
-    """
-    near, before = approach(model, setting, progress)
-    current = start = fit(near, setting, hypotheses, progress=progress, before=before)
+    """As ``search``, from a fit that was asked about the hypotheses; each step fits the ``tried`` likeliest anew."""
+    current = start
     steps: list[Step] = []
     while True:
         screened = screen(current)
