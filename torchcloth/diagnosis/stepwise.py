@@ -62,7 +62,13 @@ class Found:
     floor: float  # m, of a cell: what repetitions differ by, else what the sensor does
     sensor: float  # m, of a cell: noise and slow errors
     repeats: Repeats | None  # None: no episode repeats another
-    left_out: float  # share of cells that jump between shapes
+    setting: Setting  # without the cells that jump between shapes
+
+    @property
+    def left_out(self) -> float:
+        """Share of the cells that jump."""
+        jumping = sum(map(len, self.setting.unstable or ()))
+        return jumping / (jumping + len(self.end.white.value))
 
 
 def search(
@@ -70,19 +76,29 @@ def search(
 ) -> Found:
     """Causes one after the other, until none is both present and useful on motions held out."""
     near, before = approach(model, setting, staged(progress, "from the data sheet"))
-    current = start = fit(near, setting, hypotheses, progress=staged(progress, "base model"), before=before)
+    start = fit(near, setting, hypotheses, progress=staged(progress, "base model"), before=before)
     jumping = unstable(start, setting, staged(progress, "folds that turn over"))
-    left_out = sum(map(len, jumping)) / len(start.white.value)
-    if left_out:
-        setting, current = replace(setting, unstable=jumping), without(start, jumping)
-        start = current
+    if any(map(len, jumping)):
+        setting, start = replace(setting, unstable=jumping), without(start, jumping)
+    return extend(start, setting, hypotheses, progress)
+
+
+def extend(
+    start: Fitted,
+    setting: Setting,
+    hypotheses: Sequence[Hypothesis],
+    progress: Progress = lambda _: None,
+    tried: int = TRIED,
+) -> Found:
+    """As ``search``, from a fit that was asked about the hypotheses; each step fits the ``tried`` likeliest anew."""
+    current = start
     steps: list[Step] = []
     while True:
         screened = screen(current)
         likely = _likely(current, screened)
         if not likely or len(steps) == MOST:
             break
-        step = _step(current, setting, likely, screened, progress)
+        step = _step(current, setting, likely[:tried], screened, progress)
         if step is None:
             break
         steps.append(step)
@@ -96,7 +112,7 @@ def search(
     floor = sensor if repeated is None else repeated.rms
     first = predict(renoised(start, current.noise), setting.names)
     whole = compare(first, last, floor) if steps else None
-    return Found(start, current, steps, screened, whole, floor, sensor, repeated, left_out)
+    return Found(start, current, steps, screened, whole, floor, sensor, repeated, setting)
 
 
 def _likely(current: Fitted, screened: Sequence[Row]) -> list[Row]:
@@ -131,7 +147,7 @@ def _step(
     current: Fitted, setting: Setting, likely: Sequence[Row], screened: list[Row], progress: Progress
 ) -> Step | None:
     fits: list[tuple[Row, Fitted]] = []
-    for row in likely[:TRIED]:
+    for row in likely:
         trial = staged(progress, f"trying {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
