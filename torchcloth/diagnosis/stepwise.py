@@ -21,7 +21,7 @@ TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 2  # steps of the likelier ones among them
 CLEAR = 4.0  # log density below which two models predict alike
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
-LACKING = 1e-3  # m: slow errors beyond this are not only a sensor's
+MUCH = 50.0  # chi^2, of a cause that is worth fitting
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 
 
@@ -95,7 +95,7 @@ def extend(
     steps: list[Step] = []
     while True:
         screened = screen(current)
-        likely = _likely(current, screened)
+        likely = _likely(screened)
         if not likely or len(steps) == MOST:
             break
         step = _step(current, setting, likely[:tried], screened, progress)
@@ -115,15 +115,12 @@ def extend(
     return Found(start, current, steps, screened, whole, floor, sensor, repeated, setting)
 
 
-def _likely(current: Fitted, screened: Sequence[Row]) -> list[Row]:
-    """What is present by slopes; where the fit is lacking and nothing is, all that could matter.
+def _likely(screened: Sequence[Row]) -> list[Row]:
+    """What is present by slopes, and what would gain much though it is small by them.
 
-    A large effect bends the fitted parameters so far that slopes there no longer ask for it.
+    A large effect bends the fitted parameters so far that slopes there ask for less of it than there is.
     """
-    present = [row for row in screened if row.decision == "present"]
-    if present or float(current.noise.level[0]) < LACKING:
-        return present
-    return [row for row in screened if row.decision != "unresolvable" and row.forward > 0]
+    return [r for r in screened if r.decision == "present" or (r.gain > MUCH and r.forward > 0 and r.visible)]
 
 
 def _pruned(
