@@ -67,4 +67,4 @@ def fitted(ev: Evidence, level: float = SLOW, std: float = 0.5) -> Fitted:
     white = whitened(ev, Noise(levels))
     own = white.jacobian[:, : ev.own]
     covariance = torch.linalg.inv(own.mT @ own + torch.eye(ev.own).double() / std**2)
-    return Fitted(model, ev, Noise(levels), white, covariance)
+    return Fitted(model, ev, Noise(levels), white, covariance, 0.0)

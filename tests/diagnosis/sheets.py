@@ -11,12 +11,14 @@ import torch
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import World, base_model
+from torchcloth.identification.episodes import Episode
 from torchcloth.identification.episodes import episode as tensors
 from torchcloth.identification.replays import Frames
 
 SIDE = 0.2  # m
 TRUTH, FIT = (13, 13), (7, 7)
 NOMINAL = {"membrane_stiffness": 60.0, "poisson_ratio": 0.3, "bending_stiffness": 2e-4, "bending_damping_time": 0.01}
+EYE = (0.1, -1.2, 1.1)  # m, of the camera
 FRAMES, RATE, POINTS, NOISE = 16, 20.0, 80, 5e-4  # -, Hz, a frame, m
 
 
@@ -63,19 +65,28 @@ def episode(motion: str = "slow", resolution: tuple[int, int] = FIT, duration: f
         grippers=grippers,
         points=rec.PointClouds(np.arange(frames) / RATE, points.reshape(-1, 3), np.full(frames, 40)),
         observation_noise_std=1e-3,
+        cameras={"camera": rec.Camera(width=640, height=480, K=np.eye(3), T_world_camera=_at(EYE))},
         split={"motion": motion},
     )
 
 
-def recorded(motion: str, change: Callable[[World], World], seed: int) -> rec.Recording:
-    """What a noisy sensor has of a world that is changed, simulated on a finer mesh; the first shape is settled."""
+def _at(place: tuple[float, float, float]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    return pose
+
+
+def recorded(
+    motion: str, change: Callable[[World], World], seed: int, play: Callable[[World, Episode], Frames] = World.frames
+) -> rec.Recording:
+    """What a noisy sensor has of a world that is changed, played on a finer mesh; the first shape is settled."""
     blank, rng = episode(motion, TRUTH, (FRAMES - 1) / RATE + 0.01), np.random.default_rng(seed)
     world = change(base_model(blank).world())
     with torch.no_grad():
         data = tensors(world.cloth, blank)
         state = world.cloth.settle(world.cloth.state(data.initial), data.motion, duration=1.0, rate=15.0)
         settled = replace(blank, cloth=replace(blank.cloth, initial_vertices=state.x.numpy()))
-        found: Frames = world.frames(tensors(world.cloth, settled))
+        found = play(world, tensors(world.cloth, settled))
     coarse = episode(motion, FIT, (FRAMES - 1) / RATE + 0.01)
     clouds = [_seen(x, rng) for x in found.x.numpy()]
     first = _bilinear(found.x[0].numpy(), np.asarray(coarse.cloth.uv)) + 2e-4 * rng.standard_normal(

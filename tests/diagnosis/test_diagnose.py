@@ -26,7 +26,7 @@ def asked(recordings):
 def with_drag():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    hidden = next(h for h in catalogue(base_model(sheets.episode()), []) if h.name == "air.drag_n")
+    (hidden,) = (h for h in asked([sheets.episode()]) if h.name == "air.drag_n")
     recordings = episodes(lambda world: hidden.apply(world, 1.5))
     yield recordings, diagnose(recordings, hypotheses=asked(recordings))
     torch.set_default_dtype(before)
@@ -46,7 +46,7 @@ def test_hidden_drag_is_named(with_drag):
 
 def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
     recordings, answer = with_drag
-    content = json.loads(write_diagnosis(answer, recordings[0], tmp_path).read_text())
+    content = json.loads(write_diagnosis(answer, recordings, tmp_path).read_text())
     assert {"verdict", "causes", "ruled_out", "unresolvable", "gain", "next_experiment", "model", "warnings"} <= set(
         content
     )

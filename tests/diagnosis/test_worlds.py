@@ -8,13 +8,14 @@ import sheets
 import torch
 
 from torchcloth.diagnosis import air, fabric, grip, observer
-from torchcloth.diagnosis.base_model import base_model
+from torchcloth.diagnosis.base_model import base_model, together
 from torchcloth.diagnosis.evidence import gather, setting_of
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
 from torchcloth.diagnosis.world import Hypothesis
 from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.recordings import Collider
 
 RECORDING = sheets.episode()
 
@@ -29,7 +30,7 @@ def made():
 
 
 EVERY = [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES]
-NAMES = [h.name for h in EVERY if not h.needs_table]
+NAMES = [h.name for h in EVERY if h.needs(RECORDING)]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -62,6 +63,32 @@ def test_air_and_hem_do_what_their_names_say(made):
     assert float((last("env.gravity_tilt[x]", 0.2) - base)[free, 0].mean()) > 1e-5
     assert float((last("rest.shrink[weft]", 0.05) - base)[free, 2].mean()) > 1e-3
     torch.testing.assert_close(last("obs.extrinsic[x]", 0.004) - base, torch.tensor([0.004, 0.0, 0.0]).expand_as(base))
+    depth = lambda x: (x - torch.as_tensor(sheets.EYE)).norm(dim=-1)  # noqa: E731
+    torch.testing.assert_close(depth(last("obs.depth_scale", 0.015)), 1.015 * depth(base))
+    torch.testing.assert_close(depth(last("obs.depth_bias", 5e-3)), depth(base) + 5e-3)
+
+
+@pytest.mark.parametrize("first", ["elas.ortho", "plast.crease", "air.drag_n", "rest.skew", "grip.width"])
+def test_whatever_was_accepted_all_others_still_apply(made, first):
+    model, _ = made
+    by = {h.name: h for h in catalogue(model, [RECORDING])}
+    for h in by.values():
+        model.world([(by[first], by[first].typical), (h, h.typical)])
+
+
+def test_a_table_may_rub_more_and_otherwise_along_x():
+    table = replace(RECORDING, colliders={"table": Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.4)})
+    model = base_model(table)
+    by = {h.name: h for h in catalogue(model, [table])}
+    law = model.world([(by["contact.aniso"], -0.5), (by["contact.mu"], 0.2)]).cloth.boundaries["table"].friction
+    assert float(law.value) == pytest.approx(0.4)  # (0.4 / 2) + 0.2 along x
+    assert float(law.ratio.value) == pytest.approx(2.0)
+
+
+def test_what_a_recording_cannot_show_is_not_asked(made):
+    model, _ = made
+    asked = {h.name for h in catalogue(model, [replace(RECORDING, cameras={})])}
+    assert asked.isdisjoint({"obs.depth_scale", "obs.depth_bias", "contact.mu"})
 
 
 def test_two_effects_in_one_part_keep_both(made):
@@ -71,6 +98,11 @@ def test_two_effects_in_one_part_keep_both(made):
     air = world.cloth.effects["air"]
     assert (float(air.normal.value), float(air.tangential.value)) == pytest.approx((0.8, 0.02))
     assert air.wind.tolist() == pytest.approx([0.3, 0.0, 0.0])
+    bending = model.world(
+        [(by[name], by[name].typical) for name in ("rest.curl[weft]", "plast.crease", "damp.bend", "bend.aniso")]
+    ).cloth.effects["bending"]
+    found = [float(getattr(bending, name).value) for name in ("curl_weft", "mobility", "damping_time", "weft_ratio")]
+    assert found == pytest.approx([3.0, 5.0, 0.06, 0.4])
     rest = model.world([(by["rest.shrink[warp]"], 0.02), (by["rest.skew"], 0.01)]).cloth.effects["rest_shape"]
     assert (float(rest.shrink_warp.value), float(rest.skew.value)) == pytest.approx((0.02, 0.01))
     woven = model.world([(by["elas.ortho"], 0.5), (by["elas.shear"], -0.4)]).cloth.material
@@ -138,3 +170,12 @@ def test_model_files_that_cannot_be_read_are_refused(made, tmp_path):
     path = save_model(tmp_path / "m.tcm", model.plus(stranger, 1.0), RECORDING)
     with pytest.raises(InvalidInput, match=r"'user.unknown'.*register"):
         load_model(path)
+
+
+def test_a_table_that_one_episode_names_is_there_in_all():
+    plane = Collider(np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, 1.0]), 0.4)
+    with_table = replace(RECORDING, colliders={"table": plane})
+    assert list(together([RECORDING, with_table]).colliders) == ["table"]
+    high = replace(RECORDING, colliders={"table": replace(plane, point=np.array([0.0, 0.0, 1.1]))})
+    with pytest.raises(InvalidInput, match=r"inside 'table', which only other episodes have"):
+        together([RECORDING, high])

@@ -12,6 +12,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from motions import NAMES, Motion, motion
 from mujoco_cloth import Result
 from scene import Scene, believed, simulate
 from scipy.spatial.transform import Rotation
-from sensor import see
+from sensor import pinhole, see
 
 from torchcloth import recordings
 from torchcloth.errors import TorchclothError
@@ -35,7 +36,14 @@ FORCE_NOISE, TORQUE_NOISE = 0.02, 0.002  # N, N m
 
 
 def record(
-    scene: Scene, moved: Motion, result: Result, name: str, seed: int, nodes: int, exact: bool = False
+    scene: Scene,
+    moved: Motion,
+    result: Result,
+    name: str,
+    seed: int | Sequence[int],
+    nodes: int,
+    exact: bool = False,
+    said: Scene | None = None,
 ) -> recordings.Recording:
     """The recording of a simulated motion.
 
@@ -45,19 +53,21 @@ def record(
         seed: of all noise.
         nodes: vertices along each side of the mesh that a fit uses.
         exact: no noise at all: points on the surface, first positions and forces as they are.
+        said: whose values the data sheet, grasps and table are said to have; None: the effect-free fabric's.
     """
-    seen, first, touch = (np.random.default_rng([seed, k]) for k in range(3))
-    nominal, sensor = Scene(), replace(scene.sensor, noise=0.0) if exact else scene.sensor
+    seen, first, touch = (np.random.default_rng([*np.atleast_1d(seed), k]) for k in range(3))
+    nominal, sensor = said or Scene(), replace(scene.sensor, noise=0.0) if exact else scene.sensor
     noise = {key: 0.0 if exact else value for key, value in (("force", FORCE_NOISE), ("torque", TORQUE_NOISE))}
     grasps = {key: recordings.GraspInfo(np.array([uv]), nominal.grip.radius) for key, uv in moved.held.items()}
     table = recordings.Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), nominal.table.friction)
     faces, size = grid(scene.sheet)[1].astype(np.int32), {"nodes": np.array(scene.sheet.nodes)}
     return recordings.Recording(
-        cloth=_cloth(scene, moved, result.x[0], nodes, 0.0 if exact else INITIAL_ERROR, first),
+        cloth=_cloth(scene, nominal, moved, result.x[0], nodes, 0.0 if exact else INITIAL_ERROR, first),
         provenance=f"synthetic: MuJoCo flex {mujoco.__version__}, tests/independent/generate.py",
         licence="CC0-1.0",
         grasps=grasps,
         grippers={key: _gripper(scene, moved, result, key, noise, touch) for key in moved.pose},
+        cameras={"cam0": recordings.Camera(**pinhole(scene.sensor))},
         colliders={"table": table} if moved.table else {},
         points=see(sensor, scene.sheet, moved.t, result.x, seen),
         truth=recordings.Truth(moved.t[::2], result.x[::2].astype(np.float32), faces, size),
@@ -68,10 +78,10 @@ def record(
 
 
 def _cloth(
-    scene: Scene, moved: Motion, x: Array, nodes: int, error: float, rng: np.random.Generator
+    scene: Scene, nominal: Scene, moved: Motion, x: Array, nodes: int, error: float, rng: np.random.Generator
 ) -> recordings.ClothInfo:
-    """What is said of the cloth: the effect-free fabric's values, and where it was seen to be at first."""
-    nominal, held = Scene(), list(moved.held.values())
+    """What is said of the cloth: nominal values, and where it was seen to be at first."""
+    held = list(moved.held.values())
     uv, faces, start = measured_mesh(scene.sheet, x, nodes, error, held, nominal.grip.radius, rng)
     if moved.table:
         start[:, 2] = np.maximum(start[:, 2], 0.0)

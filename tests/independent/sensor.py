@@ -80,10 +80,28 @@ def _measured(spec: SensorSpec, points: Array, noise: Array, walk: Array) -> Arr
     slow = spec.bias / np.sqrt(2.18) * (walk @ modes)
     depth = depth * (1 + spec.scale) + spec.offset + spec.noise * noise + slow
     found = ray / np.linalg.norm(ray, axis=1, keepdims=True) * depth[:, None]
-    c, s = np.cos(spec.rotation), np.sin(spec.rotation)
-    angle = np.deg2rad(spec.heading)
-    turned = found @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
-    return EYE + turned + spec.shift * np.array([np.cos(angle), np.sin(angle), 0.0])
+    turn, shift = _believed(spec)
+    return EYE + found @ turn.T + shift
+
+
+def pinhole(spec: SensorSpec) -> dict[str, object]:
+    """Where the camera is believed to be, and a lens that holds the scene: fields of a recording's camera (OpenCV)."""
+    ahead = (TARGET - EYE) / np.linalg.norm(TARGET - EYE)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    turn, shift = _believed(spec)
+    pose = np.eye(4)
+    pose[:3, :3] = turn @ np.stack([right, np.cross(ahead, right), ahead], 1)
+    pose[:3, 3] = EYE + shift
+    lens = np.array([[504.0, 0.0, 320.0], [0.0, 504.0, 288.0], [0.0, 0.0, 1.0]])
+    return {"width": 640, "height": 576, "K": lens, "T_world_camera": pose}
+
+
+def _believed(spec: SensorSpec) -> tuple[Array, Array]:
+    """Turn [3, 3] and shift [3] m of the camera's believed pose from its true one."""
+    c, s, angle = np.cos(spec.rotation), np.sin(spec.rotation), np.deg2rad(spec.heading)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return turn, spec.shift * np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
 def _image(points: Array) -> Array:

@@ -16,7 +16,7 @@ from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
 from torchcloth.inspection import draw, inspect, show
 from torchcloth.inspection.cuts import cuts
-from torchcloth.inspection.streams import ticks
+from torchcloth.recordings.ticks import ticks
 
 GRID = {"extra": {"grid": np.array([8, 8])}}
 

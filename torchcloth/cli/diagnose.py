@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from .folders import check_folder
+from .identify import PROGRESS, STOPPED
 
 
 def add(verbs: Any) -> None:
@@ -18,26 +19,35 @@ def add(verbs: Any) -> None:
     parser.add_argument("episodes", nargs="+", metavar="EPISODE", help="folders of one cloth's episodes")
     parser.add_argument("--model", metavar="MODEL", help="a .tcm file to start from (default: A-EP in vacuum)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result")
-    parser.set_defaults(run=_diagnose)
+    parser.add_argument("--resume", action="store_true", help="go on with a diagnosis that was stopped")
+    parser.set_defaults(run=_diagnose, stopped=STOPPED)
 
 
 def _diagnose(options: argparse.Namespace) -> int:
     import torch
 
-    from .. import diagnosis, recordings
+    from .. import diagnosis
+    from ..identification.journal import clear
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
     check_folder(options.out)
     model = None if options.model is None else diagnosis.load_model(options.model)
-    episodes = [recordings.read(path) for path in options.episodes]
-    print(f"{len(episodes)} episodes: about a minute each on one core", flush=True)
-    with _progress() as progress:
-        answer = diagnosis.diagnose(episodes, model, progress=progress)
-    path = diagnosis.write_diagnosis(answer, episodes[0], options.out)
+    episodes, faults = diagnosis.read_episodes(options.episodes)
+    if faults:
+        answer = diagnosis.refused(faults)
+    else:
+        print(f"{len(episodes)} episodes: about a minute each on one core", flush=True)
+        with _progress() as progress:
+            answer = diagnosis.diagnose(
+                episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume
+            )
+    path = diagnosis.write_diagnosis(answer, episodes, options.out)
+    clear(options.out / PROGRESS)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())
-    print("\n".join(str(path.parent / name) for name in (path.name, "report.html", answer.content["model"])))
+    written = (path.name, "report.html", answer.content["model"])
+    print("\n".join(str(path.parent / name) for name in written if name))
     return 0
 
 
@@ -45,7 +55,7 @@ def _diagnose(options: argparse.Namespace) -> int:
 def _progress() -> Iterator[Callable[[str], None]]:
     """One line that changes on a terminal; in a log, a line for every stage."""
     if not sys.stderr.isatty():
-        yield lambda text: None if text.endswith("slopes") else print(text, flush=True)
+        yield lambda text: None if text.endswith("left") else print(text, flush=True)
         return
     from rich.console import Console
 

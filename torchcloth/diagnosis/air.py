@@ -8,7 +8,6 @@ from ..effects import (
     AbstractEffect,
     AddedMass,
     AirDrag,
-    Bending,
     BendingFriction,
     KelvinVoigt,
     MassDamping,
@@ -45,14 +44,9 @@ def _added(name: str, make: type[AbstractEffect], world: World, amplitude: float
 
 
 def _viscosity(world: World, time: float) -> World:
-    stiffness = world.cloth.material.membrane_stiffness.item()  # type: ignore[union-attr,operator]
+    own = world.cloth.material
+    stiffness = float(own.youngs_modulus.value) * float(own.thickness)  # type: ignore[union-attr,arg-type]
     return world.with_cloth({"viscosity": KelvinVoigt(time * stiffness)})
-
-
-def _bending_damping(world: World, time: float) -> World:
-    own: Bending = world.cloth.effects["bending"]  # type: ignore[assignment]
-    before = 0.0 if own.damping_time is None else own.damping_time.value.item()
-    return world.with_cloth({"bending": Bending(own.stiffness.value.item(), before + time)})
 
 
 HYPOTHESES = (
@@ -63,7 +57,6 @@ HYPOTHESES = (
     Hypothesis("air.wind[x]", "m/s", 0.3, partial(_with_wind, 0), signed=True),
     Hypothesis("air.wind[y]", "m/s", 0.3, partial(_with_wind, 1), signed=True),
     Hypothesis("damp.kv", "s", 5e-3, _viscosity),
-    Hypothesis("damp.bend", "s", 0.05, _bending_damping),
     Hypothesis("fric.internal_bend", "N", 3e-4, partial(_added, "bending_friction", BendingFriction)),
     Hypothesis("fric.internal_shear", "N/m", 1.0, partial(_added, "shear_friction", ShearFriction)),
 )

@@ -3,19 +3,47 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from ..cloth import Cloth
+from ..errors import InvalidInput
 from ..identification.episodes import cloth_from
 from ..parameters import PhysicalParameter
-from ..recordings import Recording
+from ..recordings import Collider, Recording
 from .world import Model, Parameter, World
 
+INSIDE = 0.02  # m, that noise and a table's place may explain
 WRONG_BY = 2.5  # factor that a data sheet may be wrong by: two standard deviations
 LOGIT = 0.8  # standard deviation of logit(2 nu)
+
+
+def together(recordings: Sequence[Recording]) -> Recording:
+    """The first episode with the tables of all: an episode may lack one that its cloth never comes near.
+
+    Raises:
+        InvalidInput: cloth was seen inside another episode's table.
+    """
+    tables = {name: table for r in recordings for name, table in r.colliders.items()}
+    for r in recordings:
+        for name, table in tables.items():
+            depth = 0.0 if name in r.colliders or r.points is None else _depth(r.points.xyz, table)
+            if depth > INSIDE:
+                raise InvalidInput(
+                    "episodes",
+                    got=f"cloth {depth:.3f} m inside {name!r}, which only other episodes have",
+                    expected="one scene",
+                    remedy="diagnose episodes with and without it apart, or name it in every episode.json",
+                )
+    return replace(recordings[0], colliders=tables)
+
+
+def _depth(points: np.ndarray, table: Collider) -> float:
+    """m, by which the deepest hundredth of the points lies inside."""
+    return -float(np.quantile((points - table.point) @ table.normal, 0.01))
 
 
 def base_model(recording: Recording) -> Model:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..effects import Bending, Gravity, LineMass, RestShape
+from ..effects import Bending, CreasingBending, Gravity, LineMass, RestShape
 from ..materials import OrthotropicAEP
 from ..meshes import Mesh
 from .world import Hypothesis, World
 
 MIDDLE = 1e-6  # m
+YIELD = 30.0  # 1/m, beyond which bent cloth keeps a crease
 
 
 def _moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffening: float = 0.0) -> World:
@@ -35,18 +36,19 @@ def _moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffening: flo
 
 
 def _bending(world: World, **changes: float) -> World:
-    """Further curl [1/m]; weft stiffness as a share beyond the warp's."""
+    """Further damping [s], curl [1/m], mobility of creases [1/s]; weft stiffness as a share beyond the warp's."""
     own: Bending = world.cloth.effects["bending"]  # type: ignore[assignment]
-    number = lambda name: 0.0 if getattr(own, name) is None else float(getattr(own, name).value)  # noqa: E731
-    options = {
-        "curl_warp": number("curl_warp") + changes.get("curl_warp", 0.0),
-        "curl_weft": number("curl_weft") + changes.get("curl_weft", 0.0),
-    }
+    number = lambda name: 0.0 if (part := getattr(own, name, None)) is None else float(part.value)  # noqa: E731
+    names = ("damping_time", "curl_warp", "curl_weft", "mobility")
+    options = {name: number(name) + changes.get(name, 0.0) for name in names}
     kept = {name: value for name, value in options.items() if value}
     ratio = (number("weft_ratio") or 1.0) * (1 + changes.get("weft", 0.0))
     if ratio != 1.0:
         kept |= {"weft_ratio": ratio, "twist_ratio": ratio**0.5}
-    new = Bending(number("stiffness"), number("damping_time") or None, own.poisson, **kept)  # type: ignore[arg-type]
+    if "mobility" in kept:
+        kept["yield_curvature"] = YIELD
+    kind = CreasingBending if "mobility" in kept else Bending
+    new = kind(number("stiffness"), poisson=own.poisson, **kept)  # type: ignore[arg-type]
     return world.with_cloth({"bending": new.requires_grad_(False)})
 
 
@@ -87,6 +89,8 @@ def _tilt(axis: int, world: World, angle: float) -> World:
 
 
 HYPOTHESES = (
+    Hypothesis("damp.bend", "s", 0.05, lambda w, a: _bending(w, damping_time=a)),
+    Hypothesis("plast.crease", "1/s", 5.0, lambda w, a: _bending(w, mobility=a)),
     Hypothesis("bend.aniso", "-", -0.6, lambda w, a: _bending(w, weft=a), signed=True),
     Hypothesis("elas.ortho", "-", 0.5, lambda w, a: _moduli(w, weft=a), signed=True),
     Hypothesis("elas.shear", "-", -0.6, lambda w, a: _moduli(w, shear=a), signed=True),

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .evidence import Evidence, Progress, Setting, gather
+from .evidence import Evidence, Progress, Setting, gather, staged
 from .noise import Noise, Whitened, fit_noise, whitened
 from .world import Hypothesis, Model
 
-SMALL = 0.1  # standard errors, of a step that ends the search
+ENOUGH = 2.0  # log density that a further step is expected to gain, below which the search ends
+ITERATIONS = 3  # at most
 LONGEST = 1.0  # prior standard deviations, of a step
 
 
@@ -26,6 +27,7 @@ class Fitted:
         noise: as estimated there.
         white: evidence, whitened.
         covariance: [P + A, P + A] of the model's coordinates.
+        ahead: log density that a further step is expected to gain.
     """
 
     model: Model
@@ -33,6 +35,7 @@ class Fitted:
     noise: Noise
     white: Whitened
     covariance: Tensor
+    ahead: float
 
 
 def prior_precision(model: Model) -> Tensor:
@@ -45,30 +48,33 @@ def fit(
     model: Model,
     setting: Setting,
     hypotheses: Sequence[Hypothesis] = (),
-    iterations: int = 2,
+    iterations: int = ITERATIONS,
     progress: Progress = lambda _: None,
     noise: Noise | None = None,
     before: Evidence | None = None,
+    here: Evidence | None = None,
 ) -> Fitted:
     """Fit the model's parameters and amplitudes, then ask about the hypotheses there.
 
     Fits are compared with the same ``noise``; None: estimated. The nuisances' slopes are those of ``before``, if given.
+    ``here`` is the evidence at the model's point, where that is known already.
     """
     precision = prior_precision(model)
-    for _ in range(iterations):
-        evidence = gather(model, setting, (), progress, before)
-        before = before or evidence
-        white = whitened(evidence, noise or fit_noise(evidence))
-        step, covariance = _step(white, model.point, precision)
-        limit = LONGEST * precision.rsqrt()
-        model = model.at(model.point + step.clamp(-limit, limit))
-        if float((step / covariance.diagonal().sqrt()).abs().max()) < SMALL:
+    for k in range(iterations):
+        here = here or gather(model, setting, (), staged(progress, f"fit {k + 1}"), before)
+        before = before or here
+        step, _, ahead = step_of(whitened(here, noise or fit_noise(here)), model.point, precision)
+        if ahead < ENOUGH:
             break
-    evidence = gather(model, setting, hypotheses, progress, before)
-    noise = noise or fit_noise(evidence)
-    white = whitened(evidence, noise)
-    _, covariance = _step(white, model.point, precision)
-    return Fitted(model, evidence, noise, white, covariance)
+        limit = LONGEST * precision.rsqrt()
+        model, here = model.at(model.point + step.clamp(-limit, limit)), None
+    if here is None or hypotheses:
+        about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
+        here = gather(model, setting, hypotheses, staged(progress, about), before)
+    noise = noise or fit_noise(here)
+    white = whitened(here, noise)
+    _, covariance, ahead = step_of(white, model.point, precision)
+    return Fitted(model, here, noise, white, covariance, ahead)
 
 
 def renoised(found: Fitted, noise: Noise) -> Fitted:
@@ -76,7 +82,10 @@ def renoised(found: Fitted, noise: Noise) -> Fitted:
     return replace(found, noise=noise, white=whitened(found.evidence, noise))
 
 
-def _step(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+def step_of(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, float]:
+    """(Gauss-Newton step, covariance, log density that the step is expected to gain) of the model's coordinates."""
     own = white.jacobian[:, : len(point)]
     covariance = torch.linalg.inv(own.mT @ own + torch.diag(precision))
-    return -covariance @ (own.mT @ white.value + precision * point), covariance
+    uphill = own.mT @ white.value + precision * point
+    step = -covariance @ uphill
+    return step, covariance, -0.5 * float(step @ uphill)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..boundaries import Coulomb, Grasp, Plane
+from ..boundaries import Coulomb, Elliptic, Grasp, Plane
 from ..effects import GripSlip
+from ..recordings import Recording
 from .world import Hypothesis, World
 
+LEAST = 1e-3  # -, of friction
 HOLD = 0.3  # N, above which a loose grip yields
 
 
@@ -37,17 +39,27 @@ def _planes(world: World, change) -> World:
     return world.with_cloth(boundaries=parts) if parts else world
 
 
-def _friction(world: World, more: float) -> World:
+def _friction(world: World, more: float = 0.0, along: float = 0.0) -> World:
+    """Everywhere by so much; for slip along the table's x by a share."""
+
     def changed(plane: Plane) -> Plane:
         law: Coulomb = plane.friction  # type: ignore[assignment]
-        return Plane(plane.point.tolist(), plane.normal.tolist(), max(0.0, float(law.value) + more))
+        mu = max(law.value.item() + more, LEAST)
+        ratio = law.ratio.value.item() if isinstance(law, Elliptic) else 1.0
+        new = Elliptic(mu * (1 + along), mu * ratio) if along or ratio != 1.0 else mu
+        return Plane(plane.point.tolist(), plane.normal.tolist(), new)
 
     return _planes(world, changed)
+
+
+def _has_table(recording: Recording) -> bool:
+    return bool(recording.colliders)
 
 
 HYPOTHESES = (
     Hypothesis("grip.slip", "m/(N s)", 0.05, _slip),
     Hypothesis("grip.width", "m", 0.02, lambda w, a: _regrasped(w, wider=a)),
     Hypothesis("robot.regrasp", "m", 0.017, lambda w, a: _regrasped(w, along=a), signed=True),
-    Hypothesis("contact.mu", "-", 0.2, _friction, signed=True, needs_table=True),
+    Hypothesis("contact.mu", "-", 0.2, lambda w, a: _friction(w, more=a), signed=True, needs=_has_table),
+    Hypothesis("contact.aniso", "-", -0.5, lambda w, a: _friction(w, along=a), signed=True, needs=_has_table),
 )

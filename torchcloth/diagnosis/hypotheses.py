@@ -34,6 +34,5 @@ def known() -> list[Hypothesis]:
 
 def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]:
     """All hypotheses that the recordings could say something about."""
-    table = any(r.colliders for r in recordings)
     taken = {h.name for h in model.accepted}
-    return [h for h in known() if h.name not in taken and (table or not h.needs_table)]
+    return [h for h in known() if h.name not in taken and any(h.needs(r) for r in recordings)]

@@ -9,6 +9,7 @@ import torch
 from ..identification.episodes import Episode
 from ..identification.nuisances import Camera, Clock, Rim
 from ..identification.replays import Frames
+from ..recordings import Recording
 from .world import Hypothesis, World
 
 AXES = "xyz"
@@ -24,6 +25,22 @@ def _see(kind: Clock | Camera | Rim, index: int, count: int, world: World, ampli
     return world.with_view(view)
 
 
+def _depth(world: World, share: float = 0.0, offset: float = 0.0) -> World:
+    """Along the rays of the one camera that an episode has; others stay as they are."""
+
+    def view(frames: Frames, episode: Episode) -> Frames:
+        if episode.eye is None:
+            return frames
+        ray = frames.x - episode.eye
+        return frames._replace(x=frames.x + ray * (share + offset / ray.norm(dim=-1, keepdim=True)))
+
+    return world.with_view(view)
+
+
+def _one_camera(recording: Recording) -> bool:
+    return len(recording.cameras) == 1
+
+
 _CAMERA, _CLOCK, _RIM = Camera(), Clock(), Rim()
 HYPOTHESES = (
     *(
@@ -36,4 +53,6 @@ HYPOTHESES = (
     ),
     Hypothesis("obs.clock", "s", 0.03, partial(_see, _CLOCK, 0, 1), signed=True),
     Hypothesis("obs.edge", "m", 8e-3, partial(_see, _RIM, 0, 1), signed=True),
+    Hypothesis("obs.depth_scale", "-", 0.015, lambda w, a: _depth(w, share=a), signed=True, needs=_one_camera),
+    Hypothesis("obs.depth_bias", "m", 5e-3, lambda w, a: _depth(w, offset=a), signed=True, needs=_one_camera),
 )

@@ -24,12 +24,22 @@ th { border-bottom: 1px solid #999 } td:first-child, th:first-child { text-align
 
 def write_report(answer: Diagnosis, folder: Path) -> Path:
     """Write report.html into ``folder``; returns its path."""
+    verdict = [
+        f'<p class="verdict">Verdict: <b>{answer.verdict}</b></p>',
+        *(f"<p>{html.escape(line)}</p>" for line in answer.summary().splitlines()),
+    ]
+    parts = verdict if answer.searched is None else verdict + _evidence(answer)
+    title = "What the simulation gets wrong"
+    page = f"<!doctype html><html><head><meta charset='utf-8'><title>{title}</title><style>{STYLE}</style></head>"
+    return write_text(folder / "report.html", f"{page}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")
+
+
+def _evidence(answer: Diagnosis) -> list[str]:
+    """Pictures and tables of a search."""
     found, motions = answer.found, answer.content["motions"]
     before = predict(found.start, motions)
     after = predict(found.end, motions) if found.steps else None
-    parts = [
-        f'<p class="verdict">Verdict: <b>{answer.verdict}</b></p>',
-        *(f"<p>{html.escape(line)}</p>" for line in answer.summary().splitlines()),
+    return [
         "<h2>Where and when</h2>",
         _image(pictures.residual_maps(answer)),
         "<h2>Motions held out</h2>",
@@ -38,14 +48,14 @@ def write_report(answer: Diagnosis, folder: Path) -> Path:
         _image(pictures.screening(found.steps[0].screened if found.steps else found.screened)),
         "<h2>What is left</h2>" if found.steps else "<h2>All hypotheses</h2>",
         _table(found.screened),
+        "<h2>Lack of fit</h2>",
+        _left(answer.content["lack_of_fit"]),
+        *_missing(answer),
         "<h2>What these motions can tell apart</h2>",
         _image(pictures.isolability(answer)),
         "<h2>Parameters of the model</h2>",
         _parameters(answer.content["parameters"]),
     ]
-    title = "What the simulation gets wrong"
-    page = f"<!doctype html><html><head><meta charset='utf-8'><title>{title}</title><style>{STYLE}</style></head>"
-    return write_text(folder / "report.html", f"{page}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")
 
 
 def _image(figure: Any) -> str:
@@ -73,6 +83,29 @@ def _table(rows: list[Row]) -> str:
         body.append("".join(f"<td>{html.escape(c)}</td>" for c in cells))
     heads = "".join(f"<th>{h}</th>" for h in head)
     return f"<table><tr>{heads}</tr>{''.join(f'<tr>{row}</tr>' for row in body)}</table>"
+
+
+def _left(rows: list[dict[str, Any]]) -> str:
+    """What remains, by motion and kind of data, beside what a right model would leave; lacking rows in bold."""
+    body = ""
+    for r in rows:
+        scale, unit = {"m": (1e3, "mm"), "N": (1e3, "mN"), "N m": (1e3, "mN m")}[r["unit"]]
+        numbers = [f"{scale * r[key]:.2f}" for key in ("left", "expected", "numerics")]
+        cells = [r["motion"], r["kind"], *numbers, unit, f"{r['ratio']:.2f}", f"{r['p']:.2g}"]
+        tag = "th" if r["lacking"] else "td"
+        body += f"<tr>{''.join(f'<{tag}>{html.escape(c)}</{tag}>' for c in cells)}</tr>"
+    head = ("motion", "data", "left", "a right model leaves", "of which numerics", "", "ratio", "chance")
+    return f"<table><tr>{''.join(f'<th>{h}</th>' for h in head)}</tr>{body}</table>"
+
+
+def _missing(answer: Diagnosis) -> list[str]:
+    if answer.missing is None:
+        return []
+    return [
+        "<h2>The force that is missing</h2>",
+        "<p>Beside the model and its causes, where and when it is the surest in each motion. Names no cause.</p>",
+        _image(pictures.missing_force(answer.missing)),
+    ]
 
 
 def _parameters(found: dict[str, Any]) -> str:

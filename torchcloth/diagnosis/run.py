@@ -11,13 +11,17 @@ from pathlib import Path
 from .._files import write_text
 from ..errors import InvalidInput
 from ..recordings import Recording
-from .base_model import base_model
-from .evidence import Progress, setting_of
+from .base_model import base_model, together
+from .evidence import Progress, Setting, setting_of
+from .gate import check
 from .hypotheses import catalogue
+from .keeping import kept_in
+from .missing import missing_force
 from .model_file import save_model
 from .report import write_report
+from .residual import learn_residual
 from .stepwise import search
-from .verdict import Diagnosis, judge
+from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
 
 RESULT, EXTENDED = "diagnosis.json", "extended.tcm"
@@ -28,6 +32,8 @@ def diagnose(
     model: Model | None = None,
     hypotheses: Sequence[Hypothesis] | None = None,
     progress: Progress = lambda _: None,
+    journal: Path | None = None,
+    resume: bool = False,
 ) -> Diagnosis:
     """What a simulation of these episodes gets wrong, and what mending it gains.
 
@@ -35,10 +41,12 @@ def diagnose(
         recordings: episodes of one cloth, at least two, of different motions (``split["motion"]``).
         model: where to start; None: the base model of the first episode, in vacuum.
         hypotheses: what to look for; None: the catalogue.
-        progress: called with one line for each thing that is simulated.
+        progress: called with one line for each episode that is simulated.
+        journal: folder for finished episodes, a few hundred kilobytes each; None: nothing is kept.
+        resume: go on with what a diagnosis that was stopped left there; the answer is the same, bit by bit.
 
     Raises:
-        InvalidInput: fewer than two episodes, or too few motions to hold one out.
+        InvalidInput: fewer than two episodes, too few motions to hold one out, or different cloths.
         RecordingError: an episode that lacks what is needed.
         SimulationDiverged: the base model cannot be simulated.
     """
@@ -50,17 +58,36 @@ def diagnose(
             expected="at least two motions: one is held out while the other is fitted",
             remedy="record another motion, or name them apart (split.motion in episode.json)",
         )
-    model = model or base_model(recordings[0])
+    if faults := check(recordings):
+        return refused(faults, names)
+    model = model or base_model(together(recordings))
     asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
     plan = hashlib.sha256(json.dumps([[h.name, h.typical, h.share] for h in asked]).encode()).hexdigest()[:16]
     setting = setting_of(model, recordings)
+    if journal is not None:
+        setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     answer = judge(search(model, setting, asked, progress), setting.names)
+    if any(row["lacking"] for row in answer.content["lack_of_fit"]):
+        answer = _beyond(answer, answer.found.setting, progress)
     return replace(answer, content=answer.content | {"plan_hash": plan, "model": EXTENDED})
 
 
-def write_diagnosis(answer: Diagnosis, recording: Recording, folder: Path) -> Path:
-    """diagnosis.json, report.html and the extended model into ``folder``; returns the first's path."""
+def _beyond(answer: Diagnosis, setting: Setting, progress: Progress) -> Diagnosis:
+    """With what can be said of what no known cause explains."""
+    missing = missing_force(answer.found.end, setting, progress=progress)
+    residual = learn_residual(answer.found.end, setting, progress)
+    content = answer.content | {"missing_force": missing.as_dict(), "residual": residual.as_dict()}
+    return replace(answer, content=content, missing=missing, residual=residual)
+
+
+def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Path:
+    """Write diagnosis.json, report.html and, unless data are invalid, the extended model; returns the first's path.
+
+    ``recordings`` are the episodes, which say what the base model is of.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    save_model(folder / EXTENDED, answer.model, recording, answer.found.end.covariance)
+    if answer.searched is not None:
+        residual = answer.residual.model if answer.residual is not None and answer.residual.terms else None
+        save_model(folder / EXTENDED, answer.model, together(recordings), answer.found.end.covariance, residual)
     write_report(answer, folder)
     return write_text(folder / RESULT, json.dumps(answer.content, indent=1, allow_nan=False) + "\n")

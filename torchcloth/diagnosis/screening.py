@@ -51,10 +51,16 @@ class Row(NamedTuple):
     @property
     def excess(self) -> float:
         """Standard errors by which the amplitude exceeds the smallest of interest."""
-        return (self._forward - abs(self.hypothesis.smallest)) / self.total
+        return (self.forward - abs(self.hypothesis.smallest)) / self.total
 
     @property
-    def _forward(self) -> float:
+    def visible(self) -> bool:
+        """A typical amplitude would show."""
+        return self.decision != "unresolvable"
+
+    @property
+    def forward(self) -> float:
+        """The amplitude; negative where it would need a sign that makes no sense."""
         h = self.hypothesis
         return abs(self.amplitude) if h.signed else self.amplitude
 
@@ -102,7 +108,7 @@ def _decided(row: Row) -> Decision:
         return "unresolvable"
     if row.excess > PRESENT:
         return "present"
-    if row._forward + 1.64 * row.total < abs(row.hypothesis.smallest):
+    if row.forward + 1.64 * row.total < abs(row.hypothesis.smallest):
         return "absent"
     return "inconclusive"
 

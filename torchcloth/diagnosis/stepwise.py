@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ..errors import SimulationDiverged, UnstableStep
+from .approach import approach
+from .branches import unstable, without
 from .comparison import Gain, Predicted, compare, predict
-from .evidence import Progress, Setting
+from .evidence import Progress, Setting, staged
 from .fitting import Fitted, fit, renoised
-from .noise import Noise, fit_noise, floor_of
+from .noise import Noise, fit_noise, floor_of, unfitted
+from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
 from .world import Hypothesis, Model
 
 MOST = 4  # causes
 TRIED = 4  # hypotheses that are fitted at each step
+FURTHER = 2  # steps of the likelier ones among them
 CLEAR = 4.0  # log density below which two models predict alike
+MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
+MUCH = 50.0  # chi^2, of a cause that is worth fitting
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 
 
@@ -53,55 +59,124 @@ class Found:
     steps: list[Step]
     screened: list[Row]  # at the end
     whole: Gain | None  # of all causes together
-    floor: float  # m, of a cell
+    floor: float  # m, of a cell: what repetitions differ by, else what the sensor does
+    sensor: float  # m, of a cell: noise and slow errors
+    repeats: Repeats | None  # None: no episode repeats another
+    setting: Setting  # without the cells that jump between shapes
+
+    @property
+    def left_out(self) -> float:
+        """Share of the cells that jump."""
+        jumping = sum(map(len, self.setting.unstable or ()))
+        return jumping / (jumping + len(self.end.white.value))
 
 
 def search(
     model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
 ) -> Found:
     """Causes one after the other, until none is both present and useful on motions held out."""
-    current = start = fit(model, setting, hypotheses, progress=progress)
+    near, before = approach(model, setting, staged(progress, "from the data sheet"))
+    start = fit(near, setting, hypotheses, progress=staged(progress, "base model"), before=before)
+    jumping = unstable(start, setting, staged(progress, "folds that turn over"))
+    if any(map(len, jumping)):
+        setting, start = replace(setting, unstable=jumping), without(start, jumping)
+    return extend(start, setting, hypotheses, progress)
+
+
+def extend(
+    start: Fitted,
+    setting: Setting,
+    hypotheses: Sequence[Hypothesis],
+    progress: Progress = lambda _: None,
+    tried: int = TRIED,
+) -> Found:
+    """As ``search``, from a fit that was asked about the hypotheses; each step fits the ``tried`` likeliest anew."""
+    current = start
     steps: list[Step] = []
     while True:
         screened = screen(current)
-        present = [row for row in screened if row.decision == "present"]
-        if not present or len(steps) == MOST:
+        likely = _likely(screened)
+        if not likely or len(steps) == MOST:
             break
-        step = _step(current, setting, present, screened, progress)
+        step = _step(current, setting, likely[:tried], screened, progress)
         if step is None:
             break
         steps.append(step)
         left = [h for h in hypotheses if h.name not in {a.name for a in step.best.fitted.model.accepted}]
-        current = fit(step.best.fitted.model, setting, left, 1, progress, before=start.evidence)
-    floor = floor_of(current.evidence, current.noise)
+        now = staged(progress, f"with {step.best.hypothesis.name}")
+        current = fit(step.best.fitted.model, setting, left, FURTHER, now, before=start.evidence)
+    current, steps = _pruned(current, steps, setting, hypotheses, progress)
+    screened = screen(current)
+    last, sensor = predict(current, setting.names), floor_of(current.evidence, current.noise)
+    repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
+    floor = sensor if repeated is None else repeated.rms
     first = predict(renoised(start, current.noise), setting.names)
-    whole = compare(first, predict(current, setting.names), floor) if steps else None
-    return Found(start, current, steps, screened, whole, floor)
+    whole = compare(first, last, floor) if steps else None
+    return Found(start, current, steps, screened, whole, floor, sensor, repeated, setting)
+
+
+def _likely(screened: Sequence[Row]) -> list[Row]:
+    """What is present by slopes, and what would gain much though it is small by them.
+
+    A large effect bends the fitted parameters so far that slopes there ask for less of it than there is.
+    """
+    return [r for r in screened if r.decision == "present" or (r.gain > MUCH and r.forward > 0 and r.visible)]
+
+
+def _pruned(
+    current: Fitted, steps: list[Step], setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
+) -> tuple[Fitted, list[Step]]:
+    """Less the causes that the later ones have made needless; the last one has just been tried."""
+    for step in steps[:-1]:
+        name = step.best.hypothesis.name
+        without = staged(progress, f"without {name}")
+        less = fit(current.model.without(name), setting, (), 1, without, current.noise, current.evidence)
+        gain = compare(predict(less, setting.names), predict(current, setting.names), 0.0)
+        if _worthwhile(gain):
+            continue
+        steps = [s for s in steps if s is not step]
+        left = [h for h in hypotheses if h.name not in {a.name for a in less.model.accepted}]
+        current = fit(less.model, setting, left, 1, progress, before=current.evidence)
+    return current, steps
 
 
 def _step(
-    current: Fitted, setting: Setting, present: Sequence[Row], screened: list[Row], progress: Progress
+    current: Fitted, setting: Setting, likely: Sequence[Row], screened: list[Row], progress: Progress
 ) -> Step | None:
     fits: list[tuple[Row, Fitted]] = []
-    for row in present[:TRIED]:
-        progress(f"fitting {row.hypothesis.name}")
+    for row in likely:
+        trial = staged(progress, f"trying {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
-            fits.append((row, fit(begun, setting, (), 1, progress, current.noise, current.evidence)))
+            fits.append((row, fit(begun, setting, (), 1, trial, unfitted(), current.evidence)))
         except (SimulationDiverged, UnstableStep):
             continue
     if not fits:
         return None
+    fits = _settled(_compared(current, fits, setting.names, current.noise), setting, progress)
     tried = _compared(current, fits, setting.names, current.noise)
-    likely = max(tried, key=lambda c: c.gain.density)
+    first = max(tried, key=lambda c: c.gain.density)
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
-    tried = _compared(current, fits, setting.names, fit_noise(likely.fitted.evidence))
+    tried = _compared(current, fits, setting.names, fit_noise(first.fitted.evidence))
     useful = [c for c in tried if _useful(c)]
     if not useful:
         return None
     best = max(useful, key=lambda c: c.gain.density)
     rivals = [c for c in useful if c is not best and _rival(c, best)]
     return Step(best, tried, rivals, screened)
+
+
+def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> list[tuple[Row, Fitted]]:
+    """The better ones where further steps lead: one step does for small effects only."""
+    enough = max(0.0, 0.5 * max(c.gain.density for c in tried))
+    out = []
+    for c in tried:
+        found = c.fitted
+        if c.gain.density > enough and found.ahead > CLEAR:
+            further = staged(progress, f"trying {c.hypothesis.name} further")
+            found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
+        out.append((c.row, found))
+    return out
 
 
 def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise) -> list[Candidate]:
@@ -114,9 +189,12 @@ def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str],
 
 
 def _useful(c: Candidate) -> bool:
-    worth = c.gain.before - c.gain.after > WORTH_MM or c.gain.explained > WORTH_SHARE
-    amplitude = abs(c.fitted.model.amplitudes[-1])
-    return worth and c.gain.ci95[0] > 0 and amplitude > abs(c.hypothesis.smallest)
+    return _worthwhile(c.gain) and abs(c.fitted.model.amplitudes[-1]) > MATTERS * abs(c.hypothesis.smallest)
+
+
+def _worthwhile(gain: Gain) -> bool:
+    worth = gain.before - gain.after > WORTH_MM or gain.explained > WORTH_SHARE
+    return worth and gain.ci95[0] > 0
 
 
 def _rival(c: Candidate, best: Candidate) -> bool:

@@ -15,6 +15,7 @@ from ..effects import AbstractEffect
 from ..identification.episodes import Episode
 from ..identification.replays import Frames, Replay, frames_of
 from ..materials import AbstractMaterial
+from ..recordings import Recording
 
 Motion = Callable[[Episode], Episode]  # what the robot really does, from what it says
 View = Callable[[Frames, Episode], Frames]  # what is seen, from what is there
@@ -30,14 +31,24 @@ class World:
 
     def frames(self, episode: Episode, dt: float | None = None) -> Frames:
         """What an observer has of the episode, simulated without derivatives."""
-        driven = episode
-        for motion in self.motions:
-            driven = motion(driven)
+        return self.seen(self.simulated(episode, dt), episode)
+
+    def simulated(self, episode: Episode, dt: float | None = None) -> Frames:
+        """What happens, whoever looks on."""
         with torch.no_grad():
-            found = frames_of(Replay(self.cloth)(driven, dt))
+            return frames_of(Replay(self.cloth)(self.driven(episode), dt))
+
+    def driven(self, episode: Episode) -> Episode:
+        """The episode with what the robot really does."""
+        for motion in self.motions:
+            episode = motion(episode)
+        return episode
+
+    def seen(self, frames: Frames, episode: Episode) -> Frames:
+        """What an observer has of what happens."""
         for view in self.views:
-            found = view(found, episode)
-        return found
+            frames = view(frames, episode)
+        return frames
 
     def with_motion(self, motion: Motion) -> World:
         """The same with one more error of the robot."""
@@ -93,7 +104,7 @@ class Hypothesis:
         apply: (world, amplitude) -> world.
         signed: negative amplitudes make sense.
         share: smallest amplitude of interest, as a share of the typical one.
-        needs_table: only where cloth touches something.
+        needs: what a recording must have for it to mean anything.
         kin: names that no experiment of this kind can tell from it, by structure.
     """
 
@@ -103,7 +114,7 @@ class Hypothesis:
     apply: Callable[[World, float], World]
     signed: bool = False
     share: float = 0.4
-    needs_table: bool = False
+    needs: Callable[[Recording], bool] = lambda recording: True
     kin: tuple[str, ...] = ()
 
     @property
@@ -174,3 +185,8 @@ class Model:
     def plus(self, hypothesis: Hypothesis, amplitude: float = 0.0) -> Model:
         """With one more accepted hypothesis."""
         return replace(self, accepted=(*self.accepted, hypothesis), amplitudes=(*self.amplitudes, amplitude))
+
+    def without(self, name: str) -> Model:
+        """Less one accepted hypothesis."""
+        kept = [(h, a) for h, a in zip(self.accepted, self.amplitudes, strict=True) if h.name != name]
+        return replace(self, accepted=tuple(h for h, _ in kept), amplitudes=tuple(a for _, a in kept))

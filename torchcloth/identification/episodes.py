@@ -47,6 +47,7 @@ class Episode:
         wrenches: gripper -> [T, 6] N, N m, what the cloth exerts on it about its origin: mean over the interval that
             ends at the frame, NaN where not measured.
         unseen: frames at the end that are simulated and not observed.
+        eye: [3] m, where the camera stands; None where there is none, or more than one.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Episode:
     places: Hits | None = None
     wrenches: Mapping[str, Tensor] = field(default_factory=dict)
     unseen: int = 0
+    eye: Tensor | None = None
 
     @property
     def observed(self) -> int:
@@ -173,7 +175,7 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
     if missing:
         raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=f"motion of {sorted(motion)}")
     times = _frame_times(name, recording, motion, needed)
-    initial = _initial(name, cloth, recording).to(dtype)
+    initial = first_shape(name, cloth, recording).to(dtype)
     _check_place(name, cloth, motion, initial, times[0])
     markers = streams.markers(recording, times, dtype)
     return Episode(
@@ -187,7 +189,15 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
         markers=markers,
         places=None if markers is None else streams.on_pattern(cloth.mesh, recording.markers.uv),  # type: ignore
         wrenches=streams.wrenches(recording, needed, times, dtype),
+        eye=_eye(recording, dtype),
     )
+
+
+def _eye(recording: Recording, dtype: torch.dtype) -> Tensor | None:
+    if len(recording.cameras) != 1:
+        return None
+    (camera,) = recording.cameras.values()
+    return torch.as_tensor(camera.T_world_camera[:3, 3], dtype=dtype)
 
 
 def _frame_times(name: str, recording: Recording, motion: Mapping[str, Trajectory], needed: list[str]) -> np.ndarray:
@@ -210,7 +220,12 @@ def _frame_times(name: str, recording: Recording, motion: Mapping[str, Trajector
     return _overlap(times[times >= first[0] - streams.SAME], motion, needed)
 
 
-def _initial(name: str, cloth: Cloth, recording: Recording) -> Tensor:
+def first_shape(name: str, cloth: Cloth, recording: Recording) -> Tensor:
+    """[V, 3] m, where the vertices are at the first frame.
+
+    Raises:
+        InvalidInput: they do not belong to the cloth's mesh.
+    """
     initial = recording.cloth.initial_vertices
     if initial is not None and initial.ndim == 3 and cloth.mesh.uv is not None:
         initial = recording.cloth.initial_at(cloth.mesh.uv)

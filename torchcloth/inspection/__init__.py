@@ -5,13 +5,13 @@ inspection.show(report)
 inspection.draw(report, "out/ep_01")
 """
 
+from ..recordings.ticks import Stream
 from .frames import Frames
 from .images import Depth
 from .lag import Lag
 from .look import Inspection, inspect
 from .noise import Noise
 from .pictures import draw
-from .streams import Stream
 from .tables import show
 
 __all__ = ["Depth", "Frames", "Inspection", "Lag", "Noise", "Stream", "draw", "inspect", "show"]

@@ -9,6 +9,7 @@ import numpy as np
 from ..errors import MissingDependency, RecordingError
 from ..observe import Segmentation, segment
 from ..recordings import ClothInfo, Markers, PointClouds
+from ..recordings.extents import longest, size
 from .cuts import cuts
 from .robust import median
 
@@ -122,23 +123,13 @@ def of_clouds(clouds: PointClouds, cloth: ClothInfo, held: np.ndarray) -> tuple[
             break
         kept.append(found.points)
         removed = {stage: removed.get(stage, 0) + count for stage, count in found.removed.items()}
-    longest, area = _size(cloth)
-    extent = np.array([_longest(c) for c in kept])
+    length, area = size(cloth)
+    extent = np.array([longest(c) for c in kept])
     seen = np.array([_area(c) for c in kept]) / (area or np.nan)
-    why = "larger than the cloth" if longest else "none: the cloth's size is unknown"
-    rejected = np.greater(extent, (1 + TOLERANCE) * longest if longest else np.inf) | (extent == 0)
+    why = "larger than the cloth" if length else "none: the cloth's size is unknown"
+    rejected = np.greater(extent, (1 + TOLERANCE) * length if length else np.inf) | (extent == 0)
     found = cuts([clouds.frame(i) for i in range(len(clouds))], kept, cloth, seen, held)
     return Frames(rejected, why, seen, removed, found), notes
-
-
-def _longest(cloud: np.ndarray) -> float:
-    """Largest width of a cloud, m, over many directions: its diameter to 2 %."""
-    if len(cloud) == 0:
-        return 0.0
-    turn, height = np.meshgrid(np.arange(24) * np.pi / 12, np.linspace(0, 1, 8))
-    flat = np.sqrt(1 - height**2)
-    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], -1).reshape(-1, 3)
-    return float(np.ptp(cloud @ directions.T, axis=0).max())
 
 
 def _stages(cloud: np.ndarray) -> Segmentation:
@@ -170,14 +161,3 @@ def _area(full: np.ndarray) -> float:
     cloud = full[:: len(full) // LARGE + 1]
     away = _nearest(cloud, AREA)
     return float(len(cloud) * np.pi * np.median(away) ** 2 / (AREA - 1 / 3)) if len(away) else 0.0
-
-
-def _size(cloth: ClothInfo) -> tuple[float | None, float | None]:
-    """Longest distance on the cloth, m, and its area, m^2."""
-    if cloth.vertices is not None and cloth.faces is not None:
-        a, b, c = (cloth.vertices[cloth.faces[:, k]] for k in range(3))
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-        return float(np.linalg.norm(np.ptp(cloth.vertices, axis=0))), float(area)
-    if cloth.sheet is not None:
-        return float(np.hypot(*cloth.sheet)), float(np.prod(cloth.sheet))
-    return None, None

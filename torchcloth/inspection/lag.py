@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from ..recordings import Markers, PointClouds, Recording
-from .paths import Path
+from ..robots.paths import Path  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from .robust import median
 
 SEARCH, COARSE = 1.0, 0.02  # s to either side; step

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from ..errors import MissingDependency, TorchclothError
-from ..recordings import Recording
-from . import frames, images, noise, streams
+from ..recordings import Recording, ticks
+from ..recordings.ticks import Stream
+from ..robots.paths import Path, paths  # pyright: ignore[reportMissingImports] - mapped from robots/
+from . import frames, images, noise
 from .frames import Frames
 from .images import Depth
 from .lag import CANNOT, Lag, lag
 from .noise import Noise
-from .paths import Path, paths
-from .streams import Stream
 
 CONVENTION = (
     "SI units. Times on each stream's own clock. lag: observation stamps minus motion stamps of the same event (the "
@@ -101,7 +101,7 @@ def inspect(recording: Recording) -> Inspection:
             notes.append(f"{name}: {error}")
     return Inspection(
         recording,
-        {name: streams.ticks(kind, t) for name, (kind, t) in streams.times(recording).items()},
+        {name: ticks.ticks(kind, t) for name, (kind, t) in ticks.times(recording).items()},
         moved,
         late,
         _noises(recording, moved, seen, shift),

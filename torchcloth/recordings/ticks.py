@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..recordings import Recording
+from .types import Recording
 
 GAP = 1.5  # an interval longer than so many usual ones is a gap
 

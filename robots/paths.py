@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..recordings import Recording
-from ..robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from torchcloth.recordings import Recording
+
+from .replay import replay
 
 STILL = 2e-3  # m within which a gripper stands
 AROUND = 0.2  # s before and after

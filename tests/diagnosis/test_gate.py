@@ -1,0 +1,156 @@
+"""Faults planted in another engine's episodes are named; effects that a diagnosis looks for are none."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sheets
+import torch
+
+from torchcloth import recordings as rec
+from torchcloth.cli import main
+from torchcloth.diagnosis import check, diagnose
+from torchcloth.errors import InvalidInput
+
+GENERATE = Path(__file__).parents[1] / "independent" / "generate.py"
+AHEAD, DEEP = np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.0, 0.6])
+SMALL = ("--nodes", "9", "--fit-nodes", "7")
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory):
+    """A sheet that is turned by a quarter; MuJoCo's."""
+    out = tmp_path_factory.mktemp("gate") / "turn"
+    subprocess.run([sys.executable, GENERATE, "--motion", "turn", *SMALL, "--seed", "5", "--out", out], check=True)
+    return rec.read(out)
+
+
+def seen(recording, change):
+    """With other points."""
+    points = recording.points
+    return replace(recording, points=replace(points, xyz=change(points.xyz)))
+
+
+def stamped(recording, change):
+    return replace(recording, points=replace(recording.points, t=change(recording.points.t)))
+
+
+def renamed(recording):
+    left, right = recording.grippers["left"], recording.grippers["right"]
+    return replace(recording, grippers={"left": right, "right": left})
+
+
+def thinned(recording, every):
+    points = recording.points
+    kept = np.flatnonzero(np.arange(len(points)) % 20 < every)
+    xyz = np.concatenate([points.frame(i) for i in kept])
+    return replace(recording, points=rec.PointClouds(points.t[kept], xyz, points.counts[kept]))
+
+
+FAULTS = {
+    "the stamps of points does not increase": lambda r: stamped(r, lambda t: np.where(np.arange(len(t)) == 9, t[8], t)),
+    "the stamps of points jump by 0.4": lambda r: stamped(r, lambda t: t + 0.4 * (np.arange(len(t)) > 30)),
+    "camera and robot do not overlap": lambda r: stamped(r, lambda t: t + 100.0),
+    "jump by 0.53": lambda r: thinned(r, 5),
+    "the grippers are swapped": renamed,
+    "times as long as the cloth, as if in inches": lambda r: seen(r, lambda x: x / 0.0254),
+    r"0\.02\d+ times as long": lambda r: seen(r, lambda x: x * 0.0254),
+    "the cloud is mirrored along y": lambda r: seen(r, lambda x: x * [1, -1, 1]),
+    "the cloud is mirrored along x": lambda r: seen(r, lambda x: x * [-1, 1, 1]),
+    "the cloud is mirrored with y and z exchanged": lambda r: seen(r, lambda x: x[:, [0, 2, 1]]),
+    "points lie 0.[2-5]. m off": lambda r: seen(r, lambda x: x + AHEAD),
+    "of the points lie farther from a gripper": lambda r: seen(
+        r, lambda x: np.where(np.arange(len(x))[:, None] % 4 == 0, x - DEEP, x)
+    ),
+}
+
+
+@pytest.mark.parametrize("said", FAULTS)
+def test_a_planted_fault_is_named(turned, said):
+    found = check([FAULTS[said](turned)])
+    assert found, "nothing"
+    assert re.search(said, str(found[0])), found[0]
+    assert found[0].episode == "turn"
+    assert found[0].remedy
+
+
+GOOD = {
+    "as it is": lambda r: r,
+    "clock 30 ms": lambda r: stamped(r, lambda t: t + 0.03),
+    "camera 4 mm": lambda r: seen(r, lambda x: x + 0.004),
+    "camera 0.02 rad": lambda r: seen(r, lambda x: x @ np.array([[1, -0.02, 0], [0.02, 1, 0], [0, 0, 1]])),
+    "depth 2 %": lambda r: seen(r, lambda x: [-0.7, 0.0, 0.3] + 1.02 * (x - [-0.7, 0.0, 0.3])),
+    "half is hidden": lambda r: seen_where(r, lambda x: x[:, 2] > np.median(x[:, 2])),
+    "every fifth frame lost": lambda r: thinned(r, 16),
+    "three stray points of a hundred": lambda r: seen(
+        r, lambda x: np.where(np.arange(len(x))[:, None] % 33 == 0, x - DEEP, x)
+    ),
+}
+
+
+def seen_where(recording, keep):
+    points = recording.points
+    frames = [f[keep(f)] for f in (points.frame(i) for i in range(len(points)))]
+    counts = np.array([len(f) for f in frames])
+    return replace(recording, points=rec.PointClouds(points.t, np.concatenate(frames), counts))
+
+
+@pytest.mark.parametrize("what", GOOD)
+def test_what_a_diagnosis_looks_for_passes(turned, what):
+    assert check([GOOD[what](turned)]) == []
+
+
+def test_episodes_of_two_cloths_are_refused(turned):
+    light = replace(turned, cloth=replace(turned.cloth, areal_density=0.1))
+    with pytest.raises(InvalidInput, match=r"another areal density.*got 0\.1.*expected 0\.25.*apart"):
+        check([turned, light])
+    uv = turned.cloth.uv * 1.5
+    with pytest.raises(InvalidInput, match=r"another cloth.*got 0\.45 x 0\.45.*expected 0\.3 x 0\.3"):
+        check([turned, replace(turned, cloth=replace(turned.cloth, uv=uv))])
+    elsewhere = {name: rec.GraspInfo(g.uv * 0.5, g.radius) for name, g in turned.grasps.items()}
+    with pytest.raises(InvalidInput, match="another place of a grasp"):
+        check([turned, replace(turned, grasps=elsewhere)])
+
+
+def test_the_verdict_is_written_and_the_command_is_done(turned, tmp_path, capsys):
+    swapped = rec.write(renamed(turned), tmp_path / "swapped")
+    other = rec.write(replace(turned, split={"motion": "other"}), tmp_path / "good")
+    assert main(["diagnose", str(swapped), str(other), "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "verdict: invalid_data" in said
+    assert "swapped: the grippers are swapped" in said
+    content = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert content["verdict"] == "invalid_data"
+    assert [f["episode"] for f in content["faults"]] == ["swapped"]
+    assert {"causes", "gain", "next_experiment", "unresolvable", "model", "warnings"} <= set(content)
+    assert "the grippers are swapped" in (tmp_path / "out" / "report.html").read_text()
+    assert not (tmp_path / "out" / "extended.tcm").exists()
+
+
+def test_a_stream_that_cannot_be_read_is_invalid_data_and_a_missing_folder_is_not(tmp_path, capsys):
+    folders = [str(rec.write(sheets.episode(motion), tmp_path / motion)) for motion in ("slow", "fast")]
+    with np.load(tmp_path / "slow" / "points.npz") as file:
+        arrays = dict(file)
+    arrays["t"] = arrays["t"][::-1].copy()
+    np.savez(tmp_path / "slow" / "points.npz", **arrays)
+    assert main(["diagnose", *folders, "--out", str(tmp_path / "out")]) == 0
+    assert "does not increase" in capsys.readouterr().out
+    assert main(["diagnose", *folders, str(tmp_path / "none"), "--out", str(tmp_path / "other")]) == 2
+    assert not (tmp_path / "other").exists()
+
+
+def test_what_was_not_searched_has_no_model(turned):
+    answer = diagnose([renamed(turned), replace(turned, split={"motion": "b"})])
+    assert answer.verdict == "invalid_data"
+    with pytest.raises(InvalidInput, match="invalid data"):
+        _ = answer.model
+
+
+def test_small_episodes_of_the_same_engine_pass():
+    torch.set_default_dtype(torch.float64)
+    assert check([sheets.episode(motion, duration=0.6) for motion in sheets.MOTIONS]) == []

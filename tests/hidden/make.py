@@ -1,0 +1,107 @@
+"""Makes the episodes of a hidden case, and tells nothing.
+
+python tests/hidden/make.py --seed 12 --out cases/12            # e1, e2, ... in that folder
+python tests/hidden/make.py --seed 12 --motion lift --heading 90 --out cases/12-next   # one more
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import beside  # noqa: F401
+import numpy as np
+from drawn import REDUCED, SMALL, UNSEEN, Case, Hidden, Take, case
+from effects import hide
+from faults import FAULTS
+from generate import record
+from motions import motion
+from scene import Scene, simulate
+
+from torchcloth import recordings
+from torchcloth.errors import TorchclothError
+
+SAID_BY = "synthetic: an engine of its own"
+
+
+def scenes(found: Case, take: Take) -> tuple[Scene, Scene]:
+    """(what is, what is said) in an episode."""
+    plain, fabric = Scene(), found.fabric
+    sheet = replace(
+        plain.sheet,
+        nodes=(found.nodes, found.nodes),
+        diagonals=found.diagonals,
+        areal_density=fabric["areal_density"],
+        membrane_stiffness=fabric["membrane_stiffness"],
+    )
+    plate = replace(plain.plate, stiffness=fabric["bending_stiffness"])
+    sensor = replace(plain.sensor, bias=found.bias, occlusion=found.occlusion)
+    true = replace(plain, sheet=sheet, plate=plate, sensor=sensor)
+    said = replace(
+        true,
+        sheet=replace(
+            sheet,
+            areal_density=fabric["areal_density"] * found.said["areal_density"],
+            membrane_stiffness=fabric["membrane_stiffness"] * found.said["membrane_stiffness"],
+        ),
+        plate=replace(plate, stiffness=fabric["bending_stiffness"] * found.said["bending_stiffness"]),
+    )
+    for effect in (*found.effects, *take.own):
+        true = _hidden(true, effect)
+    return true, said
+
+
+def _hidden(scene: Scene, effect: Hidden) -> Scene:
+    return hide(scene, effect.name, effect.amplitude, effect.options)
+
+
+def episode(found: Case, take: Take, number: int) -> recordings.Recording:
+    """One episode; ``number`` keeps its noise apart from the others'."""
+    true, said = scenes(found, take)
+    moved = motion(take.motion, true.sheet, take.heading, take.speed)
+    result = simulate(true, moved)
+    made = record(true, moved, result, take.motion, [found.seed, number], found.size.fit, said=said)
+    if not found.forces:
+        made = replace(made, grippers={k: replace(g, force=None, torque=None) for k, g in made.grippers.items()})
+    wrong = np.random.default_rng([found.seed, 13])  # the same in all episodes
+    return FAULTS[found.fault](replace(made, truth=None, provenance=SAID_BY), wrong)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--fast", action="store_true", help="fewer and shorter episodes, coarser meshes")
+    parser.add_argument("--motion", help="one more episode of the case, with this motion, instead of all")
+    parser.add_argument("--heading", type=float, default=0.0, metavar="DEGREES")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="FACTOR")
+    parser.add_argument("--unseen", action="store_true", help="one more episode, of a motion that no case has")
+    options = parser.parse_args(arguments)
+    try:
+        found = case(options.seed, SMALL if options.fast else REDUCED)
+        for number, take in _asked(found, options):
+            made = episode(found, take, number)
+            recordings.write(made, options.out / f"e{number}", overwrite=True)
+            print(f"{options.out / f'e{number}'}: {take.motion}", flush=True)
+    except (TorchclothError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+def _asked(found: Case, options: argparse.Namespace) -> list[tuple[int, Take]]:
+    count = len(found.takes)
+    if options.unseen:
+        return [(count + 1, Take(*UNSEEN))]
+    if options.motion:
+        key = zlib.crc32(f"{options.motion} {options.heading} {options.speed}".encode())
+        return [(count + 2 + key % 1000, Take(options.motion, options.heading, options.speed))]
+    return list(enumerate(found.takes, 1))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""Says what a hidden case holds, after the answer is written.
+
+python tests/hidden/reveal.py --seed 12
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+
+import beside  # noqa: F401
+from drawn import CONFOUNDED, REDUCED, SMALL, Case, case
+from partners import OUTSIDE, SINGLES
+
+TELLS_NOTHING = "mass without forces"
+LIKE = {  # confounded cases: what else explains the data as well; what one may tell apart after all is "soft"
+    "tilt or wind": {"like": ["env.gravity_tilt", "air.wind", "obs.rotation"], "soft": False},
+    "base or extrinsic": {"like": ["obs.extrinsic", "robot.base"], "soft": False},
+    "mass without forces": {"like": ["mass.density"], "soft": False},
+    "damping or drag": {"like": ["air.linear", "air.drag_n"], "soft": True},
+}
+
+
+def truth(found: Case) -> dict[str, object]:
+    """What is hidden, and what a diagnosis may call it."""
+    needed = {n for h in found.effects for n, _ in _partner(h.name).beside}
+    effects = [
+        {
+            **asdict(h),
+            "names": list(_partner(h.name).names) or ([h.name] if h.name in SINGLES else []),
+            "sign": _axis(h.options.get("heading")) * _partner(h.name).sign,
+            "beside": h.name in needed,
+        }
+        for h in found.effects
+    ]
+    return {
+        "seed": found.seed,
+        "sealed": found.sealed,
+        "family": found.family,
+        "kind": found.kind,
+        "effects": effects,
+        "confounded": LIKE.get(found.kind) if found.kind in CONFOUNDED else None,
+        "fault": found.fault,
+        "right_for_fault": ["obs.clock"] if found.fault == "clock jump" else [],
+        "motions": [{"motion": t.motion, "heading": t.heading, "speed": t.speed} for t in found.takes],
+        "said": found.said,
+        "fabric": found.fabric,
+    }
+
+
+def _partner(name: str):
+    return (SINGLES | OUTSIDE)[name]
+
+
+def _axis(heading: float | None) -> float:
+    """Sign along the world's axis that a heading follows."""
+    return 1.0 if heading in (None, 0.0, 90.0) else -1.0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--fast", action="store_true", help="as the case was made")
+    options = parser.parse_args(arguments)
+    try:
+        print(json.dumps(truth(case(options.seed, SMALL if options.fast else REDUCED)), indent=1))
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

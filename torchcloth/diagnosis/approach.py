@@ -1,0 +1,62 @@
+"""From a data sheet to where slopes hold.
+
+A data sheet may be wrong by a factor, and a sheet of cloth that is half as stiff folds elsewhere: slopes at the start
+point anywhere. So residuals are first described by a parabola along every coordinate, as wide as its prior,
+
+    r(u) = r + J u + Q u^2,
+
+whose minimum is looked for within that width. Then the same with half the width.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .evidence import Evidence, Progress, Setting, gather
+from .fitting import prior_precision
+from .noise import unfitted, whitened
+from .world import Model
+
+SWEEPS = 2
+FARTHEST = 1.2  # widths, of one sweep
+THERE = 0.25  # widths, from which on slopes do
+
+
+def approach(model: Model, setting: Setting, progress: Progress = lambda _: None) -> tuple[Model, Evidence]:
+    """(a model near the optimum, evidence whose nuisances' slopes may be used from there on)."""
+    wide = [*(p.std for p in model.parameters), *(0.5 * abs(h.typical) for h in model.accepted)]
+    width, before = torch.tensor(wide, dtype=torch.float64), None
+    prior = prior_precision(model).sqrt()
+    for _ in range(SWEEPS):
+        shifts = [(k, sign * w) for sign in (1.0, -1.0) for k, w in enumerate(width.tolist())]
+        evidence = gather(model, setting, (), progress, before, shifts)
+        before = before or evidence
+        white = whitened(evidence, unfitted())
+        up, down = white.jacobian.chunk(2, dim=1)
+        slope, bend = 0.5 * (up + down) * width, 0.5 * (up - down) * width
+        u = _lowest(white.value, slope, bend, model.point * prior, width * prior)
+        model = model.at(model.point + u * width)
+        if float(u.abs().max()) < THERE:
+            break
+        width = torch.where(u.abs() > 0.8, width, 0.5 * width)
+    return model, before  # type: ignore[return-value]
+
+
+def _lowest(value: Tensor, slope: Tensor, bend: Tensor, start: Tensor, pull: Tensor, iterations: int = 50) -> Tensor:
+    """[P] minimum of |value + slope u + bend u^2|^2 + |start + pull u|^2 in reach, by damped Gauss-Newton."""
+    count = slope.shape[1]
+    triangle = torch.linalg.qr(torch.cat([value[:, None], slope, bend], 1)).R
+    value, slope, bend = triangle[:, 0], triangle[:, 1 : count + 1], triangle[:, count + 1 :]
+    rest = lambda u: torch.cat([value + slope @ u + bend @ (u * u), start + pull * u])  # noqa: E731
+    u, damping = torch.zeros(count, dtype=value.dtype), 1e-3
+    for _ in range(iterations):
+        r, j = rest(u), torch.cat([slope + 2 * bend * u, torch.diag(pull)])
+        square = j.mT @ j
+        step = -torch.linalg.solve(square + damping * torch.diag(square.diagonal()), j.mT @ r)
+        tried = (u + step).clamp(-FARTHEST, FARTHEST)
+        better = float(rest(tried).norm()) < float(r.norm())
+        u, damping = (tried, 0.3 * damping) if better else (u, 10 * damping)
+        if damping > 1e6:
+            break
+    return u

@@ -1,0 +1,166 @@
+"""Before anything is simulated: can these episodes be believed?
+
+What is looked for is what no model could mend and what would pass as a cause: clocks that jump, streams that do not
+overlap, grippers that were swapped, lengths in another unit, clouds that are mirrored or of something else. An error
+of the size that is among the causes, a camera 4 mm off or a clock 30 ms late, is none of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InvalidInput, RecordingError
+from ..recordings import Recording, checks, read
+from ..recordings.reading import EPISODE
+from ..recordings.ticks import times
+from .gate_clouds import Seen, handed, places, units
+
+JUMP, LEAST_JUMP = 8.0, 0.2  # usual intervals and s: a longer one is no dropped frame any more
+DROPPED = 0.5  # share of the frames
+COVERED = 0.5  # share of the frames that the motion must cover
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something about an episode that makes every answer worthless.
+
+    Attributes:
+        episode: its name.
+        what: a plain sentence.
+        remedy: what to do about it.
+    """
+
+    episode: str
+    what: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.episode}: {self.what}; {self.remedy}"
+
+
+def check(recordings: Sequence[Recording]) -> list[Fault]:
+    """What makes these episodes unusable; empty where nothing does.
+
+    Raises:
+        InvalidInput: the episodes are of different cloths, or of one that is held elsewhere.
+    """
+    same_cloth(recordings)
+    found = []
+    for k, recording in enumerate(recordings):
+        name = name_of(recording, k)
+        found += [Fault(name, what, remedy) for what, remedy in _faults(recording)]
+    return found
+
+
+def read_episodes(folders: Sequence[str | Path]) -> tuple[list[Recording], list[Fault]]:
+    """Episodes from disk, and what is wrong with the streams of those that cannot be read.
+
+    Raises:
+        RecordingError: a folder that is no episode, or one whose description cannot be read.
+    """
+    found, faults = [], []
+    for folder in folders:
+        try:
+            found.append(read(folder))
+        except RecordingError as error:
+            if EPISODE in error.what or not (Path(folder) / EPISODE).is_file():
+                raise
+            what = f"{error.what}, got {error.got}" if error.got is not None else error.what
+            faults.append(Fault(Path(folder).name, what, error.remedy or "record again"))
+    return found, faults
+
+
+def name_of(recording: Recording, k: int) -> str:
+    """Of the k-th episode, in messages."""
+    return recording.path.name if recording.path is not None else f"episode {k}"
+
+
+def same_cloth(recordings: Sequence[Recording]) -> None:
+    """Raises InvalidInput where the episodes do not describe one cloth, held at the same places."""
+    first = recordings[0]
+    for k, other in enumerate(recordings[1:], 1):
+        for what, of in _DESCRIBED.items():
+            a, b = of(first), of(other)
+            if not _equal(a, b):
+                raise InvalidInput(
+                    f"{name_of(other, k)}: another {what} than in {name_of(first, 0)}",
+                    got=_shown(b),
+                    expected=_shown(a),
+                    remedy="diagnose the episodes of each cloth apart, or correct the description of one",
+                )
+
+
+_DESCRIBED = {
+    "cloth (width and height of the pattern, m)": lambda r: (
+        None if (b := r.cloth.pattern_box()) is None else b[1] - b[0]
+    ),
+    "mesh (vertices, triangles)": lambda r: (
+        None if r.cloth.faces is None else [r.cloth.faces.max() + 1, len(r.cloth.faces)]
+    ),
+    "areal density (kg/m^2)": lambda r: r.cloth.areal_density,
+    "thickness (m)": lambda r: r.cloth.thickness,
+    "set of grasps": lambda r: sorted(r.grasps),
+    "place of a grasp (m)": lambda r: [g.uv.tolist() for _, g in sorted(r.grasps.items()) if g.uv is not None],
+}
+
+
+def _equal(a: object, b: object) -> bool:
+    if a is None or b is None:
+        return a is b
+    try:
+        return bool(np.allclose(a, b, rtol=1e-3, atol=1e-6))  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return a == b
+
+
+def _shown(value: object) -> str:
+    return " x ".join(f"{x:.4g}" for x in value) if isinstance(value, np.ndarray) else str(value)
+
+
+def _faults(recording: Recording) -> Iterator[tuple[str, str]]:
+    """(what, remedy); a fault hides those that it would cause."""
+    try:
+        yield from (found := list(_stamps(recording)))
+        if not found:
+            seen = Seen(recording)
+            yield from next((found for kind in (_overlap, units, places, handed) if (found := list(kind(seen)))), [])
+    except RecordingError as error:
+        yield str(error), "repair or repeat the recording"
+
+
+def _stamps(recording: Recording) -> Iterator[tuple[str, str]]:
+    for name, (_, t) in times(recording).items():
+        checks.increasing(t, f"the stamps of {name}")
+        between = np.diff(t)
+        if not len(between):
+            continue
+        usual = float(np.median(between))
+        worst = int(between.argmax())
+        if between[worst] > max(JUMP * usual, LEAST_JUMP):
+            yield (
+                f"the stamps of {name} jump by {between[worst]:.3g} s at {t[worst]:.3g} s ({usual:.3g} s is usual)",
+                "the clock was set or frames are missing: cut the episode there, or repair the stamps",
+            )
+        missing = 1 - len(t) / (1 + (t[-1] - t[0]) / usual)
+        if missing > DROPPED:
+            yield (
+                f"{name}: {100 * missing:.0f} % of the frames are missing",
+                "record again, or state a rate that was kept",
+            )
+
+
+def _overlap(seen: Seen) -> Iterator[tuple[str, str]]:
+    if not seen.paths or not len(seen.t):
+        return
+    start, end = max(p.t[0] for p in seen.paths.values()), min(p.t[-1] for p in seen.paths.values())
+    inside = (seen.t >= start - 1e-6) & (seen.t <= end + 1e-6)
+    if not inside[0] or inside.mean() < COVERED:
+        yield (
+            f"camera and robot do not overlap: frames from {seen.t[0]:.3g} to {seen.t[-1]:.3g} s, "
+            f"motion from {start:.3g} to {end:.3g} s, {100 * inside.mean():.0f} % of the frames inside",
+            "bring both onto one clock (clock_offset in episode.json), or cut the frames before the motion begins",
+        )

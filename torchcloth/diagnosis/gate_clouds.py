@@ -1,0 +1,205 @@
+"""What was seen beside what it should be of: its size, its place, whether it follows the grippers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from itertools import permutations
+
+import numpy as np
+import torch
+
+from ..boundaries import Grasp
+from ..cloth import Cloth
+from ..identification.episodes import cloth_from, first_shape
+from ..losses import closest
+from ..recordings import Recording
+from ..recordings.extents import longest, size
+from ..robots.paths import Path, paths  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+
+TOO_WIDE, TOO_NARROW = 0.65, 0.03  # of the cloth's length: half of the points lie within so much of their middle
+FAR = 0.1  # m, of the first points from the first shape, half of them
+STRAY, REACH = 0.1, 1.1  # share of points, and lengths of the cloth from a gripper that holds it
+AWAY = 0.05  # m, of held places from their grippers: another order that halves it is the right one
+FOLLOW, BETTER = 0.06, 0.4  # m by which the cloud leaves the grippers; share of it that a mirrored cloud leaves
+NEAREST = 5  # points, whose mean distance from a gripper is looked at
+FIRST = 3  # frames
+SURELY = 1.5  # factor within which a unit is recognised
+LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
+SOME = 400  # points of a frame that are looked at
+
+
+class Seen:
+    """One episode as the checks look at it."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        stream = recording.points if recording.points is not None else recording.markers
+        self.t = np.zeros(0) if stream is None else stream.t + recording.clock_offset
+        rng = np.random.default_rng(0)
+        self.clouds = [] if stream is None else [_thinned(c, rng) for c in _frames(recording)]
+        self.paths: dict[str, Path] = paths(recording)
+
+    @cached_property
+    def cloth(self) -> Cloth:
+        """As the episode describes it."""
+        return cloth_from(self.recording)
+
+    @cached_property
+    def first(self) -> torch.Tensor:
+        """[V, 3] m, first shape."""
+        return first_shape("episode", self.cloth, self.recording).double()
+
+    @cached_property
+    def length(self) -> float:
+        """m, of the cloth from corner to corner."""
+        return size(self.recording.cloth)[0] or float(longest(self.first.numpy()))
+
+    def off(self, clouds: Sequence[np.ndarray]) -> float:
+        """m, median distance of the first points from the first shape."""
+        points = torch.as_tensor(np.concatenate(clouds[:FIRST])).to(self.first)
+        on = closest(points, self.first, torch.as_tensor(self.cloth.mesh.faces)).on(self.first)
+        return float((points - on).norm(dim=-1).median())
+
+    def left(self, clouds: Sequence[np.ndarray]) -> float:
+        """m by which clouds come to lie farther from the grippers than at first, in the worst tenth of the frames."""
+        away = np.array([_nearest(c, at) for c, at in zip(clouds, self.held, strict=True)])
+        return float(np.quantile(np.abs(away - np.median(away[:FIRST], axis=0)).max(1), 0.9))
+
+    @cached_property
+    def held(self) -> np.ndarray:
+        """[T, G, 3] m, where the grippers are."""
+        return np.stack([path.at(self.t)[0] for path in self.paths.values()], 1)
+
+
+def _frames(recording: Recording) -> Iterator[np.ndarray]:
+    points, markers = recording.points, recording.markers
+    if points is not None:
+        yield from np.split(points.xyz, np.cumsum(points.counts)[:-1])
+    elif markers is not None:
+        yield from (m[np.isfinite(m).all(-1)] for m in markers.xyz)
+
+
+def _thinned(cloud: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return cloud if len(cloud) <= SOME else cloud[rng.choice(len(cloud), SOME, replace=False)]
+
+
+def _nearest(cloud: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """[G] m, mean distance of the nearest points from each gripper."""
+    if not len(cloud):
+        return np.full(len(at), np.nan)
+    away = np.sort(np.linalg.norm(cloud - at[:, None], axis=-1), axis=1)
+    return away[:, :NEAREST].mean(1)
+
+
+def units(seen: Seen) -> Iterator[tuple[str, str]]:
+    """A cloud that no cloth of this size could show."""
+    clouds = [c for c in seen.clouds if len(c)]
+    if not clouds:
+        return
+    spreads = [float(np.median(np.linalg.norm(c - np.median(c, axis=0), axis=1))) for c in clouds]
+    wide, narrow = (float(np.quantile(spreads, q)) / seen.length for q in (0.5, 0.9))
+    if wide > TOO_WIDE or narrow < TOO_NARROW:
+        factor = float(np.median([longest(c) for c in clouds])) / seen.length
+        unit = min(LENGTHS, key=lambda name: abs(np.log(factor * LENGTHS[name])))
+        guess = f", as if in {unit}" if abs(np.log(factor * LENGTHS[unit])) < np.log(SURELY) else ""
+        yield (
+            f"the cloud is {factor:.3g} times as long as the cloth{guess}",
+            "check the unit of points, of depth (depth_scale) and of the cloth's mesh, and leave out what is no cloth",
+        )
+
+
+def places(seen: Seen) -> Iterator[tuple[str, str]]:
+    """Grippers, cloth and cloud that are not where each other says."""
+    yield from _swapped(seen)
+    if not any(len(c) for c in seen.clouds[:FIRST]):
+        return
+    if (off := seen.off(seen.clouds)) > FAR:
+        how, best = _least(seen, seen.off)
+        if best < BETTER * off:
+            yield _is_mirrored(how)
+        else:
+            yield (
+                f"the first points lie {off:.2f} m off the cloth's first shape",
+                "check the camera's place (T_world_camera) and cloth.initial_vertices; both are in world coordinates",
+            )
+        return
+    if seen.paths:
+        stray = np.mean([_beyond(c, at, REACH * seen.length) for c, at in zip(seen.clouds, seen.held, strict=True)])
+        if stray > STRAY:
+            yield (
+                f"{100 * stray:.0f} % of the points lie farther from a gripper than the cloth reaches",
+                "leave out what is no cloth (torchcloth inspect shows it)",
+            )
+
+
+def _beyond(cloud: np.ndarray, at: np.ndarray, reach: float) -> float:
+    if not len(cloud):
+        return 0.0
+    return float((np.linalg.norm(cloud[:, None] - at, axis=-1) > reach).any(1).mean())
+
+
+def _swapped(seen: Seen) -> Iterator[tuple[str, str]]:
+    held = {name: part.index for name, part in seen.cloth.boundaries.items() if isinstance(part, Grasp)}
+    names = [name for name in held if name in seen.paths]
+    if len(names) < 2:
+        return
+    start = seen.t[:1] if len(seen.t) else np.array([max(p.t[0] for p in seen.paths.values())])
+    place = np.stack([seen.first[held[name]].mean(0).numpy() for name in names])
+    hands = np.stack([seen.paths[name].at(start)[0][0] for name in names])
+    away = np.linalg.norm(place[:, None] - hands, axis=-1)
+    orders = {
+        order: float(np.mean([away[i, k] for i, k in enumerate(order)])) for order in permutations(range(len(names)))
+    }
+    own, best = orders[tuple(range(len(names)))], min(orders, key=lambda order: orders[order])
+    if own > AWAY and orders[best] < 0.5 * own:
+        pairs = ", ".join(f"{names[i]} holds what {names[k]} should" for k, i in enumerate(best) if i != k)
+        yield (
+            f"the grippers are swapped: {pairs} ({100 * own:.0f} cm from its place, {100 * orders[best]:.0f} cm then)",
+            "exchange their names in motion.npz or in grasps",
+        )
+
+
+def _least(seen: Seen, measure: Callable[[list[np.ndarray]], float]) -> tuple[str, float]:
+    """The mirror that leaves least of a measure [m], and what it leaves."""
+    return min(((how, measure(turned)) for how, turned in _mirrors(seen)), key=lambda pair: pair[1])
+
+
+def _mirrors(seen: Seen) -> Iterator[tuple[str, list[np.ndarray]]]:
+    """Clouds as they would be if they had been mirrored: at planes through the origin, the cloud and the cameras."""
+    middle = np.concatenate(seen.clouds[:FIRST]).mean(0)
+    frames = [("", np.eye(4)), ("", _at(middle))]
+    frames += [(f" of {name}", c.T_world_camera) for name, c in seen.recording.cameras.items()]
+    for of, pose in frames:
+        turn, place = pose[:3, :3], pose[:3, 3]
+        for k, axis in enumerate("xyz"):
+            flip = turn @ np.diag(1.0 - 2.0 * np.eye(3)[k]) @ turn.T
+            yield f"along {axis}{of}", [(c - place) @ flip.T + place for c in seen.clouds]
+    for k, pair in enumerate(("y and z", "z and x", "x and y")):
+        order = [0, 1, 2]
+        a, b = (k + 1) % 3, (k + 2) % 3
+        order[a], order[b] = b, a
+        yield f"with {pair} exchanged", [c[:, order] for c in seen.clouds]
+
+
+def _at(place: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    return pose
+
+
+def handed(seen: Seen) -> Iterator[tuple[str, str]]:
+    """A symmetric cloth looks the same in a mirror, but does not follow its grippers there."""
+    if not seen.paths or len(seen.clouds) <= FIRST or not all(len(c) for c in seen.clouds):
+        return
+    if (left := seen.left(seen.clouds)) > FOLLOW:
+        how, best = _least(seen, lambda clouds: max(seen.left(clouds), seen.off(clouds)))
+        if best < BETTER * left:
+            yield _is_mirrored(how)
+
+
+def _is_mirrored(how: str) -> tuple[str, str]:
+    return (
+        f"the cloud is mirrored {how}: turned back, it lies on the cloth and follows the grippers",
+        "check the handedness of the camera's frame and of what made points of its depth (OpenCV: x right, y down)",
+    )

@@ -1,0 +1,137 @@
+"""Hidden effects: another engine hides one in recordings, ``torchcloth diagnose`` answers, then the truth is opened.
+
+Each case is made by a process of its own, diagnosed by another that gets the episodes alone, and revealed by a third
+once the answer is on disk (tests/hidden). Sealed cases are drawn from a secret; the program is tuned on others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import secrets
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torchcloth._files import write_text
+from torchcloth.errors import InvalidInput
+
+from ..kept import Kept
+from . import hidden_tables
+from .checkout import folder, module
+from .hidden_scores import judged
+
+CASES = 60
+FAST_CASES, FAST_SECRET = 12, 7
+REFUSED = 2  # exit code
+
+
+class Round(NamedTuple):
+    """Which cases, and how large."""
+
+    seeds: dict[str, int]  # by the case's name
+    fast: bool
+    settings: dict[str, Any]
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Options."""
+    parser.add_argument("--cases", type=int, metavar="N", help=f"how many ({CASES}; more may be added later)")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
+        "--seed", type=int, metavar="SECRET", help="that sealed cases are drawn from (default: a new one)"
+    )
+    which.add_argument("--dev", action="store_true", help="cases for development, on which thresholds may be tuned")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Make, diagnose and reveal what is missing, then print and write hidden.json and hidden.md."""
+    chosen = drawn(options)
+    kept = Kept(options.out, chosen.settings)
+    work: dict[str, Callable[[], dict[str, Any]]] = {
+        name: partial(one, options.out, name, seed, chosen.fast) for name, seed in chosen.seeds.items()
+    }
+    cases = [scored(name, case) for name, case in kept.run(work).items()]
+    write_text(options.out / "hidden.json", json.dumps(cases, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_text(options.out / "hidden.md", hidden_tables.markdown(cases))
+    hidden_tables.show(cases)
+    print(f"result: {options.out / 'hidden.json'}, {options.out / 'hidden.md'}")
+
+
+def drawn(options: argparse.Namespace) -> Round:
+    """The cases that were asked for; a folder remembers its secret."""
+    count = options.cases or (FAST_CASES if options.fast else CASES)
+    cases = module("hidden", "drawn")
+    if count < 1:
+        raise InvalidInput("--cases", got=count, expected="1 or more")
+    if options.dev:
+        settings, seeds = {"study": "hidden", "secret": None, "fast": options.fast}, list(range(count))
+        if count > cases.DEVELOPMENT:
+            raise InvalidInput("--cases", got=count, expected=f"at most {cases.DEVELOPMENT} for development")
+    else:
+        secret = _secret(options)
+        settings, seeds = {"study": "hidden", "secret": secret, "fast": options.fast}, cases.sealed(secret, count)
+    return Round({f"{k:03d}": seed for k, seed in enumerate(seeds, 1)}, options.fast, settings)
+
+
+def _secret(options: argparse.Namespace) -> int:
+    if options.seed is not None:
+        return options.seed
+    if options.fast:
+        return FAST_SECRET
+    try:
+        found = json.loads((options.out / "study.json").read_text()).get("secret")
+    except (FileNotFoundError, NotADirectoryError, ValueError):  # a damaged one is refused by who reads it next
+        found = None
+    return secrets.randbits(48) if found is None else int(found)
+
+
+def one(out: Path, name: str, seed: int, fast: bool) -> dict[str, Any]:
+    """One case from making to revealing."""
+    episodes, answer = out / "episodes" / name, out / "answers" / name
+    size = ["--fast"] if fast else []
+    _script("make.py", "--seed", str(seed), *size, "--out", str(episodes))
+    begun = time.perf_counter()
+    found = answered(sorted(episodes.iterdir()), answer)
+    spent = time.perf_counter() - begun
+    # only now
+    truth = json.loads(_script("reveal.py", "--seed", str(seed), *size))
+    return {"truth": truth, "answer": found, "seconds": round(spent, 1)}
+
+
+def answered(episodes: list[Path], out: Path) -> dict[str, Any]:
+    """What ``torchcloth diagnose`` writes, or how it ended instead."""
+    command = [sys.executable, "-m", "torchcloth.cli", "diagnose", *map(str, episodes), "--out", str(out)]
+    done = _run(command)
+    if done.returncode == 0:
+        return json.loads((out / "diagnosis.json").read_text())
+    said = done.stderr.strip().splitlines() or ["nothing"]
+    answer = {"refused" if done.returncode == REFUSED else "failed": said[-1]}
+    out.mkdir(parents=True, exist_ok=True)
+    write_text(out / "diagnosis.json", json.dumps(answer) + "\n")
+    return answer
+
+
+def _script(name: str, *arguments: str) -> str:
+    """Output of a script of tests/hidden."""
+    done = _run([sys.executable, str(folder("hidden") / name), *arguments])
+    if done.returncode:
+        raise InvalidInput(f"tests/hidden/{name} {' '.join(arguments)}", got=done.stderr.strip()[-300:])
+    return done.stdout
+
+
+def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+def scored(name: str, case: Mapping[str, Any]) -> dict[str, Any]:
+    """A kept case as the tables have it."""
+    rest = {key: case.get(key) for key in ("seconds", "gain")}
+    sealed = {"seed": case["truth"]["seed"], "sealed": case["truth"]["sealed"]}
+    return {"name": name, **sealed, **judged(case["truth"], case["answer"]), **rest}

@@ -1,0 +1,165 @@
+"""How answers to hidden cases are judged: pure functions of what was hidden and what was answered.
+
+A truth is what tests/hidden/reveal.py prints; an answer is the content of diagnosis.json, or ``{"refused": text}``
+where the command refused the recordings, or ``{"failed": text}`` where it ended otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+Truth = Mapping[str, Any]
+Answer = Mapping[str, Any]
+WITH_EFFECT = ("single", "double", "confounded", "next experiment")
+NULLS = ("null", "hard null")
+UNDECIDED = ("unresolvable", "undecided", "inconclusive")
+
+
+class Wanted(NamedTuple):
+    """One hidden effect that should be found."""
+
+    names: frozenset[str]  # any of them is right
+    amplitude: float  # by the library's sign
+    comparable: bool
+
+
+class Named(NamedTuple):
+    """One cause of an answer."""
+
+    best: str
+    alike: frozenset[str]  # with what no such data tell from it, itself included
+    all: frozenset[str]  # with rivals, too
+    amplitude: float
+    ci95: tuple[float, float]
+
+    @property
+    def alone(self) -> bool:
+        """Nothing else is said to be possible."""
+        return len(self.all) == 1
+
+
+def effect(name: str) -> str:
+    """A cause's name without its axis."""
+    return name.partition("[")[0]
+
+
+def named(answer: Answer) -> list[Named]:
+    """The causes of an answer."""
+    found = []
+    for cause in answer.get("causes", ()):
+        alike = frozenset(map(effect, [cause["effect"], *cause["class"]]))
+        rivals = frozenset(effect(r["effect"]) for r in cause["rivals"])
+        low, high = cause["ci95"]
+        found.append(Named(effect(cause["effect"]), alike, alike | rivals, cause["amplitude"], (low, high)))
+    return found
+
+
+def wanted(truth: Truth) -> list[Wanted]:
+    """What should be found; what is too small to matter, or beyond the catalogue, is not."""
+    if truth["family"] in NULLS:
+        return []
+    return [
+        Wanted(frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"]))
+        for e in truth["effects"]
+        if e["names"] and not e["beside"]
+    ]
+
+
+def fine(truth: Truth) -> frozenset[str]:
+    """Names that are no error."""
+    return frozenset(n for e in truth["effects"] for n in e["names"])
+
+
+def judged(truth: Truth, answer: Answer) -> dict[str, Any]:
+    """One case: what counts in the tables."""
+    causes, asked, right = named(answer), wanted(truth), fine(truth)
+    out: dict[str, Any] = {
+        "family": truth["family"],
+        "kind": truth["kind"],
+        "hidden": [e["name"] for e in truth["effects"]],
+        "verdict": verdict(answer),
+        "named": [" | ".join([c.best, *sorted(c.all - {c.best})]) for c in causes],
+        "wrong": any(c.alone and c.best not in right for c in causes),
+        "spurious": sum(not c.all & right for c in causes),
+        "sizes": [len(c.all) for c in causes],
+        "no_answer": "refused" in answer or "failed" in answer,
+    }
+    if asked:
+        found = [_best(causes, w) for w in asked]
+        out |= {
+            "found": [c is not None and bool(c.alike & w.names) for c, w in zip(found, asked, strict=True)],
+            "covered": [c is not None for c in found],
+            "said_invisible": [_invisible(answer, w) for w in asked],
+            "amplitudes": [_amplitude(c, w) for c, w in zip(found, asked, strict=True)],
+        }
+    return out | {"right": _right(truth, answer, causes, asked, out)}
+
+
+def verdict(answer: Answer) -> str:
+    """With the ways not to answer among them."""
+    return next((word for word in ("refused", "failed") if word in answer), str(answer.get("verdict")))
+
+
+def _best(causes: Sequence[Named], w: Wanted) -> Named | None:
+    """The cause that stands for an effect: by its name, else by its class, else by a rival."""
+    for part in (lambda c: {c.best}, lambda c: c.alike, lambda c: c.all):
+        for cause in causes:
+            if part(cause) & w.names:
+                return cause
+    return None
+
+
+def _invisible(answer: Answer, w: Wanted) -> bool:
+    """The answer says that these data do not show it."""
+    return any(effect(row["effect"]) in w.names for row in answer.get("unresolvable", ()))
+
+
+def _amplitude(cause: Named | None, w: Wanted) -> dict[str, Any] | None:
+    """Error as a share, and whether the interval holds the truth; None where they cannot be compared."""
+    if cause is None or cause.best not in w.names or not w.comparable:
+        return None
+    low, high = cause.ci95
+    return {"error": cause.amplitude / w.amplitude - 1, "inside": low <= w.amplitude <= high}
+
+
+def _right(truth: Truth, answer: Answer, causes: Sequence[Named], asked: Sequence[Wanted], out: Mapping) -> bool:
+    """The family's own question, answered well."""
+    family = truth["family"]
+    if out["no_answer"] and family != "fault":
+        return False
+    if family in NULLS:
+        return not causes
+    if family == "single":
+        return out["found"][0]
+    if family == "double":
+        return all(out["found"])
+    if family == "outside":
+        return unexplained(answer)
+    if family == "fault":
+        return verdict(answer) in ("refused", "invalid_data") or _only(causes, truth["right_for_fault"])
+    return said_alike(truth, answer, causes)
+
+
+def unexplained(answer: Answer) -> bool:
+    """The answer says that something is left over which no known cause mends."""
+    return answer.get("verdict") == "unexplained" or bool(answer.get("also_unexplained"))
+
+
+def _only(causes: Sequence[Named], names: Sequence[str]) -> bool:
+    return bool(causes) and all(c.best in names for c in causes)
+
+
+def said_alike(truth: Truth, answer: Answer, causes: Sequence[Named]) -> bool:
+    """A confounded case is answered as such.
+
+    Either the effect is named with something else beside it, and nothing false alone; or nothing is named and the
+    effect is among what these data cannot decide. Where the data might tell after all, its name alone is right, too.
+    """
+    names, like = frozenset(n for w in wanted(truth) for n in w.names), truth["confounded"] or {}
+    if not causes:
+        listed = [row["effect"] if isinstance(row, Mapping) else row for k in UNDECIDED for row in answer.get(k, ())]
+        return any(effect(name) in names for name in listed)
+    if any(c.alone and c.best not in fine(truth) for c in causes):
+        return False
+    return any(c.all & names and (len(c.all) > 1 or like.get("soft", False)) for c in causes)

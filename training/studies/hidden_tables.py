@@ -1,0 +1,96 @@
+"""The hidden round as tables: for a terminal, and as Markdown for the docs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .fabric_tables import NOTHING, table
+from .hidden_rates import Mark, Rate, further, marks
+
+HEADINGS = ("figure", "must", "aim", "is", "95 %", "of", "")
+
+
+def show(cases: Sequence[Mapping[str, Any]]) -> None:
+    """Marks, further rates, and every case."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    console.width = max(console.width, 130)
+    console.print(_filled("What must show", HEADINGS, [_mark(m) for m in marks(cases)]))
+    console.print(_filled("Further", ("figure", "is", "95 %", "of"), [_rate(*row) for row in further(cases)]))
+    console.print(_filled("Every case", CASE, [_case(c) for c in cases], left=7))
+    console.print(seconds(cases), markup=False)
+
+
+def markdown(cases: Sequence[Mapping[str, Any]]) -> str:
+    """The same, to be pasted."""
+    parts = [
+        _lines(HEADINGS, [_mark(m) for m in marks(cases)]),
+        _lines(("figure", "is", "95 %", "of"), [_rate(*row) for row in further(cases)]),
+        _lines(CASE, [_case(c) for c in cases]),
+    ]
+    return "\n\n".join(parts) + f"\n\n{seconds(cases)}\n"
+
+
+def seconds(cases: Sequence[Mapping[str, Any]]) -> str:
+    """What a case costs."""
+    spent = [c["seconds"] for c in cases]
+    if not spent:
+        return "no case is finished"
+    return (
+        f"{np.median(spent):.0f} s a diagnosis (median; longest {max(spent):.0f} s), {len(cases)} cases, "
+        f"{sum(c['sealed'] for c in cases)} of them sealed"
+    )
+
+
+def _mark(m: Mark) -> tuple[str, ...]:
+    sign, count = "≥" if m.least else "≤", m.label.startswith("mean size")
+    must, aim = (f"{sign} {x:g}" if count else f"{sign} {percent(x)}" for x in (m.must, m.aim))
+    return (m.label, must, aim, *_value(m.value, count), m.reached)
+
+
+def _rate(label: str, value: Rate | float | None) -> tuple[str, ...]:
+    return (label, *_value(value, label.endswith("a case")))
+
+
+def _value(value: Rate | float | None, count: bool = False) -> tuple[str, str, str]:
+    """(point, bounds, number of cases)."""
+    if isinstance(value, Rate):
+        bounds = NOTHING if value.bounds is None else "{}–{}".format(*map(percent, value.bounds))
+        return percent(value.share), bounds, str(value.of)
+    return (NOTHING if value is None else f"{value:.2f}" if count else percent(value)), "", ""
+
+
+def percent(share: float | None) -> str:
+    """Whole per cents."""
+    return NOTHING if share is None else f"{100 * share:.0f} %"
+
+
+CASE = ("case", "family", "kind", "hidden", "verdict", "named", "", "amplitude", "gain", "s")
+
+
+def _case(c: Mapping[str, Any]) -> tuple[str, ...]:
+    off = [f"{100 * a['error']:+.0f} %" for a in c.get("amplitudes", ()) if a is not None]
+    gain = "" if c.get("gain") is None else f"{c['gain']:.2f}"
+    named = ", ".join(c["named"]) or NOTHING
+    said = "right" if c["right"] else "WRONG" if c["wrong"] else "missed"
+    hidden = ", ".join(c["hidden"]) or NOTHING
+    first = (c["name"], c["family"], c["kind"], hidden, c["verdict"], named, said)
+    return (*first, ", ".join(off), gain, f"{c['seconds']:.0f}")
+
+
+def _filled(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1):
+    out = table(title, *headings, left=left)
+    for column in out.columns:
+        column.no_wrap = False
+    for row in rows:
+        out.add_row(*row)
+    return out
+
+
+def _lines(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    table = [headings, ["---"] * len(headings), *([cell.replace("|", "or") for cell in row] for row in rows)]
+    return "\n".join("| " + " | ".join(row) + " |" for row in table)
