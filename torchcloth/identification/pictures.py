@@ -182,6 +182,6 @@ def field_maps(fields: Mapping[str, Tensor], cloth: Cloth) -> Any:
         shown = values.detach().numpy()
         norm = LogNorm() if shown.max() > WIDE * shown.min() > 0 else None
         drawn = axis.tripcolor(*place.T, np.asarray(mesh.faces), facecolors=shown, norm=norm)
-        figure.colorbar(drawn, ax=axis, label=getattr(cloth.material, name).unit)
+        figure.colorbar(drawn, ax=axis, label=getattr(cloth.material, name).unit, shrink=0.8)
         axis.set(title=name, aspect="equal", xlabel="m", ylabel="m")
     return figure
