@@ -20,6 +20,7 @@ from twins import doubles, first, twin
 
 from torchcloth import recordings
 from torchcloth.cli import main
+from torchcloth.errors import InvalidInput
 
 COMMAND = [sys.executable, "-m", "torchcloth.cli"]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "80", "PYTHONUNBUFFERED": "1"}
@@ -237,6 +238,30 @@ def test_no_name_and_no_number_of_the_table_is_cut(done):
         assert name in process.stdout
     table = process.stdout.split("Parameters")[1].split("Distance")[0]
     assert not re.search(r"\S…|…\S", table)  # "a … b" is an interval, "4.0…" a lost number
+
+
+@pytest.mark.parametrize(
+    ("arguments", "refines"),
+    [
+        ([], True),
+        (["--no-refine"], False),
+        (["--method", "lbfgs"], True),
+        (["--method", "adam"], False),
+        (["--stop", "paper"], False),
+        (["--profile", "air.normal"], False),
+        (["--method", "adam", "--refine"], True),
+    ],
+)
+def test_a_fit_corrects_for_its_mesh_unless_that_makes_no_sense(monkeypatch, folder, tmp_path, arguments, refines):
+    asked = {}
+
+    def identify(*_, **options):
+        asked.update(options)
+        raise InvalidInput("enough", got="this", expected="nothing more")
+
+    monkeypatch.setattr("torchcloth.identification.identify", identify)
+    assert main(["identify", str(folder), "--out", str(tmp_path / "out"), *arguments]) == 2
+    assert asked["refine"] is refines
 
 
 def test_fields_have_a_value_for_each_triangle(folder, tmp_path, capsys):

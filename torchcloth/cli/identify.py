@@ -88,8 +88,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--refine",
         action=argparse.BooleanOptionalAction,
-        help="correct for the coarseness of the mesh by one run on a mesh twice as fine (default, unless --method or "
-        "--stop follow the paper)",
+        help="correct for the coarseness of the mesh by one run on a mesh twice as fine (default; not with --profile, "
+        "or where --method or --stop follow the paper)",
     )
     parser.add_argument("--resume", action="store_true", help="go on where a stopped fit into DIR was")
     fields.add(parser)
@@ -217,10 +217,10 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
 
 
 def _refines(options: argparse.Namespace) -> bool:
-    """As asked for; else where a search ends at the optimum, which the correction is about."""
+    """As asked for; else where a search ends at the optimum, which the correction moves, and nothing is profiled."""
     if options.refine is not None:
         return options.refine
-    return options.method in ("gauss-newton", "lbfgs") and options.stop == "converged"
+    return options.method in ("gauss-newton", "lbfgs") and options.stop == "converged" and not options.profile
 
 
 def _report(folder: Path, fit: Identification, cloth: Cloth, recordings: list[Recording]) -> int:
