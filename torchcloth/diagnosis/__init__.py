@@ -6,11 +6,13 @@
 
 from .base_model import base_model
 from .comparison import Gain, compare, predict
+from .confirming import Confirmation, confirm
 from .evidence import gather, setting_of
 from .fitting import Fitted, fit
 from .gate import Fault, check, read_episodes
 from .hypotheses import catalogue, register
-from .model_file import load_model, save_model
+from .loading import beside_the_cloth, cloth_for, load, load_world, predicted, uncertain
+from .model_file import load_model, read_model, save_model
 from .noise import fit_noise
 from .run import diagnose, write_diagnosis
 from .screening import screen
@@ -19,6 +21,7 @@ from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model, World
 
 __all__ = [
+    "Confirmation",
     "Diagnosis",
     "Fault",
     "Fitted",
@@ -27,22 +30,30 @@ __all__ = [
     "Model",
     "World",
     "base_model",
+    "beside_the_cloth",
     "catalogue",
     "check",
+    "cloth_for",
     "compare",
+    "confirm",
     "diagnose",
     "fit",
     "fit_noise",
     "gather",
     "judge",
+    "load",
     "load_model",
+    "load_world",
     "predict",
+    "predicted",
     "read_episodes",
+    "read_model",
     "refused",
     "register",
     "save_model",
     "screen",
     "search",
     "setting_of",
+    "uncertain",
     "write_diagnosis",
 ]

@@ -58,7 +58,22 @@ def predict(found: Fitted, groups: Sequence[str]) -> Predicted:
         rest, r = own[~inside], white.value[~inside]
         step = -torch.linalg.solve(rest.mT @ rest + precision, rest.mT @ r + precision @ point)
         whitened[inside] += own[inside] @ step
-    cells = found.evidence.cells
+    return _told(found, whitened)
+
+
+def as_it_is(found: Fitted) -> Predicted:
+    """Residuals of every episode by a model that was not fitted to any of them."""
+    return _told(found, found.white.value)
+
+
+def of_episodes(p: Predicted, episodes: Sequence[int]) -> Predicted:
+    """Only these."""
+    kept = torch.isin(p.episode, torch.as_tensor(episodes))
+    return Predicted(*(column[kept] for column in p))
+
+
+def _told(found: Fitted, whitened: Tensor) -> Predicted:
+    cells, white = found.evidence.cells, found.white
     join = lambda name: torch.cat([getattr(c, name) for c in cells])  # noqa: E731
     value = torch.cat([_adjusted(found, k, whitened[white.episode == k]) for k in range(len(cells))])
     return Predicted(value, whitened, join("key"), white.episode, join("window"), join("block") < SEEN)

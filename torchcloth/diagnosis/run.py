@@ -10,6 +10,7 @@ from pathlib import Path
 
 from .._files import write_text
 from ..errors import InvalidInput
+from ..identification.saved import mark
 from ..recordings import Recording
 from .base_model import base_model, together
 from .evidence import Progress, setting_of
@@ -22,7 +23,7 @@ from .stepwise import search
 from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
 
-RESULT, EXTENDED = "diagnosis.json", "extended.tcm"
+RESULT, BASE, EXTENDED = "diagnosis.json", "base.tcm", "extended.tcm"
 
 
 def diagnose(
@@ -65,16 +66,22 @@ def diagnose(
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     answer = judge(search(model, setting, asked, progress), setting.names)
-    return replace(answer, content=answer.content | {"plan_hash": plan, "model": EXTENDED})
+    return replace(
+        answer,
+        content=answer.content
+        | {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]},
+    )
 
 
 def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Path:
-    """Write diagnosis.json, report.html and, unless data are invalid, the extended model; returns the first's path.
+    """Write diagnosis.json, report.html and, unless data are invalid, the models; returns the first's path.
 
     ``recordings`` are the episodes, which say what the base model is of.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if answer.searched is not None:
-        save_model(folder / EXTENDED, answer.model, together(recordings), answer.found.end.covariance)
+        said, scene = answer.content["episodes"], together(recordings)
+        for name, fitted in ((BASE, answer.found.start), (EXTENDED, answer.found.end)):
+            save_model(folder / name, fitted.model, scene, fitted.covariance, said)
     write_report(answer, folder)
     return write_text(folder / RESULT, json.dumps(answer.content, indent=1, allow_nan=False) + "\n")

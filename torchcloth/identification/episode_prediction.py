@@ -85,7 +85,7 @@ def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction
     raw = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
     frames, moved = tangents(cloth, unknowns, raw, data, model.dt)
     spread = lambda slopes: torch.einsum("k...,kl,l...->...", slopes, covariance.to(slopes), slopes).clamp(min=0)  # noqa: E731
-    seen, per_frame = _figures(cloth, data, frames)
+    seen, per_frame = distances(cloth, data, frames)
     return EpisodePrediction(
         cloth,
         data,
@@ -114,8 +114,8 @@ def _known(path: Path, cloth: Cloth) -> tuple[list[Unknown], Tensor, float]:
     return unknowns, matrix * deviation[:, None] * deviation, math.nan if left is None else float(left)
 
 
-def _figures(cloth: Cloth, data: Episode, frames: Frames) -> tuple[dict[str, float], Tensor]:
-    """Distances and force errors of the prediction and of the null."""
+def distances(cloth: Cloth, data: Episode, frames: Frames) -> tuple[dict[str, float], Tensor]:
+    """Distances [m] and force errors [N] of the prediction and of the null, and [T'] m of frames with points."""
     faces = torch.as_tensor(cloth.mesh.faces)
     found, null = (figures([x], [data], faces) for x in (frames.x, rigid_carry(data)))
     out = {"rms": found.rms, "rms_null": null.rms, "chamfer": found.chamfer, "chamfer_null": null.chamfer}

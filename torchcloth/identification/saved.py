@@ -56,7 +56,7 @@ def model_of(cloth: Cloth, fit: Identification, recordings: Sequence[Recording],
     episodes = []
     for recording, frames in zip(recordings, fit.frames_after, strict=True):
         chamfer = figures([frames], [episode(cloth, recording)], faces).chamfer
-        episodes.append({**_mark(recording), "chamfer": or_none(chamfer)})
+        episodes.append({**mark(recording), "chamfer": or_none(chamfer)})
     contact = None if cloth.contact is None else asdict(cloth.contact)
     return {"values": values, "contact": contact, "dt": dt, "episodes": episodes}
 
@@ -171,7 +171,7 @@ def read_saved(path: Path) -> SavedModel:
         ) from None
 
 
-def _mark(recording: Recording) -> dict[str, Any]:
+def mark(recording: Recording) -> dict[str, Any]:
     """What an episode is recognised by, wherever it lies."""
     name = recording.path.name if recording.path else "recording"
     points, markers = recording.points, recording.markers
@@ -188,18 +188,19 @@ def _mark(recording: Recording) -> dict[str, Any]:
 
 def is_fitted(path: str | Path, recording: Recording) -> bool:
     """Whether the fit used this episode: then nothing about it is a prediction, nor new."""
-    return any(_alike(kept, _mark(recording)) for kept in read_saved(result_file(path)).episodes)
+    return any(alike(kept, mark(recording)) for kept in read_saved(result_file(path)).episodes)
 
 
-def _alike(kept: dict[str, Any], own: dict[str, Any]) -> bool:
+def alike(kept: dict[str, Any], own: dict[str, Any]) -> bool:
+    """Whether two marks are of one episode."""
     counts = all(kept[key] == own[key] for key in ("frames", "points"))
     return counts and bool(np.abs(np.subtract(kept["mean"], own["mean"])).max() < SAME)
 
 
 def _same(path: Path, episodes: Sequence[dict[str, Any]], recording: Recording) -> dict[str, Any]:
-    own = _mark(recording)
+    own = mark(recording)
     for kept in episodes:
-        if _alike(kept, own):
+        if alike(kept, own):
             return kept
     raise InvalidInput(
         f"{path}: a fit of another episode",
