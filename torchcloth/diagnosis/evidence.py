@@ -169,8 +169,8 @@ def _piece(
     base = world.seen(runs.plain, e)
     moved = directions(base, [*runs.beside, *(t for t in runs.trials if t is not None)], [*steps, *typical])
     if known is None:
-        other, std = _nuisances(world, base, runs.held, e)
-        coarse = cells_of(base, _joined(moved, other), e, setting.sheet, setting.rest)
+        other, std = nuisances(world, base, runs.held, e)
+        coarse = cells_of(base, joined(moved, other), e, setting.sheet, setting.rest)
     else:
         key, slopes, std = known
         coarse = cells_of(base, moved, e, setting.sheet, setting.rest)
@@ -267,7 +267,7 @@ def shifted(model: Model, coordinate: int, step: float) -> Model:
     return model.at(beside)
 
 
-def _nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:
+def nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:
     """Derivatives along what differs from episode to episode, and its standard deviations."""
     moved, steps, stds = [], [], []
     for kind, std in ((Clock(), [CLOCK]), (Camera(), [SHIFT] * 3 + [TURN] * 3), (Rim(), [RIM]), (Tare(), None)):
@@ -283,6 +283,7 @@ def _nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -
     return directions(base, [*moved, *held], [*steps, *every]), torch.tensor([*stds, *every], dtype=torch.float64)
 
 
-def _joined(a: Frames, b: Frames) -> Frames:
+def joined(a: Frames, b: Frames) -> Frames:
+    """Directions of both."""
     wrench = {name: torch.cat([a.wrench[name], b.wrench[name]]) for name in a.wrench}
     return Frames(torch.cat([a.x, b.x]), torch.cat([a.v, b.v]), wrench, torch.cat([a.edge, b.edge]))

@@ -13,11 +13,12 @@ from ..errors import InvalidInput
 from ..identification.saved import mark
 from ..recordings import Recording
 from .base_model import base_model, together
-from .evidence import Progress, setting_of
+from .evidence import Progress, setting_of, staged
 from .gate import check
 from .hypotheses import catalogue
 from .keeping import kept_in
 from .model_file import save_model
+from .next_experiment import propose
 from .report import write_report
 from .stepwise import search
 from .verdict import Diagnosis, judge, refused
@@ -66,10 +67,17 @@ def diagnose(
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     answer = judge(search(model, setting, asked, progress), setting.names)
+    following = propose(answer.found, answer.content["causes"], setting, staged(progress, "next experiment"))
     return replace(
         answer,
         content=answer.content
-        | {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]},
+        | {
+            "plan_hash": plan,
+            "base": BASE,
+            "model": EXTENDED,
+            "next_experiment": following,
+            "episodes": [mark(r) for r in recordings],
+        },
     )
 
 

@@ -47,6 +47,7 @@ class Step:
     tried: list[Candidate]  # best among them
     rivals: list[Candidate]
     screened: list[Row]
+    before: Fitted  # the model without it, with slopes along everything that was asked about
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +150,7 @@ def _step(
         return None
     best = max(useful, key=lambda c: c.gain.density)
     rivals = [c for c in useful if c is not best and _rival(c, best)]
-    return Step(best, tried, rivals, screened)
+    return Step(best, tried, rivals, screened, current)
 
 
 def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> list[tuple[Row, Fitted]]:

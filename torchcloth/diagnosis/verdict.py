@@ -111,10 +111,9 @@ def _cause(found: Found, step: Step) -> dict[str, Any]:
     amplitude = found.end.model.amplitudes[place]
     std = float(found.end.covariance[count + place, count + place].sqrt())
     std = (std**2 + best.row.bias**2) ** 0.5
-    before = found.start if place == 0 else found.steps[place - 1].best.fitted
     beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
     others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in beaten]
-    kin = [r.hypothesis.name for r in alike(before, best.row, others)]
+    kin = [r.hypothesis.name for r in alike(step.before, best.row, others)]
     return {
         "effect": h.name,
         "amplitude": amplitude,
