@@ -14,7 +14,9 @@ import torch
 
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import base_model, catalogue, diagnose, fit, setting_of
+from torchcloth.diagnosis.cells import NAMES
 from torchcloth.diagnosis.experiments import LIBRARY, PLANS, Experiment, planned, possible
+from torchcloth.diagnosis.fitting import renoised
 from torchcloth.diagnosis.next_experiment import (
     Question,
     distances,
@@ -23,6 +25,7 @@ from torchcloth.diagnosis.next_experiment import (
     question_of,
     whitened_slopes,
 )
+from torchcloth.diagnosis.noise import FLOOR, Noise
 
 INDEPENDENT = Path(__file__).parents[1] / "independent"
 MOTIONS = """
@@ -33,7 +36,7 @@ sheet = SheetSpec(0.2, 0.2, areal_density=0.2, membrane_stiffness=60.0, damping_
 found = []
 for name, heading, speed in json.loads(sys.argv[1]):
     m = motion(name, sheet, heading, speed)
-    found.append([{n: p[:, :3, 3].tolist() for n, p in m.pose.items()}, {n: p[:, 0, 0].tolist() for n, p in m.pose.items()}])
+    found.append({n: p[:, :3, 3].tolist() for n, p in m.pose.items()})
 print(json.dumps(found))
 """
 
@@ -44,9 +47,7 @@ def test_the_library_is_that_of_the_independent_engine():
     run = [sys.executable, "-c", MOTIONS, asked]
     out = subprocess.run(run, cwd=INDEPENDENT, capture_output=True, text=True, check=True).stdout
     template = sheets.episode()
-    edge = {name: g.position[0] for name, g in template.grippers.items()}
-    order = sorted(edge, key=lambda n: edge[n][0])  # the edge runs along x here
-    for experiment, (paths, cosines) in zip(LIBRARY, json.loads(out), strict=True):
+    for experiment, paths in zip(LIBRARY, json.loads(out), strict=True):
         plan = planned(experiment, template)
         own = np.stack([plan.grippers[n].position for n in ("left", "right")])
         other = np.stack([np.asarray(paths[n]) for n in ("left", "right")])
@@ -56,7 +57,6 @@ def test_the_library_is_that_of_the_independent_engine():
         np.testing.assert_allclose(apart - apart[0], said - said[0], atol=1e-9)
         along = lambda p: np.arctan2(*(p[0] - p[1])[:, [1, 0]].T)  # noqa: E731
         np.testing.assert_allclose(np.cos(along(own) - along(other)), 1.0, atol=1e-9)
-    assert order == ["left", "right"]
 
 
 def test_only_what_can_be_begun_is_asked_for():
@@ -94,7 +94,8 @@ def undecided(names):
     model = base_model(recordings[0])
     setting = setting_of(model, recordings)
     asked = [h for h in catalogue(model, recordings) if h.name in names]
-    found = fit(model, setting, asked, 1)
+    level = 3 * torch.tensor([FLOOR[name] for name in NAMES]).double()  # the points here are anywhere
+    found = renoised(fit(model, setting, asked, 0), Noise(level))
     hypothesis = SimpleNamespace(name=names[0])
     step = SimpleNamespace(best=SimpleNamespace(hypothesis=hypothesis), before=found, screened=[])
     amplitudes = {h.name: h.typical for h in asked}
@@ -112,7 +113,8 @@ def test_gravity_and_camera_are_told_apart_by_turning():
     for name in ("hang", "turn"):
         slopes = whitened_slopes(question, planned(Experiment(name), setting.recordings[0]), setting)
         told[name] = min(distances(question, information(question, [slopes])).values())
-    assert told["turn"] > 3 * told["hang"] > 3 * 0.9 * min(now.values())
+    least = min(now.values())
+    assert told["turn"] - least > 10 * (told["hang"] - least) >= 0
 
 
 def test_nothing_open_asks_for_nothing():

@@ -68,17 +68,8 @@ def diagnose(
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     answer = judge(search(model, setting, asked, progress), setting.names)
     following = propose(answer.found, answer.content["causes"], setting, staged(progress, "next experiment"))
-    return replace(
-        answer,
-        content=answer.content
-        | {
-            "plan_hash": plan,
-            "base": BASE,
-            "model": EXTENDED,
-            "next_experiment": following,
-            "episodes": [mark(r) for r in recordings],
-        },
-    )
+    files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
+    return replace(answer, content=answer.content | files | {"next_experiment": following})
 
 
 def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Path:
