@@ -84,7 +84,10 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--profile", nargs="+", default=[], metavar="NAME", help="seek the interval by fitting the others beside it"
     )
     parser.add_argument(
-        "--refine", action="store_true", help="correct for the coarseness of the mesh (one run on a mesh twice as fine)"
+        "--refine",
+        action=argparse.BooleanOptionalAction,
+        help="correct for the coarseness of the mesh by one run on a mesh twice as fine (default, unless --method or "
+        "--stop follow the paper)",
     )
     parser.add_argument("--resume", action="store_true", help="go on where a stopped fit into DIR was")
 
@@ -190,8 +193,15 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             nuisances=nuisances_of(options.nuisance),
             priors=_priors(options.prior),
             on_progress=advance,
-            refine=options.refine,
+            refine=_refines(options),
         )
+
+
+def _refines(options: argparse.Namespace) -> bool:
+    """As asked for; else where a search ends at the optimum, which the correction is about."""
+    if options.refine is not None:
+        return options.refine
+    return options.method in ("gauss-newton", "lbfgs") and options.stop == "converged"
 
 
 def _report(folder: Path, fit: Identification, cloth: Cloth, recordings: list[Recording]) -> int:

@@ -32,7 +32,9 @@ def unstable(found: Fitted, setting: Setting, progress: Progress = lambda _: Non
     """
     rng = torch.Generator().manual_seed(seed)
     point = found.model.point
-    sizes = torch.maximum(found.covariance.diagonal().sqrt(), torch.tensor(step_sizes(found.model)).abs().to(point))
+    sizes = torch.maximum(
+        found.covariance.diagonal().sqrt(), torch.tensor([abs(step) for _, step in step_sizes(found.model)]).to(point)
+    )
     drawn = torch.randn(DIRECTIONS, len(point), generator=rng, dtype=point.dtype)
     steps = drawn / drawn.norm(dim=1, keepdim=True) * sizes
     steps = torch.cat([steps, -steps])

@@ -25,7 +25,6 @@ from .world import Hypothesis, Model, World
 
 CLOCK, SHIFT, TURN, GRASP, RIM, TARE = 3e-3, 5e-4, 1e-3, 1.5e-3, 2e-3, 0.1  # standard deviations between episodes
 Progress = Callable[[str], None]
-Shift = tuple[int, float]  # coordinate, step
 Kept = Callable[[Sequence[object], Tensor, Callable[[], "Piece"]], "Piece"]  # (question, point, work) -> answer
 T = TypeVar("T")
 U = TypeVar("U")
@@ -96,7 +95,7 @@ def gather(
     hypotheses: Sequence[Hypothesis] = (),
     progress: Progress = lambda _: None,
     before: Evidence | None = None,
-    shifts: Sequence[Shift] | None = None,
+    shifts: Sequence[tuple[int, float]] | None = None,
 ) -> Evidence:
     """Simulate every episode at the model's point, beside it, and with each hypothesis at its typical amplitude.
 
@@ -104,14 +103,14 @@ def gather(
     that cannot be simulated in one of the episodes are left out. ``shifts`` are (coordinate, step) of the points
     beside; None: a small step along each coordinate.
     """
-    shifts = list(enumerate(step_sizes(model))) if shifts is None else list(shifts)
+    shifts = step_sizes(model) if shifts is None else list(shifts)
     own, possible, pieces, began = len(shifts), list(hypotheses), [], time.monotonic()
     for k, e in enumerate(setting.episodes):
         progress(f"{e.name}, {k + 1} of {len(setting.episodes)}{_left(began, k, len(setting.episodes))}")
         slopes = None if before is None else _known_slopes(before, k)
         asked = [(h.name, h.typical) for h in possible]
         question = [k, [h.name for h in model.accepted], asked, shifts, *(slopes or ())]
-        work = partial(_piece, model, setting, k, shifts, possible, slopes)
+        work = partial(_piece, model, setting, k, possible, slopes, shifts)
         piece = setting.kept(question, model.point, work)
         pieces.append((piece, possible))
         possible = [h for h, able in zip(possible, piece.able.tolist(), strict=True) if able]
@@ -157,13 +156,14 @@ def _piece(
     model: Model,
     setting: Setting,
     k: int,
-    shifts: Sequence[Shift],
     hypotheses: Sequence[Hypothesis],
     known: Sequence[Tensor] | None,
+    shifts: Sequence[tuple[int, float]],
 ) -> Piece:
     """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
     e, world, steps = setting.episodes[k], model.world(), [step for _, step in shifts]
-    runs = _runs(model, world, setting, k, shifts, hypotheses, with_held=known is None)
+    beside = [_shifted(model, coordinate, step).world() for coordinate, step in shifts]
+    runs = _runs(model, world, setting, k, hypotheses, beside, with_held=known is None)
     able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
     typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
     base = world.seen(runs.plain, e)
@@ -195,12 +195,12 @@ def _runs(
     world: World,
     setting: Setting,
     k: int,
-    shifts: Sequence[Shift],
     hypotheses: Sequence[Hypothesis],
+    shifted: Sequence[World],
     with_held: bool,
 ) -> _Runs:
     e, dt = setting.episodes[k], setting.dt
-    beside = [partial(w.frames, e, dt) for w in _beside(model, shifts)]
+    beside = [partial(w.frames, e, dt) for w in shifted]
     modes = Held().modes(world.cloth, e) if with_held else ()
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m, settles=True), dt) for m in modes]
     changed = [h.apply(world, h.typical) for h in hypotheses]
@@ -255,14 +255,15 @@ def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
     return kept._replace(value=fine.value[place], spread=fine.spread[place]), kept.value - fine.value[place]
 
 
-def step_sizes(model: Model) -> list[float]:
-    """Along each of the model's own coordinates."""
-    return [*(p.step for p in model.parameters), *(0.1 * h.typical for h in model.accepted)]
+def step_sizes(model: Model) -> list[tuple[int, float]]:
+    """(coordinate, small step) along each of the model's own."""
+    return list(enumerate([*(p.step for p in model.parameters), *(0.1 * h.typical for h in model.accepted)]))
 
 
-def _beside(model: Model, shifts: Sequence[Shift]) -> list[World]:
-    along = torch.eye(len(model.point), dtype=model.point.dtype)
-    return [model.at(model.point + step * along[k]).world() for k, step in shifts]
+def _shifted(model: Model, coordinate: int, step: float) -> Model:
+    beside = model.point
+    beside[coordinate] += step
+    return model.at(beside)
 
 
 def _nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:

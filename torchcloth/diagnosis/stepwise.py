@@ -20,6 +20,7 @@ MOST = 4  # causes
 TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 2  # steps of the likelier ones among them
 CLEAR = 4.0  # log density below which two models predict alike
+MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
 LACKING = 1e-3  # m: slow errors beyond this are not only a sensor's
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 
@@ -68,7 +69,7 @@ def search(
     model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
 ) -> Found:
     """Causes one after the other, until none is both present and useful on motions held out."""
-    near, before = approach(model, setting, staged(progress, "data sheet"))
+    near, before = approach(model, setting, staged(progress, "from the data sheet"))
     current = start = fit(near, setting, hypotheses, progress=staged(progress, "base model"), before=before)
     jumping = unstable(start, setting, staged(progress, "folds that turn over"))
     left_out = sum(map(len, jumping)) / len(start.white.value)
@@ -87,7 +88,7 @@ def search(
         steps.append(step)
         left = [h for h in hypotheses if h.name not in {a.name for a in step.best.fitted.model.accepted}]
         now = staged(progress, f"with {step.best.hypothesis.name}")
-        current = fit(step.best.fitted.model, setting, left, 1, now, before=start.evidence)
+        current = fit(step.best.fitted.model, setting, left, FURTHER, now, before=start.evidence)
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     screened = screen(current)
     last, sensor = predict(current, setting.names), floor_of(current.evidence, current.noise)
@@ -159,8 +160,8 @@ def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> li
     for c in tried:
         found = c.fitted
         if c.gain.density > enough and found.ahead > CLEAR:
-            progress(f"fitting {c.hypothesis.name} further")
-            found = fit(found.model, setting, (), FURTHER, progress, unfitted(), found.evidence, found.evidence)
+            further = staged(progress, f"trying {c.hypothesis.name} further")
+            found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
         out.append((c.row, found))
     return out
 
@@ -175,7 +176,7 @@ def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str],
 
 
 def _useful(c: Candidate) -> bool:
-    return _worthwhile(c.gain) and abs(c.fitted.model.amplitudes[-1]) > abs(c.hypothesis.smallest)
+    return _worthwhile(c.gain) and abs(c.fitted.model.amplitudes[-1]) > MATTERS * abs(c.hypothesis.smallest)
 
 
 def _worthwhile(gain: Gain) -> bool:
