@@ -11,9 +11,12 @@ from .evidence import gather, setting_of
 from .fitting import Fitted, fit
 from .gate import Fault, check, read_episodes
 from .hypotheses import catalogue, register
+from .lacking import lack_of_fit
 from .loading import beside_the_cloth, cloth_for, load, load_world, predicted, uncertain
+from .missing import MissingForce, missing_force
 from .model_file import load_model, read_model, save_model
 from .noise import fit_noise
+from .residual import Residual, learn_residual
 from .run import diagnose, write_diagnosis
 from .screening import screen
 from .stepwise import search
@@ -27,7 +30,9 @@ __all__ = [
     "Fitted",
     "Gain",
     "Hypothesis",
+    "MissingForce",
     "Model",
+    "Residual",
     "World",
     "base_model",
     "beside_the_cloth",
@@ -41,9 +46,12 @@ __all__ = [
     "fit_noise",
     "gather",
     "judge",
+    "lack_of_fit",
+    "learn_residual",
     "load",
     "load_model",
     "load_world",
+    "missing_force",
     "predict",
     "predicted",
     "read_episodes",

@@ -83,7 +83,7 @@ def renoised(found: Fitted, noise: Noise) -> Fitted:
 
 
 def step_of(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, float]:
-    """(step, covariance, log density that the step is expected to gain)."""
+    """(Gauss-Newton step, covariance, log density that the step is expected to gain) of the model's coordinates."""
     own = white.jacobian[:, : len(point)]
     covariance = torch.linalg.inv(own.mT @ own + torch.diag(precision))
     uphill = own.mT @ white.value + precision * point

@@ -8,9 +8,8 @@ from pathlib import Path
 import torch
 
 from ..cloth import Cloth
-from ..identification.episode_prediction import EpisodePrediction, distances
+from ..identification.episode_prediction import EpisodePrediction, with_errors
 from ..identification.episodes import episode
-from ..identification.replays import Frames
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from .cells import directions
@@ -84,20 +83,10 @@ def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
     """
     file = read_model(path, recording)
     model, world = file.model, file.model.world()
-    data = episode(world.cloth, recording)
-    shifts = step_sizes(model) if file.covariance is not None else []
+    data, every = episode(world.cloth, recording), step_sizes(model)
+    covariance = torch.zeros(len(every), len(every)) if file.covariance is None else file.covariance
+    shifts = every[: len(covariance)]  # a residual force, which comes last, has no errors
     worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]
     frames, *beside = side_by_side(lambda w: w.frames(data), worlds)
-    slopes = directions(frames, beside, [step for _, step in shifts]) if shifts else None
-    seen, per_frame = distances(world.cloth, data, frames)
-    std, wrench_std = _spread(frames, slopes, file.covariance)
-    return EpisodePrediction(world.cloth, data, frames, std, wrench_std, math.nan, seen, per_frame)
-
-
-def _spread(
-    frames: Frames, slopes: Frames | None, covariance: torch.Tensor | None
-) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    if slopes is None or covariance is None:
-        return torch.zeros(frames.x.shape[:-1]), {name: torch.zeros_like(w) for name, w in frames.wrench.items()}
-    square = lambda s: torch.einsum("k...,kl,l...->...", s, covariance.to(s), s).clamp(min=0)  # noqa: E731
-    return square(slopes.x).sum(-1).sqrt(), {name: square(w).sqrt() for name, w in slopes.wrench.items()}
+    slopes = directions(frames, beside, [step for _, step in shifts])
+    return with_errors(world.cloth, data, frames, slopes, covariance, math.nan)

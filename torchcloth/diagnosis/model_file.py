@@ -24,6 +24,7 @@ from ..errors import InvalidInput, RecordingError
 from ..recordings import ClothInfo, Collider, GraspInfo, Recording
 from .base_model import base_model
 from .hypotheses import known
+from .residual import TERMS
 from .world import Model
 
 FORMAT = 1
@@ -36,9 +37,10 @@ def save_model(
     model: Model,
     recording: Recording,
     covariance: Tensor | None = None,
+    residual: Model | None = None,
     episodes: Sequence[dict[str, Any]] = (),
 ) -> Path:
-    """Write a model whose base is that of ``recording``; returns the path.
+    """Write a model whose base is that of ``recording``, and the same with a residual force; returns the path.
 
     ``episodes`` are the marks (``identification.saved.mark``) of those that it was fitted to.
     """
@@ -56,14 +58,12 @@ def save_model(
             for name, c in recording.colliders.items()
         },
     }
-    values = zip(model.parameters, model.values.tolist(), strict=True)
-    causes = zip(model.accepted, model.amplitudes, strict=True)
     content = {
         "format": FORMAT,
         "torchcloth": metadata.version("torchcloth"),
         "cloth": facts,
-        "parameters": {p.name: {"coordinate": c, "value": p.value(c), "unit": p.unit} for p, c in values},
-        "causes": [{"effect": h.name, "amplitude": a, "unit": h.unit} for h, a in causes],
+        **_numbers(model),
+        "residual": None if residual is None else _numbers(residual),
         "covariance": None if covariance is None else covariance.tolist(),
         "episodes": list(episodes),
     }
@@ -76,6 +76,15 @@ def save_model(
     return Path(path)
 
 
+def _numbers(model: Model) -> dict[str, Any]:
+    values = zip(model.parameters, model.values.tolist(), strict=True)
+    causes = zip(model.accepted, model.amplitudes, strict=True)
+    return {
+        "parameters": {p.name: {"coordinate": c, "value": p.value(c), "unit": p.unit} for p, c in values},
+        "causes": [{"effect": h.name, "amplitude": a, "unit": h.unit} for h, a in causes],
+    }
+
+
 class ModelFile(NamedTuple):
     """What a file holds."""
 
@@ -84,13 +93,15 @@ class ModelFile(NamedTuple):
     episodes: list[dict[str, Any]]  # marks of those that it was fitted to
 
 
-def load_model(path: str | Path) -> Model:
+def load_model(path: str | Path, residual: bool = True) -> Model:
     """A model that was written by ``save_model``; raises as ``read_model``."""
-    return read_model(path).model
+    return read_model(path, residual=residual).model
 
 
-def read_model(path: str | Path, scene: Recording | None = None) -> ModelFile:
+def read_model(path: str | Path, scene: Recording | None = None, residual: bool = True) -> ModelFile:
     """A model file; with a ``scene``, in that episode's mesh, grasps and tables.
+
+    With its residual force, if it has one, unless that is left out; the covariance is that of all other numbers.
 
     Raises:
         InvalidInput: no such file, a cause that is not in the catalogue, or a scene with another fabric.
@@ -109,8 +120,9 @@ def read_model(path: str | Path, scene: Recording | None = None) -> ModelFile:
                 f"{path}: format {content['format']}", expected=f"{FORMAT}", remedy="update torchcloth"
             )
         own = _recording(content["cloth"], mesh)
-        coordinates = {name: float(p["coordinate"]) for name, p in content["parameters"].items()}
-        causes = [(str(c["effect"]), float(c["amplitude"])) for c in content["causes"]]
+        numbers = (content.get("residual") if residual else None) or content
+        coordinates = {name: float(p["coordinate"]) for name, p in numbers["parameters"].items()}
+        causes = [(str(c["effect"]), float(c["amplitude"])) for c in numbers["causes"]]
         matrix, episodes = content["covariance"], list(content.get("episodes", ()))
     except (zipfile.BadZipFile, KeyError, TypeError, ValueError, OSError) as error:
         raise RecordingError(f"{path}: unreadable", got=repr(error), expected="a model of torchcloth") from None
@@ -135,7 +147,7 @@ def _of_fabric(path: Path, own: Recording, scene: Recording) -> Recording:
 
 
 def _extended(path: Path, model: Model, causes: Sequence[tuple[str, float]]) -> Model:
-    by_name = {h.name: h for h in known()}
+    by_name = {h.name: h for h in (*known(), *TERMS)}
     for name, amplitude in causes:
         if name not in by_name:
             raise InvalidInput(

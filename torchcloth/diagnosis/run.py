@@ -13,13 +13,15 @@ from ..errors import InvalidInput
 from ..identification.saved import mark
 from ..recordings import Recording
 from .base_model import base_model, together
-from .evidence import Progress, setting_of, staged
+from .evidence import Progress, Setting, setting_of, staged
 from .gate import check
 from .hypotheses import catalogue
 from .keeping import kept_in
+from .missing import missing_force
 from .model_file import save_model
 from .next_experiment import propose
 from .report import write_report
+from .residual import learn_residual
 from .stepwise import search
 from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
@@ -68,8 +70,18 @@ def diagnose(
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     answer = judge(search(model, setting, asked, progress), setting.names)
     following = propose(answer.found, answer.content["causes"], setting, staged(progress, "next experiment"))
+    if any(row["lacking"] for row in answer.content["lack_of_fit"]):
+        answer = _beyond(answer, answer.found.setting, progress)
     files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
     return replace(answer, content=answer.content | files | {"next_experiment": following})
+
+
+def _beyond(answer: Diagnosis, setting: Setting, progress: Progress) -> Diagnosis:
+    """With what can be said of what no known cause explains."""
+    missing = missing_force(answer.found.end, setting, progress=progress)
+    residual = learn_residual(answer.found.end, setting, progress)
+    content = answer.content | {"missing_force": missing.as_dict(), "residual": residual.as_dict()}
+    return replace(answer, content=content, missing=missing, residual=residual)
 
 
 def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Path:
@@ -80,7 +92,9 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
     folder.mkdir(parents=True, exist_ok=True)
     if answer.searched is not None:
         said, scene = answer.content["episodes"], together(recordings)
-        for name, fitted in ((BASE, answer.found.start), (EXTENDED, answer.found.end)):
-            save_model(folder / name, fitted.model, scene, fitted.covariance, said)
+        residual = answer.residual.model if answer.residual is not None and answer.residual.terms else None
+        start, end = answer.found.start, answer.found.end
+        save_model(folder / BASE, start.model, scene, start.covariance, episodes=said)
+        save_model(folder / EXTENDED, end.model, scene, end.covariance, residual, said)
     write_report(answer, folder)
     return write_text(folder / RESULT, json.dumps(answer.content, indent=1, allow_nan=False) + "\n")
