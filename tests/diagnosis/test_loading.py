@@ -28,7 +28,7 @@ def made(tmp_path_factory):
     extended = base.plus(by["air.drag_n"], TRUE).plus(by["obs.clock"], 0.0)
     dx.save_model(folder / "base.tcm", base, blank)
     covariance = torch.diag(torch.tensor([0.02, 0.5, 0.05, 0.01, 0.03, 1e-3]).double() ** 2)
-    dx.save_model(folder / "extended.tcm", extended, blank, covariance, [mark(blank)])
+    dx.save_model(folder / "extended.tcm", extended, blank, covariance, episodes=[mark(blank)])
     seen = sheets.recorded("fast", lambda world: by["air.drag_n"].apply(world, TRUE), 3)
     yield folder, rec.read(rec.write(seen, folder / "fast")), blank
     torch.set_default_dtype(before)

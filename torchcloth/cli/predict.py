@@ -106,7 +106,7 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
     with atomically(out / "prediction.npz") as file:
         t, vertices, std = (part.numpy() for part in (found.episode.times, found.frames.x, found.std))
         more = {"interval": found.interval.numpy(), "faces": found.cloth.mesh.faces}
-        np.savez_compressed(file, t=t, vertices=vertices, std=std, **more)
+        np.savez_compressed(file, t=t, vertices=vertices, std=std, **more)  # type: ignore[arg-type]
     picture = pictures.save_figure(prediction_report.predicted(found), out / "prediction.png")
     prediction_report.print_predicted(found)
     if not of_model and is_fitted(fit, recording):

@@ -11,6 +11,7 @@ from typing import Any
 from .._files import write_text
 from . import pictures
 from .comparison import predict
+from .glossary import GLOSSARY
 from .screening import Row
 from .verdict import Diagnosis
 
@@ -55,6 +56,8 @@ def _evidence(answer: Diagnosis) -> list[str]:
         _image(pictures.isolability(answer)),
         "<h2>Parameters of the model</h2>",
         _parameters(answer.content["parameters"]),
+        "<h2>What the names mean</h2>",
+        *(f"<p><b>{name}</b>: {html.escape(said)}</p>" for name, said in GLOSSARY.items()),
     ]
 
 

@@ -10,6 +10,7 @@ from ..errors import InvalidInput
 from .classes import alike
 from .comparison import Gain
 from .gate import Fault
+from .glossary import GLOSSARY
 from .lacking import Left, lack_of_fit
 from .missing import MissingForce
 from .residual import Residual
@@ -217,6 +218,7 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
         low, high = c["ci95"]
         out.append(f"Cause: {c['effect']} = {c['amplitude']:.4g} {c['unit']} (95 %: {low:.4g} to {high:.4g}).")
         others = [name for name in c["class"] if name != c["effect"]] + [r["effect"] for r in c["rivals"]]
+        out += [f"  {said}" for said in (GLOSSARY.get(c["effect"].partition("[")[0]),) if said]
         if others:
             out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
     words = {
@@ -240,6 +242,8 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
             out.append(f"{label}: {', '.join(content[key])}.")
     if content["unresolvable"]:
         out.append(f"Cannot be seen in these data: {', '.join(r['effect'] for r in content['unresolvable'])}.")
+    if content["next_experiment"]:
+        out.append(f"Next experiment: {content['next_experiment']['why']}")
     return [*out, *(f"Warning: {text}." for text in content["warnings"])]
 
 
