@@ -5,7 +5,7 @@ from __future__ import annotations
 from .world import Hypothesis
 
 GLOSSARY = {
-    "air.drag_n": "Air pushes against cloth that moves broadside, by the square of its speed; C_n of a flat plate is 1.2.",
+    "air.drag_n": "Air pushes against cloth that moves broadside, by the square of its speed (1.2: a flat plate).",
     "air.drag_t": "Air rubs along cloth that moves edgewise; as a rule too little to be seen.",
     "air.linear": "Something slows the cloth in proportion to its mass and speed.",
     "air.added_mass": "Air that the cloth carries along makes it heavier to shake and no heavier to hold.",
