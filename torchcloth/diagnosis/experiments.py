@@ -89,7 +89,8 @@ LIBRARY = (
 
 def possible(recordings: Sequence[Recording]) -> list[tuple[Experiment, Recording]]:
     """Experiments with the episode whose first shape they begin with; none where no gripper was recorded."""
-    begins = {lying: next((r for r in recordings if _lies(r) == lying), None) for lying in (False, True)}
+    placed = [r for r in recordings if r.cloth.initial_vertices is not None or r.cloth.vertices is not None]
+    begins = {lying: next((r for r in placed if _lies(r) == lying), None) for lying in (False, True)}
     found = []
     for experiment in LIBRARY:
         template = begins[PLANS[experiment.motion].lying]

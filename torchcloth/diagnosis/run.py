@@ -26,6 +26,7 @@ from .stepwise import search
 from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
 
+OPEN = ("ambiguous", "inconclusive", "unexplained")  # verdicts that another experiment may change
 RESULT, BASE, EXTENDED = "diagnosis.json", "base.tcm", "extended.tcm"
 
 
@@ -69,7 +70,9 @@ def diagnose(
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     answer = judge(search(model, setting, asked, progress), setting.names)
-    following = propose(answer.found, answer.content["causes"], setting, staged(progress, "next experiment"))
+    following = None
+    if answer.verdict in OPEN:
+        following = propose(answer.found, answer.content["causes"], setting, staged(progress, "next experiment"))
     if any(row["lacking"] for row in answer.content["lack_of_fit"]):
         answer = _beyond(answer, answer.found.setting, progress)
     files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
