@@ -69,7 +69,8 @@ def run(options: argparse.Namespace) -> None:
 
 def drawn(options: argparse.Namespace) -> Round:
     """The cases that were asked for; a folder remembers its secret."""
-    count = options.cases or (FAST_CASES if options.fast else CASES)
+    usual = FAST_CASES if options.fast else CASES
+    count = usual if options.cases is None else options.cases
     cases = module("hidden", "drawn")
     if count < 1:
         raise InvalidInput("--cases", got=count, expected="1 or more")
