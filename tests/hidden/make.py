@@ -37,9 +37,7 @@ def scenes(found: Case, take: Take) -> tuple[Scene, Scene]:
         areal_density=fabric["areal_density"],
         membrane_stiffness=fabric["membrane_stiffness"],
     )
-    # as viscous, whatever it resists: a stiffer one damped for as long would need tiny steps
-    damping = plain.plate.damping_time * plain.plate.stiffness / found.size.bending
-    plate = replace(plain.plate, stiffness=fabric["bending_stiffness"], damping_time=damping)
+    plate = replace(plain.plate, stiffness=fabric["bending_stiffness"])
     sensor = replace(plain.sensor, bias=found.bias, occlusion=found.occlusion)
     true = replace(plain, sheet=sheet, plate=plate, sensor=sensor)
     said = replace(

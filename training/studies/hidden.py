@@ -30,7 +30,7 @@ from .hidden_gain import gain
 from .hidden_scores import judged, told_apart
 
 CASES = 60
-FAST_CASES, FAST_SECRET = 12, 7
+FAST_CASES, FAST_SECRET = 8, 23682
 REFUSED = 2  # exit code
 HEADINGS = (0.0, 90.0, 180.0, 270.0)  # degrees, of random experiments
 
