@@ -28,7 +28,8 @@ FLOORS = (
     ("sensitivities",),
     ("cloth", "robots"),
     ("identification", "plan", "testing"),
-    ("diagnosis", "pose"),
+    ("pose",),
+    ("diagnosis",),
     ("inspection", "synthesis", "viewing"),
     ("",),  # torchcloth/__init__.py: the names a user sees
     ("training", "benchmarks", "demo"),

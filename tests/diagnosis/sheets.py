@@ -11,6 +11,7 @@ import torch
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import World, base_model
+from torchcloth.identification.episodes import Episode
 from torchcloth.identification.episodes import episode as tensors
 from torchcloth.identification.replays import Frames
 
@@ -75,15 +76,17 @@ def _at(place: tuple[float, float, float]) -> np.ndarray:
     return pose
 
 
-def recorded(motion: str, change: Callable[[World], World], seed: int) -> rec.Recording:
-    """What a noisy sensor has of a world that is changed, simulated on a finer mesh; the first shape is settled."""
+def recorded(
+    motion: str, change: Callable[[World], World], seed: int, play: Callable[[World, Episode], Frames] = World.frames
+) -> rec.Recording:
+    """What a noisy sensor has of a world that is changed, played on a finer mesh; the first shape is settled."""
     blank, rng = episode(motion, TRUTH, (FRAMES - 1) / RATE + 0.01), np.random.default_rng(seed)
     world = change(base_model(blank).world())
     with torch.no_grad():
         data = tensors(world.cloth, blank)
         state = world.cloth.settle(world.cloth.state(data.initial), data.motion, duration=1.0, rate=15.0)
         settled = replace(blank, cloth=replace(blank.cloth, initial_vertices=state.x.numpy()))
-        found: Frames = world.frames(tensors(world.cloth, settled))
+        found = play(world, tensors(world.cloth, settled))
     coarse = episode(motion, FIT, (FRAMES - 1) / RATE + 0.01)
     clouds = [_seen(x, rng) for x in found.x.numpy()]
     first = _bilinear(found.x[0].numpy(), np.asarray(coarse.cloth.uv)) + 2e-4 * rng.standard_normal(

@@ -42,6 +42,11 @@ def test_fields_are_refused_before_anything_is_computed(model, recording):
         identify(model, recording, ["air.normal"], refine=True)
 
 
+def test_a_profile_is_that_of_the_given_mesh(model, recording):
+    with pytest.raises(InvalidInput, match="profile; got refine as well; expected one of them"):
+        identify(model, recording, PAIR, refine=True, profile=PAIR[:1])
+
+
 def test_a_finer_mesh_that_cannot_be_simulated_leaves_the_fit_and_says_so(model, brief, monkeypatch):
     def torn(*_):
         raise SimulationDiverged("the cloth is torn apart")

@@ -77,6 +77,12 @@ class TestMassDamping(EffectContract):
         return tc.effects.MassDamping(amplitude)
 
 
+class TestResidualForce(EffectContract):
+    def make(self, amplitude):
+        laws = ("across", "across2@edge", "along@inside", "along2", "mass@edge", "strain_rate@inside")
+        return tc.effects.ResidualForce({**dict.fromkeys(laws, amplitude), "bend@edge": 1e-4 * amplitude})
+
+
 class TestBodyForce(EffectContract):
     def make(self, amplitude):
         return tc.effects.BodyForce(amplitude * torch.tensor([[0.6, 0.0, -0.8]]))

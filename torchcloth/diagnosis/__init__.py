@@ -10,8 +10,11 @@ from .evidence import gather, setting_of
 from .fitting import Fitted, fit
 from .gate import Fault, check, read_episodes
 from .hypotheses import catalogue, register
+from .lacking import lack_of_fit
+from .missing import MissingForce, missing_force
 from .model_file import load_model, save_model
 from .noise import fit_noise
+from .residual import Residual, learn_residual
 from .run import diagnose, write_diagnosis
 from .screening import screen
 from .stepwise import search
@@ -24,7 +27,9 @@ __all__ = [
     "Fitted",
     "Gain",
     "Hypothesis",
+    "MissingForce",
     "Model",
+    "Residual",
     "World",
     "base_model",
     "catalogue",
@@ -35,7 +40,10 @@ __all__ = [
     "fit_noise",
     "gather",
     "judge",
+    "lack_of_fit",
+    "learn_residual",
     "load_model",
+    "missing_force",
     "predict",
     "read_episodes",
     "refused",

@@ -22,14 +22,17 @@ from ..errors import InvalidInput, RecordingError
 from ..recordings import ClothInfo, Collider, GraspInfo, Recording
 from .base_model import base_model
 from .hypotheses import known
+from .residual import TERMS
 from .world import Model
 
 FORMAT = 1
 MESH = ("vertices", "faces", "uv")
 
 
-def save_model(path: Path, model: Model, recording: Recording, covariance: Tensor | None = None) -> Path:
-    """Write a model whose base is that of ``recording``; returns the path."""
+def save_model(
+    path: Path, model: Model, recording: Recording, covariance: Tensor | None = None, residual: Model | None = None
+) -> Path:
+    """Write a model whose base is that of ``recording``, and the same with a residual force; returns the path."""
     cloth = recording.cloth
     facts: dict[str, Any] = {
         "areal_density": cloth.areal_density,
@@ -44,14 +47,12 @@ def save_model(path: Path, model: Model, recording: Recording, covariance: Tenso
             for name, c in recording.colliders.items()
         },
     }
-    values = zip(model.parameters, model.values.tolist(), strict=True)
-    causes = zip(model.accepted, model.amplitudes, strict=True)
     content = {
         "format": FORMAT,
         "torchcloth": metadata.version("torchcloth"),
         "cloth": facts,
-        "parameters": {p.name: {"coordinate": c, "value": p.value(c), "unit": p.unit} for p, c in values},
-        "causes": [{"effect": h.name, "amplitude": a, "unit": h.unit} for h, a in causes],
+        **_numbers(model),
+        "residual": None if residual is None else _numbers(residual),
         "covariance": None if covariance is None else covariance.tolist(),
     }
     arrays = {name: getattr(cloth, name) for name in MESH if getattr(cloth, name) is not None}
@@ -63,8 +64,17 @@ def save_model(path: Path, model: Model, recording: Recording, covariance: Tenso
     return Path(path)
 
 
-def load_model(path: str | Path) -> Model:
-    """A model that was written by ``save_model``.
+def _numbers(model: Model) -> dict[str, Any]:
+    values = zip(model.parameters, model.values.tolist(), strict=True)
+    causes = zip(model.accepted, model.amplitudes, strict=True)
+    return {
+        "parameters": {p.name: {"coordinate": c, "value": p.value(c), "unit": p.unit} for p, c in values},
+        "causes": [{"effect": h.name, "amplitude": a, "unit": h.unit} for h, a in causes],
+    }
+
+
+def load_model(path: str | Path, residual: bool = True) -> Model:
+    """A model that was written by ``save_model``; with its residual force, if it has one, unless that is left out.
 
     Raises:
         InvalidInput: no such file, or a cause that is not in the catalogue.
@@ -83,8 +93,9 @@ def load_model(path: str | Path) -> Model:
                 f"{path}: format {content['format']}", expected=f"{FORMAT}", remedy="update torchcloth"
             )
         model = base_model(_recording(content["cloth"], mesh))
-        coordinates = {name: float(p["coordinate"]) for name, p in content["parameters"].items()}
-        causes = [(str(c["effect"]), float(c["amplitude"])) for c in content["causes"]]
+        numbers = (content.get("residual") if residual else None) or content
+        coordinates = {name: float(p["coordinate"]) for name, p in numbers["parameters"].items()}
+        causes = [(str(c["effect"]), float(c["amplitude"])) for c in numbers["causes"]]
     except (zipfile.BadZipFile, KeyError, TypeError, ValueError, OSError) as error:
         raise RecordingError(f"{path}: unreadable", got=repr(error), expected="a model of torchcloth") from None
     values = torch.tensor([coordinates[p.name] for p in model.parameters], dtype=torch.float64)
@@ -93,7 +104,7 @@ def load_model(path: str | Path) -> Model:
 
 
 def _extended(path: Path, model: Model, causes: Sequence[tuple[str, float]]) -> Model:
-    by_name = {h.name: h for h in known()}
+    by_name = {h.name: h for h in (*known(), *TERMS)}
     for name, amplitude in causes:
         if name not in by_name:
             raise InvalidInput(

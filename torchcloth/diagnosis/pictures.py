@@ -11,6 +11,7 @@ from .cells import STRETCH
 from .classes import correlations
 from .comparison import Predicted
 from .evidence import Evidence
+from .missing import SURE, Missing, MissingForce
 from .screening import Row
 from .verdict import Diagnosis
 
@@ -107,6 +108,61 @@ def courses(answer: Diagnosis, before: Predicted, after: Predicted | None) -> An
     axes[0].set_ylabel("held out, mm RMS")
     axes[0].legend(fontsize=8)
     return figure
+
+
+def missing_force(found: MissingForce) -> Any:
+    """Per motion, the missing force of its most certain stretch on the pattern, and how certain it is over time.
+
+    Colour: along the cloth's normal, in share of its weight; arrows: along the cloth, where they are certain.
+    """
+    from matplotlib.figure import Figure
+
+    count = len(found.parts)
+    figure = Figure(figsize=(2.9 * count + 1.2, 4.6), layout="constrained")
+    axes = figure.subplots(2, count, squeeze=False, height_ratios=(3, 1))
+    split = [_local(found, m) for m in found.parts]
+    limit = max(*(float(np.abs(across).max()) for across, _ in split), 1e-3)
+    for k, (m, (across, along)) in enumerate(zip(found.parts, split, strict=True)):
+        image = _pressed(axes[0, k], found, m, across, along, limit)
+        axis, certain = axes[1, k], m.certainty.amax(1).numpy()
+        axis.stairs(certain, [*m.windows[:, 0].tolist(), float(m.windows[-1, 1])], color="#1f6f8b")
+        axis.axhline(SURE, color="#888888", ls=":")
+        axis.set_ylim(0, 1.15 * max(SURE, *(float(q.certainty.max()) for q in found.parts)))
+        axis.set_xlabel("time, s")
+    axes[1, 0].set_ylabel("standard errors")
+    figure.colorbar(image, ax=axes[0], label="along the normal, share of the weight")  # pyright: ignore[reportPossiblyUnbound]
+    return figure
+
+
+def _pressed(axis: Any, found: MissingForce, m: Missing, across: np.ndarray, along: np.ndarray, limit: float) -> Any:
+    window, _ = m.strongest
+    u, v = (found.uv.numpy() - found.uv.numpy().min(0)).T
+    shown = axis.tripcolor(u, v, found.faces.numpy(), across, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="gouraud")
+    sure = (m.certainty[window].numpy() > 0.5 * SURE) & (np.linalg.norm(along, axis=1) > 0.1 * limit)
+    length = max(float(u.max()), float(v.max())) / 6
+    arrows = along[sure] * length / limit
+    axis.quiver(u[sure], v[sure], *arrows.T, angles="xy", scale_units="xy", scale=1, width=0.006)
+    begin, end = m.windows[window].tolist()
+    axis.set_title(f"{m.motion}\n{begin:.2f} to {end:.2f} s", fontsize=9)
+    axis.set_aspect("equal")
+    axis.tick_params(labelsize=7)
+    return shown
+
+
+def _local(found: MissingForce, m: Missing) -> tuple[np.ndarray, np.ndarray]:
+    """(along the normal [V], along warp and weft [V, 2]) of the most certain stretch, in share of the weight."""
+    window, _ = m.strongest
+    x, uv = m.x[window].numpy(), found.uv.numpy()
+    corners, place = x[found.faces.numpy()], uv[found.faces.numpy()]
+    sides = np.stack([place[:, 1] - place[:, 0], place[:, 2] - place[:, 0]], -1)  # columns in the pattern
+    gradient = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], -1) @ np.linalg.inv(sides)
+    tangent = np.zeros((len(x), 3, 2))
+    np.add.at(tangent, found.faces.numpy().ravel(), np.repeat(gradient, 3, axis=0))
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    normal = np.cross(tangent[..., 0], tangent[..., 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    force = m.force[window].numpy() / found.weight
+    return np.einsum("vc,vc->v", force, normal), np.einsum("vc,vck->vk", force, tangent)
 
 
 def _maps(evidence: Evidence) -> list[np.ndarray]:

@@ -48,6 +48,9 @@ def _evidence(answer: Diagnosis) -> list[str]:
         _image(pictures.screening(found.steps[0].screened if found.steps else found.screened)),
         "<h2>What is left</h2>" if found.steps else "<h2>All hypotheses</h2>",
         _table(found.screened),
+        "<h2>Lack of fit</h2>",
+        _left(answer.content["lack_of_fit"]),
+        *_missing(answer),
         "<h2>What these motions can tell apart</h2>",
         _image(pictures.isolability(answer)),
         "<h2>Parameters of the model</h2>",
@@ -80,6 +83,29 @@ def _table(rows: list[Row]) -> str:
         body.append("".join(f"<td>{html.escape(c)}</td>" for c in cells))
     heads = "".join(f"<th>{h}</th>" for h in head)
     return f"<table><tr>{heads}</tr>{''.join(f'<tr>{row}</tr>' for row in body)}</table>"
+
+
+def _left(rows: list[dict[str, Any]]) -> str:
+    """What remains, by motion and kind of data, beside what a right model would leave; lacking rows in bold."""
+    body = ""
+    for r in rows:
+        scale, unit = {"m": (1e3, "mm"), "N": (1e3, "mN"), "N m": (1e3, "mN m")}[r["unit"]]
+        numbers = [f"{scale * r[key]:.2f}" for key in ("left", "expected", "numerics")]
+        cells = [r["motion"], r["kind"], *numbers, unit, f"{r['ratio']:.2f}", f"{r['p']:.2g}"]
+        tag = "th" if r["lacking"] else "td"
+        body += f"<tr>{''.join(f'<{tag}>{html.escape(c)}</{tag}>' for c in cells)}</tr>"
+    head = ("motion", "data", "left", "a right model leaves", "of which numerics", "", "ratio", "chance")
+    return f"<table><tr>{''.join(f'<th>{h}</th>' for h in head)}</tr>{body}</table>"
+
+
+def _missing(answer: Diagnosis) -> list[str]:
+    if answer.missing is None:
+        return []
+    return [
+        "<h2>The force that is missing</h2>",
+        "<p>Beside the model and its causes, where and when it is the surest in each motion. Names no cause.</p>",
+        _image(pictures.missing_force(answer.missing)),
+    ]
 
 
 def _parameters(found: dict[str, Any]) -> str:

@@ -12,12 +12,14 @@ from .._files import write_text
 from ..errors import InvalidInput
 from ..recordings import Recording
 from .base_model import base_model, together
-from .evidence import Progress, setting_of
+from .evidence import Progress, Setting, setting_of
 from .gate import check
 from .hypotheses import catalogue
 from .keeping import kept_in
+from .missing import missing_force
 from .model_file import save_model
 from .report import write_report
+from .residual import learn_residual
 from .stepwise import search
 from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
@@ -65,7 +67,17 @@ def diagnose(
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     answer = judge(search(model, setting, asked, progress), setting.names)
+    if any(row["lacking"] for row in answer.content["lack_of_fit"]):
+        answer = _beyond(answer, answer.found.setting, progress)
     return replace(answer, content=answer.content | {"plan_hash": plan, "model": EXTENDED})
+
+
+def _beyond(answer: Diagnosis, setting: Setting, progress: Progress) -> Diagnosis:
+    """With what can be said of what no known cause explains."""
+    missing = missing_force(answer.found.end, setting, progress=progress)
+    residual = learn_residual(answer.found.end, setting, progress)
+    content = answer.content | {"missing_force": missing.as_dict(), "residual": residual.as_dict()}
+    return replace(answer, content=content, missing=missing, residual=residual)
 
 
 def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Path:
@@ -75,6 +87,7 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
     """
     folder.mkdir(parents=True, exist_ok=True)
     if answer.searched is not None:
-        save_model(folder / EXTENDED, answer.model, together(recordings), answer.found.end.covariance)
+        residual = answer.residual.model if answer.residual is not None and answer.residual.terms else None
+        save_model(folder / EXTENDED, answer.model, together(recordings), answer.found.end.covariance, residual)
     write_report(answer, folder)
     return write_text(folder / RESULT, json.dumps(answer.content, indent=1, allow_nan=False) + "\n")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from ..errors import SimulationDiverged, UnstableStep
 from .approach import approach
 from .branches import unstable, without
-from .comparison import Gain, Predicted, compare, predict
+from .comparison import Gain, Predicted, compare, predict, telling
 from .evidence import Progress, Setting, staged
 from .fitting import Fitted, fit, renoised
 from .noise import Noise, fit_noise, floor_of, unfitted
@@ -21,7 +21,7 @@ TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 2  # steps of the likelier ones among them
 CLEAR = 4.0  # log density below which two models predict alike
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
-LACKING = 1e-3  # m: slow errors beyond this are not only a sensor's
+MUCH = 50.0  # chi^2, of a cause that is worth fitting
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 
 
@@ -33,6 +33,7 @@ class Candidate:
     fitted: Fitted
     predicted: Predicted
     gain: Gain  # over the model without it
+    alone: set[str]  # the motion that alone tells of it, if any
 
     @property
     def hypothesis(self) -> Hypothesis:
@@ -62,7 +63,13 @@ class Found:
     floor: float  # m, of a cell: what repetitions differ by, else what the sensor does
     sensor: float  # m, of a cell: noise and slow errors
     repeats: Repeats | None  # None: no episode repeats another
-    left_out: float  # share of cells that jump between shapes
+    setting: Setting  # without the cells that jump between shapes
+
+    @property
+    def left_out(self) -> float:
+        """Share of the cells that jump."""
+        jumping = sum(map(len, self.setting.unstable or ()))
+        return jumping / (jumping + len(self.end.white.value))
 
 
 def search(
@@ -70,19 +77,29 @@ def search(
 ) -> Found:
     """Causes one after the other, until none is both present and useful on motions held out."""
     near, before = approach(model, setting, staged(progress, "from the data sheet"))
-    current = start = fit(near, setting, hypotheses, progress=staged(progress, "base model"), before=before)
+    start = fit(near, setting, hypotheses, progress=staged(progress, "base model"), before=before)
     jumping = unstable(start, setting, staged(progress, "folds that turn over"))
-    left_out = sum(map(len, jumping)) / len(start.white.value)
-    if left_out:
-        setting, current = replace(setting, unstable=jumping), without(start, jumping)
-        start = current
+    if any(map(len, jumping)):
+        setting, start = replace(setting, unstable=jumping), without(start, jumping)
+    return extend(start, setting, hypotheses, progress)
+
+
+def extend(
+    start: Fitted,
+    setting: Setting,
+    hypotheses: Sequence[Hypothesis],
+    progress: Progress = lambda _: None,
+    tried: int = TRIED,
+) -> Found:
+    """As ``search``, from a fit that was asked about the hypotheses; each step fits the ``tried`` likeliest anew."""
+    current = start
     steps: list[Step] = []
     while True:
         screened = screen(current)
-        likely = _likely(current, screened)
+        likely = _likely(screened)
         if not likely or len(steps) == MOST:
             break
-        step = _step(current, setting, likely, screened, progress)
+        step = _step(current, setting, likely[:tried], screened, progress)
         if step is None:
             break
         steps.append(step)
@@ -91,23 +108,21 @@ def search(
         current = fit(step.best.fitted.model, setting, left, FURTHER, now, before=start.evidence)
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     screened = screen(current)
-    last, sensor = predict(current, setting.names), floor_of(current.evidence, current.noise)
+    alone = {name for step in steps for name in step.best.alone}
+    last, sensor = predict(current, setting.names, alone), floor_of(current.evidence, current.noise)
     repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
     floor = sensor if repeated is None else repeated.rms
-    first = predict(renoised(start, current.noise), setting.names)
+    first = predict(renoised(start, current.noise), setting.names, alone)
     whole = compare(first, last, floor) if steps else None
-    return Found(start, current, steps, screened, whole, floor, sensor, repeated, left_out)
+    return Found(start, current, steps, screened, whole, floor, sensor, repeated, setting)
 
 
-def _likely(current: Fitted, screened: Sequence[Row]) -> list[Row]:
-    """What is present by slopes; where the fit is lacking and nothing is, all that could matter.
+def _likely(screened: Sequence[Row]) -> list[Row]:
+    """What is present by slopes, and what would gain much though it is small by them.
 
-    A large effect bends the fitted parameters so far that slopes there no longer ask for it.
+    A large effect bends the fitted parameters so far that slopes there ask for less of it than there is.
     """
-    present = [row for row in screened if row.decision == "present"]
-    if present or float(current.noise.level[0]) < LACKING:
-        return present
-    return [row for row in screened if row.decision != "unresolvable" and row.forward > 0]
+    return [r for r in screened if r.decision == "present" or (r.gain > MUCH and r.forward > 0 and r.visible)]
 
 
 def _pruned(
@@ -118,7 +133,8 @@ def _pruned(
         name = step.best.hypothesis.name
         without = staged(progress, f"without {name}")
         less = fit(current.model.without(name), setting, (), 1, without, current.noise, current.evidence)
-        gain = compare(predict(less, setting.names), predict(current, setting.names), 0.0)
+        alone = step.best.alone
+        gain = compare(predict(less, setting.names, alone), predict(current, setting.names, alone), 0.0)
         if _worthwhile(gain):
             continue
         steps = [s for s in steps if s is not step]
@@ -131,7 +147,7 @@ def _step(
     current: Fitted, setting: Setting, likely: Sequence[Row], screened: list[Row], progress: Progress
 ) -> Step | None:
     fits: list[tuple[Row, Fitted]] = []
-    for row in likely[:TRIED]:
+    for row in likely:
         trial = staged(progress, f"trying {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
@@ -144,12 +160,14 @@ def _step(
     tried = _compared(current, fits, setting.names, current.noise)
     first = max(tried, key=lambda c: c.gain.density)
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
-    tried = _compared(current, fits, setting.names, fit_noise(first.fitted.evidence))
+    noise = fit_noise(first.fitted.evidence)
+    tried = _compared(current, fits, setting.names, noise)
     useful = [c for c in tried if _useful(c)]
     if not useful:
         return None
     best = max(useful, key=lambda c: c.gain.density)
-    rivals = [c for c in useful if c is not best and _rival(c, best)]
+    alike = lambda c: predict(renoised(c.fitted, noise), setting.names, best.alone)  # noqa: E731
+    rivals = [c for c in useful if c is not best and _rival(c, alike(c), best)]
     return Step(best, tried, rivals, screened)
 
 
@@ -168,10 +186,12 @@ def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> li
 
 def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise) -> list[Candidate]:
     """Each fit beside the model without it, on motions held out."""
-    before, out = predict(renoised(current, noise), names), []
+    before, out = renoised(current, noise), []
     for row, found in fits:
-        predicted = predict(renoised(found, noise), names)
-        out.append(Candidate(row, found, predicted, compare(before, predicted, 0.0)))
+        after = renoised(found, noise)
+        alone = telling(after, names)
+        predicted = predict(after, names, alone)
+        out.append(Candidate(row, found, predicted, compare(predict(before, names, alone), predicted, 0.0), alone))
     return out
 
 
@@ -184,9 +204,9 @@ def _worthwhile(gain: Gain) -> bool:
     return worth and gain.ci95[0] > 0
 
 
-def _rival(c: Candidate, best: Candidate) -> bool:
+def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
     """Predicts about as well: the paired difference is not clear."""
     if c.hypothesis.effect == best.hypothesis.effect:
         return False
-    over = compare(c.predicted, best.predicted, 0.0)
+    over = compare(predicted, best.predicted, 0.0)
     return over.density < CLEAR or over.ci95[0] < 0

@@ -7,17 +7,18 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ..errors import InvalidInput
-from .cells import SEEN
 from .classes import alike
 from .comparison import Gain
-from .evidence import Evidence
 from .gate import Fault
+from .lacking import Left, lack_of_fit
+from .missing import MissingForce
+from .residual import Residual
 from .stepwise import Found, Step
 from .world import Model
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 NORMAL = 1.96
-ROUGH = 5e-4  # m: slow errors of position cells beyond this are a lack of fit
+COARSE = 3e-3  # m, that the finer mesh leaves of the difference between both: causes hide behind more
 OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
 
 
@@ -32,11 +33,15 @@ class Diagnosis:
             episode cannot be believed, and nothing was simulated).
         content: all of it, as diagnosis.json has it.
         searched: the search; None of invalid data.
+        missing: the force that is missing, where the fit is lacking.
+        residual: a force that was learned for what stays unexplained.
     """
 
     verdict: Verdict
     content: dict[str, Any]
     searched: Found | None
+    missing: MissingForce | None = None
+    residual: Residual | None = None
 
     @property
     def found(self) -> Found:
@@ -63,8 +68,9 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
     """The answer of a search over episodes with these motions."""
     causes = [_cause(found, step) for step in found.steps]
     rows = found.screened
-    lacking = _lack_of_fit(found)
-    verdict = _verdict(found, causes, lacking)
+    left = lack_of_fit(found.end, names)
+    lacking = any(row.lacking for row in left)
+    verdict = _verdict(found, causes, left)
     content = {
         "verdict": verdict,
         "causes": causes,
@@ -78,7 +84,9 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
         "gain": _gain(found),
         "also_unexplained": bool(causes) and lacking,
         "floor": _floor(found),
-        "lack_of_fit": {"slow_errors": _slow(found), "numerics": _numerics(found.end.evidence), "unit": "m"},
+        "lack_of_fit": [row.as_dict() for row in left],
+        "missing_force": None,
+        "residual": None,
         "next_experiment": None,
         "parameters": _parameters(found),
         "warnings": _warnings(found, names),
@@ -89,18 +97,22 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
 
 def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
     """The answer where episodes cannot be believed: what is wrong with them."""
-    lists: dict[str, Any] = {key: [] for key in ("causes", "ruled_out", "undecided", "unresolvable", "warnings")}
-    none = dict.fromkeys(("gain", "lack_of_fit", "next_experiment", "model"))
+    lists: dict[str, Any] = {
+        key: [] for key in ("causes", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "warnings")
+    }
+    none = dict.fromkeys(("gain", "missing_force", "residual", "next_experiment", "model"))
     said = [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults]
     content = {**lists, **none, "verdict": "invalid_data", "also_unexplained": False, "parameters": {}}
     return Diagnosis("invalid_data", {**content, "faults": said, "motions": list(names)}, None)
 
 
-def _verdict(found: Found, causes: Sequence[dict[str, Any]], lacking: bool) -> Verdict:
+def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left]) -> Verdict:
     if causes:
         return "identified" if all(not c["rivals"] and len(c["class"]) == 1 for c in causes) else "ambiguous"
-    if lacking:
-        return "numerics" if _numerics(found.end.evidence) > 0.5 * _slow(found) else "unexplained"
+    if any(row.lacking for row in left):
+        return "unexplained"
+    if max((row.numerics for row in left if row.unit == "m"), default=0.0) > COARSE:
+        return "numerics"
     undecided = [r for r in found.screened if r.decision == "present"]
     return "inconclusive" if undecided else "adequate"
 
@@ -172,21 +184,6 @@ def _parameters(found: Found) -> dict[str, Any]:
     }
 
 
-def _slow(found: Found) -> float:
-    return float(found.end.noise.level[0])
-
-
-def _numerics(evidence: Evidence) -> float:
-    """m, RMS that the finer mesh is expected to leave of the difference between both."""
-    squares = [n[c.block < SEEN].square().sum() for n, c in zip(evidence.numerics, evidence.cells, strict=True)]
-    count = sum(int((c.block < SEEN).sum()) for c in evidence.cells)
-    return float(sum(squares) / count) ** 0.5 / 3
-
-
-def _lack_of_fit(found: Found) -> bool:
-    return _slow(found) > ROUGH
-
-
 def _warnings(found: Found, names: Sequence[str]) -> list[str]:
     out = []
     for p, c in zip(found.end.model.parameters, found.end.model.values.tolist(), strict=True):
@@ -235,6 +232,7 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
     out += [f"{f['episode']}: {f['what']}. To do: {f['remedy']}." for f in content.get("faults", ())]
     if content["also_unexplained"]:
         out.append("Something beyond these causes remains unexplained.")
+    out += _lacking(content)
     for label, key in (
         ("Too small to matter, or of a sign that makes no sense", "ruled_out"),
         ("Undecided", "undecided"),
@@ -244,3 +242,31 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
     if content["unresolvable"]:
         out.append(f"Cannot be seen in these data: {', '.join(r['effect'] for r in content['unresolvable'])}.")
     return [*out, *(f"Warning: {text}." for text in content["warnings"])]
+
+
+def _lacking(content: dict[str, Any]) -> list[str]:
+    """Where the fit is lacking, and what force would mend it."""
+    rows = [row for row in content["lack_of_fit"] if row["lacking"]]
+    if not rows:
+        return []
+    seen = ", ".join(f"{r['kind']} of {r['motion']} ({r['ratio']:.1f} times what is expected)" for r in rows)
+    out = [f"Lacking: {seen}."]
+    missing = content["missing_force"] or {"motions": []}
+    for m in (m for m in missing["motions"] if m["sure"]):
+        where = ", ".join(f"{1e3 * c:.0f}" for c in m["at"])
+        size = sum(c * c for c in m["pressure"]) ** 0.5 / missing["weight"]
+        out.append(
+            f"  A force of {100 * size:.0f} % of the weight is missing in {m['motion']}, the surest about "
+            f"({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
+        )
+    return out + _residual(content["residual"])
+
+
+def _residual(found: dict[str, Any] | None) -> list[str]:
+    """What a learned force does; no cause."""
+    if found is None or not found["terms"]:
+        return []
+    gain, terms = found["gain"], found["terms"]
+    told = "; ".join(f"{t['told']} ({abs(t['coefficient']):.2g} {t['unit']})" for t in terms)
+    before, after = 1e3 * gain["rms_before"], 1e3 * gain["rms_after"]
+    return [f"  A force that {told} would mend {before:.2f} to {after:.2f} mm on motions held out. It names no cause."]

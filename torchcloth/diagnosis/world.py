@@ -35,11 +35,14 @@ class World:
 
     def simulated(self, episode: Episode, dt: float | None = None) -> Frames:
         """What happens, whoever looks on."""
-        driven = episode
-        for motion in self.motions:
-            driven = motion(driven)
         with torch.no_grad():
-            return frames_of(Replay(self.cloth)(driven, dt))
+            return frames_of(Replay(self.cloth)(self.driven(episode), dt))
+
+    def driven(self, episode: Episode) -> Episode:
+        """The episode with what the robot really does."""
+        for motion in self.motions:
+            episode = motion(episode)
+        return episode
 
     def seen(self, frames: Frames, episode: Episode) -> Frames:
         """What an observer has of what happens."""

@@ -11,6 +11,7 @@ from .friction import BendingFriction, ShearFriction
 from .gravity import Gravity
 from .grip_slip import GripSlip
 from .hem import LineMass
+from .residual import ResidualForce
 from .rest_shape import RestShape
 from .saturating import SaturatingBending
 from .viscous import KelvinVoigt
@@ -29,6 +30,7 @@ __all__ = [
     "KelvinVoigt",
     "LineMass",
     "MassDamping",
+    "ResidualForce",
     "RestShape",
     "SaturatingBending",
     "ShearFriction",

@@ -45,7 +45,7 @@ class KelvinVoigt(AbstractEffect):
         """Resolve the triangles, and the bound on their spectrum."""
         device, dtype = self.viscosity.raw.device, torch.get_default_dtype()
         self.triangles.bind(mesh, device)
-        bound = mesh.vertex_area * 3 * _largest(mesh.shape_gradient)
+        bound = mesh.vertex_area * 3 * largest_strain_rate(mesh.shape_gradient)
         self.bound = torch.as_tensor(bound, dtype=dtype, device=device).unsqueeze(-1)
         return self
 
@@ -65,7 +65,7 @@ class KelvinVoigt(AbstractEffect):
         return mass.new_zeros(()), c.amax() * (self.bound / mass).amax()
 
 
-def _largest(gradient: np.ndarray) -> float:
+def largest_strain_rate(gradient: np.ndarray) -> float:
     """Largest eigenvalue [1/m^2] of |E'|^2 over the triangles, in the velocities of their corners."""
     gx, gy = gradient[..., 0], gradient[..., 1]
     zero = np.zeros_like(gx)

@@ -96,7 +96,7 @@ def identify(
         resume: go on where a fit with this journal was stopped; the result is what it would have been, bit by bit.
         refine: correct the result for the coarseness of the mesh, by one simulation on a mesh twice as fine, and widen
             its errors by what that leaves open (see ``finer.py``). ``fit["mesh_step"]`` has the largest correction in
-            standard errors. Not where the motion is chaotic.
+            standard errors. Not where the motion is chaotic, and not together with ``profile``.
         on_progress: called with (iteration, chamfer, values, share of the frames that were used) after every iteration;
             chamfer is NaN if nothing was seen.
 
@@ -113,6 +113,8 @@ def identify(
     episodes_in = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not episodes_in:
         raise InvalidInput("recordings", got="none", expected="at least one episode")
+    if refine and profile:
+        raise InvalidInput("profile", got="refine as well", expected="one of them: a profile is that of the given mesh")
     if refine:
         finer_cloth(cloth)  # refuses now what it would refuse at the end
     names = default_parameters(cloth) if parameters is None else list(parameters)

@@ -140,7 +140,7 @@ class Corrected(Objective):
 
     def simulate(self, raw: Tensor, i: int) -> Frames:
         """The episode as it is seen."""
-        frames = _joined([frames_of(out) for out in self.rollouts(raw)])
+        frames = joined([frames_of(out) for out in self.rollouts(raw)])
         for p in self.placed[i]:
             frames = p.nuisance.see(frames, raw[p.where].to(frames.x), self.episodes[i])
         return frames
@@ -190,7 +190,7 @@ class Corrected(Objective):
             spread = torch.tensor(index)
             full = lambda d, at=spread: d.new_zeros(len(raw), *d.shape[1:]).index_copy(0, at, d)  # noqa: E731
             ways.append(each(frames_of(way), full))
-        return _joined(parts), _joined(ways)
+        return joined(parts), joined(ways)
 
 
 class _Window(nn.Module):
@@ -218,7 +218,7 @@ class _Window(nn.Module):
         return self.cloth(state, episode.motion, times, dt=dt)
 
 
-def _joined(parts: Sequence[Frames]) -> Frames:
+def joined(parts: Sequence[Frames]) -> Frames:
     """Windows one after the other; each begins with the frame that the one before ended with."""
     names = parts[0].wrench
 

@@ -18,10 +18,12 @@ from ...effects import (
     KelvinVoigt,
     LineMass,
     MassDamping,
+    ResidualForce,
     RestShape,
     SaturatingBending,
     ShearFriction,
 )
+from ...effects.residual import Coefficients as Residual
 from ..lowering import Lowering, Unfused
 from . import bending
 
@@ -70,6 +72,19 @@ def _shear_friction(low: Lowering, name: str, effect: ShearFriction, c: Any) -> 
     t.stress(after[2:])
 
 
+def _residual(low: Lowering, name: str, effect: ResidualForce, c: Residual) -> None:
+    t = low.triangles
+    if c.drags:
+        none = t.loop.load(low.number(0.0))
+        laws = [none if part is None else t.parameter(part) for part in c[:4]]
+        t.push("local_drag", *t.x, *t.v, *laws, t.area)
+    if c.strain_rate is not None:
+        t.stress(t.loop.call("kelvin_voigt", t.surface[:6], *t.v, t.shape, t.parameter(c.strain_rate)))
+    if c.bend is not None:
+        sheet = low.sheet(effect.sheet)
+        sheet.moment(sheet.loop.call("scaled3", sheet.loop.load(low.parameter(c.bend)), sheet.curvature))
+
+
 def _nothing(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
     """It acts through the vertices' mass, the material's rest shape, or in a grasp, alone."""
 
@@ -86,6 +101,7 @@ _EFFECTS: dict[type, Callable[[Lowering, str, Any, Any], None]] = {
     KelvinVoigt: _kelvin_voigt,
     LineMass: _nothing,
     MassDamping: _mass_damping,
+    ResidualForce: _residual,
     RestShape: _nothing,
     SaturatingBending: bending.saturating,
     ShearFriction: _shear_friction,

@@ -27,6 +27,29 @@ struct AirDrag {
     }
 };
 
+// Positions and velocities of the corners; across, across2, along, along2; area -> forces on the corners.
+// effects/residual.py
+struct LocalDrag {
+    static constexpr const char* name = "local_drag";
+    static constexpr int inputs = 23, outputs = 9;
+    static constexpr auto fixed = bits(22, 1);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto x0 = r.vec(), x1 = r.vec(), x2 = r.vec(), a = r.vec(), b = r.vec(), c = r.vec();
+        const T across = r.number(), across2 = r.number(), along = r.number(), along2 = r.number(), area = r.number();
+        const auto v = (1.0 / 3) * (a + b + c);
+        const auto normal = cross(x1 - x0, x2 - x0);
+        const auto n = (1.0 / sqrt(dot(normal, normal))) * normal;
+        const T speed = dot(v, n);
+        const auto beside = v - speed * n;
+        const T press = (across + across2 * abs(speed)) * speed, slide = along + along2 * safe_norm(beside);
+        const auto part = ((-1.0 / 3) * area) * (press * n + slide * beside);
+        Write<T> w{out};
+        w.vec(part), w.vec(part), w.vec(part);
+    }
+};
+
 // Mass of the air per area, n, J, area -> a corner's third of it, along the normal only. effects/added_mass.py
 struct AddedMass {
     static constexpr const char* name = "added_mass";
@@ -87,6 +110,6 @@ struct KelvinVoigt {
 
 }  // namespace
 
-TC_KERNELS(effect_kernels, AirDrag, AddedMass, Weight, MassDamping, KelvinVoigt)
+TC_KERNELS(effect_kernels, AirDrag, LocalDrag, AddedMass, Weight, MassDamping, KelvinVoigt)
 
 }  // namespace tc

@@ -1,0 +1,93 @@
+"""A force planted in a known part of the cloth for a known time, on another mesh, is found there and then."""
+
+import pytest
+import sheets
+import torch
+
+from torchcloth.diagnosis import base_model, fit, lack_of_fit, missing_force, setting_of
+from torchcloth.diagnosis.pushes import Pushes, pushed
+from torchcloth.effects import BodyForce
+from torchcloth.identification.replays import frames_of
+from torchcloth.pose.objective import joined
+
+BEGIN, END = 6, 9  # frames of 0.05 s
+PUSH = torch.tensor([0.0, 2.0, 0.0])  # m/s^2 on the lower left quarter: 0.4 Pa, a fifth of the weight
+STRETCH = 0.15  # s
+
+
+def quarter(uv):
+    return (uv < 0.5 * sheets.SIDE).all(1)
+
+
+def pushed_for_a_while(world, episode):
+    """The world, with the force between two frames."""
+    uv = torch.as_tensor(world.cloth.mesh.uv)
+    force = {"planted": BodyForce(torch.where(quarter(uv)[:, None], PUSH, 0.0))}
+    during = world.with_cloth(force).cloth
+    state, parts = world.cloth.state(episode.initial), []
+    for cloth, first, last in (
+        (world.cloth, 0, BEGIN),
+        (during, BEGIN, END),
+        (world.cloth, END, len(episode.times) - 1),
+    ):
+        if first == 0:
+            state = cloth.settle(state, episode.motion, start=float(episode.times[0]), duration=0.3)
+        out = cloth(state, episode.motion, episode.times[first : last + 1])
+        state = out.state
+        parts.append(frames_of(out))
+    return joined(parts)
+
+
+def fitted(recordings):
+    model = base_model(recordings[0])
+    setting = setting_of(model, recordings)
+    return fit(model, setting), setting
+
+
+@pytest.fixture(scope="module")
+def planted():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    still = lambda world: world  # noqa: E731
+    recordings = [sheets.recorded("slow", still, 0, pushed_for_a_while), sheets.recorded("fast", still, 1)]
+    yield fitted(recordings)
+    torch.set_default_dtype(before)
+
+
+def test_it_is_found_there_and_then(planted):
+    found, setting = planted
+    answer = missing_force(found, setting, window=STRETCH)
+    there, elsewhere = answer.parts
+    window, vertex = there.strongest
+    begin, end = BEGIN / sheets.RATE, END / sheets.RATE
+    assert float(there.windows[window].mean()) == pytest.approx((begin + end) / 2, abs=STRETCH)
+    assert bool(quarter(answer.uv)[vertex])
+    force = there.force[window, vertex]
+    assert float(force[1] / force.norm()) > 0.9
+    assert float(there.certainty[window, vertex]) > 5
+    total = answer.total(there)[window]
+    assert float(total[1]) == pytest.approx(0.2 * float(PUSH[1]) * sheets.SIDE**2 / 4, rel=0.25)
+    assert float(elsewhere.certainty.max()) < 0.5 * float(there.certainty.max())
+    told = answer.as_dict()["motions"]
+    assert [t["sure"] for t in told] == [True, False]
+
+
+def test_the_fit_lacks_there_and_not_in_the_other_motion(planted):
+    found, setting = planted
+    lacking = {(row.motion, row.kind): row.lacking for row in lack_of_fit(found, setting.names)}
+    assert lacking["slow", "points"]
+    assert not lacking["fast", "points"]
+
+
+def test_pushes_are_those_of_a_body_force(planted):
+    """A constant push from the first frame on, against finite differences of a simulation with that force."""
+    found, setting = planted
+    world, episode = found.model.world(), setting.episodes[0]
+    last, count = len(episode.times) - 1, len(setting.rest)
+    push = torch.zeros(2, 1, count, 3)
+    push[:, 0, :, 1] = 1.0
+    frames, moved = pushed(world, episode, Pushes([(0, 5), (5, last)], push))
+    step = 1e-3
+    beside = world.with_cloth({"more": BodyForce(step * push[0, 0])}).frames(episode)
+    difference = (beside.x - frames.x) / step
+    assert torch.allclose(moved.x[0], difference, atol=1e-2 * float(difference.abs().max()))

@@ -1,0 +1,104 @@
+"""A residual force against the effects that it generalises, and against what must not matter to it."""
+
+import pytest
+import torch
+
+import torchcloth as tc
+from torchcloth import functional
+from torchcloth.effects import AirDrag, KelvinVoigt, MassDamping, ResidualForce
+from torchcloth.effects.residual import LAWS, PLACES, describe
+from torchcloth.errors import InvalidInput
+from torchcloth.types import Moment
+
+DENSITY = 0.2  # kg/m^2
+
+
+@pytest.fixture(autouse=True)
+def _values_only():
+    with torch.no_grad():
+        yield
+
+
+def cloth_with(effect, n=5):
+    mesh = tc.meshes.rectangle(0.3, 0.2, resolution=(n, n))
+    return tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), DENSITY, {"it": effect}, contact=None)
+
+
+def force(cloth, x, v):
+    """[V, 3] N."""
+    model = cloth.model()
+    effect, c = model.effects["it"]
+    found = effect.force(c, Moment(x, v, functional.surface(model.geometry, x, v), model.mass))
+    if effect.acts_on == "vertices":
+        return found
+    corners = torch.as_tensor(cloth.mesh.faces)
+    out = torch.zeros_like(x)
+    for k in range(3):
+        out = out.index_add(-2, corners[:, k], found / 3)
+    return out
+
+
+def moving(cloth):
+    """Turned rigidly, so that rest areas are areas, and moving unevenly."""
+    torch.manual_seed(1)
+    x = cloth.rest_state().x
+    turn = torch.linalg.qr(torch.randn(3, 3)).Q
+    return x @ turn.mT, torch.randn(x.shape)
+
+
+@pytest.mark.parametrize(
+    ("terms", "known"),
+    [
+        ({"across2": 0.5 * 1.204 * 1.3, "along2": 0.5 * 1.204 * 0.1}, lambda: AirDrag(1.3, 1.204, 0.1)),
+        ({"strain_rate": 0.7}, lambda: KelvinVoigt(0.7)),
+    ],
+)
+def test_laws_are_those_of_known_effects(terms, known):
+    own, other = cloth_with(ResidualForce(terms)), cloth_with(known())
+    x, v = moving(own)
+    assert torch.allclose(force(own, x, v), force(other, x, v), rtol=1e-9, atol=1e-14)
+
+
+def test_across_and_along_make_up_linear_drag():
+    """On a sheet that moves as a whole: the area's share of a triangle is the vertex's mass over the density."""
+    own, other = cloth_with(ResidualForce({"across": 0.4, "along": 0.4})), cloth_with(MassDamping(0.4 / DENSITY))
+    x, _ = moving(own)
+    v = torch.tensor([0.3, -0.2, 0.5]).expand_as(x)
+    assert torch.allclose(force(own, x, v), force(other, x, v), rtol=1e-9, atol=1e-14)
+
+
+def test_mass_is_added_and_weighs():
+    heavier = cloth_with(ResidualForce({"mass": 0.1}))
+    bare = cloth_with(ResidualForce({"across": 0.0}))
+    assert torch.allclose(heavier.model().mass, 1.5 * bare.model().mass)
+
+
+@pytest.mark.parametrize("place", [p for p in PLACES if p])
+def test_places_do_not_know_the_mesh(place):
+    totals = []
+    for n in (13, 25):
+        mesh = tc.meshes.rectangle(0.3, 0.2, resolution=(n, n))
+        corner = [int(((mesh.uv - [0.0, 0.2]) ** 2).sum(1).argmin())]
+        effect = ResidualForce({f"mass@{place}": 0.1}, corner)
+        cloth = tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), DENSITY, {"it": effect}, contact=None)
+        totals.append(float(cloth.model().mass.sum()) - DENSITY * 0.06)
+    assert totals[0] > 1e-4
+    assert totals[0] == pytest.approx(totals[1], rel=0.03)
+
+
+@pytest.mark.parametrize("law", [law for law in LAWS if law not in ("mass", "bend")])
+def test_what_opposes_takes_power(law):
+    cloth = cloth_with(ResidualForce({law: 1.0}))
+    x, v = moving(cloth)
+    assert float((force(cloth, x, v) * v).sum()) < 0
+
+
+def test_it_says_what_it_does_and_refuses_what_it_does_not_know():
+    assert (
+        describe("across2@edge", 0.4)
+        == "opposes motion across the cloth, growing as speed squared, near the free edges"
+    )
+    assert describe("mass", -0.1).startswith("the opposite of")
+    for terms in ({}, {"magnetism": 1.0}, {"across@hem": 1.0}):
+        with pytest.raises(InvalidInput, match="terms"):
+            ResidualForce(terms)

@@ -1,0 +1,99 @@
+"""What remains when a search has ended, beside what a right model would leave.
+
+A right model leaves K = S + M M', where S are white noise and slow errors of a level that is known beforehand, the
+sensor's (``SENSOR``) and what the finer mesh leaves of the difference between both meshes, and M what differs from
+episode to episode and what the fitted numbers are uncertain by. Of the cells r, S K^-1 r is left over. Its mean square
+is held against the one to be expected, tr(S K^-1 S) / n, for every motion and kind of data. For a right model the
+quotient follows a chi^2 with the effective number of cells for degrees of freedom (Satterthwaite 1946), which says
+what cannot be chance. Two engines never agree exactly, so what counts as a lack of fit must also be ``TOLERATED`` times
+as large as expected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .cells import NAMES, SEEN, Cells
+from .fitting import Fitted
+from .noise import Noise
+from .screening import NUMERICS
+
+SENSOR = {"points": 5e-4, "edges": 8e-4, "markers": 3e-4, "force": 1e-2, "torque": 1e-3}  # m, N, N m: slow errors
+TOLERATED = 2.0  # times the expected RMS
+RARE = 0.01  # probability of a right model's leaving more
+
+
+class Left(NamedTuple):
+    """One kind of data in one motion."""
+
+    motion: str
+    kind: str
+    unit: str
+    left: float  # RMS of the cells, without what nuisances and uncertain parameters explain
+    expected: float  # the same of a right model
+    numerics: float  # share of ``expected`` that the finer mesh leaves of the difference between both
+    cells: float  # effective number of independent ones
+    p: float  # of a right model's leaving as much
+
+    @property
+    def ratio(self) -> float:
+        """Of what is left to what was to be expected."""
+        return self.left / self.expected
+
+    @property
+    def lacking(self) -> bool:
+        """More than a right model would leave."""
+        return self.ratio > TOLERATED and self.p < RARE
+
+    def as_dict(self) -> dict[str, Any]:
+        """As diagnosis.json has it."""
+        return {**self._asdict(), "ratio": self.ratio, "lacking": self.lacking}
+
+
+def lack_of_fit(found: Fitted, names: Sequence[str]) -> list[Left]:
+    """One row for each kind of data in each of the motions ``names``."""
+    return [row for k, name in enumerate(names) for row in _episode(found, k, name)]
+
+
+def _episode(found: Fitted, k: int, name: str) -> list[Left]:
+    cells, stds = found.evidence.cells[k], found.evidence.stds[k]
+    uncertain = cells.jacobian[:, : found.evidence.own] @ torch.linalg.cholesky(found.covariance)
+    moved = torch.cat([uncertain, cells.jacobian[:, -len(stds) :] * stds], 1)
+    level, numerics = reference(cells, found.evidence.numerics[k])
+    one = moved.new_ones(moved.shape[1])
+    still = level.covariance(cells, moved[:, :0], one[:0])
+    kept = torch.linalg.solve(still + moved @ moved.mT, still).mT  # S K^-1
+    left, covariance = kept @ cells.value, kept @ still
+    rows = []
+    for b in cells.block.unique().tolist():
+        here = cells.block == b
+        own = covariance[here][:, here]
+        count, total, squares = int(here.sum()), float(own.trace()), float(own.square().sum())
+        freedom = total**2 / squares
+        seen = float(left[here].square().sum())
+        rows.append(
+            Left(
+                name,
+                NAMES[b],
+                "m" if b < SEEN else "N" if NAMES[b] == "force" else "N m",
+                (seen / count) ** 0.5,
+                (total / count) ** 0.5,
+                float(numerics[b]),
+                freedom,
+                float(torch.special.gammaincc(torch.tensor(freedom / 2), torch.tensor(freedom * seen / total / 2))),
+            )
+        )
+    return rows
+
+
+def reference(cells: Cells, difference: Tensor) -> tuple[Noise, Tensor]:
+    """(slow errors of a right model, those of numerics alone [blocks]); ``difference`` [C] between both meshes."""
+    numerics = torch.zeros(len(NAMES), dtype=cells.value.dtype)
+    for b in cells.block.unique().tolist():
+        numerics[b] = NUMERICS * difference[cells.block == b].square().mean().sqrt()
+    sensor = torch.tensor([SENSOR[name] for name in NAMES], dtype=numerics.dtype)
+    return Noise((sensor**2 + numerics**2).sqrt()), numerics

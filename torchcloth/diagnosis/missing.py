@@ -1,0 +1,213 @@
+"""Where, when and in which direction a force is missing.
+
+A pressure that is smooth over the fabric and constant within ``WINDOW`` is asked for beside the model: the likeliest
+one under a prior whose size the data set (weak-constraint variational assimilation, Tremolet 2006), beside the noise
+that a right model would leave (``lacking.reference``). Tangents along all directions cost about as much as the
+adjoint's twenty passes of conjugate gradients, and give its errors too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..identification.replays import Frames
+from ..pose.modes import modes_of
+from ..pose.objective import windows_of
+from .cells import cells_of
+from .evidence import Progress, Setting, aligned
+from .fitting import Fitted, prior_precision
+from .lacking import reference
+from .pushes import Pushes, pushed
+
+WINDOW, MODES = 0.2, 8  # s, fields for each axis
+LEVELS = 10 ** torch.linspace(-2.5, 1.5, 41, dtype=torch.float64)  # m/s^2, prior standard deviation of a field
+SWEEPS = 15  # of learning the size window by window
+GRAVITY = 9.81  # m/s^2
+SURE = 4.0  # standard errors; a chi of three numbers exceeds it once in 900 places
+
+
+class Missing(NamedTuple):
+    """The missing force in one motion."""
+
+    motion: str
+    windows: Tensor  # [W, 2] s
+    force: Tensor  # [W, V, 3] Pa, world axes
+    std: Tensor  # [W, V, 3] Pa
+    x: Tensor  # [W, V, 3] m, where the cloth is in the middle of each
+
+    @property
+    def certainty(self) -> Tensor:
+        """[W, V] standard errors by which the force differs from zero."""
+        return (self.force / self.std).norm(dim=-1)
+
+    @property
+    def strongest(self) -> tuple[int, int]:
+        """(window, vertex) where it is the most certain."""
+        place = int(self.certainty.argmax())
+        return place // self.force.shape[1], place % self.force.shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class MissingForce:
+    """In all motions.
+
+    Attributes:
+        parts: one for each episode.
+        gain: log-likelihood of a missing force over none.
+        weight: Pa, of the cloth.
+        uv: [V, 2] m, the pattern.
+        faces: [F, 3].
+        area: [V] m^2.
+    """
+
+    parts: Sequence[Missing]
+    gain: float
+    weight: float
+    uv: Tensor
+    faces: Tensor
+    area: Tensor
+
+    def total(self, m: Missing) -> Tensor:
+        """[W, 3] N, sum over the cloth."""
+        return (m.force * self.area[:, None]).sum(1)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of diagnosis.json: where it is the most certain, motion by motion."""
+        return {"weight": self.weight, "gain": self.gain, "motions": [self._told(m) for m in self.parts]}
+
+    def _told(self, m: Missing) -> dict[str, Any]:
+        w, v = m.strongest
+        certain = float(m.certainty[w, v])
+        return {
+            "motion": m.motion,
+            "rms": float(m.force.square().sum(-1).mean().sqrt()),
+            "at": self.uv[v].tolist(),
+            "from": float(m.windows[w, 0]),
+            "to": float(m.windows[w, 1]),
+            "pressure": m.force[w, v].tolist(),
+            "total": self.total(m)[w].tolist(),
+            "standard_errors": certain,
+            "sure": certain > SURE,
+        }
+
+
+def missing_force(
+    found: Fitted,
+    setting: Setting,
+    window: float = WINDOW,
+    modes: int = MODES,
+    progress: Progress = lambda _: None,
+) -> MissingForce:
+    """The force beside a fitted model that the episodes of its setting ask for.
+
+    Args:
+        found: a model at its solution.
+        setting: the episodes that it was fitted to.
+        window: of time [s], in which the force is constant.
+        modes: smooth fields over the fabric for each axis.
+        progress: called with one line for each episode.
+    """
+    world = found.model.world()
+    fields = modes_of(world.cloth.mesh, modes).fields
+    parts = [_asked(found, setting, k, fields, window, progress) for k in range(len(setting.episodes))]
+    gain, answer = _likeliest(parts, found, 3 * modes)
+    area = torch.as_tensor(world.cloth.mesh.vertex_area).to(fields)
+    density = world.cloth.model().mass.to(fields)[:, 0] / area  # kg/m^2 where it pushes
+    told, first = [], found.evidence.own
+    for name, p, e in zip(setting.names, parts, setting.episodes, strict=True):
+        here = slice(first, first := first + 3 * modes * len(p.windows))
+        force, std = (density[:, None] * f for f in _spread(answer.mean[here], answer.covariance[here, here], fields))
+        told.append(Missing(name, torch.stack([e.times[list(w)] for w in p.windows]), force, std, p.x))
+    weight = GRAVITY * float((density * area).sum() / area.sum())
+    return MissingForce(told, gain, weight, setting.rest[:, :2], torch.as_tensor(world.cloth.mesh.faces), area)
+
+
+class _Asked(NamedTuple):
+    """Of one episode, in units in which what a right model leaves is white."""
+
+    value: Tensor  # [C]
+    slopes: Tensor  # [C, own + W * M * 3]
+    windows: list[tuple[int, int]]
+    x: Tensor  # [W, V, 3]
+
+
+def _asked(found: Fitted, setting: Setting, k: int, fields: Tensor, window: float, progress: Progress) -> _Asked:
+    e = setting.episodes[k]
+    progress(f"{e.name}: missing force")
+    windows = windows_of(e.times, window)
+    frames, moved = pushed(found.model.world(), e, Pushes(windows, modal(windows, fields)), setting.dt)
+    middle = torch.tensor([(first + last) // 2 for first, last in windows])
+    value, slopes = whitened_beside(found, setting, k, frames, moved)
+    return _Asked(value, slopes, windows, frames.x[middle])
+
+
+def modal(windows: Sequence[tuple[int, int]], fields: Tensor) -> Tensor:
+    """[W, W * M * 3, V, 3]: every field [M, V] along every axis in every window."""
+    count = len(windows)
+    unit = torch.einsum("mv,ab->mavb", fields, torch.eye(3).to(fields)).flatten(0, 1)
+    return torch.einsum("wu,kvb->wukvb", torch.eye(count).to(fields), unit).flatten(1, 2)
+
+
+def whitened_beside(found: Fitted, setting: Setting, k: int, frames: Frames, moved: Frames) -> tuple[Tensor, Tensor]:
+    """(residuals [C], slopes [C, own + K]) along the model's own coordinates, then along ``moved``; both whitened."""
+    e, cells, stds = setting.episodes[k], found.evidence.cells[k], found.evidence.stds[k]
+    coarse = cells_of(frames, moved, e, setting.sheet, setting.rest)
+    slopes = aligned(cells.key, coarse.key, coarse.jacobian)
+    noise, _ = reference(cells, found.evidence.numerics[k])
+    root = torch.linalg.cholesky(noise.covariance(cells, cells.jacobian[:, -len(stds) :], stds))
+    both = torch.cat([cells.value[:, None], cells.jacobian[:, : found.evidence.own], slopes], 1)
+    both = torch.linalg.solve_triangular(root, both, upper=False)
+    return both[:, 0], both[:, 1:]
+
+
+class _Found(NamedTuple):
+    """Numbers of the model, then of every episode's windows, fields and axes."""
+
+    log: Tensor  # likelihood, up to a constant
+    mean: Tensor
+    covariance: Tensor
+
+
+def _likeliest(parts: Sequence[_Asked], found: Fitted, each: int) -> tuple[float, _Found]:
+    """(gain in log-likelihood over no force, the force).
+
+    First one size for all that is pushed, then one for each window, of ``each`` numbers (MacKay 1992): most are still.
+    """
+    own = found.evidence.own
+    pushes = torch.block_diag(*(p.slopes[:, own:] for p in parts))
+    slopes = torch.cat([torch.cat([p.slopes[:, :own] for p in parts]), pushes], 1)
+    known = prior_precision(found.model)
+    information, asked = slopes.mT @ slopes, slopes.mT @ torch.cat([p.value for p in parts])
+    asked[:own] += known * found.model.point
+    ask = lambda sizes: _posterior(information, asked, known, sizes.repeat_interleave(each))  # noqa: E731
+    count = pushes.shape[1] // each
+    tried = [ask(level.expand(count)) for level in LEVELS]
+    best = max(range(len(tried)), key=lambda i: float(tried[i].log))
+    answer, sizes = tried[best], LEVELS[best].expand(count)
+    for _ in range(SWEEPS):
+        spread = answer.mean[own:] ** 2 + answer.covariance.diagonal()[own:]
+        sizes = spread.reshape(count, each).mean(1).sqrt().clamp(min=float(LEVELS[0]))
+        answer = ask(sizes)
+    return float(answer.log - ask(1e-3 * LEVELS[0].expand(count)).log), answer
+
+
+def _posterior(information: Tensor, asked: Tensor, known: Tensor, sizes: Tensor) -> _Found:
+    root = torch.linalg.cholesky(information + torch.diag(torch.cat([known, sizes**-2])))
+    mean = -torch.cholesky_solve(asked[:, None], root)[:, 0]
+    log = -0.5 * asked @ mean - root.diagonal().log().sum() - sizes.log().sum()
+    return _Found(log, mean, torch.cholesky_inverse(root))
+
+
+def _spread(mean: Tensor, covariance: Tensor, fields: Tensor) -> tuple[Tensor, Tensor]:
+    """(mean, standard error) [W, V, 3] m/s^2 from numbers of windows, fields and axes."""
+    each = 3 * len(fields)
+    numbers = mean.reshape(-1, len(fields), 3)
+    blocks = torch.stack([covariance[s : s + each, s : s + each] for s in range(0, len(mean), each)])
+    blocks = blocks.reshape(-1, len(fields), 3, len(fields), 3)
+    variance = torch.einsum("wmana,mv,nv->wva", blocks, fields, fields)
+    return torch.einsum("wma,mv->wva", numbers, fields), variance.clamp(min=1e-30).sqrt()

@@ -1,0 +1,190 @@
+"""What is left over: local laws without a cause of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .._math import dot, safe_norm
+from ..errors import InvalidInput
+from ..meshes import Mesh
+from ..parameters import PhysicalParameter
+from ..types import Moment
+from ._bent import BentSheet
+from ._triangles import Triangles
+from .base import AbstractEffect, Amplitude
+from .viscous import largest_strain_rate
+
+
+class Law(NamedTuple):
+    """One way to push."""
+
+    unit: str
+    typical: float
+    told: str  # what a positive coefficient does
+
+
+LAWS = {
+    "across": Law("Pa s/m", 0.5, "opposes motion across the cloth, in proportion to speed"),
+    "across2": Law("Pa s^2/m^2", 0.7, "opposes motion across the cloth, growing as speed squared"),
+    "along": Law("Pa s/m", 0.2, "opposes motion along the cloth, in proportion to speed"),
+    "along2": Law("Pa s^2/m^2", 0.3, "opposes motion along the cloth, growing as speed squared"),
+    "mass": Law("kg/m^2", 0.1, "is weight and inertia"),
+    "strain_rate": Law("N s/m", 0.5, "opposes stretching and shearing, in proportion to their speed"),
+    "bend": Law("N m", 1e-4, "opposes bending"),
+}
+PLACES = {"": "everywhere", "edge": "near the free edges", "grip": "near the grippers", "inside": "far from the edges"}
+
+
+def describe(term: str, coefficient: float) -> str:
+    """What a term does, in words; the opposite where the coefficient is negative."""
+    law, _, place = term.partition("@")
+    sign = "" if coefficient > 0 else "the opposite of what "
+    return f"{sign}{LAWS[law].told}, {PLACES[place]}"
+
+
+class Coefficients(NamedTuple):
+    """Of every law, per triangle [..., E, 1] or, of mass and bend, per vertex [..., V, 1]; None: no such term."""
+
+    across: Tensor | None = None
+    across2: Tensor | None = None
+    along: Tensor | None = None
+    along2: Tensor | None = None
+    mass: Tensor | None = None
+    strain_rate: Tensor | None = None
+    bend: Tensor | None = None
+
+    @property
+    def drags(self) -> bool:
+        """Whether any law of the velocity is there."""
+        return any(part is not None for part in self[:4])
+
+
+class ResidualForce(AbstractEffect):
+    """A sum of local laws, each alone or weighed by where on the fabric it acts. It describes, and names no cause.
+
+    All are frame-indifferent and know of the mesh only how far a place is from the free edges and the grippers, d and
+    g over the largest d: "@edge" weighs by exp(-3 d), "@inside" by d^2, "@grip" by exp(-g^2). Per rest area:
+
+        across: -c v_n n                across2: -c |v_n| v_n n      along: -c v_t      along2: -c |v_t| v_t
+        mass: c more of it, with weight where there is ``Gravity``   strain_rate: as ``KelvinVoigt``
+        bend: moment c times the curvature
+
+    Args:
+        terms: coefficient [SI] by term, "LAW" or "LAW@PLACE", of ``LAWS`` and ``PLACES``; either sign.
+        held: vertices that grippers hold.
+
+    Raises:
+        InvalidInput: no term, or one that does not exist.
+    """
+
+    amplitudes = {"strength": Amplitude("of the law", 1.0, 0.1, ("air", "mass_damping", "membrane_viscosity"))}
+
+    def __init__(self, terms: Mapping[str, float], held: Sequence[int] = ()) -> None:
+        super().__init__()
+        known = [f"{law}@{place}".rstrip("@") for law in LAWS for place in PLACES]
+        unknown = [term for term in terms if term not in known]
+        if unknown or not terms:
+            raise InvalidInput(
+                "terms", got=", ".join(unknown) or "none", expected=f"LAW or LAW@PLACE, laws {', '.join(LAWS)}"
+            )
+        self.terms, self.held = tuple(terms), tuple(held)
+        self.strength = PhysicalParameter(
+            torch.tensor(list(terms.values()), dtype=torch.get_default_dtype()), "SI", "real", name="residual force"
+        )
+        self.triangles, self.sheet = Triangles(), BentSheet()
+        for name in ("weights", "on_triangles", "share", "bound"):
+            self.register_buffer(name, torch.zeros(0), persistent=False)
+        self.weights: Tensor  # [places, V, 1] -
+        self.on_triangles: Tensor  # [places, E, 1] -
+        self.share: Tensor  # [V, 1] m^2
+        self.bound: Tensor  # [V, 1] -: over mass, bounds the damping rate per unit viscosity
+
+    def bind(self, mesh: Mesh) -> ResidualForce:
+        """Resolve places and stencils."""
+        like = {"dtype": torch.get_default_dtype(), "device": self.strength.raw.device}
+        self.triangles.bind(mesh, self.strength.raw.device)
+        self.sheet.bind(mesh, device=self.strength.raw.device)
+        weights = torch.as_tensor(_places(mesh, self.held), **like)
+        self.weights = weights.unsqueeze(-1)
+        self.on_triangles = weights[:, torch.as_tensor(mesh.faces)].mean(-1, keepdim=True)
+        self.share = torch.as_tensor(mesh.vertex_area, **like).unsqueeze(-1)
+        self.bound = self.share * 3 * largest_strain_rate(mesh.shape_gradient)
+        return self
+
+    def coefficients(self) -> Coefficients:
+        """Each law's, place by place."""
+        strength, sums = self.strength.value, {}
+        for k, term in enumerate(self.terms):
+            law, _, place = term.partition("@")
+            weight = (self.weights if law in ("mass", "bend") else self.on_triangles)[list(PLACES).index(place)]
+            part = strength[..., k, None, None] * weight
+            sums[law] = sums[law] + part if law in sums else part
+        return Coefficients(**sums)
+
+    def mass(self, c: Coefficients) -> Tensor | None:
+        """On the vertices."""
+        return None if c.mass is None else c.mass * self.share
+
+    def force(self, c: Coefficients, now: Moment) -> Tensor:
+        """Of all laws but mass."""
+        total = torch.zeros_like(now.x)
+        if c.drags:
+            total = self._dragged(c, now)
+        if c.strain_rate is not None:
+            f1, f2 = now.surface.f1, now.surface.f2
+            rate1, rate2 = self.triangles.columns(now.v)
+            e11, e22, e12 = dot(f1, rate1), dot(f2, rate2), 0.5 * (dot(f1, rate2) + dot(f2, rate1))
+            viscous = c.strain_rate
+            total = total + self.triangles.force(viscous * (e11 * f1 + e12 * f2), viscous * (e12 * f1 + e22 * f2))
+        if c.bend is not None:
+            bent = self.sheet.see(now.x)
+            total = total + self.sheet.force(bent, c.bend * bent.curvature)
+        return total
+
+    def _dragged(self, c: Coefficients, now: Moment) -> Tensor:
+        surface = now.surface
+        across, along, across2, along2 = (0.0 if p is None else p for p in (c.across, c.along, c.across2, c.along2))
+        speed = dot(surface.v, surface.n)
+        beside = surface.v - speed * surface.n
+        push = -(across + across2 * speed.abs()) * speed * surface.n - (along + along2 * safe_norm(beside)) * beside
+        shares = torch.cat([surface.area * push / 3] * 3, dim=-2)
+        index = self.triangles.corners.unsqueeze(-1).expand(shares.shape)
+        return torch.zeros_like(now.x).expand(*shares.shape[:-2], -1, 3).scatter_add(-2, index, shares)
+
+    def rates(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """Of a sheet at rest: the laws of speed squared are 0 there."""
+        largest = lambda part: mass.new_zeros(()) if part is None else part.abs().amax()  # noqa: E731
+        slowed = (largest(c.across) + largest(c.along)) * (self.share / mass).amax()
+        slowed = slowed + largest(c.strain_rate) * (self.bound / mass).amax()
+        return largest(c.bend) * self.sheet.bend_rate(mass), slowed
+
+    def extra_repr(self) -> str:
+        """One line of the data sheet."""
+        values = self.strength.value.detach().flatten().tolist()
+        return ", ".join(f"{term}={value:.3g}" for term, value in zip(self.terms, values, strict=False))
+
+
+def _places(mesh: Mesh, held: Sequence[int]) -> np.ndarray:
+    """[places, V] weights in [0, 1]."""
+    x, edges = mesh.vertices, mesh.boundary_edges
+    edge = _distances(x, x[edges[:, 0]], x[edges[:, 1]]) if len(edges) else np.full(len(x), np.inf)
+    size = edge.max() if len(edges) else float(np.ptp(x, axis=0).max())
+    near = np.exp(-3 * edge / size)
+    inside = np.minimum(edge / size, 1.0) ** 2
+    grip = np.zeros(len(x))
+    if len(held):
+        patch = x[list(held)]
+        grip = np.exp(-((_distances(x, patch, patch) / size) ** 2))
+    return np.stack([np.ones(len(x)), near, grip, inside])
+
+
+def _distances(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[V] m, from the nearest of the segments from ``a`` to ``b`` [N, 3]."""
+    along, offset = b - a, x[:, None] - a
+    s = np.clip((offset * along).sum(-1) / np.maximum((along * along).sum(-1), 1e-30), 0, 1)
+    return np.linalg.norm(offset - s[..., None] * along, axis=-1).min(1)
