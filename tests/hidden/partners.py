@@ -50,7 +50,7 @@ SINGLES = {
     "elas.ortho": Partner(("elas.ortho",)),
     "elas.shear": Partner(("elas.shear",)),
     "elas.stiffen": Partner(("elas.stiffen",)),
-    "rest.curl": Partner(("rest.curl",), signs=BOTH, sign=0.0, axis="warp"),
+    "rest.curl": Partner(("rest.curl",), signs=BOTH, axis="warp"),
     "rest.shrink": Partner(("rest.shrink",), signs=BOTH, axis="weft"),
     "rest.shrink_u": Partner(("rest.shrink",), signs=BOTH, axis="warp"),
     "rest.skew": Partner(("rest.skew",), signs=BOTH),
