@@ -242,7 +242,7 @@ def _lacking(content: dict[str, Any]) -> list[str]:
         where = ", ".join(f"{1e3 * c:.0f}" for c in m["at"])
         size = sum(c * c for c in m["pressure"]) ** 0.5 / missing["weight"]
         out.append(
-            f"  A force of {100 * size:.0f} % of the weight is missing in {m['motion']}, the surest about "
+            f"  A force of {100 * size:.0f} % of the weight is missing in {m['motion']}, about "
             f"({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
         )
     return out + _residual(content["residual"])
