@@ -7,6 +7,7 @@ import torch
 from torchcloth.diagnosis import base_model, fit, lack_of_fit, missing_force, setting_of
 from torchcloth.diagnosis.pushes import Pushes, pushed
 from torchcloth.effects import BodyForce
+from torchcloth.identification.replays import frames_of
 from torchcloth.pose.objective import joined
 
 BEGIN, END = 6, 9  # frames of 0.05 s
@@ -33,7 +34,7 @@ def pushed_for_a_while(world, episode):
             state = cloth.settle(state, episode.motion, start=float(episode.times[0]), duration=0.3)
         out = cloth(state, episode.motion, episode.times[first : last + 1])
         state = out.state
-        parts.append(sheets.frames_of(out))
+        parts.append(frames_of(out))
     return joined(parts)
 
 
