@@ -20,6 +20,7 @@ from twins import doubles, first, twin
 
 from torchcloth import recordings
 from torchcloth.cli import main
+from torchcloth.errors import InvalidInput
 
 COMMAND = [sys.executable, "-m", "torchcloth.cli"]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "80", "PYTHONUNBUFFERED": "1"}
@@ -75,6 +76,10 @@ WRONG = {
     "no iterations": (["--iterations", "0"], "iterations; got 0; expected at least 1"),
     "resume of nothing": (["--resume"], "resume; got no .*progress; expected what an interrupted fit left"),
     "negative contact": (["--contact", "-0.01"], "spacing"),
+    "field of nothing": (["--fields", "stiffness"], "--fields; got 'stiffness'; expected one of .*youngs_modulus"),
+    "fields and values": (["--fields", "youngs_modulus", "--fit", "air.normal"], "--fit; got a value, with --fields"),
+    "contrast of nothing": (["--contrast", "2"], "--contrast; got 2.0; expected --fields beside it"),
+    "impossible contrast": (["--fields", "youngs_modulus", "--contrast", "-1"], "contrast; got .*-1"),
 }
 
 
@@ -233,6 +238,43 @@ def test_no_name_and_no_number_of_the_table_is_cut(done):
         assert name in process.stdout
     table = process.stdout.split("Parameters")[1].split("Distance")[0]
     assert not re.search(r"\S…|…\S", table)  # "a … b" is an interval, "4.0…" a lost number
+
+
+@pytest.mark.parametrize(
+    ("arguments", "refines"),
+    [
+        ([], True),
+        (["--no-refine"], False),
+        (["--method", "lbfgs"], True),
+        (["--method", "adam"], False),
+        (["--stop", "paper"], False),
+        (["--profile", "air.normal"], False),
+        (["--method", "adam", "--refine"], True),
+    ],
+)
+def test_a_fit_corrects_for_its_mesh_unless_that_makes_no_sense(monkeypatch, folder, tmp_path, arguments, refines):
+    asked = {}
+
+    def identify(*_, **options):
+        asked.update(options)
+        raise InvalidInput("enough", got="this", expected="nothing more")
+
+    monkeypatch.setattr("torchcloth.identification.identify", identify)
+    assert main(["identify", str(folder), "--out", str(tmp_path / "out"), *arguments]) == 2
+    assert asked["refine"] is refines
+
+
+def test_fields_have_a_value_for_each_triangle(folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = ["--fields", "youngs_modulus", "--iterations", "2", "--start", "youngs_modulus=5e4"]
+    assert main(["identify", str(folder), "--out", str(out), *arguments]) == 0
+    printed = capsys.readouterr().out
+    content = json.loads((out / "fields.json").read_text())
+    values = content["fields"]["youngs_modulus"]["values"]
+    assert re.search(rf"{len(values)} triangles", printed)
+    assert min(values) < max(values)
+    assert content["fit"]["chamfer_after"] < content["fit"]["chamfer_before"]
+    assert {path.name for path in out.iterdir()} == {"fields.json", "fields.png"}
 
 
 def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(folder, tmp_path, done):

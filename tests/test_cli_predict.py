@@ -71,7 +71,7 @@ def test_another_episode(swing, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["predict", str(fit), str(other), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    for word in ("by parameters", "null: carried rigidly", "predicted"):
+    for word in ("by parameters", "together:", "of them are", "null: carried rigidly", "predicted"):
         assert word in printed
     content = json.loads((out / "prediction.json").read_text())
     assert content["measured"]["rms"] < 0.5 * content["measured"]["rms_null"]
@@ -100,7 +100,7 @@ def test_wrong_input_is_one_line(strips, swing, tmp_path, capsys):
         (strips, "--angle", "30", "--length", "-1"): "length; got -1.0",
         (strips, table, "--angle", "30"): "SEEN; got a table and a strip's numbers; expected one of them",
         (strips, other): "FIT; got tension.json with an episode to predict; expected identification.json",
-        (fit, "--angle", "30"): "FIT; got identification.json with a strip to predict; expected tension.json",
+        (fit, "--angle", "30"): "with a strip to predict; expected tension.json; --angle and tables need a fit of tens",
         (fit,): "SEEN; got none; expected an episode",
         (fit, tmp_path / "no"): "no",
     }

@@ -111,13 +111,14 @@ def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
     except ValueError:
         raise unreadable(folder / "study.json") from None
     other = {key: found.get(key) for key in settings if found.get(key) != settings[key]}
-    if other:
-        raise InvalidInput(
-            "--out",
-            got=f"a study with {', '.join(f'{key} {value}' for key, value in other.items())}",
-            expected=", ".join(f"{key} {settings[key]}" for key in other),
-            remedy="use the same settings, or another folder",
-        )
+    if not other:
+        return
+    remedy = "use the same settings, or another folder"
+    if not found.keys() & settings.keys():
+        raise InvalidInput("--out", got=f"{folder}, which holds another study", expected="a folder", remedy=remedy)
+    holds = ", ".join(f"{key} {value}" if key in found else f"no {key}" for key, value in other.items())
+    expected = ", ".join(f"{key} {settings[key]}" for key in other)
+    raise InvalidInput("--out", got=f"{folder}, which holds a study with {holds}", expected=expected, remedy=remedy)
 
 
 def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:

@@ -32,12 +32,14 @@ class Size:
     Attributes:
         nodes: vertices along the truth's sides; fit: along those of the recordings' mesh.
         free, table: motions in the air, and with one on a table.
+        bending: N m, of the fabric: a coarse mesh needs one that does not wrinkle.
     """
 
     nodes: int
     fit: int
     free: tuple[Plan, ...]
     table: tuple[Plan, ...]
+    bending: float = 6e-5
 
 
 _COMMON: tuple[Plan, ...] = (
@@ -48,8 +50,8 @@ _COMMON: tuple[Plan, ...] = (
     ("hang", 90.0, 2.0),
 )
 REDUCED = Size(21, 13, (*_COMMON, ("shake", 0.0, 1.5)), (*_COMMON, ("drag-fast", 0.0, 1.0)))
-_FEW: tuple[Plan, ...] = (("swing-fast", 0.0, 1.2), ("turn", 0.0, 2.5))
-SMALL = Size(15, 9, (*_FEW, ("stretch", 90.0, 2.0)), (*_FEW, ("drag-fast", 0.0, 1.2)))
+_FEW: tuple[Plan, ...] = (("swing-fast", 0.0, 1.3),)
+SMALL = Size(17, 9, (*_FEW, ("turn", 0.0, 3.0)), (*_FEW, ("drag-fast", 0.0, 1.3)), 5e-4)
 FOLDING = 1.3  # speed
 UNSEEN: Plan = ("swing", 45.0, 1.4)  # of no case
 
@@ -139,7 +141,7 @@ def case(seed: int, size: Size = REDUCED) -> Case:
     takes = tuple(_take(plan, parts.get("regrasp", 0.0), rng) for plan in parts.pop("plans"))
     parts.pop("regrasp", None)
     order = rng.permutation(len(takes))
-    given = {"nodes": size.nodes, "fabric": _fabric(rng), "said": _sheet(rng, 0.15)} | parts
+    given = {"nodes": size.nodes, "fabric": _fabric(size, rng), "said": _sheet(rng, 0.15)} | parts
     return Case(seed, family, size=size, takes=tuple(takes[k] for k in order), **given)
 
 
@@ -175,12 +177,12 @@ def _take(plan: Plan, regrasp: float, rng: np.random.Generator) -> Take:
     return Take(motion, float(heading), float(speed), own)
 
 
-def _fabric(rng: np.random.Generator) -> dict[str, float]:
+def _fabric(size: Size, rng: np.random.Generator) -> dict[str, float]:
     """Near the generator's: a sheet that is lighter and stiffer wrinkles at the size of any mesh."""
     return {
         "areal_density": 0.25 * float(np.exp(0.1 * rng.standard_normal())),
         "membrane_stiffness": 120.0 * float(np.exp(0.15 * rng.standard_normal())),
-        "bending_stiffness": 6e-5 * float(np.exp(0.15 * rng.standard_normal())),
+        "bending_stiffness": size.bending * float(np.exp(0.15 * rng.standard_normal())),
     }
 
 
@@ -193,11 +195,17 @@ def _sheet(rng: np.random.Generator, spread: float) -> dict[str, float]:
 STIFFNESSES = ("membrane_stiffness", "bending_stiffness")
 
 
-def _hide(name: str, share: float, rng: np.random.Generator, partners: dict[str, Partner]) -> tuple[Hidden, ...]:
+def _hide(
+    name: str,
+    share: float,
+    rng: np.random.Generator,
+    partners: dict[str, Partner],
+    headings: tuple[float, ...] = (0.0, 90.0, 180.0, 270.0),
+) -> tuple[Hidden, ...]:
     """An effect at a share of its typical amplitude, and what it needs to be felt."""
     own = partners[name]
     typical = CATALOGUE[name].typical if own.typical is None else own.typical
-    options = {"heading": float(rng.choice([0.0, 90.0, 180.0, 270.0]))} if own.headed else {}
+    options = {"heading": float(rng.choice(headings))} if own.headed else {}
     amplitude = share * typical * int(rng.choice(own.signs))
     return (*(Hidden(n, a) for n, a in own.beside), Hidden(name, amplitude, options, share))
 
@@ -238,10 +246,8 @@ def _double(rng, turn, slot, size):
 def _confounded(rng, turn, slot, size):
     kind = CONFOUNDED[(2 * turn + slot) % len(CONFOUNDED)]
     fast = size == SMALL
-    still = (("hang", 0.0, 1.0), ("drape", 0.0, 1.0), ("hang", 0.0, 1.4), ("drape", 0.0, 1.4))
     if kind == "tilt or wind":
-        name = str(rng.choice(["env.gravity_tilt", "air.wind"]))
-        found = {"effects": _hide(name, FULL, rng, SINGLES), "plans": still[: 2 if fast else 4]}
+        found = _hanging(rng)
     elif kind == "base or extrinsic":
         name = str(rng.choice(["robot.base", "obs.extrinsic"]))
         found = {"effects": _hide(name, MORE, rng, SINGLES), "plans": size.free}
@@ -267,6 +273,11 @@ def _fault(rng, turn, slot, size):
 
 def _next(rng, turn, slot, size):
     """As confounded; what is proposed is then done."""
+    return {"kind": "tilt or wind", **_hanging(rng)}
+
+
+def _hanging(rng):
+    """Across a sheet that hangs still, wind pushes as gravity does that leans."""
     name = str(rng.choice(["env.gravity_tilt", "air.wind"]))
     still = (("hang", 0.0, 1.0), ("drape", 0.0, 1.0), ("hang", 0.0, 1.4))
-    return {"kind": "tilt or wind", "effects": _hide(name, FULL, rng, SINGLES), "plans": still}
+    return {"effects": _hide(name, MORE, rng, SINGLES, (0.0, 180.0)), "plans": still}

@@ -148,24 +148,29 @@ def test_what_cannot_be_simulated_around_is_left_as_it_was():
 
 
 def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
-    """Each search begins where the last ended; a failure after a success ends the growth, two halvings refine it."""
+    """Each search begins where the last ended; a failure after a success ends the growth, two halvings refine it.
+
+    The longest is solved to the end.
+    """
     asked = []
 
     def motion(frames):
         return SimpleNamespace(times=torch.arange(frames) / 10.0, observed=frames)
 
-    def solved(objective, share, start, on_iterate):
-        asked.append((share, float(start)))
+    def solved(objective, share, start, on_iterate, tolerance):
+        asked.append((share, float(start), tolerance))
         part = SimpleNamespace(
             episodes=[SimpleNamespace(times=torch.arange(round(100 * share)) / 10.0, observed=round(100 * share))]
         )
-        checked = linearity.Checked(SimpleNamespace(raw=torch.tensor(share)), None, [], [])
+        final = gauss_newton.Iterate(torch.tensor(share), *[None] * 5)
+        checked = linearity.Checked(final, None, [], [])
         return (part, checked) if 0.12 < share < 0.45 else None
 
     monkeypatch.setattr(horizon, "_solved", solved)
     whole = SimpleNamespace(episodes=[motion(100)])
     found = horizon.within(whole, FAILED, torch.tensor(0.0), lambda it, o: False)
-    shares = [share for share, _ in asked]
-    assert shares == pytest.approx([0.1, 0.15, 0.22, 0.33, 0.5, 0.415, 0.4575])
-    assert [start for _, start in asked] == pytest.approx([0.0, 0.0, 0.15, 0.22, 0.33, 0.33, 0.415])
+    shares, starts, tolerances = zip(*asked, strict=True)
+    assert shares == pytest.approx([0.1, 0.15, 0.22, 0.33, 0.5, 0.415, 0.4575, 0.415])
+    assert starts == pytest.approx([0.0, 0.0, 0.15, 0.22, 0.33, 0.33, 0.415, 0.415])
+    assert tolerances == (*[1.0] * 7, 0.1)
     assert "42 of 100, were used" in found.checked.warnings[0]

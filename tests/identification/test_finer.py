@@ -7,8 +7,8 @@ import twins
 
 import torchcloth as tc
 from torchcloth.boundaries import Grasp
-from torchcloth.errors import InvalidInput
-from torchcloth.identification import identify
+from torchcloth.errors import InvalidInput, SimulationDiverged
+from torchcloth.identification import fit, identify
 from torchcloth.identification.finer import finer_cloth, finer_recording
 
 PAIR = ["youngs_modulus", "air.normal"]
@@ -34,12 +34,29 @@ def test_a_grip_holds_the_new_vertices_between_those_it_held():
     assert (held[:, 0] == 0).all()
 
 
-def test_fields_are_refused(model):
+def test_fields_are_refused_before_anything_is_computed(model, recording):
     model.material.youngs_modulus.raw.data = model.material.youngs_modulus.raw.data.expand(
         len(model.mesh.faces)
     ).clone()
     with pytest.raises(InvalidInput, match=r"finer mesh: material.youngs_modulus.*one number for all triangles"):
-        finer_cloth(model)
+        identify(model, recording, ["air.normal"], refine=True)
+
+
+def test_a_profile_is_that_of_the_given_mesh(model, recording):
+    with pytest.raises(InvalidInput, match="profile; got refine as well; expected one of them"):
+        identify(model, recording, PAIR, refine=True, profile=PAIR[:1])
+
+
+def test_a_finer_mesh_that_cannot_be_simulated_leaves_the_fit_and_says_so(model, brief, monkeypatch):
+    def torn(*_):
+        raise SimulationDiverged("the cloth is torn apart")
+
+    plain = identify(model, brief, ["youngs_modulus"], iterations=1)
+    monkeypatch.setattr(fit, "mesh_step", torn)
+    found = identify(model, brief, ["youngs_modulus"], iterations=1, refine=True)
+    assert found.parameters == plain.parameters
+    assert "mesh_step" not in found.fit
+    assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in found.warnings)
 
 
 def test_it_moves_towards_what_a_finer_mesh_finds(recording, model):

@@ -8,8 +8,8 @@ import torch
 import twins
 
 from torchcloth import recordings
-from torchcloth.errors import InvalidInput
-from torchcloth.identification import cloth_from, identify, replayed
+from torchcloth.errors import RecordingError
+from torchcloth.identification import cloth_from, fitted, identify, predict_episode, replayed
 from torchcloth.identification.saved import read_saved
 from torchcloth.transfer import Contact
 
@@ -55,5 +55,29 @@ def test_the_right_one_of_several_episodes_is_found(recording, brief, tmp_path):
         again = replayed(tmp_path, one)
         torch.testing.assert_close(again.frames, fit.frames_after[number], rtol=0, atol=1e-9)
         assert again.warning == ""
-    with pytest.raises(InvalidInput, match="a fit of another episode; got recording; expected recording or recording"):
-        replayed(tmp_path, twins.first(recording, 5))
+        assert again.fitted
+    again = replayed(tmp_path, twins.first(recording, 5))
+    assert not again.fitted
+    assert again.warning == ""
+
+
+@pytest.mark.parametrize("damage", ["a word", None, float("nan"), -1.0])
+def test_a_damaged_error_is_refused_by_all_that_read_it(pair, recording, tmp_path, damage):
+    """A prediction and a pose would take it for something else each."""
+    path = pair.save(tmp_path)
+    content = json.loads(path.read_text())
+    content["parameters"]["youngs_modulus"]["std"] = damage
+    path.write_text(json.dumps(content))
+    for read in (fitted, predict_episode, replayed):
+        with pytest.raises(RecordingError, match="does not say which model was fitted; got"):
+            read(path, recording)
+
+
+def test_a_value_that_cannot_be_is_refused_by_name(pair, recording, tmp_path):
+    path = pair.save(tmp_path)
+    content = json.loads(path.read_text())
+    content["model"]["values"]["youngs_modulus"] = -1.0
+    path.write_text(json.dumps(content))
+    for read in (fitted, predict_episode, replayed):
+        with pytest.raises(RecordingError, match=r"identification.json: .*got -1 Pa"):
+            read(path, recording)

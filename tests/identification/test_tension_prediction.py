@@ -165,7 +165,7 @@ def test_files_that_are_no_fit(fit, tmp_path):
     content = json.loads(path.read_text())
     for damage in ({}, {**content, "model": {}}, {**content, "model": {**content["model"], "covariance": [[1.0]]}}):
         path.write_text(json.dumps(damage))
-        with pytest.raises(RecordingError, match="does not say which law was fitted"):
+        with pytest.raises(RecordingError, match="does not say which model was fitted"):
             read_model(tmp_path)
     path.write_text("{")
     with pytest.raises(RecordingError, match="unreadable"):

@@ -218,10 +218,10 @@ def main() -> None:
     torch.set_num_threads(1)
     done = list(track(rows(source, options.out), "adapters", total=len(ADAPTERS)))
     console = Console(highlight=False)
-    console.width = max(console.width, 160)
-    table = Table(box=box.SIMPLE_HEAD)
+    console.width = 110
+    table = Table(box=box.SIMPLE_HEAD, leading=1, pad_edge=False)
     for heading in ("source", "became", "size", "rejected", "noise", "found", "not known"):
-        table.add_column(heading)
+        table.add_column(heading, no_wrap=heading in ("source", "became"))
     for row in done:
         table.add_row(*asdict(row).values())
     console.print(table)

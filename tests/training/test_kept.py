@@ -37,7 +37,7 @@ def test_nothing_is_written_before_a_case_is_finished(tmp_path):
 def test_other_settings_damage_and_files_are_refused(tmp_path):
     kept = Kept(tmp_path / "s", {"points": 3})
     kept.keep("a", {"x": 1})
-    with pytest.raises(InvalidInput, match=r"got a study with points 3; expected points 4"):
+    with pytest.raises(InvalidInput, match=r"which holds a study with points 3; expected points 4"):
         Kept(tmp_path / "s", {"points": 4})
     (tmp_path / "s" / "cases" / "a.json").write_text('{"x":')
     with pytest.raises(RecordingError, match=r"a\.json: unreadable.*delete it"):

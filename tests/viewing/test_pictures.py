@@ -178,6 +178,22 @@ def test_a_png_has_four_moments(film, tmp_path):
     assert (pixels[:, :200] != pixels[:, 600:]).any()
 
 
+def test_the_title_is_shown_once_and_the_colour_bar_at_the_end(film, tmp_path):
+    sheet = film.sheets["cloth"]
+    coloured = replace(film, sheets={"cloth": replace(sheet, values=np.ones(sheet.vertices.shape[:2], np.float32))})
+    stage = Stage(coloured, (400, 160))
+    whole, scene = stage.pixels(0), stage.scene
+    assert 320 < scene < 400
+    with Image.open(picture(coloured, tmp_path / "a.png", size=(400, 160))) as image:
+        pixels = np.asarray(image.convert("RGB"))
+    assert pixels.shape == (160, 3 * scene + 400, 3)
+    np.testing.assert_array_equal(pixels[:, :scene], whole[:, :scene])
+    last = pixels[:, 3 * scene :]
+    np.testing.assert_array_equal(last[:, scene:], whole[:, scene:])
+    assert (stage.pixels(5)[:30, :scene] != last[:30, :scene]).any()
+    np.testing.assert_array_equal(last, stage.pixels(5, titled=False))
+
+
 def test_one_frame_is_enough(film, tmp_path):
     still = film.take(np.array([2]))
     with Image.open(animate(still, tmp_path / "a.gif", size=(200, 160))) as gif:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from .folders import check_folder
+from .identify import PROGRESS, STOPPED
 
 
 def add(verbs: Any) -> None:
@@ -18,13 +19,15 @@ def add(verbs: Any) -> None:
     parser.add_argument("episodes", nargs="+", metavar="EPISODE", help="folders of one cloth's episodes")
     parser.add_argument("--model", metavar="MODEL", help="a .tcm file to start from (default: A-EP in vacuum)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result")
-    parser.set_defaults(run=_diagnose)
+    parser.add_argument("--resume", action="store_true", help="go on with a diagnosis that was stopped")
+    parser.set_defaults(run=_diagnose, stopped=STOPPED)
 
 
 def _diagnose(options: argparse.Namespace) -> int:
     import torch
 
     from .. import diagnosis
+    from ..identification.journal import clear
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
@@ -36,8 +39,11 @@ def _diagnose(options: argparse.Namespace) -> int:
     else:
         print(f"{len(episodes)} episodes: about a minute each on one core", flush=True)
         with _progress() as progress:
-            answer = diagnosis.diagnose(episodes, model, progress=progress)
+            answer = diagnosis.diagnose(
+                episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume
+            )
     path = diagnosis.write_diagnosis(answer, episodes, options.out)
+    clear(options.out / PROGRESS)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())
     written = (path.name, "report.html", answer.content["model"])
@@ -49,7 +55,7 @@ def _diagnose(options: argparse.Namespace) -> int:
 def _progress() -> Iterator[Callable[[str], None]]:
     """One line that changes on a terminal; in a log, a line for every stage."""
     if not sys.stderr.isatty():
-        yield lambda text: None if text.endswith("slopes") else print(text, flush=True)
+        yield lambda text: None if text.endswith("left") else print(text, flush=True)
         return
     from rich.console import Console
 

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
+from . import fields
 from .folders import check_folder
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
     from ..identification import Identification
+    from ..identification.fields import FieldFit
     from ..recordings import Recording
 
 DEMO = "bimanual_swing"
@@ -84,9 +86,13 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--profile", nargs="+", default=[], metavar="NAME", help="seek the interval by fitting the others beside it"
     )
     parser.add_argument(
-        "--refine", action="store_true", help="correct for the coarseness of the mesh (one run on a mesh twice as fine)"
+        "--refine",
+        action=argparse.BooleanOptionalAction,
+        help="correct for the coarseness of the mesh by one run on a mesh twice as fine (default; not with --profile, "
+        "or where --method or --stop follow the paper)",
     )
     parser.add_argument("--resume", action="store_true", help="go on where a stopped fit into DIR was")
+    fields.add(parser)
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -99,16 +105,30 @@ def _identify(options: argparse.Namespace) -> int:
     import torch
 
     from .. import recordings
+    from ..identification import Identification
+    from ..identification.journal import clear
 
     torch.set_default_dtype(torch.float64)  # sensitivities lose digits over thousands of substeps in float32
     torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
     check_folder(options.out)
+    fields.check(options, _defaults())
     episodes = [recordings.read(path) for path in options.episodes]
     cloth = _cloth(options, episodes[0])
     size = f"{len(episodes)} episode(s), {len(cloth.mesh.faces)} triangles"
     print(f"{size}, stable substep {cloth.stable_step():.3g} s with the start values")
+    if options.fields:
+        fields.spread_out(cloth, options.fields)
     fit = _fit(options, cloth, episodes)
-    return _report(options.out, fit, cloth, episodes)
+    if isinstance(fit, Identification):
+        return _report(options.out, fit, cloth, episodes)
+    clear(options.out / PROGRESS)
+    return fields.report(options.out, fit, cloth)
+
+
+def _defaults() -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    _add_options(parser)
+    return parser.parse_args([])
 
 
 def _cloth(options: argparse.Namespace, recording: Recording) -> Cloth:
@@ -156,7 +176,7 @@ def _priors(pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
     return out
 
 
-def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -> Identification:
+def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -> Identification | FieldFit:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from ..identification import identify
@@ -174,6 +194,8 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             if not progress.console.is_terminal:  # a log file shows a bar once, at the end
                 print(f"iteration {iteration}: {text}", flush=True)
 
+        if options.fields:
+            return fields.fit(options, cloth, episodes, options.out / PROGRESS, advance)
         return identify(
             cloth,
             episodes,
@@ -190,8 +212,15 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             nuisances=nuisances_of(options.nuisance),
             priors=_priors(options.prior),
             on_progress=advance,
-            refine=options.refine,
+            refine=_refines(options),
         )
+
+
+def _refines(options: argparse.Namespace) -> bool:
+    """As asked for; else where a search ends at the optimum, which the correction moves, and nothing is profiled."""
+    if options.refine is not None:
+        return options.refine
+    return options.method in ("gauss-newton", "lbfgs") and options.stop == "converged" and not options.profile
 
 
 def _report(folder: Path, fit: Identification, cloth: Cloth, recordings: list[Recording]) -> int:

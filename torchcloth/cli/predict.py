@@ -56,7 +56,8 @@ def _predict(options: argparse.Namespace) -> int:
     name = TENSION if of_table or (options.seen is None and known == [TENSION]) else RESULT
     if name not in known:
         what = "a strip" if of_table else "an episode"
-        raise InvalidInput("FIT", got=f"{known[0]} with {what} to predict", expected=name)
+        fits = "--angle and tables need a fit of tension tables" if of_table else "episodes need a fit of episodes"
+        raise InvalidInput("FIT", got=f"{known[0]} with {what} to predict", expected=name, remedy=fits)
     return (_of_strip if name == TENSION else _of_episode)(folder / name, out, options)
 
 
@@ -95,7 +96,8 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
     path = _write(out, found.as_dict())
     with atomically(out / "prediction.npz") as file:
         t, vertices, std = (part.numpy() for part in (found.episode.times, found.frames.x, found.std))
-        np.savez_compressed(file, t=t, vertices=vertices, std=std, faces=found.cloth.mesh.faces)
+        more = {"interval": found.interval.numpy(), "faces": found.cloth.mesh.faces}
+        np.savez_compressed(file, t=t, vertices=vertices, std=std, **more)
     picture = pictures.save_figure(prediction_report.predicted(found), out / "prediction.png")
     prediction_report.print_predicted(found)
     if is_fitted(fit, recording):

@@ -13,21 +13,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .cells import NAMES
 from .evidence import Evidence, Progress, Setting, gather
 from .fitting import prior_precision
-from .noise import FLOOR, Noise, whitened
+from .noise import unfitted, whitened
 from .world import Model
 
 SWEEPS = 2
-EXPECTED = 5.0  # slow errors over their least size: those of a model that is not fitted yet say nothing
 FARTHEST = 1.2  # widths, of one sweep
 THERE = 0.25  # widths, from which on slopes do
 
 
 def approach(model: Model, setting: Setting, progress: Progress = lambda _: None) -> tuple[Model, Evidence]:
     """(a model near the optimum, evidence whose nuisances' slopes may be used from there on)."""
-    noise = Noise(EXPECTED * torch.tensor([FLOOR[name] for name in NAMES], dtype=torch.float64))
     wide = [*(p.std for p in model.parameters), *(0.5 * abs(h.typical) for h in model.accepted)]
     width, before = torch.tensor(wide, dtype=torch.float64), None
     prior = prior_precision(model).sqrt()
@@ -35,7 +32,7 @@ def approach(model: Model, setting: Setting, progress: Progress = lambda _: None
         shifts = [(k, sign * w) for sign in (1.0, -1.0) for k, w in enumerate(width.tolist())]
         evidence = gather(model, setting, (), progress, before, shifts)
         before = before or evidence
-        white = whitened(evidence, noise)
+        white = whitened(evidence, unfitted())
         up, down = white.jacobian.chunk(2, dim=1)
         slope, bend = 0.5 * (up + down) * width, 0.5 * (up - down) * width
         u = _lowest(white.value, slope, bend, model.point * prior, width * prior)

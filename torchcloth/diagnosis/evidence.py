@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,8 +25,14 @@ from .world import Hypothesis, Model, World
 
 CLOCK, SHIFT, TURN, GRASP, RIM, TARE = 3e-3, 5e-4, 1e-3, 1.5e-3, 2e-3, 0.1  # standard deviations between episodes
 Progress = Callable[[str], None]
+Kept = Callable[[Sequence[object], Tensor, Callable[[], "Piece"]], "Piece"]  # (question, point, work) -> answer
 T = TypeVar("T")
 U = TypeVar("U")
+
+
+def simply(question: Sequence[object], point: Tensor, work: Callable[[], Piece]) -> Piece:
+    """Keeps nothing."""
+    return work()
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +46,8 @@ class Setting:
     rest: Tensor  # [V, 3] m, the pattern
     dt: float | None = None
     finer: Setting | None = None
+    unstable: tuple[Tensor, ...] = ()  # per episode, keys of cells that jump; empty: not looked for
+    kept: Kept = simply  # where finished episodes are kept
 
     @property
     def names(self) -> list[str]:
@@ -89,61 +99,142 @@ def gather(
 ) -> Evidence:
     """Simulate every episode at the model's point, beside it, and with each hypothesis at its typical amplitude.
 
-    The nuisances' slopes, which hardly depend on the point, are taken from ``before`` where that is given. ``shifts``
-    are (coordinate, step) of the points beside; None: a small step along each coordinate.
+    The nuisances' slopes, which hardly depend on the point, are taken from ``before`` where that is given. Hypotheses
+    that cannot be simulated in one of the episodes are left out. ``shifts`` are (coordinate, step) of the points
+    beside; None: a small step along each coordinate.
     """
-    shifts = _steps(model) if shifts is None else shifts
-    asked, trials = _simulable(model, setting, hypotheses, progress)
+    shifts = step_sizes(model) if shifts is None else list(shifts)
+    own, possible, pieces, began = len(shifts), list(hypotheses), [], time.monotonic()
+    for k, e in enumerate(setting.episodes):
+        progress(f"{e.name}, {k + 1} of {len(setting.episodes)}{_left(began, k, len(setting.episodes))}")
+        slopes = None if before is None else _known_slopes(before, k)
+        asked = [(h.name, h.typical) for h in possible]
+        question = [k, [h.name for h in model.accepted], asked, shifts, *(slopes or ())]
+        work = partial(_piece, model, setting, k, possible, slopes, shifts)
+        piece = setting.kept(question, model.point, work)
+        pieces.append((piece, possible))
+        possible = [h for h, able in zip(possible, piece.able.tolist(), strict=True) if able]
     cells, stds, numerics = [], [], []
-    for k, (e, fine) in enumerate(zip(setting.episodes, finer_residuals(model, setting), strict=True)):
-        progress(f"{e.name}: slopes")
-        base, own = _own(model, e, setting.dt, shifts)
-        moved = directions(base, [*own, *trials[k]], [*(s for _, s in shifts), *(h.typical for h in asked)])
-        if before is None:
-            other, std = _nuisances(model, base, e, setting.dt)
-            moved = _joined(moved, other)
+    for k, (piece, asked) in enumerate(pieces):
+        simulated = [h for h, able in zip(asked, piece.able.tolist(), strict=True) if able]
+        use = [*range(own), *(own + i for i, h in enumerate(simulated) if h in possible)]
+        use += range(own + len(simulated), piece.cells.jacobian.shape[1])
+        stable = ~torch.isin(piece.cells.key, setting.unstable[k]) if setting.unstable else slice(None)
+        found = Cells(*(column[stable] for column in piece.cells))
+        cells.append(found._replace(jacobian=found.jacobian[:, use]))
+        numerics.append(piece.numerics[stable])
+        stds.append(piece.std)
+    return Evidence(cells, own, possible, stds, numerics)
+
+
+def staged(progress: Progress, stage: str) -> Progress:
+    """The same, with what all lines are about in front."""
+    return lambda text: progress(f"{stage}: {text}")
+
+
+def _left(began: float, done: int, total: int) -> str:
+    """What a person wants to know of a stage that has ``done`` of ``total`` parts behind it."""
+    return f", {(time.monotonic() - began) / done * (total - done):.0f} s left" if done else ""
+
+
+class Piece(NamedTuple):
+    """What one episode says."""
+
+    cells: Cells  # columns: the model's own, the hypotheses that could be simulated, nuisances
+    std: Tensor  # of the nuisances
+    numerics: Tensor  # [C]
+    able: Tensor  # [hypotheses] bool, could be simulated
+
+
+def _known_slopes(before: Evidence, k: int) -> tuple[Tensor, Tensor, Tensor]:
+    """(keys [C], slopes [C, N] along the nuisances, their standard deviations [N])."""
+    std = before.stds[k]
+    return before.cells[k].key, before.cells[k].jacobian[:, -len(std) :], std
+
+
+def _piece(
+    model: Model,
+    setting: Setting,
+    k: int,
+    hypotheses: Sequence[Hypothesis],
+    known: Sequence[Tensor] | None,
+    shifts: Sequence[tuple[int, float]],
+) -> Piece:
+    """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
+    e, world, steps = setting.episodes[k], model.world(), [step for _, step in shifts]
+    beside = [_shifted(model, coordinate, step).world() for coordinate, step in shifts]
+    runs = _runs(model, world, setting, k, hypotheses, beside, with_held=known is None)
+    able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
+    typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
+    base = world.seen(runs.plain, e)
+    moved = directions(base, [*runs.beside, *(t for t in runs.trials if t is not None)], [*steps, *typical])
+    if known is None:
+        other, std = _nuisances(world, base, runs.held, e)
+        coarse = cells_of(base, _joined(moved, other), e, setting.sheet, setting.rest)
+    else:
+        key, slopes, std = known
         coarse = cells_of(base, moved, e, setting.sheet, setting.rest)
-        if before is not None:
-            std = before.stds[k]
-            slopes = aligned(coarse.key, before.cells[k].key, before.cells[k].jacobian[:, -len(std) :])
-            coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, slopes], 1))
-        kept, difference = _replaced(coarse, fine)
-        cells.append(kept)
-        numerics.append(difference)
-        stds.append(std)
-    return Evidence(cells, len(shifts), asked, stds, numerics)
+        coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, aligned(coarse.key, key, slopes)], 1))
+    finer: Setting = setting.finer  # type: ignore[assignment]
+    kept, difference = _replaced(coarse, cells_of(runs.fine, None, finer.episodes[k], finer.sheet, finer.rest))
+    return Piece(kept, std, difference, able)
 
 
-def _simulable(
-    model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
-) -> tuple[list[Hypothesis], list[list[Frames]]]:
-    """(hypotheses that can be simulated in all episodes; per episode, the frames with each of them)."""
-    found: list[dict[str, Frames]] = []
-    possible = list(hypotheses)
-    for e in setting.episodes:
-        progress(f"{e.name}: {len(possible)} hypotheses")
-        plain, world = model.world().simulated(e, setting.dt), model.world()
-        trials = side_by_side(lambda h, e=e, p=plain, w=world: _tried(w, p, h, e, setting.dt), possible)
-        found.append({h.name: frames for h, frames in zip(possible, trials, strict=True) if frames is not None})
-        possible = [h for h in possible if h.name in found[-1]]
-    return possible, [[own[h.name] for h in possible] for own in found]
+class _Runs(NamedTuple):
+    """All simulations of one episode."""
+
+    fine: Frames  # on the finer mesh
+    plain: Frames  # what happens, whoever looks on
+    beside: list[Frames]  # along the model's own coordinates
+    held: list[Frames]  # with the held places off
+    trials: list[Frames | None]  # with each hypothesis; None: cannot be simulated
 
 
-def _tried(world: World, plain: Frames, h: Hypothesis, e: Episode, dt: float | None) -> Frames | None:
-    """With a hypothesis; where it is only looked at otherwise, ``plain`` is what happens."""
-    changed = h.apply(world, h.typical)
-    if changed.cloth is world.cloth and changed.motions is world.motions:
-        return changed.seen(plain, e)
+def _runs(
+    model: Model,
+    world: World,
+    setting: Setting,
+    k: int,
+    hypotheses: Sequence[Hypothesis],
+    shifted: Sequence[World],
+    with_held: bool,
+) -> _Runs:
+    e, dt = setting.episodes[k], setting.dt
+    beside = [partial(w.frames, e, dt) for w in shifted]
+    modes = Held().modes(world.cloth, e) if with_held else ()
+    held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m, settles=True), dt) for m in modes]
+    changed = [h.apply(world, h.typical) for h in hypotheses]
+    moves = [c.cloth is not world.cloth or c.motions is not world.motions for c in changed]
+    jobs = [partial(_finest, model, setting, k), partial(world.simulated, e, dt), *beside, *held]
+    tried = [partial(_tried, c, e, dt) for c, own in zip(changed, moves, strict=True) if own]
+    done: list[Any] = side_by_side(lambda job: job(), [*jobs, *tried])
+    fine, plain, *sure = done[: len(jobs)]
+    rest = iter(done[len(jobs) :])
+    trials = [next(rest) if own else c.seen(plain, e) for c, own in zip(changed, moves, strict=True)]
+    return _Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials)
+
+
+def _finest(model: Model, setting: Setting, k: int) -> Frames:
+    """The episode on the finer mesh."""
+    if setting.finer is None:
+        raise ValueError("a setting without a finer one")
+    return replace(model, base=setting.finer.base).world().frames(setting.finer.episodes[k], setting.finer.dt)
+
+
+def _tried(world: World, e: Episode, dt: float | None) -> Frames | None:
     try:
-        return changed.frames(e, dt)
+        return world.frames(e, dt)
     except (SimulationDiverged, UnstableStep):
         return None
 
 
 def side_by_side(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
     """Results in order, on all cores: simulations are independent, and the engine leaves Python alone meanwhile."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    pool = ThreadPoolExecutor(os.cpu_count())
+    try:
         return list(pool.map(work, items))
+    finally:
+        pool.shutdown(cancel_futures=True)  # when interrupted, what has begun ends and nothing else begins
 
 
 def aligned(key: Tensor, other: Tensor, columns: Tensor) -> Tensor:
@@ -155,16 +246,6 @@ def aligned(key: Tensor, other: Tensor, columns: Tensor) -> Tensor:
     return found
 
 
-def finer_residuals(model: Model, setting: Setting) -> list[Cells]:
-    """Cells without derivatives, on the finer mesh."""
-    if setting.finer is None:
-        raise ValueError("a setting without a finer one")
-    finer = setting.finer
-    world = replace(model, base=finer.base).world()
-    seen = side_by_side(lambda e: world.frames(e, finer.dt), finer.episodes)
-    return [cells_of(f, None, e, finer.sheet, finer.rest) for f, e in zip(seen, finer.episodes, strict=True)]
-
-
 def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
     """(cells that both have, with the slopes of the first and the values of the second; first minus second)."""
     both = torch.isin(coarse.key, fine.key)
@@ -174,30 +255,22 @@ def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
     return kept._replace(value=fine.value[place], spread=fine.spread[place]), kept.value - fine.value[place]
 
 
-def _steps(model: Model) -> list[tuple[int, float]]:
-    own = [*(p.step for p in model.parameters), *(0.1 * h.typical for h in model.accepted)]
-    return list(enumerate(own))
+def step_sizes(model: Model) -> list[tuple[int, float]]:
+    """(coordinate, small step) along each of the model's own."""
+    return list(enumerate([*(p.step for p in model.parameters), *(0.1 * h.typical for h in model.accepted)]))
 
 
-def _own(
-    model: Model, e: Episode, dt: float | None, shifts: Sequence[tuple[int, float]]
-) -> tuple[Frames, list[Frames]]:
-    """(at the point, beside it) along the model's own coordinates."""
-    worlds = [model.world()]
-    for coordinate, step in shifts:
-        beside = model.point
-        beside[coordinate] += step
-        worlds.append(model.at(beside).world())
-    base, *shifted = side_by_side(lambda world: world.frames(e, dt), worlds)
-    return base, shifted
+def _shifted(model: Model, coordinate: int, step: float) -> Model:
+    beside = model.point
+    beside[coordinate] += step
+    return model.at(beside)
 
 
-def _nuisances(model: Model, base: Frames, e: Episode, dt: float | None) -> tuple[Frames, Tensor]:
+def _nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:
     """Derivatives along what differs from episode to episode, and its standard deviations."""
-    cloth, shifted, steps, stds = model.base.cloth, [], [], []
-    world = model.world()
+    shifted, steps, stds = [], [], []
     for kind, std in ((Clock(), [CLOCK]), (Camera(), [SHIFT] * 3 + [TURN] * 3), (Rim(), [RIM]), (Tare(), None)):
-        parts = len(kind.parts(cloth, e))
+        parts = len(kind.parts(world.cloth, e))
         for k in range(parts):
             own = TARE if std is None else std[k]
             values = torch.zeros(parts, dtype=base.x.dtype)
@@ -205,11 +278,8 @@ def _nuisances(model: Model, base: Frames, e: Episode, dt: float | None) -> tupl
             shifted.append(kind.see(base, values, e))
             steps.append(0.5 * own)
             stds.append(own)
-    moved = [replace(e, initial=e.initial + GRASP * mode, settles=True) for mode in Held().modes(cloth, e)]
-    shifted += side_by_side(lambda off: world.frames(off, dt), moved)
-    steps += [GRASP] * len(moved)
-    stds += [GRASP] * len(moved)
-    return directions(base, shifted, steps), torch.tensor(stds, dtype=torch.float64)
+    every = [GRASP] * len(held)
+    return directions(base, [*shifted, *held], [*steps, *every]), torch.tensor([*stds, *every], dtype=torch.float64)
 
 
 def _joined(a: Frames, b: Frames) -> Frames:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .evidence import Evidence, Progress, Setting, gather
+from .evidence import Evidence, Progress, Setting, gather, staged
 from .noise import Noise, Whitened, fit_noise, whitened
 from .world import Hypothesis, Model
 
@@ -60,19 +60,20 @@ def fit(
     ``here`` is the evidence at the model's point, where that is known already.
     """
     precision = prior_precision(model)
-    for _ in range(iterations):
-        here = here or gather(model, setting, (), progress, before)
+    for k in range(iterations):
+        here = here or gather(model, setting, (), staged(progress, f"fit {k + 1}"), before)
         before = before or here
-        step, _, ahead = _step(whitened(here, noise or fit_noise(here)), model.point, precision)
+        step, _, ahead = step_of(whitened(here, noise or fit_noise(here)), model.point, precision)
         if ahead < ENOUGH:
             break
         limit = LONGEST * precision.rsqrt()
         model, here = model.at(model.point + step.clamp(-limit, limit)), None
     if here is None or hypotheses:
-        here = gather(model, setting, hypotheses, progress, before)
+        about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
+        here = gather(model, setting, hypotheses, staged(progress, about), before)
     noise = noise or fit_noise(here)
     white = whitened(here, noise)
-    _, covariance, ahead = _step(white, model.point, precision)
+    _, covariance, ahead = step_of(white, model.point, precision)
     return Fitted(model, here, noise, white, covariance, ahead)
 
 
@@ -81,8 +82,8 @@ def renoised(found: Fitted, noise: Noise) -> Fitted:
     return replace(found, noise=noise, white=whitened(found.evidence, noise))
 
 
-def _step(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, float]:
-    """(step, covariance, log density that the step is expected to gain)."""
+def step_of(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, float]:
+    """(Gauss-Newton step, covariance, log density that the step is expected to gain) of the model's coordinates."""
     own = white.jacobian[:, : len(point)]
     covariance = torch.linalg.inv(own.mT @ own + torch.diag(precision))
     uphill = own.mT @ white.value + precision * point

@@ -19,6 +19,7 @@ from .evidence import Evidence
 
 REACH, MEMORY = 0.1, 0.3  # m, s, over which slow errors agree
 FLOOR = {"points": 1e-4, "edges": 3e-4, "markers": 1e-4, "force": 5e-3, "torque": 5e-4}  # m, N, N m: of one cell
+UNFITTED = 5.0  # slow errors over their least size, to fit by: those of a model that is wrong yet say nothing
 RANK = 1e-9  # relative, of directions that count in the likelihood
 
 
@@ -32,6 +33,11 @@ class Noise(NamedTuple):
         moved = nuisance * std
         slow = self.level[cells.block] ** 2
         return torch.diag(_white(cells)) + slow[:, None] * _together(cells) + moved @ moved.mT
+
+
+def unfitted() -> Noise:
+    """To fit by, where residuals are mostly the model's."""
+    return Noise(UNFITTED * torch.tensor([FLOOR[name] for name in NAMES], dtype=torch.float64))
 
 
 class Whitened(NamedTuple):

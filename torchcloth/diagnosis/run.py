@@ -15,6 +15,7 @@ from .base_model import base_model, together
 from .evidence import Progress, Setting, setting_of
 from .gate import check
 from .hypotheses import catalogue
+from .keeping import kept_in
 from .missing import missing_force
 from .model_file import save_model
 from .report import write_report
@@ -31,6 +32,8 @@ def diagnose(
     model: Model | None = None,
     hypotheses: Sequence[Hypothesis] | None = None,
     progress: Progress = lambda _: None,
+    journal: Path | None = None,
+    resume: bool = False,
 ) -> Diagnosis:
     """What a simulation of these episodes gets wrong, and what mending it gains.
 
@@ -38,7 +41,9 @@ def diagnose(
         recordings: episodes of one cloth, at least two, of different motions (``split["motion"]``).
         model: where to start; None: the base model of the first episode, in vacuum.
         hypotheses: what to look for; None: the catalogue.
-        progress: called with one line for each thing that is simulated.
+        progress: called with one line for each episode that is simulated.
+        journal: folder for finished episodes, a few hundred kilobytes each; None: nothing is kept.
+        resume: go on with what a diagnosis that was stopped left there; the answer is the same, bit by bit.
 
     Raises:
         InvalidInput: fewer than two episodes, too few motions to hold one out, or different cloths.
@@ -59,9 +64,11 @@ def diagnose(
     asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
     plan = hashlib.sha256(json.dumps([[h.name, h.typical, h.share] for h in asked]).encode()).hexdigest()[:16]
     setting = setting_of(model, recordings)
+    if journal is not None:
+        setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     answer = judge(search(model, setting, asked, progress), setting.names)
     if any(row["lacking"] for row in answer.content["lack_of_fit"]):
-        answer = _beyond(answer, setting, progress)
+        answer = _beyond(answer, answer.found.setting, progress)
     return replace(answer, content=answer.content | {"plan_hash": plan, "model": EXTENDED})
 
 

@@ -54,6 +54,11 @@ class Row(NamedTuple):
         return (self.forward - abs(self.hypothesis.smallest)) / self.total
 
     @property
+    def visible(self) -> bool:
+        """A typical amplitude would show."""
+        return self.decision != "unresolvable"
+
+    @property
     def forward(self) -> float:
         """The amplitude; negative where it would need a sign that makes no sense."""
         h = self.hypothesis

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ..errors import SimulationDiverged, UnstableStep
 from .approach import approach
-from .comparison import Gain, Predicted, compare, predict
-from .evidence import Progress, Setting
+from .branches import unstable, without
+from .comparison import Gain, Predicted, compare, predict, telling
+from .evidence import Progress, Setting, staged
 from .fitting import Fitted, fit, renoised
-from .noise import Noise, fit_noise, floor_of
+from .noise import Noise, fit_noise, floor_of, unfitted
+from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
 from .world import Hypothesis, Model
 
@@ -18,7 +20,8 @@ MOST = 4  # causes
 TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 2  # steps of the likelier ones among them
 CLEAR = 4.0  # log density below which two models predict alike
-LACKING = 1e-3  # m: slow errors beyond this are not only a sensor's
+MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
+MUCH = 50.0  # chi^2, of a cause that is worth fitting
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 
 
@@ -30,6 +33,7 @@ class Candidate:
     fitted: Fitted
     predicted: Predicted
     gain: Gain  # over the model without it
+    alone: set[str]  # the motion that alone tells of it, if any
 
     @property
     def hypothesis(self) -> Hypothesis:
@@ -56,15 +60,27 @@ class Found:
     steps: list[Step]
     screened: list[Row]  # at the end
     whole: Gain | None  # of all causes together
-    floor: float  # m, of a cell
+    floor: float  # m, of a cell: what repetitions differ by, else what the sensor does
+    sensor: float  # m, of a cell: noise and slow errors
+    repeats: Repeats | None  # None: no episode repeats another
+    setting: Setting  # without the cells that jump between shapes
+
+    @property
+    def left_out(self) -> float:
+        """Share of the cells that jump."""
+        jumping = sum(map(len, self.setting.unstable or ()))
+        return jumping / (jumping + len(self.end.white.value))
 
 
 def search(
     model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
 ) -> Found:
     """Causes one after the other, until none is both present and useful on motions held out."""
-    near, before = approach(model, setting, progress)
-    start = fit(near, setting, hypotheses, progress=progress, before=before)
+    near, before = approach(model, setting, staged(progress, "from the data sheet"))
+    start = fit(near, setting, hypotheses, progress=staged(progress, "base model"), before=before)
+    jumping = unstable(start, setting, staged(progress, "folds that turn over"))
+    if any(map(len, jumping)):
+        setting, start = replace(setting, unstable=jumping), without(start, jumping)
     return extend(start, setting, hypotheses, progress)
 
 
@@ -80,7 +96,7 @@ def extend(
     steps: list[Step] = []
     while True:
         screened = screen(current)
-        likely = _likely(current, screened)
+        likely = _likely(screened)
         if not likely or len(steps) == MOST:
             break
         step = _step(current, setting, likely[:tried], screened, progress)
@@ -88,24 +104,25 @@ def extend(
             break
         steps.append(step)
         left = [h for h in hypotheses if h.name not in {a.name for a in step.best.fitted.model.accepted}]
-        current = fit(step.best.fitted.model, setting, left, 1, progress, before=start.evidence)
+        now = staged(progress, f"with {step.best.hypothesis.name}")
+        current = fit(step.best.fitted.model, setting, left, FURTHER, now, before=start.evidence)
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     screened = screen(current)
-    floor = floor_of(current.evidence, current.noise)
-    first = predict(renoised(start, current.noise), setting.names)
-    whole = compare(first, predict(current, setting.names), floor) if steps else None
-    return Found(start, current, steps, screened, whole, floor)
+    alone = {name for step in steps for name in step.best.alone}
+    last, sensor = predict(current, setting.names, alone), floor_of(current.evidence, current.noise)
+    repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
+    floor = sensor if repeated is None else repeated.rms
+    first = predict(renoised(start, current.noise), setting.names, alone)
+    whole = compare(first, last, floor) if steps else None
+    return Found(start, current, steps, screened, whole, floor, sensor, repeated, setting)
 
 
-def _likely(current: Fitted, screened: Sequence[Row]) -> list[Row]:
-    """What is present by slopes; where the fit is lacking and nothing is, all that could matter.
+def _likely(screened: Sequence[Row]) -> list[Row]:
+    """What is present by slopes, and what would gain much though it is small by them.
 
-    A large effect bends the fitted parameters so far that slopes there no longer ask for it.
+    A large effect bends the fitted parameters so far that slopes there ask for less of it than there is.
     """
-    present = [row for row in screened if row.decision == "present"]
-    if present or float(current.noise.level[0]) < LACKING:
-        return present
-    return [row for row in screened if row.decision != "unresolvable" and row.forward > 0]
+    return [r for r in screened if r.decision == "present" or (r.gain > MUCH and r.forward > 0 and r.visible)]
 
 
 def _pruned(
@@ -114,9 +131,10 @@ def _pruned(
     """Less the causes that the later ones have made needless; the last one has just been tried."""
     for step in steps[:-1]:
         name = step.best.hypothesis.name
-        progress(f"without {name}")
-        less = fit(current.model.without(name), setting, (), 1, progress, current.noise, current.evidence)
-        gain = compare(predict(less, setting.names), predict(current, setting.names), 0.0)
+        without = staged(progress, f"without {name}")
+        less = fit(current.model.without(name), setting, (), 1, without, current.noise, current.evidence)
+        alone = step.best.alone
+        gain = compare(predict(less, setting.names, alone), predict(current, setting.names, alone), 0.0)
         if _worthwhile(gain):
             continue
         steps = [s for s in steps if s is not step]
@@ -130,10 +148,10 @@ def _step(
 ) -> Step | None:
     fits: list[tuple[Row, Fitted]] = []
     for row in likely:
-        progress(f"fitting {row.hypothesis.name}")
+        trial = staged(progress, f"trying {row.hypothesis.name}")
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
-            fits.append((row, fit(begun, setting, (), 1, progress, current.noise, current.evidence)))
+            fits.append((row, fit(begun, setting, (), 1, trial, unfitted(), current.evidence)))
         except (SimulationDiverged, UnstableStep):
             continue
     if not fits:
@@ -142,12 +160,14 @@ def _step(
     tried = _compared(current, fits, setting.names, current.noise)
     first = max(tried, key=lambda c: c.gain.density)
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
-    tried = _compared(current, fits, setting.names, fit_noise(first.fitted.evidence))
+    noise = fit_noise(first.fitted.evidence)
+    tried = _compared(current, fits, setting.names, noise)
     useful = [c for c in tried if _useful(c)]
     if not useful:
         return None
     best = max(useful, key=lambda c: c.gain.density)
-    rivals = [c for c in useful if c is not best and _rival(c, best)]
+    alike = lambda c: predict(renoised(c.fitted, noise), setting.names, best.alone)  # noqa: E731
+    rivals = [c for c in useful if c is not best and _rival(c, alike(c), best)]
     return Step(best, tried, rivals, screened)
 
 
@@ -158,23 +178,25 @@ def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> li
     for c in tried:
         found = c.fitted
         if c.gain.density > enough and found.ahead > CLEAR:
-            progress(f"fitting {c.hypothesis.name} further")
-            found = fit(found.model, setting, (), FURTHER, progress, found.noise, found.evidence, found.evidence)
+            further = staged(progress, f"trying {c.hypothesis.name} further")
+            found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
         out.append((c.row, found))
     return out
 
 
 def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise) -> list[Candidate]:
     """Each fit beside the model without it, on motions held out."""
-    before, out = predict(renoised(current, noise), names), []
+    before, out = renoised(current, noise), []
     for row, found in fits:
-        predicted = predict(renoised(found, noise), names)
-        out.append(Candidate(row, found, predicted, compare(before, predicted, 0.0)))
+        after = renoised(found, noise)
+        alone = telling(after, names)
+        predicted = predict(after, names, alone)
+        out.append(Candidate(row, found, predicted, compare(predict(before, names, alone), predicted, 0.0), alone))
     return out
 
 
 def _useful(c: Candidate) -> bool:
-    return _worthwhile(c.gain) and abs(c.fitted.model.amplitudes[-1]) > abs(c.hypothesis.smallest)
+    return _worthwhile(c.gain) and abs(c.fitted.model.amplitudes[-1]) > MATTERS * abs(c.hypothesis.smallest)
 
 
 def _worthwhile(gain: Gain) -> bool:
@@ -182,9 +204,9 @@ def _worthwhile(gain: Gain) -> bool:
     return worth and gain.ci95[0] > 0
 
 
-def _rival(c: Candidate, best: Candidate) -> bool:
+def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
     """Predicts about as well: the paired difference is not clear."""
     if c.hypothesis.effect == best.hypothesis.effect:
         return False
-    over = compare(c.predicted, best.predicted, 0.0)
+    over = compare(predicted, best.predicted, 0.0)
     return over.density < CLEAR or over.ci95[0] < 0

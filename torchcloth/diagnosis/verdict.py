@@ -83,6 +83,7 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
         ],
         "gain": _gain(found),
         "also_unexplained": bool(causes) and lacking,
+        "floor": _floor(found),
         "lack_of_fit": [row.as_dict() for row in left],
         "missing_force": None,
         "residual": None,
@@ -163,6 +164,14 @@ def _gain(found: Found) -> dict[str, Any] | None:
     }
 
 
+def _floor(found: Found) -> dict[str, Any]:
+    """What a true model would leave of a cell, and where that is known from."""
+    out: dict[str, Any] = {"value": found.floor, "sensor": found.sensor, "unit": "m", "left_out": found.left_out}
+    if found.repeats is None:
+        return {**out, "source": "sensor only", "pairs": 0}
+    return {**out, "source": "repetitions", "pairs": found.repeats.pairs}
+
+
 def _parameters(found: Found) -> dict[str, Any]:
     model, std = found.end.model, found.end.covariance.diagonal().sqrt().tolist()
     return {
@@ -182,6 +191,10 @@ def _warnings(found: Found, names: Sequence[str]) -> list[str]:
             out.append(
                 f"{p.name} is {abs(c) / p.std:.1f} standard deviations from its data sheet: it does another's job"
             )
+    if found.repeats is None:
+        out.append("floor: sensor only; no episode repeats another, so what repetitions differ by is not known")
+    if found.left_out:
+        out.append(f"{100 * found.left_out:.1f} % of the cells jump between shapes of the cloth and are left out")
     if len(set(names)) < 3:
         out.append(f"{len(set(names))} kind(s) of motion: many causes look alike in them")
     if len(names) < 8:
@@ -198,7 +211,8 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
     if gain:
         out.append(
             f"On motions held out the simulation is {1e3 * gain['rms_before']:.2f} mm RMS off, "
-            f"{1e3 * gain['rms_after']:.2f} mm with the causes below; {1e3 * gain['floor']:.2f} mm would be expected."
+            f"{1e3 * gain['rms_after']:.2f} mm with the causes below; {1e3 * gain['floor']:.2f} mm would be expected "
+            f"({content['floor']['source']})."
         )
     for c in content["causes"]:
         low, high = c["ci95"]

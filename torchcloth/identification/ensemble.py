@@ -278,9 +278,11 @@ def _reach(objective: Objective, near: Sequence[Sample], raw: Tensor) -> Reach:
 
     def size(parts: list[Tensor]) -> Tensor:
         many = torch.stack(parts).to(design).flatten(1)
+        if not many.shape[1]:  # no gripper was felt
+            return many.new_zeros(count)
         found = torch.linalg.lstsq(design, many).solution
         slope = found[1 : count + 1].unflatten(1, (-1, 3)).square().sum(-1).mean(1)
         ripples = 3 * (many - design @ found).square().sum(0).mean() / (len(design) - design.shape[1])
-        return torch.where(slope > SEEN * error * ripples, slope - error * ripples, 0.0).sqrt().nan_to_num(0.0)
+        return torch.where(slope > SEEN * error * ripples, slope - error * ripples, 0.0).sqrt()
 
     return Reach(size([s.x for s in near]), size([s.force for s in near]))

@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..cloth import Cloth
-from ..errors import RecordingError
+from ..losses import closest
+from ..losses.surface import distances
 from ..recordings import Recording
 from .episodes import Episode, episode
+from .gauss_newton import NORMAL
 from .misfit import figures, forces_rms
 from .null import no_force, rigid_carry
 from .replays import Frames, tangents
 from .result import or_none
-from .saved import read_saved, rebuilt, result_file
+from .saved import SavedModel, read_saved, rebuilt
 from .unknowns import Unknown, collect
 
 CONVENTION = (
     "SI units. std_parameters: standard error [m] of a vertex's place (root mean square over the cloth and time, and "
     "the largest) by the covariance of the fitted parameters, linearised. std_law: rms distance that the fit left in "
-    "its own episodes: sensor noise and what the law misses. rms, chamfer: of the measured points from the simulated "
+    "its own episodes: sensor noise and what the law misses. interval: half width [m], along the surface's normal, of "
+    "the 95 % interval of a measured point by both together (root mean square over the cloth and time, and the "
+    "largest), and the share of the measured points inside. rms, chamfer: of the measured points from the simulated "
     "surface, one-sided; null: the cloth carried rigidly by the grippers. Null (JSON) where nothing was seen."
 )
 
@@ -41,6 +44,9 @@ class EpisodePrediction:
         std: [T, V] m, standard error of a vertex's place by the parameters' covariance (all three axes together).
         wrench_std: gripper -> [T, 6] N, N m, likewise.
         law: m, rms distance that the fit left in its own episodes.
+        interval: [T, F] m, half width of the 95 % interval of a point measured on a triangle, along its normal: by the
+            parameters and by ``law`` together; NaN where the fit left none.
+        inside: share of the measured points that lie in it, NaN without points.
         figures: distances [m] of what was seen, NaN where nothing was.
         per_frame: [T'] m, mean distance in the frames that have points.
     """
@@ -51,6 +57,8 @@ class EpisodePrediction:
     std: Tensor
     wrench_std: dict[str, Tensor]
     law: float
+    interval: Tensor
+    inside: float
     figures: dict[str, float]
     per_frame: Tensor
 
@@ -61,6 +69,11 @@ class EpisodePrediction:
             "frames": len(self.std),
             "std_parameters": {"rms": float(self.std.square().mean().sqrt()), "max": float(self.std.max())},
             "std_law": or_none(self.law),
+            "interval": {
+                "rms": or_none(float(self.interval.square().mean().sqrt())),
+                "max": or_none(float(self.interval.max())),
+                "inside": or_none(self.inside),
+            },
             "measured": {name: or_none(value) for name, value in self.figures.items()},
             "convention": CONVENTION,
         }
@@ -77,41 +90,68 @@ def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction
         InvalidInput: there is no such file, or the fit is of another model.
         RecordingError: the file cannot be read; or an episode that has no frames to predict.
     """
-    path = result_file(path)
     model = read_saved(path)
     cloth = rebuilt(path, model, recording)
-    unknowns, covariance, law = _known(path, cloth)
+    unknowns, covariance = _known(model, cloth)
     data = episode(cloth, recording)
     raw = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
     frames, moved = tangents(cloth, unknowns, raw, data, model.dt)
     spread = lambda slopes: torch.einsum("k...,kl,l...->...", slopes, covariance.to(slopes), slopes).clamp(min=0)  # noqa: E731
     seen, per_frame = _figures(cloth, data, frames)
+    normal = _Along(torch.as_tensor(cloth.mesh.faces), frames.x, moved.x, covariance, model.left)
     return EpisodePrediction(
         cloth,
         data,
         frames,
         spread(moved.x).sum(-1).sqrt(),
         {name: spread(slopes).sqrt() for name, slopes in moved.wrench.items()},
-        law,
+        model.left,
+        normal.of_triangles(),
+        normal.inside(data),
         seen,
         per_frame,
     )
 
 
-def _known(path: Path, cloth: Cloth) -> tuple[list[Unknown], Tensor, float]:
-    """Fitted parameters at their values, the covariance [K, K] of the unconstrained ones, and the fit's rms [m]."""
-    try:
-        content = json.loads(path.read_text())
-        correlation, said = content["correlation"], content["parameters"]
-        unknowns = collect(cloth, list(correlation), None)
-        matrix = torch.tensor([[correlation[a.name][b.name] for b in unknowns] for a in unknowns], dtype=torch.float64)
-        stds = [float(said[u.name]["std"]) / u.slope(u.start) for u in unknowns]
-        left = content["fit"]["rms_after"]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        expected, again = "parameters, correlation and fit", "run `torchcloth identify` again"
-        raise RecordingError(f"{path}: is not complete", got=repr(error), expected=expected, remedy=again) from None
-    deviation = torch.tensor(stds, dtype=torch.float64)
-    return unknowns, matrix * deviation[:, None] * deviation, math.nan if left is None else float(left)
+class _Along(NamedTuple):
+    """The 95 % interval of measured points along the surface's normal."""
+
+    faces: Tensor  # [F, 3]
+    x: Tensor  # [T, V, 3] m
+    slopes: Tensor  # [K, T, V, 3] of x
+    covariance: Tensor  # [K, K]
+    law: float  # m
+
+    def of_triangles(self) -> Tensor:
+        """[T, F] m, half its width at their centres."""
+        return self._half(self.slopes[..., self.faces, :].mean(-2), self.x[..., self.faces, :])
+
+    def inside(self, data: Episode) -> float:
+        """Share of all measured points."""
+        found = []
+        for t, x in enumerate(self.x):
+            cloud = data.positions(t)
+            if len(cloud):
+                hits = closest(cloud, x, self.faces)
+                half = self._half(hits.on(self.slopes[:, t]), x[hits.corners])
+                found.append(distances(cloud, x, hits) <= half)
+        return float(torch.cat(found).double().mean()) if found and math.isfinite(self.law) else math.nan
+
+    def _half(self, slopes: Tensor, corners: Tensor) -> Tensor:
+        """Of places with slopes [K, ..., 3] on triangles with corners [..., 3, 3]."""
+        a, b, c = corners.unbind(-2)
+        normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+        along = (slopes * normal).sum(-1)
+        variance = torch.einsum("k...,kl,l...->...", along, self.covariance.to(along), along).clamp(min=0)
+        return NORMAL * (variance + self.law**2).sqrt()
+
+
+def _known(model: SavedModel, cloth: Cloth) -> tuple[list[Unknown], Tensor]:
+    """Fitted parameters at their values, and the covariance [K, K] of the unconstrained ones."""
+    unknowns = collect(cloth, list(model.stds), None)
+    stds = [model.stds[u.name] / u.slope(u.start) for u in unknowns]
+    deviation, order = torch.tensor(stds, dtype=torch.float64), [list(model.stds).index(u.name) for u in unknowns]
+    return unknowns, torch.as_tensor(model.correlation)[order][:, order] * deviation[:, None] * deviation
 
 
 def _figures(cloth: Cloth, data: Episode, frames: Frames) -> tuple[dict[str, float], Tensor]:

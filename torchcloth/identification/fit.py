@@ -13,14 +13,14 @@ from torch import Tensor
 
 from ..cloth import Cloth
 from ..effects import AbstractEffect
-from ..errors import InvalidInput
+from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from . import gauss_newton
 from .blocks import blocks_for
 from .considered import covariance_of
 from .episodes import Episode, episode
-from .finer import LIMIT, OPEN, mesh_step
+from .finer import LIMIT, OPEN, finer_cloth, mesh_step
 from .identifiability import combinations, influences
 from .journal import Journal
 from .misfit import figures, forces_rms
@@ -96,7 +96,7 @@ def identify(
         resume: go on where a fit with this journal was stopped; the result is what it would have been, bit by bit.
         refine: correct the result for the coarseness of the mesh, by one simulation on a mesh twice as fine, and widen
             its errors by what that leaves open (see ``finer.py``). ``fit["mesh_step"]`` has the largest correction in
-            standard errors. Not where the motion is chaotic.
+            standard errors. Not where the motion is chaotic, and not together with ``profile``.
         on_progress: called with (iteration, chamfer, values, share of the frames that were used) after every iteration;
             chamfer is NaN if nothing was seen.
 
@@ -113,6 +113,10 @@ def identify(
     episodes_in = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not episodes_in:
         raise InvalidInput("recordings", got="none", expected="at least one episode")
+    if refine and profile:
+        raise InvalidInput("profile", got="refine as well", expected="one of them: a profile is that of the given mesh")
+    if refine:
+        finer_cloth(cloth)  # refuses now what it would refuse at the end
     names = default_parameters(cloth) if parameters is None else list(parameters)
     unknowns = with_priors(collect(cloth, names, episodes_in[0].cloth.areal_density_std), priors or {})
     if not unknowns:
@@ -191,11 +195,13 @@ def _concluded(
     full, told, checked = search.objective, outcome.objective, outcome.checked
     final, warnings = checked.final, list(checked.warnings)
     covariance = covariance_of(told, checked, strata)
-    final, covariance, coarseness = _refined(full, told, final, covariance, refining if not checked.withdrawn else [])
+    found = _refined(full, told, final, covariance, refining if not checked.withdrawn else [])
+    final, covariance, coarseness, uncorrected = found
+    warnings += uncorrected
     end = full.seen(final.raw)
     before, after, null = [s.x for s in start], [s.x for s in end], [rigid_carry(e) for e in full.episodes]
     found = estimates(full.cloth, full.unknowns, final.raw, covariance)
-    profiled = {} if warnings else profiles(told, final, covariance, profile, search.tell)
+    profiled = {} if checked.warnings else profiles(told, final, covariance, profile, search.tell)
     found = with_profiles(found, profiled)
     fit: dict[str, Any] = _figures(full, before, after, null)
     fit |= _force_figures(full, start, end)
@@ -243,14 +249,17 @@ def _concluded(
 
 def _refined(
     full: Objective, told: Objective, final: gauss_newton.Iterate, covariance: Tensor, recordings: Sequence[Recording]
-) -> tuple[gauss_newton.Iterate, Tensor, dict[str, float]]:
-    """The solution on a mesh of ever smaller triangles, with wider errors, and how far that is."""
+) -> tuple[gauss_newton.Iterate, Tensor, dict[str, float], list[str]]:
+    """The solution on a mesh of ever smaller triangles, with wider errors, how far that is; or why it is not known."""
     if not recordings or told is not full:
-        return final, covariance, {}
-    step = mesh_step(full, final, recordings)
+        return final, covariance, {}, []
+    try:
+        step = mesh_step(full, final, recordings)
+    except (SimulationDiverged, UnstableStep) as error:
+        return final, covariance, {}, [f"not corrected for the coarseness of the mesh: on a finer one, {error}"]
     far = float((LIMIT * step.abs() / covariance.diagonal().sqrt())[: len(full.unknowns)].max())
     moved = final._replace(raw=full.clip(final.raw + LIMIT * step))
-    return moved, covariance + OPEN**2 * torch.outer(step, step), {"mesh_step": far}
+    return moved, covariance + OPEN**2 * torch.outer(step, step), {"mesh_step": far}, []
 
 
 def _observed(frames: Sequence[Tensor], full: Objective) -> list[Tensor]:

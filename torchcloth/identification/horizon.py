@@ -21,6 +21,7 @@ from .objective import Objective
 SHARES = (0.1, 0.15, 0.22, 0.33, 0.5, 0.75)  # of the frames, one after the other
 HALVINGS = 2
 ITERATIONS = 20
+NEAR, EXACT = 1.0, 0.1  # standard errors of a step that ends a search: while the beginning grows, and of the longest
 
 
 class Within(NamedTuple):
@@ -48,7 +49,7 @@ def within(objective: Objective, failed: Checked, start: Tensor, on_iterate: OnI
     """
     best, high = None, 1.0
     for share in SHARES:
-        found = _solved(objective, share, start if best is None else best[1].final.raw, on_iterate)
+        found = _solved(objective, share, start if best is None else best[1].final.raw, on_iterate, NEAR)
         if found is not None:
             best, low = found, share
         elif best is not None:
@@ -58,18 +59,19 @@ def within(objective: Objective, failed: Checked, start: Tensor, on_iterate: OnI
         return None
     for _ in range(HALVINGS):
         share = 0.5 * (low + high)
-        found = _solved(objective, share, best[1].final.raw, on_iterate)
+        found = _solved(objective, share, best[1].final.raw, on_iterate, NEAR)
         low, high, best = (low, share, best) if found is None else (share, high, found)
-    return _told(objective, failed, *best)
+    near = best[0], best[1]._replace(final=best[1].final._replace(converged=False))
+    return _told(objective, failed, *(_solved(objective, low, best[1].final.raw, on_iterate, EXACT) or near))
 
 
 def _solved(
-    objective: Objective, share: float, start: Tensor, on_iterate: OnIterate
+    objective: Objective, share: float, start: Tensor, on_iterate: OnIterate, tolerance: float
 ) -> tuple[Objective, Checked] | None:
     """On a share of the frames; None where derivatives do not hold."""
     part = objective.part(share)
     try:
-        final = gauss_newton.minimise(part.problem(), start, ITERATIONS, lambda it: on_iterate(it, part))
+        final = gauss_newton.minimise(part.problem(), start, ITERATIONS, lambda it: on_iterate(it, part), tolerance)
         checked = None if runaway(part, final) else check(part, final)
     except (SimulationDiverged, UnstableStep):
         checked = None

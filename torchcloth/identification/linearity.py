@@ -42,14 +42,16 @@ def check(objective: Objective, final: gauss_newton.Iterate) -> Checked:
     prior = objective.problem().prior_std
     deviation = torch.zeros_like(prior)
     if not runaway(objective, final):  # else their covariance is none
-        deviation = gauss_newton.covariance(objective.problem(), final).diagonal().sqrt().nan_to_num(0.0)
+        found = gauss_newton.covariance(objective.problem(), final).diagonal().sqrt()
+        deviation = torch.where(found.isfinite(), found, 0.0)  # else slopes that overflow: the smallest steps
     steps = torch.minimum(torch.maximum(deviation, SMALLEST * prior), LARGEST * prior)[: len(objective.unknowns)]
     secants, reach = objective.secants(final.raw, steps)
     weight = final.influence()[0].sqrt()[:, None]
     moved, slope = (weight * j[:, : len(steps)] for j in (secants.jacobian, final.linear.jacobian))
     missed = (moved - slope).norm(dim=0) / moved.norm(dim=0).clamp(min=1e-12)
-    noticed = torch.maximum(moved.norm(dim=0), slope.norm(dim=0)) * steps >= NOTICED
-    missed = torch.where(noticed, missed.nan_to_num(torch.inf), 0.0)
+    noticed = ~(torch.maximum(moved.norm(dim=0), slope.norm(dim=0)) * steps < NOTICED)
+    missed = torch.where(missed.isfinite(), missed, torch.inf)  # slopes that overflow say nothing
+    missed = torch.where(noticed, missed, 0.0)
     if float(missed.max()) < NONLINEAR:
         over_one = missed * deviation[: len(steps)] / steps
         curved = [u.name for u, error in zip(objective.unknowns, over_one, strict=True) if error >= CURVED]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from .._files import atomically
+from ..cloth import Cloth
 from ..losses import closest
 from .episodes import Episode
 from .result import Identification
@@ -166,4 +167,21 @@ def parameters(fit: Identification) -> Any:
         axis.margins(x=0.1)
     figure.suptitle("estimate and 95 % interval; cross: start", fontsize=10)
     figure.tight_layout()
+    return figure
+
+
+def field_maps(fields: Mapping[str, Tensor], cloth: Cloth) -> Any:
+    """One value per triangle [F], on the cloth's pattern or, without one, on its rest mesh seen along z."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    mesh = cloth.mesh
+    place = np.asarray(mesh.vertices)[:, :2] if mesh.uv is None else np.asarray(mesh.uv)
+    figure = Figure(figsize=(5.5 * len(fields), 4.5), layout="constrained")
+    for axis, (name, values) in zip(figure.subplots(1, len(fields), squeeze=False)[0], fields.items(), strict=True):
+        shown = values.detach().numpy()
+        norm = LogNorm() if shown.max() > WIDE * shown.min() > 0 else None
+        drawn = axis.tripcolor(*place.T, np.asarray(mesh.faces), facecolors=shown, norm=norm)
+        figure.colorbar(drawn, ax=axis, label=getattr(cloth.material, name).unit, shrink=0.8)
+        axis.set(title=name, aspect="equal", xlabel="m", ylabel="m")
     return figure

@@ -93,14 +93,25 @@ def print_predicted(found: EpisodePrediction) -> None:
     print(f"by parameters: a vertex is known to {1e3 * own['rms']:.2g} mm (rms; at most {1e3 * own['max']:.2g} mm)")
     if math.isfinite(found.law):
         print(f"by the law:    the fit left {1e3 * found.law:.2g} mm rms in its own episodes, noise included")
-    table = Table(title="Against what was seen", title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("", "rms mm", "Chamfer mm", *(["force rms N"] if "force_rms" in f else [])):
+    if math.isfinite(found.law):
+        half = content["interval"]
+        inside = "" if half["inside"] is None else f"; {100 * half['inside']:.0f} % of them are"
+        print(
+            f"together:      95 % of measured points should be within {1e3 * half['rms']:.2g} mm of the surface{inside}"
+        )
+    columns = {"rms mm": ("rms", 1e3), "Chamfer mm": ("chamfer", 1e3), "force rms N": ("force_rms", 1.0)}
+    known = {heading: own for heading, own in columns.items() if math.isfinite(f.get(own[0], math.nan))}
+    if not known:
+        print("nothing was seen or felt in this episode to compare with")
+        return
+    table = Table(title="Against what was measured", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("", *known):
         table.add_column(heading, justify="right" if heading else "left")
     for label, end in (("null: carried rigidly, no force", "_null"), ("predicted", "")):
-        cells = [f"{1e3 * f[name + end]:.2f}" for name in ("rms", "chamfer")]
-        table.add_row(label, *cells, *([f"{f['force_rms' + end]:.3g}"] if "force_rms" in f else []))
-    seen = any(math.isfinite(number) for number in f.values())
-    console.print(table if seen else "nothing was seen or felt in this episode to compare with")
+        table.add_row(label, *(f"{unit * f[name + end]:.3g}" for name, unit in known.values()))
+    console.print(table)
+    if "rms mm" not in known:
+        print("the episode has no points and no markers: only its forces are compared with")
 
 
 def predicted(found: EpisodePrediction) -> Any:
@@ -116,6 +127,8 @@ def predicted(found: EpisodePrediction) -> Any:
         axis.plot(e.times[shown], 1e3 * found.per_frame, color=BEFORE, label="seen: mean distance from the prediction")
     if math.isfinite(found.law):
         axis.axhline(1e3 * found.law, color=NULL, linestyle="--", label="rms that the fit left in its own episodes")
+        half = 1e3 * found.interval.square().mean(-1).sqrt()
+        axis.plot(e.times, half, color=AFTER, linestyle=":", label="both: 95 % of measured points should be nearer")
     axis.set(xlabel="time [s]", ylabel="mm", title=f"{e.name}, predicted")
     axis.set_ylim(bottom=0)
     axis.legend()

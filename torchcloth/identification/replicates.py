@@ -22,10 +22,15 @@ def strata_of(recordings: Sequence[Recording]) -> Tensor:
 
     Those with fewer than two companions are taken together as number 0.
     """
-    named = {r.path.name: r for r in recordings if r.path is not None}
-    keys = [_key(r, named) for r in recordings]
+    keys = keys_of(recordings)
     many = [key for key, count in Counter(keys).items() if count >= FEWEST]
     return torch.tensor([1 + many.index(key) if key in many else 0 for key in keys])
+
+
+def keys_of(recordings: Sequence[Recording]) -> list[Hashable]:
+    """Equal for episodes of one ``split.motion``, or that repeat one (``split.replicate_of``)."""
+    named = {r.path.name: r for r in recordings if r.path is not None}
+    return [_key(r, named) for r in recordings]
 
 
 def _key(recording: Recording, named: dict[str, Recording]) -> Hashable:

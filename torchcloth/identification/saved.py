@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -19,6 +18,7 @@ from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from ..transfer import Contact
 from .episodes import Episode, cloth_from, episode
+from .files import number, read_result
 from .misfit import figures
 from .replays import Replay
 from .result import Identification, or_none
@@ -38,6 +38,7 @@ class Replayed:
         episode: what it was driven by and is compared with.
         frames: [T, V, 3] m at ``episode.times``.
         chamfer: [T] m, mean distance of each frame's measured points from the simulated surface.
+        fitted: whether the fit used the episode; else this is a prediction.
         warning: when the distances are not those that the fit had; else empty.
     """
 
@@ -45,6 +46,7 @@ class Replayed:
     episode: Episode
     frames: Tensor
     chamfer: Tensor
+    fitted: bool
     warning: str
 
 
@@ -62,31 +64,31 @@ def model_of(cloth: Cloth, fit: Identification, recordings: Sequence[Recording],
 
 
 def replayed(path: str | Path, recording: Recording) -> Replayed:
-    """Simulate one of a fit's episodes with the fitted values.
+    """Simulate an episode with the values of a fit.
 
     Args:
         path: identification.json, or the folder that holds it.
-        recording: one of the episodes that were fitted.
+        recording: one of the episodes that were fitted, or another of the same cloth.
 
     Raises:
-        InvalidInput: there is no such file, or the fit is of another episode or model.
+        InvalidInput: there is no such file, or the fit is of another model.
         RecordingError: the file cannot be read, or does not hold what is needed.
     """
-    path = result_file(path)
     model = read_saved(path)
-    kept = _same(path, model.episodes, recording)
+    own = _mark(recording)
+    before = [kept["chamfer"] for kept in model.episodes if _alike(kept, own)]
     cloth = rebuilt(path, model, recording)
     data = episode(cloth, recording)
     with torch.no_grad():
         frames = Replay(cloth)(data, model.dt).x
     found = figures([frames], [data], torch.as_tensor(cloth.mesh.faces))
     warning = ""
-    if abs(found.chamfer - kept["chamfer"]) > FAITHFUL * kept["chamfer"]:
+    if before and abs(found.chamfer - before[0]) > FAITHFUL * before[0]:
         warning = (
-            f"the simulation is {1e3 * found.chamfer:.2f} mm from the points, the fit was {1e3 * kept['chamfer']:.2f}: "
+            f"the simulation is {1e3 * found.chamfer:.2f} mm from the points, the fit was {1e3 * before[0]:.2f}: "
             "the fitted model had parts that the episode does not describe"
         )
-    return Replayed(cloth, data, frames, found.per_frame, warning)
+    return Replayed(cloth, data, frames, found.per_frame, bool(before), warning)
 
 
 def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
@@ -103,11 +105,11 @@ def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tup
         InvalidInput: there is no such file, or the fit is of another model.
         RecordingError: the file cannot be read, or does not hold what is needed.
     """
-    path = result_file(path)
     model = read_saved(path)
     cloth = rebuilt(path, model, recording)
     names, out = available(cloth), {}
-    for name, (value, std) in model.identified.items():
+    for name in model.identified:
+        value, std = model.values[name], model.stds[name]
         positive = name in names and _parameter(cloth, names[name]).domain == "positive"
         if name in names and std > 0:
             out[name] = (value, math.exp(std / value) if positive else std)
@@ -116,59 +118,60 @@ def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tup
 
 @dataclass(frozen=True)
 class SavedModel:
-    """The entry "model" of identification.json."""
+    """What identification.json says of a model and how well it is known.
+
+    Attributes:
+        values: by name, fitted or not.
+        stds: standard errors of the fitted parameters, by name.
+        identified: names of those that the data determined.
+        correlation: [K, K] of the fitted parameters, in the order of ``stds``.
+        left: m, rms distance that the fit left in its own episodes; NaN where nothing was seen.
+    """
 
     values: dict[str, float]
-    identified: dict[str, tuple[float, float]]  # (value, standard error)
+    stds: dict[str, float]
+    identified: list[str]
+    correlation: np.ndarray
+    left: float
     contact: Contact | None
     dt: float | None
     episodes: list[dict[str, Any]]
 
 
-def result_file(path: str | Path) -> Path:
-    """identification.json, given itself or by the folder that holds it."""
-    path = Path(path)
-    return path / RESULT if path.is_dir() else path
-
-
-def read_saved(path: Path) -> SavedModel:
-    """The entry "model" of identification.json.
+def read_saved(path: str | Path) -> SavedModel:
+    """A saved fit: identification.json, or the folder that holds it.
 
     Raises:
         InvalidInput: there is no such file.
         RecordingError: it cannot be read, or does not hold what is needed.
     """
-    again = "run `torchcloth identify` again"
-    try:
-        content = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InvalidInput("fit", got=f"no {path}", expected=f"{RESULT}, or the folder that holds it") from None
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{path}: unreadable", got=error, remedy=again) from None
-    try:
-        model = content["model"]
-        return SavedModel(
-            {str(name): float(value) for name, value in model["values"].items()},
-            {
-                str(name): (float(e["value"]), float(e["std"]))
-                for name, e in content.get("parameters", {}).items()
-                if e["identifiable"] and e["source"] == "data"
-            },
-            None if model["contact"] is None else Contact(**model["contact"]),
-            None if model["dt"] is None else float(model["dt"]),
-            [
-                {"name": str(e["name"]), **{key: int(e[key]) for key in ("frames", "points")}}
-                | {
-                    "mean": np.asarray(e["mean"], float).reshape(3),
-                    "chamfer": math.nan if e["chamfer"] is None else float(e["chamfer"]),
-                }
-                for e in model["episodes"]
-            ],
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise RecordingError(
-            f"{path}: does not say which model was fitted", got=repr(error), expected="an entry model", remedy=again
-        ) from None
+    expected = "parameters, correlation, fit and model, all numbers finite"
+    return read_result(path, RESULT, _model, expected, "run `torchcloth identify` again")
+
+
+def _model(content: dict[str, Any]) -> SavedModel:
+    model, said, correlation = (content[key] for key in ("model", "parameters", "correlation"))
+    matrix = np.array([[number(row[name], -1.0) for name in correlation] for row in correlation.values()])
+    if (np.abs(matrix) > 1 + 1e-9).any():
+        raise ValueError("a correlation above 1")
+    left = content["fit"]["rms_after"]
+    return SavedModel(
+        {str(name): number(value) for name, value in model["values"].items()},
+        {name: number(said[name]["std"], 0.0) for name in correlation},
+        [name for name in correlation if said[name]["identifiable"] and said[name]["source"] == "data"],
+        matrix,
+        math.nan if left is None else number(left, 0.0),
+        None if model["contact"] is None else Contact(**model["contact"]),
+        None if model["dt"] is None else number(model["dt"]),
+        [
+            {"name": str(e["name"]), **{key: int(e[key]) for key in ("frames", "points")}}
+            | {
+                "mean": np.asarray(e["mean"], float).reshape(3),
+                "chamfer": math.nan if e["chamfer"] is None else number(e["chamfer"], 0.0),
+            }
+            for e in model["episodes"]
+        ],
+    )
 
 
 def _mark(recording: Recording) -> dict[str, Any]:
@@ -188,7 +191,7 @@ def _mark(recording: Recording) -> dict[str, Any]:
 
 def is_fitted(path: str | Path, recording: Recording) -> bool:
     """Whether the fit used this episode: then nothing about it is a prediction, nor new."""
-    return any(_alike(kept, _mark(recording)) for kept in read_saved(result_file(path)).episodes)
+    return any(_alike(kept, _mark(recording)) for kept in read_saved(path).episodes)
 
 
 def _alike(kept: dict[str, Any], own: dict[str, Any]) -> bool:
@@ -196,24 +199,12 @@ def _alike(kept: dict[str, Any], own: dict[str, Any]) -> bool:
     return counts and bool(np.abs(np.subtract(kept["mean"], own["mean"])).max() < SAME)
 
 
-def _same(path: Path, episodes: Sequence[dict[str, Any]], recording: Recording) -> dict[str, Any]:
-    own = _mark(recording)
-    for kept in episodes:
-        if _alike(kept, own):
-            return kept
-    raise InvalidInput(
-        f"{path}: a fit of another episode",
-        got=own["name"],
-        expected=" or ".join(str(kept["name"]) for kept in episodes),
-        remedy="view the fitted episode, or fit this one",
-    )
-
-
-def rebuilt(path: Path, model: SavedModel, recording: Recording) -> Cloth:
+def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:
     """The cloth that an episode describes, at the fitted values.
 
     Raises:
         InvalidInput: it has other parameters than the fitted one.
+        RecordingError: a value that no such parameter can have.
     """
     cloth = cloth_from(recording, contact=model.contact)
     names = available(cloth)
@@ -225,7 +216,10 @@ def rebuilt(path: Path, model: SavedModel, recording: Recording) -> Cloth:
             remedy="fit this episode, or show a cloth of your own with viewing.with_cloth",
         )
     for name, value in model.values.items():
-        _parameter(cloth, names[name]).set(value)
+        try:
+            _parameter(cloth, names[name]).set(value)
+        except InvalidInput as error:
+            raise RecordingError(f"{path}: {error}", remedy="run `torchcloth identify` again") from None
     return cloth
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -14,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import InvalidInput, RecordingError
 from ..materials import AEP, AbstractMaterial, OrthotropicAEP
 from ..parameters import PhysicalParameter
 from ..recordings import ForceDisplacement
+from .files import number, read_result
 from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial, curves
 
 RESULT = "tension.json"
@@ -155,27 +154,15 @@ def read_model(path: str | Path) -> TensionModel:
         InvalidInput: there is no such file.
         RecordingError: it cannot be read, or does not hold what is needed.
     """
-    path = Path(path)
-    path = path / RESULT if path.is_dir() else path
+    expected = f"a law among {', '.join(LAWS)} with its numbers"
     again = "fit again with fit_tension and save"
-    try:
-        content = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InvalidInput("fit", got=f"no {path}", expected=f"{RESULT}, or the folder that holds it") from None
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{path}: unreadable", got=error, remedy=again) from None
-    try:
-        return _model(content["model"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        expected = f"a law among {', '.join(LAWS)} with its numbers"
-        raise RecordingError(
-            f"{path}: does not say which law was fitted", got=repr(error), expected=expected, remedy=again
-        ) from None
+    return read_result(path, RESULT, lambda content: _model(content["model"]), expected, again)
 
 
 def _model(kept: dict[str, Any]) -> TensionModel:
     names = [str(name) for name in kept["fitted"]]
-    material = LAWS[kept["material"]](**kept["values"]).to(torch.float64)
+    values = {name: value if isinstance(value, str) else number(value) for name, value in kept["values"].items()}
+    material = LAWS[kept["material"]](**values).to(torch.float64)
     for name in names:
         if not isinstance(getattr(material, name), PhysicalParameter):
             raise ValueError(f"{name} is no parameter")

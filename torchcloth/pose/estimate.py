@@ -146,7 +146,7 @@ def _distances(objective: Corrected, frames: Mapping[str, Tensor]) -> dict[str, 
 
 def _errors(objective: Corrected, found: Smoothed, x: Tensor, moved: Tensor, fields: Modes) -> Tensor:
     """[T, V, 3] m, of what was estimated, and of what is finer than it."""
-    root = torch.linalg.cholesky(found.covariance).to(moved)
+    root = found.root.to(moved)
     variance = torch.stack([(root.mT @ frame.flatten(1)).square().sum(0) for frame in moved.unbind(1)])
     held = _held(objective.cloth)
     noise = objective.episodes[0].noise or objective.blocks[0].floor

@@ -25,8 +25,13 @@ class Smoothed(NamedTuple):
 
     raw: Tensor  # [K]
     final: gauss_newton.Iterate
-    covariance: Tensor  # [K, K]
+    root: Tensor  # [K, K], times its own transpose the covariance
     converged: bool
+
+    @property
+    def covariance(self) -> Tensor:
+        """[K, K]."""
+        return self.root @ self.root.mT
 
 
 def smooth(objective: Corrected, told: Told) -> Smoothed:
@@ -43,16 +48,20 @@ def smooth(objective: Corrected, told: Told) -> Smoothed:
         before = raw
         final = gauss_newton.minimise(objective.problem(), raw, 1, lambda _: False)
         raw = final.raw
-        covariance = _learn(objective, final)
+        root, information = _learn(objective, final)
         step = raw - before
-        converged = float(step @ torch.linalg.solve(covariance, step)) < SMALL**2 * len(raw)
+        prior = (step / objective.prior_std).square().sum()
+        converged = float(step @ information @ step + prior) < SMALL**2 * len(raw)
         if converged:
             break
-    return Smoothed(raw, final, covariance, converged)
+    return Smoothed(raw, final, root, converged)
 
 
-def _learn(objective: Corrected, at: gauss_newton.Iterate) -> Tensor:
-    """Set the prior's size of every mode to what the numbers and their errors show; the covariance with it.
+def _learn(objective: Corrected, at: gauss_newton.Iterate) -> tuple[Tensor, Tensor]:
+    """Set the prior's size of every mode to what the numbers and their errors show.
+
+    Returns:
+        (root of the covariance with that prior [K, K], information of the data [K, K])
 
     Expectation and maximisation (Dempster et al. 1977) on the linearised problem, where both are closed forms.
     """
@@ -61,9 +70,24 @@ def _learn(objective: Corrected, at: gauss_newton.Iterate) -> Tensor:
     pull = (weight * jacobian).mT @ (jacobian @ at.raw - at.linear.value)
     shape = len(objective.correction.windows), len(objective.correction.modes), 3
     for _ in range(TRIES):
-        prior = objective.prior_std**-2
-        covariance = torch.linalg.inv(information + torch.diag(prior))
-        mean = covariance @ (pull + prior * objective.middle)
-        squared = (mean.square() + covariance.diagonal())[objective.pushes].reshape(shape).mean((0, 2))
+        root = root_of(information, objective.prior_std)
+        mean = root @ (root.mT @ (pull + objective.middle / objective.prior_std**2))
+        squared = (mean.square() + root.square().sum(1))[objective.pushes].reshape(shape).mean((0, 2))
         objective.expecting(squared.sqrt().clamp(min=LEAST))
-    return torch.linalg.inv(information + torch.diag(objective.prior_std**-2))
+    return root_of(information, objective.prior_std), information
+
+
+def root_of(information: Tensor, prior_std: Tensor) -> Tensor:
+    """[K, K], whose product with its own transpose is the covariance by data and priors.
+
+    In units of the priors' standard deviations, where no eigenvalue is below 1. Steep tangents can make others so large
+    that rounding takes this away: what they leave of such a direction is then the prior.
+    """
+    scaled = prior_std[:, None] * information * prior_std
+    scaled = 0.5 * (scaled + scaled.mT)
+    eye = torch.eye(len(scaled), dtype=scaled.dtype)
+    factor, failed = torch.linalg.cholesky_ex(scaled + eye)
+    if not int(failed):
+        return prior_std[:, None] * torch.linalg.solve_triangular(factor, eye, upper=False).mT
+    values, vectors = torch.linalg.eigh(scaled)
+    return prior_std[:, None] * vectors * (1 + values.clamp(min=0)).rsqrt()

@@ -26,19 +26,19 @@ def film_of_fit(recording: Recording, fit: str | Path, *, truth: bool = False) -
     """An episode and the cloth simulated with fitted values, coloured by distance.
 
     Args:
-        recording: one of the fit's episodes.
+        recording: one of the fit's episodes, or another of the same cloth, which is then predicted.
         fit: identification.json, or the folder that holds it.
         truth: as of ``film_of``.
 
     Raises:
-        InvalidInput: the fit is of another episode or model.
+        InvalidInput: the fit is of another model.
         RecordingError: the file cannot be read.
     """
     again = replayed(fit, recording)
     film = film_of(recording, truth=truth, times=again.episode.times.numpy())
     film = with_cloth(film, again.frames.numpy(), again.cloth.mesh.faces, noise=recording.observation_noise_std)
     distance = f", {1e3 * float(again.chamfer.mean()):.2f} mm from the points" if len(again.chamfer) else ""
-    title = f"{film.title}: fitted{distance}"
+    title = f"{film.title}: {'fitted' if again.fitted else 'predicted'}{distance}"
     return replace(film, title=title, notes=film.notes + ((again.warning,) if again.warning else ()))
 
 

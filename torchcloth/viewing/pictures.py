@@ -71,10 +71,12 @@ def picture(
 ) -> Path:
     """Write a PNG with four moments of the film, from the first frame to the last, side by side.
 
+    The title is over the first, the colour bar beside the last.
+
     Args:
         film: what to show.
         path: the file; it only ever holds a whole PNG.
-        size: (width, height) pixels of one moment; None: 480 x 420.
+        size: (width, height) pixels of one moment with its colour bar; None: 480 x 420.
         look: as of ``animate``.
 
     Returns:
@@ -84,7 +86,8 @@ def picture(
 
     shown = np.unique(np.linspace(0, len(film) - 1, PANELS).round().astype(int))
     stage = Stage(film, size or MOMENT, look)
-    row = np.concatenate([stage.pixels(int(frame)) for frame in shown], axis=1)
+    moments = [stage.pixels(int(frame), titled=frame == shown[0]) for frame in shown]
+    row = np.concatenate([*(moment[:, : stage.scene] for moment in moments[:-1]), moments[-1]], axis=1)
     with atomically(Path(path)) as part:
         Image.fromarray(row).save(part, format="PNG", optimize=True)
     return Path(path)

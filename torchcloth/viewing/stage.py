@@ -57,12 +57,19 @@ class Stage:
         self.canvas.draw()
         self.background = self.canvas.copy_from_bbox(self.figure.bbox)
 
-    def pixels(self, frame: int) -> Array:
+    def pixels(self, frame: int, titled: bool = True) -> Array:
         """The frame's picture, sRGB uint8 [H, W, 3]."""
         self.canvas.restore_region(self.background)
         for draw in self.moving:
             draw(frame)
+        if titled:
+            self.axes.draw_artist(self.title)
         return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
+
+    @property
+    def scene(self) -> int:
+        """Columns of ``pixels`` that show the scene; what follows is the colour bar."""
+        return round(self.figure.get_size_inches()[0] * DPI * (1 - (BAR if self.film.measured else 0.0)))
 
     def _project(self, points: Array) -> Array:
         return self.camera.project(points)[0]
@@ -129,12 +136,11 @@ class Stage:
             "animated": True,
             "path_effects": [withStroke(linewidth=3, foreground=PAPER)],
         }
-        title = self.axes.text(0.02, 0.975, self.film.title, fontsize=9, **common)
+        self.title = self.axes.text(0.02, 0.975, self.film.title, fontsize=9, **common)
         clock = self.axes.text(0.98, 0.975, "", ha="right", fontsize=10, **common)
 
         def draw(frame: int) -> None:
             clock.set_text(f"{self.film.times[frame]:.2f} s")
-            self.axes.draw_artist(title)
             self.axes.draw_artist(clock)
 
         return draw

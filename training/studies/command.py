@@ -10,7 +10,17 @@ from pathlib import Path
 from ..kept import guarded
 
 # Modules of this package; ``add(parser)`` declares options, ``run(options)`` does it.
-STUDIES: tuple[str, ...] = ("fabrics", "garments", "chamfer", "factors", "classify", "measured", "pose", "hidden")
+STUDIES: tuple[str, ...] = (
+    "fabrics",
+    "garments",
+    "chamfer",
+    "factors",
+    "classify",
+    "measured",
+    "pose",
+    "cost",
+    "hidden",
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .manipulations import cost, joint, options, paper, pictures
+from .manipulations import joint, options, paper, pictures
 from .manipulations.cases import FREE, SOUGHT
 from .manipulations.measures import spread
 from .manipulations.printing import heading_table, number, percent, show, write
@@ -26,14 +26,11 @@ SHOWN = {  # symbol, unit, SI units in one of these
 def add(parser: argparse.ArgumentParser) -> None:
     """Options."""
     options.add(parser)
-    cost.add(parser)
     joint.add(parser)
 
 
 def run(chosen: argparse.Namespace) -> None:
     """All cases, or what is done instead; then tables, result and pictures."""
-    if chosen.cost:
-        return cost.run(chosen)
     if chosen.joint:
         return joint.run(chosen)
     found = options.cases(chosen)

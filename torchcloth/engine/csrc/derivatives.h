@@ -95,20 +95,36 @@ struct Derivatives : Stage<R> {
     Row& row(R* field, int v) const { return *reinterpret_cast<Row*>(field + size_t(v) * 16); }
     static Row five_times(Quad<R> a) {  // in two steps: a widening shuffle would go through memory
         const auto b = __builtin_shufflevector(a.v, a.v, 0, 1, 2, 3, 4, 5, 6, 7);
-        const auto c = __builtin_shufflevector(b, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-        return Row(__builtin_shufflevector(c, c, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 3));
+        if constexpr (HALVED<R, 16>)
+            return {Wide<R>(__builtin_shufflevector(b, b, 0, 1, 2, 0, 1, 2, 0, 1)), Wide<R>(__builtin_shufflevector(b, b, 2, 0, 1, 2, 0, 1, 2, 3))};
+        else {
+            const auto c = __builtin_shufflevector(b, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+            return Row(__builtin_shufflevector(c, c, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 3));
+        }
     }
     static Row weights(const R* w) {
         const auto a = reinterpret_cast<const Pack<R, 8>*>(w)->v;
-        const auto b = __builtin_shufflevector(a, a, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-        return Row(__builtin_shufflevector(b, b, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5));
+        if constexpr (HALVED<R, 16>)
+            return {Wide<R>(__builtin_shufflevector(a, a, 0, 0, 0, 1, 1, 1, 2, 2)), Wide<R>(__builtin_shufflevector(a, a, 2, 3, 3, 3, 4, 4, 4, 5))};
+        else {
+            const auto b = __builtin_shufflevector(a, a, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+            return Row(__builtin_shufflevector(b, b, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5));
+        }
     }
     static Quad<R> summed(Row a) {  // of the five vectors
-        const auto b = a.v + __builtin_shufflevector(a.v, a.v, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2);
-        const auto c = b + __builtin_shufflevector(b, b, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5);
-        const auto d = c + __builtin_shufflevector(a.v, a.v, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11);
         const typename Quad<R>::Lanes none{};
-        return Quad<R>(__builtin_shufflevector(__builtin_shufflevector(d, d, 0, 1, 2, 3), none, 0, 1, 2, 4));
+        if constexpr (HALVED<R, 16>) {
+            const auto l = a.low.v, h = a.high.v;
+            const auto sum = __builtin_shufflevector(l, h, 0, 1, 2, 15) + __builtin_shufflevector(l, h, 3, 4, 5, 15) +
+                             __builtin_shufflevector(l, h, 6, 7, 8, 15) + __builtin_shufflevector(l, h, 9, 10, 11, 15) +
+                             __builtin_shufflevector(l, h, 12, 13, 14, 15);
+            return Quad<R>(__builtin_shufflevector(sum, none, 0, 1, 2, 4));
+        } else {
+            const auto b = a.v + __builtin_shufflevector(a.v, a.v, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2);
+            const auto c = b + __builtin_shufflevector(b, b, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5);
+            const auto d = c + __builtin_shufflevector(a.v, a.v, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11);
+            return Quad<R>(__builtin_shufflevector(__builtin_shufflevector(d, d, 0, 1, 2, 3), none, 0, 1, 2, 4));
+        }
     }
 
     // Y(v) += sign sum_u w(u) (X(u) - X(v)): differences, which are small wherever the sheet is.
@@ -119,7 +135,7 @@ struct Derivatives : Stage<R> {
             Row sum(0.0);
             for (int k = l.first[v]; k < l.first[v + 1]; k++)
                 sum = sum + weights(l.weight.data + 8 * size_t(k)) * five_times(vector(from, l.other[k]) - own);
-            row(to, v) = row(to, v) + Row(typename Row::Lanes{} + sign) * sum;
+            row(to, v) = row(to, v) + double(sign) * sum;
         }
     }
     // X(v) -= sign times the transpose of that.

@@ -19,6 +19,20 @@ struct Pack {
     R operator[](int lane) const { return v[lane]; }
 };
 
+// What is wider than a register is two halves: as one vector, the compiler would take it through memory.
+template <class R, int L>
+constexpr bool HALVED = L * int(sizeof(R)) > WIDTH;
+template <class R, int L>
+    requires(HALVED<R, L>)
+struct Pack<R, L> {
+    using Half = Pack<R, L / 2>;
+    Half low, high;
+
+    Pack() = default;
+    Pack(Half low, Half high) : low(low), high(high) {}
+    Pack(double c) : low(c), high(c) {}
+};
+
 template <class R>
 constexpr int LANES = WIDTH / int(sizeof(R));
 template <class R>
@@ -30,7 +44,16 @@ using Wide = Pack<R, LANES<R>>;
     template <class R, int L>                                                                             \
     inline Pack<R, L> operator op(Pack<R, L> a, double b) { return Pack<R, L>(a.v op R(b)); }             \
     template <class R, int L>                                                                             \
-    inline Pack<R, L> operator op(double a, Pack<R, L> b) { return Pack<R, L>(R(a) op b.v); }
+    inline Pack<R, L> operator op(double a, Pack<R, L> b) { return Pack<R, L>(R(a) op b.v); }             \
+    template <class R, int L>                                                                             \
+        requires(HALVED<R, L>)                                                                            \
+    inline Pack<R, L> operator op(Pack<R, L> a, Pack<R, L> b) { return {a.low op b.low, a.high op b.high}; } \
+    template <class R, int L>                                                                             \
+        requires(HALVED<R, L>)                                                                            \
+    inline Pack<R, L> operator op(Pack<R, L> a, double b) { return {a.low op b, a.high op b}; }           \
+    template <class R, int L>                                                                             \
+        requires(HALVED<R, L>)                                                                            \
+    inline Pack<R, L> operator op(double a, Pack<R, L> b) { return {a op b.low, a op b.high}; }
 TC_BINARY(+)
 TC_BINARY(-)
 TC_BINARY(*)

@@ -9,7 +9,7 @@ namespace tc {
 // has the mass itself beside the vector, given is the mass; it comes first, and its reverse sweep last.
 template <class R>
 struct PerMass : Stage<R> {
-    using B = Block<R>;
+    using P = Wide<R>;     // of whole nodes
     int mass, given, out;  // fields of nodes
     R least;               // less mass than that has no say, and its square underflows
 
@@ -17,18 +17,18 @@ struct PerMass : Stage<R> {
 
     void forward(Scene<R>& s) const override {
         if (!join(s, s.value[given], 1)) return;
-        const B *m = at(s.value[mass]), *from = at(s.value[given]);
-        B* to = at(s.value[out]);
-        for (int b = 1; b < s.layers->nodes.count(); b++) to[b] = vectors(from[b] * inverse(m[b]));
+        const P *m = at(s.value[mass]), *from = at(s.value[given]);
+        P* to = at(s.value[out]);
+        for (int i = PACKS; i < packs(s); i++) to[i] = vectors(from[i] * inverse(m[i]));
     }
     void reverse(Scene<R>& s) const override {
         if (s.layers->points.size() == 0) return;
-        const B *m = at(s.value[mass]), *quotient = at(s.value[out]), *seed = at(s.bar[out]);
-        B *by_mass = at(s.bar[mass]), *by_given = at(s.bar[given]);
-        for (int b = 1; b < s.layers->nodes.count(); b++) {
-            const B g = vectors(seed[b] * inverse(m[b])), work = g * quotient[b];
-            by_given[b] = by_given[b] + g;
-            by_mass[b] = by_mass[b] - counts(m[b]) * on_masses(work);
+        const P *m = at(s.value[mass]), *quotient = at(s.value[out]), *seed = at(s.bar[out]);
+        P *by_mass = at(s.bar[mass]), *by_given = at(s.bar[given]);
+        for (int i = PACKS; i < packs(s); i++) {
+            const P g = vectors(seed[i] * inverse(m[i])), work = g * quotient[i];
+            by_given[i] = by_given[i] + g;
+            by_mass[i] = by_mass[i] - counts(m[i]) * on_masses(work);
         }
         join(s, s.bar[given], 1);
     }
@@ -42,7 +42,7 @@ struct PerMass : Stage<R> {
             const R own = m[n * ON_NODE];
             const bool counts = own > least;
             const Node moved = counts ? m_dot[n] : Node(0.0);
-            const Quad<R> by_mass = chunk_of(moved), there = reinterpret_cast<const Quad<R>*>(quotient)[n];
+            const Quad<R> by_mass = first_of(moved), there = reinterpret_cast<const Quad<R>*>(quotient)[n];
             const Node change = (from[n] - widened(there) * repeated(by_mass)) * alike(counts ? 1 / own : R(1));
             to[n] = without_mass(change);
         }
@@ -50,7 +50,9 @@ struct PerMass : Stage<R> {
 
   private:
     using Node = Pack<R, ON_NODE * DIRECTIONS>;  // four directions of each of the four numbers
-    static B* at(R* field) { return reinterpret_cast<B*>(field); }
+    static constexpr int PACKS = ON_BLOCK / LANES<R>;
+    static int packs(const Scene<R>& s) { return PACKS * s.layers->nodes.count(); }
+    static P* at(R* field) { return reinterpret_cast<P*>(field); }
     static Node* node(R* field) { return reinterpret_cast<Node*>(field); }
 
     // The last two nodes of a block are the first two of the one above: both get the sum. False: there are no points.
@@ -68,26 +70,39 @@ struct PerMass : Stage<R> {
         }
         return true;
     }
-    static B masses(B a) {
-        return B(__builtin_shufflevector(a.v, a.v, 0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12));
+    static P masses(P a) {
+        if constexpr (PACKS == 2) return P(__builtin_shufflevector(a.v, a.v, 0, 0, 0, 0, 4, 4, 4, 4));
+        else return P(__builtin_shufflevector(a.v, a.v, 0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12));
     }
-    B counts(B m) const { return less(alike(least), masses(m)); }
-    B inverse(B m) const { return 1.0 / select(counts(m), masses(m), 1.0); }
-    static B vectors(B a) {  // 0 beside them
-        const typename B::Lanes none{};
-        return B(__builtin_shufflevector(a.v, none, 16, 1, 2, 3, 16, 5, 6, 7, 16, 9, 10, 11, 16, 13, 14, 15));
+    P counts(P m) const { return less(P(double(least)), masses(m)); }
+    P inverse(P m) const { return 1.0 / select(counts(m), masses(m), 1.0); }
+    static P vectors(P a) {  // 0 beside them
+        const typename P::Lanes none{};
+        if constexpr (PACKS == 2) return P(__builtin_shufflevector(a.v, none, 8, 1, 2, 3, 8, 5, 6, 7));
+        else return P(__builtin_shufflevector(a.v, none, 16, 1, 2, 3, 16, 5, 6, 7, 16, 9, 10, 11, 16, 13, 14, 15));
     }
-    static B on_masses(B a) {  // the sums of the vectors, in the place of the masses
-        const auto sum = __builtin_shufflevector(a.v, a.v, 1, 1, 1, 1, 5, 5, 5, 5, 9, 9, 9, 9, 13, 13, 13, 13) +
-                         __builtin_shufflevector(a.v, a.v, 2, 2, 2, 2, 6, 6, 6, 6, 10, 10, 10, 10, 14, 14, 14, 14) +
-                         __builtin_shufflevector(a.v, a.v, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
-        const typename B::Lanes none{};
-        return B(__builtin_shufflevector(sum, none, 0, 16, 16, 16, 4, 16, 16, 16, 8, 16, 16, 16, 12, 16, 16, 16));
+    static P on_masses(P a) {  // the sums of the vectors, in the place of the masses
+        const typename P::Lanes none{};
+        if constexpr (PACKS == 2) {
+            const auto sum = __builtin_shufflevector(a.v, a.v, 1, 1, 1, 1, 5, 5, 5, 5) +
+                             __builtin_shufflevector(a.v, a.v, 2, 2, 2, 2, 6, 6, 6, 6) +
+                             __builtin_shufflevector(a.v, a.v, 3, 3, 3, 3, 7, 7, 7, 7);
+            return P(__builtin_shufflevector(sum, none, 0, 8, 8, 8, 4, 8, 8, 8));
+        } else {
+            const auto sum = __builtin_shufflevector(a.v, a.v, 1, 1, 1, 1, 5, 5, 5, 5, 9, 9, 9, 9, 13, 13, 13, 13) +
+                             __builtin_shufflevector(a.v, a.v, 2, 2, 2, 2, 6, 6, 6, 6, 10, 10, 10, 10, 14, 14, 14, 14) +
+                             __builtin_shufflevector(a.v, a.v, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
+            return P(__builtin_shufflevector(sum, none, 0, 16, 16, 16, 4, 16, 16, 16, 8, 16, 16, 16, 12, 16, 16, 16));
+        }
     }
-    static Quad<R> chunk_of(Node a) { return Quad<R>(__builtin_shufflevector(a.v, a.v, 0, 1, 2, 3)); }
+    static Quad<R> first_of(Node a) {
+        if constexpr (HALVED<R, ON_BLOCK>) return chunk<0>(a.low);
+        else return chunk<0>(a);
+    }
     static Node without_mass(Node a) {
-        const typename Node::Lanes none{};
-        return Node(__builtin_shufflevector(a.v, none, 16, 16, 16, 16, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
+        const typename P::Lanes none{};
+        if constexpr (HALVED<R, ON_BLOCK>) return {P(__builtin_shufflevector(a.low.v, none, 8, 8, 8, 8, 4, 5, 6, 7)), a.high};
+        else return Node(__builtin_shufflevector(a.v, none, 16, 16, 16, 16, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
     }
 };
 

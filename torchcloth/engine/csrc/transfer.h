@@ -33,30 +33,39 @@ template <class R>
 using Block = Pack<R, ON_BLOCK>;
 
 template <class R>
-TC_INLINE Block<R> alike(R number) { return Block<R>(typename Block<R>::Lanes{} + number); }
+TC_INLINE Block<R> alike(R number) { return Block<R>(double(number)); }
 template <class R>
 TC_INLINE Block<R> repeated(Quad<R> a) {  // one after the other
-    if constexpr (sizeof(R) == 4) return joined(a, a, a, a);
-    const Quad<R> four[4] = {a, a, a, a};
-    Block<R> out;
-    std::memcpy(&out, four, sizeof(out));
-    return out;
+    if constexpr (HALVED<R, ON_BLOCK>) return {joined(a, a), joined(a, a)};
+    else return joined(a, a, a, a);
 }
 template <class R>
 TC_INLINE Block<R> widened(Quad<R> a) {  // each number four times
-    const typename Block<R>::Lanes all = repeated(a).v;
-    return Block<R>(__builtin_shufflevector(all, all, 0, 0, 0, 0, 5, 5, 5, 5, 10, 10, 10, 10, 15, 15, 15, 15));
+    const auto b = __builtin_shufflevector(a.v, a.v, 0, 1, 2, 3, 0, 1, 2, 3);  // in two steps: a widening shuffle would go through memory
+    if constexpr (HALVED<R, ON_BLOCK>)
+        return {Wide<R>(__builtin_shufflevector(b, b, 0, 0, 0, 0, 1, 1, 1, 1)), Wide<R>(__builtin_shufflevector(b, b, 2, 2, 2, 2, 3, 3, 3, 3))};
+    else {
+        const auto all = repeated(a).v;
+        return Block<R>(__builtin_shufflevector(all, all, 0, 0, 0, 0, 5, 5, 5, 5, 10, 10, 10, 10, 15, 15, 15, 15));
+    }
 }
 // Quad k: the sum of the four of argument k.
 template <class R>
 TC_INLINE Block<R> summed(Block<R> a, Block<R> b, Block<R> c, Block<R> d) {
-    auto halves = [](Block<R> x, Block<R> y) {
-        return __builtin_shufflevector(x.v, y.v, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
-               __builtin_shufflevector(x.v, y.v, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
-    };
-    const auto ab = halves(a, b), cd = halves(c, d);
-    return Block<R>(__builtin_shufflevector(ab, cd, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27) +
-                    __builtin_shufflevector(ab, cd, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31));
+    if constexpr (HALVED<R, ON_BLOCK>) {
+        auto halves = [](Wide<R> x, Wide<R> y) {
+            return Wide<R>(__builtin_shufflevector(x.v, y.v, 0, 1, 2, 3, 8, 9, 10, 11) + __builtin_shufflevector(x.v, y.v, 4, 5, 6, 7, 12, 13, 14, 15));
+        };
+        return {halves(a.low + a.high, b.low + b.high), halves(c.low + c.high, d.low + d.high)};
+    } else {
+        auto halves = [](Block<R> x, Block<R> y) {
+            return __builtin_shufflevector(x.v, y.v, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
+                   __builtin_shufflevector(x.v, y.v, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+        };
+        const auto ab = halves(a, b), cd = halves(c, d);
+        return Block<R>(__builtin_shufflevector(ab, cd, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27) +
+                        __builtin_shufflevector(ab, cd, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31));
+    }
 }
 
 // What a point sees along one axis.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,7 +39,7 @@ REST = 0.12  # s, after the grippers open
 
 @dataclass(frozen=True)
 class Manipulation:
-    """One way to move a garment; ``number`` seeds the sensor's errors."""
+    """One way to move a garment; ``number`` seeds the sensor's errors, ``slower`` divides the grippers' speed."""
 
     garment: str
     number: int
@@ -47,6 +47,7 @@ class Manipulation:
     speed: str
     grip: str
     posture: str
+    slower: float = 1.0
 
     @property
     def name(self) -> str:
@@ -179,7 +180,7 @@ class Scene:
 
     def _action(self, grips: dict[str, tuple[float, ...]]) -> Action:
         """Away for cover and fling, towards the arms for drag."""
-        speed = SPEEDS[self.what.speed]
+        speed = SPEEDS[self.what.speed] / self.what.slower
         limits = Limits(speed, 8.0 * speed**2)
         if self.what.action == "fling":
             return primitives.fling(grips, 0.12, heading=0.0, pull=0.15, landing=0.05, rest=REST, limits=limits)
@@ -187,3 +188,15 @@ class Scene:
             return primitives.drag(grips, 0.15, heading=math.pi, landing=0.02, rest=REST, limits=limits)
         reach = 0.75 * self.length
         return primitives.cover(grips, reach, heading=0.0, landing=2 * self.fine.gap, rest=REST, limits=limits)
+
+
+def slowed(what: Manipulation, length: float, fine: Discretisation) -> Manipulation:
+    """The same with grippers so slow that it takes ``length`` seconds.
+
+    Raises:
+        InvalidInput: it takes longer as it is.
+    """
+    lasts = min(float(path.t[-1]) for path in Scene(what, fine).action.motion.values())
+    if length < lasts:
+        raise InvalidInput("--length", got=f"{length:g} s", expected=f"{lasts:.2f} s or more")
+    return replace(what, slower=what.slower * (length - REST) / (lasts - REST))

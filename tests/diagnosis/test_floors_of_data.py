@@ -1,0 +1,72 @@
+"""What repetitions differ by, and cells that jump between shapes of the cloth."""
+
+from dataclasses import replace
+
+import linear_toys as toys
+import pytest
+import sheets
+import torch
+
+from torchcloth import recordings as rec
+from torchcloth.diagnosis import base_model
+from torchcloth.diagnosis.branches import _jumped, without
+from torchcloth.diagnosis.comparison import Predicted
+from torchcloth.diagnosis.evidence import setting_of
+from torchcloth.diagnosis.repeats import pairs_of, repeats
+
+
+def told(values: list[torch.Tensor]) -> Predicted:
+    """Residuals of one cell after the other, as if predicted."""
+    size, every = len(values[0]), torch.cat(values)
+    key = torch.arange(size).repeat(len(values))
+    episode = torch.arange(len(values)).repeat_interleave(size)
+    return Predicted(every, every, key, episode, 0 * key, torch.ones(len(key), dtype=torch.bool))
+
+
+def test_the_floor_is_what_repetitions_differ_by_whatever_the_model_gets_wrong():
+    rng = torch.Generator().manual_seed(0)
+    wrong = 0.02 * torch.randn(4000, generator=rng).double()
+    spread = torch.linspace(1e-3, 3e-3, 4000).double()
+    noise = [spread * torch.randn(4000, generator=rng).double() for _ in range(3)]
+    found = repeats(told([wrong + n for n in noise]), [(0, 1), (0, 2), (1, 2)])
+    assert found.rms == pytest.approx(float(spread.square().mean().sqrt()), rel=0.03)
+    first, last = found.sd[:1000].square().mean().sqrt(), found.sd[-1000:].square().mean().sqrt()
+    assert float(first) == pytest.approx(1.28e-3, rel=0.08)
+    assert float(last) == pytest.approx(2.76e-3, rel=0.08)
+    assert repeats(told(noise), []) is None
+
+
+def test_repetitions_are_of_one_command(tmp_path):
+    def kept(name, motion, split, shift=0.0):
+        own = replace(sheets.episode(motion), split=split)
+        moved = {n: replace(g, position=g.position + shift * g.t[:, None]) for n, g in own.grippers.items()}
+        return rec.read(rec.write(replace(own, grippers=moved), tmp_path / name))
+
+    recordings = [
+        kept("a", "slow", {"motion": "swing"}),
+        kept("b", "slow", {"motion": "swing"}),
+        kept("c", "fast", {"motion": "swing"}),  # another amplitude
+        kept("d", "slow", {"motion": "other", "replicate_of": "a"}),
+        kept("e", "slow", {"motion": "swing"}, shift=0.1),  # 3 cm farther on
+        kept("f", "lift", {"motion": "lift"}),
+    ]
+    setting = setting_of(base_model(recordings[0]), recordings)
+    assert pairs_of(setting.recordings, setting.episodes) == [(0, 1), (0, 3), (1, 3)]
+
+
+def test_a_cell_that_does_not_follow_its_slope_is_left_out():
+    slopes = toys.smooth(3, 4)
+    found = toys.fitted(toys.evidence(slopes, 1, ["one", "two"], torch.zeros(3).double(), 0))
+    cells = found.evidence.cells[0]
+    step = torch.tensor([0.2]).double()
+    follows = cells._replace(value=cells.value + cells.jacobian[:, 0] * 0.2)
+    assert len(_jumped(found.evidence, 0, [follows, None], [step, step])) == 0
+    turned = follows._replace(value=follows.value.clone())
+    turned.value[[7, 30]] += 0.05
+    keys = _jumped(found.evidence, 0, [follows, turned], [step, step])
+    assert keys.tolist() == cells.key[[7, 30]].tolist()
+    none = torch.zeros(0, dtype=torch.int64)
+    less = without(found, [keys, none, none, none])
+    assert len(less.white.value) == len(found.white.value) - 2
+    assert float(less.covariance[0, 0]) >= float(found.covariance[0, 0]) * 0.5
+    assert not torch.isin(keys, less.evidence.cells[0].key).any()

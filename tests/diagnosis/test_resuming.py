@@ -1,0 +1,82 @@
+"""A diagnosis that was stopped anywhere goes on where it was, and answers the same bit by bit."""
+
+import json
+from functools import partial
+
+import pytest
+import sheets
+import torch
+
+from torchcloth import recordings as rec
+from torchcloth.cli import main
+from torchcloth.diagnosis import base_model, catalogue, diagnose, evidence, run
+from torchcloth.errors import InvalidInput
+
+ASKED = ("air.drag_n", "obs.extrinsic[y]")
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    drag = next(h for h in catalogue(base_model(sheets.episode()), [sheets.episode()]) if h.name == "air.drag_n")
+    yield [sheets.recorded(m, lambda world: drag.apply(world, 1.5), k) for k, m in enumerate(("slow", "fast"))]
+    torch.set_default_dtype(before)
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Calls of the simulations of an episode; ``stop`` interrupts after so many."""
+    work, state = evidence._piece, {"calls": 0, "stop": 10**9}
+
+    def piece(*arguments):
+        if state["calls"] == state["stop"]:
+            raise KeyboardInterrupt
+        state["calls"] += 1
+        return work(*arguments)
+
+    monkeypatch.setattr(evidence, "_piece", piece)
+    return state
+
+
+def test_the_answer_of_a_resumed_diagnosis_is_the_same(episodes, counted, tmp_path):
+    asked = [h for h in catalogue(base_model(episodes[0]), episodes) if h.name in ASKED]
+    search = partial(diagnose, episodes, hypotheses=asked, journal=tmp_path / "progress")
+    whole = search()
+    total, size = counted["calls"], sum(f.stat().st_size for f in (tmp_path / "progress").iterdir())
+    assert size < 2e6  # 80 points a frame; a few hundred kilobytes an episode at most
+    done = 0
+    for stop in (3, 4, 10**9):  # stopped twice, at other places
+        counted.update(calls=0, stop=stop)
+        try:
+            again = search(resume=done > 0)
+        except KeyboardInterrupt:
+            done += stop
+    assert done == 7
+    assert counted["calls"] == total - done
+    assert again.content == whole.content
+    assert torch.equal(again.model.point, whole.model.point)
+    assert torch.equal(again.found.end.covariance, whole.found.end.covariance)
+
+
+def test_another_diagnosis_is_not_resumed(episodes, counted, tmp_path):
+    counted["stop"] = 1
+    with pytest.raises(KeyboardInterrupt):
+        diagnose(episodes, hypotheses=[], journal=tmp_path / "progress")
+    with pytest.raises(InvalidInput, match="another fit"):
+        diagnose(episodes[::-1], hypotheses=[], journal=tmp_path / "progress", resume=True)
+
+
+def test_the_command_says_how_to_go_on(episodes, counted, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(run, "catalogue", lambda *_: [])
+    folders = [str(rec.write(e, tmp_path / e.split["motion"])) for e in episodes]
+    out, counted["stop"] = tmp_path / "out", 2
+    assert main(["diagnose", *folders, "--out", str(out)]) == 130
+    assert capsys.readouterr().err.splitlines() == ["torchcloth: stopped; `--resume` goes on from there"]
+    assert len(list((out / "progress").glob("episode*.pt"))) == 2
+    counted["stop"] = 10**9
+    assert main(["diagnose", *folders, "--out", str(out), "--resume"]) == 0
+    assert "base model: as fitted: slow, 1 of 2" in capsys.readouterr().out
+    assert json.loads((out / "diagnosis.json").read_text())["causes"] == []
+    assert not (out / "progress").exists()
+    assert main(["diagnose", *folders, "--out", str(out), "--resume"]) == 2

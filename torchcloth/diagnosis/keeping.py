@@ -1,0 +1,55 @@
+"""Finished episodes on disk, so that a diagnosis that was stopped goes on where it was.
+
+What an episode says at a point is a function of model, episode and question. A search is deterministic: run again, it
+asks the same questions in the same order, and finds the answers of before, bit by bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import metadata
+from pathlib import Path
+
+from torch import Tensor
+
+from ..identification.episodes import Episode
+from ..identification.journal import Journal, digest
+from .cells import Cells
+from .evidence import Kept, Piece, Setting
+from .world import Model
+
+FIELDS = len(Cells._fields)
+
+
+def kept_in(folder: Path, model: Model, setting: Setting, resume: bool) -> Kept:
+    """Answers in a folder, which is made when the first is known.
+
+    Raises:
+        InvalidInput: nothing to resume, or what another diagnosis left; a folder of other things.
+    """
+    journal = Journal(folder, _problem(model, setting), resume)
+
+    def kept(question: Sequence[object], point: Tensor, work: Callable[[], Piece]) -> Piece:
+        def flat() -> tuple[Tensor, ...]:
+            found = work()
+            return (*found.cells, found.std, found.numerics, found.able)
+
+        answer = journal.ask(f"episode{question[0]}-{digest(question)}", point, flat)
+        return Piece(Cells(*answer[:FIELDS]), *answer[FIELDS:])
+
+    return kept
+
+
+def _problem(model: Model, setting: Setting) -> list[object]:
+    """All that an answer depends on beside the question."""
+    cloth = model.base.cloth
+    data = [part for e in setting.episodes for part in _parts(e)]
+    parts = [(p.name, p.step, p.std) for p in model.parameters]
+    fabric = [*cloth.state_dict().values(), cloth.mesh.rest.tobytes(), cloth.mesh.faces.tobytes()]
+    return [metadata.version("torchcloth"), setting.dt, parts, *fabric, *data]
+
+
+def _parts(e: Episode) -> list[object]:
+    seen = [e.times, e.initial, *e.clouds, e.markers, e.noise]
+    moved = [part for name, m in e.motion.items() for part in (name, m.t, m.pose)]
+    return [*seen, *moved, *e.wrenches.values()]

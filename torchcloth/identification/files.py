@@ -1,0 +1,54 @@
+"""Results on disk, read again: what is missing or damaged is said in one way."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ..errors import InvalidInput, RecordingError
+
+T = TypeVar("T")
+
+
+def read_result(path: str | Path, name: str, parse: Callable[[dict[str, Any]], T], expected: str, again: str) -> T:
+    """``parse`` of a JSON file; what it raises for a content that it cannot use becomes one error.
+
+    Args:
+        path: the file, or the folder that holds it.
+        name: of the file.
+        parse: of its content.
+        expected: what a good file holds.
+        again: how to make one.
+
+    Raises:
+        InvalidInput: there is no such file.
+        RecordingError: it cannot be read, or does not hold what is needed.
+    """
+    path = Path(path)
+    path = path / name if path.is_dir() else path
+    try:
+        content = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise InvalidInput("fit", got=f"no {path}", expected=f"{name}, or the folder that holds it") from None
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path}: unreadable", got=error, remedy=again) from None
+    try:
+        return parse(content)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        said = f"{path}: does not say which model was fitted"
+        raise RecordingError(said, got=repr(error), expected=expected, remedy=again) from None
+
+
+def number(value: Any, least: float = -math.inf) -> float:
+    """A finite number, not below ``least``.
+
+    Raises:
+        ValueError: it is not.
+        TypeError: it is no number at all.
+    """
+    if isinstance(value, str) or not least <= (out := float(value)) < math.inf:
+        raise ValueError(f"{value!r} where a finite number{'' if least == -math.inf else f' >= {least:g}'} should be")
+    return out
