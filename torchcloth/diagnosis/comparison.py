@@ -60,6 +60,7 @@ def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) 
     for inside in _folds(found, groups, halved):
         rest, r = own[~inside], white.value[~inside]
         step = -torch.linalg.solve(rest.mT @ rest + precision, rest.mT @ r + precision @ point)
+        step = found.model.at(point + step).point - point
         whitened[inside] += own[inside] @ step
     cells = found.evidence.cells
     join = lambda name: torch.cat([getattr(c, name) for c in cells])  # noqa: E731
