@@ -2,7 +2,8 @@
 
 ``tc.Cloth`` is the layer; ``tc.meshes``, ``tc.materials``, ``tc.effects``, ``tc.boundaries`` are its parts;
 ``tc.robots`` gives end-effector poses, ``tc.recordings`` episodes, ``tc.identify`` parameters with errors,
-``tc.estimate_pose`` the mesh over time, ``tc.diagnose`` what a simulation of episodes gets wrong.
+``tc.estimate_pose`` the mesh over time, ``tc.diagnose`` what a simulation of episodes gets wrong,
+``tc.load`` the model that it was extended to.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from .types import ClothState, Rollout, Trajectory
 
 if TYPE_CHECKING:
     from . import diagnosis, identification, observe, pose, recordings, robots
-    from .diagnosis import diagnose
+    from .diagnosis import diagnose, load
     from .identification import identify
     from .pose import estimate_pose
 
@@ -41,6 +42,7 @@ __all__ = [
     "functional",
     "identification",
     "identify",
+    "load",
     "losses",
     "materials",
     "meshes",
@@ -51,7 +53,12 @@ __all__ = [
 ]
 
 ROOMS = ("diagnosis", "identification", "observe", "pose", "recordings", "robots")
-VERBS = {"diagnose": "diagnosis", "estimate_pose": "pose", "identify": "identification"}  # function: its room
+VERBS = {
+    "diagnose": "diagnosis",
+    "estimate_pose": "pose",
+    "identify": "identification",
+    "load": "diagnosis",
+}  # function: its room
 
 
 def __dir__() -> list[str]:

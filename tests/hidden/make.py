@@ -39,7 +39,8 @@ def scenes(found: Case, take: Take) -> tuple[Scene, Scene]:
     )
     plate = replace(plain.plate, stiffness=fabric["bending_stiffness"])
     sensor = replace(plain.sensor, bias=found.bias, occlusion=found.occlusion)
-    true = replace(plain, sheet=sheet, plate=plate, sensor=sensor)
+    grip = replace(plain.grip, radius=found.size.pad)
+    true = replace(plain, sheet=sheet, plate=plate, sensor=sensor, grip=grip)
     said = replace(
         true,
         sheet=replace(

@@ -18,6 +18,7 @@ class Partner:
         signs: drawn from these.
         sign: of the library's amplitude over the generator's; 0: not comparable.
         headed: takes a heading: one of the world's four.
+        axis: of the library's amplitude; what is headed has the world's.
         table: shows on a table only; ``motion``: in this one, which then is among the case's.
         beside: further effects that must be there for this one to be felt; naming them is right, too.
     """
@@ -27,6 +28,7 @@ class Partner:
     signs: tuple[int, ...] = (1,)
     sign: float = 1.0
     headed: bool = False
+    axis: str = ""
     table: bool = False
     motion: str = ""
     beside: tuple[tuple[str, float], ...] = ()
@@ -48,9 +50,9 @@ SINGLES = {
     "elas.ortho": Partner(("elas.ortho",)),
     "elas.shear": Partner(("elas.shear",)),
     "elas.stiffen": Partner(("elas.stiffen",)),
-    "rest.curl": Partner(("rest.curl",), signs=BOTH, sign=0.0),
-    "rest.shrink": Partner(("rest.shrink",), signs=BOTH),
-    "rest.shrink_u": Partner(("rest.shrink",), signs=BOTH),
+    "rest.curl": Partner(("rest.curl",), signs=BOTH, axis="warp"),
+    "rest.shrink": Partner(("rest.shrink",), signs=BOTH, axis="weft"),
+    "rest.shrink_u": Partner(("rest.shrink",), signs=BOTH, axis="warp"),
     "rest.skew": Partner(("rest.skew",), signs=BOTH),
     "mass.density": Partner(("mass.density",), signs=BOTH),
     "mass.hem": Partner(("mass.hem",)),
@@ -80,7 +82,7 @@ OUTSIDE = {
     "x.backlash": Partner(()),
     "x.jet": Partner((), headed=True, beside=DRAG),
     "x.layer_mass": Partner(()),
-    "x.layer_stiffness": Partner(()),
+    "x.layer_stiffness": Partner((), 4.0),  # stiffer needs steps too small for a round
     "x.moisture": Partner((), 0.2),
     "x.stick_slip": Partner((), table=True),
 }

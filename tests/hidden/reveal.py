@@ -11,10 +11,9 @@ import sys
 from dataclasses import asdict
 
 import beside  # noqa: F401
-from drawn import CONFOUNDED, REDUCED, SMALL, Case, case
+from drawn import CONFOUNDED, REDUCED, SMALL, Case, Hidden, case
 from partners import OUTSIDE, SINGLES
 
-TELLS_NOTHING = "mass without forces"
 LIKE = {  # confounded cases: what else explains the data as well; what one may tell apart after all is "soft"
     "tilt or wind": {"like": ["env.gravity_tilt", "air.wind", "obs.rotation"], "soft": False},
     "base or extrinsic": {"like": ["obs.extrinsic", "robot.base"], "soft": False},
@@ -29,8 +28,9 @@ def truth(found: Case) -> dict[str, object]:
     effects = [
         {
             **asdict(h),
-            "names": list(_partner(h.name).names) or ([h.name] if h.name in SINGLES else []),
-            "sign": _axis(h.options.get("heading")) * _partner(h.name).sign,
+            "names": list(_partner(h.name).names),
+            "hypothesis": _hypothesis(h),
+            "sign": _forward(h.options.get("heading")) * _partner(h.name).sign,
             "beside": h.name in needed,
         }
         for h in found.effects
@@ -54,7 +54,14 @@ def _partner(name: str):
     return (SINGLES | OUTSIDE)[name]
 
 
-def _axis(heading: float | None) -> float:
+def _hypothesis(hidden: Hidden) -> str:
+    """The library's name with its axis; "" where it has none."""
+    own = _partner(hidden.name)
+    axis = ("x" if hidden.options["heading"] in (0.0, 180.0) else "y") if own.headed else own.axis
+    return own.names[0] + (f"[{axis}]" if axis else "") if own.names else ""
+
+
+def _forward(heading: float | None) -> float:
     """Sign along the world's axis that a heading follows."""
     return 1.0 if heading in (None, 0.0, 90.0) else -1.0
 

@@ -150,6 +150,13 @@ def test_truths_name_what_is_right():
     assert json.loads(json.dumps(wind)) == wind
 
 
+def test_hypotheses_are_the_librarys_with_their_axes():
+    names = {h.name for h in known()}
+    for seed in range(DEVELOPMENT):
+        for e in truth(case(seed))["effects"]:
+            assert e["hypothesis"] in names if e["names"] else e["hypothesis"] == ""
+
+
 def test_wrong_numbers_are_refused_in_one_line(tmp_path, capsys):
     assert main(["--seed", "5000", "--out", str(tmp_path / "x")]) == 2
     assert capsys.readouterr().err == "seed 5000: expected 0 to 999, or 100000 and more\n"

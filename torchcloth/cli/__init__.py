@@ -8,9 +8,21 @@ from collections.abc import Sequence
 from importlib import metadata
 
 from ..errors import TorchclothError
-from . import bench, convert, diagnose, doctor, identify, inspect, pose, predict, simulate, view
+from . import bench, confirm, convert, diagnose, doctor, identify, inspect, pose, predict, simulate, view
 
-VERBS = (identify, predict, pose, diagnose, inspect, view, convert, simulate, doctor, bench)  # each has add(verbs)
+VERBS = (
+    identify,
+    predict,
+    pose,
+    diagnose,
+    confirm,
+    inspect,
+    view,
+    convert,
+    simulate,
+    doctor,
+    bench,
+)  # each has add(verbs)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -38,7 +38,7 @@ def _diagnose(options: argparse.Namespace) -> int:
         answer = diagnosis.refused(faults)
     else:
         print(f"{len(episodes)} episodes: about a minute each on one core", flush=True)
-        with _progress() as progress:
+        with progress_line() as progress:
             answer = diagnosis.diagnose(
                 episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume
             )
@@ -52,7 +52,7 @@ def _diagnose(options: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _progress() -> Iterator[Callable[[str], None]]:
+def progress_line() -> Iterator[Callable[[str], None]]:
     """One line that changes on a terminal; in a log, a line for every stage."""
     if not sys.stderr.isatty():
         yield lambda text: None if text.endswith("left") else print(text, flush=True)

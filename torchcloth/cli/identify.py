@@ -16,6 +16,7 @@ from .folders import check_folder
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
+    from ..diagnosis import Model
     from ..identification import Identification
     from ..identification.fields import FieldFit
     from ..recordings import Recording
@@ -39,6 +40,7 @@ def add(verbs: Any) -> None:
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--model", metavar="MODEL", help="a .tcm file of `diagnose` to start from")
     parser.add_argument("--fit", nargs="+", metavar="NAME", help="parameters to fit (default: all of the model)")
     parser.add_argument(
         "--start", nargs="+", default=[], metavar="NAME=VALUE", help="start values, SI units, e.g. youngs_modulus=2e5"
@@ -136,7 +138,10 @@ def _cloth(options: argparse.Namespace, recording: Recording) -> Cloth:
     from ..identification.unknowns import available
     from ..transfer import Contact
 
-    cloth = cloth_from(recording, contact=None if options.contact is None else Contact(options.contact))
+    if options.model is not None:
+        cloth = _of_model(options, recording)
+    else:
+        cloth = cloth_from(recording, contact=None if options.contact is None else Contact(options.contact))
     cloth.engine = options.engine
     names = available(cloth)
     for name, value in assignments(options.start).items():
@@ -144,6 +149,25 @@ def _cloth(options: argparse.Namespace, recording: Recording) -> Cloth:
             raise InvalidInput("--start", got=repr(name), expected=f"one of {', '.join(sorted(names))}")
         cloth.get_submodule(names[name]).set(value)  # type: ignore[operator]
     return cloth
+
+
+def _of_model(options: argparse.Namespace, recording: Recording) -> Cloth:
+    """The extended cloth of a diagnosis, in the episode's scene."""
+    from .. import diagnosis
+
+    if options.contact is not None:
+        raise InvalidInput("--contact", got="it beside --model", expected="one of them")
+    file = diagnosis.read_model(options.model, recording)
+    say_what_is_beside(file.model, "name it under --nuisance to allow for it")
+    return file.model.world().cloth.requires_grad_(True)
+
+
+def say_what_is_beside(model: Model, remedy: str) -> None:
+    """A note on causes that a cloth cannot carry."""
+    from .. import diagnosis
+
+    for name, amplitude in diagnosis.beside_the_cloth(model).items():
+        print(f"note: {name} = {amplitude:.4g} of the model is not in the cloth: {remedy}")
 
 
 def assignments(pairs: Sequence[str], option: str = "--start") -> dict[str, float]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
 from .folders import check_folder
-from .identify import assignments, nuisances_of
+from .identify import assignments, nuisances_of, say_what_is_beside
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -23,7 +23,9 @@ def add(verbs: Any) -> None:
     """The verb and its options."""
     pose = verbs.add_parser("pose", help="estimate the full mesh over time from partial clouds")
     pose.add_argument("episode", metavar="EPISODE", help="folder of a recording")
-    pose.add_argument("--fit", type=Path, metavar="RESULT", help="identification.json or its folder: take its values")
+    pose.add_argument(
+        "--fit", type=Path, metavar="RESULT", help="identification.json, its folder or a .tcm file: take its values"
+    )
     pose.add_argument(
         "--uncertain",
         nargs="+",
@@ -60,7 +62,7 @@ def _pose(options: argparse.Namespace) -> int:
     film = viewing.film_of_pose(recording, estimate, truth=options.truth)
     picture = viewing.picture(film, options.out / "pose.png", size=PICTURE)
     print_pose(estimate)
-    if options.fit is not None and is_fitted(options.fit, recording):
+    if options.fit is not None and options.fit.suffix != ".tcm" and is_fitted(options.fit, recording):
         print("note: the fit used this episode: it counts twice, and the errors of the fabric's values are too small")
     print("result: " + ", ".join(str(path) for path in (*files, picture)))
     return 0
@@ -71,13 +73,24 @@ def _model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, di
     from ..identification import cloth_from, fitted
     from ..identification.unknowns import available
 
-    cloth, uncertain = (cloth_from(recording), {}) if options.fit is None else fitted(options.fit, recording)
+    if options.fit is not None and options.fit.suffix == ".tcm":
+        cloth, uncertain = _of_model(options.fit, recording)
+    else:
+        cloth, uncertain = (cloth_from(recording), {}) if options.fit is None else fitted(options.fit, recording)
     names = available(cloth)
     for name, spread in assignments(options.uncertain, "--uncertain").items():
         if name not in names:
             raise InvalidInput("--uncertain", got=repr(name), expected=f"one of {', '.join(sorted(names))}")
         uncertain[name] = (cloth.get_submodule(names[name]).value.item(), spread)  # type: ignore[union-attr]
     return cloth, uncertain
+
+
+def _of_model(path: Path, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
+    from .. import diagnosis
+
+    file = diagnosis.read_model(path, recording)
+    say_what_is_beside(file.model, "name it under --nuisance to allow for it")
+    return file.model.world().cloth, diagnosis.uncertain(file)
 
 
 def _estimate(

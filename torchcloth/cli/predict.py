@@ -25,7 +25,12 @@ def add(verbs: Any) -> None:
         "episode, how sure that is, and how far it is from what was seen.",
     )
     add = predict.add_argument
-    add("fit", type=Path, metavar="FIT", help="tension.json or identification.json, or the folder that holds it")
+    add(
+        "fit",
+        type=Path,
+        metavar="FIT",
+        help="tension.json or identification.json, the folder that holds it, or a .tcm file of `diagnose`",
+    )
     add("seen", type=Path, nargs="?", metavar="SEEN", help="a tension table or an episode: to predict and compare with")
     add("--out", type=Path, metavar="DIR", help="folder for prediction.json and pictures (FIT's folder/prediction)")
     add("--angle", type=float, metavar="DEGREES", help="of the strip, from the warp")
@@ -47,6 +52,8 @@ def _predict(options: argparse.Namespace) -> int:
     folder = options.fit if options.fit.is_dir() else options.fit.parent
     out = folder / "prediction" if options.out is None else options.out
     check_folder(out)
+    if options.fit.suffix == ".tcm":
+        return _of_episode(options.fit, out, options)
     known = [name for name in (TENSION, RESULT) if (folder / name).is_file()]
     if options.fit.name in (TENSION, RESULT):
         known = [options.fit.name] if options.fit.is_file() else []
@@ -87,12 +94,14 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
 
     from .. import recordings
     from .._files import atomically
+    from ..diagnosis import predicted
     from ..identification import is_fitted, pictures, predict_episode, prediction_report
 
     if options.seen is None:
         raise InvalidInput("SEEN", got="none", expected="an episode whose motion is to be predicted")
     recording = recordings.read(options.seen)
-    found = predict_episode(fit, recording)
+    of_model = fit.suffix == ".tcm"
+    found = predicted(fit, recording) if of_model else predict_episode(fit, recording)
     path = _write(out, found.as_dict())
     with atomically(out / "prediction.npz") as file:
         t, vertices, std = (part.numpy() for part in (found.episode.times, found.frames.x, found.std))
@@ -100,7 +109,7 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
         np.savez_compressed(file, t=t, vertices=vertices, std=std, interval=interval, faces=faces)
     picture = pictures.save_figure(prediction_report.predicted(found), out / "prediction.png")
     prediction_report.print_predicted(found)
-    if is_fitted(fit, recording):
+    if not of_model and is_fitted(fit, recording):
         print("note: this episode was fitted: its distances are residuals, not errors of a prediction")
     print(f"result:   {path}\nframes:   {out / 'prediction.npz'}\npicture:  {picture}")
     return 0

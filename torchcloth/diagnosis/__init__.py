@@ -6,13 +6,15 @@
 
 from .base_model import base_model
 from .comparison import Gain, compare, predict
+from .confirming import Confirmation, confirm
 from .evidence import gather, setting_of
 from .fitting import Fitted, fit
 from .gate import Fault, check, read_episodes
 from .hypotheses import catalogue, register
 from .lacking import lack_of_fit
+from .loading import beside_the_cloth, cloth_for, load, load_world, predicted, uncertain
 from .missing import MissingForce, missing_force
-from .model_file import load_model, save_model
+from .model_file import load_model, read_model, save_model
 from .noise import fit_noise
 from .residual import Residual, learn_residual
 from .run import diagnose, write_diagnosis
@@ -22,6 +24,7 @@ from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model, World
 
 __all__ = [
+    "Confirmation",
     "Diagnosis",
     "Fault",
     "Fitted",
@@ -32,9 +35,12 @@ __all__ = [
     "Residual",
     "World",
     "base_model",
+    "beside_the_cloth",
     "catalogue",
     "check",
+    "cloth_for",
     "compare",
+    "confirm",
     "diagnose",
     "fit",
     "fit_noise",
@@ -42,15 +48,20 @@ __all__ = [
     "judge",
     "lack_of_fit",
     "learn_residual",
+    "load",
     "load_model",
+    "load_world",
     "missing_force",
     "predict",
+    "predicted",
     "read_episodes",
+    "read_model",
     "refused",
     "register",
     "save_model",
     "screen",
     "search",
     "setting_of",
+    "uncertain",
     "write_diagnosis",
 ]

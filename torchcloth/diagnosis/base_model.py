@@ -16,9 +16,10 @@ from ..parameters import PhysicalParameter
 from ..recordings import Collider, Recording
 from .world import Model, Parameter, World
 
+LEAST = 1e-3  # -, of Poisson's ratio
 INSIDE = 0.02  # m, that noise and a table's place may explain
 WRONG_BY = 2.5  # factor that a data sheet may be wrong by: two standard deviations
-LOGIT = 0.8  # standard deviation of logit(2 nu)
+POISSON, SPREAD, MOST = 0.05, 0.1, 0.45  # step, standard deviation and largest value of Poisson's ratio
 
 
 def together(recordings: Sequence[Recording]) -> Recording:
@@ -56,8 +57,8 @@ def _parameters(cloth: Cloth, recording: Recording) -> list[Parameter]:
     spread = 0.5 * math.log(WRONG_BY)
     found = [_log(cloth, "material.youngs_modulus", 0.05, spread)]
     nu = float(cloth.material.poisson_ratio.value)  # type: ignore[attr-defined,union-attr]
-    middle = math.log(2 * nu / (1 - 2 * nu))
-    found.append(_of(cloth, "material.poisson_ratio", 0.2, LOGIT, lambda c: 0.5 / (1 + math.exp(-middle - c))))
+    ratio = _of(cloth, "material.poisson_ratio", POISSON, SPREAD, lambda c: min(max(nu + c, LEAST), MOST + POISSON))
+    found.append(replace(ratio, low=LEAST - nu, high=MOST - nu))
     if "bending" in cloth.effects:
         found.append(_log(cloth, "effects.bending.stiffness", 0.1, spread))
     std = recording.cloth.areal_density_std

@@ -7,7 +7,7 @@ priors, is used.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from .cells import SEEN
 from .evidence import aligned
 from .fitting import Fitted, prior_precision
 
+ALONE = 0.7  # share of the information, of a motion without which a cause cannot be sized
 BLOCK = 2  # windows of cells that are resampled together
 DRAWS = 2000
 FEW = 8  # episodes, below which they show too little of their own spread: the share's interval is doubled
@@ -46,22 +47,68 @@ class Gain(NamedTuple):
     explained_ci95: tuple[float, float]
 
 
-def predict(found: Fitted, groups: Sequence[str]) -> Predicted:
-    """Residuals of every episode when its group of motions is left out of the fit."""
+def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> Predicted:
+    """Residuals of every episode when its group of motions is left out of the fit.
+
+    Of the groups ``halved`` every other stretch of time is left out instead, and then the others: where one kind of
+    motion alone tells of a cause, no other can say how large it is.
+    """
     white, count = found.white, found.evidence.own
     precision = torch.diag(prior_precision(found.model))
     own, point = white.jacobian[:, :count], found.model.point
     whitened = white.value.clone()
-    names = np.array(groups)
-    for group in sorted(set(groups)):
-        inside = torch.as_tensor(np.isin(white.episode.numpy(), np.flatnonzero(names == group)))
+    for inside in _folds(found, groups, halved):
         rest, r = own[~inside], white.value[~inside]
         step = -torch.linalg.solve(rest.mT @ rest + precision, rest.mT @ r + precision @ point)
+        step = found.model.at(point + step).point - point
         whitened[inside] += own[inside] @ step
-    cells = found.evidence.cells
+    return _told(found, whitened)
+
+
+def as_it_is(found: Fitted) -> Predicted:
+    """Residuals of every episode by a model that was not fitted to any of them."""
+    return _told(found, found.white.value)
+
+
+def of_episodes(p: Predicted, episodes: Sequence[int]) -> Predicted:
+    """Only these."""
+    kept = torch.isin(p.episode, torch.as_tensor(episodes))
+    return Predicted(*(column[kept] for column in p))
+
+
+def _told(found: Fitted, whitened: Tensor) -> Predicted:
+    cells, white = found.evidence.cells, found.white
     join = lambda name: torch.cat([getattr(c, name) for c in cells])  # noqa: E731
     value = torch.cat([_adjusted(found, k, whitened[white.episode == k]) for k in range(len(cells))])
     return Predicted(value, whitened, join("key"), white.episode, join("window"), join("block") < SEEN)
+
+
+def _folds(found: Fitted, groups: Sequence[str], halved: Collection[str]) -> list[Tensor]:
+    """[C] bool each: what is left out together."""
+    member = _member(found, groups)
+    odd = torch.cat([c.window for c in found.evidence.cells]) // BLOCK % 2 == 1
+    out = []
+    for k, group in enumerate(sorted(set(groups))):
+        inside = member == k
+        out += [inside & odd, inside & ~odd] if group in halved else [inside]
+    return out
+
+
+def _member(found: Fitted, groups: Sequence[str]) -> Tensor:
+    """[C] which of the sorted groups a cell belongs to."""
+    order = {group: k for k, group in enumerate(sorted(set(groups)))}
+    return torch.tensor([order[g] for g in groups])[found.white.episode]
+
+
+def telling(found: Fitted, groups: Sequence[str]) -> set[str]:
+    """The group that alone tells of the last accepted cause, beside what is fitted anyway; none, as a rule."""
+    count, member = found.evidence.own, _member(found, groups)
+    own, prior = found.white.jacobian[:, :count], prior_precision(found.model)
+    others = torch.cat([own[:, :-1], torch.diag(prior[:-1].sqrt())])
+    asked = torch.cat([own[:, -1], own.new_zeros(count - 1)])
+    left = (asked - others @ torch.linalg.lstsq(others, asked[:, None]).solution[:, 0])[: len(own)].square()
+    share = torch.stack([left[member == k].sum() for k in range(len(set(groups)))]) / left.sum().clamp(min=1e-30)
+    return {sorted(set(groups))[int(share.argmax())]} if float(share.max()) > ALONE else set()
 
 
 def _adjusted(found: Fitted, k: int, white: Tensor) -> Tensor:

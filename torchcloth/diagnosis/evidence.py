@@ -162,15 +162,15 @@ def _piece(
 ) -> Piece:
     """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
     e, world, steps = setting.episodes[k], model.world(), [step for _, step in shifts]
-    beside = [_shifted(model, coordinate, step).world() for coordinate, step in shifts]
+    beside = [shifted(model, coordinate, step).world() for coordinate, step in shifts]
     runs = _runs(model, world, setting, k, hypotheses, beside, with_held=known is None)
     able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
     typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
     base = world.seen(runs.plain, e)
     moved = directions(base, [*runs.beside, *(t for t in runs.trials if t is not None)], [*steps, *typical])
     if known is None:
-        other, std = _nuisances(world, base, runs.held, e)
-        coarse = cells_of(base, _joined(moved, other), e, setting.sheet, setting.rest)
+        other, std = nuisances(world, base, runs.held, e)
+        coarse = cells_of(base, joined(moved, other), e, setting.sheet, setting.rest)
     else:
         key, slopes, std = known
         coarse = cells_of(base, moved, e, setting.sheet, setting.rest)
@@ -196,11 +196,11 @@ def _runs(
     setting: Setting,
     k: int,
     hypotheses: Sequence[Hypothesis],
-    shifted: Sequence[World],
+    near: Sequence[World],
     with_held: bool,
 ) -> _Runs:
     e, dt = setting.episodes[k], setting.dt
-    beside = [partial(w.frames, e, dt) for w in shifted]
+    beside = [partial(w.frames, e, dt) for w in near]
     modes = Held().modes(world.cloth, e) if with_held else ()
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m, settles=True), dt) for m in modes]
     changed = [h.apply(world, h.typical) for h in hypotheses]
@@ -260,28 +260,30 @@ def step_sizes(model: Model) -> list[tuple[int, float]]:
     return list(enumerate([*(p.step for p in model.parameters), *(0.1 * h.typical for h in model.accepted)]))
 
 
-def _shifted(model: Model, coordinate: int, step: float) -> Model:
+def shifted(model: Model, coordinate: int, step: float) -> Model:
+    """Beside the model's point."""
     beside = model.point
     beside[coordinate] += step
     return model.at(beside)
 
 
-def _nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:
+def nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:
     """Derivatives along what differs from episode to episode, and its standard deviations."""
-    shifted, steps, stds = [], [], []
+    moved, steps, stds = [], [], []
     for kind, std in ((Clock(), [CLOCK]), (Camera(), [SHIFT] * 3 + [TURN] * 3), (Rim(), [RIM]), (Tare(), None)):
         parts = len(kind.parts(world.cloth, e))
         for k in range(parts):
             own = TARE if std is None else std[k]
             values = torch.zeros(parts, dtype=base.x.dtype)
             values[k] = 0.5 * own
-            shifted.append(kind.see(base, values, e))
+            moved.append(kind.see(base, values, e))
             steps.append(0.5 * own)
             stds.append(own)
     every = [GRASP] * len(held)
-    return directions(base, [*shifted, *held], [*steps, *every]), torch.tensor([*stds, *every], dtype=torch.float64)
+    return directions(base, [*moved, *held], [*steps, *every]), torch.tensor([*stds, *every], dtype=torch.float64)
 
 
-def _joined(a: Frames, b: Frames) -> Frames:
+def joined(a: Frames, b: Frames) -> Frames:
+    """Directions of both."""
     wrench = {name: torch.cat([a.wrench[name], b.wrench[name]]) for name in a.wrench}
     return Frames(torch.cat([a.x, b.x]), torch.cat([a.v, b.v]), wrench, torch.cat([a.edge, b.edge]))

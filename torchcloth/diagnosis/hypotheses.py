@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ..errors import InvalidInput
 from ..recordings import Recording
 from . import air, fabric, grip, observer
 from .world import Hypothesis, Model
@@ -16,8 +17,19 @@ _registered: list[Hypothesis] = []
 
 
 def register(hypothesis: Hypothesis) -> Hypothesis:
-    """Let a hypothesis of one's own join every search; one of the same name is replaced."""
+    """Let a hypothesis of one's own join every search; one of the same name that was registered before is replaced.
+
+    Raises:
+        InvalidInput: a name of the catalogue.
+    """
     forget(hypothesis.name)
+    if hypothesis.name in {h.name for h in known()}:
+        raise InvalidInput(
+            "hypothesis",
+            got=f"the name {hypothesis.name!r}, which the catalogue has",
+            expected="a name of its own",
+            remedy=f"call it e.g. 'my.{hypothesis.name.partition('.')[2]}'",
+        )
     _registered.append(hypothesis)
     return hypothesis
 

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import zipfile
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,12 +29,21 @@ from .world import Model
 
 FORMAT = 1
 MESH = ("vertices", "faces", "uv")
+SAME_FABRIC = 0.01  # relative difference of areal density that rounding explains
 
 
 def save_model(
-    path: Path, model: Model, recording: Recording, covariance: Tensor | None = None, residual: Model | None = None
+    path: Path,
+    model: Model,
+    recording: Recording,
+    covariance: Tensor | None = None,
+    residual: Model | None = None,
+    episodes: Sequence[dict[str, Any]] = (),
 ) -> Path:
-    """Write a model whose base is that of ``recording``, and the same with a residual force; returns the path."""
+    """Write a model whose base is that of ``recording``, and the same with a residual force; returns the path.
+
+    ``episodes`` are the marks (``identification.saved.mark``) of those that it was fitted to.
+    """
     cloth = recording.cloth
     facts: dict[str, Any] = {
         "areal_density": cloth.areal_density,
@@ -54,6 +65,7 @@ def save_model(
         **_numbers(model),
         "residual": None if residual is None else _numbers(residual),
         "covariance": None if covariance is None else covariance.tolist(),
+        "episodes": list(episodes),
     }
     arrays = {name: getattr(cloth, name) for name in MESH if getattr(cloth, name) is not None}
     buffer = io.BytesIO()
@@ -73,11 +85,26 @@ def _numbers(model: Model) -> dict[str, Any]:
     }
 
 
+class ModelFile(NamedTuple):
+    """What a file holds."""
+
+    model: Model
+    covariance: Tensor | None  # [P + A, P + A] of the model's coordinates
+    episodes: list[dict[str, Any]]  # marks of those that it was fitted to
+
+
 def load_model(path: str | Path, residual: bool = True) -> Model:
-    """A model that was written by ``save_model``; with its residual force, if it has one, unless that is left out.
+    """A model that was written by ``save_model``; raises as ``read_model``."""
+    return read_model(path, residual=residual).model
+
+
+def read_model(path: str | Path, scene: Recording | None = None, residual: bool = True) -> ModelFile:
+    """A model file; with a ``scene``, in that episode's mesh, grasps and tables.
+
+    With its residual force, if it has one, unless that is left out; the covariance is that of all other numbers.
 
     Raises:
-        InvalidInput: no such file, or a cause that is not in the catalogue.
+        InvalidInput: no such file, a cause that is not in the catalogue, or a scene with another fabric.
         RecordingError: a file that is damaged or no model.
     """
     path = Path(path)
@@ -92,15 +119,31 @@ def load_model(path: str | Path, residual: bool = True) -> Model:
             raise RecordingError(
                 f"{path}: format {content['format']}", expected=f"{FORMAT}", remedy="update torchcloth"
             )
-        model = base_model(_recording(content["cloth"], mesh))
+        own = _recording(content["cloth"], mesh)
         numbers = (content.get("residual") if residual else None) or content
         coordinates = {name: float(p["coordinate"]) for name, p in numbers["parameters"].items()}
         causes = [(str(c["effect"]), float(c["amplitude"])) for c in numbers["causes"]]
+        matrix, episodes = content["covariance"], list(content.get("episodes", ()))
     except (zipfile.BadZipFile, KeyError, TypeError, ValueError, OSError) as error:
         raise RecordingError(f"{path}: unreadable", got=repr(error), expected="a model of torchcloth") from None
+    model = base_model(own if scene is None else _of_fabric(path, own, scene))
     values = torch.tensor([coordinates[p.name] for p in model.parameters], dtype=torch.float64)
-    model = Model(model.base, model.parameters, values)
-    return _extended(path, model, causes)
+    model = _extended(path, replace(model, values=values), causes)
+    return ModelFile(model, None if matrix is None else torch.tensor(matrix, dtype=torch.float64), episodes)
+
+
+def _of_fabric(path: Path, own: Recording, scene: Recording) -> Recording:
+    """The scene with the data sheet that the model's coordinates are relative to."""
+    a, b = own.cloth, scene.cloth
+    if not math.isclose(a.areal_density, b.areal_density, rel_tol=SAME_FABRIC):
+        raise InvalidInput(
+            f"{path}: a model of another fabric",
+            got=f"an episode with {b.areal_density:.4g} kg/m^2",
+            expected=f"{a.areal_density:.4g} kg/m^2",
+            remedy="diagnose this cloth, or correct the episode's areal_density",
+        )
+    sheet = ("areal_density", "areal_density_std", "thickness", "nominal")
+    return replace(scene, cloth=replace(b, **{name: getattr(a, name) for name in sheet}))
 
 
 def _extended(path: Path, model: Model, causes: Sequence[tuple[str, float]]) -> Model:

@@ -10,21 +10,24 @@ from pathlib import Path
 
 from .._files import write_text
 from ..errors import InvalidInput
+from ..identification.saved import mark
 from ..recordings import Recording
 from .base_model import base_model, together
-from .evidence import Progress, Setting, setting_of
+from .evidence import Progress, Setting, setting_of, staged
 from .gate import check
 from .hypotheses import catalogue
 from .keeping import kept_in
 from .missing import missing_force
 from .model_file import save_model
+from .next_experiment import propose
 from .report import write_report
 from .residual import learn_residual
 from .stepwise import search
 from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
 
-RESULT, EXTENDED = "diagnosis.json", "extended.tcm"
+OPEN = ("ambiguous", "inconclusive", "unexplained")  # verdicts that another experiment may change
+RESULT, BASE, EXTENDED = "diagnosis.json", "base.tcm", "extended.tcm"
 
 
 def diagnose(
@@ -67,9 +70,13 @@ def diagnose(
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     answer = judge(search(model, setting, asked, progress), setting.names)
+    following = None
+    if answer.verdict in OPEN:
+        following = propose(answer.found, answer.content["causes"], setting, staged(progress, "next experiment"))
     if any(row["lacking"] for row in answer.content["lack_of_fit"]):
         answer = _beyond(answer, answer.found.setting, progress)
-    return replace(answer, content=answer.content | {"plan_hash": plan, "model": EXTENDED})
+    files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
+    return replace(answer, content=answer.content | files | {"next_experiment": following})
 
 
 def _beyond(answer: Diagnosis, setting: Setting, progress: Progress) -> Diagnosis:
@@ -81,13 +88,16 @@ def _beyond(answer: Diagnosis, setting: Setting, progress: Progress) -> Diagnosi
 
 
 def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Path:
-    """Write diagnosis.json, report.html and, unless data are invalid, the extended model; returns the first's path.
+    """Write diagnosis.json, report.html and, unless data are invalid, the models; returns the first's path.
 
     ``recordings`` are the episodes, which say what the base model is of.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if answer.searched is not None:
+        said, scene = answer.content["episodes"], together(recordings)
         residual = answer.residual.model if answer.residual is not None and answer.residual.terms else None
-        save_model(folder / EXTENDED, answer.model, together(recordings), answer.found.end.covariance, residual)
+        start, end = answer.found.start, answer.found.end
+        save_model(folder / BASE, start.model, scene, start.covariance, episodes=said)
+        save_model(folder / EXTENDED, end.model, scene, end.covariance, residual, said)
     write_report(answer, folder)
     return write_text(folder / RESULT, json.dumps(answer.content, indent=1, allow_nan=False) + "\n")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from ..errors import SimulationDiverged, UnstableStep
 from .approach import approach
 from .branches import unstable, without
-from .comparison import Gain, Predicted, compare, predict
+from .comparison import Gain, Predicted, compare, predict, telling
 from .evidence import Progress, Setting, staged
 from .fitting import Fitted, fit, renoised
 from .noise import Noise, fit_noise, floor_of, unfitted
@@ -33,6 +33,7 @@ class Candidate:
     fitted: Fitted
     predicted: Predicted
     gain: Gain  # over the model without it
+    alone: set[str]  # the motion that alone tells of it, if any
 
     @property
     def hypothesis(self) -> Hypothesis:
@@ -48,6 +49,7 @@ class Step:
     tried: list[Candidate]  # best among them
     rivals: list[Candidate]
     screened: list[Row]
+    before: Fitted  # the model without it, with slopes along everything that was asked about
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +109,11 @@ def extend(
         current = fit(step.best.fitted.model, setting, left, FURTHER, now, before=start.evidence)
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     screened = screen(current)
-    last, sensor = predict(current, setting.names), floor_of(current.evidence, current.noise)
+    alone = {name for step in steps for name in step.best.alone}
+    last, sensor = predict(current, setting.names, alone), floor_of(current.evidence, current.noise)
     repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
     floor = sensor if repeated is None else repeated.rms
-    first = predict(renoised(start, current.noise), setting.names)
+    first = predict(renoised(start, current.noise), setting.names, alone)
     whole = compare(first, last, floor) if steps else None
     return Found(start, current, steps, screened, whole, floor, sensor, repeated, setting)
 
@@ -131,7 +134,8 @@ def _pruned(
         name = step.best.hypothesis.name
         without = staged(progress, f"without {name}")
         less = fit(current.model.without(name), setting, (), 1, without, current.noise, current.evidence)
-        gain = compare(predict(less, setting.names), predict(current, setting.names), 0.0)
+        alone = step.best.alone
+        gain = compare(predict(less, setting.names, alone), predict(current, setting.names, alone), 0.0)
         if _worthwhile(gain):
             continue
         steps = [s for s in steps if s is not step]
@@ -157,13 +161,15 @@ def _step(
     tried = _compared(current, fits, setting.names, current.noise)
     first = max(tried, key=lambda c: c.gain.density)
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
-    tried = _compared(current, fits, setting.names, fit_noise(first.fitted.evidence))
+    noise = fit_noise(first.fitted.evidence)
+    tried = _compared(current, fits, setting.names, noise)
     useful = [c for c in tried if _useful(c)]
     if not useful:
         return None
     best = max(useful, key=lambda c: c.gain.density)
-    rivals = [c for c in useful if c is not best and _rival(c, best)]
-    return Step(best, tried, rivals, screened)
+    alike = lambda c: predict(renoised(c.fitted, noise), setting.names, best.alone)  # noqa: E731
+    rivals = [c for c in useful if c is not best and _rival(c, alike(c), best)]
+    return Step(best, tried, rivals, screened, current)
 
 
 def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> list[tuple[Row, Fitted]]:
@@ -181,10 +187,12 @@ def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> li
 
 def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise) -> list[Candidate]:
     """Each fit beside the model without it, on motions held out."""
-    before, out = predict(renoised(current, noise), names), []
+    before, out = renoised(current, noise), []
     for row, found in fits:
-        predicted = predict(renoised(found, noise), names)
-        out.append(Candidate(row, found, predicted, compare(before, predicted, 0.0)))
+        after = renoised(found, noise)
+        alone = telling(after, names)
+        predicted = predict(after, names, alone)
+        out.append(Candidate(row, found, predicted, compare(predict(before, names, alone), predicted, 0.0), alone))
     return out
 
 
@@ -197,9 +205,9 @@ def _worthwhile(gain: Gain) -> bool:
     return worth and gain.ci95[0] > 0
 
 
-def _rival(c: Candidate, best: Candidate) -> bool:
+def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
     """Predicts about as well: the paired difference is not clear."""
     if c.hypothesis.effect == best.hypothesis.effect:
         return False
-    over = compare(c.predicted, best.predicted, 0.0)
+    over = compare(predicted, best.predicted, 0.0)
     return over.density < CLEAR or over.ci95[0] < 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -132,12 +133,15 @@ class Hypothesis:
 class Parameter:
     """A number of the base model that is always fitted: log or plain, with a Gaussian prior around the data sheet.
 
+    Plain where a logarithm or logit would saturate: a coordinate in which nothing moves any more has no end.
+
     Attributes:
         name: public name of the parameter.
         step: finite step for derivatives, in the coordinate.
         std: of the prior, in the coordinate.
         set: (cloth, coordinate) -> None; 0 is the data sheet's value.
         value: coordinate -> physical value.
+        low, high: least and largest coordinate.
     """
 
     name: str
@@ -146,6 +150,8 @@ class Parameter:
     std: float
     set: Callable[[Cloth, float], None]
     value: Callable[[float], float]
+    low: float = -math.inf
+    high: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -176,11 +182,12 @@ class Model:
         return torch.cat([self.values, torch.tensor(self.amplitudes, dtype=self.values.dtype)])
 
     def at(self, point: Tensor) -> Model:
-        """The same model elsewhere; amplitudes that make no sense below zero stop there."""
+        """The same model elsewhere; coordinates stop at their ends, amplitudes without a sign at zero."""
         count = len(self.parameters)
         found = zip(self.accepted, point[count:].tolist(), strict=True)
         amplitudes = tuple(a if h.signed else max(a, 0.0) for h, a in found)
-        return replace(self, values=point[:count].clone(), amplitudes=amplitudes)
+        ends = torch.tensor([[p.low, p.high] for p in self.parameters], dtype=point.dtype)
+        return replace(self, values=point[:count].clamp(*ends.unbind(-1)), amplitudes=amplitudes)
 
     def plus(self, hypothesis: Hypothesis, amplitude: float = 0.0) -> Model:
         """With one more accepted hypothesis."""

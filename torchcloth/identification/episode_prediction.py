@@ -96,16 +96,30 @@ def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction
     data = episode(cloth, recording)
     raw = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
     frames, moved = tangents(cloth, unknowns, raw, data, model.dt)
+    return with_errors(cloth, data, frames, moved, covariance, model.left)
+
+
+def with_errors(
+    cloth: Cloth, data: Episode, frames: Frames, moved: Frames, covariance: Tensor, law: float
+) -> EpisodePrediction:
+    """A simulation beside what was seen, with the errors that follow from derivatives along K numbers.
+
+    Args:
+        cloth, data, frames: what was simulated.
+        moved: derivatives, with K in front.
+        covariance: [K, K] of the numbers.
+        law: m, rms distance that a fit left; NaN where that is not known.
+    """
     spread = lambda slopes: torch.einsum("k...,kl,l...->...", slopes, covariance.to(slopes), slopes).clamp(min=0)  # noqa: E731
     seen, per_frame = _figures(cloth, data, frames)
-    normal = _Along(torch.as_tensor(cloth.mesh.faces), frames.x, moved.x, covariance, model.left)
+    normal = _Along(torch.as_tensor(cloth.mesh.faces), frames.x, moved.x, covariance, law)
     return EpisodePrediction(
         cloth,
         data,
         frames,
         spread(moved.x).sum(-1).sqrt(),
         {name: spread(slopes).sqrt() for name, slopes in moved.wrench.items()},
-        model.left,
+        law,
         normal.of_triangles(),
         normal.inside(data),
         seen,

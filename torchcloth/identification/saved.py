@@ -58,7 +58,7 @@ def model_of(cloth: Cloth, fit: Identification, recordings: Sequence[Recording],
     episodes = []
     for recording, frames in zip(recordings, fit.frames_after, strict=True):
         chamfer = figures([frames], [episode(cloth, recording)], faces).chamfer
-        episodes.append({**_mark(recording), "chamfer": or_none(chamfer)})
+        episodes.append({**mark(recording), "chamfer": or_none(chamfer)})
     contact = None if cloth.contact is None else asdict(cloth.contact)
     return {"values": values, "contact": contact, "dt": dt, "episodes": episodes}
 
@@ -75,8 +75,8 @@ def replayed(path: str | Path, recording: Recording) -> Replayed:
         RecordingError: the file cannot be read, or does not hold what is needed.
     """
     model = read_saved(path)
-    own = _mark(recording)
-    before = [kept["chamfer"] for kept in model.episodes if _alike(kept, own)]
+    own = mark(recording)
+    before = [kept["chamfer"] for kept in model.episodes if alike(kept, own)]
     cloth = rebuilt(path, model, recording)
     data = episode(cloth, recording)
     with torch.no_grad():
@@ -174,7 +174,7 @@ def _model(content: dict[str, Any]) -> SavedModel:
     )
 
 
-def _mark(recording: Recording) -> dict[str, Any]:
+def mark(recording: Recording) -> dict[str, Any]:
     """What an episode is recognised by, wherever it lies."""
     name = recording.path.name if recording.path else "recording"
     points, markers = recording.points, recording.markers
@@ -191,10 +191,11 @@ def _mark(recording: Recording) -> dict[str, Any]:
 
 def is_fitted(path: str | Path, recording: Recording) -> bool:
     """Whether the fit used this episode: then nothing about it is a prediction, nor new."""
-    return any(_alike(kept, _mark(recording)) for kept in read_saved(path).episodes)
+    return any(alike(kept, mark(recording)) for kept in read_saved(path).episodes)
 
 
-def _alike(kept: dict[str, Any], own: dict[str, Any]) -> bool:
+def alike(kept: dict[str, Any], own: dict[str, Any]) -> bool:
+    """Whether two marks are of one episode."""
     counts = all(kept[key] == own[key] for key in ("frames", "points"))
     return counts and bool(np.abs(np.subtract(kept["mean"], own["mean"])).max() < SAME)
 

@@ -18,17 +18,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from torchcloth._files import write_text
 from torchcloth.errors import InvalidInput
 
 from ..kept import Kept
 from . import hidden_tables
 from .checkout import folder, module
-from .hidden_scores import judged
+from .hidden_gain import gain
+from .hidden_scores import judged, told_apart
 
 CASES = 60
-FAST_CASES, FAST_SECRET = 12, 7
+FAST_CASES, FAST_SECRET = 8, 23682
 REFUSED = 2  # exit code
+HEADINGS = (0.0, 90.0, 180.0, 270.0)  # degrees, of random experiments
 
 
 class Round(NamedTuple):
@@ -65,7 +69,8 @@ def run(options: argparse.Namespace) -> None:
 
 def drawn(options: argparse.Namespace) -> Round:
     """The cases that were asked for; a folder remembers its secret."""
-    count = options.cases or (FAST_CASES if options.fast else CASES)
+    usual = FAST_CASES if options.fast else CASES
+    count = usual if options.cases is None else options.cases
     cases = module("hidden", "drawn")
     if count < 1:
         raise InvalidInput("--cases", got=count, expected="1 or more")
@@ -94,14 +99,50 @@ def _secret(options: argparse.Namespace) -> int:
 def one(out: Path, name: str, seed: int, fast: bool) -> dict[str, Any]:
     """One case from making to revealing."""
     episodes, answer = out / "episodes" / name, out / "answers" / name
-    size = ["--fast"] if fast else []
-    _script("make.py", "--seed", str(seed), *size, "--out", str(episodes))
+    make = partial(_script, "make.py", "--seed", str(seed), *(["--fast"] if fast else []))
+    make("--out", str(episodes))
+    given = sorted(episodes.iterdir())
     begun = time.perf_counter()
-    found = answered(sorted(episodes.iterdir()), answer)
+    found = answered(given, answer)
     spent = time.perf_counter() - begun
     # only now
-    truth = json.loads(_script("reveal.py", "--seed", str(seed), *size))
-    return {"truth": truth, "answer": found, "seconds": round(spent, 1)}
+    truth = json.loads(_script("reveal.py", "--seed", str(seed), *(["--fast"] if fast else [])))
+    case = {"truth": truth, "answer": found, "seconds": round(spent, 1), "gain": None}
+    if truth["family"] == "next experiment":
+        case["next"] = experiments(out, name, make, given, found, seed)
+    if truth["family"] in ("single", "double") and not fast:
+        case["gain"] = _gain(out, name, make, given, found, truth)
+    return case
+
+
+def experiments(
+    out: Path, name: str, make: Callable[..., str], given: list[Path], answer: Mapping[str, Any], seed: int
+) -> dict[str, Any]:
+    """Answers after the experiment that was proposed, and after a random one; None where none was proposed."""
+    proposed = answer.get("next_experiment")
+    if not proposed:
+        return {"proposed": None, "random": None}
+    rng = np.random.default_rng([seed, 17])
+    motions = module("independent", "motions").NAMES
+    drawn = {"motion": str(rng.choice(motions)), "heading": float(rng.choice(HEADINGS)), "speed": 1.0}
+    found = {}
+    for which, plan in (("proposed", proposed), ("random", drawn)):
+        folder = out / "episodes" / f"{name}-{which}"
+        asked = [part for key in drawn if plan.get(key) is not None for part in (f"--{key}", str(plan[key]))]
+        make(*asked, "--out", str(folder))
+        found[which] = answered([*given, *folder.iterdir()], out / "answers" / f"{name}-{which}")
+    return found
+
+
+def _gain(
+    out: Path, name: str, make: Callable[..., str], given: list[Path], answer: Mapping[str, Any], truth: Mapping
+) -> float | None:
+    """Of the answer, over the oracle's."""
+    if not answer.get("model"):
+        return None
+    folder = out / "episodes" / f"{name}-unseen"
+    make("--unseen", "--out", str(folder))
+    return gain(given, out / "answers" / name / str(answer["model"]), next(folder.iterdir()), truth)
 
 
 def answered(episodes: list[Path], out: Path) -> dict[str, Any]:
@@ -132,6 +173,10 @@ def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
 
 def scored(name: str, case: Mapping[str, Any]) -> dict[str, Any]:
     """A kept case as the tables have it."""
-    rest = {key: case.get(key) for key in ("seconds", "gain")}
-    sealed = {"seed": case["truth"]["seed"], "sealed": case["truth"]["sealed"]}
-    return {"name": name, **sealed, **judged(case["truth"], case["answer"]), **rest}
+    truth, later = case["truth"], case.get("next")
+    rest: dict[str, Any] = {key: case.get(key) for key in ("seconds", "gain")}
+    if later is not None:
+        rest["resolved"] = later["proposed"] is not None and told_apart(truth, later["proposed"])
+        rest["random_resolved"] = None if later["random"] is None else told_apart(truth, later["random"])
+    sealed = {"seed": truth["seed"], "sealed": truth["sealed"]}
+    return {"name": name, **sealed, **judged(truth, case["answer"]), **rest}

@@ -163,3 +163,10 @@ def said_alike(truth: Truth, answer: Answer, causes: Sequence[Named]) -> bool:
     if any(c.alone and c.best not in fine(truth) for c in causes):
         return False
     return any(c.all & names and (len(c.all) > 1 or like.get("soft", False)) for c in causes)
+
+
+def told_apart(truth: Truth, answer: Answer) -> bool:
+    """The effect is named alone, and nothing false is."""
+    names, causes = frozenset(n for w in wanted(truth) for n in w.names), named(answer)
+    false = any(c.alone and c.best not in fine(truth) for c in causes)
+    return not false and any(c.alone and c.best in names for c in causes)

@@ -1,0 +1,156 @@
+"""Experiments are those that the independent engine can carry out, and the proposed one tells causes apart."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import linear_toys as toys
+import numpy as np
+import pytest
+import sheets
+import torch
+
+from torchcloth import recordings as rec
+from torchcloth.diagnosis import base_model, catalogue, diagnose, fit, setting_of
+from torchcloth.diagnosis.cells import NAMES
+from torchcloth.diagnosis.experiments import LIBRARY, PLANS, Experiment, planned, possible
+from torchcloth.diagnosis.fitting import renoised
+from torchcloth.diagnosis.next_experiment import (
+    Question,
+    distances,
+    information,
+    propose,
+    question_of,
+    whitened_slopes,
+)
+from torchcloth.diagnosis.noise import FLOOR, Noise
+
+INDEPENDENT = Path(__file__).parents[1] / "independent"
+MOTIONS = """
+import json, sys
+from flex_sheet import SheetSpec
+from motions import motion
+sheet = SheetSpec(0.2, 0.2, areal_density=0.2, membrane_stiffness=60.0, damping_time=1e-4)
+found = []
+for name, heading, speed in json.loads(sys.argv[1]):
+    m = motion(name, sheet, heading, speed)
+    found.append({n: p[:, :3, 3].tolist() for n, p in m.pose.items()})
+print(json.dumps(found))
+"""
+
+
+def test_the_library_is_that_of_the_independent_engine():
+    """Displacements and turns of both grippers, by the other code."""
+    asked = json.dumps([[e.motion, e.heading, e.speed] for e in LIBRARY])
+    run = [sys.executable, "-c", MOTIONS, asked]
+    out = subprocess.run(run, cwd=INDEPENDENT, capture_output=True, text=True, check=True).stdout
+    template = sheets.episode()
+    for experiment, paths in zip(LIBRARY, json.loads(out), strict=True):
+        plan = planned(experiment, template)
+        own = np.stack([plan.grippers[n].position for n in ("left", "right")])
+        other = np.stack([np.asarray(paths[n]) for n in ("left", "right")])
+        assert own.shape == other.shape, experiment
+        np.testing.assert_allclose(own.mean(0) - own.mean(0)[0], other.mean(0) - other.mean(0)[0], atol=1e-9)
+        apart, said = (np.linalg.norm(p[0] - p[1], axis=-1) for p in (own, other))
+        np.testing.assert_allclose(apart - apart[0], said - said[0], atol=1e-9)
+        along = lambda p: np.arctan2(*(p[0] - p[1])[:, [1, 0]].T)  # noqa: E731
+        np.testing.assert_allclose(np.cos(along(own) - along(other)), 1.0, atol=1e-9)
+
+
+def test_only_what_can_be_begun_is_asked_for():
+    hanging = [str(e) for e, _ in possible([sheets.episode()])]
+    assert len(hanging) == sum(not PLANS[e.motion].lying for e in LIBRARY)
+    assert "swing, the scene turned by 90 degrees" in hanging
+    assert possible([]) == []
+
+
+def test_distances_are_those_of_two_columns():
+    """D of i from j is what chi^2 is left of i's effect when j does its best, by least squares."""
+    slopes = toys.smooth(5, 6)  # 2 own, 3 hypotheses, a nuisance
+    found = toys.fitted(toys.evidence(slopes, 2, ["a", "b", "c"], torch.zeros(5).double(), 0))
+    question = Question(found, {"c": 0.7, "a": 0.4}, (("c", "a"),))
+    told = distances(question, information(question, []))[("c", "a")]
+    white, prior = found.white.jacobian, 2.0 * torch.eye(2).double()
+    fitted = torch.cat([white[:, :2], prior])
+
+    def left(columns, target):
+        best = torch.linalg.lstsq(columns, target[:, None]).solution
+        return float((target[:, None] - columns @ best).square().sum())
+
+    wide = lambda k: torch.cat([white[:, 2 + k], torch.zeros(2).double()])  # noqa: E731
+    one = left(torch.cat([fitted, wide(0)[:, None]], 1), 0.7 * wide(2))
+    other = left(torch.cat([fitted, wide(2)[:, None]], 1), 0.4 * wide(0))
+    assert told == pytest.approx(min(one, other), rel=1e-6)
+    again = white[: len(white) // 2][:, [0, 1, 4, 2]]
+    more = distances(question, information(question, [again]))[("c", "a")]
+    assert more > told
+
+
+def undecided(names):
+    """A search of a slow episode that ends with two causes of one class."""
+    recordings = [sheets.episode("slow", duration=0.4), sheets.episode("lift", duration=0.4)]
+    model = base_model(recordings[0])
+    setting = setting_of(model, recordings)
+    asked = [h for h in catalogue(model, recordings) if h.name in names]
+    level = 3 * torch.tensor([FLOOR[name] for name in NAMES]).double()  # the points here are anywhere
+    found = renoised(fit(model, setting, asked, 0), Noise(level))
+    hypothesis = SimpleNamespace(name=names[0])
+    step = SimpleNamespace(best=SimpleNamespace(hypothesis=hypothesis), before=found, screened=[])
+    amplitudes = {h.name: h.typical for h in asked}
+    rivals = [{"effect": names[1], "amplitude": amplitudes[names[1]]}]
+    cause = {"effect": names[0], "amplitude": amplitudes[names[0]], "rivals": rivals, "class": list(names)}
+    return SimpleNamespace(steps=[step], screened=[], end=found), [cause], setting
+
+
+def test_gravity_and_camera_are_told_apart_by_turning():
+    """A sheet that leans with the room and one that the camera sees leaning turn apart when the sheet is turned."""
+    found, causes, setting = undecided(("env.gravity_tilt[y]", "obs.rotation[x]"))
+    question = question_of(found, causes)
+    now = distances(question, information(question, []))
+    told = {}
+    for name in ("hang", "turn"):
+        slopes = whitened_slopes(question, planned(Experiment(name), setting.recordings[0]), setting)
+        told[name] = min(distances(question, information(question, [slopes])).values())
+    least = min(now.values())
+    assert told["turn"] - least > 10 * (told["hang"] - least) >= 0
+
+
+def test_nothing_open_asks_for_nothing():
+    end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
+    assert propose(SimpleNamespace(steps=[], screened=[], end=end), [], SimpleNamespace(recordings=()), print) is None
+
+
+def made(folder, name, motion, seed, hidden):
+    """Another engine's episode."""
+    script, out = INDEPENDENT / "generate.py", folder / name
+    options = ["--nodes", "13", "--fit-nodes", "9", "--seed", str(seed), "--effect", hidden, "--out", str(out)]
+    subprocess.run([sys.executable, script, *motion, *options], check=True)
+    return rec.read(out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("hidden", "motions", "asked"),
+    [
+        (
+            "env.gravity_tilt=0.03",
+            (["--motion", "hang"], ["--motion", "stretch"]),
+            ("env.gravity_tilt[x]", "env.gravity_tilt[y]", "obs.rotation[x]", "obs.rotation[y]"),
+        ),
+    ],
+)
+def test_the_proposed_experiment_resolves_an_ambiguous_set(tmp_path, hidden, motions, asked):
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    episodes = [made(tmp_path, f"e{k}", m, 40 + k, hidden) for k, m in enumerate(motions)]
+    known = [h for h in catalogue(base_model(episodes[0]), episodes) if h.name in asked]
+    first = diagnose(episodes, hypotheses=known)
+    following = first.content["next_experiment"]
+    assert first.verdict in ("ambiguous", "inconclusive", "unexplained"), first.summary()
+    said = ["--motion", following["motion"], "--heading", str(following["heading"]), "--speed", str(following["speed"])]
+    second = diagnose([*episodes, made(tmp_path, "next", said, 50, hidden)], hypotheses=known)
+    torch.set_default_dtype(before)
+    assert [c["effect"].partition("[")[0] for c in second.content["causes"]] == [hidden.partition("=")[0]]
+    assert second.verdict == "identified", second.summary()

@@ -1,0 +1,26 @@
+"""Every cause has its sentence, here and in the docs."""
+
+from pathlib import Path
+
+import pytest
+
+from torchcloth.diagnosis import Hypothesis, register
+from torchcloth.diagnosis.glossary import GLOSSARY, table
+from torchcloth.diagnosis.hypotheses import known
+from torchcloth.errors import InvalidInput
+
+DOCS = Path(__file__).parents[2] / "docs" / "causes.md"
+
+
+def test_every_cause_has_a_sentence_and_no_other_has():
+    assert set(GLOSSARY) == {h.effect for h in known()}
+    assert all(text.endswith(".") and text.count(". ") == 0 for text in GLOSSARY.values())
+
+
+def test_the_docs_have_the_table():
+    assert table(known()) in DOCS.read_text(encoding="utf-8")
+
+
+def test_a_name_of_the_catalogue_is_not_for_users():
+    with pytest.raises(InvalidInput, match=r"'air\.drag_n', which the catalogue has.*'my\.drag_n'"):
+        register(Hypothesis("air.drag_n", "-", 1.0, lambda world, _: world))

@@ -1,0 +1,100 @@
+"""What a model file gives: a layer, a start for fits, a prediction, and a gain that can be confirmed."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import sheets
+import torch
+
+import torchcloth as tc
+from torchcloth import diagnosis as dx
+from torchcloth import recordings as rec
+from torchcloth.cli import main
+from torchcloth.errors import InvalidInput
+from torchcloth.identification.saved import mark
+
+TRUE = 1.5
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """(base and extended model files, an episode of another motion than they know)."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    folder, blank = tmp_path_factory.mktemp("models"), sheets.episode()
+    by = {h.name: h for h in dx.catalogue(dx.base_model(blank), [blank])}
+    base = dx.base_model(blank)
+    extended = base.plus(by["air.drag_n"], TRUE).plus(by["obs.clock"], 0.0)
+    dx.save_model(folder / "base.tcm", base, blank)
+    covariance = torch.diag(torch.tensor([0.02, 0.5, 0.05, 0.01, 0.03, 1e-3]).double() ** 2)
+    dx.save_model(folder / "extended.tcm", extended, blank, covariance, episodes=[mark(blank)])
+    seen = sheets.recorded("fast", lambda world: by["air.drag_n"].apply(world, TRUE), 3)
+    yield folder, rec.read(rec.write(seen, folder / "fast")), blank
+    torch.set_default_dtype(before)
+
+
+def test_a_model_file_is_a_layer(made):
+    folder, _, blank = made
+    cloth = tc.load(folder / "extended.tcm")
+    assert isinstance(cloth, tc.Cloth)
+    assert float(cloth.effects["air"].normal.value) == pytest.approx(TRUE)
+    assert all(p.requires_grad for p in cloth.parameters())
+    first = torch.as_tensor(blank.cloth.initial_vertices)
+    pose = torch.eye(4).repeat(2, 1, 1)
+    pose[1, 1, 3] = 0.01
+    hold = tc.Trajectory(torch.tensor([0.0, 0.02]), pose, torch.ones(2, dtype=torch.bool))
+    out = cloth(cloth.state(first), {"left": hold, "right": hold}, times=[0.0, 0.02])
+    out.x[-1].sum().backward()
+    assert float(cloth.effects["air"].normal.raw.grad.abs()) > 0
+
+
+def test_what_is_not_in_the_cloth_is_beside_it(made, tmp_path):
+    _, _, blank = made
+    base = dx.base_model(blank)
+    clock = next(h for h in dx.catalogue(base, [blank]) if h.name == "obs.clock")
+    dx.save_model(tmp_path / "late.tcm", base.plus(clock, -0.03), blank)
+    assert dx.beside_the_cloth(dx.load_model(tmp_path / "late.tcm")) == {"obs.clock": -0.03}
+    assert len(dx.load_world(tmp_path / "late.tcm").views) == 1
+
+
+def test_another_scene_keeps_the_fabric_and_another_fabric_is_refused(made):
+    folder, seen, _ = made
+    elsewhere = replace(seen, grasps={"left": seen.grasps["left"]})
+    cloth = dx.cloth_for(folder / "extended.tcm", elsewhere)
+    assert list(cloth.boundaries) == ["left"]
+    assert "air" in cloth.effects
+    heavy = replace(seen, cloth=replace(seen.cloth, areal_density=0.4))
+    with pytest.raises(InvalidInput, match=r"another fabric.*0\.4.*expected 0\.2"):
+        dx.cloth_for(folder / "extended.tcm", heavy)
+
+
+def test_priors_come_from_what_data_told(made):
+    folder, seen, _ = made
+    spread = dx.uncertain(dx.read_model(folder / "extended.tcm", seen))
+    assert set(spread) == {"youngs_modulus", "bending.stiffness"}  # the others are no better than their data sheet
+    assert spread["youngs_modulus"] == pytest.approx((6e4, 1.0202), rel=1e-4)
+
+
+def test_a_prediction_has_errors_and_meets_the_truth(made, tmp_path):
+    folder, seen, _ = made
+    found = dx.predicted(folder / "extended.tcm", seen)
+    assert found.figures["rms"] < 0.5 * dx.predicted(folder / "base.tcm", seen).figures["rms"]
+    assert 0 < float(found.std.max()) < 0.01
+    assert main(["predict", str(folder / "extended.tcm"), str(folder / "fast"), "--out", str(tmp_path / "p")]) == 0
+    assert json.loads((tmp_path / "p" / "prediction.json").read_text())["measured"]["rms"] == found.figures["rms"]
+
+
+def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
+    folder, seen, blank = made
+    models = [str(folder / name) for name in ("base.tcm", "extended.tcm")]
+    assert main(["confirm", *models, str(folder / "fast"), "--out", str(tmp_path)]) == 0
+    assert "The gain is confirmed" in capsys.readouterr().out
+    found = json.loads((tmp_path / "confirmation.json").read_text())
+    assert found["confirmed"]
+    assert found["gain"]["rms_after"] < 0.4 * found["gain"]["rms_before"]
+    assert found["motions"]["fast"]["explained_fraction"] > 0.8
+    assert main(["confirm", *models[::-1], str(folder / "fast"), "--out", str(tmp_path / "b")]) == 0
+    assert not json.loads((tmp_path / "b" / "confirmation.json").read_text())["confirmed"]
+    with pytest.raises(InvalidInput, match="that the model was fitted to"):
+        dx.confirm(*models, [seen, blank])

@@ -1,0 +1,103 @@
+"""The hidden round as a study: what each process is given, in which order, and what is kept."""
+
+import json
+from argparse import Namespace
+from pathlib import Path
+
+import pytest
+
+from torchcloth.errors import InvalidInput
+from torchcloth.training.studies import hidden
+from torchcloth.training.studies.checkout import module
+from torchcloth.training.studies.command import main
+
+ANSWER = {"verdict": "adequate", "causes": [], "unresolvable": [], "undecided": [], "model": None}
+
+
+@pytest.fixture
+def called(monkeypatch):
+    """Commands instead of processes: making leaves two folders, a diagnosis its file."""
+    commands = []
+
+    def run(command):
+        commands.append([Path(part).name if "/" in part else part for part in command[1:]])
+        out = Path(command[command.index("--out") + 1]) if "--out" in command else None
+        if "diagnose" in command:
+            (out / "diagnosis.json").parent.mkdir(parents=True)
+            (out / "diagnosis.json").write_text(json.dumps(ANSWER))
+        elif out is not None:
+            for name in ("e1", "e2"):
+                (out / name).mkdir(parents=True)
+        else:  # what reveal.py prints
+            seed = int(command[command.index("--seed") + 1])
+            truth = module("hidden", "reveal").truth(module("hidden", "drawn").case(seed))
+            return Namespace(returncode=0, stdout=json.dumps(truth), stderr="")
+        return Namespace(returncode=0, stdout="", stderr="")
+
+    monkeypatch.setattr(hidden, "_run", run)
+    return commands
+
+
+def options(tmp_path, **more):
+    return Namespace(**{"out": tmp_path / "s", "cases": None, "seed": None, "dev": False, "fast": False} | more)
+
+
+def test_the_truth_is_opened_after_the_answer_and_nothing_is_told(called, tmp_path):
+    hidden.run(options(tmp_path, dev=True, cases=2))
+    kinds = [command[0] if command[0] != "-m" else command[2] for command in called]
+    assert kinds == ["make.py", "diagnose", "reveal.py"] * 2
+    assert called[1] == ["-m", "torchcloth.cli", "diagnose", "e1", "e2", "--out", "001"]
+    kept = json.loads((tmp_path / "s" / "cases" / "001.json").read_text())
+    assert kept["truth"]["family"] == "null"
+    assert kept["answer"] == ANSWER
+
+
+def test_finished_cases_are_not_repeated_and_more_may_be_added(called, tmp_path, capsys):
+    hidden.run(options(tmp_path, seed=9, cases=3))
+    first = (tmp_path / "s" / "cases" / "002.json").read_text()
+    del called[:]
+    hidden.run(options(tmp_path, cases=4))  # the folder remembers its secret
+    assert len([c for c in called if "make.py" in c]) == 1
+    assert (tmp_path / "s" / "cases" / "002.json").read_text() == first
+    assert "What must show" in capsys.readouterr().out
+    assert (tmp_path / "s" / "hidden.md").read_text().count("| 00") == 4
+
+
+def test_secrets_are_kept_fresh_ones_differ_and_development_is_no_secret(tmp_path):
+    one, two = (hidden.drawn(options(tmp_path / name)) for name in "ab")
+    assert one.settings["secret"] != two.settings["secret"]
+    assert len(one.seeds) == hidden.CASES
+    assert min(one.seeds.values()) >= 100_000
+    dev = hidden.drawn(options(tmp_path, dev=True, cases=5))
+    assert list(dev.seeds.values()) == [0, 1, 2, 3, 4]
+    assert dev.settings["secret"] is None
+    for wrong in ({"cases": 0}, {"dev": True, "cases": 1001}):
+        with pytest.raises(InvalidInput, match="--cases"):
+            hidden.drawn(options(tmp_path, **wrong))
+
+
+def test_an_answer_that_is_none_says_how_it_ended(monkeypatch, tmp_path):
+    for code, word in ((2, "refused"), (-9, "failed")):
+        ended = Namespace(returncode=code, stdout="", stderr="progress\npoints.npz: t does not increase")
+        monkeypatch.setattr(hidden, "_run", lambda command, ended=ended: ended)
+        found = hidden.answered([tmp_path / "e1"], tmp_path / word)
+        assert found == {word: "points.npz: t does not increase"}
+        assert json.loads((tmp_path / word / "diagnosis.json").read_text()) == found
+
+
+def test_experiments_are_made_of_the_same_case_and_answered_with_all_episodes(called, tmp_path):
+    made = []
+    make = lambda *arguments: (made.append(arguments), (Path(arguments[-1]) / "e9").mkdir(parents=True))  # noqa: E731
+    asked = ANSWER | {"next_experiment": {"motion": "turn", "heading": 90.0, "separates": ["a", "b"]}}
+    found = hidden.experiments(tmp_path, "007", make, [tmp_path / "e1"], asked, 19)
+    assert made[0] == ("--motion", "turn", "--heading", "90.0", "--out", str(tmp_path / "episodes" / "007-proposed"))
+    assert made[1][0] == "--motion"
+    assert called[0][2:] == ["diagnose", "e1", "e9", "--out", "007-proposed"]
+    assert found == {"proposed": ANSWER, "random": ANSWER}
+    assert hidden.experiments(tmp_path, "008", make, [], ANSWER, 19) == {"proposed": None, "random": None}
+
+
+def test_wrong_options_are_one_line(tmp_path, capsys):
+    assert main(["hidden", "--out", str(tmp_path / "s"), "--cases", "0"]) == 2
+    assert capsys.readouterr().err.startswith("studies: --cases")
+    assert not (tmp_path / "s").exists()

@@ -1,0 +1,187 @@
+"""Short, safe motions from where the grippers are: what may be asked of a robot to tell causes apart.
+
+All keep within 16 cm of the first pose on a table and 5 cm in the air, and stretch the cloth by at most 1 cm. They are
+those of ``tests/independent/motions.py``, so that another engine can carry an experiment out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ..recordings import GripperMotion, PointClouds, Recording
+from ..robots import gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..robots.paths import paths  # pyright: ignore[reportMissingImports]
+from ..types import Trajectory
+
+STILL, KNOT = 0.2, 0.01  # s, all stand still before and after; between knots
+RATE = 20.0  # Hz, of frames
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Waypoints of the grippers, relative to where they are: x ahead of the cloth, y along its upper edge, z up."""
+
+    t: tuple[float, ...]  # s
+    offset: tuple[tuple[float, float, float], ...]  # m, of all grippers
+    apart: tuple[float, ...] = ()  # m, beyond the first distance
+    yaw: tuple[float, ...] = ()  # rad, about the vertical through their middle
+    lying: bool = False  # begins with the cloth on a table
+
+
+def _back_and_forth(amplitude: float, leg: float, cycles: int, axis: int) -> Plan:
+    offsets, times = [(0.0, 0.0, 0.0)], [0.0]
+    for k in range(2 * cycles):
+        there = np.eye(3)[axis] * amplitude * (-1) ** k
+        offsets.append((float(there[0]), float(there[1]), float(there[2])))
+        times.append(times[-1] + (leg if k else 0.6 * leg))
+    return Plan((*times, times[-1] + 0.6 * leg), (*offsets, (0.0, 0.0, 0.0)))
+
+
+HERE = (0.0, 0.0, 0.0)
+AHEAD = (0.04, 0.0, 0.0)
+PLANS = {
+    "hang": Plan((0.0, 1.0), (HERE, HERE)),
+    "swing": _back_and_forth(0.05, 0.85, 1, 0),
+    "swing-fast": _back_and_forth(0.04, 0.34, 1, 0),
+    "shake": _back_and_forth(0.02, 0.22, 3, 2),
+    "stretch": Plan((0.0, 0.5, 0.8, 1.3), (HERE,) * 4, apart=(0.0, 0.010, 0.010, 0.0)),
+    "turn": Plan((0.0, 1.0, 1.3, 2.3), (HERE, AHEAD, AHEAD, HERE), yaw=(0.0, np.pi / 2, np.pi / 2, 0.0)),
+    "drag": Plan((0.0, 0.25, 1.25), (HERE, (0.0, 0.0, 0.02), (0.16, 0.0, 0.02)), lying=True),
+    "drag-fast": Plan((0.0, 0.25, 0.70), (HERE, (0.0, 0.0, 0.02), (0.16, 0.0, 0.02)), lying=True),
+    "lift": Plan((0.0, 1.4), (HERE, (-0.12, 0.0, 0.40)), lying=True),
+}
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One that may be done.
+
+    Attributes:
+        motion: one of ``PLANS``.
+        heading: degrees about the vertical, of the whole scene but the camera.
+        speed: 2 takes half the time.
+    """
+
+    motion: str
+    heading: float = 0.0
+    speed: float = 1.0
+
+    def __str__(self) -> str:
+        turned = f", the scene turned by {self.heading:g} degrees" if self.heading else ""
+        return f"{self.motion}{turned}" + (f", {self.speed:g} times as fast" if self.speed != 1 else "")
+
+
+LIBRARY = (
+    *(Experiment("hang", heading) for heading in (0.0, 90.0)),
+    *(Experiment("swing", 0.0, speed) for speed in (0.7, 1.0, 1.5)),
+    Experiment("swing", 90.0),
+    *(Experiment("swing-fast", heading) for heading in (0.0, 90.0)),
+    Experiment("shake"),
+    Experiment("stretch"),
+    *(Experiment("turn", heading) for heading in (0.0, 90.0)),
+    *(Experiment(name) for name in ("drag", "drag-fast", "lift")),
+)
+
+
+def possible(recordings: Sequence[Recording]) -> list[tuple[Experiment, Recording]]:
+    """Experiments with the episode whose first shape they begin with; none where no gripper was recorded."""
+    placed = [r for r in recordings if r.cloth.initial_vertices is not None or r.cloth.vertices is not None]
+    begins = {lying: next((r for r in placed if _lies(r) == lying), None) for lying in (False, True)}
+    found = []
+    for experiment in LIBRARY:
+        template = begins[PLANS[experiment.motion].lying]
+        if template is None or not paths(template):
+            continue
+        if experiment.motion == "stretch" and len(paths(template)) < 2:
+            continue
+        found.append((experiment, template))
+    return found
+
+
+def _lies(recording: Recording) -> bool:
+    """Whether half of the cloth begins on a table."""
+    first = recording.cloth.initial_vertices
+    if first is None or not recording.colliders:
+        return False
+    points = first.reshape(-1, 3)
+    heights = [(points - c.point) @ c.normal for c in recording.colliders.values()]
+    return bool(np.median(np.min(heights, axis=0)) < 0.03)
+
+
+def planned(experiment: Experiment, template: Recording) -> Recording:
+    """The experiment as an episode: what the grippers do, where the cloth begins; nothing is seen of it yet."""
+    plan, own = PLANS[experiment.motion], paths(template)
+    start = max(p.t[0] for p in own.values())
+    if template.points is not None:
+        start = max(start, float(template.points.t[0] + template.clock_offset))
+    first = {name: tuple(part[0] for part in p.at(np.array([start]))) for name, p in own.items()}
+    centre = np.mean([place for place, _ in first.values()], axis=0)
+    heading = np.deg2rad(experiment.heading)
+    turn = about_z(heading - heading_of(template))[0]
+    knots = STILL + np.asarray(plan.t) / experiment.speed
+    t = np.arange(round((knots[-1] + STILL) / KNOT) + 1) * KNOT
+    offset = minimum_jerk(t, knots, np.asarray(plan.offset)) @ about_z(heading)[0].T
+    apart, yaw = (minimum_jerk(t, knots, np.asarray(v)) if v else np.zeros(len(t)) for v in (plan.apart, plan.yaw))
+    spin = about_z(yaw)
+    grippers = {}
+    for name, (place, rotation) in first.items():
+        aside = turn @ (place - centre)
+        flat = aside * [1.0, 1.0, 0.0]
+        outward = flat / max(float(np.linalg.norm(flat)), 1e-9)
+        path = centre + offset + np.einsum("kab,kb->ka", spin, aside + 0.5 * apart[:, None] * outward)
+        grippers[name] = _gripper(t, path, spin @ turn @ rotation, template, name)
+    initial = template.cloth.initial_vertices
+    shape = np.asarray(template.cloth.vertices if initial is None else initial)
+    moved = (shape - centre) @ turn.T + centre
+    frames = np.arange(int(t[-1] * RATE) + 1) / RATE
+    points = np.repeat(moved.reshape(-1, 3)[:1], len(frames), axis=0)
+    return replace(
+        template,
+        cloth=replace(template.cloth, initial_vertices=moved),
+        grippers=grippers,
+        joints={},
+        points=PointClouds(frames, points, np.ones(len(frames), int)),
+        markers=None,
+        clock_offset=0.0,
+        split={"motion": str(experiment)},
+        path=None,
+    )
+
+
+def _gripper(t: np.ndarray, path: np.ndarray, rotation: np.ndarray, template: Recording, name: str) -> GripperMotion:
+    """With empty readings where the template has some."""
+    measured = template.grippers.get(name) or template.joints.get(name)
+    zero = {key: np.zeros((len(t), 3)) for key in ("force", "torque") if getattr(measured, key, None) is not None}
+    pose = np.tile(np.eye(4), (len(t), 1, 1))
+    pose[:, :3, :3], pose[:, :3, 3] = rotation, path
+    closed = torch.ones(len(t), dtype=torch.bool)
+    return replace(gripper_motion(Trajectory(torch.as_tensor(t), torch.as_tensor(pose), closed)), **zero)
+
+
+def heading_of(recording: Recording) -> float:
+    """rad about the vertical by which an episode's upper edge is turned from y; 0 with a single gripper."""
+    own = paths(recording)
+    if len(own) < 2:
+        return 0.0
+    first, last = (own[name].position[0] for name in (min(own), max(own)))  # left, right
+    edge = first - last
+    return float(np.arctan2(-edge[0], edge[1]))
+
+
+def minimum_jerk(t: np.ndarray, knots: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values [K, ...] at times [K] s between ``values`` [N, ...] at ``knots`` [N] s, at rest at each."""
+    leg = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(knots) - 2)
+    s = np.clip((t - knots[leg]) / (knots[leg + 1] - knots[leg]), 0, 1)
+    s = (s**3 * (10 - 15 * s + 6 * s * s)).reshape(-1, *[1] * (values.ndim - 1))
+    return (1 - s) * values[leg] + s * values[leg + 1]
+
+
+def about_z(angle: np.ndarray | float) -> np.ndarray:
+    """[K, 3, 3] rotations."""
+    a = np.atleast_1d(np.asarray(angle, float))
+    c, s, o = np.cos(a), np.sin(a), 0 * a
+    return np.stack([c, -s, o, s, c, o, o, o, o + 1], 1).reshape(-1, 3, 3)

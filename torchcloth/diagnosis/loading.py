@@ -1,0 +1,92 @@
+"""A model file as what a user needs of it: a layer, a world, a start for fits, a prediction."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+
+from ..cloth import Cloth
+from ..identification.episode_prediction import EpisodePrediction, with_errors
+from ..identification.episodes import episode
+from ..parameters import PhysicalParameter
+from ..recordings import Recording
+from .cells import directions
+from .evidence import shifted, side_by_side, step_sizes
+from .model_file import ModelFile, load_model, read_model
+from .world import Model, World
+
+TOLD = 0.5  # of the prior's width: a parameter that is known better is known from data
+
+
+def load(path: str | Path) -> Cloth:
+    """The model of a ``.tcm`` file as a layer, with its fitted values and effects, ready to be called with motions.
+
+    What the robot and the observer do otherwise is no part of a cloth: ``diagnosis.load_world`` has both beside it.
+
+    Raises:
+        InvalidInput: no such file, or a cause that is not in the catalogue.
+        RecordingError: a file that is damaged or no model.
+    """
+    return load_world(path).cloth.requires_grad_(True)
+
+
+def load_world(path: str | Path) -> World:
+    """``cloth``, ``motions`` (what the robot really does), ``views`` (what the observer sees); raises as ``load``."""
+    return load_model(path).world()
+
+
+def cloth_for(path: str | Path, recording: Recording) -> Cloth:
+    """The model's fabric and effects in the mesh, grasps and tables of an episode.
+
+    Raises:
+        InvalidInput: as ``load``, or an episode with another fabric.
+        RecordingError: as ``load``.
+    """
+    return read_model(path, recording).model.world().cloth.requires_grad_(True)
+
+
+def beside_the_cloth(model: Model) -> dict[str, float]:
+    """Amplitudes of accepted causes that are in robot or observer and not in the cloth."""
+    found, world = {}, model.world()
+    for h, amplitude in zip(model.accepted, model.amplitudes, strict=True):
+        if h.apply(world, amplitude).cloth is world.cloth:
+            found[h.name] = amplitude
+    return found
+
+
+def uncertain(file: ModelFile) -> dict[str, tuple[float, float]]:
+    """By name of the base parameters that data determine: (value, spread), as the priors of ``identify``."""
+    out = {}
+    if file.covariance is None:
+        return out
+    stds, cloth = file.covariance.diagonal().sqrt().tolist(), file.model.base.cloth
+    for p, c, std in zip(file.model.parameters, file.model.values.tolist(), stds, strict=False):
+        if std < TOLD * p.std:
+            positive = _parameter(cloth, p.name).domain == "positive"
+            up, value, down = p.value(c + std), p.value(c), p.value(c - std)
+            out[p.name] = (value, math.sqrt(up / down) if positive else abs(up - down) / 2)
+    return out
+
+
+def _parameter(cloth: Cloth, name: str) -> PhysicalParameter:
+    from ..identification.unknowns import available
+
+    return cloth.get_submodule(available(cloth)[name])  # type: ignore[return-value]
+
+
+def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
+    """Where the cloth goes in any episode, with errors from the covariance of the model's numbers.
+
+    Robot and observer err as the model says. Raises as ``cloth_for``, or RecordingError for an episode without frames.
+    """
+    file = read_model(path, recording)
+    model, world = file.model, file.model.world()
+    data, every = episode(world.cloth, recording), step_sizes(model)
+    covariance = torch.zeros(len(every), len(every)) if file.covariance is None else file.covariance
+    shifts = every[: len(covariance)]  # a residual force, which comes last, has no errors
+    worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]
+    frames, *beside = side_by_side(lambda w: w.frames(data), worlds)
+    slopes = directions(frames, beside, [step for _, step in shifts])
+    return with_errors(world.cloth, data, frames, slopes, covariance, math.nan)

@@ -1,0 +1,223 @@
+"""Which experiment would tell causes apart, or show one that cannot be seen yet.
+
+With V the information on causes that is left beside everything that is fitted anyway,
+
+    D_ij = a_i^2 V_ii (1 - rho_ij^2)
+
+is the chi^2 by which cause i at amplitude a_i is told from j at its best amplitude. An experiment adds its own slopes,
+as the present model has them, to those of the data (T-optimal design, linearised: Chen and Asprey 2003); of all
+experiments the one is proposed whose smallest D over the pairs is largest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import TorchclothError
+from ..identification.episodes import Episode, episode
+from ..identification.nuisances import Held
+from ..identification.replays import Frames
+from ..recordings import Recording
+from .cells import Cells, cells_of, directions
+from .evidence import GRASP, Progress, Setting, joined, nuisances, shifted, side_by_side, step_sizes
+from .experiments import Experiment, planned, possible
+from .fitting import Fitted, prior_precision
+from .stepwise import Found
+
+NEEDED = (1.64 + 0.84) ** 2  # chi^2: told apart in 80 % of cases at 5 %
+MOST_REPEATS = 10
+MANY = 6  # causes that cannot be decided yet, the likeliest
+POINTS = 250  # of a frame, where the data do not say
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is to be told.
+
+    Attributes:
+        fitted: a model with slopes along all the causes.
+        amplitudes: of the causes by name.
+        pairs: of causes to be told apart; none: each is to be seen at all.
+    """
+
+    fitted: Fitted
+    amplitudes: Mapping[str, float]
+    pairs: tuple[tuple[str, str], ...] = ()
+
+
+def propose(found: Found, causes: Sequence[dict[str, Any]], setting: Setting, progress: Progress) -> dict | None:
+    """The content of ``next_experiment``; None where nothing is open, or nothing can be done about it."""
+    question = question_of(found, causes)
+    if question is None:
+        return None
+    names = list(question.amplitudes)
+    now = distances(question, information(question, []))
+    tried: list[tuple[Experiment, Tensor]] = []
+    for experiment, template in possible(setting.recordings):
+        progress(str(experiment))
+        try:
+            slopes = whitened_slopes(question, planned(experiment, template), setting)
+        except (TorchclothError, torch.linalg.LinAlgError):
+            continue  # it cannot be simulated, so it says nothing
+        tried.append((experiment, slopes))
+    if not tried:
+        return None
+    told = [distances(question, information(question, [slopes])) for _, slopes in tried]
+    best = max(range(len(tried)), key=lambda k: _worth(told[k], question))
+    middle = sorted(range(len(tried)), key=lambda k: _worth(told[k], question))[len(tried) // 2]
+    experiment, slopes = tried[best]
+    repeats = _repeats(question, slopes)
+    return {
+        "motion": experiment.motion,
+        "heading": experiment.heading,
+        "speed": experiment.speed,
+        "separates": [list(pair) for pair in question.pairs],
+        "shows": [] if question.pairs else names,
+        "expected_d": _weakest(told[best]),
+        "d_now": _weakest(now),
+        "random": {"experiment": str(tried[middle][0]), "expected_d": _weakest(told[middle])},
+        "repeats": repeats,
+        "why": _why(experiment, question, now, told[best], _weakest(told[middle]), repeats),
+    }
+
+
+def question_of(found: Found, causes: Sequence[dict[str, Any]]) -> Question | None:
+    """What a search leaves open: causes that have rivals, else causes that are not decided."""
+    for step, cause in zip(found.steps, causes, strict=False):
+        known = {h.name for h in step.before.evidence.hypotheses}
+        amplitudes = {step.best.hypothesis.name: cause["amplitude"]}
+        amplitudes |= {r["effect"]: r["amplitude"] for r in cause["rivals"] if r["effect"] in known}
+        rows = {r.hypothesis.name: r.amplitude for r in step.screened}
+        amplitudes |= {name: rows[name] for name in cause["class"] if name in rows and name not in amplitudes}
+        first, *others = amplitudes
+        if others:
+            return Question(step.before, amplitudes, tuple((first, other) for other in others))
+    if causes:
+        return None
+    known = {h.name for h in found.end.evidence.hypotheses}
+    open_rows = [r for r in found.screened if r.decision in ("present", "inconclusive") and r.hypothesis.name in known]
+    amplitudes = {r.hypothesis.name: r.hypothesis.smallest for r in open_rows[:MANY]}
+    return Question(found.end, amplitudes) if amplitudes else None
+
+
+def information(question: Question, added: Sequence[Tensor]) -> Tensor:
+    """[causes, causes] that is left beside what is fitted anyway, of the data and of added experiments."""
+    found, own = question.fitted, question.fitted.evidence.own
+    columns = [*range(own), *(own + k for k in _columns(question))]
+    data = found.white.jacobian[:, columns]
+    square = data.mT @ data + sum(slopes.mT @ slopes for slopes in added)
+    square[range(own), range(own)] += prior_precision(found.model)
+    beside = torch.linalg.solve(square[:own, :own], square[:own, own:])
+    return square[own:, own:] - square[own:, :own] @ beside
+
+
+def distances(question: Question, left: Tensor) -> dict[tuple[str, ...], float]:
+    """D of every pair, the smaller way round; of every cause alone where there are no pairs."""
+    index = {name: k for k, name in enumerate(question.amplitudes)}
+    alone = {
+        name: a * a * float(left[k, k])
+        for (name, a), k in zip(question.amplitudes.items(), index.values(), strict=True)
+    }
+    if not question.pairs:
+        return {(name,): d for name, d in alone.items()}
+    out = {}
+    for a, b in question.pairs:
+        i, j = index[a], index[b]
+        alike = float(left[i, j] ** 2 / (left[i, i] * left[j, j]).clamp(min=1e-30))
+        out[(a, b)] = min(alone[a], alone[b]) * max(1 - alike, 0.0)
+    return out
+
+
+def whitened_slopes(question: Question, recording: Recording, setting: Setting) -> Tensor:
+    """[C, own + causes] of an experiment that has not been done, by the present model on the coarser mesh."""
+    found, model = question.fitted, question.fitted.model
+    hypotheses = [found.evidence.hypotheses[k] for k in _columns(question)]
+    world, blank = model.world(), episode(model.base.cloth, recording)
+    shifts = step_sizes(model)
+    held = [replace(blank, initial=blank.initial + GRASP * m, settles=True) for m in Held().modes(world.cloth, blank)]
+    worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]
+    worlds += [h.apply(world, h.typical) for h in hypotheses]
+    jobs = [(w, blank) for w in worlds] + [(world, off) for off in held]
+    base, *rest = side_by_side(lambda job: job[0].frames(job[1], setting.dt), jobs)
+    seen = as_seen(base, blank, setting)
+    count = len(shifts) + len(hypotheses)
+    moved = directions(base, rest[:count], [*(s for _, s in shifts), *(h.typical for h in hypotheses)])
+    other, std = nuisances(world, base, rest[count:], seen)
+    cells = cells_of(base, joined(moved, other), seen, setting.sheet, setting.rest)
+    return _white(found, cells, count, std)
+
+
+def as_seen(frames: Frames, blank: Episode, setting: Setting, seed: int = 0) -> Episode:
+    """The episode with points as many and as noisy as in the data, evenly over the surface, and felt forces."""
+    rng = torch.Generator().manual_seed(seed)
+    counts = sorted(len(c) for e in setting.episodes for c in e.clouds if len(c))
+    many = counts[len(counts) // 2] if counts else POINTS
+    faces, noise = setting.sheet.faces, blank.noise or 1e-3
+    corners = setting.rest[faces]
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1)
+    clouds = []
+    for x in frames.x:
+        face = faces[torch.multinomial(area, many, replacement=True, generator=rng)]
+        weight = -torch.rand(many, 3, generator=rng).log()
+        weight = (weight / weight.sum(1, keepdim=True)).to(x)
+        on = (weight[..., None] * x[face]).sum(1)
+        clouds.append(on + noise * torch.randn(many, 3, generator=rng).to(x))
+    return replace(blank, clouds=clouds, wrenches={name: frames.wrench[name] for name in blank.wrenches})
+
+
+def _white(found: Fitted, cells: Cells, count: int, std: Tensor) -> Tensor:
+    covariance = found.noise.covariance(cells, cells.jacobian[:, count:], std)
+    return torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), cells.jacobian[:, :count], upper=False)
+
+
+def _columns(question: Question) -> list[int]:
+    index = {h.name: k for k, h in enumerate(question.fitted.evidence.hypotheses)}
+    return [index[name] for name in question.amplitudes]
+
+
+def _weakest(told: Mapping[tuple[str, ...], float]) -> float:
+    return min(told.values())
+
+
+def _worth(told: Mapping[tuple[str, ...], float], question: Question) -> float:
+    """Of pairs the weakest; of single causes how many are seen, since one that never is must not decide."""
+    if question.pairs:
+        return _weakest(told)
+    return sum(min(d / NEEDED, 1.0) + 1e-3 * math.log1p(d) for d in told.values())
+
+
+def _repeats(question: Question, slopes: Tensor) -> int | None:
+    """How often it must be done; None: more than can be asked."""
+    for n in range(1, MOST_REPEATS + 1):
+        told = distances(question, information(question, [slopes] * n))
+        if _weakest(told) >= NEEDED:
+            return n
+    return None
+
+
+def _why(
+    experiment: Experiment,
+    question: Question,
+    now: Mapping[tuple[str, ...], float],
+    told: Mapping[tuple[str, ...], float],
+    random: float,
+    repeats: int | None,
+) -> str:
+    hardest = min(told, key=lambda key: told[key])
+    if question.pairs:
+        about = f"{hardest[0]} is hardest to tell from {hardest[1]}"
+    else:
+        about = f"{hardest[0]} is hardest to see"
+    times = {None: f"even {MOST_REPEATS} repetitions would not do", 1: "once is enough"}.get(
+        repeats, f"{repeats} repetitions"
+    )
+    return (
+        f"{experiment}: {about}, by chi^2 = {now[hardest]:.2g} now and {told[hardest]:.2g} with it "
+        f"({NEEDED:.1f} is needed; {times}). A choice at random gives {random:.2g}."
+    )

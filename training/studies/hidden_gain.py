@@ -1,0 +1,75 @@
+"""How much of what an oracle gains a diagnosis gains, on a motion that it never saw.
+
+    (RMS of the base model - RMS of the extended one) / (RMS of the base model - RMS of the oracle)
+
+All have their fabric's parameters fitted to the same episodes; the oracle is the library's own model with what was
+hidden, at its true amplitude.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from torchcloth.diagnosis import Hypothesis, Model, World, base_model, fit, load_model, setting_of
+from torchcloth.diagnosis.base_model import together
+from torchcloth.diagnosis.cells import SEEN, cells_of
+from torchcloth.diagnosis.hypotheses import known
+from torchcloth.recordings import read
+
+LEAST = 2e-4  # m: where an oracle gains less, there is nothing to be gained
+
+
+@dataclass(frozen=True)
+class Oracle(Model):
+    """A model that knows what is hidden."""
+
+    hidden: tuple[tuple[Hypothesis, float], ...] = ()
+
+    def world(self, extra: Sequence[tuple[Hypothesis, float]] = ()) -> World:
+        """With what is hidden, first."""
+        return super().world((*self.hidden, *extra))
+
+
+def knowing(model: Model, truth: Mapping[str, Any]) -> Oracle | None:
+    """The base model with all that is hidden; None where the library has no words or no sign for it."""
+    words, hidden = {h.name: h for h in known()}, []
+    for e in truth["effects"]:
+        if e["hypothesis"] not in words or not e["sign"]:
+            return None
+        # wind brings the drag that makes it felt
+        if not e["beside"]:
+            hidden.append((words[e["hypothesis"]], e["amplitude"] * e["sign"]))
+    return Oracle(model.base, model.parameters, model.values, hidden=tuple(hidden)) if hidden else None
+
+
+def gain(episodes: Sequence[Path], extended: Path, unseen: Path, truth: Mapping[str, Any]) -> float | None:
+    """The share of the oracle's gain; None where nothing is to be gained, or where nobody can know all.
+
+    Args:
+        episodes: those that were diagnosed.
+        extended: the model that the diagnosis wrote.
+        unseen: an episode of another motion.
+        truth: what was hidden.
+    """
+    recordings, last = [read(path) for path in episodes], read(unseen)
+    base = base_model(together([*recordings, last]))
+    oracle = knowing(base, truth)
+    if oracle is None:
+        return None
+    setting, found = setting_of(base, recordings), load_model(extended)
+    fitted = fit(base, setting).model if found.accepted else found  # without causes it is the fitted base
+    before, best = rms(fitted, last), rms(fit(oracle, setting).model, last)
+    return None if before - best < LEAST else (before - rms(found, last)) / (before - best)
+
+
+def rms(model: Model, recording: Any) -> float:
+    """m, of the mean residuals of positions, on the finer mesh."""
+    setting = setting_of(model, [recording]).finer
+    if setting is None:
+        raise ValueError("a setting without a finer one")
+    episode, world = setting.episodes[0], replace(model, base=setting.base).world()
+    cells = cells_of(world.frames(episode, setting.dt), None, episode, setting.sheet, setting.rest)
+    return float(cells.value[cells.block < SEEN].square().mean().sqrt())
