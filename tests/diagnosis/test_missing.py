@@ -70,6 +70,7 @@ def test_it_is_found_there_and_then(planted):
     assert float(elsewhere.certainty.max()) < 0.5 * float(there.certainty.max())
     told = answer.as_dict()["motions"]
     assert [t["sure"] for t in told] == [True, False]
+    assert max(told[0]["at"]) < 0.5 * sheets.SIDE
 
 
 def test_the_fit_lacks_there_and_not_in_the_other_motion(planted):

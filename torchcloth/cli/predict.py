@@ -105,8 +105,8 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
     path = _write(out, found.as_dict())
     with atomically(out / "prediction.npz") as file:
         t, vertices, std = (part.numpy() for part in (found.episode.times, found.frames.x, found.std))
-        more = {"interval": found.interval.numpy(), "faces": found.cloth.mesh.faces}
-        np.savez_compressed(file, t=t, vertices=vertices, std=std, **more)  # type: ignore[arg-type]
+        interval, faces = found.interval.numpy(), found.cloth.mesh.faces
+        np.savez_compressed(file, t=t, vertices=vertices, std=std, interval=interval, faces=faces)
     picture = pictures.save_figure(prediction_report.predicted(found), out / "prediction.png")
     prediction_report.print_predicted(found)
     if not of_model and is_fitted(fit, recording):

@@ -77,19 +77,22 @@ class MissingForce:
         return (m.force * self.area[:, None]).sum(1)
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of diagnosis.json: where it is the most certain, motion by motion."""
+        """The content of diagnosis.json: the middle of the force when it is the most certain, motion by motion."""
         return {"weight": self.weight, "gain": self.gain, "motions": [self._told(m) for m in self.parts]}
 
     def _told(self, m: Missing) -> dict[str, Any]:
-        w, v = m.strongest
-        certain = float(m.certainty[w, v])
+        w, _ = m.strongest
+        weight = m.force[w].square().sum(-1) * self.area
+        middle = (weight[:, None] * self.uv).sum(0) / weight.sum()
+        nearest = int((self.uv - middle).norm(dim=1).argmin())
+        certain = float(m.certainty[w].max())
         return {
             "motion": m.motion,
             "rms": float(m.force.square().sum(-1).mean().sqrt()),
-            "at": self.uv[v].tolist(),
+            "at": middle.tolist(),
             "from": float(m.windows[w, 0]),
             "to": float(m.windows[w, 1]),
-            "pressure": m.force[w, v].tolist(),
+            "pressure": m.force[w, nearest].tolist(),
             "total": self.total(m)[w].tolist(),
             "standard_errors": certain,
             "sure": certain > SURE,

@@ -108,6 +108,23 @@ def _missing(answer: Diagnosis) -> list[str]:
         "<h2>The force that is missing</h2>",
         "<p>Beside the model and its causes, where and when it is the surest in each motion. Names no cause.</p>",
         _image(pictures.missing_force(answer.missing)),
+        *_learned(answer.content["residual"]),
+    ]
+
+
+def _learned(found: dict[str, Any]) -> list[str]:
+    """The laws of a residual force, if any was learned."""
+    if not found["terms"]:
+        return ["<p>No local law of it was found that would predict motions held out.</p>"]
+    gain, body = found["gain"], ""
+    for t in found["terms"]:
+        cells = [t["law"], f"{t['coefficient']:.3g}", t["unit"], t["told"]]
+        body += f"<tr>{''.join(f'<td>{html.escape(c)}</td>' for c in cells)}</tr>"
+    head = "".join(f"<th>{h}</th>" for h in ("law", "coefficient", "unit", "what it does"))
+    return [
+        f"<p>Local laws that were learned from it: {1e3 * gain['rms_before']:.2f} to {1e3 * gain['rms_after']:.2f} mm "
+        "on motions held out. They are part of the extended model and can be left out.</p>",
+        f"<table><tr>{head}</tr>{body}</table>",
     ]
 
 

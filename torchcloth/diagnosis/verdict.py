@@ -19,7 +19,6 @@ from .world import Model
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 NORMAL = 1.96
-COARSE = 3e-3  # m, that the finer mesh leaves of the difference between both: causes hide behind more
 OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
 
 
@@ -90,7 +89,7 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
         "residual": None,
         "next_experiment": None,
         "parameters": _parameters(found),
-        "warnings": _warnings(found, names),
+        "warnings": _warnings(found, names, left),
         "motions": list(names),
     }
     return Diagnosis(verdict, content, found)
@@ -112,7 +111,7 @@ def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left
         return "identified" if all(not c["rivals"] and len(c["class"]) == 1 for c in causes) else "ambiguous"
     if any(row.lacking for row in left):
         return "unexplained"
-    if max((row.numerics for row in left if row.unit == "m"), default=0.0) > COARSE:
+    if not all(row.stable for row in left):
         return "numerics"
     undecided = [r for r in found.screened if r.decision == "present"]
     return "inconclusive" if undecided else "adequate"
@@ -184,7 +183,7 @@ def _parameters(found: Found) -> dict[str, Any]:
     }
 
 
-def _warnings(found: Found, names: Sequence[str]) -> list[str]:
+def _warnings(found: Found, names: Sequence[str], left: Sequence[Left]) -> list[str]:
     out = []
     for p, c in zip(found.end.model.parameters, found.end.model.values.tolist(), strict=True):
         if abs(c) > OFTEN * p.std:
@@ -195,6 +194,9 @@ def _warnings(found: Found, names: Sequence[str]) -> list[str]:
         out.append("floor: sensor only; no episode repeats another, so what repetitions differ by is not known")
     if found.left_out:
         out.append(f"{100 * found.left_out:.1f} % of the cells jump between shapes of the cloth and are left out")
+    folded = sorted({row.motion for row in left if not row.stable})
+    if folded:
+        out.append(f"the cloth folds in another way on another mesh in {', '.join(folded)}: no judgement there")
     if len(set(names)) < 3:
         out.append(f"{len(set(names))} kind(s) of motion: many causes look alike in them")
     if len(names) < 8:
@@ -259,7 +261,7 @@ def _lacking(content: dict[str, Any]) -> list[str]:
         where = ", ".join(f"{1e3 * c:.0f}" for c in m["at"])
         size = sum(c * c for c in m["pressure"]) ** 0.5 / missing["weight"]
         out.append(
-            f"  A force of {100 * size:.0f} % of the weight is missing in {m['motion']}, the surest about "
+            f"  A force of {100 * size:.0f} % of the weight is missing in {m['motion']}, about "
             f"({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
         )
     return out + _residual(content["residual"])

@@ -161,7 +161,9 @@ def read_model(path: str | Path) -> TensionModel:
 
 def _model(kept: dict[str, Any]) -> TensionModel:
     names = [str(name) for name in kept["fitted"]]
-    values = {name: value if isinstance(value, str) else number(value) for name, value in kept["values"].items()}
+    values: dict[str, Any] = {
+        name: value if isinstance(value, str) else number(value) for name, value in kept["values"].items()
+    }
     material = LAWS[kept["material"]](**values).to(torch.float64)
     for name in names:
         if not isinstance(getattr(material, name), PhysicalParameter):

@@ -9,6 +9,7 @@ import numpy as np
 
 from .fabric_tables import NOTHING, table
 from .hidden_rates import Mark, Rate, further, marks
+from .hidden_scores import NULLS
 
 HEADINGS = ("figure", "must", "aim", "is", "95 %", "of", "")
 
@@ -76,7 +77,8 @@ def _case(c: Mapping[str, Any]) -> tuple[str, ...]:
     off = [f"{100 * a['error']:+.0f} %" for a in c.get("amplitudes", ()) if a is not None]
     gain = "" if c.get("gain") is None else f"{c['gain']:.2f}"
     named = ", ".join(c["named"]) or NOTHING
-    said = "right" if c["right"] else "WRONG" if c["wrong"] else "missed"
+    said = "right" if c["right"] else "alarm" if c["family"] in NULLS and c["named"] else "missed"
+    said += ", false cause" if c["wrong"] and said != "alarm" else ""
     hidden = ", ".join(c["hidden"]) or NOTHING
     first = (c["name"], c["family"], c["kind"], hidden, c["verdict"], named, said)
     return (*first, ", ".join(off), gain, f"{c['seconds']:.0f}")

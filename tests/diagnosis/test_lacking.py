@@ -1,0 +1,72 @@
+"""Lack of fit on linear toys: what a right model leaves is called so, what it does not is not."""
+
+from dataclasses import replace
+
+import linear_toys as toys
+import pytest
+import torch
+
+from torchcloth.diagnosis import lack_of_fit
+from torchcloth.diagnosis.lacking import RARE, SENSOR
+
+NAMES = ["a"]
+SLOPES = toys.smooth(1, 4)  # two parameters, one hypothesis, one nuisance
+MOTIONS = [f"motion {k}" for k in range(toys.EPISODES)]
+
+
+@pytest.fixture(autouse=True)
+def _sensor(monkeypatch):
+    """The toys' slow errors are known."""
+    monkeypatch.setitem(SENSOR, "points", toys.SLOW)
+
+
+def left(truth, seed):
+    return lack_of_fit(toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor(truth).double(), seed)), MOTIONS)
+
+
+def test_of_a_right_model_the_chances_are_what_they_say():
+    """Of 160 motions with nothing but noise about 5 % leave what is to be expected in 5 %."""
+    rows = [row for seed in range(40) for row in left([0.0, 0.0, 0.0], seed)]
+    p = torch.tensor([row.p for row in rows])
+    assert 0.01 < float((p < 0.05).double().mean()) < 0.11
+    assert 0.4 < float(p.mean()) < 0.6
+    assert torch.tensor([row.ratio for row in rows]).square().mean() == pytest.approx(1.0, abs=0.1)
+    assert not any(row.lacking for row in rows)
+
+
+def test_the_effective_number_of_cells_is_far_from_their_count():
+    (row, *_) = left([0.0, 0.0, 0.0], 0)
+    assert 4 < row.cells < 0.5 * toys.PATCHES * toys.WINDOWS
+
+
+def test_what_nothing_explains_is_lacking_and_what_parameters_do_is_not():
+    assert all(row.lacking for row in left([0.0, 0.0, 2.0], 0))  # 7 mm RMS
+    found = toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.3, -0.3, 0.0]).double(), 0), std=0.5)
+    free = torch.eye(2).double()
+    rows = lack_of_fit(replace(found, covariance=free), MOTIONS)
+    assert not any(row.lacking for row in rows)
+
+
+def test_small_excess_is_no_lack_even_where_it_is_certain():
+    rows = left([0.0, 0.0, 0.35], 1)
+    assert min(row.p for row in rows) < RARE
+    assert not any(row.lacking for row in rows)
+
+
+def between_meshes(difference):
+    """3 mm RMS that nothing explains, and so much between both meshes."""
+    ev = toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.9]).double(), 0)
+    rough = [torch.full_like(c.value, difference) for c in ev.cells]
+    return lack_of_fit(toys.fitted(replace(ev, numerics=rough)), MOTIONS)
+
+
+def test_numerics_are_expected_to_leave_their_share():
+    assert any(row.lacking for row in between_meshes(0.0))
+    rows = between_meshes(6e-3)
+    assert rows[0].numerics == pytest.approx(2e-3)
+    assert not any(row.lacking for row in rows)
+
+
+def test_where_meshes_fold_apart_nothing_is_judged():
+    rows = between_meshes(0.03)
+    assert not any(row.stable or row.lacking for row in rows)

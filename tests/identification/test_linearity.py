@@ -1,0 +1,59 @@
+"""Tangents against finite steps, where numbers overflow: NaN is a named case and never zero."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+import toys
+
+from torchcloth.identification import ensemble, gauss_newton, linearity
+from torchcloth.identification.blocks import BLOCKS
+from torchcloth.identification.identifiability import Reach
+
+ONE = torch.ones(3, dtype=torch.float64)
+
+
+@pytest.fixture
+def problem():
+    """(a linear problem without simulation, its solution); ``secants`` are what the test makes them."""
+    draw = torch.Generator().manual_seed(0)
+    slopes, (frame, patch) = toys.sensitivities(draw), toys.layout()
+    value = toys.SIGMA * torch.randn(len(frame), generator=draw, dtype=torch.float64)
+    linear = gauss_newton.Linearised(value, slopes, torch.ones_like(value), frame, patch)
+    solver = gauss_newton.Problem(None, None, None, 0 * ONE, 5 * ONE, ONE, torch.tensor([toys.SIGMA]))
+    objective = SimpleNamespace(
+        problem=lambda: solver,
+        unknowns=[SimpleNamespace(name=name) for name in "abc"],
+        blocks=BLOCKS[:1],
+        cloth=SimpleNamespace(mesh=SimpleNamespace(extent=1e9)),
+        secants=lambda raw, steps: (linear, Reach(ONE, ONE)),
+    )
+    return objective, gauss_newton.judged(solver, 0 * ONE, linear)
+
+
+def test_slopes_that_hold_are_not_withdrawn(problem):
+    checked = linearity.check(*problem)
+    assert not checked.withdrawn
+    assert checked.curved == []
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_finite_steps_that_overflow_withdraw_the_tangents(problem, value):
+    objective, final = problem
+    broken = final.linear._replace(jacobian=final.linear.jacobian.clone())
+    broken.jacobian[0, 1] = value
+    objective.secants = lambda raw, steps: (broken, Reach(ONE, ONE))
+    checked = linearity.check(objective, final)
+    assert checked.withdrawn
+    assert "tangents of b miss finite steps" in checked.reason
+
+
+def test_without_grippers_that_feel_nothing_reaches_forces():
+    objective = SimpleNamespace(unknowns=[0, 1])
+    draw = torch.Generator().manual_seed(0)
+    raws = torch.randn(12, 2, generator=draw, dtype=torch.float64)
+    slope = torch.tensor([[1.0, 0, 0], [0, 0, 0]], dtype=torch.float64)
+    near = [ensemble.Sample(raw, raw[:1], (raw @ slope)[None, None], torch.zeros(0, 3)) for raw in raws]
+    reach = ensemble._reach(objective, near, torch.zeros(2, dtype=torch.float64))
+    assert reach.position[0] == pytest.approx(1.0, rel=1e-3)
+    assert torch.equal(reach.force, torch.zeros(2, dtype=torch.float64))

@@ -1,0 +1,54 @@
+"""The share of an oracle's gain, on small sheets of the same engine: nothing for who learned nothing."""
+
+import pytest
+import torch
+
+from torchcloth import recordings as rec
+from torchcloth.diagnosis import base_model, fit, save_model, setting_of
+from torchcloth.diagnosis.hypotheses import known
+from torchcloth.training.studies.checkout import module
+from torchcloth.training.studies.hidden_gain import gain, knowing
+
+DRAG = next(h for h in known() if h.name == "air.drag_n")
+TRUE = 1.5
+
+
+def truth(hypothesis="air.drag_n", sign=1.0):
+    return {"effects": [{"name": "?", "amplitude": TRUE, "hypothesis": hypothesis, "sign": sign, "beside": False}]}
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    """Folders of two episodes and an unseen one, and the base model fitted to the two."""
+    before, folder, sheets = torch.get_default_dtype(), tmp_path_factory.mktemp("case"), module("diagnosis", "sheets")
+    torch.set_default_dtype(torch.float64)
+    paths = {}
+    for k, motion in enumerate(("slow", "lift", "fast")):
+        recording = sheets.recorded(motion, lambda world: DRAG.apply(world, TRUE), k)
+        paths[motion] = rec.write(recording, folder / motion)
+    recordings = [rec.read(paths[name]) for name in ("slow", "lift")]
+    model = base_model(recordings[0])
+    fitted = fit(model, setting_of(model, recordings))
+    yield folder, paths, recordings[0], fitted
+    torch.set_default_dtype(before)
+
+
+@pytest.mark.parametrize(("amplitude", "low", "high"), [(None, -1e-9, 1e-9), (TRUE, 0.8, 1.0), (0.5 * TRUE, 0.3, 0.7)])
+def test_share_of_the_oracles_gain(case, amplitude, low, high):
+    """The oracle's fabric is fitted beside the drag, the others' was without it: no 1 can be had here."""
+    folder, paths, recording, fitted = case
+    model = fitted.model if amplitude is None else fitted.model.plus(DRAG, amplitude)
+    path = save_model(folder / f"{amplitude}.tcm", model, recording, torch.eye(len(model.point)).double())
+    found = gain([paths["slow"], paths["lift"]], path, paths["fast"], truth())
+    assert low <= found <= high
+
+
+def test_what_nobody_can_know_is_not_compared(case):
+    base = case[3].model
+    assert knowing(base, truth("")) is None
+    assert knowing(base, truth(sign=0.0)) is None
+    assert knowing(base, {"effects": []}) is None
+    oracle = knowing(base, truth(sign=-1.0))
+    assert [(h.name, a) for h, a in oracle.hidden] == [("air.drag_n", -TRUE)]
+    beside = truth("air.wind[x]")["effects"] + [truth()["effects"][0] | {"beside": True}]
+    assert [h.name for h, _ in knowing(base, {"effects": beside}).hidden] == ["air.wind[x]"]
