@@ -12,8 +12,7 @@ import pytest
 import sheets
 import torch
 
-from torchcloth import recordings as rec
-from torchcloth.diagnosis import base_model, catalogue, diagnose, fit, setting_of
+from torchcloth.diagnosis import base_model, catalogue, fit, setting_of
 from torchcloth.diagnosis.cells import NAMES
 from torchcloth.diagnosis.experiments import LIBRARY, PLANS, Experiment, planned, possible
 from torchcloth.diagnosis.fitting import renoised
@@ -120,37 +119,3 @@ def test_gravity_and_camera_are_told_apart_by_turning():
 def test_nothing_open_asks_for_nothing():
     end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
     assert propose(SimpleNamespace(steps=[], screened=[], end=end), [], SimpleNamespace(recordings=()), print) is None
-
-
-def made(folder, name, motion, seed, hidden):
-    """Another engine's episode."""
-    script, out = INDEPENDENT / "generate.py", folder / name
-    options = ["--nodes", "13", "--fit-nodes", "9", "--seed", str(seed), "--effect", hidden, "--out", str(out)]
-    subprocess.run([sys.executable, script, *motion, *options], check=True)
-    return rec.read(out)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("hidden", "motions", "asked"),
-    [
-        (
-            "env.gravity_tilt=0.03",
-            (["--motion", "hang"], ["--motion", "stretch"]),
-            ("env.gravity_tilt[x]", "env.gravity_tilt[y]", "obs.rotation[x]", "obs.rotation[y]"),
-        ),
-    ],
-)
-def test_the_proposed_experiment_resolves_an_ambiguous_set(tmp_path, hidden, motions, asked):
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
-    episodes = [made(tmp_path, f"e{k}", m, 40 + k, hidden) for k, m in enumerate(motions)]
-    known = [h for h in catalogue(base_model(episodes[0]), episodes) if h.name in asked]
-    first = diagnose(episodes, hypotheses=known)
-    following = first.content["next_experiment"]
-    assert first.verdict in ("ambiguous", "inconclusive", "unexplained"), first.summary()
-    said = ["--motion", following["motion"], "--heading", str(following["heading"]), "--speed", str(following["speed"])]
-    second = diagnose([*episodes, made(tmp_path, "next", said, 50, hidden)], hypotheses=known)
-    torch.set_default_dtype(before)
-    assert [c["effect"].partition("[")[0] for c in second.content["causes"]] == [hidden.partition("=")[0]]
-    assert second.verdict == "identified", second.summary()

@@ -55,6 +55,7 @@ def thinned(recording, every):
 FAULTS = {
     "the stamps of points does not increase": lambda r: stamped(r, lambda t: np.where(np.arange(len(t)) == 9, t[8], t)),
     "the stamps of points jump by 0.4": lambda r: stamped(r, lambda t: t + 0.4 * (np.arange(len(t)) > 30)),
+    "the stamps of points jump by 0.18": lambda r: stamped(r, lambda t: t + 0.15 * (np.arange(len(t)) > 30)),
     "camera and robot do not overlap": lambda r: stamped(r, lambda t: t + 100.0),
     "jump by 0.53": lambda r: thinned(r, 5),
     "the grippers are swapped": renamed,
@@ -86,6 +87,9 @@ GOOD = {
     "camera 0.02 rad": lambda r: seen(r, lambda x: x @ np.array([[1, -0.02, 0], [0.02, 1, 0], [0, 0, 1]])),
     "depth 2 %": lambda r: seen(r, lambda x: [-0.7, 0.0, 0.3] + 1.02 * (x - [-0.7, 0.0, 0.3])),
     "half is hidden": lambda r: seen_where(r, lambda x: x[:, 2] > np.median(x[:, 2])),
+    "stamps that scatter by 3 ms": lambda r: stamped(
+        r, lambda t: t + 3e-3 * np.random.default_rng(0).standard_normal(len(t))
+    ),
     "every fifth frame lost": lambda r: thinned(r, 16),
     "three stray points of a hundred": lambda r: seen(
         r, lambda x: np.where(np.arange(len(x))[:, None] % 33 == 0, x - DEEP, x)

@@ -38,7 +38,7 @@ def test_a_model_file_is_a_layer(made):
     folder, _, blank = made
     cloth = tc.load(folder / "extended.tcm")
     assert isinstance(cloth, tc.Cloth)
-    assert float(cloth.effects["air"].normal.value) == pytest.approx(TRUE)
+    assert cloth.effects["air"].normal.value.item() == pytest.approx(TRUE)
     assert all(p.requires_grad for p in cloth.parameters())
     first = torch.as_tensor(blank.cloth.initial_vertices)
     pose = torch.eye(4).repeat(2, 1, 1)

@@ -20,6 +20,7 @@ from ..recordings.ticks import times
 from .gate_clouds import Seen, handed, places, units
 
 JUMP, LEAST_JUMP = 8.0, 0.2  # usual intervals and s: a longer one is no dropped frame any more
+TICKS, EVEN, BEAT = 8, 0.05, 0.15  # frames to either side that tick evenly; usual intervals, of a tick and of a jump
 DROPPED = 0.5  # share of the frames
 COVERED = 0.5  # share of the frames that the motion must cover
 
@@ -139,8 +140,9 @@ def _stamps(recording: Recording) -> Iterator[tuple[str, str]]:
         if not len(between):
             continue
         usual = float(np.median(between))
-        worst = int(between.argmax())
-        if between[worst] > max(JUMP * usual, LEAST_JUMP):
+        jump = _set_clock(t, usual)
+        worst = int(between.argmax()) if jump is None else jump
+        if jump is not None or between[worst] > max(JUMP * usual, LEAST_JUMP):
             yield (
                 f"the stamps of {name} jump by {between[worst]:.3g} s at {t[worst]:.3g} s ({usual:.3g} s is usual)",
                 "the clock was set or frames are missing: cut the episode there, or repair the stamps",
@@ -151,6 +153,22 @@ def _stamps(recording: Recording) -> Iterator[tuple[str, str]]:
                 f"{name}: {100 * missing:.0f} % of the frames are missing",
                 "record again, or state a rate that was kept",
             )
+
+
+def _set_clock(t: np.ndarray, usual: float) -> int | None:
+    """The interval at which a clock that otherwise ticks evenly jumps: lost frames leave a whole number of ticks."""
+    between = np.diff(t)
+    for k in np.flatnonzero(np.abs(between / usual - 1) > BEAT):
+        before, after = t[max(k - TICKS, 0) : k + 1], t[k + 1 : k + 1 + TICKS]
+        if min(len(before), len(after)) < TICKS // 2:
+            continue
+        beats = [(part - part[0]) / usual for part in (before, after)]
+        if max(np.abs(b - b.round()).max() for b in beats) > EVEN:
+            continue
+        ticks = between[k] / usual
+        if abs(ticks - round(ticks)) > BEAT:
+            return int(k)
+    return None
 
 
 def _overlap(seen: Seen) -> Iterator[tuple[str, str]]:

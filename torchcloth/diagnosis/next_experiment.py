@@ -63,7 +63,7 @@ def propose(found: Found, causes: Sequence[dict[str, Any]], setting: Setting, pr
         progress(str(experiment))
         try:
             slopes = whitened_slopes(question, planned(experiment, template), setting)
-        except (TorchclothError, RuntimeError):  # torch raises the latter where a matrix is singular
+        except (TorchclothError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             continue  # it cannot be simulated, so it says nothing
         tried.append((experiment, slopes))
     if not tried:
