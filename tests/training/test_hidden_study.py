@@ -81,7 +81,10 @@ def test_an_answer_that_is_none_says_how_it_ended(monkeypatch, tmp_path):
         ended = Namespace(returncode=code, stdout="", stderr="progress\npoints.npz: t does not increase")
         monkeypatch.setattr(hidden, "_run", lambda command, ended=ended: ended)
         found = hidden.answered([tmp_path / "e1"], tmp_path / word)
-        assert found == {word: "points.npz: t does not increase"}
+        assert found == {
+            word: "points.npz: t does not increase",
+            "stderr": ["progress", "points.npz: t does not increase"],
+        }
         assert json.loads((tmp_path / word / "diagnosis.json").read_text()) == found
 
 

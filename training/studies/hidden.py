@@ -32,6 +32,7 @@ from .hidden_scores import judged, told_apart
 CASES = 60
 FAST_CASES, FAST_SECRET = 8, 23682
 REFUSED = 2  # exit code
+LINES = 20  # of an error that are kept
 HEADINGS = (0.0, 90.0, 180.0, 270.0)  # degrees, of random experiments
 
 
@@ -152,7 +153,7 @@ def answered(episodes: list[Path], out: Path) -> dict[str, Any]:
     if done.returncode == 0:
         return json.loads((out / "diagnosis.json").read_text())
     said = done.stderr.strip().splitlines() or ["nothing"]
-    answer = {"refused" if done.returncode == REFUSED else "failed": said[-1]}
+    answer: dict[str, Any] = {"refused" if done.returncode == REFUSED else "failed": said[-1], "stderr": said[-LINES:]}
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "diagnosis.json", json.dumps(answer) + "\n")
     return answer
