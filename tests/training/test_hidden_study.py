@@ -104,3 +104,12 @@ def test_wrong_options_are_one_line(tmp_path, capsys):
     assert main(["hidden", "--out", str(tmp_path / "s"), "--cases", "0"]) == 2
     assert capsys.readouterr().err.startswith("studies: --cases")
     assert not (tmp_path / "s").exists()
+
+
+def test_the_small_round_is_always_the_same(tmp_path):
+    small = hidden.drawn(options(tmp_path, fast=True))
+    assert tuple(small.seeds.values()) == hidden.FAST
+    assert min(hidden.FAST) >= 100_000
+    assert len(hidden.drawn(options(tmp_path, fast=True, seed=4, cases=9)).seeds) == 9
+    with pytest.raises(InvalidInput, match="--cases; got 9; expected at most 5"):
+        hidden.drawn(options(tmp_path, fast=True, cases=9))
