@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 DRAG = 2  # the number of a manipulation without folds
 SHEET = stretching.Fabric(60.0, 0.3, 0.25)  # N/m, -, kg/m^2
 OFF = {"youngs_modulus": 2.5, "poisson_ratio": 2 / 3, "bending.stiffness": 1.5, "air.normal": 0.8}  # of the start
-HELD: dict[str, float | None] = {"grasp": 1e-3}  # m, prior of the clamps' places, which are free as well
 METHODS: dict[str, dict[str, Any]] = {
     "gauss-newton": {"method": "gauss-newton"},
     "descent": {"method": "gradient-descent"},
@@ -84,7 +83,6 @@ class Problem(NamedTuple):
     names: list[str]
     truth: dict[str, float]
     iterations: int
-    nuisances: dict[str, float | None]
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -122,7 +120,7 @@ def run(chosen: argparse.Namespace) -> None:
 def sheet(scale: Scale) -> Problem:
     """Pulled by two clamps for a second: E, nu, bending and drag from clouds, markers and forces.
 
-    Where the clamps hold is known to half a millimetre only: six nuisances.
+    Where the clamps hold is known to half a millimetre only, which no method is told.
     """
     detail = stretching.Detail(scale.cell, scale.frames)
     recording = stretching.record(SHEET, stretching.Pull("x"), 5, detail)
@@ -132,7 +130,7 @@ def sheet(scale: Scale) -> Problem:
     truth = {name: float(p.value.detach()) for name, p in parameters.items()}
     for name, off in OFF.items():
         parameters[name].set(off * truth[name])
-    return Problem(cloth, recording, list(OFF), truth, scale.sheet_iterations, HELD)
+    return Problem(cloth, recording, list(OFF), truth, scale.sheet_iterations)
 
 
 def shirt(scale: Scale) -> Problem:
@@ -143,9 +141,7 @@ def shirt(scale: Scale) -> Problem:
         what = slowed(what, scale.length, Discretisation(scale.triangles, scale.gap))
     model, data = cases.seen(setup, what)
     true = Fabric.true("shirt")
-    return Problem(
-        model.cloth(true.start()), data.recording, list(cases.SOUGHT), true.named(), scale.shirt_iterations, {}
-    )
+    return Problem(model.cloth(true.start()), data.recording, list(cases.SOUGHT), true.named(), scale.shirt_iterations)
 
 
 def _measure(make: Callable[[Scale], Problem], scale: Scale, name: str, method: str) -> dict[str, Any]:
@@ -153,7 +149,7 @@ def _measure(make: Callable[[Scale], Problem], scale: Scale, name: str, method: 
     p, options = make(scale), METHODS[method]
     count = p.iterations if options["method"] == "gauss-newton" else scale.descent
     begun, used = time.perf_counter(), time.process_time()
-    fit = identify(p.cloth, p.recording, p.names, iterations=count, nuisances=p.nuisances, **options)
+    fit = identify(p.cloth, p.recording, p.names, iterations=count, **options)
     keys = ("simulations", "iterations", "converged", "chamfer_before", "chamfer_after")
     e = fit.parameters["youngs_modulus"]
     return {
@@ -176,7 +172,7 @@ def _measure(make: Callable[[Scale], Problem], scale: Scale, name: str, method: 
 def _table(found: dict[str, dict[str, Any]]):
     table = heading_table(
         "Cost of a fit of four parameters", "problem", "method", "triangles", "frames", "iterations", "simulations",
-        "processor", "clock", "load", "Chamfer [mm]", "E / truth",
+        "CPU", "clock", "load", "Chamfer [mm]", "E / truth",
     )  # fmt: skip
     for row in found.values():
         table.add_row(
@@ -198,7 +194,7 @@ def _table(found: dict[str, dict[str, Any]]):
 NOTE = (
     "descent: plain gradient descent; paper: Adam with the paper's stop, a Chamfer distance below 15 mm. Both follow "
     "the paper's loss (cloud to nearest vertex), in logarithms, and have no test of convergence. *: stopped there, not "
-    "converged. ?: called not identifiable. Iterations: of all stages. Processor: of the fit alone; clock: with what "
+    "converged. ?: called not identifiable. Iterations: of all stages. CPU: of the fit alone; clock: with what "
     "else ran; load: processes that wanted to run, mean of 5 minutes. Chamfer: one-sided, cloud to surface, at start "
     "and end. Gauss-Newton counts each of its tangents as a simulation, and ends with error bars."
 )
