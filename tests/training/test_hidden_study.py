@@ -81,7 +81,10 @@ def test_an_answer_that_is_none_says_how_it_ended(monkeypatch, tmp_path):
         ended = Namespace(returncode=code, stdout="", stderr="progress\npoints.npz: t does not increase")
         monkeypatch.setattr(hidden, "_run", lambda command, ended=ended: ended)
         found = hidden.answered([tmp_path / "e1"], tmp_path / word)
-        assert found == {word: "points.npz: t does not increase"}
+        assert found == {
+            word: "points.npz: t does not increase",
+            "stderr": ["progress", "points.npz: t does not increase"],
+        }
         assert json.loads((tmp_path / word / "diagnosis.json").read_text()) == found
 
 
@@ -101,3 +104,12 @@ def test_wrong_options_are_one_line(tmp_path, capsys):
     assert main(["hidden", "--out", str(tmp_path / "s"), "--cases", "0"]) == 2
     assert capsys.readouterr().err.startswith("studies: --cases")
     assert not (tmp_path / "s").exists()
+
+
+def test_the_small_round_is_always_the_same(tmp_path):
+    small = hidden.drawn(options(tmp_path, fast=True))
+    assert tuple(small.seeds.values()) == hidden.FAST
+    assert min(hidden.FAST) >= 100_000
+    assert len(hidden.drawn(options(tmp_path, fast=True, seed=4, cases=9)).seeds) == 9
+    with pytest.raises(InvalidInput, match="--cases; got 9; expected at most 5"):
+        hidden.drawn(options(tmp_path, fast=True, cases=9))
