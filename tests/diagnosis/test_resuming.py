@@ -76,7 +76,7 @@ def test_the_command_says_how_to_go_on(episodes, counted, tmp_path, capsys, monk
     assert len(list((out / "progress").glob("episode*.pt"))) == 2
     counted["stop"] = 10**9
     assert main(["diagnose", *folders, "--out", str(out), "--resume"]) == 0
-    assert "base model: as fitted: slow, 1 of 2" in capsys.readouterr().out
+    assert "base model: fit 1: slow, 1 of 2" in capsys.readouterr().out
     assert json.loads((out / "diagnosis.json").read_text())["causes"] == []
     assert not (out / "progress").exists()
     assert main(["diagnose", *folders, "--out", str(out), "--resume"]) == 2
