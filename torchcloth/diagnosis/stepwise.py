@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from ..errors import SimulationDiverged, UnstableStep
 from .approach import approach
 from .branches import unstable, without
 from .comparison import Gain, Predicted, compare, predict, telling
 from .evidence import Progress, Setting, staged
-from .fitting import Fitted, fit, renoised
+from .fitting import IMPOSSIBLE, Fitted, fit, renoised
 from .noise import Noise, fit_noise, floor_of, unfitted
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
@@ -20,6 +20,7 @@ MOST = 4  # causes
 TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 2  # steps of the likelier ones among them
 CLEAR = 4.0  # log density below which two models predict alike
+PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
 MUCH = 50.0  # chi^2, of a cause that is worth fitting
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
@@ -106,7 +107,10 @@ def extend(
         steps.append(step)
         left = [h for h in hypotheses if h.name not in {a.name for a in step.best.fitted.model.accepted}]
         now = staged(progress, f"with {step.best.hypothesis.name}")
-        current = fit(step.best.fitted.model, setting, left, FURTHER, now, before=start.evidence)
+        try:
+            current = fit(step.best.fitted.model, setting, left, FURTHER, now, before=start.evidence)
+        except IMPOSSIBLE:  # a step too far; what was found before stands
+            current = fit(step.best.fitted.model, setting, left, 0, now, before=start.evidence)
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     screened = screen(current)
     alone = {name for step in steps for name in step.best.alone}
@@ -153,7 +157,7 @@ def _step(
         begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
             fits.append((row, fit(begun, setting, (), 1, trial, unfitted(), current.evidence)))
-        except (SimulationDiverged, UnstableStep):
+        except IMPOSSIBLE:
             continue
     if not fits:
         return None
@@ -180,7 +184,8 @@ def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> li
         found = c.fitted
         if c.gain.density > enough and found.ahead > CLEAR:
             further = staged(progress, f"trying {c.hypothesis.name} further")
-            found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
+            with suppress(*IMPOSSIBLE):  # what was found before stands
+                found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
         out.append((c.row, found))
     return out
 
@@ -197,7 +202,8 @@ def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str],
 
 
 def _useful(c: Candidate) -> bool:
-    return _worthwhile(c.gain) and abs(c.fitted.model.amplitudes[-1]) > MATTERS * abs(c.hypothesis.smallest)
+    amplitude, h = abs(c.fitted.model.amplitudes[-1]), c.hypothesis
+    return _worthwhile(c.gain) and MATTERS * abs(h.smallest) < amplitude < PLAUSIBLE * abs(h.typical)
 
 
 def _worthwhile(gain: Gain) -> bool:
