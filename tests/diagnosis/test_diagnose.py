@@ -1,6 +1,7 @@
 """From recordings to an answer: one hidden effect, none, and input that cannot be used."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import sheets
@@ -8,7 +9,7 @@ import torch
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
-from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, write_diagnosis
+from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, search, setting_of, write_diagnosis
 from torchcloth.errors import InvalidInput
 
 ASKED = ("air.drag_n", "air.linear", "mass.hem", "rest.shrink[weft]", "obs.extrinsic[y]")
@@ -42,6 +43,20 @@ def test_hidden_drag_is_named(with_drag):
     assert gain["rms_after"] < 0.5 * gain["rms_before"]
     assert gain["explained_fraction"] > 0.9
     assert "Cause: air.drag_n" in answer.summary()
+
+
+def test_an_amplitude_that_no_world_can_have_ends_a_fit_and_not_the_diagnosis(with_drag):
+    recordings, _ = with_drag
+    (drag,) = (h for h in asked(recordings) if h.name == "air.drag_n")
+
+    def brittle(world, amplitude):
+        if amplitude > drag.typical:
+            raise InvalidInput("brittle", got=amplitude, expected="no more than typical")
+        return drag.apply(world, amplitude)
+
+    model = base_model(recordings[0])
+    found = search(model, setting_of(model, recordings), [replace(drag, name="user.brittle", apply=brittle)])
+    assert all(amplitude <= drag.typical for amplitude in found.end.model.amplitudes)
 
 
 def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
