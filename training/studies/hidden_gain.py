@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from torchcloth.diagnosis import Hypothesis, Model, World, base_model, fit, load_model, setting_of
+from torchcloth.diagnosis.approach import approach
 from torchcloth.diagnosis.base_model import together
 from torchcloth.diagnosis.cells import SEEN, cells_of
+from torchcloth.diagnosis.evidence import Setting
 from torchcloth.diagnosis.hypotheses import known
 from torchcloth.recordings import read
 
@@ -60,9 +62,14 @@ def gain(episodes: Sequence[Path], extended: Path, unseen: Path, truth: Mapping[
     if oracle is None:
         return None
     setting, found = setting_of(base, recordings), load_model(extended)
-    fitted = fit(base, setting).model if found.accepted else found  # without causes it is the fitted base
-    before, best = rms(fitted, last), rms(fit(oracle, setting).model, last)
+    fitted = _fitted(base, setting) if found.accepted else found  # without causes it is the fitted base
+    before, best = rms(fitted, last), rms(_fitted(oracle, setting), last)
     return None if before - best < LEAST else (before - rms(found, last)) / (before - best)
+
+
+def _fitted(model: Model, setting: Setting) -> Model:
+    near, before = approach(model, setting)
+    return fit(near, setting, before=before).model
 
 
 def rms(model: Model, recording: Any) -> float:
