@@ -94,7 +94,10 @@ def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
     assert found["confirmed"]
     assert found["gain"]["rms_after"] < 0.4 * found["gain"]["rms_before"]
     assert found["motions"]["fast"]["explained_fraction"] > 0.8
-    assert main(["confirm", *models[::-1], str(folder / "fast"), "--out", str(tmp_path / "b")]) == 0
-    assert not json.loads((tmp_path / "b" / "confirmation.json").read_text())["confirmed"]
+    assert main(["confirm", *models[::-1], str(folder / "fast"), "--out", str(tmp_path / "b")]) == 2
+    assert "a base model, then one with all its causes and more" in capsys.readouterr().err
+    assert not (tmp_path / "b").exists()
+    with pytest.raises(InvalidInput, match="'fast' twice"):
+        dx.confirm(*models, 2 * [rec.read(folder / "fast")])
     with pytest.raises(InvalidInput, match="that the model was fitted to"):
         dx.confirm(*models, [seen, blank])

@@ -28,6 +28,16 @@ def test_an_answer_is_computed_once(tmp_path):
     assert float(again.ask("rows", POINT + 1e-15, answer(3.0))[0]) == 3.0  # the next number is another question
 
 
+@pytest.mark.parametrize("damage", ["cut", "junk", "empty"])
+def test_a_damaged_answer_is_computed_anew(tmp_path, damage):
+    Journal(tmp_path / "j", ["a"], resume=False).ask("rows", POINT, answer(1.0))
+    (file,) = (tmp_path / "j").glob("*.pt")
+    file.write_bytes({"cut": file.read_bytes()[:300], "junk": b"no tensor at all", "empty": b""}[damage])
+    again = Journal(tmp_path / "j", ["a"], resume=True)
+    assert float(again.ask("rows", POINT, answer(2.0))[0]) == 2.0
+    assert again.recalled == 0
+
+
 def test_another_problem_is_refused(tmp_path):
     Journal(tmp_path / "j", ["a", torch.zeros(3)], resume=False).ask("rows", POINT, answer(1.0))
     Journal(tmp_path / "j", ["a", torch.zeros(3)], resume=True)

@@ -37,7 +37,9 @@ def _diagnose(options: argparse.Namespace) -> int:
     if faults:
         answer = diagnosis.refused(faults)
     else:
-        print(f"{len(episodes)} episodes: about a minute each on one core", flush=True)
+        print(
+            f"{len(episodes)} episodes: up to a minute each on one core, with a cause; half of it without", flush=True
+        )
         with progress_line() as progress:
             answer = diagnosis.diagnose(
                 episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume

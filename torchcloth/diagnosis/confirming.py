@@ -15,7 +15,7 @@ from ..recordings import Recording
 from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
 from .evidence import Evidence, Progress, gather, setting_of, staged
 from .fitting import Fitted
-from .gate import check
+from .gate import check, each_once
 from .model_file import ModelFile, read_model
 from .noise import Noise, fit_noise, floor_of, whitened
 from .repeats import pairs_of, repeats
@@ -82,12 +82,15 @@ def confirm(
         progress: called with one line for each episode that is simulated.
 
     Raises:
-        InvalidInput: no model file, an episode of another cloth or one that a model was fitted to.
+        InvalidInput: no model file, a second model that does not extend the first, an episode that is given twice, of
+            another cloth, or one that a model was fitted to.
         RecordingError: a file that is no model, or an episode that cannot be believed.
     """
     if faults := check(recordings):
         raise RecordingError(str(faults[0]))
+    each_once(recordings)
     files = [read_model(path, recordings[0]) for path in (base, extended)]
+    _refuse_no_extension(*(file.model for file in files))
     for recording in recordings:
         _refuse_seen(recording, files)
     settings = [setting_of(file.model, recordings) for file in files]
@@ -108,6 +111,17 @@ def confirm(
 def _of_motion(before: Predicted, after: Predicted, names: Sequence[str], motion: str, floor: float) -> Gain:
     own = [k for k, name in enumerate(names) if name == motion]
     return compare(of_episodes(before, own), of_episodes(after, own), floor)
+
+
+def _refuse_no_extension(base: Model, extended: Model) -> None:
+    first, second = ({h.name for h in model.accepted} for model in (base, extended))
+    if not first < second:
+        raise InvalidInput(
+            "models",
+            got=f"causes {', '.join(sorted(first)) or 'none'}, then {', '.join(sorted(second)) or 'none'}",
+            expected="a base model, then one with all its causes and more",
+            remedy="DIR/base.tcm DIR/extended.tcm of `diagnose`, in this order",
+        )
 
 
 def _refuse_seen(recording: Recording, files: Sequence[ModelFile]) -> None:

@@ -14,7 +14,7 @@ from ..identification.saved import mark
 from ..recordings import Recording
 from .base_model import base_model, together
 from .evidence import Progress, Setting, setting_of, staged
-from .gate import check
+from .gate import check, each_once
 from .hypotheses import catalogue
 from .keeping import kept_in
 from .missing import missing_force
@@ -49,7 +49,7 @@ def diagnose(
         resume: go on with what a diagnosis that was stopped left there; the answer is the same, bit by bit.
 
     Raises:
-        InvalidInput: fewer than two episodes, too few motions to hold one out, or different cloths.
+        InvalidInput: fewer than two episodes, too few motions to hold one out, different cloths, or one episode twice.
         RecordingError: an episode that lacks what is needed.
         SimulationDiverged: the base model cannot be simulated.
     """
@@ -63,6 +63,7 @@ def diagnose(
         )
     if faults := check(recordings):
         return refused(faults, names)
+    each_once(recordings)
     model = model or base_model(together(recordings))
     asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
     plan = hashlib.sha256(json.dumps([[h.name, h.typical, h.share] for h in asked]).encode()).hexdigest()[:16]

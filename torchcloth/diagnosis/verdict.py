@@ -144,7 +144,7 @@ def _cause(found: Found, step: Step) -> dict[str, Any]:
 def _share(found: Found, gain: Gain) -> float | None:
     """Of what all causes explain together, by what each adds to the predictive density."""
     every = sum(step.best.gain.density for step in found.steps)
-    return None if found.whole is None else found.whole.explained * gain.density / every
+    return None if found.whole is None else min(1.0, found.whole.explained) * gain.density / every
 
 
 def _gain(found: Found) -> dict[str, Any] | None:
@@ -223,6 +223,8 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
         out += [f"  {said}" for said in (GLOSSARY.get(c["effect"].partition("[")[0]),) if said]
         if others:
             out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
+    if content["causes"]:
+        out.append("These intervals know of noise and meshes, not of laws that differ from the model's.")
     words = {
         "adequate": "Nothing known is wrong beyond what matters.",
         "unexplained": "The fit is lacking, and no known cause mends it.",

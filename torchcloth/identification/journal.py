@@ -7,6 +7,7 @@ That holds for every estimator alike, and there is no state of a search that cou
 from __future__ import annotations
 
 import hashlib
+import pickle
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from .._files import atomically
 from ..errors import InvalidInput
 
 FORMAT = 1
+DAMAGED = (RuntimeError, KeyError, ValueError, EOFError, pickle.UnpicklingError)  # torch's, of a file that is none
 T = TypeVar("T", bound=Sequence)
 
 
@@ -58,7 +60,7 @@ class Journal:
             answer = torch.load(path, weights_only=True)
             self.recalled += 1
             return answer
-        except FileNotFoundError:
+        except (FileNotFoundError, *DAMAGED):
             answer = work()
         self._write(path, tuple(answer))
         return answer
