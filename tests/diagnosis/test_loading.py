@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import sheets
 import torch
@@ -13,6 +14,7 @@ from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.errors import InvalidInput
 from torchcloth.identification.saved import mark
+from torchcloth.viewing import film_of_fit
 
 TRUE = 1.5
 
@@ -85,6 +87,16 @@ def test_a_prediction_has_errors_and_meets_the_truth(made, tmp_path):
     assert json.loads((tmp_path / "p" / "prediction.json").read_text())["measured"]["rms"] == found.figures["rms"]
 
 
+def test_a_model_is_looked_at_beside_the_points(made):
+    folder, seen, _ = made
+    base, extended = (film_of_fit(seen, folder / name) for name in ("base.tcm", "extended.tcm"))
+    far = [film.curves["distance"].values.mean() for film in (base, extended)]  # mm
+    assert far[1] < 0.5 * far[0]
+    assert f"extended model, {far[1]:.2f} mm from the points" in extended.title
+    found = dx.predicted(folder / "extended.tcm", seen).frames.x.numpy()
+    np.testing.assert_allclose(extended.sheets["cloth"].vertices, found, atol=1e-6)
+
+
 def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
     folder, seen, blank = made
     models = [str(folder / name) for name in ("base.tcm", "extended.tcm")]
@@ -101,3 +113,12 @@ def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
         dx.confirm(*models, 2 * [rec.read(folder / "fast")])
     with pytest.raises(InvalidInput, match="that the model was fitted to"):
         dx.confirm(*models, [seen, blank])
+
+
+def test_a_table_that_one_episode_has_is_in_the_scene_of_all(made):
+    folder, seen, _ = made
+    plane = rec.Collider(np.array([0.0, 0.0, 1.004]), np.array([0.0, 0.0, 1.0]), 0.4)
+    over = replace(sheets.episode("lift", duration=0.4), colliders={"table": plane})
+    models = [folder / name for name in ("base.tcm", "extended.tcm")]
+    one, other = (dx.confirm(*models, order).motions["lift"] for order in ([seen, over], [over, seen]))
+    assert one.after == pytest.approx(other.after, rel=1e-9)

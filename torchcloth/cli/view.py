@@ -21,7 +21,9 @@ def add(verbs: Any) -> None:
     """The verb and its options."""
     view = verbs.add_parser("view", help="look at an episode, and at a fit beside it")
     view.add_argument("episode", metavar="EPISODE", help="folder of a recording")
-    view.add_argument("--fit", type=Path, metavar="RESULT", help="identification.json or its folder: simulate it too")
+    view.add_argument(
+        "--fit", type=Path, metavar="RESULT", help="identification.json, its folder or a .tcm file: simulate it too"
+    )
     view.add_argument(
         "--out",
         type=Path,

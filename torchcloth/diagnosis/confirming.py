@@ -12,6 +12,7 @@ import torch
 from ..errors import InvalidInput, RecordingError
 from ..identification.saved import alike, mark
 from ..recordings import Recording
+from .base_model import together
 from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
 from .evidence import Evidence, Progress, gather, setting_of, staged
 from .fitting import Fitted
@@ -89,7 +90,8 @@ def confirm(
     if faults := check(recordings):
         raise RecordingError(str(faults[0]))
     each_once(recordings)
-    files = [read_model(path, recordings[0]) for path in (base, extended)]
+    scene = together(recordings)
+    files = [read_model(path, scene) for path in (base, extended)]
     _refuse_no_extension(*(file.model for file in files))
     for recording in recordings:
         _refuse_seen(recording, files)

@@ -16,6 +16,7 @@ from .screening import Row
 from .verdict import Diagnosis
 
 COLOURS = {"present": "#b0653a", "inconclusive": "#c9a227", "absent": "#1f6f8b", "unresolvable": "#bbbbbb"}
+FARTHEST = 2.2  # typical amplitudes that are shown
 
 
 def residual_maps(answer: Diagnosis) -> Any:
@@ -58,13 +59,15 @@ def screening(rows: Sequence[Row]) -> Any:
         typical, share = abs(r.hypothesis.typical), r.hypothesis.share
         sign = 1.0 if r.hypothesis.typical > 0 else -1.0
         axis.plot([-share, share], [k, k], color="#e6e6e6", lw=9, solid_capstyle="butt", zorder=0)
-        axis.errorbar(
-            sign * r.amplitude / typical, k, xerr=1.96 * r.total / typical, fmt="o", ms=4, color=COLOURS[r.decision]
-        )
+        asked = sign * r.amplitude / typical
+        if abs(asked) > FARTHEST:  # beyond the picture
+            axis.plot(np.copysign(FARTHEST - 0.05, asked), k, ">" if asked > 0 else "<", color=COLOURS[r.decision])
+        axis.errorbar(asked, k, xerr=1.96 * r.total / typical, fmt="o", ms=4, color=COLOURS[r.decision])
     axis.set_yticks(range(len(shown)), [r.hypothesis.name for r in reversed(shown)], fontsize=8)
-    axis.set_xlim(-2.2, 2.2)
+    axis.set_xlim(-FARTHEST, FARTHEST)
+    axis.set_ylim(-1, len(shown))
     axis.axvline(0, color="k", lw=0.6)
-    axis.set_xlabel("amplitude over its typical value; grey: too small to matter")
+    axis.set_xlabel("amplitude over its typical value; grey: too small to matter; arrows: beyond")
     handles = [Patch(color=colour, label=name) for name, colour in COLOURS.items()]
     axis.legend(handles=handles, fontsize=8, loc="lower right")
     return figure

@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..diagnosis import read_model
 from ..identification import replayed
+from ..identification.episodes import episode
 from ..losses import closest
 from ..recordings import Recording
 from .episodes import film_of
 from .film import DISTANCE, Curve, Film, Sheet
 from .geometry import Array, edges_of
 
+MODEL = ".tcm"
 QUANTILE = 0.95  # of the distances, is dark red
 NOISES = 4.0  # standard deviations of the sensor that the colour bar spans at least
 LEAST = 2.0  # mm, that the colour bar spans at least
@@ -27,19 +30,33 @@ def film_of_fit(recording: Recording, fit: str | Path, *, truth: bool = False) -
 
     Args:
         recording: one of the fit's episodes, or another of the same cloth, which is then predicted.
-        fit: identification.json, or the folder that holds it.
+        fit: identification.json, or the folder that holds it; or a .tcm file of ``diagnose``.
         truth: as of ``film_of``.
 
     Raises:
         InvalidInput: the fit is of another model.
         RecordingError: the file cannot be read.
     """
+    if Path(fit).suffix == MODEL:
+        return _film_of_model(recording, fit, truth)
     again = replayed(fit, recording)
     film = film_of(recording, truth=truth, times=again.episode.times.numpy())
     film = with_cloth(film, again.frames.numpy(), again.cloth.mesh.faces, noise=recording.observation_noise_std)
     distance = f", {1e3 * float(again.chamfer.mean()):.2f} mm from the points" if len(again.chamfer) else ""
     title = f"{film.title}: {'fitted' if again.fitted else 'predicted'}{distance}"
     return replace(film, title=title, notes=film.notes + ((again.warning,) if again.warning else ()))
+
+
+def _film_of_model(recording: Recording, path: str | Path, truth: bool) -> Film:
+    """As ``film_of_fit``, with the cloth, robot and observer of a model file."""
+    world = read_model(path, recording).model.world()
+    data = episode(world.cloth, recording)
+    film = film_of(recording, truth=truth, times=data.times.numpy())
+    x = world.frames(data).x.numpy()
+    film = with_cloth(film, x, world.cloth.mesh.faces, noise=recording.observation_noise_std)
+    far = film.curves[DISTANCE].values if DISTANCE in film.curves else np.array([np.nan])
+    distance = f", {np.nanmean(far):.2f} mm from the points" if np.isfinite(far).any() else ""
+    return replace(film, title=f"{film.title}: {Path(path).stem} model{distance}")
 
 
 def with_cloth(film: Film, vertices: Array, faces: Array, *, noise: float | None = None) -> Film:

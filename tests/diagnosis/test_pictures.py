@@ -1,0 +1,66 @@
+"""Pictures show what the numbers say, where they belong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sheets
+import torch
+
+from torchcloth import diagnosis as dx
+from torchcloth.diagnosis.cells import STRETCH
+from torchcloth.diagnosis.fabric_maps import misfit_limit, misfit_maps
+from torchcloth.diagnosis.pictures import FARTHEST, screening
+from torchcloth.diagnosis.screening import Row
+
+
+@pytest.fixture(scope="module")
+def gathered():
+    """(evidence, setting) of an episode whose points lie on a surface that wind has moved."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    blank = sheets.episode()
+    wind = next(h for h in dx.catalogue(dx.base_model(blank), [blank]) if h.name == "air.wind[y]")
+    model = dx.base_model(blank)
+    setting = dx.setting_of(model, [sheets.recorded("slow", lambda world: wind.apply(world, 0.5), 3)])
+    yield dx.gather(model, setting), setting
+    torch.set_default_dtype(before)
+
+
+def test_a_part_of_the_fabric_has_its_misfit_where_it_lies(gathered):
+    evidence, _ = gathered
+    cells, figure = evidence.cells[0], misfit_maps(*gathered)
+    tiles = [axis for axis in figure.axes if axis.get_title().endswith(" s")]
+    checked = 0
+    for k in np.flatnonzero(cells.block == 0):
+        assert tiles[cells.window[k]].get_title() == f"{STRETCH * cells.window[k]:.1f} s"
+        image = tiles[cells.window[k]].images[0]
+        left, right, low, high = image.get_extent()
+        field, (u, v, _) = image.get_array(), cells.place[k].tolist()
+        rows, columns = field.shape
+        row, column = int(rows * (v - low) / (high - low)), int(columns * (u - left) / (right - left))
+        assert field[row, column] == pytest.approx(1e3 * cells.value[k].item())
+        checked += 1
+    assert checked > 30
+    limit = misfit_limit(evidence)
+    assert tiles[0].images[0].get_clim() == (-limit, limit)
+    assert limit > 3.0  # mm, what half a metre a second does
+
+
+def test_parts_that_nobody_saw_are_grey(gathered):
+    evidence, setting = gathered
+    cells = evidence.cells[0]
+    kept = ~((cells.window == 0) & (cells.patch < 3))
+    less = replace(evidence, cells=[type(cells)(*(column[kept] for column in cells))])
+    tile = misfit_maps(less, setting).axes[0]
+    unseen = tile.images[1].get_array()[..., 3] > 0
+    assert 0 < unseen.mean() < 0.15
+    assert not (tile.images[0].get_array().filled(np.nan)[~unseen] == 0).any()
+
+
+def test_amplitudes_beyond_the_picture_are_arrows_at_its_end():
+    h = dx.Hypothesis("my.own", "N", 2.0, lambda world, a: world)
+    rows = [Row(h, a, 0.1, 0.0, 9.0, 1e-3, "present") for a in (1.0, 50.0, -50.0)]
+    (axis,) = screening(rows).axes
+    arrows = {line.get_marker(): float(line.get_xdata()[0]) for line in axis.lines if line.get_marker() in "<>"}
+    assert arrows == {">": pytest.approx(FARTHEST - 0.05), "<": pytest.approx(0.05 - FARTHEST)}
