@@ -91,6 +91,12 @@ def test_one_motion_is_refused(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_single_precision_is_refused(with_drag):
+    torch.set_default_dtype(torch.float32)
+    with pytest.raises(InvalidInput, match=r"got torch\.float32; expected torch\.float64"):
+        diagnose(with_drag[0])
+
+
 def test_a_model_that_is_none_is_refused(tmp_path, capsys):
     folder = rec.write(sheets.episode(), tmp_path / "a")
     (tmp_path / "m.tcm").write_text("x")

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from .._files import write_text
 from ..errors import InvalidInput
 from ..identification.saved import mark
@@ -49,7 +51,8 @@ def diagnose(
         resume: go on with what a diagnosis that was stopped left there; the answer is the same, bit by bit.
 
     Raises:
-        InvalidInput: fewer than two episodes, too few motions to hold one out, different cloths, or one episode twice.
+        InvalidInput: fewer than two episodes, too few motions to hold one out, different cloths, one episode twice, or
+            a default dtype other than float64.
         RecordingError: an episode that lacks what is needed.
         SimulationDiverged: the base model cannot be simulated.
     """
@@ -60,6 +63,13 @@ def diagnose(
             got=f"{len(recordings)} with motion {', '.join(sorted(set(names))) or 'none'}",
             expected="at least two motions: one is held out while the other is fitted",
             remedy="record another motion, or name them apart (split.motion in episode.json)",
+        )
+    if torch.get_default_dtype() != torch.float64:
+        raise InvalidInput(
+            "default dtype",
+            got=torch.get_default_dtype(),
+            expected="torch.float64: differences between simulations lose their digits in float32",
+            remedy="torch.set_default_dtype(torch.float64)",
         )
     if faults := check(recordings):
         return refused(faults, names)
