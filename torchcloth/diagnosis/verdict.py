@@ -225,7 +225,9 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
         if others:
             out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
     if content["causes"]:
-        out.append("These intervals know of noise, meshes and how far motions disagree, not of what is wrong in all alike.")
+        out.append(
+            "These intervals know of noise, meshes and how far motions disagree, not of what is wrong in all alike."
+        )
     words = {
         "adequate": "Nothing known is wrong beyond what matters.",
         "unexplained": "The fit is lacking, and no known cause mends it.",
