@@ -178,12 +178,15 @@ def _step(
 
 
 def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> list[tuple[Row, Fitted]]:
-    """The better ones where further steps lead: one step does for small effects only."""
-    enough = max(0.0, 0.5 * max(c.gain.density for c in tried))
+    """The likelier ones where further steps lead: one step does for small effects only.
+
+    Likely is what predicts well or still has far to go: a large effect that is half fitted predicts nothing.
+    """
+    hope = [c.gain.density + c.fitted.ahead for c in tried]
     out = []
-    for c in tried:
+    for c, expected in zip(tried, hope, strict=True):
         found = c.fitted
-        if c.gain.density > enough and found.ahead > CLEAR:
+        if expected > max(0.0, 0.5 * max(hope)) and found.ahead > CLEAR:
             further = staged(progress, f"trying {c.hypothesis.name} further")
             with suppress(*IMPOSSIBLE):  # what was found before stands
                 found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
