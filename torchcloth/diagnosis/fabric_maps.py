@@ -84,5 +84,5 @@ def _raster(setting: Setting) -> tuple[np.ndarray, np.ndarray, tuple[float, floa
     u, v = np.meshgrid(*(np.linspace(a, b, PIXELS) for a, b in zip(low, high, strict=True)))
     pixels = np.stack([u, v], -1)
     nearest = np.linalg.norm(pixels[..., None, :] - place, axis=-1).argmin(-1)
-    inside = Triangulation(*place.T, faces).get_trifinder()(u, v) >= 0
-    return setting.sheet.patches.numpy()[nearest], inside, (low[0], high[0], low[1], high[1])
+    triangle: Any = Triangulation(place[:, 0], place[:, 1], faces).get_trifinder()(u, v)
+    return setting.sheet.patches.numpy()[nearest], triangle >= 0, (low[0], high[0], low[1], high[1])
