@@ -201,7 +201,7 @@ def _concluded(
     end = full.seen(final.raw)
     before, after, null = [s.x for s in start], [s.x for s in end], [rigid_carry(e) for e in full.episodes]
     found = estimates(full.cloth, full.unknowns, final.raw, covariance)
-    profiled = {} if checked.warnings else profiles(told, final, covariance, profile, search.tell)
+    profiled = {} if checked.warnings or checked.withdrawn else profiles(told, final, covariance, profile, search.tell)
     found = with_profiles(found, profiled)
     fit: dict[str, Any] = _figures(full, before, after, null)
     fit |= _force_figures(full, start, end)
@@ -219,7 +219,7 @@ def _concluded(
         fit["replicates"] = int((strata > 0).sum())
     if outcome.reached is not None:
         fit |= {"starts": outcome.reached.tried, "starts_agreeing": outcome.reached.agree}
-    if checked.withdrawn or worthless(fit):  # steep chaotic slopes promise tiny errors
+    if checked.withdrawn or worthless(fit):  # slopes of chaos, or of elsewhere, promise tiny errors
         found = withdraw(found, full.unknowns)
     warnings += [outcome.unfinished] if outcome.unfinished else []
     warnings += skewed(found, [name for name in checked.curved if name not in profiled])
