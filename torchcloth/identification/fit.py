@@ -60,7 +60,7 @@ def identify(
     starts: int = 1,
     profile: Sequence[str] = (),
     journal: str | Path | None = None,
-    resume: bool = False,
+    resume: bool | None = False,
     on_progress: Progress | None = None,
     refine: bool = False,
 ) -> Identification:
@@ -94,6 +94,7 @@ def identify(
             the others anew: it may be skew, and open. Some 20 simulations for each unknown of the fit.
         journal: folder in which the fit keeps what it computed; of no use any more once the result is safe.
         resume: go on where a fit with this journal was stopped; the result is what it would have been, bit by bit.
+            None: start over, but refuse to where it could go on.
         refine: correct the result for the coarseness of the mesh, by one simulation on a mesh twice as fine, and widen
             its errors by what that leaves open (see ``finer.py``). ``fit["mesh_step"]`` has the largest correction in
             standard errors. Not where the motion is chaotic, and not together with ``profile``.
