@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -53,27 +54,42 @@ class Kept:
         self._path(name).parent.mkdir(exist_ok=True)
         write_text(self._path(name), json.dumps(content, indent=1, allow_nan=False) + "\n")
 
-    def run(self, cases: Mapping[str, Case]) -> dict[str, dict[str, Any]]:
-        """All cases by name, the missing ones computed in turn, with progress."""
+    def run(self, cases: Mapping[str, Case], jobs: int = 1) -> dict[str, dict[str, Any]]:
+        """All cases by name, the missing ones computed in turn, ``jobs`` at a time, with progress."""
         missing = [name for name in cases if self.find(name) is None]
         if missing:
-            self._compute({name: cases[name] for name in missing}, len(cases))
+            self._compute({name: cases[name] for name in missing}, len(cases), jobs)
         return {name: found for name in cases if (found := self.find(name)) is not None}
 
-    def _compute(self, cases: Mapping[str, Case], total: int) -> None:
+    def _compute(self, cases: Mapping[str, Case], total: int, jobs: int) -> None:
         from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
         columns = (MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
         begun, terminal = time.monotonic(), sys.stdout.isatty()
         with Progress(*columns, refresh_per_second=2, disable=not terminal) as bar:
             shown = bar.add_task("", total=total, completed=total - len(cases))
-            for done, (name, work) in enumerate(cases.items(), 1):
-                bar.update(shown, description=name)
-                self.keep(name, work())
+            for done, name in enumerate(self._finished(cases, jobs, lambda n: bar.update(shown, description=n)), 1):
                 bar.advance(shown)
                 if not terminal:  # a log file gets lines, not a bar
                     left = (time.monotonic() - begun) / done * (len(cases) - done) / 60
                     print(f"{total - len(cases) + done}/{total} {name}, about {left:.1f} min left", flush=True)
+
+    def _finished(self, cases: Mapping[str, Case], jobs: int, begins: Callable[[str], object]) -> Iterator[str]:
+        """Names of cases as they are kept."""
+
+        def work(name: str) -> str:
+            begins(name)
+            self.keep(name, cases[name]())
+            return name
+
+        if jobs == 1:
+            yield from map(work, cases)
+            return
+        pool = ThreadPoolExecutor(jobs)
+        try:
+            yield from (done.result() for done in as_completed([pool.submit(work, name) for name in cases]))
+        finally:
+            pool.shutdown(cancel_futures=True)  # when stopped, what has begun ends and nothing else begins
 
     def _path(self, name: str) -> Path:
         return self.folder / "cases" / f"{name}.json"

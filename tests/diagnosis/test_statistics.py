@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchcloth.diagnosis.classes import alike, correlations
-from torchcloth.diagnosis.comparison import compare, predict
+from torchcloth.diagnosis.comparison import compare, predict, spread
 from torchcloth.diagnosis.noise import fit_noise, floor_of, whitened
 from torchcloth.diagnosis.screening import screen
 
@@ -44,6 +44,29 @@ def test_without_noise_it_is_exact_and_parameters_do_not_matter():
         ).solution
         assert float(-joint[2, 0]) == pytest.approx(0.7, rel=1e-9)
         assert fitted_out["b"].amplitude == pytest.approx(0.7, rel=1e-6)
+
+
+def disagreeing(seed, by):
+    """(error of the third parameter's estimate, its spread over motions, its error from noise), truth 0.7 +- ``by``."""
+    rng = torch.Generator().manual_seed(seed)
+    truths = 0.7 + by * torch.randn(toys.EPISODES, generator=rng).double()
+    none = torch.zeros(5).double()
+    ev = toys.evidence(SLOPES, 3, NAMES[:2], none, seed)
+    cells = [c._replace(value=c.value - t * c.jacobian[:, 2]) for c, t in zip(ev.cells, truths, strict=True)]
+    found = toys.fitted(ev.__class__(cells, 3, ev.hypotheses, ev.stds, ev.numerics), std=1e6)
+    own, value = found.white.jacobian[:, :3], found.white.value
+    estimate = -torch.linalg.lstsq(own, value[:, None]).solution[2, 0]
+    motions = [str(k) for k in range(toys.EPISODES)]
+    return float(estimate) - 0.7, float(spread(found, motions)[2]), float(found.covariance[2, 2].sqrt())
+
+
+def test_motions_that_disagree_widen_an_error_and_those_that_agree_do_not():
+    alike = [disagreeing(seed, 0.0) for seed in range(20)]
+    apart = torch.tensor([disagreeing(seed, 0.3) for seed in range(60)])
+    assert sum(s for _, s, _ in alike) == pytest.approx(sum(n for _, _, n in alike), rel=0.35)
+    covered = lambda std: float((apart[:, 0].abs() < 1.96 * std).double().mean())  # noqa: E731
+    assert covered(apart[:, 2]) < 0.5, "the noise within motions knows nothing of it"
+    assert covered(apart[:, 1]) > 0.75, "four motions: 95 % by a normal distribution is too much to ask"
 
 
 def test_scores_do_not_depend_on_how_parameters_are_written():

@@ -15,7 +15,7 @@ from drawn import CONFOUNDED, REDUCED, SMALL, Case, Hidden, case
 from partners import OUTSIDE, SINGLES
 
 LIKE = {  # confounded cases: what else explains the data as well; what one may tell apart after all is "soft"
-    "tilt or wind": {"like": ["env.gravity_tilt", "air.wind", "obs.rotation"], "soft": False},
+    "tilt or wind": {"like": ["env.gravity_tilt", "air.wind", "obs.rotation"], "soft": True},  # wind brings drag
     "base or extrinsic": {"like": ["obs.extrinsic", "robot.base"], "soft": False},
     "mass without forces": {"like": ["mass.density"], "soft": False},
     "damping or drag": {"like": ["air.linear", "air.drag_n"], "soft": True},

@@ -39,7 +39,9 @@ def called(monkeypatch):
 
 
 def options(tmp_path, **more):
-    return Namespace(**{"out": tmp_path / "s", "cases": None, "seed": None, "dev": False, "fast": False} | more)
+    return Namespace(
+        **{"out": tmp_path / "s", "cases": None, "seed": None, "dev": False, "fast": False, "jobs": 1} | more
+    )
 
 
 def test_the_truth_is_opened_after_the_answer_and_nothing_is_told(called, tmp_path):

@@ -1,5 +1,7 @@
 """Studies on disk: what is finished is never done twice, and other settings are refused."""
 
+import threading
+
 import pytest
 
 from torchcloth.errors import InvalidInput, RecordingError
@@ -25,6 +27,30 @@ def test_a_stopped_study_goes_on_where_it_was(tmp_path, capsys):
     assert called == ["a", "b", "c", "c", "d"]
     assert found == {name: {"name": name, "value": 0.1 + 0.2} for name in "abcd"}  # exact: JSON keeps doubles
     assert "4/4 d" in capsys.readouterr().out
+
+
+def test_cases_run_at_a_time(tmp_path, capsys):
+    both = threading.Barrier(2, timeout=20)
+
+    def case(name):
+        def work():
+            both.wait()  # never, one after the other
+            return {"name": name}
+
+        return work
+
+    cases = {name: case(name) for name in "abcd"}
+    assert Kept(tmp_path / "s", {}).run(cases, jobs=2) == {name: {"name": name} for name in "abcd"}
+    assert "4/4" in capsys.readouterr().out
+
+
+def test_an_error_ends_a_study_of_several_jobs(tmp_path):
+    def work():
+        raise InvalidInput("x", got=1, expected=2)
+
+    never = {str(k): lambda: {} for k in range(50)}
+    with pytest.raises(InvalidInput):
+        Kept(tmp_path / "s", {}).run({"bad": work} | never, jobs=2)
 
 
 def test_nothing_is_written_before_a_case_is_finished(tmp_path):

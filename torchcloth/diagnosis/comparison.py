@@ -53,16 +53,28 @@ def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) 
     Of the groups ``halved`` every other stretch of time is left out instead, and then the others: where one kind of
     motion alone tells of a cause, no other can say how large it is.
     """
-    white, count = found.white, found.evidence.own
-    precision = torch.diag(prior_precision(found.model))
-    own, point = white.jacobian[:, :count], found.model.point
-    whitened = white.value.clone()
+    own, whitened = found.white.jacobian[:, : found.evidence.own], found.white.value.clone()
     for inside in _folds(found, groups, halved):
-        rest, r = own[~inside], white.value[~inside]
-        step = -torch.linalg.solve(rest.mT @ rest + precision, rest.mT @ r + precision @ point)
-        step = found.model.at(point + step).point - point
-        whitened[inside] += own[inside] @ step
+        whitened[inside] += own[inside] @ _step_of_others(found, inside)
     return _told(found, whitened)
+
+
+def spread(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> Tensor:
+    """[P + A] standard errors of the model's coordinates by what they become without one group after the other.
+
+    The jackknife: motions that disagree about a number say by how much a law may differ from the model's, which the
+    noise within a motion does not.
+    """
+    steps = torch.stack([_step_of_others(found, inside) for inside in _folds(found, groups, halved)])
+    return ((len(steps) - 1) * (steps - steps.mean(0)).square().mean(0)).sqrt()
+
+
+def _step_of_others(found: Fitted, inside: Tensor) -> Tensor:
+    """[P + A] from the solution of all data to that of the cells outside, by one linear step."""
+    own, point = found.white.jacobian[~inside, : found.evidence.own], found.model.point
+    precision = torch.diag(prior_precision(found.model))
+    step = -torch.linalg.solve(own.mT @ own + precision, own.mT @ found.white.value[~inside] + precision @ point)
+    return found.model.at(point + step).point - point
 
 
 def as_it_is(found: Fitted) -> Predicted:

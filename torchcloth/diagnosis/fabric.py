@@ -32,7 +32,7 @@ def _moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffening: flo
         weft_stiffening=c,
         thickness=own.thickness,  # type: ignore[union-attr,arg-type]
     )
-    return world.with_cloth(material=new.requires_grad_(False))
+    return world.with_cloth(material=new)
 
 
 def _bending(world: World, **changes: float) -> World:
@@ -49,7 +49,7 @@ def _bending(world: World, **changes: float) -> World:
         kept["yield_curvature"] = YIELD
     kind = CreasingBending if "mobility" in kept else Bending
     new = kind(number("stiffness"), poisson=own.poisson, **kept)  # type: ignore[arg-type]
-    return world.with_cloth({"bending": new.requires_grad_(False)})
+    return world.with_cloth({"bending": new})
 
 
 def _rest(world: World, name: str, amount: float) -> World:
@@ -85,7 +85,7 @@ def _tilt(axis: int, world: World, angle: float) -> World:
     own: Gravity = world.cloth.effects["gravity"]  # type: ignore[assignment]
     tilt = own.tilt.tolist()
     tilt[1 - axis] += angle if axis == 1 else -angle  # about the other axis, by the right hand, with g along -z
-    return world.with_cloth({"gravity": Gravity(own.acceleration.tolist(), tilt).requires_grad_(False)})
+    return world.with_cloth({"gravity": Gravity(own.acceleration.tolist(), tilt)})
 
 
 HYPOTHESES = (

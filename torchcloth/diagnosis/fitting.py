@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from .evidence import Evidence, Progress, Setting, gather, staged
-from .noise import Noise, Whitened, fit_noise, whitened
+from .noise import Noise, Whitened, fit_noise, unfitted, whitened
 from .world import Hypothesis, Model
 
 IMPOSSIBLE = (InvalidInput, SimulationDiverged, UnstableStep)  # no world has such values, or none that is stable
@@ -68,8 +68,7 @@ def fit(
         step, _, ahead = step_of(whitened(here, noise or fit_noise(here)), model.point, precision)
         if ahead < ENOUGH:
             break
-        limit = LONGEST * precision.rsqrt()
-        model, here = model.at(model.point + step.clamp(-limit, limit)), None
+        model, here = model.at(model.point + _within(step, model)), None
     if here is None or hypotheses:
         about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
         here = gather(model, setting, hypotheses, staged(progress, about), before)
@@ -79,9 +78,35 @@ def fit(
     return Fitted(model, here, noise, white, covariance, ahead)
 
 
+def with_cause(found: Fitted, hypothesis: Hypothesis) -> Model:
+    """With one more cause, where one step leads: the parameters make room for it."""
+    own = found.evidence.own
+    columns = [*range(own), own + found.evidence.hypotheses.index(hypothesis)]
+    return _stepped(found.model.plus(hypothesis), whitened(found.evidence, unfitted()), columns)
+
+
+def without_cause(found: Fitted, name: str) -> Model:
+    """With one cause less, where one step leads: the parameters take over what they can."""
+    index = [a.name for a in found.model.accepted].index(name)
+    white, place = whitened(found.evidence, unfitted()), len(found.model.parameters) + index
+    less = white._replace(value=white.value - found.model.amplitudes[index] * white.jacobian[:, place])
+    return _stepped(found.model.without(name), less, [k for k in range(found.evidence.own) if k != place])
+
+
+def _stepped(model: Model, white: Whitened, columns: Sequence[int]) -> Model:
+    slopes = white._replace(jacobian=white.jacobian[:, columns])
+    step, _, _ = step_of(slopes, model.point, prior_precision(model))
+    return model.at(model.point + _within(step, model))
+
+
 def renoised(found: Fitted, noise: Noise) -> Fitted:
     """The same with residuals weighed by another noise."""
     return replace(found, noise=noise, white=whitened(found.evidence, noise))
+
+
+def _within(step: Tensor, model: Model) -> Tensor:
+    limit = LONGEST * prior_precision(model).rsqrt()
+    return step.clamp(-limit, limit)
 
 
 def step_of(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, float]:

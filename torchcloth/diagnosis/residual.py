@@ -34,7 +34,7 @@ def _with(term: str, world: World, coefficient: float) -> World:
     held = [part.index for part in world.cloth.boundaries.values() if isinstance(part, Grasp)]
     index = torch.cat(held).tolist() if held else []
     new = ResidualForce(terms | {term: terms.get(term, 0.0) + coefficient}, index)
-    return world.with_cloth({RESIDUAL: new.requires_grad_(False)})
+    return world.with_cloth({RESIDUAL: new})
 
 
 def _term(law: str, place: str) -> Hypothesis:

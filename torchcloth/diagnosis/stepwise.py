@@ -10,7 +10,7 @@ from .approach import approach
 from .branches import unstable, without
 from .comparison import Gain, Predicted, compare, predict, telling
 from .evidence import Progress, Setting, staged
-from .fitting import IMPOSSIBLE, Fitted, fit, renoised
+from .fitting import IMPOSSIBLE, Fitted, fit, renoised, with_cause, without_cause
 from .noise import Noise, fit_noise, floor_of, unfitted
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
@@ -108,7 +108,8 @@ def extend(
         left = [h for h in hypotheses if h.name not in {a.name for a in step.best.fitted.model.accepted}]
         now = staged(progress, f"with {step.best.hypothesis.name}")
         try:
-            current = fit(step.best.fitted.model, setting, left, FURTHER, now, before=start.evidence)
+            best = step.best.fitted
+            current = fit(best.model, setting, left, FURTHER, now, before=start.evidence, here=best.evidence)
         except IMPOSSIBLE:  # a step too far; what was found before stands
             current = fit(step.best.fitted.model, setting, left, 0, now, before=start.evidence)
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
@@ -136,8 +137,8 @@ def _pruned(
     """Less the causes that the later ones have made needless; the last one has just been tried."""
     for step in steps[:-1]:
         name = step.best.hypothesis.name
-        without = staged(progress, f"without {name}")
-        less = fit(current.model.without(name), setting, (), 1, without, current.noise, current.evidence)
+        less = without_cause(current, name)
+        less = fit(less, setting, (), 0, staged(progress, f"without {name}"), current.noise, current.evidence)
         alone = step.best.alone
         gain = compare(predict(less, setting.names, alone), predict(current, setting.names, alone), 0.0)
         if _worthwhile(gain):
@@ -154,9 +155,9 @@ def _step(
     fits: list[tuple[Row, Fitted]] = []
     for row in likely:
         trial = staged(progress, f"trying {row.hypothesis.name}")
-        begun = current.model.plus(row.hypothesis, row.amplitude)
         try:
-            fits.append((row, fit(begun, setting, (), 1, trial, unfitted(), current.evidence)))
+            begun = with_cause(current, row.hypothesis)
+            fits.append((row, fit(begun, setting, (), 0, trial, unfitted(), current.evidence)))
         except IMPOSSIBLE:
             continue
     if not fits:
@@ -177,12 +178,15 @@ def _step(
 
 
 def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> list[tuple[Row, Fitted]]:
-    """The better ones where further steps lead: one step does for small effects only."""
-    enough = max(0.0, 0.5 * max(c.gain.density for c in tried))
+    """The likelier ones where further steps lead: one step does for small effects only.
+
+    Likely is what predicts well or still has far to go: a large effect that is half fitted predicts nothing.
+    """
+    hope = [c.gain.density + c.fitted.ahead for c in tried]
     out = []
-    for c in tried:
+    for c, expected in zip(tried, hope, strict=True):
         found = c.fitted
-        if c.gain.density > enough and found.ahead > CLEAR:
+        if expected > max(0.0, 0.5 * max(hope)) and found.ahead > CLEAR:
             further = staged(progress, f"trying {c.hypothesis.name} further")
             with suppress(*IMPOSSIBLE):  # what was found before stands
                 found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from ..errors import InvalidInput
 from .classes import alike
-from .comparison import Gain
+from .comparison import Gain, spread
 from .gate import Fault
 from .glossary import GLOSSARY
 from .lacking import Left, lack_of_fit
@@ -66,7 +66,7 @@ class Diagnosis:
 
 def judge(found: Found, names: Sequence[str]) -> Diagnosis:
     """The answer of a search over episodes with these motions."""
-    causes = [_cause(found, step) for step in found.steps]
+    causes = [_cause(found, step, names) for step in found.steps]
     rows = found.screened
     left = lack_of_fit(found.end, names)
     lacking = any(row.lacking for row in left)
@@ -117,12 +117,13 @@ def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left
     return "inconclusive" if undecided else "adequate"
 
 
-def _cause(found: Found, step: Step) -> dict[str, Any]:
+def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     best, place = step.best, found.steps.index(step)
     h, count = best.hypothesis, len(found.end.model.parameters)
     amplitude = found.end.model.amplitudes[place]
-    std = float(found.end.covariance[count + place, count + place].sqrt())
-    std = (std**2 + best.row.bias**2) ** 0.5
+    noise = float(found.end.covariance[count + place, count + place])
+    motions = float(spread(found.end, names, best.alone)[count + place])
+    std = (max(noise, motions**2) + best.row.bias**2) ** 0.5
     beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
     others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in beaten]
     kin = [r.hypothesis.name for r in alike(step.before, best.row, others)]
@@ -224,7 +225,9 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
         if others:
             out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
     if content["causes"]:
-        out.append("These intervals know of noise and meshes, not of laws that differ from the model's.")
+        out.append(
+            "These intervals know of noise, meshes and how far motions disagree, not of what is wrong in all alike."
+        )
     words = {
         "adequate": "Nothing known is wrong beyond what matters.",
         "unexplained": "The fit is lacking, and no known cause mends it.",

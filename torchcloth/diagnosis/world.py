@@ -80,9 +80,9 @@ def rebuilt(
     material: AbstractMaterial | None,
     boundaries: Mapping[str, AbstractBoundary],
 ) -> Cloth:
-    """A new cloth with some parts replaced or added; nothing but the mesh is shared with the old one."""
+    """A new cloth with some parts replaced or added, which nobody trains; it shares the mesh alone with the old one."""
     kept = copied(cloth)
-    return Cloth(
+    found = Cloth(
         kept.mesh,
         material or kept.material,
         kept.areal_density.value.detach().clone(),
@@ -92,6 +92,7 @@ def rebuilt(
         kept.transfer,
         kept.engine,
     )
+    return found.requires_grad_(False)
 
 
 @dataclass(frozen=True)

@@ -99,8 +99,8 @@ def _on_triangles(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
     """(barycentric coordinates [M, 3], squared distance [M]) of the closest places on one triangle [M, 3, 3] each."""
     candidates = [_project_inside(points, corners), *(_project_edge(points, corners, i) for i in range(3))]
     weights = torch.stack(candidates)  # [4, M, 3]
-    on = (weights.unsqueeze(-1) * corners).sum(-2)
-    squared, kind = (points - on).square().sum(-1).min(0)
+    offset = points - sum(weights[..., i, None] * corners[:, i] for i in range(3))
+    squared, kind = _inner(offset, offset).min(0)
     return weights[kind, torch.arange(len(points), device=points.device)], squared
 
 
@@ -109,9 +109,9 @@ def _project_inside(points: Tensor, corners: Tensor) -> Tensor:
     a, b, c = corners.unbind(1)
     e1, e2, offset = b - a, c - a, points - a
     normal = cross(e1, e2)
-    scale = normal / dot(normal, normal)
-    v, w = dot(cross(offset, e2), scale), dot(cross(e1, offset), scale)
-    weights = torch.cat([1 - v - w, v, w], dim=-1)
+    scale = normal / _inner(normal, normal)[:, None]
+    v, w = _inner(cross(offset, e2), scale), _inner(cross(e1, offset), scale)
+    weights = torch.stack([1 - v - w, v, w], dim=-1)
     outside = (weights < 0).any(-1, keepdim=True)
     return torch.where(outside, torch.eye(3, dtype=a.dtype, device=a.device)[0], weights)
 
@@ -120,10 +120,15 @@ def _project_edge(points: Tensor, corners: Tensor, start: int) -> Tensor:
     """Barycentric coordinates [M, 3] of the closest point on the edge from corner ``start`` to the next."""
     end = (start + 1) % 3
     a, edge = corners[:, start], corners[:, end] - corners[:, start]
-    t = (dot(points - a, edge) / dot(edge, edge)).squeeze(-1).clamp(0.0, 1.0)
+    t = (_inner(points - a, edge) / _inner(edge, edge)).clamp(0.0, 1.0)
     weights = t.new_zeros(*t.shape, 3)
     weights[..., start], weights[..., end] = 1 - t, t
     return weights
+
+
+def _inner(a: Tensor, b: Tensor) -> Tensor:
+    """[...], over a last axis of three: a fraction of the time that a sum takes, without derivatives."""
+    return sum(x * y for x, y in zip(a.unbind(-1), b.unbind(-1), strict=True))  # type: ignore[return-value]
 
 
 def _on_boundary(faces: Tensor, face: Tensor, weights: Tensor) -> Tensor:

@@ -48,6 +48,7 @@ class Round(NamedTuple):
 def add(parser: argparse.ArgumentParser) -> None:
     """Options."""
     parser.add_argument("--cases", type=int, metavar="N", help=f"how many ({CASES}; more may be added later)")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="cases at a time (1)")
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--seed", type=int, metavar="SECRET", help="that sealed cases are drawn from (default: a new one)"
@@ -62,7 +63,7 @@ def run(options: argparse.Namespace) -> None:
     work: dict[str, Callable[[], dict[str, Any]]] = {
         name: partial(one, options.out, name, seed, chosen.fast) for name, seed in chosen.seeds.items()
     }
-    cases = [scored(name, case) for name, case in kept.run(work).items()]
+    cases = [scored(name, case) for name, case in kept.run(work, options.jobs).items()]
     write_text(options.out / "hidden.json", json.dumps(cases, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
     write_text(options.out / "hidden.md", hidden_tables.markdown(cases))
     hidden_tables.show(cases)
@@ -75,8 +76,9 @@ def drawn(options: argparse.Namespace) -> Round:
     usual = len(FAST) if fixed else CASES
     count = usual if options.cases is None else options.cases
     cases = module("hidden", "drawn")
-    if count < 1:
-        raise InvalidInput("--cases", got=count, expected="1 or more")
+    for option, number in (("--cases", count), ("--jobs", options.jobs)):
+        if number < 1:
+            raise InvalidInput(option, got=number, expected="1 or more")
     if fixed:
         settings, seeds = {"study": "hidden", "secret": "fixed", "fast": True}, list(FAST)[:count]
         if count > usual:
