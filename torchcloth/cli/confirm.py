@@ -69,7 +69,7 @@ def _print(found: Any) -> None:
     table.add_row("all", *_cells(found.whole))
     console = Console()
     console.print(table)
-    word = "The gain is confirmed" if found.confirmed else "No gain is confirmed: not all of it is above 0"
+    word = "The gain is confirmed" if found.confirmed else "No gain is confirmed: not both of its intervals are above 0"
     console.print(f"{word}. A true model would leave {1e3 * found.floor:.2f} mm ({found.source}).")
 
 
