@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchcloth.diagnosis import lack_of_fit
-from torchcloth.diagnosis.lacking import RARE, SENSOR
+from torchcloth.diagnosis.lacking import RARE, SENSOR, Left, explained
 
 NAMES = ["a"]
 SLOPES = toys.smooth(1, 4)  # two parameters, one hypothesis, one nuisance
@@ -70,3 +70,15 @@ def test_numerics_are_expected_to_leave_their_share():
 def test_where_meshes_fold_apart_nothing_is_judged():
     rows = between_meshes(0.03)
     assert not any(row.stable or row.lacking for row in rows)
+
+
+def test_what_is_explained_is_counted_beyond_what_a_right_model_leaves():
+    def rows(left, stable=True):
+        return [Left("swing", "points", "m", left, 1e-3, 0.0, 50.0, 0.0, stable), row("force", 9.0)]
+
+    row = lambda kind, left: Left("swing", kind, "N", left, 1e-2, 0.0, 50.0, 0.0, True)  # noqa: E731
+    assert explained(rows(5e-3), rows(1e-3)) == pytest.approx(1.0)  # forces are no part of it
+    assert explained(rows(5e-3), rows(13**0.5 * 1e-3)) == pytest.approx(0.5)
+    assert explained(rows(5e-3), rows(7e-3)) < 0
+    assert explained(rows(0.9e-3), rows(0.8e-3)) == 1.0  # nothing was wrong
+    assert explained(rows(5e-3, False), rows(1e-3, False)) == 1.0  # nothing can be said

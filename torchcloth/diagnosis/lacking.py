@@ -61,6 +61,12 @@ def lack_of_fit(found: Fitted, names: Sequence[str]) -> list[Left]:
     return [row for k, name in enumerate(names) for row in _episode(found, k, name)]
 
 
+def explained(before: Sequence[Left], after: Sequence[Left]) -> float:
+    """Share of what a right model would not leave of points, edges and markers that is gone; 1 of nothing."""
+    over = lambda rows: sum(r.left**2 - r.expected**2 for r in rows if r.stable and r.unit == "m")  # noqa: E731
+    return 1.0 - over(after) / over(before) if over(before) > 0 else 1.0
+
+
 def _episode(found: Fitted, k: int, name: str) -> list[Left]:
     cells, stds = found.evidence.cells[k], found.evidence.stds[k]
     uncertain = cells.jacobian[:, : found.evidence.own] @ torch.linalg.cholesky(found.covariance)

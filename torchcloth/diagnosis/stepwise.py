@@ -11,6 +11,7 @@ from .branches import unstable, without
 from .comparison import Gain, Predicted, compare, predict, telling
 from .evidence import Progress, Setting, staged
 from .fitting import IMPOSSIBLE, Fitted, fit, renoised, with_cause, without_cause
+from .lacking import explained, lack_of_fit
 from .noise import Noise, fit_noise, floor_of, unfitted
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
@@ -23,6 +24,7 @@ CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
 MUCH = 50.0  # chi^2, of a cause that is worth fitting
+MOSTLY = 1 / 3  # of what is wrong, that causes must explain beside something unknown
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 
 
@@ -113,6 +115,8 @@ def extend(
         except IMPOSSIBLE:  # a step too far; what was found before stands
             current = fit(step.best.fitted.model, setting, left, 0, now, before=start.evidence)
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
+    if steps and _beside_the_point(start, current, setting.names):
+        current, steps = start, []
     screened = screen(current)
     alone = {name for step in steps for name in step.best.alone}
     last, sensor = predict(current, setting.names, alone), floor_of(current.evidence, current.noise)
@@ -147,6 +151,12 @@ def _pruned(
         left = [h for h in hypotheses if h.name not in {a.name for a in less.model.accepted}]
         current = fit(less.model, setting, left, 1, progress, before=current.evidence)
     return current, steps
+
+
+def _beside_the_point(start: Fitted, end: Fitted, names: Sequence[str]) -> bool:
+    """Most of what is wrong is still there: whatever makes it may well do what passed for the causes, too."""
+    left = lack_of_fit(end, names)
+    return any(row.lacking for row in left) and explained(lack_of_fit(start, names), left) < MOSTLY
 
 
 def _step(
