@@ -293,6 +293,11 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(folder, tmp_path,
     assert process.returncode == 130
     assert "--resume" in one_line(said)
     assert [path.name for path in out.iterdir()] == ["progress"]
+    kept = sorted(path.name for path in out.glob("progress/*.pt"))
+    unsaid = call("identify", folder, "--out", out, "--start", "youngs_modulus=5e4", *QUICK)
+    assert unsaid.returncode == 2, "work is not thrown away unasked"
+    assert "--resume, to go on from there" in one_line(unsaid.stderr)
+    assert sorted(path.name for path in out.glob("progress/*.pt")) == kept
 
     resumed = call("identify", folder, "--out", out, "--start", "youngs_modulus=5e4", *QUICK, "--resume")
     assert resumed.returncode == 0, resumed.stderr

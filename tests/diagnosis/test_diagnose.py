@@ -10,6 +10,7 @@ import torch
 from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, search, setting_of, write_diagnosis
+from torchcloth.diagnosis.pictures import residual_maps
 from torchcloth.errors import InvalidInput
 
 ASKED = ("air.drag_n", "air.linear", "mass.hem", "rest.shrink[weft]", "obs.extrinsic[y]")
@@ -69,8 +70,25 @@ def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
     assert "http" not in page  # self-contained
+    assert "<th>matters from</th><th>shows from</th>" in page
+    assert "(not zero)" in page
     world = load_model(tmp_path / content["model"]).world()
     assert float(world.cloth.effects["air"].normal.value) == pytest.approx(content["causes"][0]["amplitude"])
+
+
+def test_the_map_of_residuals_says_which_part_of_the_fabric_a_row_is(with_drag):
+    """Sixteen parts of a sheet of 0.2 m, the pattern's top first; missing drag shows at the free, lower end."""
+    _, answer = with_drag
+    figure = residual_maps(answer)
+    *maps, bar = figure.axes
+    places = [tuple(map(float, label.get_text().split(","))) for label in maps[0].get_yticklabels()]
+    assert len(places) == 16
+    assert [v for _, v in places] == sorted((v for _, v in places), reverse=True)
+    assert all(0 < u < 20 and 0 < v < 20 for u, v in places)
+    assert "u, v in cm" in maps[0].get_ylabel()
+    assert bar.get_ylabel() == "measured minus simulated, along the normal, mm"
+    fast = maps[1].images[0].get_array()
+    assert float(abs(fast[-4:]).mean()) > 3 * float(abs(fast[:4]).mean())
 
 
 def test_where_nothing_is_hidden_nothing_is_named():

@@ -101,7 +101,11 @@ def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
     folder, seen, blank = made
     models = [str(folder / name) for name in ("base.tcm", "extended.tcm")]
     assert main(["confirm", *models, str(folder / "fast"), "--out", str(tmp_path)]) == 0
-    assert "The gain is confirmed" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "The gain is confirmed" in printed
+    assert "replaced" not in printed
+    assert main(["confirm", *models, str(folder / "fast"), "--out", str(tmp_path)]) == 0
+    assert "(the last one is replaced)" in " ".join(capsys.readouterr().out.split())
     found = json.loads((tmp_path / "confirmation.json").read_text())
     assert found["confirmed"]
     assert found["gain"]["rms_after"] < 0.4 * found["gain"]["rms_before"]
@@ -123,3 +127,19 @@ def test_a_table_that_one_episode_has_is_in_the_scene_of_all(made):
     models = [folder / name for name in ("base.tcm", "extended.tcm")]
     one, other = (dx.confirm(*models, order).motions["lift"] for order in ([free, over], [over, free]))
     assert one.after == pytest.approx(other.after, rel=1e-9)
+
+
+def test_the_bases_figures_do_not_depend_on_what_it_is_compared_with(made, tmp_path):
+    """Beside the true cause, a third of it, and a wrong one, which fits no better and is not confirmed."""
+    folder, seen, blank = made
+    base = dx.base_model(blank)
+    by = {h.name: h for h in dx.catalogue(base, [blank])}
+    found = []
+    for name, amplitude in (("air.drag_n", TRUE), ("air.drag_n", 0.3 * TRUE), ("obs.clock", 0.02)):
+        path = dx.save_model(tmp_path / f"{name}-{amplitude}.tcm", base.plus(by[name], amplitude), blank)
+        found.append(dx.confirm(folder / "base.tcm", path, [seen]))
+    assert len({f.whole.before for f in found}) == 1
+    assert len({f.motions["fast"].before for f in found}) == 1
+    assert found[0].whole.after < found[1].whole.after < 0.9 * found[1].whole.before
+    assert [f.confirmed for f in found] == [True, True, False]
+    assert all(f.floor < 1e-3 for f in found), "half a millimetre a point, of which a cell has several"

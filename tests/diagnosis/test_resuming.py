@@ -75,6 +75,12 @@ def test_the_command_says_how_to_go_on(episodes, counted, tmp_path, capsys, monk
     assert capsys.readouterr().err.splitlines() == ["torchcloth: stopped; `--resume` goes on from there"]
     assert len(list((out / "progress").glob("episode*.pt"))) == 2
     counted["stop"] = 10**9
+    assert main(["diagnose", *folders, "--out", str(out)]) == 2, "what was done is not thrown away"
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert "--resume" in said[0]
+    assert f"to start over, delete {out / 'progress'}" in said[0]
+    assert len(list((out / "progress").glob("episode*.pt"))) == 2
     assert main(["diagnose", *folders, "--out", str(out), "--resume"]) == 0
     assert "base model: fit 1: slow, 1 of 2" in capsys.readouterr().out
     assert json.loads((out / "diagnosis.json").read_text())["causes"] == []

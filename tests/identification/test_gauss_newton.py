@@ -3,14 +3,17 @@
 from itertools import pairwise
 
 import pytest
+import scipy.optimize
 import torch
 import toys
 from toys import TRUE, curved, linear
 
 from torchcloth.errors import SimulationDiverged, UnstableStep
 from torchcloth.identification import gauss_newton
+from torchcloth.identification.bounds import bounded
 from torchcloth.identification.gauss_newton import covariance, minimise
 from torchcloth.identification.misfit import huber
+from torchcloth.identification.unfinished import way_left
 
 START = torch.zeros(3, dtype=torch.float64)
 FITS = 200
@@ -109,6 +112,70 @@ def test_broyden_and_exact_jacobians_end_at_the_same_point(monkeypatch):
     assert len(saving.linearised) < len(exact.linearised)
     assert a.exact
     assert b.exact
+
+
+def quadratics(count=60):
+    """(square root of the matrix [20, 6], right side of the rows [20], bounds [6]): strongly coupled unknowns."""
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(count):
+        draw = torch.randn(47, 6, generator=generator, dtype=torch.float64)
+        yield draw[:20] @ draw[20:26], 3 * draw[26:46, 0], draw[46].abs()
+
+
+def test_steps_within_bounds_are_the_best_ones():
+    """Beside scipy's bounded least squares. Steps that are cut, one by one, often lead uphill."""
+    uphill = 0
+    for rows, right, most in quadratics():
+        matrix, pull = rows.mT @ rows, rows.mT @ right
+        height = lambda s, m=matrix, p=pull: float(0.5 * s @ m @ s - p @ s)  # noqa: E731
+        found = bounded(matrix, pull, -most, most)
+        best = scipy.optimize.lsq_linear(rows.numpy(), right.numpy(), (-most.numpy(), most.numpy()), "bvls").x
+        assert bool((found.abs() <= most).all())
+        assert height(found) == pytest.approx(height(torch.tensor(best)), rel=1e-9)
+        uphill += height(torch.linalg.solve(matrix, pull).clamp(-most, most)) > 0
+    assert uphill > 10
+
+
+def test_a_step_within_wide_bounds_is_newtons():
+    for rows, right, _ in quadratics(5):
+        matrix, pull = rows.mT @ rows, rows.mT @ right
+        wide = torch.full((6,), 1e6, dtype=torch.float64)
+        torch.testing.assert_close(bounded(matrix, pull, -wide, wide), torch.linalg.solve(matrix, pull))
+
+
+def test_an_amplitude_at_zero_stays_there_while_others_move():
+    """Its bound is where it is: the others are solved for as if it were no unknown."""
+    rows, right, _ = next(iter(quadratics(1)))
+    matrix, pull = rows.mT @ rows, rows.mT @ right
+    low, high = torch.full((2, 6), 1e6, dtype=torch.float64)
+    free = torch.linalg.solve(matrix, pull)
+    low[0], high[0] = (0.0, high[0]) if free[0] < 0 else (low[0], 0.0)
+    found = bounded(matrix, pull, -low, high)
+    assert found[0] == 0.0
+    torch.testing.assert_close(found[1:], torch.linalg.solve(matrix[1:, 1:], pull[1:]))
+
+
+def test_unknowns_do_not_wait_for_one_that_may_go_no_farther():
+    """The third hardly shows and wants to go 70 steps; the others are where the data have them after a few."""
+    toy, jacobian = linear(0)
+    faint = jacobian.clone()
+    faint[:, 2] = 0.01 * (jacobian[:, 0] + 0.3 * jacobian[:, 2])
+    toy.prior_std, toy.model = 1e4, lambda raw: faint @ raw
+    toy.data = jacobian @ TRUE + toys.noise(torch.Generator().manual_seed(0), 0.0)
+    final = solve(toy, iterations=3)
+    assert float(final.raw[2]) < 4
+    rest = torch.linalg.lstsq(faint[:, :2], (toy.data - faint[:, 2] * final.raw[2])[:, None]).solution.squeeze()
+    assert float((final.raw[:2] - rest).abs().max()) < 0.02
+    assert way_left(toy.problem(), final) > 5
+
+
+def test_nothing_is_left_to_go_at_the_optimum():
+    toy, _ = linear(0)
+    assert way_left(toy.problem(), solve(toy, tolerance=1e-6)) < 1e-3
+    start = gauss_newton._linearise(toy.problem(), START)
+    gradient, hessian = gauss_newton.normal_equations(toy.problem(), start)
+    far = float((gradient @ torch.linalg.solve(hessian, gradient)).sqrt())
+    assert way_left(toy.problem(), start) == pytest.approx(far)
 
 
 def test_the_final_point_is_linearised_exactly():

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from sensor import pinhole, see
 
 from torchcloth import recordings
-from torchcloth.errors import TorchclothError
+from torchcloth.errors import InvalidInput, TorchclothError
 
 Array = np.ndarray
 INITIAL_ERROR = 1e-3  # m, of the first positions, along the cloth's normal
@@ -143,7 +143,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the episode")
     parser.add_argument("--hidden", type=Path, metavar="FILE", help="what was hidden (default DIR.hidden.json)")
-    parser.add_argument("--overwrite", action="store_true")
+    parser.add_argument("--overwrite", action="store_true", help="replace DIR")
     options = parser.parse_args(arguments)
     if options.list:
         _catalogue()
@@ -158,6 +158,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _generate(options: argparse.Namespace) -> int:
+    if options.out.exists() and not options.overwrite:  # said before the work is done, and as an option
+        raise InvalidInput("--out", got=f"{options.out}, which exists", expected="a new name", remedy="or --overwrite")
     began = time.perf_counter()
     scene, hidden = Scene(), [parse(text) for text in options.effect]
     scene = replace(scene, sheet=replace(scene.sheet, nodes=(options.nodes, options.nodes)))

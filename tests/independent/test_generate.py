@@ -232,3 +232,10 @@ def test_a_wider_sheet_moves_as_well():
     moved = motion("lift", wide)
     apart = moved.pose["left"][0, :3, 3] - moved.pose["right"][0, :3, 3]
     np.testing.assert_allclose(apart, [0, 0.5, 0], atol=1e-12)
+
+
+def test_an_episode_that_exists_is_refused_before_the_work_by_the_options_name(tmp_path, capsys):
+    assert generate.main(["--motion", NAMES[0], "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert said[0].endswith("which exists; expected a new name; or --overwrite")

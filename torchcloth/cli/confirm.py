@@ -29,7 +29,10 @@ def add(verbs: Any) -> None:
     parser.add_argument("extended", type=Path, metavar="EXTENDED", help="a .tcm file, e.g. DIR/extended.tcm")
     parser.add_argument("episodes", nargs="+", metavar="EPISODE", help="folders of the same cloth's episodes")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the result (EXTENDED's folder/confirmation)"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder for the result, which replaces the last (EXTENDED's folder/confirmation)",
     )
     parser.set_defaults(run=_confirm)
 
@@ -46,9 +49,10 @@ def _confirm(options: argparse.Namespace) -> int:
     episodes = [recordings.read(path) for path in options.episodes]
     with progress_line() as progress:
         found = diagnosis.confirm(options.base, options.extended, episodes, progress)
+    replaced = (out / RESULT).exists()
     path = write_text(out / RESULT, json.dumps(found.as_dict(), indent=1, allow_nan=False) + "\n")
     _print(found)
-    print(f"result: {path}")
+    print(f"result: {path}{' (the last one is replaced)' if replaced else ''}")
     return 0
 
 
@@ -65,7 +69,7 @@ def _print(found: Any) -> None:
     table.add_row("all", *_cells(found.whole))
     console = Console()
     console.print(table)
-    word = "The gain is confirmed" if found.confirmed else "No gain is confirmed: the interval of log density holds 0"
+    word = "The gain is confirmed" if found.confirmed else "No gain is confirmed: not both of its intervals are above 0"
     console.print(f"{word}. A true model would leave {1e3 * found.floor:.2f} mm ({found.source}).")
 
 

@@ -42,7 +42,7 @@ def _diagnose(options: argparse.Namespace) -> int:
         )
         with progress_line() as progress:
             answer = diagnosis.diagnose(
-                episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume
+                episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume or None
             )
     path = diagnosis.write_diagnosis(answer, episodes, options.out)
     clear(options.out / PROGRESS)

@@ -73,7 +73,7 @@ def fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording], jo
         dt=options.dt,
         use=options.use,
         journal=journal,
-        resume=options.resume,
+        resume=options.resume or options.unsaid,
         on_progress=advance,
         **contrast,
     )

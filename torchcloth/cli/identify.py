@@ -31,11 +31,11 @@ def add(verbs: Any) -> None:
     identify = verbs.add_parser("identify", help="fit fabric parameters to recorded episodes")
     identify.add_argument("episodes", nargs="+", metavar="EPISODE", help="folder of a recording")
     identify.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result and pictures")
-    identify.set_defaults(run=_identify, stopped=STOPPED)
+    identify.set_defaults(run=_identify, stopped=STOPPED, unsaid=None)  # work is not thrown away unasked
     _add_options(identify)
     demo = verbs.add_parser("demo", help="identify the shipped example")
     demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default out/demo")
-    demo.set_defaults(run=_demo, stopped=STOPPED)
+    demo.set_defaults(run=_demo, stopped=STOPPED, unsaid=False)
     _add_options(demo)
 
 
@@ -230,7 +230,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             starts=options.starts,
             profile=options.profile,
             journal=options.out / PROGRESS,
-            resume=options.resume,
+            resume=options.resume or options.unsaid,
             dt=options.dt,
             use=options.use,
             nuisances=nuisances_of(options.nuisance),

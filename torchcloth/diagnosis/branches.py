@@ -16,8 +16,8 @@ from torch import Tensor
 from ..errors import SimulationDiverged, UnstableStep
 from .cells import NAMES, Cells, cells_of
 from .evidence import Evidence, Progress, Setting, aligned, side_by_side, step_sizes
-from .fitting import Fitted, prior_precision, step_of
-from .noise import FLOOR, fit_noise, whitened
+from .fitting import Fitted, weighed
+from .noise import FLOOR, fit_noise
 from .world import World
 
 DIRECTIONS = 2  # random ones, each there and back
@@ -54,9 +54,7 @@ def without(found: Fitted, keys: Sequence[Tensor]) -> Fitted:
     cells = [Cells(*(column[s] for column in c)) for c, s in zip(found.evidence.cells, stable, strict=True)]
     numerics = [n[s] for n, s in zip(found.evidence.numerics, stable, strict=True)]
     evidence = replace(found.evidence, cells=cells, numerics=numerics)
-    white = whitened(evidence, noise := fit_noise(evidence))
-    _, covariance, ahead = step_of(white, found.model.point, prior_precision(found.model))
-    return Fitted(found.model, evidence, noise, white, covariance, ahead)
+    return weighed(found.model, evidence, fit_noise(evidence))
 
 
 def _cells(world: World, setting: Setting, k: int) -> Cells | None:

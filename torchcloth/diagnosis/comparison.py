@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .cells import SEEN
 from .evidence import aligned
-from .fitting import Fitted, prior_precision
+from .fitting import Fitted, prior_precision, step_of
 
 ALONE = 0.7  # share of the information, of a motion without which a cause cannot be sized
 BLOCK = 2  # windows of cells that are resampled together
@@ -71,10 +71,8 @@ def spread(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -
 
 def _step_of_others(found: Fitted, inside: Tensor) -> Tensor:
     """[P + A] from the solution of all data to that of the cells outside, by one linear step."""
-    own, point = found.white.jacobian[~inside, : found.evidence.own], found.model.point
-    precision = torch.diag(prior_precision(found.model))
-    step = -torch.linalg.solve(own.mT @ own + precision, own.mT @ found.white.value[~inside] + precision @ point)
-    return found.model.at(point + step).point - point
+    others = found.white._replace(value=found.white.value[~inside], jacobian=found.white.jacobian[~inside])
+    return step_of(others, found.model)[0]
 
 
 def as_it_is(found: Fitted) -> Predicted:

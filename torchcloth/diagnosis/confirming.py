@@ -18,14 +18,15 @@ from .evidence import Evidence, Progress, gather, setting_of, staged
 from .fitting import Fitted
 from .gate import check, each_once
 from .model_file import ModelFile, read_model
-from .noise import Noise, fit_noise, floor_of, whitened
+from .noise import Noise, fit_noise, floor_of, least, unfitted, whitened
 from .repeats import pairs_of, repeats
 from .world import Model
 
 CONVENTION = (
     "SI units. rms: root mean square of mean residuals over parts of the fabric and 0.2 s, without what clock, camera, "
     "grasp, rim and tare of the episode explain within their priors. No parameter was fitted. ci95: by resampling "
-    "stretches of 0.4 s. explained: share of rms_before^2 - floor^2. log_density: of the extended over the base model."
+    "stretches of 0.4 s. explained: share of rms_before^2 - floor^2, over parts that both models meet. log_density: of "
+    "the extended over the base model, by the noise that the extended one leaves."
 )
 
 
@@ -46,8 +47,8 @@ class Confirmation:
 
     @property
     def confirmed(self) -> bool:
-        """Whether the extended model predicts better beyond doubt."""
-        return self.whole.ci95[0] > 0
+        """Whether the extended model predicts better beyond doubt, by density and in millimetres."""
+        return min(self.whole.ci95[0], self.whole.explained_ci95[0]) > 0
 
     def as_dict(self) -> dict[str, Any]:
         """The content of confirmation.json."""
@@ -101,18 +102,27 @@ def confirm(
         for file, setting, stage in zip(files, settings, ("base", "extended"), strict=True)
     ]
     noise = fit_noise(found[1])
-    before, after = (as_it_is(_as_fitted(f.model, e, noise)) for f, e in zip(files, found, strict=True))
-    floor, source = floor_of(found[1], noise), "sensor only"
+    before, after = (_judged(f.model, e, noise) for f, e in zip(files, found, strict=True))
+    floor, source = min(floor_of(e, least()) for e in found), "sensor only"  # slow errors may be the models' own
     if (repeated := repeats(after, pairs_of(recordings, settings[1].episodes))) is not None:
         floor, source = repeated.rms, "repetitions"
     names = settings[0].names
     motions = {name: _of_motion(before, after, names, name, floor) for name in dict.fromkeys(names)}
-    return Confirmation(compare(before, after, floor), motions, floor, source)
+    return Confirmation(_gain(before, after, floor), motions, floor, source)
 
 
 def _of_motion(before: Predicted, after: Predicted, names: Sequence[str], motion: str, floor: float) -> Gain:
     own = [k for k, name in enumerate(names) if name == motion]
-    return compare(of_episodes(before, own), of_episodes(after, own), floor)
+    return _gain(of_episodes(before, own), of_episodes(after, own), floor)
+
+
+def _gain(before: Predicted, after: Predicted, floor: float) -> Gain:
+    """Each model's rms over all that it meets; what is compared, over what both do."""
+    return compare(before, after, floor)._replace(before=_rms(before), after=_rms(after))
+
+
+def _rms(p: Predicted) -> float:
+    return float(p.value[p.seen].square().mean().sqrt())
 
 
 def _refuse_no_extension(base: Model, extended: Model) -> None:
@@ -135,6 +145,15 @@ def _refuse_seen(recording: Recording, files: Sequence[ModelFile]) -> None:
             expected="episodes that neither model has seen",
             remedy="record another, also of the same motion",
         )
+
+
+def _judged(model: Model, evidence: Evidence, noise: Noise) -> Predicted:
+    """Density by ``noise``, the extended model's; what is left in metres by one that is nobody's.
+
+    So the base's figures are the same whatever it is compared with.
+    """
+    left, white = (as_it_is(_as_fitted(model, evidence, n)) for n in (unfitted(), noise))
+    return left._replace(white=white.white)
 
 
 def _as_fitted(model: Model, evidence: Evidence, noise: Noise) -> Fitted:

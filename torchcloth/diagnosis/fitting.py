@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
+from ..identification.bounds import bounded
 from .evidence import Evidence, Progress, Setting, gather, staged
 from .noise import Noise, Whitened, fit_noise, unfitted, whitened
 from .world import Hypothesis, Model
@@ -61,21 +62,25 @@ def fit(
     Fits are compared with the same ``noise``; None: estimated. The nuisances' slopes are those of ``before``, if given.
     ``here`` is the evidence at the model's point, where that is known already.
     """
-    precision = prior_precision(model)
     for k in range(iterations):
         here = here or gather(model, setting, (), staged(progress, f"fit {k + 1}"), before)
         before = before or here
-        step, _, ahead = step_of(whitened(here, noise or fit_noise(here)), model.point, precision)
+        step, ahead = step_of(whitened(here, noise or fit_noise(here)), model, LONGEST)
         if ahead < ENOUGH:
             break
-        model, here = model.at(model.point + _within(step, model)), None
+        model, here = model.at(model.point + step), None
     if here is None or hypotheses:
         about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
         here = gather(model, setting, hypotheses, staged(progress, about), before)
     noise = noise or fit_noise(here)
-    white = whitened(here, noise)
-    _, covariance, ahead = step_of(white, model.point, precision)
-    return Fitted(model, here, noise, white, covariance, ahead)
+    return weighed(model, here, noise)
+
+
+def weighed(model: Model, evidence: Evidence, noise: Noise) -> Fitted:
+    """A model at a solution, its evidence there weighed by a noise."""
+    white = whitened(evidence, noise)
+    _, ahead = step_of(white, model)
+    return Fitted(model, evidence, noise, white, torch.linalg.inv(_curvature(white, model)), ahead)
 
 
 def with_cause(found: Fitted, hypothesis: Hypothesis) -> Model:
@@ -95,8 +100,7 @@ def without_cause(found: Fitted, name: str) -> Model:
 
 def _stepped(model: Model, white: Whitened, columns: Sequence[int]) -> Model:
     slopes = white._replace(jacobian=white.jacobian[:, columns])
-    step, _, _ = step_of(slopes, model.point, prior_precision(model))
-    return model.at(model.point + _within(step, model))
+    return model.at(model.point + step_of(slopes, model, LONGEST)[0])
 
 
 def renoised(found: Fitted, noise: Noise) -> Fitted:
@@ -104,15 +108,23 @@ def renoised(found: Fitted, noise: Noise) -> Fitted:
     return replace(found, noise=noise, white=whitened(found.evidence, noise))
 
 
-def _within(step: Tensor, model: Model) -> Tensor:
-    limit = LONGEST * prior_precision(model).rsqrt()
-    return step.clamp(-limit, limit)
+def step_of(white: Whitened, model: Model, longest: float = torch.inf) -> tuple[Tensor, float]:
+    """(Gauss-Newton step of the model's coordinates, log density that it is expected to gain).
+
+    Args:
+        white: slopes along the model's coordinates first.
+        model: coordinates stop at their ends, amplitudes without a sign at zero, and what stays free makes up for it.
+        longest: step of one coordinate, in prior standard deviations.
+    """
+    point, precision = model.point, prior_precision(model)
+    uphill = white.jacobian[:, : len(point)].mT @ white.value + precision * point
+    low, high = (reached - point for reached in model.ends)
+    limit = longest * precision.rsqrt()
+    curvature = _curvature(white, model)
+    step = bounded(curvature, -uphill, torch.maximum(low, -limit), torch.minimum(high, limit))
+    return step, -float(uphill @ step + 0.5 * step @ curvature @ step)
 
 
-def step_of(white: Whitened, point: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, float]:
-    """(Gauss-Newton step, covariance, log density that the step is expected to gain) of the model's coordinates."""
-    own = white.jacobian[:, : len(point)]
-    covariance = torch.linalg.inv(own.mT @ own + torch.diag(precision))
-    uphill = own.mT @ white.value + precision * point
-    step = -covariance @ uphill
-    return step, covariance, -0.5 * float(step @ uphill)
+def _curvature(white: Whitened, model: Model) -> Tensor:
+    own = white.jacobian[:, : len(model.point)]
+    return own.mT @ own + torch.diag(prior_precision(model))

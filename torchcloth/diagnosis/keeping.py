@@ -21,7 +21,7 @@ from .world import Model
 FIELDS = len(Cells._fields)
 
 
-def kept_in(folder: Path, model: Model, setting: Setting, resume: bool) -> Kept:
+def kept_in(folder: Path, model: Model, setting: Setting, resume: bool | None) -> Kept:
     """Answers in a folder, which is made when the first is known.
 
     Raises:

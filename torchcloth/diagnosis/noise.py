@@ -35,9 +35,14 @@ class Noise(NamedTuple):
         return torch.diag(_white(cells)) + slow[:, None] * _together(cells) + moved @ moved.mT
 
 
+def least() -> Noise:
+    """The sensor's and hardly more."""
+    return Noise(torch.tensor([FLOOR[name] for name in NAMES], dtype=torch.float64))
+
+
 def unfitted() -> Noise:
     """To fit by, where residuals are mostly the model's."""
-    return Noise(UNFITTED * torch.tensor([FLOOR[name] for name in NAMES], dtype=torch.float64))
+    return Noise(UNFITTED * least().level)
 
 
 class Whitened(NamedTuple):

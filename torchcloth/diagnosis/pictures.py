@@ -20,29 +20,31 @@ FARTHEST = 2.2  # typical amplitudes that are shown
 
 
 def residual_maps(answer: Diagnosis) -> Any:
-    """Mean misfit by part of the fabric (rows) and time (columns) of every episode, before and after; mm."""
+    """Mean misfit by part of the fabric (rows, from the pattern's top down) and time of every episode; mm."""
     from matplotlib.figure import Figure
 
     found = answer.found
-    before, after = (_maps(e) for e in (found.start.evidence, found.end.evidence))
+    middles = _middles([found.start.evidence, found.end.evidence])
+    before, after = (_maps(e, list(middles)) for e in (found.start.evidence, found.end.evidence))
+    told = [f"{100 * u:.0f}, {100 * v:.0f}" for u, v in middles.values()]
     names, count = answer.content["motions"], len(before)
     limit = max(float(np.nanquantile(np.abs(np.concatenate([m.ravel() for m in before])), 0.98)), 1e-6)
     rows = 2 if found.steps else 1
-    figure = Figure(figsize=(2.6 * count + 1.4, 2.4 * rows + 0.6), layout="constrained")
+    figure = Figure(figsize=(2.6 * count + 1.8, 2.6 * rows + 0.6), layout="constrained")
     axes = np.atleast_2d(figure.subplots(rows, count, sharey=True, squeeze=False))
     for row, maps in enumerate((before, after)[:rows]):
         for k, (axis, field) in enumerate(zip(axes[row], maps, strict=True)):
             extent = (0, field.shape[1] * STRETCH, field.shape[0], 0)
             image = axis.imshow(field, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto", extent=extent)
-            axis.set_yticks([])
+            axis.set_yticks(np.arange(len(told)) + 0.5, told, fontsize=6)
             axis.set_title(names[k] if row == 0 else "", fontsize=9)
             if row == rows - 1:
                 axis.set_xlabel("time, s")
-        axes[row, 0].set_ylabel(f"{('before', 'after')[row]}\npart of the fabric")
+        axes[row, 0].set_ylabel(f"{('before', 'after')[row]}: part of the fabric,\nits middle u, v in cm", fontsize=9)
     figure.colorbar(
         image,
         ax=axes,  # pyright: ignore[reportPossiblyUnbound]
-        label="mean misfit along the normal, mm",
+        label="measured minus simulated, along the normal, mm",
     )
     return figure
 
@@ -53,7 +55,7 @@ def screening(rows: Sequence[Row]) -> Any:
     from matplotlib.patches import Patch
 
     shown = [r for r in rows if r.total < float("inf")]
-    figure = Figure(figsize=(7.5, 0.24 * len(shown) + 1.2), layout="constrained")
+    figure = Figure(figsize=(7.5, 0.24 * len(shown) + 1.5), layout="constrained")
     axis = figure.subplots()
     for k, r in enumerate(reversed(shown)):
         typical, share = abs(r.hypothesis.typical), r.hypothesis.share
@@ -67,9 +69,9 @@ def screening(rows: Sequence[Row]) -> Any:
     axis.set_xlim(-FARTHEST, FARTHEST)
     axis.set_ylim(-1, len(shown))
     axis.axvline(0, color="k", lw=0.6)
-    axis.set_xlabel("amplitude over its typical value; grey: too small to matter; arrows: beyond")
+    axis.set_xlabel("amplitude over its typical value; grey band: too small to matter; arrows: beyond")
     handles = [Patch(color=colour, label=name) for name, colour in COLOURS.items()]
-    axis.legend(handles=handles, fontsize=8, loc="lower right")
+    figure.legend(handles=handles, fontsize=8, loc="outside upper center", ncols=len(handles), frameon=False)
     return figure
 
 
@@ -168,14 +170,24 @@ def _local(found: MissingForce, m: Missing) -> tuple[np.ndarray, np.ndarray]:
     return np.einsum("vc,vc->v", force, normal), np.einsum("vc,vck->vk", force, tangent)
 
 
-def _maps(evidence: Evidence) -> list[np.ndarray]:
-    """Per episode [patches, windows] mm; NaN where nothing was seen."""
-    out = []
+def _middles(found: Sequence[Evidence]) -> dict[int, tuple[float, float]]:
+    """(u, v) m of every part of the fabric that points were seen on, from the pattern's top down."""
+    out = {}
+    for cells in (c for evidence in found for c in evidence.cells):
+        own = cells.block == 0
+        places = cells.place[own, :2].tolist()
+        out.update(zip((cells.patch[own] // 3).tolist(), map(tuple, places), strict=True))
+    return dict(sorted(out.items(), key=lambda part: (-round(part[1][1], 3), part[1][0])))
+
+
+def _maps(evidence: Evidence, parts: Sequence[int]) -> list[np.ndarray]:
+    """Per episode [parts, windows] mm; NaN where nothing was seen."""
+    out, row = [], {part: k for k, part in enumerate(parts)}
     for cells in evidence.cells:
         own = cells.block == 0
-        patch, window = cells.patch[own].numpy() // 3, cells.window[own].numpy()
-        field = np.full((patch.max() + 1, window.max() + 1), np.nan)
-        field[patch, window] = 1e3 * cells.value[own].numpy()
+        patch, window = (cells.patch[own] // 3).tolist(), cells.window[own].numpy()
+        field = np.full((len(parts), window.max() + 1), np.nan)
+        field[[row[p] for p in patch], window] = 1e3 * cells.value[own].numpy()
         out.append(field)
     return out
 

@@ -67,25 +67,27 @@ def _image(figure: Any) -> str:
     return f'<img src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
 
 
+COLUMNS = (
+    "hypothesis", "unit", "amplitude", "std. error", "of numerics", "matters from", "shows from", "typical",
+    "moves, mm", "decision",
+)  # fmt: skip
+DECISIONS = (
+    "Amplitude: what the residuals ask for. Present: surely larger than what matters. Absent: surely smaller than that "
+    "(not zero), or of a sign that makes no sense. Unresolvable: even a typical amplitude might not show; an amplitude "
+    "shows, in four of five cases, from the value in its column on. Inconclusive: none of these. Moves: what a typical "
+    "amplitude does to the cloth beyond what is fitted anyway."
+)
+
+
 def _table(rows: list[Row]) -> str:
-    head = [
-        "hypothesis",
-        "unit",
-        "amplitude",
-        "std. error",
-        "of numerics",
-        "typical",
-        "moves, mm",
-        "detectable",
-        "decision",
-    ]
     body = []
     for r in rows:
-        numbers = (r.amplitude, r.std, r.bias, r.hypothesis.typical, 1e3 * r.size, r.detectable)
-        cells = [r.hypothesis.name, r.hypothesis.unit, *(f"{x:.3g}" for x in numbers), r.decision]
+        h = r.hypothesis
+        numbers = (r.amplitude, r.std, r.bias, abs(h.smallest), r.detectable, h.typical, 1e3 * r.size)
+        cells = [h.name, h.unit, *(f"{x:.3g}" for x in numbers), r.decision]
         body.append("".join(f"<td>{html.escape(c)}</td>" for c in cells))
-    heads = "".join(f"<th>{h}</th>" for h in head)
-    return f"<table><tr>{heads}</tr>{''.join(f'<tr>{row}</tr>' for row in body)}</table>"
+    heads = "".join(f"<th>{name}</th>" for name in COLUMNS)
+    return f"<p>{DECISIONS}</p><table><tr>{heads}</tr>{''.join(f'<tr>{row}</tr>' for row in body)}</table>"
 
 
 def _left(rows: list[dict[str, Any]]) -> str:

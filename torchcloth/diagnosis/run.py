@@ -38,7 +38,7 @@ def diagnose(
     hypotheses: Sequence[Hypothesis] | None = None,
     progress: Progress = lambda _: None,
     journal: Path | None = None,
-    resume: bool = False,
+    resume: bool | None = False,
 ) -> Diagnosis:
     """What a simulation of these episodes gets wrong, and what mending it gains.
 
@@ -48,7 +48,8 @@ def diagnose(
         hypotheses: what to look for; None: the catalogue.
         progress: called with one line for each episode that is simulated.
         journal: folder for finished episodes, a few hundred kilobytes each; None: nothing is kept.
-        resume: go on with what a diagnosis that was stopped left there; the answer is the same, bit by bit.
+        resume: go on with what a diagnosis that was stopped left there; the answer is the same, bit by bit. None: start
+            over, but refuse to where it could go on.
 
     Raises:
         InvalidInput: fewer than two episodes, too few motions to hold one out, different cloths, one episode twice, or

@@ -184,11 +184,18 @@ class Model:
 
     def at(self, point: Tensor) -> Model:
         """The same model elsewhere; coordinates stop at their ends, amplitudes without a sign at zero."""
-        count = len(self.parameters)
-        found = zip(self.accepted, point[count:].tolist(), strict=True)
-        amplitudes = tuple(a if h.signed else max(a, 0.0) for h, a in found)
-        ends = torch.tensor([[p.low, p.high] for p in self.parameters], dtype=point.dtype)
-        return replace(self, values=point[:count].clamp(*ends.unbind(-1)), amplitudes=amplitudes)
+        values = point.clamp(*self.ends)
+        return replace(
+            self, values=values[: len(self.parameters)], amplitudes=tuple(values[len(self.parameters) :].tolist())
+        )
+
+    @property
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """(least, largest) of the coordinates [P + A]."""
+        own = [(p.low, p.high) for p in self.parameters]
+        own += [(-math.inf if h.signed else 0.0, math.inf) for h in self.accepted]
+        low, high = torch.tensor(own, dtype=self.values.dtype).reshape(-1, 2).unbind(-1)
+        return low, high
 
     def plus(self, hypothesis: Hypothesis, amplitude: float = 0.0) -> Model:
         """With one more accepted hypothesis."""

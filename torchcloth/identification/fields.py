@@ -83,7 +83,7 @@ def fit_fields(
     dt: float | None = None,
     use: Sequence[str] | None = None,
     journal: str | Path | None = None,
-    resume: bool = False,
+    resume: bool | None = False,
     on_progress: Progress | None = None,
 ) -> FieldFit:
     """Fit material parameters that have one value per triangle, by L-BFGS on reverse-mode gradients.

@@ -60,7 +60,7 @@ def identify(
     starts: int = 1,
     profile: Sequence[str] = (),
     journal: str | Path | None = None,
-    resume: bool = False,
+    resume: bool | None = False,
     on_progress: Progress | None = None,
     refine: bool = False,
 ) -> Identification:
@@ -94,6 +94,7 @@ def identify(
             the others anew: it may be skew, and open. Some 20 simulations for each unknown of the fit.
         journal: folder in which the fit keeps what it computed; of no use any more once the result is safe.
         resume: go on where a fit with this journal was stopped; the result is what it would have been, bit by bit.
+            None: start over, but refuse to where it could go on.
         refine: correct the result for the coarseness of the mesh, by one simulation on a mesh twice as fine, and widen
             its errors by what that leaves open (see ``finer.py``). ``fit["mesh_step"]`` has the largest correction in
             standard errors. Not where the motion is chaotic, and not together with ``profile``.
@@ -201,7 +202,7 @@ def _concluded(
     end = full.seen(final.raw)
     before, after, null = [s.x for s in start], [s.x for s in end], [rigid_carry(e) for e in full.episodes]
     found = estimates(full.cloth, full.unknowns, final.raw, covariance)
-    profiled = {} if checked.warnings else profiles(told, final, covariance, profile, search.tell)
+    profiled = {} if checked.warnings or checked.withdrawn else profiles(told, final, covariance, profile, search.tell)
     found = with_profiles(found, profiled)
     fit: dict[str, Any] = _figures(full, before, after, null)
     fit |= _force_figures(full, start, end)
@@ -219,7 +220,7 @@ def _concluded(
         fit["replicates"] = int((strata > 0).sum())
     if outcome.reached is not None:
         fit |= {"starts": outcome.reached.tried, "starts_agreeing": outcome.reached.agree}
-    if checked.withdrawn or worthless(fit):  # steep chaotic slopes promise tiny errors
+    if checked.withdrawn or worthless(fit):  # slopes of chaos, or of elsewhere, promise tiny errors
         found = withdraw(found, full.unknowns)
     warnings += [outcome.unfinished] if outcome.unfinished else []
     warnings += skewed(found, [name for name in checked.curved if name not in profiled])

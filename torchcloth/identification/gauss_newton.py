@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import SimulationDiverged, UnstableStep
+from .bounds import bounded
 from .misfit import HUBER, huber, noise_scale
 
 MISLED = 0.1, 4  # gains below it, so many in a row, show tangents that say nothing of finite steps
@@ -119,11 +120,10 @@ def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None
     """(accepted point or None, actual over predicted decrease, next damping)."""
     gradient, hessian = normal_equations(problem, at)
     now = cost(problem, at, at.raw, at.linear.value)
+    low, high = (problem.clip(at.raw + sign * problem.longest) - at.raw for sign in (-1, 1))
     for _ in range(6):
-        step = torch.linalg.solve(hessian + damping * torch.diag(hessian.diagonal()), -gradient)
-        step = step.clamp(-problem.longest, problem.longest)  # one by one: a runaway must not hold back the others
-        raw = problem.clip(at.raw + step)
-        step = raw - at.raw
+        step = bounded(hessian + damping * torch.diag(hessian.diagonal()), -gradient, low, high)
+        raw = at.raw + step
         value, patch = _try(problem, raw)
         if value is not None:
             predicted = -float(gradient @ step + 0.5 * step @ hessian @ step)

@@ -30,17 +30,25 @@ class Journal:
     Args:
         folder: made when the first answer is written; it must be a journal's or not exist.
         problem: what the answers depend on beside the questions: data, model, options.
-        resume: take up what the folder holds; otherwise it is emptied.
+        resume: take up what the folder holds; False: empty it; None: likewise, unless it could be taken up.
 
     Raises:
-        InvalidInput: nothing to resume, a journal of another problem, or a folder of other things.
+        InvalidInput: nothing to resume, a journal of another problem, a folder of other things, or, where nothing was
+            said, what could be resumed.
     """
 
-    def __init__(self, folder: str | Path, problem: Sequence[object], resume: bool) -> None:
+    def __init__(self, folder: str | Path, problem: Sequence[object], resume: bool | None) -> None:
         self.folder, self.key = Path(folder), digest([FORMAT, torch.__version__, *problem])
         self.recalled = 0
         stamp = self.folder / "problem"
         if not resume:
+            if resume is None and stamp.exists() and stamp.read_text() == self.key:
+                raise InvalidInput(
+                    "resume",
+                    got=f"nothing, and in {self.folder} the same work, stopped",
+                    expected="--resume, to go on from there, or another folder",
+                    remedy=f"to start over, delete {self.folder}",
+                )
             clear(self.folder)
             return
         if not stamp.exists():

@@ -12,6 +12,7 @@ from . import ensemble, gauss_newton, horizon, linearity, starts
 from .descent import descend, quasi_newton
 from .objective import Objective
 from .report import undecided
+from .unfinished import astray
 
 Method = Literal["gauss-newton", "lbfgs", "adam", "gradient-descent"]
 METHODS: tuple[str, ...] = ("gauss-newton", "lbfgs", "adam", "gradient-descent")
@@ -19,6 +20,7 @@ CHAMFER = METHODS[2:]  # those that follow the paper's distance alone
 PAPER_CHAMFER = 0.015  # m, the DiffCP paper's stop rule
 EARLY = 0.35  # share of the frames that the first stage of the fit sees
 EARLY_ITERATIONS = 10
+GO_ON = "more iterations of Gauss-Newton, a nearer start or several, or fewer parameters at once may get there"
 
 Progress = Callable[[int, float, dict[str, float], float], None]  # iteration, Chamfer, values, share of the frames
 
@@ -64,6 +66,10 @@ class Search:
         if checked.final.converged:
             return Outcome(told, checked, "", reached)
         why = self._undecided(iterations) if method in CHAMFER else self._why(iterations)
+        lost = "" if checked.withdrawn else astray(told, checked)
+        if lost:
+            why = f"{why}; {lost}, and no parameter counts as identified: {GO_ON}"
+            checked = checked._replace(reason=lost)
         return Outcome(told, checked, why, reached)
 
     def _resolve(

@@ -1,0 +1,176 @@
+"""Known errors put into real recordings: does the diagnosis say what they are, and how large?
+
+IRI swings with all their own errors. Clouds get later stamps, or another depth, or a leaning camera, so the truth is exact.
+What the same model sees of it is the difference between the cells with and without, which is screened as residuals are;
+the amplitude is refitted, with and without, and its difference compared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchcloth._files import write_text
+from torchcloth.diagnosis import Hypothesis, base_model, catalogue, fit, screen, setting_of
+from torchcloth.diagnosis.approach import approach
+from torchcloth.diagnosis.base_model import together
+from torchcloth.diagnosis.cells import Cells
+from torchcloth.diagnosis.evidence import Evidence, aligned
+from torchcloth.diagnosis.fitting import Fitted, weighed
+from torchcloth.recordings import Camera, PointClouds, Recording
+
+from ..kept import Kept
+from .fabric_tables import table
+from .measured import VARIABLE, find, swings
+
+RUNS = ("range60_rep1", "range90_rep1", "range30_rep1", "range60_rep2")
+SECONDS, FAST_SECONDS = 6.0, 4.0
+DISTANCE = 1.3  # m, of the camera, which the data do not say; depths grow from there
+OWN = "air.linear"  # what the swings lack first, by their own diagnosis
+NUISANCES = ("obs.", "env.gravity_tilt", "robot.base")  # causes that are asked about
+ITERATIONS = 4
+
+
+@dataclass(frozen=True)
+class Salt:
+    """One error of known size.
+
+    Attributes:
+        cause: the library's name; amplitude: by its sign.
+        put: (points [R, 3], their times [R], camera's place [3], the cloth's middle [3]) -> (points, times).
+    """
+
+    cause: str
+    amplitude: float
+    unit: str
+    put: Callable[..., tuple[np.ndarray, np.ndarray]]
+
+
+def _later(xyz, t, eye, middle):
+    return xyz, t + 0.02
+
+
+def _deeper(xyz, t, eye, middle):
+    return eye + 1.01 * (xyz - eye), t
+
+
+def _leaning(xyz, t, eye, middle):
+    angle = np.radians(1.0)
+    turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    return (xyz - middle) @ turn.T + middle, t
+
+
+SALTS = {
+    "stamps 20 ms late": Salt("obs.clock", -0.02, "s", _later),
+    "depths 1 % too large": Salt("obs.depth_scale", 0.01, "-", _deeper),
+    "camera leans by 1 degree": Salt("obs.rotation[x]", float(np.radians(1.0)), "rad", _leaning),
+}
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Options."""
+    parser.add_argument("--source", type=Path, metavar="DIR", help=f"folder of measured data (${VARIABLE})")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Compute what is missing, then print and write salting.json."""
+    source = find(options.source) / swings.SOURCE
+    kept = Kept(options.out, {"study": "salting", "fast": options.fast})
+    found = kept.run({"all": partial(salted, source, options.fast)})["all"]
+    path = write_text(options.out / "salting.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
+    show(found)
+    print(f"result: {path}")
+
+
+def salted(source: Path, fast: bool) -> dict[str, Any]:
+    """What the diagnosis says of each salt."""
+    plain = [_short(swings.recording(source, name), fast) for name in RUNS[: 2 if fast else 4]]
+    model = base_model(together(plain))
+    every = catalogue(model, plain)
+    own, asked = (_named(every, OWN), [h for h in every if h.name.startswith(NUISANCES)])
+    setting = setting_of(model, plain)
+    near, before = approach(model, setting)
+    base = fit(near.plus(own, own.typical), setting, asked, before=before)
+    out = {}
+    for label, salt in SALTS.items():
+        changed = setting_of(model, [_with(r, salt) for r in plain])
+        after = fit(base.model, changed, asked, 0, noise=base.noise)
+        rows = screen(difference(base, after))
+        h = _named(asked, salt.cause)
+        sizes = [_refitted(base, s, h) for s in (setting, changed)]
+        out[label] = {
+            "truth": {"effect": salt.cause, "amplitude": salt.amplitude, "unit": salt.unit},
+            "told": [{"effect": r.hypothesis.name, "amplitude": r.amplitude, "gain": r.gain} for r in rows[:3]],
+            "refitted": sizes[1][0] - sizes[0][0],
+            "std": sizes[1][1],
+        }
+    return out
+
+
+def difference(plain: Fitted, salted: Fitted) -> Fitted:
+    """The change of the cells as residuals, with the slopes of the first."""
+    cells, numerics = [], []
+    for a, b, n in zip(plain.evidence.cells, salted.evidence.cells, plain.evidence.numerics, strict=True):
+        both = torch.isin(a.key, b.key)
+        kept = Cells(*(column[both] for column in a))
+        cells.append(kept._replace(value=aligned(kept.key, b.key, b.value) - kept.value))
+        numerics.append(torch.zeros_like(n[both]))
+    evidence: Evidence = replace(plain.evidence, cells=cells, numerics=numerics)
+    return weighed(plain.model, evidence, plain.noise)
+
+
+def _refitted(base: Fitted, setting: Any, h: Hypothesis) -> tuple[float, float]:
+    """(amplitude, standard error) of a cause beside the model."""
+    found = fit(base.model.plus(h), setting, (), ITERATIONS, noise=base.noise)
+    return found.model.amplitudes[-1], float(found.covariance[-1, -1].sqrt())
+
+
+def _named(found: Sequence[Hypothesis], name: str) -> Hypothesis:
+    return next(h for h in found if h.name == name)
+
+
+def _short(r: Recording, fast: bool) -> Recording:
+    """The beginning, seen by a camera in front of the cloth."""
+    p = r.points
+    if p is None:
+        raise ValueError("a swing without points")
+    frames = int((p.t - p.t[0] <= (FAST_SECONDS if fast else SECONDS)).sum())
+    rows = int(p.counts[:frames].sum())
+    pose = np.eye(4)
+    pose[:3, 3] = p.xyz[:rows].mean(0) - [0.0, DISTANCE, 0.0]
+    camera = Camera(width=640, height=480, K=np.eye(3), T_world_camera=pose)
+    points = PointClouds(p.t[:frames], p.xyz[:rows], p.counts[:frames])
+    return replace(r, points=points, markers=None, cameras={"front": camera})
+
+
+def _with(r: Recording, salt: Salt) -> Recording:
+    """The recording with an error; the camera is where it was said to be."""
+    p: PointClouds = r.points  # type: ignore[assignment]
+    eye, middle = r.cameras["front"].T_world_camera[:3, 3], r.cloth.initial_vertices.mean(0)  # type: ignore[union-attr]
+    xyz, t = salt.put(p.xyz, p.t, eye, middle)
+    return replace(r, points=PointClouds(t, xyz, p.counts))
+
+
+def show(found: dict[str, Any]) -> None:
+    """As a table."""
+    from rich.console import Console
+
+    filled = table("Known errors in real swings", "put in", "amplitude", "told first", "amplitude", "refitted", left=1)
+    for label, case in found.items():
+        truth, first = case["truth"], case["told"][0]
+        filled.add_row(
+            label,
+            f"{truth['amplitude']:.4g} {truth['unit']}",
+            first["effect"],
+            f"{first['amplitude']:.4g}",
+            f"{case['refitted']:.4g} ± {case['std']:.2g}",
+        )
+    Console(highlight=False).print(filled)
