@@ -67,7 +67,8 @@ class Diagnosis:
 def judge(found: Found, names: Sequence[str]) -> Diagnosis:
     """The answer of a search over episodes with these motions."""
     causes = [_cause(found, step, names) for step in found.steps]
-    rows = found.screened
+    told = {name for c in causes for name in (*c["class"], *(r["effect"] for r in c["rivals"]))}
+    rows = [r for r in found.screened if r.hypothesis.name not in told]
     left = lack_of_fit(found.end, names)
     lacking = any(row.lacking for row in left)
     verdict = _verdict(found, causes, left)
