@@ -1,8 +1,8 @@
 """Known errors put into real recordings: does the diagnosis say what they are, and how large?
 
-IRI swings with all their own errors. Clouds get later stamps, or another depth, or a leaning camera, so the truth is exact.
-What the same model sees of it is the difference between the cells with and without, which is screened as residuals are;
-the amplitude is refitted, with and without, and its difference compared.
+IRI swings with all errors of their own get later stamps, or other depths, or a camera that leans; so truth is exact.
+What a model with air sees of that is the difference of its cells with and without, screened as residuals are. Then the
+amplitude is fitted with and without, and the difference is what was put in.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ RUNS = ("range60_rep1", "range90_rep1", "range30_rep1", "range60_rep2")
 SECONDS, FAST_SECONDS = 6.0, 4.0
 DISTANCE = 1.3  # m, of the camera, which the data do not say; depths grow from there
 OWN = "air.linear"  # what the swings lack first, by their own diagnosis
-NUISANCES = ("obs.", "env.gravity_tilt", "robot.base")  # causes that are asked about
+ASKED = ("obs.", "env.gravity_tilt")  # beginnings of the causes that are asked about
 ITERATIONS = 4
 
 
@@ -95,7 +95,7 @@ def salted(source: Path, fast: bool) -> dict[str, Any]:
     plain = [_short(swings.recording(source, name), fast) for name in RUNS[: 2 if fast else 4]]
     model = base_model(together(plain))
     every = catalogue(model, plain)
-    own, asked = (_named(every, OWN), [h for h in every if h.name.startswith(NUISANCES)])
+    own, asked = _named(every, OWN), [h for h in every if h.name.startswith(ASKED)]
     setting = setting_of(model, plain)
     near, before = approach(model, setting)
     base = fit(near.plus(own, own.typical), setting, asked, before=before)
@@ -105,11 +105,11 @@ def salted(source: Path, fast: bool) -> dict[str, Any]:
         after = fit(base.model, changed, asked, 0, noise=base.noise)
         rows = screen(difference(base, after))
         h = _named(asked, salt.cause)
-        sizes = [_refitted(base, s, h) for s in (setting, changed)]
+        sizes = [_fitted(base, s, h) for s in (setting, changed)]
         out[label] = {
             "truth": {"effect": salt.cause, "amplitude": salt.amplitude, "unit": salt.unit},
             "told": [{"effect": r.hypothesis.name, "amplitude": r.amplitude, "gain": r.gain} for r in rows[:3]],
-            "refitted": sizes[1][0] - sizes[0][0],
+            "fitted": sizes[1][0] - sizes[0][0],
             "std": sizes[1][1],
         }
     return out
@@ -127,7 +127,7 @@ def difference(plain: Fitted, salted: Fitted) -> Fitted:
     return weighed(plain.model, evidence, plain.noise)
 
 
-def _refitted(base: Fitted, setting: Any, h: Hypothesis) -> tuple[float, float]:
+def _fitted(base: Fitted, setting: Any, h: Hypothesis) -> tuple[float, float]:
     """(amplitude, standard error) of a cause beside the model."""
     found = fit(base.model.plus(h), setting, (), ITERATIONS, noise=base.noise)
     return found.model.amplitudes[-1], float(found.covariance[-1, -1].sqrt())
@@ -162,15 +162,16 @@ def _with(r: Recording, salt: Salt) -> Recording:
 def show(found: dict[str, Any]) -> None:
     """As a table."""
     from rich.console import Console
+    from rich.markup import escape
 
-    filled = table("Known errors in real swings", "put in", "amplitude", "told first", "amplitude", "refitted", left=1)
+    headings = ("put in", "as", "amplitude", "told first", "amplitude", "chi^2", "second", "chi^2", "fitted")
+    filled = table("Known errors in real swings", *headings, left=2)
     for label, case in found.items():
-        truth, first = case["truth"], case["told"][0]
-        filled.add_row(
-            label,
-            f"{truth['amplitude']:.4g} {truth['unit']}",
-            first["effect"],
-            f"{first['amplitude']:.4g}",
-            f"{case['refitted']:.4g} ± {case['std']:.2g}",
-        )
-    Console(highlight=False).print(filled)
+        truth, (first, second, *_) = case["truth"], case["told"]
+        fitted = f"{case['fitted']:.4f} ± {case['std']:.4f} {truth['unit']}"
+        told = (escape(first["effect"]), f"{first['amplitude']:.4f}", f"{first['gain']:.0f}")
+        also = (escape(second["effect"]), f"{second['gain']:.0f}")
+        filled.add_row(label, escape(truth["effect"]), f"{truth['amplitude']:.4f}", *told, *also, fitted)
+    console = Console(highlight=False)
+    console.width = max(console.width, 150)
+    console.print(filled)
