@@ -54,9 +54,9 @@ class Row(NamedTuple):
         return (self.forward - abs(self.hypothesis.smallest)) / self.total
 
     @property
-    def visible(self) -> bool:
-        """A typical amplitude would show."""
-        return self.decision != "unresolvable"
+    def shows(self) -> bool:
+        """What is asked for would show, even where a typical amplitude would not."""
+        return self.size * self.forward > LEAST * abs(self.hypothesis.typical)
 
     @property
     def forward(self) -> float:

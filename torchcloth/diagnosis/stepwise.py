@@ -14,7 +14,7 @@ from .fitting import IMPOSSIBLE, Fitted, fit, renoised, with_cause, without_caus
 from .lacking import explained, lack_of_fit
 from .noise import Noise, fit_noise, floor_of, unfitted
 from .repeats import Repeats, pairs_of, repeats
-from .screening import Row, screen
+from .screening import PRESENT, Row, screen
 from .world import Hypothesis, Model
 
 MOST = 4  # causes
@@ -128,11 +128,13 @@ def extend(
 
 
 def _likely(screened: Sequence[Row]) -> list[Row]:
-    """What is present by slopes, and what would gain much though it is small by them.
+    """What is present by slopes; what asks for plausibly more than a typical amplitude, which would not show;
 
-    A large effect bends the fitted parameters so far that slopes there ask for less of it than there is.
+    and what would gain much though it is small by slopes: a large effect bends the fitted parameters so far that slopes
+    there ask for less of it than there is.
     """
-    return [r for r in screened if r.decision == "present" or (r.gain > MUCH and r.forward > 0 and r.visible)]
+    asks = lambda r: r.shows and r.forward < PLAUSIBLE * abs(r.hypothesis.typical)  # noqa: E731
+    return [r for r in screened if r.decision == "present" or (asks(r) and (r.gain > MUCH or r.excess > PRESENT))]
 
 
 def _pruned(
