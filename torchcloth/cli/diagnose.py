@@ -15,7 +15,12 @@ from .identify import PROGRESS, STOPPED
 
 def add(verbs: Any) -> None:
     """The verb and its options."""
-    parser = verbs.add_parser("diagnose", help="find what a simulation of recorded episodes gets wrong, and why")
+    parser = verbs.add_parser(
+        "diagnose",
+        help="find what a simulation of recorded episodes gets wrong, and why",
+        description="Find what a simulation of one cloth's episodes gets wrong, and why. At least two motions "
+        "(split.motion in episode.json). Writes diagnosis.json, report.html, base.tcm and extended.tcm.",
+    )
     parser.add_argument("episodes", nargs="+", metavar="EPISODE", help="folders of one cloth's episodes")
     parser.add_argument("--model", metavar="MODEL", help="a .tcm file to start from (default: A-EP in vacuum)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result")
