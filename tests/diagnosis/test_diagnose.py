@@ -100,9 +100,11 @@ def test_where_nothing_is_hidden_nothing_is_named():
 
 
 def test_one_motion_is_refused(tmp_path, capsys):
-    only = [sheets.episode(), sheets.episode()]
+    only = [sheets.episode(), sheets.episode(duration=0.5)]
     with pytest.raises(InvalidInput, match="at least two motions"):
         diagnose(only)
+    with pytest.raises(InvalidInput, match="twice"):  # and not advice to name them apart
+        diagnose([only[0], only[0]])
     folder = rec.write(only[0], tmp_path / "a")
     assert main(["diagnose", str(folder), "--out", str(tmp_path / "out")]) == 2
     assert "at least two motions" in capsys.readouterr().err
