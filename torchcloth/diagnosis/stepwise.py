@@ -128,9 +128,9 @@ def extend(
 
 
 def _likely(screened: Sequence[Row]) -> list[Row]:
-    """What is present by slopes; what asks for plausibly more than a typical amplitude, which would not show;
+    """What is present by slopes, or asks for so much that it would show and would matter or gain much.
 
-    and what would gain much though it is small by slopes: a large effect bends the fitted parameters so far that slopes
+    A typical amplitude need not show then. And a large effect bends the fitted parameters so far that slopes
     there ask for less of it than there is.
     """
     asks = lambda r: r.shows and r.forward < PLAUSIBLE * abs(r.hypothesis.typical)  # noqa: E731
