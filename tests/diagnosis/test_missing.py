@@ -4,7 +4,7 @@ import pytest
 import sheets
 import torch
 
-from torchcloth.diagnosis import base_model, fit, lack_of_fit, missing_force, setting_of
+from torchcloth.diagnosis import base_model, fit, lack_of_fit, missing, missing_force, setting_of
 from torchcloth.diagnosis.pushes import Pushes, pushed
 from torchcloth.effects import BodyForce
 from torchcloth.identification.replays import frames_of
@@ -92,3 +92,22 @@ def test_pushes_are_those_of_a_body_force(planted):
     beside = world.with_cloth({"more": BodyForce(step * push[0, 0])}).frames(episode)
     difference = (beside.x - frames.x) / step
     assert torch.allclose(moved.x[0], difference, atol=1e-2 * float(difference.abs().max()))
+
+
+def test_slopes_of_any_size_have_a_posterior():
+    """Information over more orders than numbers have digits; where it is tame, the textbook's formula."""
+    rng = torch.Generator().manual_seed(0)
+    slopes = torch.randn(40, 12, generator=rng, dtype=torch.float64)
+    value = torch.randn(40, generator=rng, dtype=torch.float64)
+    known, sizes = torch.full((3,), 4.0, dtype=torch.float64), torch.full((9,), 0.7, dtype=torch.float64)
+    information, asked = slopes.mT @ slopes, slopes.mT @ value
+    found = missing._posterior(information, asked, known, sizes)
+    precision = information + torch.diag(torch.cat([known, sizes**-2]))
+    assert found.covariance == pytest.approx(torch.linalg.inv(precision).numpy(), rel=1e-9, abs=1e-12)
+    assert found.mean == pytest.approx((-torch.linalg.solve(precision, asked)).numpy(), rel=1e-9)
+    fewer = torch.cat([1e9 * slopes[:, :1], 1e9 * slopes[:, :1] + 1e-9 * slopes[:, 1:2], slopes[:, 2:]], 1)
+    wild = missing._posterior(fewer.mT @ fewer, fewer.mT @ value, known, 1e3 * sizes)
+    assert bool(wild.mean.isfinite().all() and wild.log.isfinite())
+    assert bool((wild.covariance.diagonal() > 0).all())
+    with pytest.raises(torch.linalg.LinAlgError):
+        torch.linalg.cholesky(fewer.mT @ fewer + torch.diag(torch.cat([known, (1e3 * sizes) ** -2])))

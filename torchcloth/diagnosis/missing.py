@@ -200,10 +200,14 @@ def _likeliest(parts: Sequence[_Asked], found: Fitted, each: int) -> tuple[float
 
 
 def _posterior(information: Tensor, asked: Tensor, known: Tensor, sizes: Tensor) -> _Found:
-    root = torch.linalg.cholesky(information + torch.diag(torch.cat([known, sizes**-2])))
-    mean = -torch.cholesky_solve(asked[:, None], root)[:, 0]
-    log = -0.5 * asked @ mean - root.diagonal().log().sum() - sizes.log().sum()
-    return _Found(log, mean, torch.cholesky_inverse(root))
+    """In units of the prior, where no direction is unknown: what is asked for may reach over many orders."""
+    unit = torch.cat([known.rsqrt(), sizes])
+    square = unit[:, None] * information * unit + torch.eye(len(unit)).to(information)
+    square.diagonal().add_(torch.finfo(square.dtype).eps * square.diagonal().sum())  # what rounding may have taken
+    root = torch.linalg.cholesky(square)
+    mean = -unit * torch.cholesky_solve((unit * asked)[:, None], root)[:, 0]
+    log = -0.5 * asked @ mean - root.diagonal().log().sum() - 0.5 * known.log().sum()
+    return _Found(log, mean, unit[:, None] * torch.cholesky_inverse(root) * unit)
 
 
 def _spread(mean: Tensor, covariance: Tensor, fields: Tensor) -> tuple[Tensor, Tensor]:
