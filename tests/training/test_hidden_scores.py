@@ -37,6 +37,7 @@ DRAG = hidden("single", ("air.drag_n", 1.2))
 def test_a_null_is_right_when_nothing_is_named():
     assert judged(hidden("null"), answer(verdict="adequate"))["right"]
     assert judged(hidden("null"), answer(verdict="unexplained"))["right"]
+    assert not judged(hidden("hard null"), answer(verdict="invalid_data"))["right"], "sound episodes are refused"
     alarm = judged(hidden("null"), answer(cause("air.linear")))
     assert not alarm["right"]
     assert alarm["named"] == ["air.linear"]

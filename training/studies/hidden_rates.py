@@ -135,6 +135,7 @@ def further(cases: Sequence[Judged]) -> list[tuple[str, Rate | float | None]]:
         ("class identified, singles of all sizes but those", rate(seen, _found)),
         ("matched nulls with a named cause", rate(of(cases, "null"), lambda c: c["named"])),
         ("hard nulls with a named cause", rate(of(cases, "hard null"), lambda c: c["named"])),
+        ("sound episodes called invalid", rate([c for c in cases if c["family"] != "fault"], _refused)),
         ("one of two effects at least", rate(doubles, lambda c: any(c["found"]))),
         ("causes that are none, a case", float(np.mean([c["spurious"] for c in extra])) if extra else None),
         ("amplitude error, 90 % quantile", float(np.quantile(errors, 0.9)) if errors else None),
@@ -144,6 +145,10 @@ def further(cases: Sequence[Judged]) -> list[tuple[str, Rate | float | None]]:
         ("a random experiment resolves", rate(random, lambda c: c["random_resolved"])),
         ("cases without an answer, but faults", rate([c for c in cases if c["family"] != "fault"], _silent)),
     ]
+
+
+def _refused(c: Judged) -> bool:
+    return c["verdict"] == "invalid_data"
 
 
 def _silent(c: Judged) -> bool:

@@ -129,7 +129,7 @@ def _right(truth: Truth, answer: Answer, causes: Sequence[Named], asked: Sequenc
     if out["no_answer"] and family != "fault":
         return False
     if family in NULLS:
-        return not causes
+        return not causes and verdict(answer) != "invalid_data"
     if family == "single":
         return out["found"][0]
     if family == "double":
