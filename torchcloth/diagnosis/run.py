@@ -57,9 +57,9 @@ def diagnose(
         RecordingError: an episode that lacks what is needed.
         SimulationDiverged: the base model cannot be simulated.
     """
-    each_once(recordings)
     names = [str(r.split.get("motion") or f"episode {k}") for k, r in enumerate(recordings)]
     if len(set(names)) < 2:
+        each_once(recordings)  # a copy needs no other name
         raise InvalidInput(
             "episodes",
             got=f"{len(recordings)} with motion {', '.join(sorted(set(names))) or 'none'}",
@@ -75,6 +75,7 @@ def diagnose(
         )
     if faults := check(recordings):
         return refused(faults, names)
+    each_once(recordings)
     model = model or base_model(together(recordings))
     asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
     plan = hashlib.sha256(json.dumps([[h.name, h.typical, h.share] for h in asked]).encode()).hexdigest()[:16]

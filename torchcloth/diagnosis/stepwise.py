@@ -23,7 +23,7 @@ FURTHER = 2  # steps of the likelier ones among them
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
-MUCH = 50.0  # chi^2, of a cause that is worth fitting
+MUCH = 25.0  # chi^2, of a cause that is worth fitting
 MOSTLY = 1 / 3  # of what is wrong, that causes must explain beside something unknown
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 
