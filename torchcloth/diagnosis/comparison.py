@@ -1,8 +1,9 @@
 """Fitted models on motions that they were not fitted to.
 
 Each group of motions is predicted by what the others determine: the solution of all data is moved by one linear step
-to that of the others, and the prediction with it. Nothing of a predicted episode but its own nuisances, within their
-priors, is used.
+to that of the others, and the prediction with it. How little the others may know of a number is part of the
+prediction: its covariance is K + J C J', with C that of the model's numbers by the others. Nothing of a predicted
+episode but its own nuisances, within their priors, and these numbers, within C, is used.
 """
 
 from __future__ import annotations
@@ -14,25 +15,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .bursts import densities, stretches, weights
 from .cells import SEEN
 from .evidence import aligned
-from .fitting import Fitted, prior_precision, step_of
+from .fitting import Fitted, curvature, prior_precision, step_of
 
 ALONE = 0.7  # share of the information, of a motion without which a cause cannot be sized
 BLOCK = 2  # windows of cells that are resampled together
 DRAWS = 2000
 FEW = 8  # episodes, below which they show too little of their own spread: the share's interval is doubled
-FREEDOM = 5  # degrees of the t-distribution by which single cells are judged
 
 
 class Predicted(NamedTuple):
     """Held-out residuals of one model; cells of all episodes."""
 
-    value: Tensor  # [C] as predicted from the other motions, without what the episode's nuisances explain
+    value: Tensor  # [C] as predicted from the other motions, without what nuisances and uncertain numbers explain
     white: Tensor  # [C] the same, whitened
+    scale: Tensor  # [C] logarithms of what that divided by, beyond the noise
     key: Tensor  # [C]
     episode: Tensor  # [C]
     window: Tensor  # [C]
+    stretch: Tensor  # [C] of time, whose cells err together
     seen: Tensor  # [C] bool, a position and not a force
 
 
@@ -45,6 +48,7 @@ class Gain(NamedTuple):
     ci95: tuple[float, float]  # of the density's difference
     explained: float  # share of before^2 - floor^2
     explained_ci95: tuple[float, float]
+    calm: tuple[float, float]  # m RMS before and after, where stretches that neither describes count for less
 
 
 def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> Predicted:
@@ -53,10 +57,22 @@ def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) 
     Of the groups ``halved`` every other stretch of time is left out instead, and then the others: where one kind of
     motion alone tells of a cause, no other can say how large it is.
     """
-    own, whitened = found.white.jacobian[:, : found.evidence.own], found.white.value.clone()
+    likely, white, scale = (torch.zeros_like(found.white.value) for _ in range(3))
     for inside in _folds(found, groups, halved):
-        whitened[inside] += own[inside] @ _step_of_others(found, inside)
-    return _told(found, whitened)
+        likely[inside], white[inside], scale[inside] = _by_others(found, inside)
+    return _told(found, likely, white, scale)
+
+
+def _by_others(found: Fitted, inside: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the cells inside, by a fit to those outside: (K^-1 r, whitened, logarithms of the scale)."""
+    step, covariance = _of_others(found, inside)
+    share = found.white.share[inside]
+    own = found.white.jacobian[inside][:, : found.evidence.own] / share[:, None]
+    value = found.white.value[inside] / share + own @ step
+    root = torch.linalg.cholesky(torch.eye(len(value)).to(own) + own @ covariance @ own.mT)
+    white = torch.linalg.solve_triangular(root, value[:, None], upper=False)
+    likely = torch.linalg.solve_triangular(root.mT, white, upper=True)
+    return likely[:, 0], white[:, 0], root.diagonal().log()
 
 
 def spread(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> Tensor:
@@ -65,19 +81,20 @@ def spread(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -
     The jackknife: motions that disagree about a number say by how much a law may differ from the model's, which the
     noise within a motion does not.
     """
-    steps = torch.stack([_step_of_others(found, inside) for inside in _folds(found, groups, halved)])
+    steps = torch.stack([_of_others(found, inside)[0] for inside in _folds(found, groups, halved)])
     return ((len(steps) - 1) * (steps - steps.mean(0)).square().mean(0)).sqrt()
 
 
-def _step_of_others(found: Fitted, inside: Tensor) -> Tensor:
-    """[P + A] from the solution of all data to that of the cells outside, by one linear step."""
+def _of_others(found: Fitted, inside: Tensor) -> tuple[Tensor, Tensor]:
+    """(step [P + A] from the solution of all data to that of the cells outside, covariance [P + A, P + A] there)."""
     others = found.white._replace(value=found.white.value[~inside], jacobian=found.white.jacobian[~inside])
-    return step_of(others, found.model)[0]
+    return step_of(others, found.model)[0], torch.linalg.inv(curvature(others, found.model))
 
 
 def as_it_is(found: Fitted) -> Predicted:
     """Residuals of every episode by a model that was not fitted to any of them."""
-    return _told(found, found.white.value)
+    white = found.white.value / found.white.share
+    return _told(found, white, white, torch.zeros_like(white))
 
 
 def of_episodes(p: Predicted, episodes: Sequence[int]) -> Predicted:
@@ -86,11 +103,11 @@ def of_episodes(p: Predicted, episodes: Sequence[int]) -> Predicted:
     return Predicted(*(column[kept] for column in p))
 
 
-def _told(found: Fitted, whitened: Tensor) -> Predicted:
-    cells, white = found.evidence.cells, found.white
+def _told(found: Fitted, likely: Tensor, white: Tensor, scale: Tensor) -> Predicted:
+    cells, episode = found.evidence.cells, found.white.episode
     join = lambda name: torch.cat([getattr(c, name) for c in cells])  # noqa: E731
-    value = torch.cat([_adjusted(found, k, whitened[white.episode == k]) for k in range(len(cells))])
-    return Predicted(value, whitened, join("key"), white.episode, join("window"), join("block") < SEEN)
+    value = torch.cat([_adjusted(found, k, likely[episode == k]) for k in range(len(cells))])
+    return Predicted(value, white, scale, join("key"), episode, join("window"), stretches(cells), join("block") < SEEN)
 
 
 def _folds(found: Fitted, groups: Sequence[str], halved: Collection[str]) -> list[Tensor]:
@@ -121,19 +138,16 @@ def telling(found: Fitted, groups: Sequence[str]) -> set[str]:
     return {sorted(set(groups))[int(share.argmax())]} if float(share.max()) > ALONE else set()
 
 
-def _adjusted(found: Fitted, k: int, white: Tensor) -> Tensor:
+def _adjusted(found: Fitted, k: int, likely: Tensor) -> Tensor:
     """[C_k] residuals less the likeliest nuisances: S K^-1 r, with S the covariance without them."""
-    cells, none = found.evidence.cells[k], torch.zeros(0, dtype=white.dtype)
+    cells, none = found.evidence.cells[k], torch.zeros(0, dtype=likely.dtype)
     slow = found.noise.covariance(cells, cells.jacobian[:, :0], none)
-    return slow @ torch.linalg.solve_triangular(found.white.roots[k].mT, white[:, None], upper=True)[:, 0]
+    return slow @ torch.linalg.solve_triangular(found.white.roots[k].mT, likely[:, None], upper=True)[:, 0]
 
 
 def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) -> Gain:
     """How much better the second predicts; intervals by resampling stretches of time."""
-    blocks = _blocks(first, second)
-    density = np.array([b[:, 0].sum() for b in blocks])
-    squares = np.array([b[:, 1:].sum(0) for b in blocks])  # before^2, after^2, count
-    owner = np.array(_owners(first))
+    owner, density, squares, calm = _blocks(first, second)
     rng = np.random.default_rng(seed)
     drawn = [_draw(owner, rng) for _ in range(DRAWS)]
     sums = np.array([density[d].sum() for d in drawn])
@@ -143,7 +157,9 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     total, share = float(density.sum()), _share(squares.sum(0), floor)
     few = 2.0 if len(set(owner.tolist())) < FEW else 1.0
     left, right = (share + few * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
-    return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, (low, high), share, (left, right))
+    calmly = calm.sum(0)
+    calmly = tuple(float(c / calmly[2]) ** 0.5 for c in calmly[:2])
+    return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, (low, high), share, (left, right), calmly)
 
 
 def _share(squares: np.ndarray, floor: float) -> float:
@@ -151,31 +167,21 @@ def _share(squares: np.ndarray, floor: float) -> float:
     return float((before - after) / max(before - n * floor**2, 1e-12))
 
 
-def _log_t(white: Tensor) -> Tensor:
-    """Of a t-distribution scaled to the Gaussian's curvature, up to a constant: one wild cell decides nothing."""
-    return -0.5 * (FREEDOM + 1) * torch.log1p(white**2 / FREEDOM)
-
-
-def _groups(p: Predicted) -> Tensor:
-    return p.episode * 1000 + p.window // BLOCK
-
-
-def _owners(p: Predicted) -> list[int]:
-    return [int(g) // 1000 for g in _groups(p).unique()]
-
-
-def _blocks(first: Predicted, second: Predicted) -> list[np.ndarray]:
-    """Per stretch [cells, 4]: difference of density, squares before and after (positions only), count."""
+def _blocks(first: Predicted, second: Predicted) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of blocks of time: episode [B], difference of density [B]; before^2, after^2, count of positions [B, 3], calmed."""
     key = lambda p: p.episode * 10**9 + p.key  # noqa: E731
-    other = aligned(
-        key(first), key(second), torch.stack([second.value, second.white, torch.ones_like(second.value)], 1)
-    )
-    both = other[:, 2] > 0
-    gain = torch.where(both, _log_t(other[:, 1]) - _log_t(first.white), 0.0)
-    counted = (both & first.seen).double()
-    rows = torch.stack([gain, counted * first.value**2, counted * other[:, 0] ** 2, counted], 1)
-    group = _groups(first)
-    return [rows[group == g].numpy() for g in group.unique()]
+    other = aligned(key(first), key(second), torch.stack([second.value, second.white, second.scale], 1))
+    both = torch.isin(key(first), key(second))
+    one, (value, white, scale) = Predicted(*(column[both] for column in first)), other[both].unbind(1)
+    stretch = one.stretch.unique(return_inverse=True)[1]
+    density = densities(white, stretch) - densities(one.white, stretch)
+    density = density[stretch] / torch.bincount(stretch)[stretch] + one.scale - scale
+    seen = one.seen.double()
+    squares = torch.stack([seen * one.value**2, seen * value**2, seen], 1)
+    calm = torch.maximum(weights(one.white, stretch), weights(white, stretch))[:, None] * squares
+    block, index = (one.episode * 1000 + one.window // BLOCK).unique(return_inverse=True)
+    sums = lambda rows: torch.zeros(len(block), *rows.shape[1:]).to(rows).index_add(0, index, rows).numpy()  # noqa: E731
+    return (block // 1000).numpy(), sums(density), sums(squares), sums(calm)
 
 
 def _draw(owner: np.ndarray, rng: np.random.Generator) -> np.ndarray:

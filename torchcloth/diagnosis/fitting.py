@@ -10,8 +10,9 @@ from torch import Tensor
 
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..identification.bounds import bounded
+from .bursts import calmed
 from .evidence import Evidence, Progress, Setting, gather, staged
-from .noise import Noise, Whitened, fit_noise, unfitted, whitened
+from .noise import Noise, Whitened, fit_noise, unfitted
 from .world import Hypothesis, Model
 
 IMPOSSIBLE = (InvalidInput, SimulationDiverged, UnstableStep)  # no world has such values, or none that is stable
@@ -65,7 +66,7 @@ def fit(
     for k in range(iterations):
         here = here or gather(model, setting, (), staged(progress, f"fit {k + 1}"), before)
         before = before or here
-        step, ahead = step_of(whitened(here, noise or fit_noise(here)), model, LONGEST)
+        step, ahead = step_of(calmed(here, noise or fit_noise(here)), model, LONGEST)
         if ahead < ENOUGH:
             break
         model, here = model.at(model.point + step), None
@@ -78,22 +79,22 @@ def fit(
 
 def weighed(model: Model, evidence: Evidence, noise: Noise) -> Fitted:
     """A model at a solution, its evidence there weighed by a noise."""
-    white = whitened(evidence, noise)
+    white = calmed(evidence, noise)
     _, ahead = step_of(white, model)
-    return Fitted(model, evidence, noise, white, torch.linalg.inv(_curvature(white, model)), ahead)
+    return Fitted(model, evidence, noise, white, torch.linalg.inv(curvature(white, model)), ahead)
 
 
 def with_cause(found: Fitted, hypothesis: Hypothesis) -> Model:
     """With one more cause, where one step leads: the parameters make room for it."""
     own = found.evidence.own
     columns = [*range(own), own + found.evidence.hypotheses.index(hypothesis)]
-    return _stepped(found.model.plus(hypothesis), whitened(found.evidence, unfitted()), columns)
+    return _stepped(found.model.plus(hypothesis), calmed(found.evidence, unfitted()), columns)
 
 
 def without_cause(found: Fitted, name: str) -> Model:
     """With one cause less, where one step leads: the parameters take over what they can."""
     index = [a.name for a in found.model.accepted].index(name)
-    white, place = whitened(found.evidence, unfitted()), len(found.model.parameters) + index
+    white, place = calmed(found.evidence, unfitted()), len(found.model.parameters) + index
     less = white._replace(value=white.value - found.model.amplitudes[index] * white.jacobian[:, place])
     return _stepped(found.model.without(name), less, [k for k in range(found.evidence.own) if k != place])
 
@@ -105,7 +106,7 @@ def _stepped(model: Model, white: Whitened, columns: Sequence[int]) -> Model:
 
 def renoised(found: Fitted, noise: Noise) -> Fitted:
     """The same with residuals weighed by another noise."""
-    return replace(found, noise=noise, white=whitened(found.evidence, noise))
+    return replace(found, noise=noise, white=calmed(found.evidence, noise))
 
 
 def step_of(white: Whitened, model: Model, longest: float = torch.inf) -> tuple[Tensor, float]:
@@ -120,11 +121,12 @@ def step_of(white: Whitened, model: Model, longest: float = torch.inf) -> tuple[
     uphill = white.jacobian[:, : len(point)].mT @ white.value + precision * point
     low, high = (reached - point for reached in model.ends)
     limit = longest * precision.rsqrt()
-    curvature = _curvature(white, model)
-    step = bounded(curvature, -uphill, torch.maximum(low, -limit), torch.minimum(high, limit))
-    return step, -float(uphill @ step + 0.5 * step @ curvature @ step)
+    square = curvature(white, model)
+    step = bounded(square, -uphill, torch.maximum(low, -limit), torch.minimum(high, limit))
+    return step, -float(uphill @ step + 0.5 * step @ square @ step)
 
 
-def _curvature(white: Whitened, model: Model) -> Tensor:
+def curvature(white: Whitened, model: Model) -> Tensor:
+    """[P + A, P + A] inverse covariance of the model's coordinates."""
     own = white.jacobian[:, : len(model.point)]
     return own.mT @ own + torch.diag(prior_precision(model))

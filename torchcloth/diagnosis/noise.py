@@ -53,6 +53,7 @@ class Whitened(NamedTuple):
     episode: Tensor  # [C] int64
     log_determinant: Tensor  # [E], of each covariance
     roots: list[Tensor]  # Cholesky factors
+    share: Tensor  # [C] by which rows were multiplied beyond that
 
 
 def whitened(evidence: Evidence, noise: Noise) -> Whitened:
@@ -68,7 +69,8 @@ def whitened(evidence: Evidence, noise: Noise) -> Whitened:
         index.append(torch.full((len(cells.value),), k))
         logs.append(2 * root.diagonal().log().sum())
         roots.append(root)
-    return Whitened(torch.cat(values), torch.cat(slopes), torch.cat(index), torch.stack(logs), roots)
+    value = torch.cat(values)
+    return Whitened(value, torch.cat(slopes), torch.cat(index), torch.stack(logs), roots, torch.ones_like(value))
 
 
 def fit_noise(evidence: Evidence, sweeps: int = 2) -> Noise:

@@ -118,7 +118,7 @@ def _numerics(found: Fitted) -> Tensor:
         torch.linalg.solve_triangular(root, NUMERICS * n[:, None], upper=False)[:, 0]
         for root, n in zip(found.white.roots, found.evidence.numerics, strict=True)
     ]
-    return torch.cat(parts)
+    return found.white.share * torch.cat(parts)
 
 
 def _sizes(found: Fitted) -> Tensor:

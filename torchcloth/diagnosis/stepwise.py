@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from .approach import approach
 from .branches import unstable, without
-from .comparison import Gain, Predicted, compare, predict, telling
+from .comparison import Gain, Predicted, compare, predict, spread, telling
 from .evidence import Progress, Setting, staged
 from .fitting import IMPOSSIBLE, Fitted, fit, renoised, with_cause, without_cause
 from .lacking import explained, lack_of_fit
@@ -25,6 +25,7 @@ PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation i
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
 MUCH = 25.0  # chi^2, of a cause that is worth fitting
 MOSTLY = 1 / 3  # of what is wrong, that causes must explain beside something unknown
+SURE = 2.57  # standard errors between motions, from which they agree that there is something (t, six motions)
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 
 
@@ -180,7 +181,7 @@ def _step(
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
     noise = fit_noise(first.fitted.evidence)
     tried = _compared(current, fits, setting.names, noise)
-    useful = [c for c in tried if _useful(c)]
+    useful = [c for c in tried if _useful(c, setting.names)]
     if not useful:
         return None
     best = max(useful, key=lambda c: c.gain.density)
@@ -217,13 +218,15 @@ def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str],
     return out
 
 
-def _useful(c: Candidate) -> bool:
+def _useful(c: Candidate, names: Sequence[str]) -> bool:
     amplitude, h = abs(c.fitted.model.amplitudes[-1]), c.hypothesis
-    return _worthwhile(c.gain) and MATTERS * abs(h.smallest) < amplitude < PLAUSIBLE * abs(h.typical)
+    known = amplitude > SURE * float(spread(c.fitted, names, c.alone)[-1])
+    return known and _worthwhile(c.gain) and MATTERS * abs(h.smallest) < amplitude < PLAUSIBLE * abs(h.typical)
 
 
 def _worthwhile(gain: Gain) -> bool:
-    worth = gain.before - gain.after > WORTH_MM or gain.explained > WORTH_SHARE
+    before, after = gain.calm
+    worth = before - after > WORTH_MM or 1 - (after / before) ** 2 > WORTH_SHARE
     return worth and gain.ci95[0] > 0
 
 
