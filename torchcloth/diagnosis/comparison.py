@@ -36,7 +36,12 @@ class Predicted(NamedTuple):
     episode: Tensor  # [C]
     window: Tensor  # [C]
     stretch: Tensor  # [C] of time, whose cells err together
-    seen: Tensor  # [C] bool, a position and not a force
+    kind: Tensor  # [C] of data, by number
+
+    @property
+    def seen(self) -> Tensor:
+        """[C] bool, a position and not a force."""
+        return self.kind < SEEN
 
 
 class Gain(NamedTuple):
@@ -49,6 +54,7 @@ class Gain(NamedTuple):
     explained: float  # share of before^2 - floor^2
     explained_ci95: tuple[float, float]
     calm: tuple[float, float]  # m RMS before and after, where stretches that neither describes count for less
+    pull: tuple[float, float]  # N, the same of forces; zero without
 
 
 def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> Predicted:
@@ -107,7 +113,7 @@ def _told(found: Fitted, likely: Tensor, white: Tensor, scale: Tensor) -> Predic
     cells, episode = found.evidence.cells, found.white.episode
     join = lambda name: torch.cat([getattr(c, name) for c in cells])  # noqa: E731
     value = torch.cat([_adjusted(found, k, likely[episode == k]) for k in range(len(cells))])
-    return Predicted(value, white, scale, join("key"), episode, join("window"), stretches(cells), join("block") < SEEN)
+    return Predicted(value, white, scale, join("key"), episode, join("window"), stretches(cells), join("block"))
 
 
 def _folds(found: Fitted, groups: Sequence[str], halved: Collection[str]) -> list[Tensor]:
@@ -147,7 +153,7 @@ def _adjusted(found: Fitted, k: int, likely: Tensor) -> Tensor:
 
 def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) -> Gain:
     """How much better the second predicts; intervals by resampling stretches of time."""
-    owner, density, squares, calm = _blocks(first, second)
+    owner, density, squares = _blocks(first, second)
     rng = np.random.default_rng(seed)
     drawn = [_draw(owner, rng) for _ in range(DRAWS)]
     sums = np.array([density[d].sum() for d in drawn])
@@ -157,9 +163,8 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     total, share = float(density.sum()), _share(squares.sum(0), floor)
     few = 2.0 if len(set(owner.tolist())) < FEW else 1.0
     left, right = (share + few * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
-    calmly = calm.sum(0)
-    calmly = tuple(float(c / calmly[2]) ** 0.5 for c in calmly[:2])
-    return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, (low, high), share, (left, right), calmly)
+    calm, pull = (_calm(first, second, kind) for kind in (range(SEEN), (SEEN,)))
+    return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, (low, high), share, (left, right), calm, pull)
 
 
 def _share(squares: np.ndarray, floor: float) -> float:
@@ -167,21 +172,35 @@ def _share(squares: np.ndarray, floor: float) -> float:
     return float((before - after) / max(before - n * floor**2, 1e-12))
 
 
-def _blocks(first: Predicted, second: Predicted) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of blocks of time: episode [B], difference of density [B]; before^2, after^2, count of positions [B, 3], calmed."""
+def _both(first: Predicted, second: Predicted) -> tuple[Predicted, Predicted]:
+    """Cells that both have, in one order, their stretches numbered alike."""
     key = lambda p: p.episode * 10**9 + p.key  # noqa: E731
-    other = aligned(key(first), key(second), torch.stack([second.value, second.white, second.scale], 1))
-    both = torch.isin(key(first), key(second))
-    one, (value, white, scale) = Predicted(*(column[both] for column in first)), other[both].unbind(1)
-    stretch = one.stretch.unique(return_inverse=True)[1]
-    density = densities(white, stretch) - densities(one.white, stretch)
-    density = density[stretch] / torch.bincount(stretch)[stretch] + one.scale - scale
+    shared = torch.isin(key(first), key(second))
+    one = Predicted(*(column[shared] for column in first))
+    one = one._replace(stretch=one.stretch.unique(return_inverse=True)[1])
+    other = aligned(key(one), key(second), torch.stack([second.value, second.white, second.scale], 1)).unbind(1)
+    return one, one._replace(value=other[0], white=other[1], scale=other[2])
+
+
+def _blocks(first: Predicted, second: Predicted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of blocks: episode [B], difference of density [B]; squares before, after and count of positions [B, 3]."""
+    one, two = _both(first, second)
+    density = densities(two.white, one.stretch) - densities(one.white, one.stretch)
+    density = density[one.stretch] / torch.bincount(one.stretch)[one.stretch] + one.scale - two.scale
     seen = one.seen.double()
-    squares = torch.stack([seen * one.value**2, seen * value**2, seen], 1)
-    calm = torch.maximum(weights(one.white, stretch), weights(white, stretch))[:, None] * squares
+    squares = torch.stack([seen * one.value**2, seen * two.value**2, seen], 1)
     block, index = (one.episode * 1000 + one.window // BLOCK).unique(return_inverse=True)
     sums = lambda rows: torch.zeros(len(block), *rows.shape[1:]).to(rows).index_add(0, index, rows).numpy()  # noqa: E731
-    return (block // 1000).numpy(), sums(density), sums(squares), sums(calm)
+    return (block // 1000).numpy(), sums(density), sums(squares)
+
+
+def _calm(first: Predicted, second: Predicted, kinds: Sequence[int]) -> tuple[float, float]:
+    """RMS before and after of kinds of data, where stretches that neither describes count for less."""
+    one, two = _both(first, second)
+    share = torch.maximum(*(weights(p.white, p.stretch) for p in (one, two)))
+    share = share * torch.isin(one.kind, torch.tensor(list(kinds)))
+    rms = lambda p: float((share * p.value**2).sum() / share.sum().clamp(min=1e-12)) ** 0.5  # noqa: E731
+    return rms(one), rms(two)
 
 
 def _draw(owner: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -87,7 +87,7 @@ def weighed(model: Model, evidence: Evidence, noise: Noise) -> Fitted:
 def with_cause(found: Fitted, hypothesis: Hypothesis) -> Model:
     """With one more cause, where one step leads: the parameters make room for it."""
     own = found.evidence.own
-    columns = [*range(own), own + found.evidence.hypotheses.index(hypothesis)]
+    columns = [*range(own), own + [h.name for h in found.evidence.hypotheses].index(hypothesis.name)]
     return _stepped(found.model.plus(hypothesis), calmed(found.evidence, unfitted()), columns)
 
 

@@ -23,6 +23,7 @@ from .world import Hypothesis
 Decision = Literal["present", "absent", "inconclusive", "unresolvable"]
 PRESENT = 2.5  # standard errors above the smallest amplitude of interest
 LEAST = 3e-4  # m or the same share of a cell's other units: a typical amplitude that moves less cannot be seen
+LEAST_PULL = 1e-2  # N, the same of forces
 POWER = 1.64 + 0.84  # standard errors: found in 80 % of cases at 5 %
 NUMERICS = 1 / 3  # of the difference between two meshes is left on the finer one (second order)
 
@@ -36,6 +37,7 @@ class Row(NamedTuple):
     bias: float  # that numerics alone would ask for
     gain: float  # chi^2
     size: float  # m, RMS by which a typical amplitude moves points beyond what is fitted anyway
+    pull: float  # N, the same of forces
     decision: Decision
 
     @property
@@ -56,7 +58,12 @@ class Row(NamedTuple):
     @property
     def shows(self) -> bool:
         """What is asked for would show, even where a typical amplitude would not."""
-        return self.size * self.forward > LEAST * abs(self.hypothesis.typical)
+        return self.sight * self.forward > abs(self.hypothesis.typical)
+
+    @property
+    def sight(self) -> float:
+        """A typical amplitude's effect on points or forces, over the least that shows."""
+        return max(self.size / LEAST, self.pull / LEAST_PULL)
 
     @property
     def forward(self) -> float:
@@ -71,16 +78,17 @@ def screen(found: Fitted) -> list[Row]:
     projected = projection(found)
     asked = projected(found.white.jacobian[:, own:])
     value, numerics = projected(found.white.value), projected(_numerics(found))
-    sizes = _sizes(found)
+    sizes, pulls = _sizes(found, 0, SEEN), _sizes(found, SEEN, SEEN + 1)
     rows = []
     for j, h in enumerate(found.evidence.hypotheses):
         information = float(asked[:, j] @ asked[:, j])
         if information < 1e-12 / h.typical**2:
-            rows.append(Row(h, 0.0, float("inf"), 0.0, 0.0, 0.0, "unresolvable"))
+            rows.append(Row(h, 0.0, float("inf"), 0.0, 0.0, 0.0, 0.0, "unresolvable"))
             continue
         amplitude = -float(asked[:, j] @ value) / information
         bias = -float(asked[:, j] @ numerics) / information
-        row = Row(h, amplitude, information**-0.5, bias, amplitude**2 * information, float(sizes[j]), "absent")
+        seen = (float(sizes[j]), float(pulls[j]))
+        row = Row(h, amplitude, information**-0.5, bias, amplitude**2 * information, *seen, "absent")
         rows.append(row._replace(decision=_decided(row)))
     return sorted(rows, key=lambda row: -row.gain)
 
@@ -104,7 +112,7 @@ def projection(found: Fitted):
 
 
 def _decided(row: Row) -> Decision:
-    if row.size < LEAST or row.detectable > 1.0 * abs(row.hypothesis.typical) + abs(row.hypothesis.smallest):
+    if row.sight < 1.0 or row.detectable > 1.0 * abs(row.hypothesis.typical) + abs(row.hypothesis.smallest):
         return "unresolvable"
     if row.excess > PRESENT:
         return "present"
@@ -121,15 +129,17 @@ def _numerics(found: Fitted) -> Tensor:
     return found.white.share * torch.cat(parts)
 
 
-def _sizes(found: Fitted) -> Tensor:
-    """[hypotheses] m, RMS over cells of points, edges and markers."""
+def _sizes(found: Fitted, first: int, end: int) -> Tensor:
+    """[hypotheses] RMS over cells of kinds from ``first`` to before ``end``; zero without any."""
     own, count = found.evidence.own, len(found.evidence.hypotheses)
     typical = torch.tensor([h.typical for h in found.evidence.hypotheses], dtype=torch.float64)
     moved = []
     for cells in found.evidence.cells:
-        seen = cells.block < SEEN
-        moved.append(cells.jacobian[seen, : own + count])
+        kind = (cells.block >= first) & (cells.block < end)
+        moved.append(cells.jacobian[kind, : own + count])
     stacked = torch.cat(moved)
+    if not len(stacked):
+        return typical.new_zeros(count)
     fitted = torch.linalg.lstsq(stacked[:, :own], stacked[:, own:]).solution
     left = stacked[:, own:] - stacked[:, :own] @ fitted
     return (left * typical).square().mean(0).sqrt()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
+from .afresh import afresh
 from .approach import approach
 from .branches import unstable, without
 from .comparison import Gain, Predicted, compare, predict, spread, telling
@@ -20,13 +21,15 @@ from .world import Hypothesis, Model
 MOST = 4  # causes
 TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 2  # steps of the likelier ones among them
+FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
-MUCH = 25.0  # chi^2, of a cause that is worth fitting
+MUCH = 15.0  # chi^2, of a cause that is worth fitting
 MOSTLY = 1 / 3  # of what is wrong, that causes must explain beside something unknown
 SURE = 2.57  # standard errors between motions, from which they agree that there is something (t, six motions)
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
+WORTH_PULL = 3e-3  # N, the same where it shows in forces
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +89,14 @@ def search(
     jumping = unstable(start, setting, staged(progress, "folds that turn over"))
     if any(map(len, jumping)):
         setting, start = replace(setting, unstable=jumping), without(start, jumping)
-    return extend(start, setting, hypotheses, progress)
+    current, steps = _chain(start, setting, hypotheses, progress, TRIED)
+    if not steps and any(row.lacking for row in lack_of_fit(start, setting.names)):
+        screened = screen(start)
+        rows = {row.hypothesis.name: row for row in screened}
+        begun = [(rows[h.name], model) for h, model in afresh(start, setting, hypotheses, TRIED, progress)]
+        if first := _step(start, setting, begun, screened, progress):
+            current, steps = _chain(start, setting, hypotheses, progress, TRIED, first)
+    return _found(start, current, steps, setting)
 
 
 def extend(
@@ -97,27 +107,45 @@ def extend(
     tried: int = TRIED,
 ) -> Found:
     """As ``search``, from a fit that was asked about the hypotheses; each step fits the ``tried`` likeliest anew."""
-    current = start
-    steps: list[Step] = []
-    while True:
-        screened = screen(current)
-        likely = _likely(screened)
-        if not likely or len(steps) == MOST:
-            break
-        step = _step(current, setting, likely[:tried], screened, progress)
+    current, steps = _chain(start, setting, hypotheses, progress, tried)
+    return _found(start, current, steps, setting)
+
+
+def _chain(
+    start: Fitted,
+    setting: Setting,
+    hypotheses: Sequence[Hypothesis],
+    progress: Progress,
+    tried: int,
+    first: Step | None = None,
+) -> tuple[Fitted, list[Step]]:
+    """(the model with all causes, the steps that led to it), after ``first`` if that is known."""
+    current, steps, step = start, [], first
+    while len(steps) < MOST:
+        if step is None:
+            screened = screen(current)
+            begun = [(row, with_cause(current, row.hypothesis)) for row in _likely(screened)[:tried]]
+            step = _step(current, setting, begun, screened, progress)
         if step is None:
             break
+        best = step.best.fitted
         steps.append(step)
-        left = [h for h in hypotheses if h.name not in {a.name for a in step.best.fitted.model.accepted}]
+        left = [h for h in hypotheses if h.name not in {a.name for a in best.model.accepted}]
         now = staged(progress, f"with {step.best.hypothesis.name}")
+        step = None
         try:
-            best = step.best.fitted
             current = fit(best.model, setting, left, FURTHER, now, before=start.evidence, here=best.evidence)
         except IMPOSSIBLE:  # a step too far; what was found before stands
-            current = fit(step.best.fitted.model, setting, left, 0, now, before=start.evidence)
+            current = fit(best.model, setting, left, 0, now, before=start.evidence)
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
-    if steps and _beside_the_point(start, current, setting.names):
-        current, steps = start, []
+    if steps and current.ahead > FAR:
+        left = [h for h in hypotheses if h.name not in {a.name for a in current.model.accepted}]
+        with suppress(*IMPOSSIBLE):  # what was found before stands
+            current = fit(current.model, setting, left, progress=staged(progress, "all"), before=current.evidence)
+    return (start, []) if steps and _beside_the_point(start, current, setting.names) else (current, steps)
+
+
+def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> Found:
     screened = screen(current)
     alone = {name for step in steps for name in step.best.alone}
     last, sensor = predict(current, setting.names, alone), floor_of(current.evidence, current.noise)
@@ -141,14 +169,17 @@ def _likely(screened: Sequence[Row]) -> list[Row]:
 def _pruned(
     current: Fitted, steps: list[Step], setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
 ) -> tuple[Fitted, list[Step]]:
-    """Less the causes that the later ones have made needless; the last one has just been tried."""
-    for step in steps[:-1]:
-        name = step.best.hypothesis.name
+    """Less the causes that the others have made needless, or so small that they do not matter."""
+    for step in steps:
+        name, last = step.best.hypothesis.name, step is steps[-1]
+        known = _known(current, name, setting.names, step.best.alone)
+        if known and last:  # it has just been tried
+            continue
         less = without_cause(current, name)
         less = fit(less, setting, (), 0, staged(progress, f"without {name}"), current.noise, current.evidence)
         alone = step.best.alone
         gain = compare(predict(less, setting.names, alone), predict(current, setting.names, alone), 0.0)
-        if _worthwhile(gain):
+        if known and _worthwhile(gain):
             continue
         steps = [s for s in steps if s is not step]
         left = [h for h in hypotheses if h.name not in {a.name for a in less.model.accepted}]
@@ -163,16 +194,17 @@ def _beside_the_point(start: Fitted, end: Fitted, names: Sequence[str]) -> bool:
 
 
 def _step(
-    current: Fitted, setting: Setting, likely: Sequence[Row], screened: list[Row], progress: Progress
+    current: Fitted,
+    setting: Setting,
+    begun: Sequence[tuple[Row, Model]],
+    screened: list[Row],
+    progress: Progress,
 ) -> Step | None:
     fits: list[tuple[Row, Fitted]] = []
-    for row in likely:
+    for row, model in begun:
         trial = staged(progress, f"trying {row.hypothesis.name}")
-        try:
-            begun = with_cause(current, row.hypothesis)
-            fits.append((row, fit(begun, setting, (), 0, trial, unfitted(), current.evidence)))
-        except IMPOSSIBLE:
-            continue
+        with suppress(*IMPOSSIBLE):
+            fits.append((row, fit(model, setting, (), 0, trial, unfitted(), current.evidence)))
     if not fits:
         return None
     fits = _settled(_compared(current, fits, setting.names, current.noise), setting, progress)
@@ -219,15 +251,21 @@ def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str],
 
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:
-    amplitude, h = abs(c.fitted.model.amplitudes[-1]), c.hypothesis
-    known = amplitude > SURE * float(spread(c.fitted, names, c.alone)[-1])
-    return known and _worthwhile(c.gain) and MATTERS * abs(h.smallest) < amplitude < PLAUSIBLE * abs(h.typical)
+    return _worthwhile(c.gain) and _known(c.fitted, c.hypothesis.name, names, c.alone)
+
+
+def _known(found: Fitted, name: str, names: Sequence[str], alone: set[str]) -> bool:
+    """Of a size that matters and makes sense, and that motions agree about so far that there is something."""
+    place = [h.name for h in found.model.accepted].index(name)
+    h, amplitude = found.model.accepted[place], abs(found.model.amplitudes[place])
+    std = float(spread(found, names, alone)[len(found.model.parameters) + place])
+    return amplitude > SURE * std and MATTERS * abs(h.smallest) < amplitude < PLAUSIBLE * abs(h.typical)
 
 
 def _worthwhile(gain: Gain) -> bool:
-    before, after = gain.calm
-    worth = before - after > WORTH_MM or 1 - (after / before) ** 2 > WORTH_SHARE
-    return worth and gain.ci95[0] > 0
+    (before, after), (pulled, pulls) = gain.calm, gain.pull
+    seen = before - after > WORTH_MM or 1 - (after / before) ** 2 > WORTH_SHARE
+    return (seen or pulled - pulls > WORTH_PULL) and gain.ci95[0] > 0
 
 
 def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:

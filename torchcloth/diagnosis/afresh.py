@@ -1,0 +1,49 @@
+"""Causes tried from the data sheet, where the fitted model leads to none.
+
+A large effect bends the numbers that are fitted without it, until slopes there point away from it. The data sheet does
+not know of the effect, and is often nearer. What pulls and what pushes need not be alike, so signed causes are asked
+about both ways.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from .bursts import calmed
+from .evidence import Progress, Setting, staged
+from .fitting import LONGEST, Fitted, fit, step_of, with_cause
+from .noise import unfitted
+from .world import Hypothesis, Model
+
+
+def afresh(
+    start: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], tried: int, progress: Progress = lambda _: None
+) -> list[tuple[Hypothesis, Model]]:
+    """The ``tried`` causes that promise most, each with the model to which one joint step from the data sheet leads."""
+    sheet = start.model.at(torch.zeros_like(start.model.point))
+    away = [replace(h, typical=-h.typical) for h in hypotheses if h.signed]
+    ways = [
+        fit(sheet, setting, asked, 0, staged(progress, f"from the data sheet, {way}"), before=start.evidence)
+        for way, asked in (("causes", hypotheses), ("causes the other way", away))
+        if asked
+    ]
+    promised = sorted((pair for found in ways for pair in _promises(found)), key=lambda pair: -pair[0])
+    likely: dict[str, Fitted] = {}
+    for _, name, found in promised:
+        likely.setdefault(name, found)
+    named = {h.name: h for h in hypotheses}
+    return [(named[name], with_cause(found, named[name])) for name, found in list(likely.items())[:tried]]
+
+
+def _promises(found: Fitted) -> list[tuple[float, str, Fitted]]:
+    """(log density that one joint step with a cause should gain, its name, the fit), where the step goes its way."""
+    white, own, out = calmed(found.evidence, unfitted()), found.evidence.own, []
+    for j, h in enumerate(found.evidence.hypotheses):
+        columns = white._replace(jacobian=white.jacobian[:, [*range(own), own + j]])
+        step, gained = step_of(columns, found.model.plus(h), LONGEST)
+        if float(step[-1]) * h.typical > 0:
+            out.append((gained, h.name, found))
+    return out
