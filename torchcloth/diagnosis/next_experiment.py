@@ -89,7 +89,7 @@ def propose(found: Found, causes: Sequence[dict[str, Any]], setting: Setting, pr
 
 def question_of(found: Found, causes: Sequence[dict[str, Any]]) -> Question | None:
     """What a search leaves open: causes that have rivals, else causes that are not decided."""
-    for step, cause in zip(found.steps, causes, strict=False):
+    for step, cause in zip(found.causes, causes, strict=True):
         known = {h.name for h in step.before.evidence.hypotheses}
         amplitudes = {step.best.hypothesis.name: cause["amplitude"]}
         amplitudes |= {r["effect"]: r["amplitude"] for r in cause["rivals"] if r["effect"] in known}

@@ -22,11 +22,12 @@ MOST = 4  # causes
 TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 2  # steps of the likelier ones among them
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
+HARDLY = 0.03  # of what the better of two models explains, below which they explain as much
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
 MUCH = 15.0  # chi^2, of a cause that is worth fitting
-MOSTLY = 1 / 3  # of what is wrong, that causes must explain beside something unknown
+MOSTLY, HALF = 1 / 3, 1 / 2  # of what is wrong: least that all causes, or a further one, explain beside something else
 SURE = 2.57  # standard errors between motions, from which they agree that there is something (t, six motions)
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 WORTH_PULL = 3e-3  # N, the same where it shows in forces
@@ -72,6 +73,16 @@ class Found:
     sensor: float  # m, of a cell: noise and slow errors
     repeats: Repeats | None  # None: no episode repeats another
     setting: Setting  # without the cells that jump between shapes
+
+    @property
+    def causes(self) -> list[Step]:
+        """Those that are large enough to matter; the others are part of the model, so that nothing stands in for them."""
+        return [s for s in self.steps if abs(self.amplitude(s)) > MATTERS * abs(s.best.hypothesis.smallest)]
+
+    def amplitude(self, step: Step) -> float:
+        """Of a step's cause in the end."""
+        names = [h.name for h in self.end.model.accepted]
+        return self.end.model.amplitudes[names.index(step.best.hypothesis.name)]
 
     @property
     def left_out(self) -> float:
@@ -128,21 +139,23 @@ def _chain(
             step = _step(current, setting, begun, screened, progress)
         if step is None:
             break
-        best = step.best.fitted
-        steps.append(step)
+        best, before = step.best.fitted, current
         left = [h for h in hypotheses if h.name not in {a.name for a in best.model.accepted}]
         now = staged(progress, f"with {step.best.hypothesis.name}")
-        step = None
         try:
             current = fit(best.model, setting, left, FURTHER, now, before=start.evidence, here=best.evidence)
         except IMPOSSIBLE:  # a step too far; what was found before stands
             current = fit(best.model, setting, left, 0, now, before=start.evidence)
+        if steps and _beside_the_point(before, current, setting.names, HALF):
+            current = before
+            break
+        steps, step = [*steps, step], None
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     if steps and current.ahead > FAR:
         left = [h for h in hypotheses if h.name not in {a.name for a in current.model.accepted}]
         with suppress(*IMPOSSIBLE):  # what was found before stands
             current = fit(current.model, setting, left, progress=staged(progress, "all"), before=current.evidence)
-    return (start, []) if steps and _beside_the_point(start, current, setting.names) else (current, steps)
+    return (start, []) if steps and _beside_the_point(start, current, setting.names, MOSTLY) else (current, steps)
 
 
 def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> Found:
@@ -169,7 +182,7 @@ def _likely(screened: Sequence[Row]) -> list[Row]:
 def _pruned(
     current: Fitted, steps: list[Step], setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
 ) -> tuple[Fitted, list[Step]]:
-    """Less the causes that the others have made needless, or so small that they do not matter."""
+    """Less the causes that the others have made needless."""
     for step in steps:
         name, last = step.best.hypothesis.name, step is steps[-1]
         known = _known(current, name, setting.names, step.best.alone)
@@ -187,10 +200,10 @@ def _pruned(
     return current, steps
 
 
-def _beside_the_point(start: Fitted, end: Fitted, names: Sequence[str]) -> bool:
-    """Most of what is wrong is still there: whatever makes it may well do what passed for the causes, too."""
+def _beside_the_point(start: Fitted, end: Fitted, names: Sequence[str], share: float) -> bool:
+    """More of what is wrong is still there: whatever makes it may well do what passed for the causes, too."""
     left = lack_of_fit(end, names)
-    return any(row.lacking for row in left) and explained(lack_of_fit(start, names), left) < MOSTLY
+    return any(row.lacking for row in left) and explained(lack_of_fit(start, names), left) < share
 
 
 def _step(
@@ -255,11 +268,11 @@ def _useful(c: Candidate, names: Sequence[str]) -> bool:
 
 
 def _known(found: Fitted, name: str, names: Sequence[str], alone: set[str]) -> bool:
-    """Of a size that matters and makes sense, and that motions agree about so far that there is something."""
+    """Of a size that makes sense, and that motions agree about so far that there is something."""
     place = [h.name for h in found.model.accepted].index(name)
     h, amplitude = found.model.accepted[place], abs(found.model.amplitudes[place])
     std = float(spread(found, names, alone)[len(found.model.parameters) + place])
-    return amplitude > SURE * std and MATTERS * abs(h.smallest) < amplitude < PLAUSIBLE * abs(h.typical)
+    return SURE * std < amplitude < PLAUSIBLE * abs(h.typical)
 
 
 def _worthwhile(gain: Gain) -> bool:
@@ -269,8 +282,9 @@ def _worthwhile(gain: Gain) -> bool:
 
 
 def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
-    """Predicts about as well: the paired difference is not clear."""
+    """Predicts about as well: the paired difference is not clear, or no more than what two engines may differ by."""
     if c.hypothesis.effect == best.hypothesis.effect:
         return False
-    over = compare(predicted, best.predicted, 0.0)
-    return over.density < CLEAR or over.ci95[0] < 0
+    over, (before, after) = compare(predicted, best.predicted, 0.0), best.gain.calm
+    more = over.calm[0] ** 2 - over.calm[1] ** 2
+    return over.density < CLEAR or over.ci95[0] < 0 or more < HARDLY * (before**2 - after**2)

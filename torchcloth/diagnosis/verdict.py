@@ -66,8 +66,10 @@ class Diagnosis:
 
 def judge(found: Found, names: Sequence[str]) -> Diagnosis:
     """The answer of a search over episodes with these motions."""
-    causes = [_cause(found, step, names) for step in found.steps]
-    told = {name for c in causes for name in (*c["class"], *(r["effect"] for r in c["rivals"]))}
+    causes = [_cause(found, step, names) for step in found.causes]
+    minor = [step for step in found.steps if step not in found.causes]
+    told = {step.best.hypothesis.name for step in minor}
+    told |= {name for c in causes for name in (*c["class"], *(r["effect"] for r in c["rivals"]))}
     rows = [r for r in found.screened if r.hypothesis.name not in told]
     left = lack_of_fit(found.end, names)
     lacking = any(row.lacking for row in left)
@@ -75,6 +77,10 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
     content = {
         "verdict": verdict,
         "causes": causes,
+        "minor": [
+            {"effect": s.best.hypothesis.name, "amplitude": found.amplitude(s), "unit": s.best.hypothesis.unit}
+            for s in minor
+        ],
         "ruled_out": [r.hypothesis.name for r in rows if r.decision == "absent"],
         "undecided": [r.hypothesis.name for r in rows if r.decision in ("inconclusive", "present")],
         "unresolvable": [
@@ -82,7 +88,7 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
             for r in rows
             if r.decision == "unresolvable"
         ],
-        "gain": _gain(found),
+        "gain": _gain(found) if causes else None,
         "also_unexplained": bool(causes) and lacking,
         "floor": _floor(found),
         "lack_of_fit": [row.as_dict() for row in left],
@@ -99,7 +105,7 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
 def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
     """The answer where episodes cannot be believed: what is wrong with them."""
     lists: dict[str, Any] = {
-        key: [] for key in ("causes", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "warnings")
+        key: [] for key in ("causes", "minor", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "warnings")
     }
     none = dict.fromkeys(("gain", "missing_force", "residual", "next_experiment", "model"))
     said = [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults]
@@ -120,8 +126,7 @@ def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left
 
 def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     best, place = step.best, found.steps.index(step)
-    h, count = best.hypothesis, len(found.end.model.parameters)
-    amplitude = found.end.model.amplitudes[place]
+    h, count, amplitude = best.hypothesis, len(found.end.model.parameters), found.amplitude(step)
     noise = float(found.end.covariance[count + place, count + place])
     motions = float(spread(found.end, names, best.alone)[count + place])
     std = (max(noise, motions**2) + best.row.bias**2) ** 0.5
@@ -248,6 +253,9 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
     ):
         if content[key]:
             out.append(f"{label}: {', '.join(content[key])}.")
+    if content["minor"]:
+        told = ", ".join(f"{m['effect']} = {m['amplitude']:.4g} {m['unit']}" for m in content["minor"])
+        out.append(f"In the model, but too small to matter: {told}.")
     if content["unresolvable"]:
         out.append(f"Cannot be seen in these data: {', '.join(r['effect'] for r in content['unresolvable'])}.")
     if content["next_experiment"]:
