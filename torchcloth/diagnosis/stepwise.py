@@ -76,7 +76,7 @@ class Found:
 
     @property
     def causes(self) -> list[Step]:
-        """Those that are large enough to matter; the others are part of the model, so that nothing stands in for them."""
+        """Those that are large enough to matter; the others stay in the model, so that nothing stands in for them."""
         return [s for s in self.steps if abs(self.amplitude(s)) > MATTERS * abs(s.best.hypothesis.smallest)]
 
     def amplitude(self, step: Step) -> float:
