@@ -1,0 +1,75 @@
+"""Stretches of time that go another way: weights against the formula, and what they are for."""
+
+import linear_toys as toys
+import pytest
+import torch
+
+from torchcloth.diagnosis.bursts import FREEDOM, calmed, densities, stretches, weights
+from torchcloth.diagnosis.comparison import compare, predict
+from torchcloth.diagnosis.fitting import step_of
+from torchcloth.diagnosis.noise import Noise, whitened
+
+SLOPES = toys.smooth(1, 4)  # three parameters, one nuisance
+TRUTH = torch.tensor([0.2, -0.3, 0.7]).double()
+LEVEL = Noise(torch.full((5,), toys.SLOW).double())
+
+
+def drawn(seed, flipped=0.0, truth=TRUTH):
+    """Evidence in which the cloth of one episode lies ``flipped`` metres off for two of its six windows."""
+    ev = toys.evidence(SLOPES, 3, [], truth, seed)
+    first = ev.cells[0]
+    away = flipped * ((first.window == 2) | (first.window == 3)).double()
+    return ev.__class__([first._replace(value=first.value + away), *ev.cells[1:]], 3, [], ev.stds, ev.numerics)
+
+
+def test_a_stretch_that_fits_counts_in_full_and_another_by_the_formula():
+    stretch = torch.tensor([0, 0, 0, 0, 1, 1])
+    value = torch.tensor([0.5, -0.5, 1.0, 0.1, 10.0, 20.0]).double()
+    assert weights(value, stretch).tolist() == pytest.approx([1.0] * 4 + [(FREEDOM + 2) / (FREEDOM + 500)] * 2)
+
+
+def test_the_weights_are_the_slope_of_the_density():
+    """d log p / d r = -w r where the weight is below one: least squares with these weights maximises it."""
+    stretch, value = torch.tensor([0, 0, 0]), torch.tensor([4.0, -6.0, 3.0]).double().requires_grad_()
+    (slope,) = torch.autograd.grad(densities(value, stretch).sum(), value)
+    assert torch.allclose(slope, -weights(value.detach(), stretch) * value.detach(), rtol=1e-12)
+
+
+def test_kinds_windows_and_episodes_are_stretches_of_their_own():
+    ev = drawn(0)
+    two = torch.cat([torch.zeros(48), torch.ones(48)]).long()
+    cells = [ev.cells[0]._replace(block=two), ev.cells[1]]
+    assert len(stretches(cells).unique()) == 2 * toys.WINDOWS + toys.WINDOWS
+
+
+def test_cloth_that_folds_over_for_a_while_moves_no_parameter():
+    """In 20 draws 30 mm in two windows of 24 bend least squares by many of its errors, and weighted ones by none."""
+    plain, calm = [], []
+    for seed in range(20):
+        ev = drawn(seed, 0.03)
+        model = toys.fitted(ev).model
+        for white, out in ((whitened(ev, LEVEL), plain), (calmed(ev, LEVEL), calm)):
+            step, _ = step_of(white, model)
+            own = white.jacobian[:, :3]
+            error = torch.linalg.inv(own.mT @ own + 4 * torch.eye(3).double()).diagonal().sqrt()
+            out.append((step - TRUTH) / error)
+    assert float(torch.stack(plain).square().mean().sqrt()) > 3.0
+    assert float(torch.stack(calm).square().mean().sqrt()) < 1.5
+
+
+def test_where_all_fits_nothing_changes():
+    ev = drawn(3, truth=torch.zeros(3).double())
+    quiet = ev.__class__([c._replace(value=0.5 * c.value) for c in ev.cells], 3, [], ev.stds, ev.numerics)
+    assert torch.equal(calmed(quiet, LEVEL).value, whitened(quiet, LEVEL).value)
+
+
+def test_a_number_that_the_others_leave_open_is_no_failure_of_the_prediction():
+    """Only the first motion tells of the third parameter: with and without it, the others predict the first as well."""
+    slopes = SLOPES.clone()
+    slopes[1:, :, 2] = 0.0
+    ev = toys.evidence(slopes, 3, [], torch.tensor([0.0, 0.0, 0.5]).double(), 0)
+    less = ev.__class__([c._replace(jacobian=c.jacobian[:, [0, 1, 3]]) for c in ev.cells], 2, [], ev.stds, ev.numerics)
+    groups = ["a", "b", "c", "d"]
+    whole = compare(predict(toys.fitted(less), groups), predict(toys.fitted(ev, std=1.0), groups), 0.0)
+    assert whole.density > 10.0  # that it may be anything is far better than that it is zero
+    assert whole.calm[1] < whole.calm[0]
