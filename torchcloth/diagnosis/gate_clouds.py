@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ FAR = 0.1  # m, of the first points from the first shape, half of them
 STRAY, REACH = 0.1, 1.1  # share of points, and lengths of the cloth from a gripper that holds it
 AWAY = 0.05  # m, of held places from their grippers: another order that halves it is the right one
 FOLLOW, BETTER = 0.06, 0.4  # m by which the cloud leaves the grippers; share of it that a mirrored cloud leaves
+TURNED = 0.5  # of that, by which a mirror must turn the grippers' motions to account for it
 NEAREST = 5  # points, whose mean distance from a gripper is looked at
 FIRST = 3  # frames
 SURELY = 1.5  # factor within which a unit is recognised
@@ -65,6 +67,11 @@ class Seen:
         """m by which clouds come to lie farther from the grippers than at first, in the worst tenth of the frames."""
         away = np.array([_nearest(c, at) for c, at in zip(clouds, self.held, strict=True)])
         return float(np.quantile(np.abs(away - np.median(away[:FIRST], axis=0)).max(1), 0.9))
+
+    def turned(self, turn: np.ndarray) -> float:
+        """m by which a mirror [3, 3] would turn the grippers' motions, in the farthest tenth of the frames."""
+        moved = self.held - self.held[0]
+        return float(np.quantile(np.linalg.norm(moved @ turn.T - moved, axis=-1).max(1), 0.9))
 
     @cached_property
     def held(self) -> np.ndarray:
@@ -115,7 +122,7 @@ def places(seen: Seen) -> Iterator[tuple[str, str]]:
     if not any(len(c) for c in seen.clouds[:FIRST]):
         return
     if (off := seen.off(seen.clouds)) > FAR:
-        how, best = _least(seen, seen.off)
+        how, best = _least(seen, seen.off, _mirrors(seen))
         if best < BETTER * off:
             yield _is_mirrored(how)
         else:
@@ -160,26 +167,38 @@ def _swapped(seen: Seen) -> Iterator[tuple[str, str]]:
         )
 
 
-def _least(seen: Seen, measure: Callable[[list[np.ndarray]], float]) -> tuple[str, float]:
+class Mirror(NamedTuple):
+    """At a plane through a place, or two axes exchanged."""
+
+    how: str
+    turn: np.ndarray  # [3, 3]
+    place: np.ndarray  # [3] m
+
+    def of(self, clouds: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Clouds as they would be if they had been mirrored so."""
+        return [(c - self.place) @ self.turn.T + self.place for c in clouds]
+
+
+def _least(seen: Seen, measure: Callable[[list[np.ndarray]], float], mirrors: Iterable[Mirror]) -> tuple[str, float]:
     """The mirror that leaves least of a measure [m], and what it leaves."""
-    return min(((how, measure(turned)) for how, turned in _mirrors(seen)), key=lambda pair: pair[1])
+    left = ((m.how, measure(m.of(seen.clouds))) for m in mirrors)
+    return min(left, key=lambda pair: pair[1], default=("", np.inf))
 
 
-def _mirrors(seen: Seen) -> Iterator[tuple[str, list[np.ndarray]]]:
-    """Clouds as they would be if they had been mirrored: at planes through the origin, the cloud and the cameras."""
+def _mirrors(seen: Seen) -> Iterator[Mirror]:
+    """Planes through the origin, the cloud and the cameras."""
     middle = np.concatenate(seen.clouds[:FIRST]).mean(0)
     frames = [("", np.eye(4)), ("", _at(middle))]
     frames += [(f" of {name}", c.T_world_camera) for name, c in seen.recording.cameras.items()]
     for of, pose in frames:
         turn, place = pose[:3, :3], pose[:3, 3]
         for k, axis in enumerate("xyz"):
-            flip = turn @ np.diag(1.0 - 2.0 * np.eye(3)[k]) @ turn.T
-            yield f"along {axis}{of}", [(c - place) @ flip.T + place for c in seen.clouds]
+            yield Mirror(f"along {axis}{of}", turn @ np.diag(1.0 - 2.0 * np.eye(3)[k]) @ turn.T, place)
     for k, pair in enumerate(("y and z", "z and x", "x and y")):
         order = [0, 1, 2]
         a, b = (k + 1) % 3, (k + 2) % 3
         order[a], order[b] = b, a
-        yield f"with {pair} exchanged", [c[:, order] for c in seen.clouds]
+        yield Mirror(f"with {pair} exchanged", np.eye(3)[order], np.zeros(3))
 
 
 def _at(place: np.ndarray) -> np.ndarray:
@@ -189,11 +208,16 @@ def _at(place: np.ndarray) -> np.ndarray:
 
 
 def handed(seen: Seen) -> Iterator[tuple[str, str]]:
-    """A symmetric cloth looks the same in a mirror, but does not follow its grippers there."""
+    """A symmetric cloth looks the same in a mirror, but does not follow its grippers there.
+
+    Where a bar hides what is near a gripper, a sound cloud seems not to follow it either: only mirrors that would turn
+    the grippers' own motion by as much are asked about.
+    """
     if not seen.paths or len(seen.clouds) <= FIRST or not all(len(c) for c in seen.clouds):
         return
     if (left := seen.left(seen.clouds)) > FOLLOW:
-        how, best = _least(seen, lambda clouds: max(seen.left(clouds), seen.off(clouds)))
+        mirrors = (m for m in _mirrors(seen) if seen.turned(m.turn) > TURNED * left)
+        how, best = _least(seen, lambda clouds: max(seen.left(clouds), seen.off(clouds)), mirrors)
         if best < BETTER * left:
             yield _is_mirrored(how)
 
