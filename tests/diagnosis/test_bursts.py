@@ -4,7 +4,8 @@ import linear_toys as toys
 import pytest
 import torch
 
-from torchcloth.diagnosis.bursts import FREEDOM, calmed, densities, stretches, weights
+from torchcloth.diagnosis.bursts import FREEDOM, calmed, densities, weights
+from torchcloth.diagnosis.cells import stretches
 from torchcloth.diagnosis.comparison import compare, predict
 from torchcloth.diagnosis.fitting import step_of
 from torchcloth.diagnosis.noise import Noise, whitened
@@ -48,7 +49,7 @@ def test_cloth_that_folds_over_for_a_while_moves_no_parameter():
     for seed in range(20):
         ev = drawn(seed, 0.03)
         model = toys.fitted(ev).model
-        for white, out in ((whitened(ev, LEVEL), plain), (calmed(ev, LEVEL), calm)):
+        for white, out in ((whitened(ev, LEVEL), plain), (calmed(whitened(ev, LEVEL)), calm)):
             step, _ = step_of(white, model)
             own = white.jacobian[:, :3]
             error = torch.linalg.inv(own.mT @ own + 4 * torch.eye(3).double()).diagonal().sqrt()
@@ -60,7 +61,7 @@ def test_cloth_that_folds_over_for_a_while_moves_no_parameter():
 def test_where_all_fits_nothing_changes():
     ev = drawn(3, truth=torch.zeros(3).double())
     quiet = ev.__class__([c._replace(value=0.5 * c.value) for c in ev.cells], 3, [], ev.stds, ev.numerics)
-    assert torch.equal(calmed(quiet, LEVEL).value, whitened(quiet, LEVEL).value)
+    assert torch.equal(calmed(whitened(quiet, LEVEL)).value, whitened(quiet, LEVEL).value)
 
 
 def test_a_number_that_the_others_leave_open_is_no_failure_of_the_prediction():

@@ -12,10 +12,9 @@ from dataclasses import replace
 
 import torch
 
-from .bursts import calmed
 from .evidence import Progress, Setting, staged
-from .fitting import LONGEST, Fitted, fit, step_of, with_cause
-from .noise import unfitted
+from .fitting import Fitted, fit, leap_with, with_cause
+from .noise import unfitted, whitened
 from .world import Hypothesis, Model
 
 
@@ -39,11 +38,10 @@ def afresh(
 
 
 def _promises(found: Fitted) -> list[tuple[float, str, Fitted]]:
-    """(log density that one joint step with a cause should gain, its name, the fit), where the step goes its way."""
-    white, own, out = calmed(found.evidence, unfitted()), found.evidence.own, []
+    """(log density that one leap with a cause should gain, its name, the fit), where the leap goes its way."""
+    white, out = whitened(found.evidence, unfitted()), []
     for j, h in enumerate(found.evidence.hypotheses):
-        columns = white._replace(jacobian=white.jacobian[:, [*range(own), own + j]])
-        step, gained = step_of(columns, found.model.plus(h), LONGEST)
+        step, gained = leap_with(white, found.model.plus(h), found.evidence.own + j)
         if float(step[-1]) * h.typical > 0:
             out.append((gained, h.name, found))
     return out

@@ -16,7 +16,7 @@ from torch import Tensor
 from .bursts import calmed
 from .evidence import Evidence, Progress, Setting, gather
 from .fitting import prior_precision
-from .noise import unfitted
+from .noise import unfitted, whitened
 from .world import Model
 
 SWEEPS = 2
@@ -33,7 +33,7 @@ def approach(model: Model, setting: Setting, progress: Progress = lambda _: None
         shifts = [(k, sign * w) for sign in (1.0, -1.0) for k, w in enumerate(width.tolist())]
         evidence = gather(model, setting, (), progress, before, shifts)
         before = before or evidence
-        white = calmed(evidence, unfitted())
+        white = calmed(whitened(evidence, unfitted()))
         up, down = white.jacobian.chunk(2, dim=1)
         slope, bend = 0.5 * (up + down) * width, 0.5 * (up - down) * width
         u = _lowest(white.value, slope, bend, model.point * prior, width * prior)

@@ -11,29 +11,34 @@ a stretch follow a multivariate t-distribution, whose maximum solves least squar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
-from .cells import Cells
-from .evidence import Evidence
-from .noise import Noise, Whitened, whitened
+from .noise import Whitened
 
 FREEDOM = 5.0  # degrees
 
 
-def calmed(evidence: Evidence, noise: Noise) -> Whitened:
-    """All episodes' cells, whitened and weighted by stretch."""
-    white = whitened(evidence, noise)
-    share = weights(white.value, stretches(evidence.cells)).sqrt()
-    return white._replace(value=share * white.value, jacobian=share[:, None] * white.jacobian, share=share)
+def calmed(white: Whitened) -> Whitened:
+    """Cells weighted by stretch, and by nothing else."""
+    return _weighted(plain := unweighted(white), plain.value)
 
 
-def stretches(cells: Sequence[Cells]) -> Tensor:
-    """[C] numbers that cells of one episode, kind of data and window share."""
-    own = [torch.stack([torch.full_like(c.window, k), c.block, c.window], 1) for k, c in enumerate(cells)]
-    return torch.cat(own).unique(dim=0, return_inverse=True)[1]
+def unweighted(white: Whitened) -> Whitened:
+    """Cells as whitening left them."""
+    value, slopes = white.value / white.share, white.jacobian / white.share[:, None]
+    return white._replace(value=value, jacobian=slopes, share=torch.ones_like(value))
+
+
+def calmed_along(white: Whitened, step: Tensor) -> Whitened:
+    """The same cells with the weights that they have after a step of the first coordinates."""
+    plain = unweighted(white)
+    return _weighted(plain, plain.value + plain.jacobian[:, : len(step)] @ step)
+
+
+def _weighted(plain: Whitened, value: Tensor) -> Whitened:
+    share = weights(value, plain.stretch).sqrt()
+    return plain._replace(value=share * plain.value, jacobian=share[:, None] * plain.jacobian, share=share)
 
 
 def weights(value: Tensor, stretch: Tensor) -> Tensor:

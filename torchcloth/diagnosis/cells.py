@@ -44,6 +44,12 @@ class Cells(NamedTuple):
         return (self.block * 10_000 + self.patch) * 1000 + self.window
 
 
+def stretches(cells: Sequence[Cells]) -> Tensor:
+    """[C] numbers that cells of one episode, kind of data and window share."""
+    own = [torch.stack([torch.full_like(c.window, k), c.block, c.window], 1) for k, c in enumerate(cells)]
+    return torch.cat(own).unique(dim=0, return_inverse=True)[1]
+
+
 def cells_of(frames: Frames, moved: Frames | None, episode: Episode, sheet: Sheet, rest: Tensor) -> Cells:
     """Of one simulated episode; ``moved`` holds derivatives of the frames, ``rest`` [V, 3] m the pattern."""
     scene = scene_of(frames, moved, episode, sheet)

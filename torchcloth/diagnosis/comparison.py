@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .bursts import densities, stretches, weights
-from .cells import SEEN
+from .bursts import densities, weights
+from .cells import SEEN, stretches
 from .evidence import aligned
 from .fitting import Fitted, curvature, prior_precision, step_of
 

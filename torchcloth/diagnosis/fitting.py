@@ -10,15 +10,16 @@ from torch import Tensor
 
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..identification.bounds import bounded
-from .bursts import calmed
+from .bursts import calmed, calmed_along, densities, unweighted
 from .evidence import Evidence, Progress, Setting, gather, staged
-from .noise import Noise, Whitened, fit_noise, unfitted
+from .noise import Noise, Whitened, fit_noise, unfitted, whitened
 from .world import Hypothesis, Model
 
 IMPOSSIBLE = (InvalidInput, SimulationDiverged, UnstableStep)  # no world has such values, or none that is stable
 ENOUGH = 2.0  # log density that a further step is expected to gain, below which the search ends
 ITERATIONS = 3  # at most
 LONGEST = 1.0  # prior standard deviations, of a step
+SWEEPS = 4  # of weighing stretches anew
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +67,7 @@ def fit(
     for k in range(iterations):
         here = here or gather(model, setting, (), staged(progress, f"fit {k + 1}"), before)
         before = before or here
-        step, ahead = step_of(calmed(here, noise or fit_noise(here)), model, LONGEST)
+        step, ahead = leap(whitened(here, noise or fit_noise(here)), model)
         if ahead < ENOUGH:
             break
         model, here = model.at(model.point + step), None
@@ -79,34 +80,69 @@ def fit(
 
 def weighed(model: Model, evidence: Evidence, noise: Noise) -> Fitted:
     """A model at a solution, its evidence there weighed by a noise."""
-    white = calmed(evidence, noise)
-    _, ahead = step_of(white, model)
+    white = calmed(whitened(evidence, noise))
+    _, ahead = leap(white, model)
     return Fitted(model, evidence, noise, white, torch.linalg.inv(curvature(white, model)), ahead)
 
 
 def with_cause(found: Fitted, hypothesis: Hypothesis) -> Model:
-    """With one more cause, where one step leads: the parameters make room for it."""
-    own = found.evidence.own
-    columns = [*range(own), own + [h.name for h in found.evidence.hypotheses].index(hypothesis.name)]
-    return _stepped(found.model.plus(hypothesis), calmed(found.evidence, unfitted()), columns)
+    """With one more cause, where one leap leads: the parameters make room for it."""
+    index = [h.name for h in found.evidence.hypotheses].index(hypothesis.name)
+    model = found.model.plus(hypothesis)
+    step, _ = leap_with(whitened(found.evidence, unfitted()), model, found.evidence.own + index)
+    return model.at(model.point + step)
 
 
 def without_cause(found: Fitted, name: str) -> Model:
-    """With one cause less, where one step leads: the parameters take over what they can."""
+    """With one cause less, where one leap leads: the parameters take over what they can."""
     index = [a.name for a in found.model.accepted].index(name)
-    white, place = calmed(found.evidence, unfitted()), len(found.model.parameters) + index
+    white, place = whitened(found.evidence, unfitted()), len(found.model.parameters) + index
     less = white._replace(value=white.value - found.model.amplitudes[index] * white.jacobian[:, place])
-    return _stepped(found.model.without(name), less, [k for k in range(found.evidence.own) if k != place])
+    less = _columns(less, [k for k in range(found.evidence.own) if k != place])
+    model = found.model.without(name)
+    return model.at(model.point + leap(less, model)[0])
 
 
-def _stepped(model: Model, white: Whitened, columns: Sequence[int]) -> Model:
-    slopes = white._replace(jacobian=white.jacobian[:, columns])
-    return model.at(model.point + step_of(slopes, model, LONGEST)[0])
+def leap_with(white: Whitened, model: Model, place: int) -> tuple[Tensor, float]:
+    """As ``leap``, of a model whose last cause has the slopes in column ``place``, begun from several amplitudes.
+
+    A stretch that only this cause describes hardly counts until it does.
+    """
+    own, h = len(model.point) - 1, model.accepted[-1]
+    slopes = _columns(white, [*range(own), place])
+    starts = [0.0, h.typical, *([-h.typical] if h.signed else [])]
+    none = torch.zeros_like(model.point)
+    tried = [leap(slopes, model, torch.cat([none[:-1], none.new_tensor([a])])) for a in starts]
+    return max(tried, key=lambda pair: pair[1])
+
+
+def leap(white: Whitened, model: Model, start: Tensor | None = None) -> tuple[Tensor, float]:
+    """(step of the model's coordinates, log density that it is expected to gain), where slopes hold that far.
+
+    The likeliest step for noise whose level differs from stretch to stretch, by least squares with ever new weights.
+
+    Args:
+        white: slopes along the model's coordinates first.
+        model: as in ``step_of``; no coordinate goes farther than ``LONGEST`` prior standard deviations.
+        start: step from which weights are taken at first; None: none.
+    """
+    step = torch.zeros_like(model.point) if start is None else start
+    for _ in range(SWEEPS):
+        step, _ = step_of(calmed_along(white, step), model, LONGEST)
+    plain, precision = unweighted(white), prior_precision(model)
+    after = plain.value + plain.jacobian[:, : len(step)] @ step
+    gained = densities(after, plain.stretch).sum() - densities(plain.value, plain.stretch).sum()
+    pull = 0.5 * precision @ ((model.point + step) ** 2 - model.point**2)
+    return step, float(gained - pull)
+
+
+def _columns(white: Whitened, columns: Sequence[int]) -> Whitened:
+    return white._replace(jacobian=white.jacobian[:, columns])
 
 
 def renoised(found: Fitted, noise: Noise) -> Fitted:
     """The same with residuals weighed by another noise."""
-    return replace(found, noise=noise, white=calmed(found.evidence, noise))
+    return replace(found, noise=noise, white=calmed(whitened(found.evidence, noise)))
 
 
 def step_of(white: Whitened, model: Model, longest: float = torch.inf) -> tuple[Tensor, float]:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .cells import NAMES, SEEN, Cells
+from .cells import NAMES, SEEN, Cells, stretches
 from .evidence import Evidence
 
 REACH, MEMORY = 0.1, 0.3  # m, s, over which slow errors agree
@@ -53,6 +53,7 @@ class Whitened(NamedTuple):
     episode: Tensor  # [C] int64
     log_determinant: Tensor  # [E], of each covariance
     roots: list[Tensor]  # Cholesky factors
+    stretch: Tensor  # [C] of time, whose cells err together
     share: Tensor  # [C] by which rows were multiplied beyond that
 
 
@@ -69,8 +70,8 @@ def whitened(evidence: Evidence, noise: Noise) -> Whitened:
         index.append(torch.full((len(cells.value),), k))
         logs.append(2 * root.diagonal().log().sum())
         roots.append(root)
-    value = torch.cat(values)
-    return Whitened(value, torch.cat(slopes), torch.cat(index), torch.stack(logs), roots, torch.ones_like(value))
+    value, log, stretch = torch.cat(values), torch.stack(logs), stretches(evidence.cells)
+    return Whitened(value, torch.cat(slopes), torch.cat(index), log, roots, stretch, torch.ones_like(value))
 
 
 def fit_noise(evidence: Evidence, sweeps: int = 2) -> Noise:

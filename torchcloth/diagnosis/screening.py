@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .cells import SEEN
-from .fitting import Fitted, prior_precision
+from .fitting import Fitted, leap, leap_with, prior_precision
 from .world import Hypothesis
 
 Decision = Literal["present", "absent", "inconclusive", "unresolvable"]
@@ -38,6 +38,8 @@ class Row(NamedTuple):
     gain: float  # chi^2
     size: float  # m, RMS by which a typical amplitude moves points beyond what is fitted anyway
     pull: float  # N, the same of forces
+    reached: float  # amplitude where a leap leads (``fitting.leap_with``)
+    worth: float  # log density that it should gain
     decision: Decision
 
     @property
@@ -58,7 +60,7 @@ class Row(NamedTuple):
     @property
     def shows(self) -> bool:
         """What is asked for would show, even where a typical amplitude would not."""
-        return self.sight * self.forward > abs(self.hypothesis.typical)
+        return self.sight * self._forward(self.reached) > abs(self.hypothesis.typical)
 
     @property
     def sight(self) -> float:
@@ -68,8 +70,10 @@ class Row(NamedTuple):
     @property
     def forward(self) -> float:
         """The amplitude; negative where it would need a sign that makes no sense."""
-        h = self.hypothesis
-        return abs(self.amplitude) if h.signed else self.amplitude
+        return self._forward(self.amplitude)
+
+    def _forward(self, amplitude: float) -> float:
+        return abs(amplitude) if self.hypothesis.signed else amplitude
 
 
 def screen(found: Fitted) -> list[Row]:
@@ -79,16 +83,18 @@ def screen(found: Fitted) -> list[Row]:
     asked = projected(found.white.jacobian[:, own:])
     value, numerics = projected(found.white.value), projected(_numerics(found))
     sizes, pulls = _sizes(found, 0, SEEN), _sizes(found, SEEN, SEEN + 1)
+    _, alone = leap(found.white, found.model)
     rows = []
     for j, h in enumerate(found.evidence.hypotheses):
         information = float(asked[:, j] @ asked[:, j])
         if information < 1e-12 / h.typical**2:
-            rows.append(Row(h, 0.0, float("inf"), 0.0, 0.0, 0.0, 0.0, "unresolvable"))
+            rows.append(Row(h, 0.0, float("inf"), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "unresolvable"))
             continue
         amplitude = -float(asked[:, j] @ value) / information
         bias = -float(asked[:, j] @ numerics) / information
-        seen = (float(sizes[j]), float(pulls[j]))
-        row = Row(h, amplitude, information**-0.5, bias, amplitude**2 * information, *seen, "absent")
+        step, gained = leap_with(found.white, found.model.plus(h), own + j)
+        more = (float(sizes[j]), float(pulls[j]), float(step[-1]), gained - alone)
+        row = Row(h, amplitude, information**-0.5, bias, amplitude**2 * information, *more, "absent")
         rows.append(row._replace(decision=_decided(row)))
     return sorted(rows, key=lambda row: -row.gain)
 

@@ -26,7 +26,7 @@ HARDLY = 0.1  # of what the better of two models explains, below which they expl
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
-MUCH = 15.0  # chi^2, of a cause that is worth fitting
+MUCH = 8.0  # log density, of a cause that is worth fitting
 MOSTLY, HALF = 1 / 3, 1 / 2  # of what is wrong: least that all causes, or a further one, explain beside something else
 SURE = 2.57  # standard errors between motions, from which they agree that there is something (t, six motions)
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
@@ -175,8 +175,9 @@ def _likely(screened: Sequence[Row]) -> list[Row]:
     A typical amplitude need not show then. And a large effect bends the fitted parameters so far that slopes
     there ask for less of it than there is.
     """
-    asks = lambda r: r.shows and r.forward < PLAUSIBLE * abs(r.hypothesis.typical)  # noqa: E731
-    return [r for r in screened if r.decision == "present" or (asks(r) and (r.gain > MUCH or r.excess > PRESENT))]
+    asks = lambda r: r.shows and abs(r.reached) < PLAUSIBLE * abs(r.hypothesis.typical)  # noqa: E731
+    likely = [r for r in screened if r.decision == "present" or (asks(r) and (r.worth > MUCH or r.excess > PRESENT))]
+    return sorted(likely, key=lambda r: -r.worth)
 
 
 def _pruned(
