@@ -22,7 +22,7 @@ MOST = 4  # causes
 TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 2  # steps of the likelier ones among them
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
-HARDLY = 0.1  # of what the better of two models explains, below which they explain as much
+HARDLY = 0.2  # of what the better of two models gains, in density and squares, that two engines may differ by
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
@@ -287,5 +287,6 @@ def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
     if c.hypothesis.effect == best.hypothesis.effect:
         return False
     over, (before, after) = compare(predicted, best.predicted, 0.0), best.gain.calm
-    more = over.calm[0] ** 2 - over.calm[1] ** 2
-    return over.density < CLEAR or over.ci95[0] < 0 or more < HARDLY * (before**2 - after**2)
+    more = (over.calm[0] ** 2 - over.calm[1] ** 2) / (before**2 - after**2)
+    hardly = max(more, over.density / best.gain.density) < HARDLY
+    return over.density < CLEAR or over.ci95[0] < 0 or hardly
