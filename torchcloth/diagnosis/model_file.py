@@ -125,7 +125,8 @@ def read_model(path: str | Path, scene: Recording | None = None, residual: bool 
         causes = [(str(c["effect"]), float(c["amplitude"])) for c in numbers["causes"]]
         matrix, episodes = content["covariance"], list(content.get("episodes", ()))
     except (zipfile.BadZipFile, KeyError, TypeError, ValueError, OSError) as error:
-        raise RecordingError(f"{path}: unreadable", got=repr(error), expected="a model of torchcloth") from None
+        got = "no archive" if isinstance(error, zipfile.BadZipFile) else f"{type(error).__name__}: {error}"
+        raise RecordingError(f"{path}: unreadable", got=got, expected="a .tcm file of `torchcloth diagnose`") from None
     model = base_model(own if scene is None else _of_fabric(path, own, scene))
     values = torch.tensor([coordinates[p.name] for p in model.parameters], dtype=torch.float64)
     model = _extended(path, replace(model, values=values), causes)
