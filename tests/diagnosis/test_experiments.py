@@ -100,7 +100,7 @@ def undecided(names):
     amplitudes = {h.name: h.typical for h in asked}
     rivals = [{"effect": names[1], "amplitude": amplitudes[names[1]]}]
     cause = {"effect": names[0], "amplitude": amplitudes[names[0]], "rivals": rivals, "class": list(names)}
-    return SimpleNamespace(steps=[step], screened=[], end=found), [cause], setting
+    return SimpleNamespace(causes=[step], screened=[], end=found), [cause], setting
 
 
 def test_gravity_and_camera_are_told_apart_by_turning():
@@ -118,4 +118,4 @@ def test_gravity_and_camera_are_told_apart_by_turning():
 
 def test_nothing_open_asks_for_nothing():
     end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
-    assert propose(SimpleNamespace(steps=[], screened=[], end=end), [], SimpleNamespace(recordings=()), print) is None
+    assert propose(SimpleNamespace(causes=[], screened=[], end=end), [], SimpleNamespace(recordings=()), print) is None

@@ -60,7 +60,7 @@ def test_parts_that_nobody_saw_are_grey(gathered):
 
 def test_amplitudes_beyond_the_picture_are_arrows_at_its_end():
     h = dx.Hypothesis("my.own", "N", 2.0, lambda world, a: world)
-    rows = [Row(h, a, 0.1, 0.0, 9.0, 1e-3, "present") for a in (1.0, 50.0, -50.0)]
+    rows = [Row(h, a, 0.1, 0.0, 9.0, 1e-3, 0.0, a, 4.5, "present") for a in (1.0, 50.0, -50.0)]
     (axis,) = screening(rows).axes
     arrows = {line.get_marker(): float(line.get_xdata()[0]) for line in axis.lines if line.get_marker() in "<>"}
     assert arrows == {">": pytest.approx(FARTHEST - 0.05), "<": pytest.approx(0.05 - FARTHEST)}

@@ -28,7 +28,8 @@ PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation i
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
 MUCH = 8.0  # log density, of a cause that is worth fitting
 MOSTLY, HALF = 1 / 3, 1 / 2  # of what is wrong: least that all causes, or a further one, explain beside something else
-SURE = 2.57  # standard errors between motions, from which they agree that there is something (t, six motions)
+# standard errors between motions, from which they agree that there is something: 97.5 % of t by one less than there are
+SURE = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26)
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 WORTH_PULL = 3e-3  # N, the same where it shows in forces
 
@@ -273,7 +274,8 @@ def _known(found: Fitted, name: str, names: Sequence[str], alone: set[str]) -> b
     place = [h.name for h in found.model.accepted].index(name)
     h, amplitude = found.model.accepted[place], abs(found.model.amplitudes[place])
     std = float(spread(found, names, alone)[len(found.model.parameters) + place])
-    return SURE * std < amplitude < PLAUSIBLE * abs(h.typical)
+    sure = SURE[min(len(set(names)) + len(alone) - 2, len(SURE) - 1)]
+    return sure * std < amplitude < PLAUSIBLE * abs(h.typical)
 
 
 def _worthwhile(gain: Gain) -> bool:
