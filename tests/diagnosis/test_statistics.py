@@ -1,5 +1,7 @@
 """Noise, screening, classes and comparison on linear toys: against theory, and against what must not matter."""
 
+from dataclasses import replace
+
 import linear_toys as toys
 import pytest
 import torch
@@ -131,6 +133,16 @@ def test_numerics_widen_the_error():
     assert wide.bias == pytest.approx(0.5, rel=0.1)
     assert plain.decision == "present"
     assert wide.decision != "present"
+
+
+def test_what_a_fitted_parameter_does_as_well_is_known_by_its_prior_alone():
+    found = asked([0.0, 0.0, 0.7, 0.0, 0.0])
+    hypotheses = [toys.hypothesis("a", twin="p1"), *found.evidence.hypotheses[1:]]
+    found = replace(found, evidence=replace(found.evidence, hypotheses=hypotheses))
+    assert row(found, "a").decision == "unresolvable"
+    far = replace(found, model=found.model.at(torch.tensor([0.0, 4 * 0.5]).double()))
+    assert row(far, "a").decision == "inconclusive"
+    assert row(far, "a").amplitude == 2.0
 
 
 def test_twins_form_a_class_and_strangers_do_not():

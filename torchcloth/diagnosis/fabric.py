@@ -100,7 +100,7 @@ HYPOTHESES = (
     Hypothesis("rest.shrink[warp]", "-", 0.03, lambda w, a: _rest(w, "shrink_warp", a), signed=True),
     Hypothesis("rest.shrink[weft]", "-", 0.03, lambda w, a: _rest(w, "shrink_weft", a), signed=True),
     Hypothesis("rest.skew", "rad", 0.03, lambda w, a: _rest(w, "skew", a), signed=True),
-    Hypothesis("mass.density", "-", 0.08, _density, signed=True),
+    Hypothesis("mass.density", "-", 0.08, _density, signed=True, twin="areal_density"),
     Hypothesis("mass.hem", "kg/m", 0.02, lambda w, a: w.with_cloth({"hem": LineMass(a)})),
     Hypothesis("mass.seam", "kg/m", 0.02, _seam),
     Hypothesis("env.gravity_tilt[x]", "rad", 0.01, lambda w, a: _tilt(0, w, a), signed=True),

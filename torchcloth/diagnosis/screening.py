@@ -24,6 +24,7 @@ Decision = Literal["present", "absent", "inconclusive", "unresolvable"]
 PRESENT = 2.5  # standard errors above the smallest amplitude of interest
 LEAST = 3e-4  # m or the same share of a cell's other units: a typical amplitude that moves less cannot be seen
 LEAST_PULL = 1e-2  # N, the same of forces
+PULLED = 3.0  # standard deviations of its prior, from which a parameter does what its twin is asked about
 POWER = 1.64 + 0.84  # standard errors: found in 80 % of cases at 5 %
 NUMERICS = 1 / 3  # of the difference between two meshes is left on the finer one (second order)
 
@@ -84,8 +85,11 @@ def screen(found: Fitted) -> list[Row]:
     value, numerics = projected(found.white.value), projected(_numerics(found))
     sizes, pulls = _sizes(found, 0, SEEN), _sizes(found, SEEN, SEEN + 1)
     _, alone = leap(found.white, found.model)
-    rows = []
+    rows, fitted = [], [p.name for p in found.model.parameters]
     for j, h in enumerate(found.evidence.hypotheses):
+        if h.twin in fitted:
+            rows.append(_twin(found, h, fitted.index(h.twin)))
+            continue
         information = float(asked[:, j] @ asked[:, j])
         if information < 1e-12 / h.typical**2:
             rows.append(Row(h, 0.0, float("inf"), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "unresolvable"))
@@ -97,6 +101,13 @@ def screen(found: Fitted) -> list[Row]:
         row = Row(h, amplitude, information**-0.5, bias, amplitude**2 * information, *more, "absent")
         rows.append(row._replace(decision=_decided(row)))
     return sorted(rows, key=lambda row: -row.gain)
+
+
+def _twin(found: Fitted, h: Hypothesis, index: int) -> Row:
+    """Of what a fitted parameter does as well: the data say nothing more, and its prior whether that is much."""
+    away = float(found.model.values[index])
+    far = abs(away) > PULLED * found.model.parameters[index].std
+    return Row(h, away, float("inf"), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "inconclusive" if far else "unresolvable")
 
 
 def projection(found: Fitted):

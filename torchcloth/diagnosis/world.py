@@ -108,6 +108,7 @@ class Hypothesis:
         share: smallest amplitude of interest, as a share of the typical one.
         needs: what a recording must have for it to mean anything.
         kin: names that no experiment of this kind can tell from it, by structure.
+        twin: base parameter that is the same number; where that is fitted, its prior alone tells of the hypothesis.
     """
 
     name: str
@@ -118,6 +119,7 @@ class Hypothesis:
     share: float = 0.4
     needs: Callable[[Recording], bool] = lambda recording: True
     kin: tuple[str, ...] = ()
+    twin: str = ""
 
     @property
     def effect(self) -> str:
