@@ -105,7 +105,8 @@ def search(
     if not steps and any(row.lacking for row in lack_of_fit(start, setting.names)):
         screened = screen(start)
         rows = {row.hypothesis.name: row for row in screened}
-        begun = [(rows[h.name], model) for h, model in afresh(start, setting, hypotheses, TRIED, progress)]
+        asked = [row.hypothesis for row in screened if row.sight]
+        begun = [(rows[h.name], model) for h, model in afresh(start, setting, asked, TRIED, progress)]
         if first := _step(start, setting, begun, screened, progress):
             current, steps = _chain(start, setting, hypotheses, progress, TRIED, first)
     return _found(start, current, steps, setting)
@@ -280,7 +281,7 @@ def _known(found: Fitted, name: str, names: Sequence[str], alone: set[str]) -> b
 
 def _worthwhile(gain: Gain) -> bool:
     (before, after), (pulled, pulls) = gain.calm, gain.pull
-    seen = before - after > WORTH_MM or 1 - (after / before) ** 2 > WORTH_SHARE
+    seen = before - after > WORTH_MM or before**2 - after**2 > WORTH_SHARE * before**2
     return (seen or pulled - pulls > WORTH_PULL) and gain.ci95[0] > 0
 
 
@@ -288,7 +289,6 @@ def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
     """Predicts about as well: the paired difference is not clear, or no more than what two engines may differ by."""
     if c.hypothesis.effect == best.hypothesis.effect:
         return False
-    over, (before, after) = compare(predicted, best.predicted, 0.0), best.gain.calm
-    more = (over.calm[0] ** 2 - over.calm[1] ** 2) / (before**2 - after**2)
-    hardly = max(more, over.density / best.gain.density) < HARDLY
+    over, mended = compare(predicted, best.predicted, 0.0), lambda gain: gain.calm[0] ** 2 - gain.calm[1] ** 2
+    hardly = over.density < HARDLY * best.gain.density and mended(over) < HARDLY * mended(best.gain)
     return over.density < CLEAR or over.ci95[0] < 0 or hardly
