@@ -19,26 +19,18 @@ from .noise import Whitened
 FREEDOM = 5.0  # degrees
 
 
-def calmed(white: Whitened) -> Whitened:
-    """Cells weighted by stretch, and by nothing else."""
-    return _weighted(plain := unweighted(white), plain.value)
+def calmed(white: Whitened, step: Tensor | None = None) -> Whitened:
+    """Cells weighted by stretch, and by nothing else: as they are, or after a ``step`` of the first coordinates."""
+    plain = unweighted(white)
+    value = plain.value if step is None else plain.value + plain.jacobian[:, : len(step)] @ step
+    share = weights(value, plain.stretch).sqrt()
+    return plain._replace(value=share * plain.value, jacobian=share[:, None] * plain.jacobian, share=share)
 
 
 def unweighted(white: Whitened) -> Whitened:
     """Cells as whitening left them."""
     value, slopes = white.value / white.share, white.jacobian / white.share[:, None]
     return white._replace(value=value, jacobian=slopes, share=torch.ones_like(value))
-
-
-def calmed_along(white: Whitened, step: Tensor) -> Whitened:
-    """The same cells with the weights that they have after a step of the first coordinates."""
-    plain = unweighted(white)
-    return _weighted(plain, plain.value + plain.jacobian[:, : len(step)] @ step)
-
-
-def _weighted(plain: Whitened, value: Tensor) -> Whitened:
-    share = weights(value, plain.stretch).sqrt()
-    return plain._replace(value=share * plain.value, jacobian=share[:, None] * plain.jacobian, share=share)
 
 
 def weights(value: Tensor, stretch: Tensor) -> Tensor:

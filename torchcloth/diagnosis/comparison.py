@@ -15,10 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .bursts import densities, weights
-from .cells import SEEN, stretches
+from .bursts import densities, unweighted, weights
+from .cells import SEEN
 from .evidence import aligned
 from .fitting import Fitted, curvature, prior_precision, step_of
+from .noise import Whitened
 
 ALONE = 0.7  # share of the information, of a motion without which a cause cannot be sized
 BLOCK = 2  # windows of cells that are resampled together
@@ -64,17 +65,18 @@ def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) 
     motion alone tells of a cause, no other can say how large it is.
     """
     likely, white, scale = (torch.zeros_like(found.white.value) for _ in range(3))
+    plain = unweighted(found.white)
     for inside in _folds(found, groups, halved):
-        likely[inside], white[inside], scale[inside] = _by_others(found, inside)
+        likely[inside], white[inside], scale[inside] = _by_others(found, plain, inside)
     return _told(found, likely, white, scale)
 
 
-def _by_others(found: Fitted, inside: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the cells inside, by a fit to those outside: (K^-1 r, whitened, logarithms of the scale)."""
-    step, covariance = _of_others(found, inside)
-    share = found.white.share[inside]
-    own = found.white.jacobian[inside][:, : found.evidence.own] / share[:, None]
-    value = found.white.value[inside] / share + own @ step
+def _by_others(found: Fitted, plain: Whitened, inside: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the ``plain`` cells inside, by a fit to those outside: (K^-1 r, whitened, logarithms of the scale)."""
+    others = _outside(found, inside)
+    step, covariance = step_of(others, found.model)[0], torch.linalg.inv(curvature(others, found.model))
+    own = plain.jacobian[inside][:, : found.evidence.own]
+    value = plain.value[inside] + own @ step
     root = torch.linalg.cholesky(torch.eye(len(value)).to(own) + own @ covariance @ own.mT)
     white = torch.linalg.solve_triangular(root, value[:, None], upper=False)
     likely = torch.linalg.solve_triangular(root.mT, white, upper=True)
@@ -87,19 +89,18 @@ def spread(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -
     The jackknife: motions that disagree about a number say by how much a law may differ from the model's, which the
     noise within a motion does not.
     """
-    steps = torch.stack([_of_others(found, inside)[0] for inside in _folds(found, groups, halved)])
+    steps = torch.stack([step_of(_outside(found, i), found.model)[0] for i in _folds(found, groups, halved)])
     return ((len(steps) - 1) * (steps - steps.mean(0)).square().mean(0)).sqrt()
 
 
-def _of_others(found: Fitted, inside: Tensor) -> tuple[Tensor, Tensor]:
-    """(step [P + A] from the solution of all data to that of the cells outside, covariance [P + A, P + A] there)."""
-    others = found.white._replace(value=found.white.value[~inside], jacobian=found.white.jacobian[~inside])
-    return step_of(others, found.model)[0], torch.linalg.inv(curvature(others, found.model))
+def _outside(found: Fitted, inside: Tensor) -> Whitened:
+    """Of the cells outside: one linear step from the solution of all data leads to theirs."""
+    return found.white._replace(value=found.white.value[~inside], jacobian=found.white.jacobian[~inside])
 
 
 def as_it_is(found: Fitted) -> Predicted:
     """Residuals of every episode by a model that was not fitted to any of them."""
-    white = found.white.value / found.white.share
+    white = unweighted(found.white).value
     return _told(found, white, white, torch.zeros_like(white))
 
 
@@ -113,7 +114,7 @@ def _told(found: Fitted, likely: Tensor, white: Tensor, scale: Tensor) -> Predic
     cells, episode = found.evidence.cells, found.white.episode
     join = lambda name: torch.cat([getattr(c, name) for c in cells])  # noqa: E731
     value = torch.cat([_adjusted(found, k, likely[episode == k]) for k in range(len(cells))])
-    return Predicted(value, white, scale, join("key"), episode, join("window"), stretches(cells), join("block"))
+    return Predicted(value, white, scale, join("key"), episode, join("window"), found.white.stretch, join("block"))
 
 
 def _folds(found: Fitted, groups: Sequence[str], halved: Collection[str]) -> list[Tensor]:
@@ -153,7 +154,8 @@ def _adjusted(found: Fitted, k: int, likely: Tensor) -> Tensor:
 
 def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) -> Gain:
     """How much better the second predicts; intervals by resampling stretches of time."""
-    owner, density, squares = _blocks(first, second)
+    one, two = _both(first, second)
+    owner, density, squares = _blocks(one, two)
     rng = np.random.default_rng(seed)
     drawn = [_draw(owner, rng) for _ in range(DRAWS)]
     sums = np.array([density[d].sum() for d in drawn])
@@ -163,7 +165,7 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     total, share = float(density.sum()), _share(squares.sum(0), floor)
     few = 2.0 if len(set(owner.tolist())) < FEW else 1.0
     left, right = (share + few * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
-    calm, pull = (_calm(first, second, kind) for kind in (range(SEEN), (SEEN,)))
+    calm, pull = (_calm(one, two, kinds) for kinds in (range(SEEN), (SEEN,)))
     return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, (low, high), share, (left, right), calm, pull)
 
 
@@ -182,9 +184,8 @@ def _both(first: Predicted, second: Predicted) -> tuple[Predicted, Predicted]:
     return one, one._replace(value=other[0], white=other[1], scale=other[2])
 
 
-def _blocks(first: Predicted, second: Predicted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _blocks(one: Predicted, two: Predicted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of blocks: episode [B], difference of density [B]; squares before, after and count of positions [B, 3]."""
-    one, two = _both(first, second)
     density = densities(two.white, one.stretch) - densities(one.white, one.stretch)
     density = density[one.stretch] / torch.bincount(one.stretch)[one.stretch] + one.scale - two.scale
     seen = one.seen.double()
@@ -194,9 +195,8 @@ def _blocks(first: Predicted, second: Predicted) -> tuple[np.ndarray, np.ndarray
     return (block // 1000).numpy(), sums(density), sums(squares)
 
 
-def _calm(first: Predicted, second: Predicted, kinds: Sequence[int]) -> tuple[float, float]:
+def _calm(one: Predicted, two: Predicted, kinds: Sequence[int]) -> tuple[float, float]:
     """RMS before and after of kinds of data, where stretches that neither describes count for less."""
-    one, two = _both(first, second)
     share = torch.maximum(*(weights(p.white, p.stretch) for p in (one, two)))
     share = share * torch.isin(one.kind, torch.tensor(list(kinds)))
     rms = lambda p: float((share * p.value**2).sum() / share.sum().clamp(min=1e-12)) ** 0.5  # noqa: E731

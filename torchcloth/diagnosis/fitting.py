@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..identification.bounds import bounded
-from .bursts import calmed, calmed_along, densities, unweighted
+from .bursts import calmed, densities, unweighted
 from .evidence import Evidence, Progress, Setting, gather, staged
 from .noise import Noise, Whitened, fit_noise, unfitted, whitened
 from .world import Hypothesis, Model
@@ -95,7 +95,7 @@ def with_cause(found: Fitted, hypothesis: Hypothesis) -> Model:
 
 def without_cause(found: Fitted, name: str) -> Model:
     """With one cause less, where one leap leads: the parameters take over what they can."""
-    index = [a.name for a in found.model.accepted].index(name)
+    index = found.model.place(name)
     white, place = whitened(found.evidence, unfitted()), len(found.model.parameters) + index
     less = white._replace(value=white.value - found.model.amplitudes[index] * white.jacobian[:, place])
     less = _columns(less, [k for k in range(found.evidence.own) if k != place])
@@ -127,9 +127,9 @@ def leap(white: Whitened, model: Model, start: Tensor | None = None) -> tuple[Te
         start: step from which weights are taken at first; None: none.
     """
     step = torch.zeros_like(model.point) if start is None else start
-    for _ in range(SWEEPS):
-        step, _ = step_of(calmed_along(white, step), model, LONGEST)
     plain, precision = unweighted(white), prior_precision(model)
+    for _ in range(SWEEPS):
+        step, _ = step_of(calmed(plain, step), model, LONGEST)
     after = plain.value + plain.jacobian[:, : len(step)] @ step
     gained = densities(after, plain.stretch).sum() - densities(plain.value, plain.stretch).sum()
     pull = 0.5 * precision @ ((model.point + step) ** 2 - model.point**2)

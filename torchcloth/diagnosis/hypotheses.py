@@ -46,5 +46,4 @@ def known() -> list[Hypothesis]:
 
 def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]:
     """All hypotheses that the recordings could say something about."""
-    taken = {h.name for h in model.accepted}
-    return [h for h in known() if h.name not in taken and any(h.needs(r) for r in recordings)]
+    return [h for h in model.others(known()) if any(h.needs(r) for r in recordings)]

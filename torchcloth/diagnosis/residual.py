@@ -105,7 +105,6 @@ def learn_residual(found: Fitted, setting: Setting, progress: Progress = lambda 
         setting: the episodes that it was fitted to.
         progress: called with one line for each thing that is simulated.
     """
-    taken = {h.name for h in found.model.accepted}
-    laws = [t for t in TERMS if t.name not in taken]
+    laws = found.model.others(TERMS)
     start = fit(found.model, setting, laws, 1, progress, before=found.evidence)
     return Residual(extend(start, setting, laws, progress, TRIED))

@@ -82,8 +82,7 @@ class Found:
 
     def amplitude(self, step: Step) -> float:
         """Of a step's cause in the end."""
-        names = [h.name for h in self.end.model.accepted]
-        return self.end.model.amplitudes[names.index(step.best.hypothesis.name)]
+        return self.end.model.amplitudes[self.end.model.place(step.best.hypothesis.name)]
 
     @property
     def left_out(self) -> float:
@@ -142,7 +141,7 @@ def _chain(
         if step is None:
             break
         best, before = step.best.fitted, current
-        left = [h for h in hypotheses if h.name not in {a.name for a in best.model.accepted}]
+        left = best.model.others(hypotheses)
         now = staged(progress, f"with {step.best.hypothesis.name}")
         try:
             current = fit(best.model, setting, left, FURTHER, now, before=start.evidence, here=best.evidence)
@@ -154,7 +153,7 @@ def _chain(
         steps, step = [*steps, step], None
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     if steps and current.ahead > FAR:
-        left = [h for h in hypotheses if h.name not in {a.name for a in current.model.accepted}]
+        left = current.model.others(hypotheses)
         with suppress(*IMPOSSIBLE):  # what was found before stands
             current = fit(current.model, setting, left, progress=staged(progress, "all"), before=current.evidence)
     return (start, []) if steps and _beside_the_point(start, current, setting.names, MOSTLY) else (current, steps)
@@ -198,7 +197,7 @@ def _pruned(
         if known and _worthwhile(gain):
             continue
         steps = [s for s in steps if s is not step]
-        left = [h for h in hypotheses if h.name not in {a.name for a in less.model.accepted}]
+        left = less.model.others(hypotheses)
         current = fit(less.model, setting, left, 1, progress, before=current.evidence)
     return current, steps
 
@@ -272,7 +271,7 @@ def _useful(c: Candidate, names: Sequence[str]) -> bool:
 
 def _known(found: Fitted, name: str, names: Sequence[str], alone: set[str]) -> bool:
     """Of a size that makes sense, and that motions agree about so far that there is something."""
-    place = [h.name for h in found.model.accepted].index(name)
+    place = found.model.place(name)
     h, amplitude = found.model.accepted[place], abs(found.model.amplitudes[place])
     std = float(spread(found, names, alone)[len(found.model.parameters) + place])
     sure = SURE[min(len(set(names)) + len(alone) - 2, len(SURE) - 1)]

@@ -199,6 +199,15 @@ class Model:
         low, high = torch.tensor(own, dtype=self.values.dtype).reshape(-1, 2).unbind(-1)
         return low, high
 
+    def others(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Those that it has not accepted."""
+        taken = {h.name for h in self.accepted}
+        return [h for h in hypotheses if h.name not in taken]
+
+    def place(self, name: str) -> int:
+        """Of an accepted hypothesis among them."""
+        return [h.name for h in self.accepted].index(name)
+
     def plus(self, hypothesis: Hypothesis, amplitude: float = 0.0) -> Model:
         """With one more accepted hypothesis."""
         return replace(self, accepted=(*self.accepted, hypothesis), amplitudes=(*self.amplitudes, amplitude))
