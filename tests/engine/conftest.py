@@ -4,7 +4,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
+from torchcloth.engine import running
 from torchcloth.engine.library import library
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -20,3 +22,13 @@ def _engine(request):
             raise
         if request.path.name != "test_library.py":  # that file asks what happens then
             pytest.skip(str(error))
+
+
+@pytest.fixture(params=[1, 3], ids=["alone", "team"])
+def team(request, monkeypatch):
+    """As many threads within one scene, however little there is to do for them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    monkeypatch.setattr(running, "WORTH", 1e-9)
+    yield request.param
+    torch.set_num_threads(before)

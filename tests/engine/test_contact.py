@@ -75,6 +75,7 @@ def test_pressed_and_sliding(subdivisions):
     print(found, agree(cloth, {}, state))
 
 
+@pytest.mark.usefixtures("team")
 def test_with_air_hand_and_woven_cloth():
     """Contact between the other parts: the air resists what it does, the hand takes part of it."""
     cloth, count = layers(
@@ -109,6 +110,7 @@ def folded(contact):
     return cloth, cloth.state(x, v)
 
 
+@pytest.mark.usefixtures("team")
 def test_triangles_come_and_go():
     """Searches in between wake some triangles and put others to sleep, at the start of a chunk and within one."""
     cloth, state = folded(tc.Contact(spacing=SPACING))
@@ -151,6 +153,7 @@ def test_batch():
     print(agree(cloth, {}, pressed(cloth, count, (3,)), substeps=40))
 
 
+@pytest.mark.usefixtures("team")
 def test_recomputed_substeps_are_bitwise_the_recorded_ones():
     cloth, state = folded(tc.Contact(spacing=SPACING))
     with torch.no_grad():

@@ -1,9 +1,12 @@
-"""Threads share the work of batches and directions, and change no bit of the results."""
+"""Threads share the work of batches and directions, and change no bit of the results; within a scene, the last ones."""
 
 import pytest
 import torch
+from agreement import agree, held, moving
+from clothes import opening, sheet, start
 
 import torchcloth as tc
+from torchcloth.engine import running
 
 SCENES, TIMES = 3, [0.0, 0.01, 0.02]
 
@@ -53,3 +56,45 @@ def test_tangents(cloth):
     along = tc.Directions({"material.youngs_modulus.raw": eye[:, 0].clone(), "areal_density.raw": eye[:, 1].clone()})
     rollout, moved = cloth.sensitivities(cloth.rest_state(), times=TIMES, along=along)
     same("forward", [rollout.x, moved.x])
+
+
+@pytest.mark.usefixtures("team")
+def test_a_team_agrees_with_the_reference():
+    """With contact: test_contact.py."""
+    cloth = sheet(n=9)
+    agree(cloth, {"left": held(0.01), "right": held(0.01)}, moving(cloth))
+
+
+@pytest.mark.usefixtures("team")
+@pytest.mark.parametrize("contact", [None, tc.Contact(everywhere=True)])
+def test_a_team_repeats_itself_bit_by_bit(contact):
+    """Of 300 substeps it does some together and some alone."""
+    cloth = sheet(n=9, contact=contact)
+    state, motion = start(cloth), opening(0.03)
+    runs = [_all(cloth, state, motion) for _ in range(3)]
+    assert all(torch.equal(a, b) for other in runs[1:] for a, b in zip(runs[0], other, strict=True))
+
+
+def _all(cloth, state, motion) -> list[torch.Tensor]:
+    x = state.x.clone().requires_grad_()
+    end = cloth(state._replace(x=x), motion, [0.0, 0.03], dt=1e-4).x
+    parameters = [p for p in cloth.parameters() if p.requires_grad]
+    grads = torch.autograd.grad((end**2).sum(), [x, *parameters], allow_unused=True)
+    along = tc.Directions({"material.youngs_modulus.raw": torch.ones(1)})
+    moved = cloth.sensitivities(state, motion, [0.0, 0.03], along=along, dt=1e-4)[1].x
+    return [end.detach(), moved, *(g for g in grads if g is not None)]
+
+
+@pytest.mark.parametrize("contact", [None, tc.Contact(everywhere=True)])
+def test_threads_change_what_a_scene_does_by_rounding_only(contact, monkeypatch):
+    cloth = sheet(n=9, contact=contact)
+    state, motion = start(cloth), opening(0.03)
+    found = []
+    for threads in (1, 2):
+        monkeypatch.setattr(running, "WORTH", 1e-9)
+        torch.set_num_threads(threads)
+        found.append(_all(cloth, state, motion)[:3])  # positions, their tangents, gradient by positions
+    torch.set_num_threads(1)
+    assert not all(torch.equal(a, b) for a, b in zip(*found, strict=True))  # sums have another order
+    for a, b in zip(*found, strict=True):
+        assert float((a - b).norm()) <= 1e-8 * float(a.norm())

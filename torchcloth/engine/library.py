@@ -44,6 +44,7 @@ class Call(ctypes.Structure):
         ("threads", ctypes.c_int64),
         ("records", ctypes.c_void_p),
         ("every", ctypes.c_int64),
+        ("worth", ctypes.c_double),
     ]
 
 

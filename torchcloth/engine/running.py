@@ -15,6 +15,7 @@ from .program import Program
 
 BUDGET = 192 * 2**20  # bytes of records that a simulation keeps for its adjoint
 ANEW = 96 * 2**20  # bytes of records that the adjoint makes at a time, of substeps that it goes through again
+WORTH = 8e5  # operations of a substep for which another thread is worth while: some 20 us
 
 
 class Job(NamedTuple):
@@ -97,4 +98,5 @@ def _ports(job: Job):
 def _run(job: Job, ports, mode: int, records: Tensor, every: int, directions: int = 0) -> None:
     threads = torch.get_num_threads()
     pointer = ctypes.cast(ports, ctypes.POINTER(Port))
-    job.program.run(Call(pointer, job.scenes, job.substeps, directions, threads, records.data_ptr(), every), mode)
+    call = Call(pointer, job.scenes, job.substeps, directions, threads, records.data_ptr(), every, WORTH)
+    job.program.run(call, mode)

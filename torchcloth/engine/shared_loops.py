@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .lowering import Lowering
 
 LANES = 16  # of the widest pack, csrc/pack.h
+TOGETHER = 16  # packs
 
 
 class Triangles:
@@ -195,7 +196,11 @@ class Velocities:
 
 
 def scattered(items: int) -> np.ndarray:
-    """An order whose neighbours are far apart in the mesh: additions to one vertex need not wait for each other."""
+    """An order in packs whose items are far apart in the mesh: additions to one vertex need not wait for each other.
+
+    Packs that follow each other are near each other, for the cache, and for threads that have some of them each.
+    """
     packs = -(-items // LANES)
-    order = np.arange(packs * LANES).reshape(LANES, packs).T.ravel()
+    groups = np.array_split(np.arange(packs * LANES).reshape(packs, LANES), -(-packs // TOGETHER))
+    order = np.concatenate([group.reshape(LANES, -1).T.ravel() for group in groups])
     return order[order < items]

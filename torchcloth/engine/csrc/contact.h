@@ -13,8 +13,7 @@
 
 namespace tc {
 
-// Rows of Scene::rows and Scene::counts, in the order of engine/parts/contact.py.
-enum Listed { POINTS_LIST, ASLEEP_LIST = 13, LISTS = 19 };
+// Of Scene::counts, in the order of engine/parts/contact.py.
 enum Counted { POINTS, WOKEN, ASLEEP, COUNTS };
 
 // What one scene remembers.
@@ -26,6 +25,14 @@ struct Layers {
     Nodes<R> nodes;
     std::vector<Buffer<R>> value, bar, dot;  // by field of the grid
 };
+
+// f(first block, behind the last one) for each part, by the thread that has its points.
+template <class R, class F>
+void over_blocks(Scene<R>& s, F f) {
+    const Nodes<R>& nodes = s.layers->nodes;
+    if (s.point_parts == 1) return f(0, nodes.count());
+    s.team->run(s.point_parts, [&](int m) { f(nodes.begin(m), nodes.begin(m + 1)); });
+}
 
 template <class R>
 struct Contact : Stage<R> {
@@ -45,6 +52,8 @@ struct Contact : Stage<R> {
     void reverse(Scene<R>&) const override {}
 
   private:
+    static constexpr double EACH = 3e4;  // operations of a point in all its loops, and what little is worth dividing
+
     int each() const { return int(place.size()) / 3; }
 
     void prepare(Scene<R>& s) const {
@@ -59,8 +68,13 @@ struct Contact : Stage<R> {
         }
         list_woken(s, near, before);
         near.asleep.list(near.mask, false, search.corner, s.substep == s.substeps - 1 ? search.triangles : 0, each());
-        if (changed) near.points.weigh(place);
-        near.nodes.place(near.points, s.value[x], program.fields[x].rows, spacing, changed);
+        if (changed) {
+            near.points.weigh(place);
+            s.counts[POINTS] = near.points.size();
+            s.parts = program.parts(s);
+            s.point_parts = near.points.size() * EACH >= s.worth ? s.parts : 1;
+        }
+        near.nodes.place(near.points, s.value[x], program.fields[x].rows, spacing, changed, s.point_parts, s.team);
         show(s, near);
         make_room(s, near);
     }
@@ -120,16 +134,28 @@ struct Contact : Stage<R> {
         const size_t packed = round_up(near.points.size(), LANES<R>);
         for (size_t i = 0; i < grid.size(); i++) {
             const Field& f = program.fields[grid[i]];
-            const size_t count = f.kind == Kind::points ? packed * f.comps : size_t(near.nodes.count()) * ON_BLOCK;
-            const bool adds = i < 2;
-            s.value[grid[i]] = room(near.value[i], count, adds);
-            if (s.bars.size) s.bar[grid[i]] = room(near.bar[i], count, true);
-            if (s.dots.size) s.dot[grid[i]] = room(near.dot[i], count * DIRECTIONS, adds);
+            const bool points = f.kind == Kind::points;
+            const size_t count = points ? packed * f.comps : size_t(near.nodes.count()) * ON_BLOCK;
+            s.value[grid[i]] = room(near.value[i], count);
+            if (s.bars.size) s.bar[grid[i]] = room(near.bar[i], count);
+            if (s.dots.size) s.dot[grid[i]] = room(near.dot[i], count * DIRECTIONS);
+            if (points && s.bars.size) std::fill_n(s.bar[grid[i]], count, R(0));
         }
+        over_blocks(s, [&](int first, int last) {
+            auto clear = [&](R* field, size_t depth) {
+                std::fill(field + first * ON_BLOCK * depth, field + last * ON_BLOCK * depth, R(0));
+            };
+            for (size_t i = 0; i < grid.size(); i++) {
+                if (program.fields[grid[i]].kind == Kind::points) continue;
+                const bool adds = i < 2;
+                if (adds) clear(s.value[grid[i]], 1);
+                if (s.bars.size) clear(s.bar[grid[i]], 1);
+                if (adds && s.dots.size) clear(s.dot[grid[i]], DIRECTIONS);
+            }
+        });
     }
-    static R* room(Buffer<R>& buffer, size_t count, bool clear) {
+    static R* room(Buffer<R>& buffer, size_t count) {
         if (buffer.size < count) buffer.reset(2 * count);
-        if (clear) std::memset(static_cast<void*>(buffer.data), 0, count * sizeof(R));
         return buffer.data;
     }
 };

@@ -74,17 +74,17 @@ struct Derivatives : Stage<R> {
     }
 
     void forward(Scene<R>& s) const override {
-        if (transposed) answer(s.value[y], s.value[x], R(1));
-        else see(s.value[x], s.value[y], R(1));
+        if (transposed) answer(s, s.value[y], s.value[x], R(1));
+        else see(s, s.value[x], s.value[y], R(1));
     }
     void reverse(Scene<R>& s) const override {
-        if (transposed) see(s.bar[x], s.bar[y], R(-1));
-        else answer(s.bar[y], s.bar[x], R(-1));
+        if (transposed) see(s, s.bar[x], s.bar[y], R(-1));
+        else answer(s, s.bar[y], s.bar[x], R(-1));
     }
     void tangent(Scene<R>& s) const override {
         forward(s);
-        if (transposed) answer_along(s.dot[y], s.dot[x]);
-        else see_along(s.dot[x], s.dot[y]);
+        if (transposed) answer_along(s, s.dot[y], s.dot[x]);
+        else see_along(s, s.dot[x], s.dot[y]);
     }
 
   private:
@@ -128,57 +128,65 @@ struct Derivatives : Stage<R> {
     }
 
     // Y(v) += sign sum_u w(u) (X(u) - X(v)): differences, which are small wherever the sheet is.
-    void see(const R* from, R* to, R sign) const {
+    void see(const Scene<R>& s, const R* from, R* to, R sign) const {
         const Links<R>& l = *links->seeing;
-        for (int v = 0; v < vertices(); v++) {
-            const Quad<R> own = vector(from, v);
-            Row sum(0.0);
-            for (int k = l.first[v]; k < l.first[v + 1]; k++)
-                sum = sum + weights(l.weight.data + 8 * size_t(k)) * five_times(vector(from, l.other[k]) - own);
-            row(to, v) = row(to, v) + double(sign) * sum;
-        }
+        over_rows(s, vertices(), [&](int begin, int end) {
+            for (int v = begin; v < end; v++) {
+                const Quad<R> own = vector(from, v);
+                Row sum(0.0);
+                for (int k = l.first[v]; k < l.first[v + 1]; k++)
+                    sum = sum + weights(l.weight.data + 8 * size_t(k)) * five_times(vector(from, l.other[k]) - own);
+                row(to, v) = row(to, v) + double(sign) * sum;
+            }
+        });
     }
     // X(v) -= sign times the transpose of that.
-    void answer(const R* from, R* to, R sign) const {
+    void answer(const Scene<R>& s, const R* from, R* to, R sign) const {
         const Links<R>& l = *links->seen;
-        for (int v = 0; v < vertices(); v++) {
-            Row sum(0.0);
-            for (int k = l.first[v]; k < l.first[v + 1]; k++)
-                sum = sum + weights(l.weight.data + 8 * size_t(k)) * row(from, l.other[k]);
-            vector(to, v) = vector(to, v) + Quad<R>(typename Quad<R>::Lanes{} + sign) * summed(sum);
-        }
+        over_rows(s, vertices(), [&](int begin, int end) {
+            for (int v = begin; v < end; v++) {
+                Row sum(0.0);
+                for (int k = l.first[v]; k < l.first[v + 1]; k++)
+                    sum = sum + weights(l.weight.data + 8 * size_t(k)) * row(from, l.other[k]);
+                vector(to, v) = vector(to, v) + Quad<R>(typename Quad<R>::Lanes{} + sign) * summed(sum);
+            }
+        });
     }
-    void see_along(const R* from, R* to) const {
+    void see_along(const Scene<R>& s, const R* from, R* to) const {
         const Links<R>& l = *links->seeing;
         const D* in = reinterpret_cast<const D*>(from);
-        for (int v = 0; v < vertices(); v++) {
-            D sum[15];  // in registers until the vertex is done
-            for (D& part : sum) part = D(0.0);
-            for (int k = l.first[v]; k < l.first[v + 1]; k++) {
-                const R* w = l.weight.data + 8 * size_t(k);
-                for (int i = 0; i < 3; i++) {
-                    const D d = in[l.other[k] * 4 + i] - in[v * 4 + i];
-                    for (int c = 0; c < 5; c++) sum[3 * c + i] = sum[3 * c + i] + d * w[c];
+        over_rows(s, vertices(), [&](int begin, int end) {
+            for (int v = begin; v < end; v++) {
+                D sum[15];  // in registers until the vertex is done
+                for (D& part : sum) part = D(0.0);
+                for (int k = l.first[v]; k < l.first[v + 1]; k++) {
+                    const R* w = l.weight.data + 8 * size_t(k);
+                    for (int i = 0; i < 3; i++) {
+                        const D d = in[l.other[k] * 4 + i] - in[v * 4 + i];
+                        for (int c = 0; c < 5; c++) sum[3 * c + i] = sum[3 * c + i] + d * w[c];
+                    }
                 }
+                D* target = reinterpret_cast<D*>(to) + size_t(v) * 16;
+                for (int c = 0; c < 15; c++) target[c] = target[c] + sum[c];
             }
-            D* target = reinterpret_cast<D*>(to) + size_t(v) * 16;
-            for (int c = 0; c < 15; c++) target[c] = target[c] + sum[c];
-        }
+        });
     }
-    void answer_along(const R* from, R* to) const {
+    void answer_along(const Scene<R>& s, const R* from, R* to) const {
         const Links<R>& l = *links->seen;
         const D* in = reinterpret_cast<const D*>(from);
-        for (int v = 0; v < vertices(); v++) {
-            D sum[3] = {D(0.0), D(0.0), D(0.0)};
-            for (int k = l.first[v]; k < l.first[v + 1]; k++) {
-                const R* w = l.weight.data + 8 * size_t(k);
-                const D* given = in + size_t(l.other[k]) * 16;
-                for (int c = 0; c < 5; c++)
-                    for (int i = 0; i < 3; i++) sum[i] = sum[i] + given[3 * c + i] * w[c];
+        over_rows(s, vertices(), [&](int begin, int end) {
+            for (int v = begin; v < end; v++) {
+                D sum[3] = {D(0.0), D(0.0), D(0.0)};
+                for (int k = l.first[v]; k < l.first[v + 1]; k++) {
+                    const R* w = l.weight.data + 8 * size_t(k);
+                    const D* given = in + size_t(l.other[k]) * 16;
+                    for (int c = 0; c < 5; c++)
+                        for (int i = 0; i < 3; i++) sum[i] = sum[i] + given[3 * c + i] * w[c];
+                }
+                D* target = reinterpret_cast<D*>(to) + size_t(v) * 4;
+                for (int i = 0; i < 3; i++) target[i] = target[i] + sum[i];
             }
-            D* target = reinterpret_cast<D*>(to) + size_t(v) * 4;
-            for (int i = 0; i < 3; i++) target[i] = target[i] + sum[i];
-        }
+        });
     }
 };
 

@@ -2,14 +2,15 @@
 // and results are scattered. The reverse sweep and the tangents go through the same instructions.
 #pragma once
 
-#include "moves.h"
+#include "shares.h"
 
 namespace tc {
 
 template <class R>
-struct Loop : Stage<R>, Moves<R> {
+struct Loop : Stage<R>, Shares<R> {
     using typename Moves<R>::P;
     using typename Moves<R>::D;
+    using Shares<R>::share, Shares<R>::work;
     using Moves<R>::L, Moves<R>::program, Moves<R>::code, Moves<R>::index, Moves<R>::span, Moves<R>::count;
     using Moves<R>::pick, Moves<R>::fix, Moves<R>::copy, Moves<R>::packed, Moves<R>::look;
     using Moves<R>::gather, Moves<R>::add, Moves<R>::store, Moves<R>::take, Moves<R>::gather_along, Moves<R>::scatter_along;
@@ -18,7 +19,19 @@ struct Loop : Stage<R>, Moves<R> {
     bool flat;  // what it gives has no derivative
 
     Loop(const Program<R>& p, const Kernel<R>* k, int n, int list, int counted, bool flat)
-        : Moves<R>{p, n, list, counted, {}, {}}, kernels(k), flat(flat) {}
+        : Shares<R>{{p, n, list, counted, {}, {}}}, kernels(k), flat(flat) {}
+
+    void ready() override {
+        for (const Instruction& i : code) {
+            const bool transfers = i.code == Instruction::spread || i.code == Instruction::collect;
+            work += transfers ? 600 : i.code == Instruction::call ? kernels[i.kernel].flops : 10 * i.comps;
+        }
+    }
+    double cost(const Scene<R>& s) const override {
+        const int kind = Moves<R>::counted;  // of what contact counts, only points go on from substep to substep
+        const int items = Moves<R>::list >= 0 || kind > 0 ? 0 : kind == 0 ? s.counts[kind] : Moves<R>::items;
+        return items * work * (s.bars.size ? 3 : s.dots.size ? 5 : 1);
+    }
 
     bool is_shared(const Instruction& i) const { return i.code == Instruction::load && i.table == SHARED; }
 
@@ -36,24 +49,26 @@ struct Loop : Stage<R>, Moves<R> {
     void forward(Scene<R>& s) const override { values(s, false); }
     void replay(Scene<R>& s) const override { values(s, true); }
     void values(Scene<R>& s, bool again) const {
-        P* regs = s.regs.data;
         const Span all = span(s);
         if (all.items == 0) return;
         fix(s, all);
-        for (const Instruction& i : code) if (is_shared(i)) gather(i, s.value[i.field], regs, 0, all);
-        for (int first = 0; first < all.items; first += L) {
-            pick(s, first);
-            for (const Instruction& i : code)
-                if (!again || !is_recorded(i)) compute(s, i, first, all, regs);
-        }
+        share(s, all, Way::value, [&](const View<R>& at, const Span& all, int begin, int end) {
+            for (const Instruction& i : code) if (is_shared(i)) gather(i, at.value[i.field], at.regs, 0, all);
+            for (int first = begin; first < end; first += L) {
+                pick(all, at.picked, first);
+                for (const Instruction& i : code)
+                    if (!again || !is_recorded(i)) compute(s, at, i, first, all);
+            }
+        });
     }
     bool is_recorded(const Instruction& i) const {
         if (i.code != Instruction::add && i.code != Instruction::put) return false;
         const Kind kind = program.fields[i.field].kind;
         return kind != Kind::temporary && kind != Kind::nodes && kind != Kind::points;
     }
-    TC_INLINE void compute(Scene<R>& s, const Instruction& i, int first, const Span& all, P* regs) const {
-        R* field = i.field >= 0 ? s.value[i.field] : nullptr;
+    TC_INLINE void compute(const Scene<R>& s, const View<R>& at, const Instruction& i, int first, const Span& all) const {
+        R* field = i.field >= 0 ? at.value[i.field] : nullptr;
+        P* regs = at.regs;
         switch (i.code) {
             case Instruction::load:
                 if (i.fixed >= 0) field = s.fixed[i.fixed].packs.data;
@@ -77,33 +92,36 @@ struct Loop : Stage<R>, Moves<R> {
     }
 
     void reverse(Scene<R>& s) const override {
-        P *regs = s.regs.data, *bars = s.bars.data;
         const Span all = span(s);
         if (flat || all.items == 0) return;
         fix(s, all);
-        for (const Instruction& i : code)
-            if (is_shared(i)) {
-                gather(i, s.value[i.field], regs, 0, all);
-                zero(bars, i.reg, i.comps);
+        share(s, all, Way::reverse, [&](const View<R>& at, const Span& all, int begin, int end) {
+            P *regs = at.regs, *bars = at.bars;
+            for (const Instruction& i : code)
+                if (is_shared(i)) {
+                    gather(i, at.value[i.field], regs, 0, all);
+                    zero(bars, i.reg, i.comps);
+                }
+            for (int first = begin; first < end; first += L) {
+                pick(all, at.picked, first);
+                for (const Instruction& i : code) {
+                    const bool gives = i.code == Instruction::call || i.code == Instruction::collect;
+                    if (gives ? i.feeds : i.code == Instruction::load || i.code == Instruction::lookup) compute(s, at, i, first, all);
+                    if (i.code == Instruction::load && !is_shared(i)) zero(bars, i.reg, i.comps);
+                    else if (i.code == Instruction::lookup) zero(bars, i.out[0], CELL);
+                    else if (i.code == Instruction::collect) zero(bars, i.in[1], SHARES);
+                    else if (i.code == Instruction::call) for (int o : i.out) if (o >= 0) bars[o] = P(0.0);
+                }
+                for (auto i = code.rbegin(); i != code.rend(); ++i) back(at, *i, first, all);
             }
-        for (int first = 0; first < all.items; first += L) {
-            pick(s, first);
-            for (const Instruction& i : code) {
-                const bool gives = i.code == Instruction::call || i.code == Instruction::collect;
-                if (gives ? i.feeds : i.code == Instruction::load || i.code == Instruction::lookup) compute(s, i, first, all, regs);
-                if (i.code == Instruction::load && !is_shared(i)) zero(bars, i.reg, i.comps);
-                else if (i.code == Instruction::lookup) zero(bars, i.out[0], CELL);
-                else if (i.code == Instruction::collect) zero(bars, i.in[1], SHARES);
-                else if (i.code == Instruction::call) for (int o : i.out) if (o >= 0) bars[o] = P(0.0);
-            }
-            for (auto i = code.rbegin(); i != code.rend(); ++i) back(s, *i, first, all, regs, bars);
-        }
-        for (const Instruction& i : code)
-            if (is_shared(i) && s.bar[i.field])
-                for (int c = 0; c < i.comps; c++) s.bar[i.field][c] += total(bars[i.reg + c]);
+            for (const Instruction& i : code)
+                if (is_shared(i) && at.bar[i.field])
+                    for (int c = 0; c < i.comps; c++) at.bar[i.field][c] += total(bars[i.reg + c]);
+        });
     }
-    TC_INLINE void back(Scene<R>& s, const Instruction& i, int first, const Span& all, P* regs, P* bars) const {
-        R* bar = i.field >= 0 ? s.bar[i.field] : nullptr;
+    TC_INLINE void back(const View<R>& at, const Instruction& i, int first, const Span& all) const {
+        R* bar = i.field >= 0 ? at.bar[i.field] : nullptr;
+        P *regs = at.regs, *bars = at.bars;
         switch (i.code) {
             case Instruction::add:
             case Instruction::put: take(i, bar, bars, first, all); break;
@@ -120,35 +138,37 @@ struct Loop : Stage<R>, Moves<R> {
             case Instruction::collect:
                 transfer<Transfer>(i, first, all, [&](auto t) {
                     t.spread(regs + i.in[0], bars + i.in[1], bar);
-                    t.weigh(regs + i.in[0], bars + i.in[1], s.value[i.field], bars + i.in[0]);
+                    t.weigh(regs + i.in[0], bars + i.in[1], at.value[i.field], bars + i.in[0]);
                 });
                 break;
         }
     }
     void tangent(Scene<R>& s) const override {
         if (flat) return forward(s);
-        P* regs = s.regs.data;
-        D* dots = s.dots.data;
         const Span all = span(s);
         if (all.items == 0) return;
         fix(s, all);
-        for (const Instruction& i : code)  // what has no tangent
-            if (i.code == Instruction::load && s.dot[i.field] == nullptr)
-                std::memset(static_cast<void*>(dots + size_t(i.reg) * L), 0, size_t(i.comps) * L * sizeof(D));
-        for (const Instruction& i : code)
-            if (is_shared(i)) {
-                gather(i, s.value[i.field], regs, 0, all);
-                gather_along(i, s.dot[i.field], dots, 0, all);
-            }
-        for (int first = 0; first < all.items; first += L) {
-            pick(s, first);
+        share(s, all, Way::tangent, [&](const View<R>& at, const Span& all, int begin, int end) {
+            for (const Instruction& i : code)  // what has no tangent
+                if (i.code == Instruction::load && at.dot[i.field] == nullptr)
+                    std::memset(static_cast<void*>(at.dots + size_t(i.reg) * L), 0, size_t(i.comps) * L * sizeof(D));
             for (const Instruction& i : code)
-                if (i.code == Instruction::call) kernels[i.kernel].tangent(regs, dots, i.in.data(), i.out.data());
-                else compute(s, i, first, all, regs), compute_along(s, i, first, all, regs, dots);
-        }
+                if (is_shared(i)) {
+                    gather(i, at.value[i.field], at.regs, 0, all);
+                    gather_along(i, at.dot[i.field], at.dots, 0, all);
+                }
+            for (int first = begin; first < end; first += L) {
+                pick(all, at.picked, first);
+                for (const Instruction& i : code)
+                    if (i.code == Instruction::call) kernels[i.kernel].tangent(at.regs, at.dots, i.in.data(), i.out.data());
+                    else compute(s, at, i, first, all), compute_along(at, i, first, all);
+            }
+        });
     }
-    TC_INLINE void compute_along(Scene<R>& s, const Instruction& i, int first, const Span& all, P* regs, D* dots) const {
-        R* along = s.dot[i.field];
+    TC_INLINE void compute_along(const View<R>& at, const Instruction& i, int first, const Span& all) const {
+        R* along = at.dot[i.field];
+        const P* regs = at.regs;
+        D* dots = at.dots;
         const bool moves = i.code == Instruction::spread || i.code == Instruction::collect;
         D *offset = moves ? dots + i.in[0] * L : nullptr, *share = moves ? dots + i.in[1] * L : nullptr;
         switch (i.code) {
@@ -162,7 +182,7 @@ struct Loop : Stage<R>, Moves<R> {
                 transfer<TransferAlong>(i, first, all, [&](auto t) { t.spread(regs + i.in[0], offset, regs + i.in[1], share, along); });
                 break;
             case Instruction::collect:
-                transfer<TransferAlong>(i, first, all, [&](auto t) { t.collect(regs + i.in[0], offset, share, s.value[i.field], along); });
+                transfer<TransferAlong>(i, first, all, [&](auto t) { t.collect(regs + i.in[0], offset, share, at.value[i.field], along); });
                 break;
             case Instruction::call: break;
         }

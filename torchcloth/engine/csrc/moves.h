@@ -31,7 +31,7 @@ struct Instruction {
 struct Span {
     const int* list;
     int items;
-    const int* picked;          // rows of a list's items in this pack, by slot
+    const int* picked;          // rows of a list's items in this pack, by slot; each thread has its own
     const int* const* varying;  // rows that contact has found
     int at(int k) const { return list ? list[k] : k; }
 };
@@ -60,11 +60,11 @@ struct Moves {
         return {s.lists[list].items.data(), s.lists[list].count, s.picked.data(), nullptr};
     }
     // Look up once what all instructions on this pack need.
-    void pick(Scene<R>& s, int first) const {
+    void pick(const Span& s, int* picked, int first) const {
         if (list < 0) return;
-        const int* item = s.lists[list].items.data() + first;
+        const int* item = s.list + first;
         for (size_t k = 0; k < tables.size(); k++) {
-            int* to = s.picked.data() + k * L;
+            int* to = picked + k * L;
             if (tables[k] == OWN) std::copy(item, item + L, to);
             else if (tables[k] >= 0) {
                 const int* index = program.tables[tables[k]].data();

@@ -19,17 +19,21 @@ struct PerMass : Stage<R> {
         if (!join(s, s.value[given], 1)) return;
         const P *m = at(s.value[mass]), *from = at(s.value[given]);
         P* to = at(s.value[out]);
-        for (int i = PACKS; i < packs(s); i++) to[i] = vectors(from[i] * inverse(m[i]));
+        over_blocks(s, [&](int first, int last) {
+            for (int i = PACKS * first; i < PACKS * last; i++) to[i] = vectors(from[i] * inverse(m[i]));
+        });
     }
     void reverse(Scene<R>& s) const override {
         if (s.layers->points.size() == 0) return;
         const P *m = at(s.value[mass]), *quotient = at(s.value[out]), *seed = at(s.bar[out]);
         P *by_mass = at(s.bar[mass]), *by_given = at(s.bar[given]);
-        for (int i = PACKS; i < packs(s); i++) {
-            const P g = vectors(seed[i] * inverse(m[i])), work = g * quotient[i];
-            by_given[i] = by_given[i] + g;
-            by_mass[i] = by_mass[i] - counts(m[i]) * on_masses(work);
-        }
+        over_blocks(s, [&](int first, int last) {
+            for (int i = PACKS * first; i < PACKS * last; i++) {
+                const P g = vectors(seed[i] * inverse(m[i])), work = g * quotient[i];
+                by_given[i] = by_given[i] + g;
+                by_mass[i] = by_mass[i] - counts(m[i]) * on_masses(work);
+            }
+        });
         join(s, s.bar[given], 1);
     }
     void tangent(Scene<R>& s) const override {
@@ -38,37 +42,62 @@ struct PerMass : Stage<R> {
         const R *m = s.value[mass], *quotient = s.value[out];
         const Node *m_dot = node(s.dot[mass]), *from = node(s.dot[given]);
         Node* to = node(s.dot[out]);
-        for (int n = 4; n < 4 * s.layers->nodes.count(); n++) {
-            const R own = m[n * ON_NODE];
-            const bool counts = own > least;
-            const Node moved = counts ? m_dot[n] : Node(0.0);
-            const Quad<R> by_mass = first_of(moved), there = reinterpret_cast<const Quad<R>*>(quotient)[n];
-            const Node change = (from[n] - widened(there) * repeated(by_mass)) * alike(counts ? 1 / own : R(1));
-            to[n] = without_mass(change);
-        }
+        over_blocks(s, [&](int first, int last) {
+            for (int n = 4 * first; n < 4 * last; n++) {
+                const R own = m[n * ON_NODE];
+                const bool counts = own > least;
+                const Node moved = counts ? m_dot[n] : Node(0.0);
+                const Quad<R> by_mass = first_of(moved), there = reinterpret_cast<const Quad<R>*>(quotient)[n];
+                const Node change = (from[n] - widened(there) * repeated(by_mass)) * alike(counts ? 1 / own : R(1));
+                to[n] = without_mass(change);
+            }
+        });
     }
 
   private:
     using Node = Pack<R, ON_NODE * DIRECTIONS>;  // four directions of each of the four numbers
     static constexpr int PACKS = ON_BLOCK / LANES<R>;
-    static int packs(const Scene<R>& s) { return PACKS * s.layers->nodes.count(); }
     static P* at(R* field) { return reinterpret_cast<P*>(field); }
     static Node* node(R* field) { return reinterpret_cast<Node*>(field); }
 
-    // The last two nodes of a block are the first two of the one above: both get the sum. False: there are no points.
+    // The last two nodes of a block are the first two of the one above, and threads may have copies of both: all get the
+    // sum. False: there are no points.
     static bool join(Scene<R>& s, R* field, int depth) {
-        const auto& above = s.layers->nodes.above;
         if (s.layers->points.size() == 0) return false;
-        struct Half {
-            Pack<R, 8> numbers;
-        };
-        for (size_t b = 1; b < above.size(); b++) {
-            if (above[b] == 0) continue;
-            Half* upper = reinterpret_cast<Half*>(field + (b * ON_BLOCK + ON_BLOCK / 2) * depth);
-            Half* lower = reinterpret_cast<Half*>(field + size_t(above[b]) * ON_BLOCK * depth);
-            for (int k = 0; k < depth; k++) upper[k].numbers = lower[k].numbers = upper[k].numbers + lower[k].numbers;
-        }
+        const Nodes<R>& nodes = s.layers->nodes;
+        over_blocks(s, [&](int first, int last) {
+            for (int b = std::max(first, 1); b < last; b++) {
+                const int over = nodes.above[b];
+                if (over < 0) continue;
+                if (nodes.twin[b] == 0 && (over == 0 || nodes.twin[over] == 0)) {
+                    if (over == 0) continue;
+                    Half *upper = half(field, b, 1, depth), *lower = half(field, over, 0, depth);
+                    for (int k = 0; k < depth; k++) upper[k].numbers = lower[k].numbers = upper[k].numbers + lower[k].numbers;
+                    continue;
+                }
+                join_copies(nodes, field, depth, b, over);
+                if (nodes.lowermost[b]) join_copies(nodes, field, depth, 0, b);
+            }
+        });
         return true;
+    }
+    struct Half {
+        Pack<R, 8> numbers;
+    };
+    static Half* half(R* field, int block, int which, int depth) {
+        return reinterpret_cast<Half*>(field + (size_t(block) * ON_BLOCK + which * (ON_BLOCK / 2)) * depth);
+    }
+    // Upper halves of the copies of one block, and lower halves of those of another; 0: none.
+    static void join_copies(const Nodes<R>& nodes, R* field, int depth, int below, int over) {
+        for (int k = 0; k < depth; k++) {
+            Pack<R, 8> sum(0.0);
+            auto each = [&](auto f) {
+                if (below) nodes.copies(below, [&](int b) { f(half(field, b, 1, depth)[k].numbers); });
+                if (over) nodes.copies(over, [&](int b) { f(half(field, b, 0, depth)[k].numbers); });
+            };
+            each([&](auto& numbers) { sum = sum + numbers; });
+            each([&](auto& numbers) { numbers = sum; });
+        }
     }
     static P masses(P a) {
         if constexpr (PACKS == 2) return P(__builtin_shufflevector(a.v, a.v, 0, 0, 0, 0, 4, 4, 4, 4));

@@ -5,6 +5,7 @@
 
 #include "pack.h"
 #include "search.h"
+#include "team.h"
 
 namespace tc {
 
@@ -31,14 +32,18 @@ struct Points {
         for (int p = 0; p < size(); p++)
             for (int c = 0; c < 3; c++) weight[p / L * 3 + c].v[p % L] = places[3 * place[p] + c];
     }
-    // Neighbours in a pack are far apart: additions to one node need not wait for each other.
+    // Neighbours in a pack are far apart, so that additions to one node need not wait for each other; neighbouring packs
+    // are near each other, for what lies in the cache, and for threads that have some packs each.
     static std::vector<int> scattered(const std::vector<int>& found) {
-        constexpr int lanes = LANES<float>;
-        const int packs = (int(found.size()) + lanes - 1) / lanes;
+        constexpr int lanes = LANES<float>, most = 16;
+        const int packs = (int(found.size()) + lanes - 1) / lanes, groups = (packs + most - 1) / most;
         std::vector<int> out;
-        for (int p = 0; p < packs; p++)
-            for (int lane = 0; lane < lanes; lane++)
-                if (size_t(lane * packs + p) < found.size()) out.push_back(found[lane * packs + p]);
+        for (int group = 0; group < groups; group++) {
+            const int first = begin_of(group, groups, packs), last = begin_of(group + 1, groups, packs);
+            const size_t end = std::min(found.size(), size_t(last) * lanes);
+            for (int p = 0; p < last - first; p++)
+                for (size_t k = size_t(first) * lanes + p; k < end; k += last - first) out.push_back(found[k]);
+        }
         return out;
     }
     void show(const int** rows) const {

@@ -1,14 +1,17 @@
 // What a substep is made of: fields, index tables, and the stages that read and write them.
 #pragma once
 
+#include <algorithm>
 #include <cstring>
 #include <memory>
+#include <mutex>
 #include <stdexcept>
 #include <string>
 #include <vector>
 
 #include "rows.h"
 #include "tape.h"
+#include "team.h"
 
 namespace tc {
 
@@ -72,23 +75,56 @@ struct Fixed {
     int made = -1;  // for which lists of contact
 };
 
-constexpr int WOKEN_LIST = 7;  // where rows begin that contact lists anew at every substep: contact.h
+// Rows that contact lists, in the order of engine/parts/contact.py: of points, of those woken and those asleep, from the
+// seventh on anew at every substep. OWN_ROW: no two points have the same there.
+enum Listed { POINTS_LIST, OWN_ROW = 4, WOKEN_LIST = 7, ASLEEP_LIST = 13, LISTS = 19 };
 
 template <class R>
 struct Layers;  // contact.h
+
+// Where a thread finds the fields, and its registers.
+template <class R>
+struct View {
+    R *const *value, *const *bar, *const *dot;
+    Wide<R>*regs, *bars;
+    Along<R>* dots;  // [register][lane]
+    int* picked;     // rows of the items of a pack, by table of the loop
+};
+
+// What a thread beside the first one needs: registers, and memory for what several add to at once.
+template <class R>
+struct Desk {
+    struct Share {
+        Buffer<R> memory;
+        R* to = nullptr;
+        size_t low = 0, high = 0;  // numbers that it may have added to
+    };
+    std::vector<R*> value, bar, dot;
+    std::vector<Share> values, bars, dots;  // by field
+    std::vector<Share*> used;               // in the present loop
+    Buffer<Wide<R>> own_regs, own_bars;
+    Buffer<Along<R>> own_dots;
+    std::vector<int> picked;
+    View<R> view() { return {value.data(), bar.data(), dot.data(), own_regs.data, own_bars.data, own_dots.data, picked.data()}; }
+};
 
 // One simulated scene, or one scene with some directions: everything that changes.
 template <class R>
 struct Scene {
     std::vector<R*> value, bar, dot;  // by field; null where there is none
     Buffer<Wide<R>> regs, bars;
-    Buffer<Along<R>> dots;            // [register][lane]
+    Buffer<Along<R>> dots;
+    std::vector<int> picked;
+    View<R> view() { return {value.data(), bar.data(), dot.data(), regs.data, bars.data, dots.data, picked.data()}; }
+    Team* team = nullptr;
+    double worth = 0;                 // operations of a substep for which another thread is worth while
+    std::vector<Desk<R>> desks;       // of the team's members beside the first
     std::vector<List> lists;          // by sieve
-    std::vector<int> picked;          // rows of the items of a pack, by table of the loop
     // What contact between layers decides anew at every substep: how many items some loops have, and which rows.
     std::vector<int> counts;
     std::vector<const int*> rows;
     std::shared_ptr<Layers<R>> layers;
+    int parts = 1, point_parts = 1;  // into which rows, and points of contact, are divided among threads
     std::vector<Fixed<R>> fixed;
     int lists_made = 0;  // how often contact listed other points
     int64_t substep = 0, substeps = 0;
@@ -96,9 +132,18 @@ struct Scene {
     bool knows = false;        // masks are there already
 };
 
+// f(first row, behind the last one) for the rows of every thread.
+template <class R, class F>
+void over_rows(const Scene<R>& s, int rows, F f) {
+    if (s.parts == 1) return f(0, rows);
+    s.team->run(s.parts, [&](int m) { f(begin_of(m, s.parts, rows), begin_of(m + 1, s.parts, rows)); });
+}
+
 template <class R>
 struct Stage {
     virtual ~Stage() = default;
+    virtual void ready() {}  // all its instructions are there
+    virtual double cost(const Scene<R>&) const { return 0; }  // operations on numbers, about
     virtual void forward(Scene<R>& s) const = 0;
     virtual void tangent(Scene<R>& s) const = 0;
     virtual void reverse(Scene<R>& s) const = 0;  // values of all that it reads are there
@@ -116,6 +161,8 @@ struct Program {
     int registers = 0, lists = 0, fixed = 0;
     int counts = 0, rows = 0, words = 0;  // sizes of what Scene has for contact
     size_t state_size = 0, record_size = 0;  // numbers
+    mutable Habit habits[3];  // by mode; guard them
+    mutable std::mutex guard;
 
     int field(Kind kind, int rows, int comps, int near = 0, int vertices = 0) {
         const bool raw = near > 0, plain = raw || kind == Kind::drive;
@@ -125,6 +172,13 @@ struct Program {
         constants.emplace_back();
         return int(fields.size()) - 1;
     }
+    // As many as are worth it.
+    int parts(const Scene<R>& s) const {
+        if (s.team == nullptr) return 1;
+        double sum = 0;
+        for (const auto& stage : stages) sum += stage->cost(s);
+        return int(std::clamp(sum / s.worth, 1.0, double(s.team->size)));
+    }
     void lay_out() {  // states first: the record of a coarse checkpoint is the start of a full one
         record_size = 0;
         for (Kind kind : {Kind::state, Kind::kept}) {
@@ -132,6 +186,7 @@ struct Program {
                 if (f.kind == kind) f.offset = int(record_size), record_size += round_up(int(f.size()), LANES<float>);
             if (kind == Kind::state) state_size = record_size;
         }
+        for (auto& stage : stages) stage->ready();
     }
 };
 

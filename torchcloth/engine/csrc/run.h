@@ -2,10 +2,8 @@
 #pragma once
 
 #include <algorithm>
-#include <atomic>
 #include <exception>
 #include <mutex>
-#include <thread>
 
 #include "program.h"
 
@@ -29,6 +27,7 @@ struct Call {
     int64_t scenes, substeps, directions, threads;
     void* records;      // [scenes, records_size]
     int64_t every;      // substeps between records; 0: none
+    double worth;       // operations of a substep for which another thread is worth while
 };
 
 // Numbers for one scene: [1 + ceil(substeps / every), record_size, or state_size where every > 1], then the triangles
@@ -41,25 +40,15 @@ size_t records_size(const Program<R>& p, int64_t substeps, int64_t every) {
     return (rows + masks + LANES<R> - 1) / LANES<R> * LANES<R>;  // the next scene's begin on a cache line
 }
 
-// While it lives, numbers too small for full precision count as 0: where a wave has not yet arrived, processors spend
-// twice the time on them.
-class Flush {
-#ifdef __SSE2__
-    unsigned before = __builtin_ia32_stmxcsr();
-
-  public:
-    Flush() { __builtin_ia32_ldmxcsr(before | 0x8040); }
-    ~Flush() { __builtin_ia32_ldmxcsr(before); }
-#endif
-};
-
 template <class R>
 class Run {
     using D = Along<R>;
+    static constexpr int64_t LONG = 4;  // substeps that are worth the start of a second thread
     const Program<R>& program;
     const Call& call;
 
     struct Memory {
+        std::unique_ptr<Team> team;
         Scene<R> scene;
         std::vector<Buffer<R>> values, bars, dots;  // by field, owned
         std::vector<size_t> temporaries;            // fields that start each substep at zero
@@ -73,7 +62,7 @@ class Run {
         each(call.scenes, [&](int64_t scene) {
             Memory m = memory(scene, Mode::value);
             R* first = call.every ? record(scene, 0) : nullptr;
-            if (call.every) clear(scene);
+            if (call.every) clear_records(scene);
             m.rows.reset(2 * program.record_size);
             R *row = call.every == 1 ? first : m.rows.data, *after = nullptr;
             start(m, scene, row);
@@ -84,6 +73,7 @@ class Run {
                 row = after;
             }
             finish(m, scene, row);
+            learn(m, Mode::value);
         });
     }
 
@@ -103,13 +93,13 @@ class Run {
                 for (int64_t k = last - 1; k >= first; k--) back(m, scene, k, row(k), row(k + 1));
             }
             gradients(m, scene);
+            learn(m, Mode::reverse);
         });
     }
 
     void tangent() {
-        const int64_t chunks = (call.directions + DIRECTIONS - 1) / DIRECTIONS;
-        each(call.scenes * chunks, [&](int64_t task) {
-            const int64_t scene = task / chunks, chunk = task % chunks;
+        each(tasks(Mode::tangent), [&](int64_t task) {
+            const int64_t scene = task / chunks(), chunk = task % chunks();
             Memory m = memory(scene, Mode::tangent);
             load_dots(m, scene, chunk);
             m.rows.reset(2 * program.record_size);
@@ -118,7 +108,6 @@ class Run {
             for (int64_t k = 0; k < call.substeps; k++) {
                 after = other(m, row);
                 point(m, scene, k, row, after);
-                for (size_t f : m.temporaries) m.dots[f].clear();
                 for (const auto& stage : program.stages) stage->tangent(m.scene);
                 for (size_t f = 0; f < program.fields.size(); f++)
                     if (program.next[f] >= 0) std::swap(m.scene.dot[f], m.scene.dot[program.next[f]]);
@@ -126,6 +115,7 @@ class Run {
             }
             if (chunk == 0) finish(m, scene, row);
             save_dots(m, scene, chunk);
+            learn(m, Mode::tangent);
         });
     }
 
@@ -159,7 +149,7 @@ class Run {
         return static_cast<R*>(call.records) + scene * records_size(program, call.substeps, call.every) + k * size;
     }
     // What no substep writes: lanes beyond the last row, and the end of the last record. Results are then reproducible.
-    void clear(int64_t scene) const {
+    void clear_records(int64_t scene) const {
         const int64_t last = (call.substeps + call.every - 1) / call.every;
         for (int64_t k = 0; k <= last; k++) {
             const size_t size = k == last && call.every == 1 ? program.record_size : program.state_size;
@@ -206,8 +196,26 @@ class Run {
                 m.scene.dot[f] = m.dots[f].data;
             }
         }
+        if (const int64_t threads = call.threads / tasks(mode); threads > 1 && call.substeps >= LONG) {
+            std::lock_guard<std::mutex> lock(program.guard);
+            m.team = std::make_unique<Team>(threads, program.habits[int(mode)]);
+            m.scene.team = m.team.get(), m.scene.worth = call.worth, m.scene.desks.resize(threads - 1);
+        }
+        for (Desk<R>& desk : m.scene.desks) {
+            for (auto* at : {&desk.value, &desk.bar, &desk.dot}) at->assign(count, nullptr);
+            for (auto* shares : {&desk.values, &desk.bars, &desk.dots}) shares->resize(count);
+            desk.own_regs.reset(m.scene.regs.size), desk.own_bars.reset(m.scene.bars.size), desk.own_dots.reset(m.scene.dots.size);
+        }
+        m.scene.parts = program.parts(m.scene);
         return m;
     }
+    void learn(const Memory& m, Mode mode) const {
+        if (m.team == nullptr) return;
+        std::lock_guard<std::mutex> lock(program.guard);
+        program.habits[int(mode)] = m.team->habit;
+    }
+    int64_t chunks() const { return (call.directions + DIRECTIONS - 1) / DIRECTIONS; }
+    int64_t tasks(Mode mode) const { return call.scenes * (mode == Mode::tangent ? chunks() : 1); }
 
     // Between the caller's [rows, components] and ours, which has pitches; `depth` numbers each.
     void load(R* to, const Field& f, const void* from, int64_t at, int depth, int which = 0) const {
@@ -242,9 +250,23 @@ class Run {
         }
     }
 
+    // Sets fields to zero, f(zero) with zero(field, numbers): every thread its own rows.
+    template <class F>
+    static void clear(Scene<R>& s, F f) {
+        auto part = [&](int m) {
+            f([&](R* field, size_t size) {
+                const size_t lines = (size + LANES<R> - 1) / LANES<R>;
+                std::fill(field + lines * m / s.parts * LANES<R>, field + std::min(size, lines * (m + 1) / s.parts * LANES<R>), R(0));
+            });
+        };
+        if (s.parts == 1) part(0);
+        else s.team->run(s.parts, part);
+    }
+
     // Let every field point to where it is in substep k.
     void point(Memory& m, int64_t scene, int64_t k, R* row, R* after) const {
         m.scene.substep = k;
+        if (m.scene.parts > 1) m.team->weigh();
         for (size_t f = 0; f < program.fields.size(); f++) {
             const Field& field = program.fields[f];
             if (field.kind == Kind::state || field.kind == Kind::kept) m.scene.value[f] = row + field.offset;
@@ -255,8 +277,12 @@ class Run {
                 if (m.dots[f].data) m.scene.dot[f] = m.dots[f].data + k * field.comps * DIRECTIONS;
             }
         }
-        std::memset(row + program.state_size, 0, (program.record_size - program.state_size) * sizeof(R));
-        for (size_t f : m.temporaries) if (m.values[f].data) m.values[f].clear();
+        clear(m.scene, [&](auto zero) {
+            for (size_t f : m.temporaries) {
+                zero(m.scene.value[f], program.fields[f].size());
+                if (m.scene.dot[f]) zero(m.scene.dot[f], program.fields[f].size() * DIRECTIONS);
+            }
+        });
     }
     void substep(Memory& m, int64_t scene, int64_t k, R* row, R* after) const {
         point(m, scene, k, row, after);
@@ -264,17 +290,23 @@ class Run {
     }
     void back(Memory& m, int64_t scene, int64_t k, R* row, R* after) const {
         m.scene.substep = k;
+        if (m.scene.parts > 1) m.team->weigh();
         for (size_t f = 0; f < program.fields.size(); f++) {
             const Field& field = program.fields[f];
             if (field.kind == Kind::state || field.kind == Kind::kept) m.scene.value[f] = row + field.offset;
             if (program.next[f] >= 0) m.scene.value[program.next[f]] = after + field.offset;
-            if (field.kind == Kind::state || is_within(field.kind)) std::memset(m.scene.bar[f], 0, field.size() * sizeof(R));
-            if (field.kind == Kind::temporary) m.values[f].clear();
             if (field.kind == Kind::drive) {
                 m.scene.value[f] = m.values[f].data + k * field.comps;
                 if (m.bars[f].data) m.scene.bar[f] = m.bars[f].data + k * field.comps;
             }
         }
+        clear(m.scene, [&](auto zero) {
+            for (size_t f = 0; f < program.fields.size(); f++) {
+                const Field& field = program.fields[f];
+                if (field.kind == Kind::state || is_within(field.kind)) zero(m.scene.bar[f], field.size());
+                if (field.kind == Kind::temporary) zero(m.scene.value[f], field.size());
+            }
+        });
         for (const auto& stage : program.stages) if (stage->again) stage->replay(m.scene);
         for (auto stage = program.stages.rbegin(); stage != program.stages.rend(); ++stage) (*stage)->reverse(m.scene);
         for (size_t f = 0; f < program.fields.size(); f++)

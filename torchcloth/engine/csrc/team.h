@@ -1,0 +1,162 @@
+// Threads that go through one scene together. A substep has a dozen pieces of some microseconds each: who waits for the
+// next one watches for it, and sleeps only after a while.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+#include <memory>
+#include <thread>
+#include <vector>
+
+namespace tc {
+
+// While it lives, numbers too small for full precision count as 0: where a wave has not yet arrived, processors spend
+// twice the time on them.
+class Flush {
+#ifdef __SSE2__
+    unsigned before = __builtin_ia32_stmxcsr();
+
+  public:
+    Flush() { __builtin_ia32_ldmxcsr(before | 0x8040); }
+    ~Flush() { __builtin_ia32_ldmxcsr(before); }
+#endif
+};
+
+// Whether work is done together or alone: what a team has learned.
+struct Habit {
+    bool alone = false;
+    int round = 0;  // of a trial, or since it
+    static constexpr int TRIAL = 32, COUNT = 16;  // rounds each way, of which the last ones count: a new thread takes
+                                                  // some to come to a processor of its own
+    std::chrono::steady_clock::duration took[2][COUNT];  // together, alone
+};
+
+class Team {
+    using Clock = std::chrono::steady_clock;
+    struct alignas(64) Word {
+        std::atomic<int64_t> at{0};
+    };
+    struct Member {
+        Word offer, done;  // even: a piece of work, odd: somebody has taken it; the last piece that the member did
+        std::thread thread;
+    };
+    std::vector<std::unique_ptr<Member>> others;  // there from the first work for several on
+    int64_t round = 0;
+    const void* work = nullptr;
+    void (*call)(const void*, int) = nullptr;
+
+  public:
+    const int size;
+    Habit habit;
+
+    Team(int64_t size, const Habit& habit) : size(int(size)), habit(habit), began(Clock::now()) {}
+    Team(const Team&) = delete;
+    Team& operator=(const Team&) = delete;
+    ~Team() {
+        call = nullptr;
+        offer(1 + int(others.size()));
+        for (auto& member : others) member->thread.join();
+    }
+
+    // job(part) for parts 0 to parts - 1 at once. What nobody has begun when the caller is done with its own part, the
+    // caller does; and all of it for a while when it had to wait for a thread that other processes keep from running.
+    // What a job throws would end the process.
+    template <class F>
+    void run(int parts, const F& job) {
+        if (habit.alone || (delayed && Clock::now() < delayed_until)) {
+            for (int part = 0; part < parts; part++) job(part);
+            return;
+        }
+        delayed = false;
+        while (int(others.size()) < parts - 1) hire();
+        work = &job, call = [](const void* to, int part) { (*static_cast<const F*>(to))(part); };
+        offer(parts);
+        [&]() noexcept { job(0); }();  // the others may be at it still
+        for (int part = 1; part < parts; part++) {
+            Member& other = *others[part - 1];
+            if (take(other, round)) job(part);
+            else await(other);
+        }
+    }
+
+    // To be called once in every round of the same work, which is tried together and alone, and then done as was faster:
+    // results are the same, and how soon one processor sees what another one wrote differs by a factor between machines.
+    void weigh() {
+        const auto now = Clock::now();
+        Habit& h = habit;
+        if (delayed && h.round <= 2 * Habit::TRIAL) h.round = 0;
+        const int counted = (h.round - 1) % Habit::TRIAL - (Habit::TRIAL - Habit::COUNT);
+        if (h.round > 0 && h.round <= 2 * Habit::TRIAL && counted >= 0) h.took[h.alone][counted] = now - began;
+        if (h.round < 2 * Habit::TRIAL) h.alone = h.round >= Habit::TRIAL;
+        else if (h.round == 2 * Habit::TRIAL) h.alone = middle(h.took[1]) < middle(h.took[0]);
+        h.round = h.round < TERM ? h.round + 1 : 0;
+        began = now;
+    }
+
+  private:
+    static constexpr int64_t WATCH = 100000;  // some 50 us
+    bool delayed = false;
+    int patience = 1;  // for how many times what was lost the caller works alone: more when it happens again soon
+    Clock::time_point delayed_until;
+
+    static constexpr int TERM = 5000;  // rounds to the next trial
+    Clock::time_point began;           // the present round
+
+    static Clock::duration middle(Clock::duration* took) {
+        std::nth_element(took, took + Habit::COUNT / 2, took + Habit::COUNT);
+        return took[Habit::COUNT / 2];
+    }
+
+    void await(const Member& other) {
+        auto done = [&] { return other.done.at.load(std::memory_order_acquire) == round; };
+        for (int64_t k = 0; k < WATCH && !done(); k++) rest(k);
+        if (done()) return;
+        const auto before = Clock::now();
+        while (!done()) std::this_thread::yield();
+        const auto now = Clock::now();
+        patience = before - delayed_until < 10 * (now - before) ? std::min(2 * patience, 64) : 1;
+        delayed = true, delayed_until = now + patience * (now - before);
+    }
+    static void rest(int64_t k) {
+        if (k > WATCH) std::this_thread::yield();
+#if defined(__x86_64__)
+        else if (k % 256 == 0) __builtin_ia32_pause();  // seldom: who pauses on and on is put aside by a virtual machine's host
+#endif
+    }
+    void offer(int parts) {
+        round += 2;
+        for (int part = 1; part < parts; part++) {
+            others[part - 1]->offer.at.store(round, std::memory_order_release);
+            others[part - 1]->offer.at.notify_one();
+        }
+    }
+    static bool take(Member& member, int64_t piece) {
+        return member.offer.at.compare_exchange_strong(piece, piece + 1, std::memory_order_acq_rel);
+    }
+    void hire() {
+        const int part = int(others.size()) + 1;
+        others.push_back(std::make_unique<Member>());
+        Member& own = *others.back();
+        own.offer.at = round + 1;
+        own.thread = std::thread([this, part, &own] {
+            [[maybe_unused]] const Flush flush;
+            for (;;) {
+                int64_t piece = own.offer.at.load(std::memory_order_acquire);
+                for (int64_t k = 0; piece % 2 != 0; k++, piece = own.offer.at.load(std::memory_order_acquire))
+                    if (k > WATCH) own.offer.at.wait(piece);
+                    else rest(k);
+                if (!take(own, piece)) continue;
+                if (call == nullptr) return;
+                call(work, part);
+                own.done.at.store(piece, std::memory_order_release);
+            }
+        });
+    }
+};
+
+// Part `m` of `parts` of so many items: where it begins. It ends where the next one does.
+inline int begin_of(int m, int parts, int count) { return int(int64_t(count) * m / parts); }
+
+}  // namespace tc
