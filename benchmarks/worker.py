@@ -1,7 +1,7 @@
 """A contestant in a process of its own: compiled code, thread pools and memory do not meet.
 
 One JSON object a line each way: {"prepare": task, "run": flag}, {"sample": shortest seconds} and {"result": {}} are
-answered in turn.
+answered in turn. Who is not asked is stopped: thread pools watch for work long after their last, at others' expense.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -44,6 +45,7 @@ class Worker:
         )
         self.threads = self._answer()["threads"]
         self.ready = time.perf_counter() - start  # s
+        self._signal("SIGSTOP")
 
     def __enter__(self) -> Worker:
         return self
@@ -71,6 +73,7 @@ class Worker:
 
     def close(self) -> None:
         """End the process."""
+        self._signal("SIGCONT")
         with contextlib.suppress(OSError):
             self._process.stdin.close()  # type: ignore[union-attr]
         try:
@@ -81,12 +84,20 @@ class Worker:
         self._errors.close()
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        self._signal("SIGCONT")
         try:
             self._process.stdin.write(json.dumps(request) + "\n")  # type: ignore[union-attr]
             self._process.stdin.flush()  # type: ignore[union-attr]
         except OSError:
             pass  # it died: the answer says why
-        return self._answer()
+        try:
+            return self._answer()
+        finally:
+            self._signal("SIGSTOP")
+
+    def _signal(self, name: str) -> None:
+        if hasattr(signal, name):  # not on every system
+            self._process.send_signal(getattr(signal, name))
 
     def _answer(self) -> dict[str, Any]:
         line = self._process.stdout.readline()  # type: ignore[union-attr]

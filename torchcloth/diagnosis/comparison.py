@@ -64,11 +64,22 @@ def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) 
     Of the groups ``halved`` every other stretch of time is left out instead, and then the others: where one kind of
     motion alone tells of a cause, no other can say how large it is.
     """
+    return _told(found, *_held_out(found, groups, halved))
+
+
+def likelihood(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> float:
+    """Log density of all cells as ``predict`` has them, up to a constant that no model changes."""
+    _, white, scale = _held_out(found, groups, halved)
+    return float(densities(white, found.white.stretch).sum() - scale.sum())
+
+
+def _held_out(found: Fitted, groups: Sequence[str], halved: Collection[str]) -> tuple[Tensor, Tensor, Tensor]:
+    """Of all cells K^-1 r, whitened, and logarithms of the scale."""
     likely, white, scale = (torch.zeros_like(found.white.value) for _ in range(3))
     plain = unweighted(found.white)
     for inside in _folds(found, groups, halved):
         likely[inside], white[inside], scale[inside] = _by_others(found, plain, inside)
-    return _told(found, likely, white, scale)
+    return likely, white, scale
 
 
 def _by_others(found: Fitted, plain: Whitened, inside: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -26,8 +26,9 @@ class Flush {
 
 // Whether work is done together or alone: what a team has learned.
 struct Habit {
-    bool alone = false;
-    int round = 0;  // of a trial, or since it
+    static constexpr int FIRST = 250, TERM = 8000;  // rounds to the next trial: the more, the more trials agree
+    bool alone = false, before = false;             // now, and after the last trial
+    int round = 0, term = FIRST;                    // of a trial, or since it; to the next one
     static constexpr int TRIAL = 32, COUNT = 16;  // rounds each way, of which the last ones count: a new thread takes
                                                   // some to come to a processor of its own
     std::chrono::steady_clock::duration took[2][COUNT];  // together, alone
@@ -90,8 +91,12 @@ class Team {
         const int counted = (h.round - 1) % Habit::TRIAL - (Habit::TRIAL - Habit::COUNT);
         if (h.round > 0 && h.round <= 2 * Habit::TRIAL && counted >= 0) h.took[h.alone][counted] = now - began;
         if (h.round < 2 * Habit::TRIAL) h.alone = h.round >= Habit::TRIAL;
-        else if (h.round == 2 * Habit::TRIAL) h.alone = middle(h.took[1]) < middle(h.took[0]);
-        h.round = h.round < TERM ? h.round + 1 : 0;
+        else if (h.round == 2 * Habit::TRIAL) {
+            h.alone = middle(h.took[1]) < middle(h.took[0]);
+            h.term = h.alone == h.before ? std::min(2 * h.term, Habit::TERM) : Habit::FIRST;
+            h.before = h.alone;
+        }
+        h.round = h.round < 2 * Habit::TRIAL + h.term ? h.round + 1 : 0;
         began = now;
     }
 
@@ -101,7 +106,6 @@ class Team {
     int patience = 1;  // for how many times what was lost the caller works alone: more when it happens again soon
     Clock::time_point delayed_until;
 
-    static constexpr int TERM = 5000;  // rounds to the next trial
     Clock::time_point began;           // the present round
 
     static Clock::duration middle(Clock::duration* took) {

@@ -1,0 +1,42 @@
+"""Placebos on linear toys: what is there beats them, what is not there does so as seldom as promised."""
+
+from dataclasses import replace
+
+import linear_toys as toys
+import torch
+
+from torchcloth.diagnosis.bursts import calmed
+from torchcloth.diagnosis.fitting import leap
+from torchcloth.diagnosis.placebo import placebo
+
+SLOPES = toys.smooth(1, 4)  # two parameters, a cause, a nuisance
+MOTIONS = [f"motion {k}" for k in range(toys.EPISODES)]
+
+
+def with_cause(amplitude: float, seed: int):
+    """A fitted model with the cause, of data that have so much of it."""
+    ev = toys.evidence(SLOPES, 3, [], torch.tensor([0.1, -0.1, amplitude]).double(), seed)
+    found = toys.fitted(ev)
+    model = replace(found.model, parameters=found.model.parameters[:2], values=found.model.values[:2])
+    model = model.plus(toys.hypothesis("cause"))
+    step, _ = leap(found.white, model)
+    there = found.white._replace(value=found.white.value + found.white.jacobian[:, :3] @ step)
+    return replace(found, model=model.at(step), white=calmed(there))
+
+
+def test_a_cause_beats_its_placebos():
+    for seed in range(5):
+        found = placebo(with_cause(0.5, seed), MOTIONS, seed=seed)
+        assert found.passed
+        assert found.gain > 20 + 5 * max(found.chance, 0.0)
+
+
+def test_what_is_not_there_seldom_does():
+    """Of 60 data without the cause some 5 % may pass by chance: 9 or more would happen once in 500 times."""
+    passed = sum(placebo(with_cause(0.0, seed), MOTIONS, seed=seed).passed for seed in range(60))
+    assert passed < 9
+
+
+def test_the_same_seed_gives_the_same_placebos():
+    found = with_cause(0.0, 1)
+    assert placebo(found, MOTIONS, seed=3) == placebo(found, MOTIONS, seed=3)
