@@ -264,12 +264,12 @@ def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str],
         alone = telling(after, names)
         predicted = predict(after, names, alone)
         gain = compare(predict(before, names, alone), predicted, 0.0)
-        sure = _sure(gain, names, alone, first=not current.model.accepted)
+        sure = standard_errors(gain, names, alone, not current.model.accepted)
         out.append(Candidate(row, found, predicted, gain, alone, sure))
     return out
 
 
-def _sure(gain: Gain, names: Sequence[str], alone: set[str], first: bool) -> float:
+def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bool) -> float:
     """Standard errors between motions from which they agree that there is something."""
     motions = len(set(names))
     # Of what mends that much of all that is wrong in motions it was not fitted to, predictions have said that it is
