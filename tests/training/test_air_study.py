@@ -48,7 +48,7 @@ def test_an_error_knows_of_runs_and_of_groups():
 
 def test_the_table_counts_what_is_named_first(capsys):
     groups = {"a": answer("air.linear", "obs.clock"), "b": answer("obs.clock", "air.linear"), "c": answer()}
-    pooled = air.pooled(predicted(), ["g0", "g1"])
+    pooled = air.pooled(predicted(), ["g0", "g1", "g1"])
     air_tables.show({"groups": groups, "predicted_runs": ["range30_rep2"], "predicted": pooled})
     said = capsys.readouterr().out
     assert "air is named before any other cause in 1 of 3 groups, another cause in 1" in said

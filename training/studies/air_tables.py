@@ -27,6 +27,12 @@ def first(answer: dict[str, Any]) -> str:
     return answer["causes"][0]["effect"] if answer["causes"] else ""
 
 
+def _named(answer: dict[str, Any]) -> str:
+    """All causes of a group with its first run."""
+    causes = ", ".join(c["effect"] for c in answer["causes"]) or "none named"
+    return f"{causes} (group of {answer['runs'][0].replace('range', '').replace('_rep', '/')})"
+
+
 def show(found: dict[str, Any]) -> None:
     """As tables, with what they say."""
     from rich.console import Console
@@ -51,12 +57,14 @@ def show(found: dict[str, Any]) -> None:
     if unseen:
         console.print(f"mass itself cannot be told: {MASS} cannot be seen in {unseen} groups, only ratios to it can")
     filled = table(f"{len(found['predicted_runs'])} whole runs that none was fitted to; 95 %", *HEADINGS, left=1)
-    for key, label in LABELS.items():
-        row = found["predicted"][key]
-        cells = [_estimate(row, name, *how) for name, how in QUANTITIES.items()]
-        filled.add_row(escape(label), *cells)
+    rows = [(label, found["predicted"][key]) for key, label in LABELS.items()]
+    rows += [(f"  {_named(a)}", row) for a, row in zip(answers, found["predicted"]["after"]["groups"], strict=True)]
+    for label, row in rows:
+        filled.add_row(escape(label), *(_estimate(row, name, *how) for name, how in QUANTITIES.items()))
     console.print(filled)
-    console.print("by drawing the runs again, and what groups differ by. decay: B of A' = -B A^2 of the amplitude A")
+    console.print(
+        "by drawing the runs again and, of means, what groups differ by. decay: B of A' = -B A^2 of the amplitude A"
+    )
 
 
 HEADINGS = ("", "node rms mm", "swing Hz", "decay 1/(m s)")
