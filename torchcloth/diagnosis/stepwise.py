@@ -30,6 +30,7 @@ MUCH = 8.0  # log density, of a cause that is worth fitting
 MOSTLY, HALF = 1 / 3, 1 / 2  # of what is wrong: least that all causes, or a further one, explain beside something else
 # standard errors between motions, from which they agree that there is something: 97.5 % of t by one less than there are
 SURE = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26)
+NORMAL = 1.96  # the same of what mends most of all that is wrong
 WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
 WORTH_PULL = 3e-3  # N, the same where it shows in forces
 
@@ -43,6 +44,7 @@ class Candidate:
     predicted: Predicted
     gain: Gain  # over the model without it
     alone: set[str]  # the motion that alone tells of it, if any
+    sure: float  # standard errors between motions that it must be away from zero
 
     @property
     def hypothesis(self) -> Hypothesis:
@@ -187,7 +189,7 @@ def _pruned(
     """Less the causes that the others have made needless."""
     for step in steps:
         name, last = step.best.hypothesis.name, step is steps[-1]
-        known = _known(current, name, setting.names, step.best.alone)
+        known = _known(current, name, setting.names, step.best)
         if known and last:  # it has just been tried
             continue
         less = without_cause(current, name)
@@ -261,21 +263,32 @@ def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str],
         after = renoised(found, noise)
         alone = telling(after, names)
         predicted = predict(after, names, alone)
-        out.append(Candidate(row, found, predicted, compare(predict(before, names, alone), predicted, 0.0), alone))
+        gain = compare(predict(before, names, alone), predicted, 0.0)
+        sure = standard_errors(gain, names, alone, not current.model.accepted)
+        out.append(Candidate(row, found, predicted, gain, alone, sure))
     return out
 
 
+def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bool) -> float:
+    """Standard errors between motions from which they agree that there is something."""
+    motions = len(set(names))
+    # Of what mends that much of all that is wrong in motions it was not fitted to, predictions have said that it is
+    # there; real motions may then differ about its size. Two motions differ once, which tells nothing.
+    if first and motions > 2 and gain.before**2 - gain.after**2 > MOSTLY * gain.before**2:
+        return NORMAL
+    return SURE[min(motions + len(alone) - 2, len(SURE) - 1)]
+
+
 def _useful(c: Candidate, names: Sequence[str]) -> bool:
-    return _worthwhile(c.gain) and _known(c.fitted, c.hypothesis.name, names, c.alone)
+    return _worthwhile(c.gain) and _known(c.fitted, c.hypothesis.name, names, c)
 
 
-def _known(found: Fitted, name: str, names: Sequence[str], alone: set[str]) -> bool:
+def _known(found: Fitted, name: str, names: Sequence[str], c: Candidate) -> bool:
     """Of a size that makes sense, and that motions agree about so far that there is something."""
     place = found.model.place(name)
     h, amplitude = found.model.accepted[place], abs(found.model.amplitudes[place])
-    std = float(spread(found, names, alone)[len(found.model.parameters) + place])
-    sure = SURE[min(len(set(names)) + len(alone) - 2, len(SURE) - 1)]
-    return sure * std < amplitude < PLAUSIBLE * abs(h.typical)
+    std = float(spread(found, names, c.alone)[len(found.model.parameters) + place])
+    return c.sure * std < amplitude < PLAUSIBLE * abs(h.typical)
 
 
 def _worthwhile(gain: Gain) -> bool:

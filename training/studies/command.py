@@ -21,6 +21,7 @@ STUDIES: tuple[str, ...] = (
     "cost",
     "hidden",
     "salting",
+    "air",
 )
 
 

@@ -7,7 +7,7 @@ hang before the tool moves, which is taken off all models alike.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from torchcloth.cloth import Cloth
+from torchcloth.diagnosis import World
 from torchcloth.identification import episode, rigid_carry
 from torchcloth.identification.replays import Replay
 from torchcloth.identification.streams import on_pattern
@@ -25,16 +26,17 @@ from ..checkout import module
 from .swings import START, cloth_of, recording
 
 Run = dict[str, np.ndarray]
+Values = dict[str, float]  # of air and damping, as ``cloth_of`` has them
 
 
-def predict(source: Path, name: str, models: dict[str, dict[str, float]]) -> dict[str, Any]:
+def predict(source: Path, name: str, models: Mapping[str, Values | World]) -> dict[str, Any]:
     """One run by every model: squares of the nodes' distances, and its free swing as the camera sees it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # rows of a frame that the camera did not see at all
         return _predict(source, name, models)
 
 
-def _predict(source: Path, name: str, models: dict[str, dict[str, float]]) -> dict[str, Any]:
+def _predict(source: Path, name: str, models: Mapping[str, Values | World]) -> dict[str, Any]:
     swings, free = module("realdata", "swings"), module("realdata", "free_swing")
     run, data = recording(source, name), swings.runs(source)[name]
     t = run.require("points", by="the study").t
@@ -68,12 +70,14 @@ def _lower_edge(nodes: np.ndarray) -> list[float | None]:
     return [float(one) if np.isfinite(one) else None for one in y]
 
 
-def _nodes(run: Recording, values: dict[str, float] | None) -> np.ndarray:
+def _nodes(run: Recording, model: Values | World | None) -> np.ndarray:
     """[F, 64, 3] m of a model at the run's frames; None: carried rigidly."""
-    cloth = cloth_of(run, values or START)
+    if isinstance(model, World):
+        return _hits(model.cloth).on(model.frames(episode(model.cloth, run)).x).numpy()
+    cloth = cloth_of(run, model or START)
     data = episode(cloth, run)
     with torch.no_grad():
-        x = rigid_carry(data) if values is None else Replay(cloth)(data).x
+        x = rigid_carry(data) if model is None else Replay(cloth)(data).x
     return _hits(cloth).on(x).numpy()
 
 

@@ -1,0 +1,28 @@
+"""How far motions must agree about a cause."""
+
+import pytest
+
+from torchcloth.diagnosis.comparison import Gain
+from torchcloth.diagnosis.stepwise import NORMAL, SURE, standard_errors
+
+
+def gain(after):
+    return Gain(1.0, after, 50.0, (10.0, 90.0), 0.5, (0.2, 0.8), (1.0, after), (0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("after", "names", "first", "asked"),
+    [
+        (0.7, ["a", "b", "c"], True, NORMAL),  # half of the mean square
+        (0.9, ["a", "b", "c"], True, SURE[1]),  # a fifth
+        (0.7, ["a", "b", "c"], False, SURE[1]),  # beside another cause
+        (0.7, ["a", "b", "b"], True, SURE[0]),  # two motions
+        (1.2, ["a", "b", "c", "d"], True, SURE[2]),
+    ],
+)
+def test_what_mends_much_of_all_that_is_wrong_may_differ_from_motion_to_motion(after, names, first, asked):
+    assert standard_errors(gain(after), names, set(), first) == asked
+
+
+def test_a_motion_that_alone_tells_counts_twice_and_does_not_make_three():
+    assert standard_errors(gain(0.7), ["a", "b"], {"a"}, True) == SURE[1]

@@ -1,0 +1,111 @@
+"""Do real swings say that air is what vacuum lacks? Diagnoses of IRI swings, and what they mend of runs held out.
+
+Groups of three swings of different sizes are diagnosed, each from a base model in vacuum and about all that the
+catalogue knows. Then every group's model predicts whole runs that none has seen, without its causes and with them: the
+distance of the nodes, and frequency and decay of the free swings after the tool has stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchcloth._files import write_text
+from torchcloth.diagnosis import base_model, catalogue, judge, load_model, save_model, search, setting_of
+from torchcloth.diagnosis.base_model import together
+from torchcloth.recordings import PointClouds, Recording
+
+from ..kept import Kept
+from . import air_tables
+from .checkout import module
+from .measured import VARIABLE, find, swings
+from .measured.swing_predictions import predict, summary
+
+GROUPS = 4
+SECONDS, FAST_SECONDS = 6.0, 3.0  # from when the tool starts: until then it stands for up to three
+FAST_ASKED = ("air.drag_n", "air.linear", "air.added_mass")
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Options."""
+    parser.add_argument("--source", type=Path, metavar="DIR", help=f"folder of measured data (${VARIABLE})")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Compute what is missing, then print and draw everything."""
+    source = find(options.source) / swings.SOURCE
+    kept = Kept(options.out, {"study": "air", "fast": options.fast})
+    fitted, held = swings.split(source, fast=False)
+    held = held[4:5] if options.fast else held
+    groups = {f"group-{k + 1}": names for k, names in enumerate(grouped(fitted)[: 1 if options.fast else GROUPS])}
+    cases = {g: partial(diagnosed, source, names, options.out / g, options.fast) for g, names in groups.items()}
+    answers = kept.run(cases)
+    cases = {f"swing-{name}": partial(_predicted, source, name, options.out, list(groups)) for name in held}
+    runs = dict(zip(held, kept.run(cases).values(), strict=True))
+    labels = [f"{when} {g}" for when in ("before", "after") for g in groups]
+    found = {"groups": answers, "predicted_runs": held, "predicted": pooled(summary(runs, labels), list(groups))}
+    path = write_text(options.out / "air.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
+    air_tables.show(found)
+    picture = air_tables.draw(found, runs, options.out / "air.png")
+    print(f"result:  {path}\npicture: {picture}")
+
+
+def grouped(names: Sequence[str]) -> list[list[str]]:
+    """Threes of different sizes, as many as there are."""
+    sizes: dict[str, list[str]] = {}
+    for name in names:
+        sizes.setdefault(name.partition("_")[0], []).append(name)
+    return [list(three) for three in zip(*sizes.values(), strict=False)]
+
+
+def diagnosed(source: Path, names: Sequence[str], folder: Path, fast: bool) -> dict[str, Any]:
+    """The answer of one group; its models are written to the folder."""
+    seconds = FAST_SECONDS if fast else SECONDS
+    recordings = [beginning(source, name, seconds) for name in names]
+    model = base_model(together(recordings))
+    asked = [h for h in catalogue(model, recordings) if not fast or h.name in FAST_ASKED]
+    setting = setting_of(model, recordings)
+    answer = judge(search(model, setting, asked), setting.names)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, end in (("before", answer.found.start), ("after", answer.found.end)):
+        save_model(folder / f"{name}.tcm", end.model, recordings[0], end.covariance)
+    keys = ("verdict", "causes", "gain", "also_unexplained", "ruled_out", "undecided", "unresolvable", "parameters")
+    return {"runs": list(names), "asked": len(asked), **{key: answer.content[key] for key in keys}}
+
+
+def beginning(source: Path, name: str, seconds: float) -> Recording:
+    """A run until that long after the cloth was seen to start."""
+    adapter, found = module("realdata", "swings"), swings.recording(source, name)
+    data, p = adapter.runs(source)[name], found.require("points", by="the study")
+    frames = int((p.t <= adapter.start(data) + adapter.lag(data).value + seconds).sum())
+    rows = int(p.counts[:frames].sum())
+    return replace(found, points=PointClouds(p.t[:frames], p.xyz[:rows], p.counts[:frames]), markers=None)
+
+
+def _predicted(source: Path, name: str, out: Path, groups: Sequence[str]) -> dict[str, Any]:
+    worlds = {
+        f"{when} {g}": load_model(out / g / f"{when}.tcm").world() for when in ("before", "after") for g in groups
+    }
+    return predict(source, name, worlds)
+
+
+def pooled(found: dict[str, Any], groups: Sequence[str]) -> dict[str, Any]:
+    """The mean over groups; errors of the runs, and of what groups differ by (standard error of their mean)."""
+    out = {key: found[key] for key in ("measured", "still", "null")}
+    for when in ("before", "after"):
+        rows = [found[f"{when} {g}"] for g in groups]
+        out[when] = {}
+        for key in ("rms", "frequency", "decay"):
+            values = np.array([row[key] for row in rows])
+            between = values.var(ddof=1) / len(rows) if len(rows) > 1 else 0.0
+            runs = np.mean([row[f"{key}_std"] ** 2 for row in rows])
+            out[when] |= {key: float(values.mean()), f"{key}_std": float((runs + between) ** 0.5)}
+        out[when]["groups"] = rows
+    return out
