@@ -14,6 +14,7 @@ from .evidence import Progress, Setting, staged
 from .fitting import IMPOSSIBLE, Fitted, fit, renoised, with_cause, without_cause
 from .lacking import explained, lack_of_fit
 from .noise import Noise, fit_noise, floor_of, unfitted
+from .placebo import Placebo, placebo
 from .repeats import Repeats, pairs_of, repeats
 from .screening import PRESENT, Row, screen
 from .world import Hypothesis, Model
@@ -57,6 +58,7 @@ class Step:
     """One accepted cause with what cannot be told from it."""
 
     best: Candidate
+    placebo: Placebo  # that it passed
     tried: list[Candidate]  # best among them
     rivals: list[Candidate]
     screened: list[Row]
@@ -230,13 +232,17 @@ def _step(
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
     noise = fit_noise(first.fitted.evidence)
     tried = _compared(current, fits, setting.names, noise)
-    useful = [c for c in tried if _useful(c, setting.names)]
-    if not useful:
+    useful = sorted((c for c in tried if _useful(c, setting.names)), key=lambda c: -c.gain.density)
+    beside = lambda c: placebo(renoised(c.fitted, noise), setting.names, c.alone)  # noqa: E731
+    chance = None
+    while useful and not (chance := beside(useful[0])).passed:
+        useful = useful[1:]
+    if not useful or chance is None:
         return None
-    best = max(useful, key=lambda c: c.gain.density)
+    best = useful[0]
     alike = lambda c: predict(renoised(c.fitted, noise), setting.names, best.alone)  # noqa: E731
     rivals = [c for c in useful if c is not best and _rival(c, alike(c), best)]
-    return Step(best, tried, rivals, screened, current)
+    return Step(best, chance, tried, rivals, screened, current)
 
 
 def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> list[tuple[Row, Fitted]]:

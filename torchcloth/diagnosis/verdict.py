@@ -144,6 +144,7 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
             for c in step.rivals
         ],
         "gain_mm": 1e3 * (best.gain.before - best.gain.after),
+        "placebo": {"log_density": step.placebo.gain, "chance": step.placebo.chance},
         "share_of_explainable": _share(found, best.gain),
     }
 

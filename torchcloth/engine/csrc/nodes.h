@@ -166,7 +166,7 @@ struct Nodes {
     }
     // Where a key is, or would be; there the number is 0.
     size_t slot(int64_t wanted) const {
-        size_t at = (uint64_t(wanted) * 0x9E3779B97F4A7C15ull >> 20) & (key.size() - 1);
+        size_t at = (uint64_t(wanted) * 0x9E3779B97F4A7C15ull >> 43) & (key.size() - 1);  // high bits: all of the key tells there
         while (key[at] != -1 && key[at] != wanted) at = (at + 1) & (key.size() - 1);
         return at;
     }
