@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import again
 import drawn
 import numpy as np
 import pytest
@@ -161,3 +162,9 @@ def test_wrong_numbers_are_refused_in_one_line(tmp_path, capsys):
     assert main(["--seed", "5000", "--out", str(tmp_path / "x")]) == 2
     assert capsys.readouterr().err == "seed 5000: expected 0 to 999, or 100000 and more\n"
     assert not (tmp_path / "x").exists()
+
+
+def test_a_sealed_case_is_not_diagnosed_again_and_again(capsys, tmp_path):
+    assert again.main(["--seed", str(SEALED), "--keep", str(tmp_path / "cases")]) == 2
+    assert "sealed" in capsys.readouterr().err
+    assert not (tmp_path / "cases").exists()

@@ -1,0 +1,80 @@
+"""Diagnoses a development case again: what was simulated before is kept, so that other decisions cost seconds.
+
+python tests/hidden/again.py --seed 66 --keep cases     # makes cases/66 once, then says what was tried and why
+
+For one process a case. A change in what is simulated (a mesh, a parameter, the catalogue) needs a new folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import beside  # noqa: F401
+import make
+import torch
+from drawn import DEVELOPMENT, REDUCED, SMALL, case
+
+from torchcloth import diagnosis, recordings
+from torchcloth.diagnosis import stepwise
+from torchcloth.diagnosis.comparison import spread
+from torchcloth.diagnosis.stepwise import Candidate
+
+
+def said(c: Candidate, names: list[str]) -> str:
+    """One line on a cause that was tried."""
+    place = c.fitted.model.place(c.hypothesis.name)
+    amplitude = c.fitted.model.amplitudes[place]
+    motions = float(spread(c.fitted, names, c.alone)[len(c.fitted.model.parameters) + place])
+    (calm, after), (low, high) = c.gain.calm, c.gain.ci95
+    return (
+        f"  {c.hypothesis.name:22} {amplitude:9.3g} {c.hypothesis.unit:8} density {c.gain.density:8.1f} "
+        f"({low:.0f} to {high:.0f}), {1e3 * calm:.2f} -> {1e3 * after:.2f} mm, {abs(amplitude) / motions:.1f} standard "
+        f"errors between motions ({c.sure:.2f} asked), chi^2 {float(c.fitted.white.value.square().sum()):.0f}"
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--keep", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--fast", action="store_true", help="fewer and shorter episodes, coarser meshes")
+    options = parser.parse_args(arguments)
+    if not 0 <= options.seed < DEVELOPMENT:
+        print(f"--seed: got {options.seed}; expected 0 to {DEVELOPMENT - 1}: others are sealed", file=sys.stderr)
+        return 2
+    torch.set_default_dtype(torch.float64)
+    folder = options.keep / str(options.seed)
+    fast = ["--fast"] if options.fast else []
+    if not folder.exists() and make.main(["--seed", str(options.seed), "--out", str(folder / "episodes"), *fast]):
+        return 2
+    episodes = [recordings.read(path) for path in sorted((folder / "episodes").iterdir())]
+    journal = folder / "journal"
+    usual = stepwise._compared
+
+    def compared(current, fits, names, noise):
+        found = usual(current, fits, names, noise)
+        print("tried:", *(said(c, names) for c in found), sep="\n", flush=True)
+        return found
+
+    stepwise._compared = compared
+    answer = diagnosis.diagnose(episodes, journal=journal, resume=journal.exists())
+    for row in sorted(answer.found.screened, key=lambda r: -r.worth)[:8]:
+        print(f"left: {row.hypothesis.name:22} {row.amplitude:9.3g} +- {row.std:.2g}  {row.decision}")
+    for row in answer.content["lack_of_fit"]:
+        if row["lacking"]:
+            print(f"lacking: {row['motion']} {row['kind']} {row['ratio']:.2f}")
+    print(answer.verdict)
+    for cause in answer.content["causes"]:
+        print("named:", json.dumps({key: cause[key] for key in ("effect", "amplitude", "ci95", "rivals", "placebo")}))
+    hidden = case(options.seed, SMALL if options.fast else REDUCED)
+    print("hidden:", json.dumps([asdict(e) for e in hidden.effects]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
