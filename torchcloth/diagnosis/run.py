@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,14 +83,26 @@ def diagnose(
     setting = setting_of(model, recordings)
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
-    answer = judge(search(model, setting, asked, progress), setting.names)
-    following = None
-    if answer.verdict in OPEN:
-        following = propose(answer.found, answer.content["causes"], setting, staged(progress, "next experiment"))
-    if any(row["lacking"] for row in answer.content["lack_of_fit"]):
-        answer = _beyond(answer, answer.found.setting, progress)
+    with _one_thread_each():
+        answer = judge(search(model, setting, asked, progress), setting.names)
+        following = None
+        if answer.verdict in OPEN:
+            following = propose(answer.found, answer.content["causes"], setting, staged(progress, "next experiment"))
+        if any(row["lacking"] for row in answer.content["lack_of_fit"]):
+            answer = _beyond(answer, answer.found.setting, progress)
     files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
     return replace(answer, content=answer.content | files | {"next_experiment": following})
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Simulations run side by side: threads of torch's for the small arrays of each would only wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _beyond(answer: Diagnosis, setting: Setting, progress: Progress) -> Diagnosis:

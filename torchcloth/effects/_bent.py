@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +11,7 @@ from torch import Tensor, nn
 
 from .._math import cross, dot, safe_norm
 from ..meshes import Mesh
-from ._curvature import Pattern, Stencils, curvature_stencils, gathered, largest_eigenvalue, local_matrices, mixed_area
-from ._curvature import pattern as pattern_of
+from ._curvature import curvature_stencils, gathered, largest_eigenvalue, local_matrices, mixed_area, pattern
 
 FOLDED = 0.5  # a fit whose tangents span less than this has no normal to speak of: its ring lies folded on itself
 
@@ -52,11 +52,10 @@ class BentSheet(nn.Module):
         self.bending_bound: Tensor  # [V, 1] 1/m^2: over mass, bounds omega^2 per unit bending stiffness [N m]
         self.turning_bound: Tensor  # [V, 1] 1/m: over mass, bounds omega^2 per unit bending moment [N]
 
-    def bind(self, mesh: Mesh, stencils: Stencils | None = None, device: torch.device | None = None) -> BentSheet:
-        """Build the stencils of a mesh, or take them if they are there already."""
-        near, second, first = curvature_stencils(mesh) if stencils is None else stencils
-        area, share = mixed_area(mesh), mesh.vertex_area
-        bending, slope = (_largest(near, part, area, share) for part in (second, first))
+    def bind(self, mesh: Mesh, device: torch.device | None = None) -> BentSheet:
+        """Build the stencils of a mesh."""
+        near, second, first = curvature_stencils(mesh)
+        area, share, (bending, slope) = mixed_area(mesh), mesh.vertex_area, _largest(mesh)
         weight = np.concatenate([second, first], axis=-1).transpose(2, 1, 0)[..., None]
         self.near = torch.as_tensor(near.T.copy(), device=device)
         self.weight, self.area, self.bending_bound, self.turning_bound = (
@@ -121,7 +120,15 @@ def differences(field: Tensor, index: Tensor) -> Tensor:
     return field.index_select(-2, index.flatten()).unflatten(-2, index.shape) - field.unsqueeze(-3)
 
 
-def _largest(near: np.ndarray, weight: np.ndarray, area: np.ndarray, share: np.ndarray) -> float:
-    local = local_matrices(weight * np.sqrt(area)[:, None, None])
-    found: Pattern = pattern_of(near, local)
-    return largest_eigenvalue(found.columns, gathered(found, local), share)
+@lru_cache(maxsize=8)  # as curvature_stencils
+def _largest(mesh: Mesh) -> tuple[float, float]:
+    """Largest eigenvalues of bending and of slopes for a unit of stiffness, over the vertices' areas."""
+    near, second, first = curvature_stencils(mesh)
+    area, share = mixed_area(mesh), mesh.vertex_area
+
+    def of(weight: np.ndarray) -> float:
+        local = local_matrices(weight * np.sqrt(area)[:, None, None])
+        found = pattern(near, local)
+        return largest_eigenvalue(found.columns, gathered(found, local), share)
+
+    return of(second), of(first)

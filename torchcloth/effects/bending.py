@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -108,19 +109,14 @@ class Bending(AbstractEffect):
             got, want = f"shape {tuple(self.stiffness.raw.shape)}", f"a number, [{len(mesh.faces)}] or [B, 1]"
             raise InvalidInput("bending stiffness", got=got, expected=want)
         dtype, device = torch.get_default_dtype(), self.stiffness.raw.device
-        stencils, area, share = curvature_stencils(mesh), mixed_area(mesh), mesh.vertex_area
-        form = stencils.second @ np.linalg.cholesky(_isotropic(self.poisson)) * np.sqrt(area)[:, None, None]
-        local = local_matrices(form)
-        shape = pattern(stencils.near, local)
-        entries = gathered(shape, local)
-        bound = share * largest_eigenvalue(shape.columns, entries, share)
-        self.columns = torch.as_tensor(shape.columns.T.copy(), device=device)
-        self.operator = torch.as_tensor(-entries.T.copy(), dtype=dtype, device=device).unsqueeze(-1)
-        self.bound = torch.as_tensor(bound, dtype=dtype, device=device).unsqueeze(-1)
+        plate = _plate(mesh, self.poisson)
+        self.columns = torch.as_tensor(plate.columns.T.copy(), device=device)
+        self.operator = torch.as_tensor(-plate.entries.T.copy(), dtype=dtype, device=device).unsqueeze(-1)
+        self.bound = torch.as_tensor(plate.bound.copy(), dtype=dtype, device=device).unsqueeze(-1)
         self.faces = torch.as_tensor(mesh.faces.copy(), device=device)
-        self.sheet.bind(mesh, stencils, device)
+        self.sheet.bind(mesh, device)
         if self._uneven(size):
-            self.woven.bind(stencils, area, device)
+            self.woven.bind(curvature_stencils(mesh), mixed_area(mesh), device)
         return self
 
     def _uneven(self, size: int) -> bool:
@@ -212,6 +208,24 @@ class Bending(AbstractEffect):
 
 def _optional(value: float | Tensor | None, unit: str, domain, name: str) -> PhysicalParameter | None:
     return None if value is None else PhysicalParameter(value, unit, domain, name=name)
+
+
+class _Even(NamedTuple):
+    """The plate matrix Q of unit stiffness, by rows."""
+
+    columns: np.ndarray  # [V, D] int
+    entries: np.ndarray  # [V, D] 1/m^2, off-diagonal
+    bound: np.ndarray  # [V] 1/m^2: each vertex's area times the largest eigenvalue of Q over the areas
+
+
+@lru_cache(maxsize=8)  # as curvature_stencils: the power iteration takes longer than many a simulation
+def _plate(mesh: Mesh, poisson: float) -> _Even:
+    stencils, area, share = curvature_stencils(mesh), mixed_area(mesh), mesh.vertex_area
+    form = stencils.second @ np.linalg.cholesky(_isotropic(poisson)) * np.sqrt(area)[:, None, None]
+    local = local_matrices(form)
+    shape = pattern(stencils.near, local)
+    entries = gathered(shape, local)
+    return _Even(shape.columns, entries, share * largest_eigenvalue(shape.columns, entries, share))
 
 
 def _isotropic(poisson: float) -> np.ndarray:

@@ -125,6 +125,7 @@ class Run {
     template <class F>
     void each(int64_t tasks, F work) {
         const int64_t workers = std::max<int64_t>(1, std::min(call.threads, tasks));
+        const Seats seats{int(workers)};
         std::atomic<int64_t> next{0};
         std::exception_ptr failure;
         std::mutex guard;

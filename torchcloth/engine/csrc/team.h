@@ -34,6 +34,27 @@ struct Habit {
     std::chrono::steady_clock::duration took[2][COUNT];  // together, alone
 };
 
+// Processors that this process keeps busy with simulations: who wants helpers gets those that are free, and no more.
+class Seats {
+    static std::atomic<int>& taken() {
+        static std::atomic<int> count{0};
+        return count;
+    }
+
+  public:
+    int own;
+    explicit Seats(int wanted) : own(wanted) { taken() += own; }
+    struct Free {};
+    Seats(int most, Free) : own(0) {
+        const int cores = std::max(1, int(std::thread::hardware_concurrency()));
+        for (int now = taken(); own = std::clamp(cores - now, 0, most), own > 0;)
+            if (taken().compare_exchange_weak(now, now + own)) break;
+    }
+    Seats(const Seats&) = delete;
+    Seats& operator=(const Seats&) = delete;
+    ~Seats() { taken() -= own; }
+};
+
 class Team {
     using Clock = std::chrono::steady_clock;
     struct alignas(64) Word {
@@ -52,7 +73,8 @@ class Team {
     const int size;
     Habit habit;
 
-    Team(int64_t size, const Habit& habit) : size(int(size)), habit(habit), began(Clock::now()) {}
+    Team(int64_t size, const Habit& habit)
+        : size(int(size)), habit(habit), seats(int(size) - 1, Seats::Free{}), began(Clock::now()) {}
     Team(const Team&) = delete;
     Team& operator=(const Team&) = delete;
     ~Team() {
@@ -61,25 +83,29 @@ class Team {
         for (auto& member : others) member->thread.join();
     }
 
-    // job(part) for parts 0 to parts - 1 at once. What nobody has begun when the caller is done with its own part, the
-    // caller does; and all of it for a while when it had to wait for a thread that other processes keep from running.
-    // What a job throws would end the process.
+    // job(part) for parts 0 to parts - 1 at once, by as many threads as there are seats. What nobody has begun when the
+    // caller is done with its own part, the caller does; and all of it for a while when it had to wait for a thread that
+    // other processes keep from running. What a job throws would end the process.
     template <class F>
     void run(int parts, const F& job) {
-        if (habit.alone || (delayed && Clock::now() < delayed_until)) {
+        const int helped = std::min(parts, 1 + seats.own);
+        if (habit.alone || helped == 1 || (delayed && Clock::now() < delayed_until)) {
             for (int part = 0; part < parts; part++) job(part);
             return;
         }
         delayed = false;
-        while (int(others.size()) < parts - 1) hire();
+        while (int(others.size()) < helped - 1) hire();
         work = &job, call = [](const void* to, int part) { (*static_cast<const F*>(to))(part); };
-        offer(parts);
-        [&]() noexcept { job(0); }();  // the others may be at it still
-        for (int part = 1; part < parts; part++) {
-            Member& other = *others[part - 1];
-            if (take(other, round)) job(part);
-            else await(other);
-        }
+        offer(helped);
+        [&]() noexcept {  // the others may be at it still
+            job(0);
+            for (int part = helped; part < parts; part++) job(part);
+            for (int part = 1; part < helped; part++) {
+                Member& other = *others[part - 1];
+                if (take(other, round)) job(part);
+                else await(other);
+            }
+        }();
     }
 
     // To be called once in every round of the same work, which is tried together and alone, and then done as was faster:
@@ -87,7 +113,7 @@ class Team {
     void weigh() {
         const auto now = Clock::now();
         Habit& h = habit;
-        if (delayed && h.round <= 2 * Habit::TRIAL) h.round = 0;
+        if ((delayed || seats.own == 0) && h.round <= 2 * Habit::TRIAL) h.round = 0;
         const int counted = (h.round - 1) % Habit::TRIAL - (Habit::TRIAL - Habit::COUNT);
         if (h.round > 0 && h.round <= 2 * Habit::TRIAL && counted >= 0) h.took[h.alone][counted] = now - began;
         if (h.round < 2 * Habit::TRIAL) h.alone = h.round >= Habit::TRIAL;
@@ -102,11 +128,11 @@ class Team {
 
   private:
     static constexpr int64_t WATCH = 100000;  // some 50 us
+    const Seats seats;
+    Clock::time_point began;  // the present round
     bool delayed = false;
     int patience = 1;  // for how many times what was lost the caller works alone: more when it happens again soon
     Clock::time_point delayed_until;
-
-    Clock::time_point began;           // the present round
 
     static Clock::duration middle(Clock::duration* took) {
         std::nth_element(took, took + Habit::COUNT / 2, took + Habit::COUNT);
