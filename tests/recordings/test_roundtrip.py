@@ -150,6 +150,10 @@ def test_frames_and_images(episode, recording):
     assert len(back.points) == 3
     assert [len(back.points.frame(i)) for i in range(3)] == [30, 1, 17]
     np.testing.assert_array_equal(back.points.frame(-1), back.points.xyz[31:])
+    ends = back.points.only(np.array([True, False, True]))
+    assert ends.counts.tolist() == [30, 17]
+    np.testing.assert_array_equal(ends.frame(1), back.points.frame(2))
+    np.testing.assert_array_equal(ends.t, back.points.t[[0, 2]])
     camera = back.cameras["cam0"]
     for kind, dtype, shape in (
         ("depth", np.uint16, (6, 8)),

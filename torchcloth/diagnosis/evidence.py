@@ -257,7 +257,7 @@ def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
 
 def step_sizes(model: Model) -> list[tuple[int, float]]:
     """(coordinate, small step) along each of the model's own."""
-    return list(enumerate([*(p.step for p in model.parameters), *(0.1 * h.typical for h in model.accepted)]))
+    return list(enumerate([*(p.step for p in model.parameters), *(h.step * h.typical for h in model.accepted)]))
 
 
 def shifted(model: Model, coordinate: int, step: float) -> Model:

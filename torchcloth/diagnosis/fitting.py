@@ -62,20 +62,32 @@ def fit(
     """Fit the model's parameters and amplitudes, then ask about the hypotheses there.
 
     Fits are compared with the same ``noise``; None: estimated. The nuisances' slopes are those of ``before``, if given.
-    ``here`` is the evidence at the model's point, where that is known already.
+    ``here`` is the evidence at the model's point, where that is known already. A step into what is ``IMPOSSIBLE`` is
+    not taken.
     """
-    for k in range(iterations):
-        here = here or gather(model, setting, (), staged(progress, f"fit {k + 1}"), before)
+    about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
+
+    def look(at: Model, steps: int) -> Evidence:
+        """After so many; once there are no more, at the hypotheses, too."""
+        if steps < iterations:
+            return gather(at, setting, (), staged(progress, f"fit {steps + 1}"), before)
+        return gather(at, setting, hypotheses, staged(progress, about), before)
+
+    asked = here is None and not iterations
+    here = here or look(model, 0)
+    for taken in range(1, iterations + 1):
         before = before or here
         step, ahead = leap(whitened(here, noise or fit_noise(here)), model)
         if ahead < ENOUGH:
             break
-        model, here = model.at(model.point + step), None
-    if here is None or hypotheses:
-        about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
-        here = gather(model, setting, hypotheses, staged(progress, about), before)
-    noise = noise or fit_noise(here)
-    return weighed(model, here, noise)
+        further = model.at(model.point + step)
+        try:
+            model, here, asked = further, look(further, taken), taken == iterations
+        except IMPOSSIBLE:
+            break
+    if hypotheses and not asked:
+        here = look(model, iterations)
+    return weighed(model, here, noise or fit_noise(here))
 
 
 def weighed(model: Model, evidence: Evidence, noise: Noise) -> Fitted:

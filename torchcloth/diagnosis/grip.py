@@ -11,6 +11,7 @@ from .world import Hypothesis, World
 
 LEAST = 1e-3  # -, of friction
 HOLD = 0.3  # N, above which a loose grip yields
+WHOLE = 1.0  # of typical: patches grow vertex by vertex, and a smaller step changes nothing
 
 
 def _grasps(world: World) -> dict[str, Grasp]:
@@ -58,8 +59,8 @@ def _has_table(recording: Recording) -> bool:
 
 HYPOTHESES = (
     Hypothesis("grip.slip", "m/(N s)", 0.05, _slip),
-    Hypothesis("grip.width", "m", 0.02, lambda w, a: _regrasped(w, wider=a)),
-    Hypothesis("robot.regrasp", "m", 0.017, lambda w, a: _regrasped(w, along=a), signed=True),
+    Hypothesis("grip.width", "m", 0.02, lambda w, a: _regrasped(w, wider=a), step=WHOLE),
+    Hypothesis("robot.regrasp", "m", 0.017, lambda w, a: _regrasped(w, along=a), signed=True, step=WHOLE),
     Hypothesis("contact.mu", "-", 0.2, lambda w, a: _friction(w, more=a), signed=True, needs=_has_table),
     Hypothesis("contact.aniso", "-", -0.5, lambda w, a: _friction(w, along=a), signed=True, needs=_has_table),
 )

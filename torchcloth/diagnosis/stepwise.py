@@ -147,10 +147,7 @@ def _chain(
         best, before = step.best.fitted, current
         left = best.model.others(hypotheses)
         now = staged(progress, f"with {step.best.hypothesis.name}")
-        try:
-            current = fit(best.model, setting, left, FURTHER, now, before=start.evidence, here=best.evidence)
-        except IMPOSSIBLE:  # a step too far; what was found before stands
-            current = fit(best.model, setting, left, 0, now, before=start.evidence)
+        current = fit(best.model, setting, left, FURTHER, now, before=start.evidence, here=best.evidence)
         if steps and _beside_the_point(before, current, setting.names, HALF):
             current = before
             break
@@ -158,8 +155,7 @@ def _chain(
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     if steps and current.ahead > FAR:
         left = current.model.others(hypotheses)
-        with suppress(*IMPOSSIBLE):  # what was found before stands
-            current = fit(current.model, setting, left, progress=staged(progress, "all"), before=current.evidence)
+        current = fit(current.model, setting, left, progress=staged(progress, "all"), before=current.evidence)
     return (start, []) if steps and _beside_the_point(start, current, setting.names, MOSTLY) else (current, steps)
 
 
@@ -256,8 +252,7 @@ def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> li
         found = c.fitted
         if expected > max(0.0, 0.5 * max(hope)) and found.ahead > CLEAR:
             further = staged(progress, f"trying {c.hypothesis.name} further")
-            with suppress(*IMPOSSIBLE):  # what was found before stands
-                found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
+            found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
         out.append((c.row, found))
     return out
 

@@ -106,6 +106,7 @@ class Hypothesis:
         apply: (world, amplitude) -> world.
         signed: negative amplitudes make sense.
         share: smallest amplitude of interest, as a share of the typical one.
+        step: of slopes beside an amplitude, as a share of the typical one.
         needs: what a recording must have for it to mean anything.
         kin: names that no experiment of this kind can tell from it, by structure.
         twin: base parameter that is the same number; where that is fitted, its prior alone tells of the hypothesis.
@@ -117,6 +118,7 @@ class Hypothesis:
     apply: Callable[[World, float], World]
     signed: bool = False
     share: float = 0.4
+    step: float = 0.1
     needs: Callable[[Recording], bool] = lambda recording: True
     kin: tuple[str, ...] = ()
     twin: str = ""

@@ -112,6 +112,10 @@ class PointClouds:
         end = int(np.cumsum(self.counts)[i])
         return self.xyz[end - int(self.counts[i]) : end]
 
+    def only(self, frames: np.ndarray) -> PointClouds:
+        """Those of some frames, by mask [T], without ``extra``."""
+        return PointClouds(self.t[frames], self.xyz[np.repeat(frames, self.counts)], self.counts[frames])
+
 
 @dataclass(frozen=True, eq=False)
 class Markers:

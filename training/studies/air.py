@@ -20,7 +20,7 @@ import numpy as np
 from torchcloth._files import write_text
 from torchcloth.diagnosis import base_model, catalogue, judge, load_model, save_model, search, setting_of
 from torchcloth.diagnosis.base_model import together
-from torchcloth.recordings import PointClouds, Recording
+from torchcloth.recordings import Recording
 
 from ..kept import Kept
 from . import air_tables
@@ -83,10 +83,9 @@ def diagnosed(source: Path, names: Sequence[str], folder: Path, fast: bool) -> d
 def beginning(source: Path, name: str, seconds: float) -> Recording:
     """A run until that long after the cloth was seen to start."""
     adapter, found = module("realdata", "swings"), swings.recording(source, name)
-    data, p = adapter.runs(source)[name], found.require("points", by="the study")
-    frames = int((p.t <= adapter.start(data) + adapter.lag(data).value + seconds).sum())
-    rows = int(p.counts[:frames].sum())
-    return replace(found, points=PointClouds(p.t[:frames], p.xyz[:rows], p.counts[:frames]), markers=None)
+    data, points = adapter.runs(source)[name], found.require("points", by="the study")
+    end = adapter.start(data) + adapter.lag(data).value + seconds
+    return replace(found, points=points.only(points.t <= end), markers=None)
 
 
 def _predicted(source: Path, name: str, out: Path, groups: Sequence[str]) -> dict[str, Any]:

@@ -139,15 +139,11 @@ def _named(found: Sequence[Hypothesis], name: str) -> Hypothesis:
 
 def _short(r: Recording, fast: bool) -> Recording:
     """The beginning, seen by a camera in front of the cloth."""
-    p = r.points
-    if p is None:
-        raise ValueError("a swing without points")
-    frames = int((p.t - p.t[0] <= (FAST_SECONDS if fast else SECONDS)).sum())
-    rows = int(p.counts[:frames].sum())
+    points = r.require("points", by="the study")
+    points = points.only(points.t - points.t[0] <= (FAST_SECONDS if fast else SECONDS))
     pose = np.eye(4)
-    pose[:3, 3] = p.xyz[:rows].mean(0) - [0.0, DISTANCE, 0.0]
+    pose[:3, 3] = points.xyz.mean(0) - [0.0, DISTANCE, 0.0]
     camera = Camera(width=640, height=480, K=np.eye(3), T_world_camera=pose)
-    points = PointClouds(p.t[:frames], p.xyz[:rows], p.counts[:frames])
     return replace(r, points=points, markers=None, cameras={"front": camera})
 
 

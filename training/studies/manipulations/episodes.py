@@ -37,8 +37,8 @@ class Seen(NamedTuple):
         """The first ``share`` of the frames."""
         points = self.recording.require("points")
         count = round(share * len(points.t))
-        cut = rec.PointClouds(points.t[:count], points.xyz[: points.counts[:count].sum()], points.counts[:count])
-        return self._replace(recording=replace(self.recording, points=cut), x=self.x[:count])
+        beginning = points.only(np.arange(len(points)) < count)
+        return self._replace(recording=replace(self.recording, points=beginning), x=self.x[:count])
 
 
 def record(truth: Scene, model: Scene, rate: float, points: int) -> Seen:

@@ -55,13 +55,7 @@ def recording(source: Path, name: str, every: int = 1) -> recordings.Recording:
         areal_density_std=None,
     )
     chosen = np.arange(len(found.points)) % every == 0
-    return replace(found, cloth=cloth, points=_some(found.points, chosen), path=Path(name))
-
-
-def _some(points: recordings.PointClouds, chosen: np.ndarray) -> recordings.PointClouds:
-    """Frames by mask."""
-    rows = np.repeat(chosen, points.counts)
-    return recordings.PointClouds(points.t[chosen], points.xyz[rows], points.counts[chosen])
+    return replace(found, cloth=cloth, points=found.points.only(chosen), path=Path(name))
 
 
 def _mesh() -> meshes.Mesh:

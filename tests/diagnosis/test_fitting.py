@@ -1,0 +1,68 @@
+"""Gauss-Newton between worlds of which some are impossible."""
+
+from dataclasses import replace
+
+import linear_toys as toys
+import pytest
+import torch
+
+from torchcloth.diagnosis import fitting
+from torchcloth.diagnosis.fitting import fit
+from torchcloth.errors import SimulationDiverged
+
+TRUTH = torch.tensor([0.4]).double()
+
+
+@pytest.fixture
+def looks(monkeypatch):
+    """(where the fit looked, with how many hypotheses); worlds beyond ``looks.edge`` are impossible."""
+    there = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0))
+
+    class Looks(list):
+        edge = torch.inf
+
+    seen = Looks()
+
+    def gather(model, setting, hypotheses, progress, before):
+        at = float(model.point[0])
+        seen.append((at, len(hypotheses)))
+        if at > seen.edge:
+            raise SimulationDiverged("x", got="nan", expected="numbers")
+        cells = [c._replace(value=c.value + c.jacobian[:, 0] * at) for c in there.evidence.cells]
+        return replace(there.evidence, cells=cells, hypotheses=list(hypotheses))
+
+    monkeypatch.setattr(fitting, "gather", gather)
+    return seen, there.model
+
+
+def test_it_ends_where_the_data_are_and_asks_there(looks):
+    seen, model = looks
+    found = fit(model, None, [toys.hypothesis("a")])  # type: ignore[arg-type]
+    assert float(found.model.point[0]) == pytest.approx(0.4, abs=4 * float(found.covariance[0, 0]) ** 0.5)
+    assert [count for _, count in seen] == [0] * (len(seen) - 1) + [1]
+    assert seen[-1][0] == float(found.model.point[0])
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_a_step_into_the_impossible_is_not_taken(looks, iterations):
+    seen, model = looks
+    seen.edge = 0.1
+    found = fit(model, None, [toys.hypothesis("a")], iterations)  # type: ignore[arg-type]
+    assert float(found.model.point[0]) == 0.0
+    assert [h.name for h in found.evidence.hypotheses] == ["a"]
+    assert seen[-1] == (0.0, 1)
+
+
+def test_where_it_begins_must_be_possible(looks):
+    seen, model = looks
+    seen.edge = -1.0
+    with pytest.raises(SimulationDiverged):
+        fit(model, None)  # type: ignore[arg-type]
+
+
+def test_what_is_known_is_not_looked_at_again(looks):
+    seen, model = looks
+    here = fit(model, None, iterations=0).evidence  # type: ignore[arg-type]
+    seen.clear()
+    fit(model, None, iterations=0, here=here)  # type: ignore[arg-type]
+    assert not seen
