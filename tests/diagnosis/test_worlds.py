@@ -86,6 +86,19 @@ def test_a_table_may_rub_more_and_otherwise_along_x():
     assert float(law.ratio.value) == pytest.approx(2.0)
 
 
+def test_a_table_may_hold_before_it_slips_and_pull():
+    table = replace(RECORDING, colliders={"table": Collider(np.array([0.0, 0.0, 0.2]), np.array([0.0, 0.0, 1.0]), 0.4)})
+    model = base_model(table)
+    by = {h.name: h for h in catalogue(model, [table])}
+    cloth = model.world([(by["contact.stick"], 0.3), (by["contact.mu"], 0.1), (by["contact.adhesion"], 2.0)]).cloth
+    law, pull = cloth.boundaries["table"].friction, cloth.effects["table_pull"]
+    assert (float(law.value), float(law.excess.value)) == pytest.approx((0.5, 0.3))
+    assert float(pull.stress.value) == pytest.approx(2.0)
+    assert pull.point.tolist() == [0.0, 0.0, 0.2]
+    both = model.world([(by["contact.stick"], 0.3), (by["contact.aniso"], -0.5)]).cloth.boundaries["table"].friction
+    assert type(both) is type(law)  # no law has both: the later changes nothing
+
+
 def test_what_a_recording_cannot_show_is_not_asked(made):
     model, _ = made
     asked = {h.name for h in catalogue(model, [replace(RECORDING, cameras={})])}

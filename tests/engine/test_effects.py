@@ -64,6 +64,7 @@ EFFECTS = {
         {"across@edge": 0.5, "across2": 0.7, "along": -0.2, "along2@inside": 0.3, "mass@edge": 0.1, "bend@inside": 1e-4}
     ),
     "residual strain rate": lambda: E.ResidualForce({"strain_rate": 0.1, "strain_rate@edge": 0.2}),
+    "adhesion": lambda: E.Adhesion(3.0, 0.4, point=(0.0, 0.0, -0.2), normal=(0.1, 0.2, 1.0)),
     "body force": lambda: E.BodyForce(torch.tensor([[0.5, -1.0, 2.0]])),
     "body force of vertices": lambda: E.BodyForce(torch.sin(torch.arange(72.0)).reshape(24, 3)),
 }

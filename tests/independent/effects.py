@@ -60,6 +60,7 @@ CATALOGUE = {
     "grip.width": Effect("grip", "wider", "m", 0.02, "turn"),
     "contact.mu": Effect("table", "friction", "-", 0.2, "drag"),
     "contact.aniso": Effect("table", "along", "-", -0.5, "drag"),
+    "contact.stick": Effect("table", "excess", "-", 0.3, "drag", ("speed",)),
     "contact.adhesion": Effect("table", "adhesion", "Pa", 1.5, "lift", ("gap",)),
     "env.gravity_tilt": Effect("weight", "tilt", "rad", 0.01, "hang", ("heading",)),
     "obs.extrinsic": Effect("sensor", "shift", "m", 4e-3, "hang", ("heading", "rotation")),
@@ -76,7 +77,6 @@ CATALOGUE = {
     "x.layer_mass": Effect("weight", "layer", "-", 1.0),
     "x.layer_stiffness": Effect("plate", "layer", "-", 7.0),
     "x.moisture": Effect("weight", "moisture", "1/s", 0.05, "stretch"),
-    "x.stick_slip": Effect("table", "excess", "-", 0.3, "drag", ("speed",)),
 }
 
 

@@ -77,6 +77,11 @@ class TestMassDamping(EffectContract):
         return tc.effects.MassDamping(amplitude)
 
 
+class TestAdhesion(EffectContract):
+    def make(self, amplitude):
+        return tc.effects.Adhesion(amplitude, gap=0.4, point=(0.0, 0.0, -0.2))
+
+
 class TestResidualForce(EffectContract):
     def make(self, amplitude):
         laws = ("across", "across2@edge", "along@inside", "along2", "mass@edge", "strain_rate@inside")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from .._math import dot, safe_norm
+from .._vectors import direction
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 
@@ -101,28 +101,3 @@ class Elliptic(Coulomb):
 def per_point(value: Tensor) -> Tensor:
     """A body's scalar [] or batch [..., 1] as it meets points [..., N, 1]."""
     return value.unsqueeze(-1) if value.ndim else value
-
-
-def direction(what: str, given: Sequence[float]) -> Tensor:
-    """[3] unit vector.
-
-    Raises:
-        InvalidInput: not three finite numbers, or all zero.
-    """
-    vector = place(what, given)
-    length = float(vector.norm())
-    if not 0 < length < math.inf:
-        raise InvalidInput(what, got=given, expected="three finite numbers, not all zero")
-    return vector / length
-
-
-def place(what: str, given: Sequence[float]) -> Tensor:
-    """[3] a point or vector.
-
-    Raises:
-        InvalidInput: not three finite numbers.
-    """
-    vector = torch.as_tensor(given, dtype=torch.get_default_dtype())
-    if vector.shape != (3,) or not bool(torch.isfinite(vector).all()):
-        raise InvalidInput(what, got=given, expected="three finite numbers")
-    return vector

@@ -8,9 +8,10 @@ from typing import Unpack
 from torch import Tensor
 
 from .._math import dot
+from .._vectors import direction, place
 from ..errors import InvalidInput
 from .collider import AbstractCollider, Options
-from .friction import Coulomb, Elliptic, direction, place
+from .friction import Coulomb, Elliptic
 
 
 class Plane(AbstractCollider):

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from .._math import cross, dot, safe_norm
+from .._vectors import place
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from .collider import AbstractCollider, Options
-from .friction import Coulomb, per_point, place
+from .friction import Coulomb, per_point
 
 
 class Sphere(AbstractCollider):

@@ -31,6 +31,8 @@ GLOSSARY = {
     "robot.regrasp": "The grippers hold the cloth elsewhere along its edge than stated.",
     "contact.mu": "Friction on the table is stronger, or weaker, than stated.",
     "contact.aniso": "Friction on the table depends on the direction of sliding.",
+    "contact.stick": "Friction on the table is stronger before the cloth slips than while it does.",
+    "contact.adhesion": "Cloth that touches the table is pulled to it: a charge, moisture, or fibres that catch.",
     "obs.extrinsic": "The camera stands elsewhere than its calibration says, along x, y or z of the world.",
     "obs.rotation": "The camera is turned about x, y or z of the world, around the cloth.",
     "obs.clock": "Frames were taken later than their stamps say, or earlier where negative.",

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..boundaries import Coulomb, Elliptic, Grasp, Plane
-from ..effects import GripSlip
+from ..boundaries import Coulomb, Elliptic, Grasp, Plane, Stribeck
+from ..effects import Adhesion, GripSlip
 from ..recordings import Recording
 from .world import Hypothesis, World
 
 LEAST = 1e-3  # -, of friction
 HOLD = 0.3  # N, above which a loose grip yields
+SLOW = 0.01  # m/s, of slip at which the excess of friction has fallen to 1 / e
+REACH = 1e-3  # m, of a sticky table's pull
 WHOLE = 1.0  # of typical: patches grow vertex by vertex, and a smaller step changes nothing
 
 
@@ -40,17 +42,30 @@ def _planes(world: World, change) -> World:
     return world.with_cloth(boundaries=parts) if parts else world
 
 
-def _friction(world: World, more: float = 0.0, along: float = 0.0) -> World:
-    """Everywhere by so much; for slip along the table's x by a share."""
+def _friction(world: World, more: float = 0.0, along: float = 0.0, excess: float = 0.0) -> World:
+    """Everywhere by so much; for slip along the table's x by a share; before it slips by an excess.
+
+    No law has both a direction and an excess: with the one, the other changes nothing.
+    """
 
     def changed(plane: Plane) -> Plane:
         law: Coulomb = plane.friction  # type: ignore[assignment]
         mu = max(law.value.item() + more, LEAST)
         ratio = law.ratio.value.item() if isinstance(law, Elliptic) else 1.0
+        sticky = excess + (law.excess.value.item() if isinstance(law, Stribeck) else 0.0)
+        if (along or ratio != 1.0) and sticky:
+            return plane
         new = Elliptic(mu * (1 + along), mu * ratio) if along or ratio != 1.0 else mu
-        return Plane(plane.point.tolist(), plane.normal.tolist(), new)
+        return Plane(plane.point.tolist(), plane.normal.tolist(), Stribeck(mu, mu + sticky, SLOW) if sticky else new)
 
     return _planes(world, changed)
+
+
+def _sticky(world: World, stress: float) -> World:
+    """Every table pulls."""
+    tables = {name: part for name, part in world.cloth.boundaries.items() if isinstance(part, Plane)}
+    pulls = {f"{name}_pull": Adhesion(stress, REACH, t.point.tolist(), t.normal.tolist()) for name, t in tables.items()}
+    return world.with_cloth(pulls)
 
 
 def _has_table(recording: Recording) -> bool:
@@ -63,4 +78,6 @@ HYPOTHESES = (
     Hypothesis("robot.regrasp", "m", 0.017, lambda w, a: _regrasped(w, along=a), signed=True, step=WHOLE),
     Hypothesis("contact.mu", "-", 0.2, lambda w, a: _friction(w, more=a), signed=True, needs=_has_table),
     Hypothesis("contact.aniso", "-", -0.5, lambda w, a: _friction(w, along=a), signed=True, needs=_has_table),
+    Hypothesis("contact.stick", "-", 0.3, lambda w, a: _friction(w, excess=a), needs=_has_table),
+    Hypothesis("contact.adhesion", "Pa", 1.5, _sticky, needs=_has_table),
 )

@@ -1,6 +1,7 @@
 """Physical effects on the bare membrane, one per file, keyed by name. They add, so their order cannot matter."""
 
 from .added_mass import AddedMass
+from .adhesion import Adhesion
 from .air import AirDrag
 from .base import AbstractEffect, Amplitude
 from .bending import Bending
@@ -19,6 +20,7 @@ from .viscous import KelvinVoigt
 __all__ = [
     "AbstractEffect",
     "AddedMass",
+    "Adhesion",
     "AirDrag",
     "Amplitude",
     "Bending",

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import torch
+
 from ...effects import (
     AbstractEffect,
     AddedMass,
+    Adhesion,
     AirDrag,
     Bending,
     BendingFriction,
@@ -42,6 +45,11 @@ def _weight(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
 
 def _mass_damping(low: Lowering, name: str, effect: MassDamping, c: Any) -> None:
     low.pull("mass_damping", low.parameter(c), low.mass, low.v.now)
+
+
+def _adhesion(low: Lowering, name: str, effect: Adhesion, c: Any) -> None:
+    plane = low.program.constant(torch.cat([effect.point, effect.normal, effect.point.new_tensor([effect.gap])])[None])
+    low.pull("adhesion", low.x.now, low.parameter(c), low.program.constant(effect.area), plane)
 
 
 def _air_drag(low: Lowering, name: str, effect: AirDrag, c: Any) -> None:
@@ -91,6 +99,7 @@ def _nothing(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
 
 _EFFECTS: dict[type, Callable[[Lowering, str, Any, Any], None]] = {
     AddedMass: _added_mass,
+    Adhesion: _adhesion,
     AirDrag: _air_drag,
     Bending: bending.plate,
     BendingFriction: bending.friction,

@@ -89,6 +89,24 @@ struct MassDamping {
     }
 };
 
+// position, stress, area, a point of the plane, its normal, gap -> force. effects/adhesion.py
+struct Adhesion {
+    static constexpr const char* name = "adhesion";
+    static constexpr int inputs = 12, outputs = 3;
+    static constexpr auto fixed = bits(4, 8);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto x = r.vec();
+        const T stress = r.number(), area = r.number();
+        const auto point = r.vec(), normal = r.vec();
+        const T height = dot(x - point, normal) / r.number();
+        const T u = select(less(height, 0.0), 0.0, select(less(1.0, height), 1.0, height));
+        const T share = 1.0 - u * u;
+        Write<T>{out}.vec(-((stress * area) * (share * share)) * normal);
+    }
+};
+
 // f1, f2, corners' velocities, warp and weft coefficients, viscosity -> stress columns. effects/viscous.py
 struct KelvinVoigt {
     static constexpr const char* name = "kelvin_voigt";
@@ -110,6 +128,6 @@ struct KelvinVoigt {
 
 }  // namespace
 
-TC_KERNELS(effect_kernels, AirDrag, LocalDrag, AddedMass, Weight, MassDamping, KelvinVoigt)
+TC_KERNELS(effect_kernels, AirDrag, LocalDrag, AddedMass, Weight, MassDamping, Adhesion, KelvinVoigt)
 
 }  // namespace tc

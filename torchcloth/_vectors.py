@@ -1,0 +1,36 @@
+"""Points and directions that a user gives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from .errors import InvalidInput
+
+
+def direction(what: str, given: Sequence[float]) -> Tensor:
+    """[3] unit vector.
+
+    Raises:
+        InvalidInput: not three finite numbers, or all zero.
+    """
+    vector = place(what, given)
+    length = float(vector.norm())
+    if not 0 < length < math.inf:
+        raise InvalidInput(what, got=given, expected="three finite numbers, not all zero")
+    return vector / length
+
+
+def place(what: str, given: Sequence[float]) -> Tensor:
+    """[3] a point or vector.
+
+    Raises:
+        InvalidInput: not three finite numbers.
+    """
+    vector = torch.as_tensor(given, dtype=torch.get_default_dtype())
+    if vector.shape != (3,) or not bool(torch.isfinite(vector).all()):
+        raise InvalidInput(what, got=given, expected="three finite numbers")
+    return vector
