@@ -16,7 +16,7 @@ COMPANIONS = ("benchmarks", "robots", "training")  # folders of their own, insta
 
 FLOORS = (
     ("errors", "_files", "_math", "forward_mode"),
-    ("types", "parameters"),
+    ("types", "parameters", "_vectors"),
     ("meshes",),
     ("materials", "effects", "boundaries", "transfer"),
     ("model",),
