@@ -6,9 +6,10 @@ import linear_toys as toys
 import pytest
 import torch
 
+from torchcloth.diagnosis.cells import NAMES as KINDS
 from torchcloth.diagnosis.classes import alike, correlations
 from torchcloth.diagnosis.comparison import compare, predict, spread
-from torchcloth.diagnosis.noise import fit_noise, floor_of, whitened
+from torchcloth.diagnosis.noise import ROUGH, Noise, fit_noise, floor_of, whitened
 from torchcloth.diagnosis.screening import screen
 
 NAMES = ["a", "b", "c"]
@@ -141,8 +142,21 @@ def test_what_a_fitted_parameter_does_as_well_is_known_by_its_prior_alone():
     found = replace(found, evidence=replace(found.evidence, hypotheses=hypotheses))
     assert row(found, "a").decision == "unresolvable"
     far = replace(found, model=found.model.at(torch.tensor([0.0, 4 * 0.5]).double()))
-    assert row(far, "a").decision == "inconclusive"
-    assert row(far, "a").amplitude == 2.0
+    stranger = replace(far.evidence, hypotheses=[toys.hypothesis("a"), *hypotheses[1:]])
+    assert row(far, "a")[1:] == row(replace(far, evidence=stranger), "a")[1:], "asked about as any other"
+
+
+def test_what_is_rough_is_noise_of_its_stretch():
+    ev = toys.evidence(SLOPES, 2, ["a", "b", "c"], torch.zeros(5).double(), 0)
+    rough = 3e-3 * (ev.cells[0].window == 2)
+    cells = [ev.cells[0]._replace(rough=rough), *ev.cells[1:]]
+    level = torch.full((len(KINDS),), toys.SLOW).double()
+    none = torch.zeros(len(rough), 0).double()
+    plain, wide = (Noise(level).covariance(c[0], none, none[0]) for c in (ev.cells, cells))
+    more = (wide - plain).diagonal()
+    assert torch.equal(more > 0, rough > 0)
+    torch.testing.assert_close(more[rough > 0], (ROUGH * rough[rough > 0]) ** 2)
+    assert torch.linalg.eigvalsh(wide).min() > 0
 
 
 def test_twins_form_a_class_and_strangers_do_not():

@@ -155,6 +155,24 @@ def test_slopes_are_those_of_finite_steps(made):
     assert float(slope.abs().median()) == pytest.approx(1.0, abs=0.05)  # the sheet faces y
 
 
+def test_slopes_along_parameters_are_central_and_their_disagreement_is_rough(made):
+    """At the end of a coordinate one side is all there is, and says nothing of roughness."""
+    model, setting = made
+    steps, last = [p.step for p in model.parameters], len(model.parameters) - 1
+    shifts = [(k, sign * step) for k, step in enumerate(steps) for sign in (1.0, -1.0)]
+    raw, found = gather(model, setting, shifts=shifts), gather(model, setting)
+    (one,), (cells,) = raw.cells, found.cells
+    up, down = one.jacobian[:, 0 : raw.own : 2], one.jacobian[:, 1 : raw.own : 2]
+    assert (raw.own, found.own) == (2 * len(steps), len(steps))
+    torch.testing.assert_close(cells.jacobian[:, : found.own], 0.5 * (up + down))
+    torch.testing.assert_close(cells.rough, (0.5 * torch.tensor(steps) * (up - down)).norm(dim=1))
+    assert not one.rough.any()
+    ended = replace(model, parameters=(*model.parameters[:-1], replace(model.parameters[-1], low=0.0)))
+    (sided,) = gather(ended, setting).cells
+    torch.testing.assert_close(sided.jacobian[:, last], up[:, last])
+    assert (sided.rough <= cells.rough + 1e-15).all()
+
+
 def test_a_hypothesis_of_ones_own_joins_the_search(made):
     model, _ = made
     own = register(Hypothesis("user.sag", "m", 0.01, lambda world, a: world.with_view(lambda f, _: f)))

@@ -55,15 +55,15 @@ def base_model(recording: Recording) -> Model:
 
 def _parameters(cloth: Cloth, recording: Recording) -> list[Parameter]:
     spread = 0.5 * math.log(WRONG_BY)
-    found = [_log(cloth, "material.youngs_modulus", 0.05, spread)]
+    found = [_log(cloth, "material.youngs_modulus", 0.1, spread)]
     nu = float(cloth.material.poisson_ratio.value)  # type: ignore[attr-defined,union-attr]
     ratio = _of(cloth, "material.poisson_ratio", POISSON, SPREAD, lambda c: min(max(nu + c, LEAST), MOST + POISSON))
     found.append(replace(ratio, low=LEAST - nu, high=MOST - nu))
     if "bending" in cloth.effects:
-        found.append(_log(cloth, "effects.bending.stiffness", 0.1, spread))
+        found.append(_log(cloth, "effects.bending.stiffness", 0.2, spread))
     std = recording.cloth.areal_density_std
     if std:
-        found.append(_log(cloth, "areal_density", 0.02, std / recording.cloth.areal_density))
+        found.append(_log(cloth, "areal_density", 0.04, std / recording.cloth.areal_density))
     return found
 
 

@@ -37,6 +37,7 @@ class Cells(NamedTuple):
     window: Tensor  # [C] int64
     place: Tensor  # [C, 3] m, where on the fabric at rest; zero where that makes no sense
     time: Tensor  # [C] s
+    rough: Tensor  # [C] in the value's unit, see ``evidence.gather``; zero where nobody asked
 
     @property
     def key(self) -> Tensor:
@@ -104,6 +105,7 @@ def _averaged(rows: Rows, block: int, episode: Episode, sheet: Sheet, rest: Tens
         group % 1000,
         add(share[:, None] * place),
         add(share * times[rows.frame]),
+        torch.zeros_like(mean),
     )
     return Cells(*(column[count >= min(FEWEST, float(count.max()))] for column in found))
 

@@ -101,9 +101,11 @@ def gather(
 
     The nuisances' slopes, which hardly depend on the point, are taken from ``before`` where that is given. Hypotheses
     that cannot be simulated in one of the episodes are left out. ``shifts`` are (coordinate, step) of the points
-    beside; None: a small step along each coordinate.
+    beside, with a column each; None: central differences along each coordinate. What these miss, a second difference,
+    makes cells ``rough``: another engine's cloth is a few per cent off in effect, and where ripples turn over within
+    that, nothing says how.
     """
-    shifts = step_sizes(model) if shifts is None else list(shifts)
+    raw, shifts = shifts is not None, both_ways(model) if shifts is None else list(shifts)
     own, possible, pieces, began = len(shifts), list(hypotheses), [], time.monotonic()
     for k, e in enumerate(setting.episodes):
         progress(f"{e.name}, {k + 1} of {len(setting.episodes)}{_left(began, k, len(setting.episodes))}")
@@ -121,10 +123,11 @@ def gather(
         use += range(own + len(simulated), piece.cells.jacobian.shape[1])
         stable = ~torch.isin(piece.cells.key, setting.unstable[k]) if setting.unstable else slice(None)
         found = Cells(*(column[stable] for column in piece.cells))
-        cells.append(found._replace(jacobian=found.jacobian[:, use]))
+        found = found._replace(jacobian=found.jacobian[:, use])
+        cells.append(found if raw else _central(found, shifts, len(model.parameters)))
         numerics.append(piece.numerics[stable])
         stds.append(piece.std)
-    return Evidence(cells, own, possible, stds, numerics)
+    return Evidence(cells, own if raw else len(model.point), possible, stds, numerics)
 
 
 def staged(progress: Progress, stage: str) -> Progress:
@@ -258,6 +261,27 @@ def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
 def step_sizes(model: Model) -> list[tuple[int, float]]:
     """(coordinate, small step) along each of the model's own."""
     return list(enumerate([*(p.step for p in model.parameters), *(h.step * h.typical for h in model.accepted)]))
+
+
+def both_ways(model: Model) -> list[tuple[int, float]]:
+    """(coordinate, step) there and back along each of the model's own, but for what lies beyond its ends."""
+    low, high = (end.tolist() for end in model.ends)
+    here = model.point.tolist()
+    every = [(k, sign * step) for k, step in step_sizes(model) for sign in (1.0, -1.0)]
+    return [(k, step) for k, step in every if low[k] <= here[k] + step <= high[k]]
+
+
+def _central(cells: Cells, shifts: Sequence[tuple[int, float]], parameters: int) -> Cells:
+    """One column for each coordinate, from those for each shift; ``parameters`` come first and tell of roughness."""
+    columns, square = [], torch.zeros_like(cells.value)
+    for k in range(1 + max((coordinate for coordinate, _ in shifts), default=-1)):
+        sides = [j for j, (coordinate, _) in enumerate(shifts) if coordinate == k]
+        columns.append(cells.jacobian[:, sides].mean(1))
+        if k < parameters and len(sides) == 2:
+            step = abs(shifts[sides[0]][1])
+            square = square + (0.5 * step * (cells.jacobian[:, sides[0]] - cells.jacobian[:, sides[1]])).square()
+    jacobian = torch.cat([*(c[:, None] for c in columns), cells.jacobian[:, len(shifts) :]], 1)
+    return cells._replace(jacobian=jacobian, rough=square.sqrt())
 
 
 def shifted(model: Model, coordinate: int, step: float) -> Model:

@@ -17,7 +17,7 @@ from .world import Hypothesis, Model
 
 IMPOSSIBLE = (InvalidInput, SimulationDiverged, UnstableStep)  # no world has such values, or none that is stable
 ENOUGH = 2.0  # log density that a further step is expected to gain, below which the search ends
-ITERATIONS = 3  # at most
+ITERATIONS = 5  # at most
 LONGEST = 1.0  # prior standard deviations, of a step
 SWEEPS = 4  # of weighing stretches anew
 

@@ -87,8 +87,8 @@ def screen(found: Fitted) -> list[Row]:
     _, alone = leap(found.white, found.model)
     rows, fitted = [], [p.name for p in found.model.parameters]
     for j, h in enumerate(found.evidence.hypotheses):
-        if h.twin in fitted:
-            rows.append(_twin(found, h, fitted.index(h.twin)))
+        if h.twin in fitted and not _pulled(found, fitted.index(h.twin)):
+            rows.append(Row(h, 0.0, float("inf"), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "unresolvable"))
             continue
         information = float(asked[:, j] @ asked[:, j])
         if information < 1e-12 / h.typical**2:
@@ -103,11 +103,13 @@ def screen(found: Fitted) -> list[Row]:
     return sorted(rows, key=lambda row: -row.gain)
 
 
-def _twin(found: Fitted, h: Hypothesis, index: int) -> Row:
-    """Of what a fitted parameter does as well: the data say nothing more, and its prior whether that is much."""
-    away = float(found.model.values[index])
-    far = abs(away) > PULLED * found.model.parameters[index].std
-    return Row(h, away, float("inf"), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "inconclusive" if far else "unresolvable")
+def _pulled(found: Fitted, index: int) -> bool:
+    """Data and data sheet disagree about a parameter: beside it, only its prior tells of what does the same.
+
+    A mean of both lies sqrt(prior variance - its own) from the sheet where they agree.
+    """
+    away, std = float(found.model.values[index]), found.model.parameters[index].std
+    return away**2 > PULLED**2 * max(std**2 - float(found.covariance[index, index]), 0.0)
 
 
 def projection(found: Fitted):
