@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import pytest
+import torch
 import twins
 
-from torchcloth.identification import identify
+from torchcloth.identification import identify, linearity
+from torchcloth.identification.search import Search
 from torchcloth.identification.unfinished import OFF
 from torchcloth.training.studies import cost
 
@@ -74,3 +76,24 @@ def test_a_sheet_between_free_clamps_is_found_from_far_off():
     assert found.identifiable
     assert found.value == pytest.approx(MEMBRANE, rel=0.05)  # cells of 50 mm: 1.5 % too stiff
     assert fit.fit["rms_after"] < OFF * p.recording.observation_noise_std
+
+
+@pytest.mark.parametrize(("quieter", "identified"), [(4.0, False), (1.0, True)])
+def test_simulations_around_a_solution_that_is_far_off_say_nothing(model, brief, monkeypatch, quieter, identified):
+    """They converge to what is near, with small errors; a coarse shirt ended at a quarter of its stiffness."""
+    checked = linearity.check
+
+    def failing(objective, final):
+        return checked(objective, final)._replace(reason="the motion is unstable")
+
+    def around(self, failed, start, iterations):
+        size = len(failed.final.raw)
+        return self.objective, failed._replace(reason="", covariance=1e-4 * torch.eye(size).to(failed.final.raw))
+
+    monkeypatch.setattr(linearity, "check", failing)
+    monkeypatch.setattr(Search, "_resolve", around)
+    said = replace(brief, observation_noise_std=brief.observation_noise_std / quieter)  # of the sensor
+    fit = identify(model, said, ["youngs_modulus"])
+    assert fit.fit["converged"]
+    assert fit.parameters["youngs_modulus"].identifiable is identified
+    assert any("not what is best" in w and "times the sensor noise" in w for w in fit.warnings) != identified

@@ -20,6 +20,7 @@ CHAMFER = METHODS[2:]  # those that follow the paper's distance alone
 PAPER_CHAMFER = 0.015  # m, the DiffCP paper's stop rule
 EARLY = 0.35  # share of the frames that the first stage of the fit sees
 EARLY_ITERATIONS = 10
+RIPPLES = "simulations around the solution know what is near, not what is best"
 GO_ON = "more iterations of Gauss-Newton, a nearer start or several, or fewer parameters at once may get there"
 
 Progress = Callable[[int, float, dict[str, float], float], None]  # iteration, Chamfer, values, share of the frames
@@ -63,12 +64,12 @@ class Search:
             told, checked = self._resolve(checked, start, iterations)
         else:
             told = full
-        if checked.final.converged:
-            return Outcome(told, checked, "", reached)
         why = self._undecided(iterations) if method in CHAMFER else self._why(iterations)
-        lost = "" if checked.withdrawn else astray(told, checked)
+        why = "" if checked.final.converged else why
+        sure = not why and checked.covariance is None
+        lost = "" if sure or checked.withdrawn else astray(told, checked)
         if lost:
-            why = f"{why}; {lost}, and no parameter counts as identified: {GO_ON}"
+            why = f"{why or RIPPLES}; {lost}, and no parameter counts as identified: {GO_ON}"
             checked = checked._replace(reason=lost)
         return Outcome(told, checked, why, reached)
 
