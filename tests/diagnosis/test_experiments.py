@@ -94,7 +94,8 @@ def undecided(names):
     setting = setting_of(model, recordings)
     asked = [h for h in catalogue(model, recordings) if h.name in names]
     level = 3 * torch.tensor([FLOOR[name] for name in NAMES]).double()  # the points here are anywhere
-    found = renoised(fit(model, setting, asked, 0), Noise(level))
+    found = fit(model, setting, asked, 0)
+    found = renoised(found, Noise(level), found.evidence)
     hypothesis = SimpleNamespace(name=names[0])
     step = SimpleNamespace(best=SimpleNamespace(hypothesis=hypothesis), before=found, screened=[])
     amplitudes = {h.name: h.typical for h in asked}

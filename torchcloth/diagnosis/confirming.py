@@ -14,7 +14,7 @@ from ..identification.saved import alike, mark
 from ..recordings import Recording
 from .base_model import together
 from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
-from .evidence import Evidence, Progress, gather, setting_of, staged
+from .evidence import Evidence, Progress, as_rough, gather, setting_of, staged
 from .fitting import Fitted
 from .gate import check, each_once
 from .model_file import ModelFile, read_model
@@ -102,7 +102,7 @@ def confirm(
         for file, setting, stage in zip(files, settings, ("base", "extended"), strict=True)
     ]
     noise = fit_noise(found[1])
-    before, after = (_judged(f.model, e, noise) for f, e in zip(files, found, strict=True))
+    before, after = (_judged(f.model, e, noise, found[1]) for f, e in zip(files, found, strict=True))
     floor, source = min(floor_of(e, least()) for e in found), "sensor only"  # slow errors may be the models' own
     if (repeated := repeats(after, pairs_of(recordings, settings[1].episodes))) is not None:
         floor, source = repeated.rms, "repetitions"
@@ -147,13 +147,13 @@ def _refuse_seen(recording: Recording, files: Sequence[ModelFile]) -> None:
         )
 
 
-def _judged(model: Model, evidence: Evidence, noise: Noise) -> Predicted:
-    """Density by ``noise``, the extended model's; what is left in metres by one that is nobody's.
+def _judged(model: Model, evidence: Evidence, noise: Noise, like: Evidence) -> Predicted:
+    """Density by ``noise``, the extended model's, as rough as that; what is left in metres by one that is nobody's.
 
     So the base's figures are the same whatever it is compared with.
     """
-    left, white = (as_it_is(_as_fitted(model, evidence, n)) for n in (unfitted(), noise))
-    return left._replace(white=white.white)
+    left = as_it_is(_as_fitted(model, evidence, unfitted()))
+    return left._replace(white=as_it_is(_as_fitted(model, as_rough(evidence, like), noise)).white)
 
 
 def _as_fitted(model: Model, evidence: Evidence, noise: Noise) -> Fitted:

@@ -249,6 +249,15 @@ def aligned(key: Tensor, other: Tensor, columns: Tensor) -> Tensor:
     return found
 
 
+def as_rough(evidence: Evidence, like: Evidence) -> Evidence:
+    """With another's roughness: densities of models are compared by the same covariance only."""
+    cells = [
+        own._replace(rough=aligned(own.key, other.key, other.rough))
+        for own, other in zip(evidence.cells, like.cells, strict=True)
+    ]
+    return replace(evidence, cells=cells)
+
+
 def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
     """(cells that both have, with the slopes of the first and the values of the second; first minus second)."""
     both = torch.isin(coarse.key, fine.key)

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..identification.bounds import bounded
 from .bursts import calmed, densities, unweighted
-from .evidence import Evidence, Progress, Setting, gather, staged
+from .evidence import Evidence, Progress, Setting, as_rough, gather, staged
 from .noise import Noise, Whitened, fit_noise, unfitted, whitened
 from .world import Hypothesis, Model
 
@@ -152,9 +152,10 @@ def _columns(white: Whitened, columns: Sequence[int]) -> Whitened:
     return white._replace(jacobian=white.jacobian[:, columns])
 
 
-def renoised(found: Fitted, noise: Noise) -> Fitted:
-    """The same with residuals weighed by another noise."""
-    return replace(found, noise=noise, white=calmed(whitened(found.evidence, noise)))
+def renoised(found: Fitted, noise: Noise, like: Evidence) -> Fitted:
+    """The same with residuals weighed by another noise, in which stretches are as rough as ``like`` has them."""
+    evidence = as_rough(found.evidence, like)
+    return replace(found, evidence=evidence, noise=noise, white=calmed(whitened(evidence, noise)))
 
 
 def step_of(white: Whitened, model: Model, longest: float = torch.inf) -> tuple[Tensor, float]:

@@ -10,7 +10,7 @@ from .afresh import afresh
 from .approach import approach
 from .branches import unstable, without
 from .comparison import Gain, Predicted, compare, predict, spread, telling
-from .evidence import Progress, Setting, staged
+from .evidence import Evidence, Progress, Setting, staged
 from .fitting import IMPOSSIBLE, Fitted, fit, renoised, with_cause, without_cause
 from .lacking import explained, lack_of_fit
 from .noise import Noise, fit_noise, floor_of, unfitted
@@ -165,7 +165,7 @@ def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) 
     last, sensor = predict(current, setting.names, alone), floor_of(current.evidence, current.noise)
     repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
     floor = sensor if repeated is None else repeated.rms
-    first = predict(renoised(start, current.noise), setting.names, alone)
+    first = predict(renoised(start, current.noise, current.evidence), setting.names, alone)
     whole = compare(first, last, floor) if steps else None
     return Found(start, current, steps, screened, whole, floor, sensor, repeated, setting)
 
@@ -192,8 +192,8 @@ def _pruned(
             continue
         less = without_cause(current, name)
         less = fit(less, setting, (), 0, staged(progress, f"without {name}"), current.noise, current.evidence)
-        alone = step.best.alone
-        gain = compare(predict(less, setting.names, alone), predict(current, setting.names, alone), 0.0)
+        plain, alone = renoised(less, current.noise, current.evidence), step.best.alone
+        gain = compare(predict(plain, setting.names, alone), predict(current, setting.names, alone), 0.0)
         if known and _worthwhile(gain):
             continue
         steps = [s for s in steps if s is not step]
@@ -222,21 +222,22 @@ def _step(
             fits.append((row, fit(model, setting, (), 0, trial, unfitted(), current.evidence)))
     if not fits:
         return None
-    fits = _settled(_compared(current, fits, setting.names, current.noise), setting, progress)
-    tried = _compared(current, fits, setting.names, current.noise)
-    first = max(tried, key=lambda c: c.gain.density)
+    now = lambda fits: _compared(current, fits, setting.names, current.noise, current.evidence)  # noqa: E731
+    one_step = now(fits)
+    likely = [_better(*pair) for pair in zip(one_step, now(_settled(one_step, setting, progress)), strict=True)]
+    likeliest = max(likely, key=lambda c: c.gain.density).fitted.evidence
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
-    noise = fit_noise(first.fitted.evidence)
-    tried = _compared(current, fits, setting.names, noise)
+    noise = fit_noise(likeliest)
+    tried = _compared(current, [(c.row, c.fitted) for c in likely], setting.names, noise, likeliest)
     useful = sorted((c for c in tried if _useful(c, setting.names)), key=lambda c: -c.gain.density)
-    beside = lambda c: placebo(renoised(c.fitted, noise), setting.names, c.alone)  # noqa: E731
+    beside = lambda c: placebo(renoised(c.fitted, noise, likeliest), setting.names, c.alone)  # noqa: E731
     chance = None
     while useful and not (chance := beside(useful[0])).passed:
         useful = useful[1:]
     if not useful or chance is None:
         return None
     best = useful[0]
-    alike = lambda c: predict(renoised(c.fitted, noise), setting.names, best.alone)  # noqa: E731
+    alike = lambda c: predict(renoised(c.fitted, noise, likeliest), setting.names, best.alone)  # noqa: E731
     rivals = [c for c in useful if c is not best and _rival(c, alike(c), best)]
     return Step(best, chance, tried, rivals, screened, current)
 
@@ -257,11 +258,18 @@ def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> li
     return out
 
 
-def _compared(current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise) -> list[Candidate]:
-    """Each fit beside the model without it, on motions held out."""
-    before, out = renoised(current, noise), []
+def _better(before: Candidate, after: Candidate) -> Candidate:
+    """Further steps, unless they predict clearly worse."""
+    return before if after.gain.density < before.gain.density - HARDLY * abs(before.gain.density) else after
+
+
+def _compared(
+    current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise, like: Evidence
+) -> list[Candidate]:
+    """Each fit beside the model without it, on motions held out; all by one noise, as rough as ``like``."""
+    before, out = renoised(current, noise, like), []
     for row, found in fits:
-        after = renoised(found, noise)
+        after = renoised(found, noise, like)
         alone = telling(after, names)
         predicted = predict(after, names, alone)
         gain = compare(predict(before, names, alone), predicted, 0.0)
