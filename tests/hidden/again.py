@@ -56,8 +56,8 @@ def main(arguments: list[str] | None = None) -> int:
     journal = folder / "journal"
     usual = stepwise._compared
 
-    def compared(current, fits, names, noise):
-        found = usual(current, fits, names, noise)
+    def compared(current, fits, names, *how):
+        found = usual(current, fits, names, *how)
         print("tried:", *(said(c, names) for c in found), sep="\n", flush=True)
         return found
 
