@@ -1,12 +1,12 @@
 """What remains when a search has ended, beside what a right model would leave.
 
-A right model leaves K = S + M M', where S are white noise and slow errors of a level that is known beforehand, the
-sensor's (``SENSOR``) and what the finer mesh leaves of the difference between both meshes, and M what differs from
-episode to episode and what the fitted numbers are uncertain by. Of the cells r, S K^-1 r is left over. Its mean square
-is held against the one to be expected, tr(S K^-1 S) / n, for every motion and kind of data. For a right model the
-quotient follows a chi^2 with the effective number of cells for degrees of freedom (Satterthwaite 1946), which says
-what cannot be chance. Two engines never agree exactly, so what counts as a lack of fit must also be ``TOLERATED`` times
-as large as expected. Where both meshes fold the cloth in different ways nothing can be judged.
+A right model leaves K = S + M M', where S are white noise, roughness and slow errors of a level that is known
+beforehand, the sensor's (``SENSOR``) and what the finer mesh leaves of the difference between both meshes, and M what
+differs from episode to episode and what the fitted numbers are uncertain by. Of the cells r, S K^-1 r is left over. Its
+mean square is held against the one to be expected, tr(S K^-1 S) / n, for every motion and kind of data. For a right
+model the quotient follows a chi^2 with the effective number of cells for degrees of freedom (Satterthwaite 1946), which
+says what cannot be chance. Two engines never agree exactly, so what counts as a lack of fit must also be ``TOLERATED``
+times as large as expected. Where both meshes fold the cloth in different ways nothing can be judged.
 """
 
 from __future__ import annotations
