@@ -164,7 +164,9 @@ def test_slopes_along_parameters_are_central_and_their_disagreement_is_rough(mad
     (one,), (cells,) = raw.cells, found.cells
     up, down = one.jacobian[:, 0 : raw.own : 2], one.jacobian[:, 1 : raw.own : 2]
     assert (raw.own, found.own) == (2 * len(steps), len(steps))
-    torch.testing.assert_close(cells.jacobian[:, : found.own], 0.5 * (up + down))
+    shrunk, central = cells.jacobian[:, : found.own].abs(), 0.5 * (up + down).abs()
+    assert (shrunk <= central).all()
+    assert (shrunk >= 0.9 * central).all(), "this sheet hardly ripples"
     torch.testing.assert_close(cells.rough, (0.5 * torch.tensor(steps) * (up - down)).norm(dim=1))
     assert not one.rough.any()
     ended = replace(model, parameters=(*model.parameters[:-1], replace(model.parameters[-1], low=0.0)))

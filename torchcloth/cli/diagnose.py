@@ -43,7 +43,8 @@ def _diagnose(options: argparse.Namespace) -> int:
         answer = diagnosis.refused(faults)
     else:
         print(
-            f"{len(episodes)} episodes: about a minute each on one core with a cause, a quarter of it without", flush=True
+            f"{len(episodes)} episodes: about a minute each on one core with a cause, a quarter without",
+            flush=True,
         )
         with progress_line() as progress:
             answer = diagnosis.diagnose(

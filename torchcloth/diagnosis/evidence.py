@@ -19,7 +19,7 @@ from ..identification.nuisances import Camera, Clock, Held, Rim, Tare
 from ..identification.replays import Frames
 from ..identification.sheet import Sheet, sheet_for
 from ..recordings import Recording
-from .cells import Cells, cells_of, directions
+from .cells import Cells, cells_of, directions, stretches
 from .refined import refined
 from .world import Hypothesis, Model, World
 
@@ -281,14 +281,23 @@ def both_ways(model: Model) -> list[tuple[int, float]]:
 
 
 def _central(cells: Cells, shifts: Sequence[tuple[int, float]], parameters: int) -> Cells:
-    """One column for each coordinate, from those for each shift; ``parameters`` come first and tell of roughness."""
-    columns, square = [], torch.zeros_like(cells.value)
+    """One column for each coordinate, from those for each shift; ``parameters`` come first and tell of roughness.
+
+    Of ripples that are strangers at -h, 0 and h, a central slope has a third of the mean square of the difference of
+    both sides' slopes from their mean. Slopes are shrunk by what this is of theirs in each stretch: noise in them would
+    pass for knowledge.
+    """
+    columns, square, stretch = [], torch.zeros_like(cells.value), stretches([cells])
     for k in range(1 + max((coordinate for coordinate, _ in shifts), default=-1)):
         sides = [j for j, (coordinate, _) in enumerate(shifts) if coordinate == k]
-        columns.append(cells.jacobian[:, sides].mean(1))
+        slope = cells.jacobian[:, sides].mean(1)
         if k < parameters and len(sides) == 2:
-            step = abs(shifts[sides[0]][1])
-            square = square + (0.5 * step * (cells.jacobian[:, sides[0]] - cells.jacobian[:, sides[1]])).square()
+            miss = 0.5 * (cells.jacobian[:, sides[0]] - cells.jacobian[:, sides[1]])
+            square = square + (shifts[sides[0]][1] * miss).square()
+            sums = cells.value.new_zeros(int(stretch.max()) + 1, 2)
+            noise, power = sums.index_add(0, stretch, torch.stack([miss**2 / 3, slope**2], 1)).unbind(1)
+            slope = slope * (1 - noise / power.clamp(min=1e-30)).clamp(min=0.0)[stretch]
+        columns.append(slope)
     jacobian = torch.cat([*(c[:, None] for c in columns), cells.jacobian[:, len(shifts) :]], 1)
     return cells._replace(jacobian=jacobian, rough=square.sqrt())
 

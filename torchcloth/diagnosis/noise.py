@@ -1,11 +1,12 @@
 """How residuals of a true model err together: sensor, slow errors, and what differs from episode to episode.
 
-    K = diag(spread^2 / n) + (level^2 + (ROUGH rough)^2) R + N P N'
+    K = diag(spread^2 / n + r^2 / 2) + (level^2 + r^2 / 2) R + N P N',  r = ROUGH rough
 
 R falls with distance on the fabric and with time; N are the slopes along clock, camera, grasp, rim and tare, and P
 their variances, so that these are neither fixed nor free. The levels, one for each kind of data, come from restricted
 maximum likelihood after everything that is asked about is projected out: an effect must not pass as noise. How rough
-a stretch of time is (``evidence.gather``) is known beforehand.
+a stretch of time is (``evidence.gather``) is known beforehand; ripples neither agree with their neighbours nor do they
+not.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from .evidence import Evidence
 REACH, MEMORY = 0.1, 0.3  # m, s, over which slow errors agree
 FLOOR = {"points": 1e-4, "edges": 3e-4, "markers": 1e-4, "force": 5e-3, "torque": 5e-4}  # m, N, N m: of one cell
 UNFITTED = 5.0  # slow errors over their least size, to fit by: those of a model that is wrong yet say nothing
-ROUGH = 3.0  # steps along every parameter by which two engines' cloths may differ in effect
+ROUGH = 2.0  # steps along every parameter by which two engines' cloths may differ in effect
 RANK = 1e-9  # relative, of directions that count in the likelihood
 
 
@@ -33,8 +34,9 @@ class Noise(NamedTuple):
     def covariance(self, cells: Cells, nuisance: Tensor, std: Tensor) -> Tensor:
         """[C, C] of one episode; ``nuisance`` [C, N] slopes, ``std`` [N]."""
         moved = nuisance * std
-        slow = (self.level[cells.block] ** 2 + _rough(cells)).sqrt()
-        return torch.diag(_white(cells)) + slow[:, None] * _together(cells) * slow + moved @ moved.mT
+        rough = 0.5 * _rough(cells)
+        slow = (self.level[cells.block] ** 2 + rough).sqrt()
+        return torch.diag(_white(cells) + rough) + slow[:, None] * _together(cells) * slow + moved @ moved.mT
 
 
 def least() -> Noise:

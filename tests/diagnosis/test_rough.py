@@ -1,0 +1,52 @@
+"""Cloth that ripples: a fit must not stop where a small step makes other ripples. Without roughness it does."""
+
+import math
+from dataclasses import replace
+
+import linear_toys as toys
+import pytest
+import torch
+
+from torchcloth.diagnosis import fitting, noise
+from torchcloth.diagnosis.evidence import Evidence, _central
+from torchcloth.diagnosis.fitting import fit
+
+TRUTH, STEP = 0.3, 0.1
+RIPPLES, LENGTH = 2e-3, 0.15  # m, of ripples that come and go within so much of the parameter
+SMOOTH = toys.smooth(3, 2)
+
+
+@pytest.fixture
+def rippling(monkeypatch):
+    """A model of one parameter; in a third of each episode ripples hide what it does."""
+    there = toys.fitted(toys.evidence(SMOOTH, 1, [], torch.tensor([TRUTH]).double(), 0))
+    rng, size = torch.Generator().manual_seed(4), len(toys.grid().value)
+    phases, real = 2 * math.pi * torch.rand(2, toys.EPISODES, size, generator=rng)  # real cloth has ripples of its own
+
+    def seen(k, at):
+        cells = there.evidence.cells[k]
+        ripples = RIPPLES * (torch.sin(2 * math.pi * at / LENGTH + phases[k]) - torch.sin(real[k]))
+        return cells.value + cells.jacobian[:, 0] * at + torch.where(cells.window >= 4, ripples.double(), 0.0)
+
+    def gather(model, setting, hypotheses, progress, before) -> Evidence:
+        at, cells = float(model.point[0]), []
+        for k, c in enumerate(there.evidence.cells):
+            down, here, up = (seen(k, at + step) for step in (-STEP, 0.0, STEP))
+            sides = torch.stack([(up - here) / STEP, (here - down) / STEP], 1)
+            sided = c._replace(value=here, jacobian=torch.cat([sides, c.jacobian[:, 1:]], 1))
+            cells.append(_central(sided, [(0, STEP), (0, -STEP)], 1))
+        return replace(there.evidence, cells=cells)
+
+    monkeypatch.setattr(fitting, "gather", gather)
+    return there.model
+
+
+def test_a_fit_goes_on_where_ripples_change(rippling):
+    found = fit(rippling, None, iterations=8)  # type: ignore[arg-type]
+    assert abs(float(found.model.point[0]) - TRUTH) < 3 * float(found.covariance[0, 0]) ** 0.5
+
+
+def test_without_roughness_it_stays(rippling, monkeypatch):
+    monkeypatch.setattr(noise, "ROUGH", 0.0)
+    found = fit(rippling, None, iterations=8)  # type: ignore[arg-type]
+    assert abs(float(found.model.point[0]) - TRUTH) > 4 * float(found.covariance[0, 0]) ** 0.5
