@@ -22,7 +22,7 @@ from .evidence import Evidence
 REACH, MEMORY = 0.1, 0.3  # m, s, over which slow errors agree
 FLOOR = {"points": 1e-4, "edges": 3e-4, "markers": 1e-4, "force": 5e-3, "torque": 5e-4}  # m, N, N m: of one cell
 UNFITTED = 5.0  # slow errors over their least size, to fit by: those of a model that is wrong yet say nothing
-ROUGH = 2.0  # steps along every parameter by which two engines' cloths may differ in effect
+ROUGH = 3.0  # steps along every parameter by which two engines' cloths may differ in effect
 RANK = 1e-9  # relative, of directions that count in the likelihood
 
 
