@@ -51,6 +51,12 @@ def stretches(cells: Sequence[Cells]) -> Tensor:
     return torch.cat(own).unique(dim=0, return_inverse=True)[1]
 
 
+def mean_over(stretch: Tensor, values: Tensor) -> Tensor:
+    """[C] of values [C], over each cell's stretch."""
+    total = values.new_zeros(int(stretch.max()) + 1).index_add(0, stretch, values)
+    return (total / torch.bincount(stretch))[stretch]
+
+
 def cells_of(frames: Frames, moved: Frames | None, episode: Episode, sheet: Sheet, rest: Tensor) -> Cells:
     """Of one simulated episode; ``moved`` holds derivatives of the frames, ``rest`` [V, 3] m the pattern."""
     scene = scene_of(frames, moved, episode, sheet)

@@ -19,7 +19,7 @@ from ..identification.nuisances import Camera, Clock, Held, Rim, Tare
 from ..identification.replays import Frames
 from ..identification.sheet import Sheet, sheet_for
 from ..recordings import Recording
-from .cells import Cells, cells_of, directions, stretches
+from .cells import Cells, cells_of, directions, mean_over, stretches
 from .refined import refined
 from .world import Hypothesis, Model, World
 
@@ -294,9 +294,8 @@ def _central(cells: Cells, shifts: Sequence[tuple[int, float]], parameters: int)
         if k < parameters and len(sides) == 2:
             miss = 0.5 * (cells.jacobian[:, sides[0]] - cells.jacobian[:, sides[1]])
             square = square + (shifts[sides[0]][1] * miss).square()
-            sums = cells.value.new_zeros(int(stretch.max()) + 1, 2)
-            noise, power = sums.index_add(0, stretch, torch.stack([miss**2 / 3, slope**2], 1)).unbind(1)
-            slope = slope * (1 - noise / power.clamp(min=1e-30)).clamp(min=0.0)[stretch]
+            noise, power = mean_over(stretch, miss**2 / 3), mean_over(stretch, slope**2)
+            slope = slope * (1 - noise / power.clamp(min=1e-30)).clamp(min=0.0)
         columns.append(slope)
     jacobian = torch.cat([*(c[:, None] for c in columns), cells.jacobian[:, len(shifts) :]], 1)
     return cells._replace(jacobian=jacobian, rough=square.sqrt())

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .cells import NAMES, SEEN, Cells, stretches
+from .cells import NAMES, SEEN, Cells, mean_over, stretches
 from .evidence import Evidence
 
 REACH, MEMORY = 0.1, 0.3  # m, s, over which slow errors agree
@@ -119,9 +119,7 @@ def _white(cells: Cells) -> Tensor:
 
 def _rough(cells: Cells) -> Tensor:
     """[C] mean square over each stretch."""
-    stretch = stretches([cells])
-    total = cells.value.new_zeros(int(stretch.max()) + 1).index_add(0, stretch, (ROUGH * cells.rough).square())
-    return (total / torch.bincount(stretch))[stretch]
+    return mean_over(stretches([cells]), (ROUGH * cells.rough).square())
 
 
 def _together(cells: Cells) -> Tensor:

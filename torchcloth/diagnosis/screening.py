@@ -87,11 +87,9 @@ def screen(found: Fitted) -> list[Row]:
     _, alone = leap(found.white, found.model)
     rows, fitted = [], [p.name for p in found.model.parameters]
     for j, h in enumerate(found.evidence.hypotheses):
-        if h.twin in fitted and not _pulled(found, fitted.index(h.twin)):
-            rows.append(Row(h, 0.0, float("inf"), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "unresolvable"))
-            continue
         information = float(asked[:, j] @ asked[:, j])
-        if information < 1e-12 / h.typical**2:
+        as_fitted = h.twin in fitted and not _pulled(found, fitted.index(h.twin))
+        if as_fitted or information < 1e-12 / h.typical**2:
             rows.append(Row(h, 0.0, float("inf"), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "unresolvable"))
             continue
         amplitude = -float(asked[:, j] @ value) / information
