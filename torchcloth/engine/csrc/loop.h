@@ -137,8 +137,7 @@ struct Loop : Stage<R>, Shares<R> {
                 break;
             case Instruction::collect:
                 transfer<Transfer>(i, first, all, [&](auto t) {
-                    t.spread(regs + i.in[0], bars + i.in[1], bar);
-                    t.weigh(regs + i.in[0], bars + i.in[1], at.value[i.field], bars + i.in[0]);
+                    t.spread_and_weigh(regs + i.in[0], bars + i.in[1], bar, at.value[i.field], bars + i.in[0]);
                 });
                 break;
         }

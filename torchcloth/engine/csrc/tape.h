@@ -173,7 +173,7 @@ template <class K, int I, class P>
 TC_INLINE P second_partial(const P* v) {
     constexpr Node n = traced<K>.tape.node[I];
     if constexpr (n.op == Op::mul) return v[n.a];
-    else if constexpr (n.op == Op::div) return -v[I] / v[n.b];
+    else if constexpr (n.op == Op::div) return -v[I] * (1.0 / v[n.b]);  // the first one has that, too
     else return -v[n.a] / (v[n.a] * v[n.a] + v[n.b] * v[n.b]);  // atan2
 }
 

@@ -166,12 +166,15 @@ struct Transfer {
         to_registers<R>(shares, share);
     }
 
-    // The derivatives of that sum, for the adjoint of what was collected.
-    void weigh(const P* offset, const P* share, const R* grid, P* offset_bar) const { look<false>(offset, share, grid, nullptr, offset_bar); }
-    // What collect gives, added to `collected`; and the derivatives by the offset of the sum over nodes of what the
-    // shares spread, times the grid.
+    // Derivatives by the offset of the sum over nodes of what the shares spread, times the grid. For the adjoint of what was
+    // collected, whose shares are spread on the grid's adjoint:
+    void spread_and_weigh(const P* offset, const P* share, R* grid_bar, const R* grid, P* offset_bar) const {
+        look<true, false>(offset, share, grid_bar, grid, nullptr, offset_bar);
+        is_written(grid_bar);
+    }
+    // and of what was spread, with what collect gives added to `collected`.
     void collect_and_weigh(const P* offset, const P* share, const R* grid, P* collected, P* offset_bar) const {
-        look<true>(offset, share, grid, collected, offset_bar);
+        look<false, true>(offset, share, nullptr, grid, collected, offset_bar);
     }
 
   private:
@@ -197,30 +200,37 @@ struct Transfer {
     };
     static TC_INLINE B part(const B* share, int b) { return repeated(reinterpret_cast<const Quad<R>*>(share)[b]); }
 
-    template <bool COLLECTS>
-    TC_INLINE void look(const P* offset, const P* share, const R* grid, P* collected, P* offset_bar) const {
+    template <bool SPREADS, bool COLLECTS>
+    TC_INLINE void look(const P* offset, const P* share, R* grid_bar, const R* grid, P* collected, P* offset_bar) const {
+        constexpr bool g_is_slope = BY == By::slopes;  // of f: some sums are then others
         const Sight<4> sight(offset);
         B shares[L], found[L], ways[L];
         to_lanes<R>(share, shares);
         for (int lane = 0; lane < lanes; lane++) {
+            const B f = sight.z(0, lane), g = sight.z(1, lane), f_slope = sight.z(2, lane), g_slope = sight.z(3, lane);
+            const B *own = shares + lane, s0 = part(own, 0), s1 = part(own, 1), s2 = part(own, 2), s3 = part(own, 3);
+            const B first = f * s0 + g * s3, second = f * s1, third = f * s2;
             B a(0.0), b(0.0), c(0.0), ax(0.0), bx(0.0), cx(0.0), ay(0.0), by(0.0), cy(0.0);
             const int* block = around + lane * AROUND;
             for (int i = 0; i < 3; i++) {
+                const Factors<R> x(sight.axes[0], i, lane);
+                const B to_f = alike(x.f) * first + alike(x.g) * second, to_g = alike(x.f) * third;
                 B u(0.0), v(0.0), uy(0.0), vy(0.0);
                 for (int j = 0; j < 3; j++) {
                     const Factors<R> y(sight.axes[1], j, lane);
                     const B& at = reinterpret_cast<const B*>(grid)[block[3 * i + j]];
-                    u = u + alike(y.f) * at, v = v + alike(y.g) * at;
-                    uy = uy + alike(y.f_slope) * at, vy = vy + alike(y.g_slope) * at;
+                    u = u + alike(y.f) * at, v = v + alike(y.g) * at, vy = vy + alike(y.g_slope) * at;
+                    if (!g_is_slope) uy = uy + alike(y.f_slope) * at;
+                    if (SPREADS) {
+                        B& to = reinterpret_cast<B*>(grid_bar)[block[3 * i + j]];
+                        to = to + alike(y.f) * to_f + alike(y.g) * to_g;
+                    }
                 }
-                const Factors<R> x(sight.axes[0], i, lane);
                 a = a + alike(x.f) * u, b = b + alike(x.g) * u, c = c + alike(x.f) * v;
-                ax = ax + alike(x.f_slope) * u, bx = bx + alike(x.g_slope) * u, cx = cx + alike(x.f_slope) * v;
-                ay = ay + alike(x.f) * uy, by = by + alike(x.g) * uy, cy = cy + alike(x.f) * vy;
+                bx = bx + alike(x.g_slope) * u, cx = cx + alike(x.f_slope) * v, cy = cy + alike(x.f) * vy;
+                if (!g_is_slope) ax = ax + alike(x.f_slope) * u, ay = ay + alike(x.f) * uy, by = by + alike(x.g) * uy;
             }
-            const B f = sight.z(0, lane), g = sight.z(1, lane), f_slope = sight.z(2, lane), g_slope = sight.z(3, lane);
-            const B *own = shares + lane, s0 = part(own, 0), s1 = part(own, 1), s2 = part(own, 2), s3 = part(own, 3);
-            const B first = f * s0 + g * s3, second = f * s1, third = f * s2;
+            if (g_is_slope) ax = b, ay = c, by = cx;
             ways[lane] = summed(first * ax + second * bx + third * cx, first * ay + second * by + third * cy,
                                 a * (f_slope * s0 + g_slope * s3) + f_slope * (s1 * b + s2 * c), B(0.0));
             if (COLLECTS) found[lane] = summed(f * a, f * b, f * c, g * a);
