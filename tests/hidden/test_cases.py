@@ -16,13 +16,14 @@ from faults import FAULTS
 from make import episode, main, scenes
 from partners import LEFT_OUT, OUTSIDE, PAIRS, SINGLES
 from reveal import truth
+from shows import rms, shown
 from test_independence import forbidden
 
 from torchcloth import recordings
 from torchcloth.diagnosis.hypotheses import known
 
 HERE = Path(__file__).parent
-MAKERS = ("beside", "drawn", "faults", "make", "partners", "reveal")
+MAKERS = ("beside", "drawn", "faults", "make", "partners", "reveal", "shows")
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -168,3 +169,18 @@ def test_a_sealed_case_is_not_diagnosed_again_and_again(capsys, tmp_path):
     assert again.main(["--seed", str(SEALED), "--keep", str(tmp_path / "cases")]) == 2
     assert "sealed" in capsys.readouterr().err
     assert not (tmp_path / "cases").exists()
+
+
+def test_how_much_an_effect_shows_is_told_beside_what_the_fabric_does():
+    """Drag at speed moves the cloth by millimetres, and no stiffness does that; internal friction hardly does."""
+    small = replace(case(6, SMALL), takes=(drawn.Take("swing-fast", 0.0, 1.3),))
+    strong = shown(replace(small, effects=(drawn.Hidden("air.drag_n", 1.2), drawn.Hidden("obs.clock", 0.02))))
+    (weak,) = shown(replace(small, effects=(drawn.Hidden("fric.internal_shear", 0.05),)))
+    assert [row["name"] for row in strong] == ["air.drag_n"], "a clock moves no cloth"
+    assert 1e-3 < strong[0]["left_moves"] <= strong[0]["moves"]
+    assert weak["left_moves"] < 3e-4
+
+
+def test_means_are_told_apart_by_kind():
+    places, forces = np.full((3, 16, 3), 2.0), np.full((3, 2, 3), 4.0)
+    assert rms(case(6), np.concatenate([places.ravel(), forces.ravel()])) == pytest.approx((1e-3, 40e-3))

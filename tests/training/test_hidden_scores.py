@@ -3,7 +3,7 @@
 import pytest
 
 from torchcloth.training.studies import hidden_rates as rates
-from torchcloth.training.studies.hidden_scores import judged
+from torchcloth.training.studies.hidden_scores import judged, shows
 from torchcloth.training.studies.hidden_tables import markdown
 
 
@@ -196,3 +196,16 @@ def test_the_page_has_every_case_and_every_mark():
     assert text.count("\n| ") > 7 + 12 + 10
     assert text.endswith("13 s a diagnosis (median; longest 16 s), 7 cases, 7 of them sealed\n")
     assert "no case is finished" in markdown([])
+
+
+def test_what_shows_is_asked_of_the_truths_engine():
+    both = hidden("double", ("mass.hem", 0.02), ("damp.kv", 0.004), ("obs.clock", 0.02))
+    sizes = [
+        {"name": "mass.hem", "left_moves": 1e-3, "left_pulls": 0.0},
+        {"name": "damp.kv", "left_moves": 1e-4, "left_pulls": 2e-3},
+    ]
+    assert shows(both, sizes) == [True, False, True], "a clock moves no cloth and is seen"
+    assert shows(both, None) is None
+    cases = [{**judged(DRAG, answer()), "shows": known} for known in ([True], [False], None)]
+    row = dict(rates.further(cases))["class identified, singles at typical size that show"]
+    assert (row.hits, row.of) == (0, 1)

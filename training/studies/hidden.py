@@ -27,7 +27,7 @@ from ..kept import Kept
 from . import hidden_tables
 from .checkout import folder, module
 from .hidden_gain import gain
-from .hidden_scores import judged, told_apart
+from .hidden_scores import judged, shows, told_apart
 
 CASES = 60
 # sealed, for the tests: a fault, air.drag_n at 1.5, a null and two hard ones
@@ -119,6 +119,7 @@ def one(out: Path, name: str, seed: int, fast: bool) -> dict[str, Any]:
         case["next"] = experiments(out, name, make, given, found, seed)
     if truth["family"] in ("single", "double") and not fast:
         case["gain"] = _gain(out, name, make, given, found, truth)
+        case["sizes"] = json.loads(_script("shows.py", "--seed", str(seed)))
     return case
 
 
@@ -182,6 +183,7 @@ def scored(name: str, case: Mapping[str, Any]) -> dict[str, Any]:
     """A kept case as the tables have it."""
     truth, later = case["truth"], case.get("next")
     rest: dict[str, Any] = {key: case.get(key) for key in ("seconds", "gain")}
+    rest["shows"] = shows(truth, case.get("sizes"))
     if later is not None:
         rest["resolved"] = later["proposed"] is not None and told_apart(truth, later["proposed"])
         rest["random_resolved"] = None if later["random"] is None else told_apart(truth, later["random"])

@@ -105,6 +105,11 @@ def at(singles: Sequence[Judged], share: str) -> list[Judged]:
     return [c for c in singles if c["kind"] == share]
 
 
+def _shown(cases: Sequence[Judged]) -> list[Judged]:
+    """Those whose effects all change what is recorded."""
+    return [c for c in cases if c.get("shows") and all(c["shows"])]
+
+
 def _found(c: Judged) -> bool:
     return c["found"][0]
 
@@ -131,6 +136,9 @@ def further(cases: Sequence[Judged]) -> list[tuple[str, Rate | float | None]]:
     seen = [c for c in singles if not (c["said_invisible"][0] and not c["named"])]
     return [
         ("class identified, singles at 1.5", rate(at(singles, "1.5"), _found)),
+        ("class identified, singles at typical size that show", rate(_shown(at(singles, "1")), _found)),
+        ("class identified, singles at half that show", rate(_shown(at(singles, "0.5")), _found)),
+        ("both of two effects that show", rate(_shown(doubles), lambda c: c["right"])),
         ("singles said to be invisible in these data, nothing named", Rate(len(singles) - len(seen), len(singles))),
         ("class identified, singles of all sizes but those", rate(seen, _found)),
         ("matched nulls with a named cause", rate(of(cases, "null"), lambda c: c["named"])),

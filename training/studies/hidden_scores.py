@@ -14,6 +14,7 @@ Answer = Mapping[str, Any]
 WITH_EFFECT = ("single", "double", "confounded", "next experiment")
 NULLS = ("null", "hard null")
 UNDECIDED = ("unresolvable", "undecided", "inconclusive")
+MOVED, PULLED = 3e-4, 10e-3  # m and N, RMS: of an effect that shows
 
 
 class Wanted(NamedTuple):
@@ -94,6 +95,17 @@ def judged(truth: Truth, answer: Answer) -> dict[str, Any]:
             "amplitudes": [_amplitude(c, w) for c, w in zip(found, asked, strict=True)],
         }
     return out | {"right": _right(truth, answer, causes, asked, out)}
+
+
+def shows(truth: Truth, sizes: Sequence[Mapping[str, Any]] | None) -> list[bool] | None:
+    """Whether each effect that should be found changes what is recorded beside what the fabric's numbers do.
+
+    ``sizes`` is what tests/hidden/shows.py prints; what is not there moves no cloth and is seen as it is. None: not known.
+    """
+    if sizes is None:
+        return None
+    left = {row["name"]: row["left_moves"] > MOVED or row["left_pulls"] > PULLED for row in sizes}
+    return [left.get(e["name"], True) for e in truth["effects"] if e["names"] and not e["beside"]]
 
 
 def verdict(answer: Answer) -> str:
