@@ -1,9 +1,9 @@
-"""Says by how much a case's effects move its cloth beside what the fabric's own numbers could do; after the answer, too.
+"""Says by how much a case's effects move its cloth beside what the fabric's numbers could do; after the answer, too.
 
 python tests/hidden/shows.py --seed 12
 
-By the truth's engine alone, without noise, on a coarser mesh: it knows nothing of how a diagnosis goes about it. What the
-sensor sees otherwise, or a robot that stands elsewhere, moves no cloth and is left out.
+By the truth's engine alone, without noise, on a coarser mesh: it knows nothing of how a diagnosis goes about it. What
+the sensor sees otherwise, or a robot that stands elsewhere, moves no cloth and is left out.
 """
 
 from __future__ import annotations
@@ -35,15 +35,16 @@ UNMOVED = ("obs.", "robot.base")
 def shown(found: Case) -> list[dict[str, object]]:
     """For each effect that moves the cloth, RMS of the means' changes: positions [m], forces [N].
 
-    ``moves`` and ``pulls``: altogether. ``left_moves`` and ``left_pulls``: what no membrane stiffness, bending stiffness or
-    areal density does, as far as a data sheet leaves them open.
+    ``moves`` and ``pulls``: altogether. ``left_moves`` and ``left_pulls``: what no membrane stiffness, bending
+    stiffness or areal density does, as far as a data sheet leaves them open.
     """
     found = replace(found, nodes=found.size.fit)
     effects = [e for e in found.effects if e.name in SINGLES and not e.name.startswith(UNMOVED)]
     if not effects:
         return []
     whole = means(found)
-    slopes = np.stack([(means(found, name, h) - means(found, name, -h)) / (2 * h) for name, (h, _) in FABRIC.items()], -1)
+    slope = lambda name, h: (means(found, name, h) - means(found, name, -h)) / (2 * h)  # noqa: E731
+    slopes = np.stack([slope(name, step) for name, (step, _) in FABRIC.items()], -1)
     known = np.diag([1 / std for _, std in FABRIC.values()])
     out: list[dict[str, object]] = []
     for effect in effects:

@@ -100,7 +100,8 @@ def judged(truth: Truth, answer: Answer) -> dict[str, Any]:
 def shows(truth: Truth, sizes: Sequence[Mapping[str, Any]] | None) -> list[bool] | None:
     """Whether each effect that should be found changes what is recorded beside what the fabric's numbers do.
 
-    ``sizes`` is what tests/hidden/shows.py prints; what is not there moves no cloth and is seen as it is. None: not known.
+    ``sizes`` is what tests/hidden/shows.py prints; what is not there moves no cloth and is seen as it is. None: not
+    known.
     """
     if sizes is None:
         return None
