@@ -8,7 +8,7 @@ import torch
 import twins
 
 from torchcloth import recordings
-from torchcloth.errors import RecordingError
+from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import cloth_from, fitted, identify, predict_episode, replayed
 from torchcloth.identification.saved import read_saved
 from torchcloth.transfer import Contact
@@ -81,3 +81,13 @@ def test_a_value_that_cannot_be_is_refused_by_name(pair, recording, tmp_path):
     for read in (fitted, predict_episode, replayed):
         with pytest.raises(RecordingError, match=r"identification.json: .*got -1 Pa"):
             read(path, recording)
+
+
+def test_a_folder_of_models_is_named_as_such(tmp_path):
+    with pytest.raises(
+        InvalidInput, match=r"no .*identification.json; expected identification.json, or the folder .*it$"
+    ):
+        read_saved(tmp_path)
+    (tmp_path / "extended.tcm").touch()
+    with pytest.raises(InvalidInput, match=r"or a model of that folder: extended\.tcm$"):
+        read_saved(tmp_path)

@@ -32,7 +32,11 @@ def read_result(path: str | Path, name: str, parse: Callable[[dict[str, Any]], T
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError:
-        raise InvalidInput("fit", got=f"no {path}", expected=f"{name}, or the folder that holds it") from None
+        models = ", ".join(sorted(p.name for p in path.parent.glob("*.tcm")))
+        remedy = f"or a model of that folder: {models}" if models else ""
+        raise InvalidInput(
+            "fit", got=f"no {path}", expected=f"{name}, or the folder that holds it", remedy=remedy
+        ) from None
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path}: unreadable", got=error, remedy=again) from None
     try:
