@@ -74,7 +74,7 @@ WRONG = {
     "start of nothing": (["--start", "stiffness=3"], "--start; got 'stiffness'; expected one of .*youngs_modulus"),
     "fit of nothing": (["--fit", "stiffness"], "got 'stiffness'; expected one of .*youngs_modulus"),
     "no iterations": (["--iterations", "0"], "iterations; got 0; expected at least 1"),
-    "resume of nothing": (["--resume"], "resume; got no .*progress; expected what an interrupted fit left"),
+    "resume of nothing": (["--resume"], "resume; got no .*progress; expected what an interrupted run left"),
     "negative contact": (["--contact", "-0.01"], "spacing"),
     "field of nothing": (["--fields", "stiffness"], "--fields; got 'stiffness'; expected one of .*youngs_modulus"),
     "fields and values": (["--fields", "youngs_modulus", "--fit", "air.normal"], "--fit; got a value, with --fields"),

@@ -1,9 +1,10 @@
 """How far motions must agree about a cause."""
 
 import pytest
+from scipy.stats import t
 
 from torchcloth.diagnosis.comparison import Gain
-from torchcloth.diagnosis.stepwise import NORMAL, standard_errors
+from torchcloth.diagnosis.stepwise import NORMAL, SURE, SURE_OF_BEST, TRIED, standard_errors
 
 
 def gain(after):
@@ -26,3 +27,9 @@ def test_what_mends_much_of_all_that_is_wrong_may_differ_from_motion_to_motion(a
 
 def test_a_motion_that_alone_tells_counts_twice_and_does_not_make_three():
     assert standard_errors(gain(0.7), ["a", "b"], {"a"}, True) == pytest.approx(4.30, abs=0.01)
+
+
+def test_the_numbers_are_those_of_students_distribution():
+    for k, (sure, of_best) in enumerate(zip(SURE, SURE_OF_BEST, strict=True), 1):
+        assert sure == pytest.approx(t.ppf(0.975, k), abs=0.006)
+        assert of_best == pytest.approx(t.ppf(1 - 0.025 / TRIED, k), abs=0.006)

@@ -124,6 +124,8 @@ def test_episodes_of_two_cloths_are_refused(turned):
 def test_the_verdict_is_written_and_the_command_is_done(turned, tmp_path, capsys):
     swapped = rec.write(renamed(turned), tmp_path / "swapped")
     other = rec.write(replace(turned, split={"motion": "other"}), tmp_path / "good")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "extended.tcm").touch()  # of an earlier diagnosis
     assert main(["diagnose", str(swapped), str(other), "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert "verdict: invalid_data" in said

@@ -71,6 +71,19 @@ def test_another_scene_keeps_the_fabric_and_another_fabric_is_refused(made):
         dx.cloth_for(folder / "extended.tcm", heavy)
 
 
+def test_a_diagnosis_begins_with_a_models_fabric_in_the_scene_of_its_episodes(made):
+    """And writes what it finds beside the data sheet that the numbers are relative to."""
+    folder, seen, _ = made
+    plane = rec.Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.4)
+    other = replace(seen.cloth, nominal=seen.cloth.nominal | {"membrane_stiffness": 1.0})
+    model, told = dx.begin_with(folder / "extended.tcm", [replace(seen, colliders={"table": plane}, cloth=other)])
+    assert "table" in model.world().cloth.boundaries
+    assert dict(zip([h.name for h in model.accepted], model.amplitudes, strict=True))["air.drag_n"] == TRUE
+    assert told[0].cloth.nominal == seen.cloth.nominal
+    own, new = (m.world().cloth.material.youngs_modulus.value for m in (dx.load_model(folder / "extended.tcm"), model))
+    assert float(own) == pytest.approx(float(new))
+
+
 def test_priors_come_from_what_data_told(made):
     folder, seen, _ = made
     spread = dx.uncertain(dx.read_model(folder / "extended.tcm", seen))
@@ -112,6 +125,8 @@ def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
     assert found["motions"]["fast"]["explained_fraction"] > 0.8
     assert main(["confirm", *models[::-1], str(folder / "fast"), "--out", str(tmp_path / "b")]) == 2
     assert "a base model, then one with all its causes and more" in capsys.readouterr().err
+    assert main(["confirm", models[0], models[0], str(folder / "fast"), "--out", str(tmp_path / "b")]) == 2
+    assert "where a diagnosis added nothing there is no gain to confirm" in capsys.readouterr().err
     assert not (tmp_path / "b").exists()
     with pytest.raises(InvalidInput, match="'fast' twice"):
         dx.confirm(*models, 2 * [rec.read(folder / "fast")])

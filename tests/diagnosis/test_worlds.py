@@ -105,6 +105,16 @@ def test_what_a_recording_cannot_show_is_not_asked(made):
     assert asked.isdisjoint({"obs.depth_scale", "obs.depth_bias", "contact.mu"})
 
 
+def test_a_data_sheet_without_bending_is_asked_nothing_about_it():
+    sheet = {k: v for k, v in RECORDING.cloth.nominal.items() if not k.startswith("bending")}
+    bare = replace(RECORDING, cloth=replace(RECORDING.cloth, nominal=sheet))
+    model = base_model(bare)
+    asked = catalogue(model, [bare])
+    assert {h.effect for h in EVERY} - {h.effect for h in asked} >= set(fabric.OF_BENDING)
+    for h in asked:
+        model.world([(h, h.typical)])
+
+
 def test_two_effects_in_one_part_keep_both(made):
     model, _ = made
     by = {h.name: h for h in catalogue(model, [RECORDING])}

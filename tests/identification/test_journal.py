@@ -43,7 +43,7 @@ def test_another_problem_is_refused(tmp_path):
     Journal(tmp_path / "j", ["a", torch.zeros(3)], resume=True)
     with pytest.raises(InvalidInput, match="of another fit; expected the same episodes"):
         Journal(tmp_path / "j", ["a", torch.ones(3)], resume=True)
-    with pytest.raises(InvalidInput, match=r"resume; got no .*; expected what an interrupted fit left"):
+    with pytest.raises(InvalidInput, match=r"resume; got no .*; expected what an interrupted run left"):
         Journal(tmp_path / "nowhere", ["a"], resume=True)
 
 

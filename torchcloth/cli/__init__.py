@@ -23,12 +23,17 @@ VERBS = (
     doctor,
     bench,
 )  # each has add(verbs)
+WITH_MODELS = ("identify", "predict", "pose", "diagnose", "confirm", "view")  # which a user's own causes may be in
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
     options = _parser().parse_args(arguments)
     try:
+        if getattr(options, "causes", None) is not None:
+            from ..diagnosis import register_file
+
+            register_file(options.causes)
         return options.run(options)
     except (TorchclothError, OSError) as error:
         print(f"torchcloth: {error}", file=sys.stderr)
@@ -44,4 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(required=True, metavar="VERB")
     for verb in VERBS:
         verb.add(verbs)
+    for name in WITH_MODELS:
+        more = "a Python file that registers causes of your own (torchcloth.diagnosis.register)"
+        verbs.choices[name].add_argument("--causes", metavar="FILE", help=more)
     return parser

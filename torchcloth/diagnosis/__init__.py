@@ -12,10 +12,11 @@ from .fitting import Fitted, fit
 from .gate import Fault, check, read_episodes
 from .hypotheses import catalogue, register
 from .lacking import lack_of_fit
-from .loading import beside_the_cloth, cloth_for, load, load_world, predicted, uncertain
+from .loading import begin_with, beside_the_cloth, cloth_for, load, load_world, predicted, uncertain
 from .missing import MissingForce, missing_force
 from .model_file import load_model, read_model, save_model
 from .noise import fit_noise
+from .own_causes import register_file
 from .residual import Residual, learn_residual
 from .run import diagnose, write_diagnosis
 from .screening import screen
@@ -35,6 +36,7 @@ __all__ = [
     "Residual",
     "World",
     "base_model",
+    "begin_with",
     "beside_the_cloth",
     "catalogue",
     "check",
@@ -58,6 +60,7 @@ __all__ = [
     "read_model",
     "refused",
     "register",
+    "register_file",
     "save_model",
     "screen",
     "search",

@@ -127,6 +127,13 @@ def _rms(p: Predicted) -> float:
 
 def _refuse_no_extension(base: Model, extended: Model) -> None:
     first, second = ({h.name for h in model.accepted} for model in (base, extended))
+    if first == second:
+        raise InvalidInput(
+            "models",
+            got=f"the same causes twice ({', '.join(sorted(first)) or 'none'})",
+            expected="an extended model",
+            remedy="where a diagnosis added nothing there is no gain to confirm",
+        )
     if not first < second:
         raise InvalidInput(
             "models",

@@ -88,6 +88,7 @@ def _tilt(axis: int, world: World, angle: float) -> World:
     return world.with_cloth({"gravity": Gravity(own.acceleration.tolist(), tilt)})
 
 
+OF_BENDING = ("damp.bend", "plast.crease", "bend.aniso", "rest.curl")  # effects that change a cloth's bending
 HYPOTHESES = (
     Hypothesis("damp.bend", "s", 0.05, lambda w, a: _bending(w, damping_time=a)),
     Hypothesis("plast.crease", "1/s", 5.0, lambda w, a: _bending(w, mobility=a)),

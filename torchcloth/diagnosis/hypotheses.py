@@ -46,4 +46,11 @@ def known() -> list[Hypothesis]:
 
 def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]:
     """All hypotheses that the recordings could say something about."""
-    return [h for h in model.others(known()) if any(h.needs(r) for r in recordings)]
+    without = () if "bending" in model.base.cloth.effects else fabric.OF_BENDING
+    asked = [h for h in model.others(known()) if h.effect not in without]
+    return [h for h in asked if any(h.needs(r) for r in recordings)]
+
+
+def registered() -> list[Hypothesis]:
+    """The user's own."""
+    return list(_registered)

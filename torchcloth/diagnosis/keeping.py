@@ -16,6 +16,7 @@ from ..identification.episodes import Episode
 from ..identification.journal import Journal, digest
 from .cells import Cells
 from .evidence import Kept, Piece, Setting
+from .own_causes import digests
 from .world import Model
 
 FIELDS = len(Cells._fields)
@@ -46,7 +47,7 @@ def _problem(model: Model, setting: Setting) -> list[object]:
     data = [part for e in setting.episodes for part in _parts(e)]
     parts = [(p.name, p.step, p.std) for p in model.parameters]
     fabric = [*cloth.state_dict().values(), cloth.mesh.rest.tobytes(), cloth.mesh.faces.tobytes()]
-    return [metadata.version("torchcloth"), setting.dt, parts, *fabric, *data]
+    return [metadata.version("torchcloth"), setting.dt, parts, *digests(), *fabric, *data]
 
 
 def _parts(e: Episode) -> list[object]:

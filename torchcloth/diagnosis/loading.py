@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -12,9 +13,10 @@ from ..identification.episode_prediction import EpisodePrediction, with_errors
 from ..identification.episodes import episode
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
+from .base_model import together
 from .cells import directions
 from .evidence import shifted, side_by_side, step_sizes
-from .model_file import ModelFile, load_model, read_model
+from .model_file import ModelFile, load_model, of_fabric, read_model
 from .world import Model, World
 
 TOLD = 0.5  # of the prior's width: a parameter that is known better is known from data
@@ -68,6 +70,17 @@ def uncertain(file: ModelFile) -> dict[str, tuple[float, float]]:
             up, value, down = p.value(c + std), p.value(c), p.value(c - std)
             out[p.name] = (value, math.sqrt(up / down) if positive else abs(up - down) / 2)
     return out
+
+
+def begin_with(path: str | Path, recordings: Sequence[Recording]) -> tuple[Model, list[Recording]]:
+    """A model file for ``diagnose``: its fabric and causes in the mesh, grasps and tables of episodes.
+
+    Without its residual force, which is no cause. The episodes come back with the data sheet that the model's numbers
+    are relative to. Raises as ``read_model``, or InvalidInput for episodes of two scenes.
+    """
+    own = read_model(path).scene
+    told = [of_fabric(path, own, r) for r in recordings]
+    return read_model(path, together(told), residual=False).model, told
 
 
 def _parameter(cloth: Cloth, name: str) -> PhysicalParameter:

@@ -91,6 +91,7 @@ class ModelFile(NamedTuple):
     model: Model
     covariance: Tensor | None  # [P + A, P + A] of the model's coordinates
     episodes: list[dict[str, Any]]  # marks of those that it was fitted to
+    scene: Recording  # what it was written with
 
 
 def load_model(path: str | Path, residual: bool = True) -> Model:
@@ -127,14 +128,18 @@ def read_model(path: str | Path, scene: Recording | None = None, residual: bool 
     except (zipfile.BadZipFile, KeyError, TypeError, ValueError, OSError) as error:
         got = "no archive" if isinstance(error, zipfile.BadZipFile) else f"{type(error).__name__}: {error}"
         raise RecordingError(f"{path}: unreadable", got=got, expected="a .tcm file of `torchcloth diagnose`") from None
-    model = base_model(own if scene is None else _of_fabric(path, own, scene))
+    model = base_model(own if scene is None else of_fabric(path, own, scene))
     values = torch.tensor([coordinates[p.name] for p in model.parameters], dtype=torch.float64)
     model = _extended(path, replace(model, values=values), causes)
-    return ModelFile(model, None if matrix is None else torch.tensor(matrix, dtype=torch.float64), episodes)
+    return ModelFile(model, None if matrix is None else torch.tensor(matrix, dtype=torch.float64), episodes, own)
 
 
-def _of_fabric(path: Path, own: Recording, scene: Recording) -> Recording:
-    """The scene with the data sheet that the model's coordinates are relative to."""
+def of_fabric(path: str | Path, own: Recording, scene: Recording) -> Recording:
+    """A scene with the data sheet that the model's coordinates are relative to.
+
+    Raises:
+        InvalidInput: it is of another fabric.
+    """
     a, b = own.cloth, scene.cloth
     if not math.isclose(a.areal_density, b.areal_density, rel_tol=SAME_FABRIC):
         raise InvalidInput(
@@ -152,7 +157,9 @@ def _extended(path: Path, model: Model, causes: Sequence[tuple[str, float]]) -> 
     for name, amplitude in causes:
         if name not in by_name:
             raise InvalidInput(
-                f"{path}: effect {name!r}", got="not in the catalogue", remedy="register it (diagnosis.register) first"
+                f"{path}: effect {name!r}",
+                got="not in the catalogue",
+                remedy="name the file that registers it (--causes FILE.py, diagnosis.register_file)",
             )
         model = model.plus(by_name[name], amplitude)
     return model

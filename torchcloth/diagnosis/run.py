@@ -119,7 +119,10 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
     ``recordings`` are the episodes, which say what the base model is of.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if answer.searched is not None:
+    if answer.searched is None:
+        for name in (BASE, EXTENDED):  # of an earlier diagnosis
+            (folder / name).unlink(missing_ok=True)
+    else:
         said, scene = answer.content["episodes"], together(recordings)
         residual = answer.residual.model if answer.residual is not None and answer.residual.terms else None
         start, end = answer.found.start, answer.found.end

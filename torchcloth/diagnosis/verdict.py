@@ -28,9 +28,9 @@ class Diagnosis:
 
     Attributes:
         verdict: "identified" (each cause stands alone), "ambiguous" (some cannot be told from others), "unexplained"
-            (the fit is lacking and nothing known mends it), "adequate" (nothing known is wrong), "inconclusive"
-            (these data cannot say), "numerics" (another mesh changes more than a cause would), "invalid_data" (an
-            episode cannot be believed, and nothing was simulated).
+            (the fit is lacking and nothing known mends it), "adequate" (no known cause is surely larger than what
+            matters), "inconclusive" (these data cannot say), "numerics" (another mesh changes more than a cause
+            would), "invalid_data" (an episode cannot be believed, and nothing was simulated).
         content: all of it, as diagnosis.json has it.
         searched: the search; None of invalid data.
         missing: the force that is missing, where the fit is lacking.
@@ -200,6 +200,10 @@ def _warnings(found: Found, names: Sequence[str], left: Sequence[Left]) -> list[
             )
     if found.repeats is None:
         out.append("floor: sensor only; no episode repeats another, so what repetitions differ by is not known")
+    if "bending" not in found.start.model.base.cloth.effects:
+        out.append(
+            "the data sheet says no bending stiffness: the model's cloth has none, and nothing is asked about it"
+        )
     if found.left_out:
         out.append(f"{100 * found.left_out:.1f} % of the cells jump between shapes of the cloth and are left out")
     folded = sorted({row.motion for row in left if not row.stable})
@@ -236,7 +240,7 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
             "These intervals know of noise, meshes and how far motions disagree, not of what is wrong in all alike."
         )
     words = {
-        "adequate": "Nothing known is wrong beyond what matters.",
+        "adequate": "No known cause is surely larger than what matters.",
         "unexplained": "The fit is lacking, and no known cause mends it.",
         "inconclusive": "Something may be wrong; these data cannot say what.",
         "numerics": "Another mesh changes the motion by more than would be noticed of a cause: use a finer one.",

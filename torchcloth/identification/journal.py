@@ -52,7 +52,12 @@ class Journal:
             clear(self.folder)
             return
         if not stamp.exists():
-            raise InvalidInput("resume", got=f"no {self.folder}", expected="what an interrupted fit left")
+            raise InvalidInput(
+                "resume",
+                got=f"no {self.folder}",
+                expected="what an interrupted run left",
+                remedy="run it without --resume",
+            )
         if stamp.read_text() != self.key:
             raise InvalidInput(
                 "resume",

@@ -23,7 +23,7 @@ def folder(name: str) -> Path:
             "studies",
             got=f"no {TESTS / name}",
             expected="a checkout of the repository",
-            remedy="git clone, make install",
+            remedy="work in a clone of the repository, after `make test`",
         )
     return TESTS / name
 

@@ -66,13 +66,18 @@ def test_depth_images_become_points(tmp_path, monkeypatch):
     matrix = [[140.0, 0, 79.5], [0, 140.0, 59.5], [0, 0, 1]]
     size = {"width": 160, "height": 120, "depth_scale": 0.001}
     told = {**foreign.KNOWN, "format": "torchcloth-recording", "version": 1}
+    told["cloth"] = told["cloth"] | {"sheet": {"width": 0.2, "height": 0.2}}
     told["cameras"] = {"cam0": {**size, "K": matrix, "T_world_camera": pose.tolist()}}
     (tmp_path / "my_episode" / "episode.json").write_text(json.dumps(told))
-    (block,) = blocks("formats.md", "python")
-    exec(compile(block, "docs/formats.md", "exec"), {})
+    cut_out, laid_on = blocks("formats.md", "python")
+    exec(compile(cut_out, "docs/formats.md", "exec"), {})
     points = rec.read("my_episode_points").require("points")
     np.testing.assert_array_equal(points.t, [0, 0.5])
     assert points.counts.min() > 150
     np.testing.assert_allclose(points.xyz[:, 2], HEIGHT, atol=1e-4)
     side = 40 / 140 * (1 - HEIGHT) / 2
     assert 0.85 * side < np.abs(points.xyz[:, :2] - [0.5, 0]).max() <= side
+    exec(compile(laid_on, "docs/formats.md", "exec"), {})
+    first = rec.read("my_episode_ready").cloth.initial_vertices
+    np.testing.assert_allclose(first[:, 2], HEIGHT, atol=2e-3)
+    np.testing.assert_allclose(np.ptp(first[:, :2], axis=0), 0.2, atol=5e-3)

@@ -1,0 +1,74 @@
+"""Causes of a user's own come from a file: on the command line, and again where a model that has them is loaded."""
+
+import re
+from pathlib import Path
+
+import pytest
+import sheets
+import torch
+
+from torchcloth.cli import main
+from torchcloth.diagnosis import base_model, hypotheses, own_causes, register_file, setting_of
+from torchcloth.errors import InvalidInput
+
+FILE = """
+from torchcloth import effects
+from torchcloth.diagnosis import Hypothesis, register
+
+register(Hypothesis("my.damping", "1/s", {typical}, lambda w, a: w.with_cloth({{"mine": effects.MassDamping(a)}})))
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    yield tmp_path / "mine.py"
+    hypotheses.forget("my.damping")
+    own_causes._files.clear()
+
+
+def test_a_file_registers_and_what_depends_on_it_knows_its_content(file):
+    file.write_text(FILE.format(typical=2.0))
+    (found,) = register_file(file)
+    assert (found.name, found.typical) == ("my.damping", 2.0)
+    assert "my.damping" in {h.name for h in hypotheses.known()}
+    before = own_causes.digests()
+    file.write_text(FILE.format(typical=3.0))
+    assert [h.typical for h in register_file(file)] == [3.0]
+    assert own_causes.digests() != before
+    assert len(own_causes.digests()) == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "got no file .*mine.py; expected a Python file that calls"),
+        ("x = 1", "got .*mine.py, which registers nothing"),
+        ("x = (", "got SyntaxError in .*mine.py, line 1"),
+        ("x = 1\n1 / 0", "got ZeroDivisionError in .*mine.py, line 2: division by zero"),
+        ("import sys\nsys.exit(3)", "got SystemExit in .*mine.py, line 2: 3"),
+    ],
+)
+def test_what_is_no_file_of_causes_is_one_line(file, content, said, capsys):
+    if content is not None:
+        file.write_text(content)
+    with pytest.raises(InvalidInput, match=said):
+        register_file(file)
+    assert main(["diagnose", "nowhere", "--out", str(file.parent / "out"), "--causes", str(file)]) == 2
+    assert capsys.readouterr().err.startswith("torchcloth: causes; got ")
+
+
+def test_the_example_of_the_docs_is_one(file):
+    page = (Path(__file__).parents[2] / "docs" / "diagnosis.md").read_text(encoding="utf-8")
+    layer, example, whole = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    for text in (layer, whole):
+        compile(text, "docs/diagnosis.md", "exec")
+    file.write_text(example)
+    (travel,) = register_file(file)
+    hypotheses.forget(travel.name)
+    recording = sheets.episode()
+    model = base_model(recording)
+    (episode,) = setting_of(model, [recording]).episodes
+    before, after = (model.world([(travel, a)]).driven(episode).motion["left"].pose[:, :3, 3] for a in (0.0, 0.1))
+    way = before - before[0]
+    assert float(way.abs().max()) > 0.01
+    torch.testing.assert_close(after - after[0], 1.1 * way)
