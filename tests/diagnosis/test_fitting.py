@@ -1,5 +1,6 @@
 """Gauss-Newton between worlds of which some are impossible."""
 
+import math
 from dataclasses import replace
 
 import linear_toys as toys
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from torchcloth.diagnosis import fitting
-from torchcloth.diagnosis.fitting import fit
+from torchcloth.diagnosis.fitting import fit, with_cause
 from torchcloth.errors import SimulationDiverged
 
 TRUTH = torch.tensor([0.4]).double()
@@ -66,3 +67,25 @@ def test_what_is_known_is_not_looked_at_again(looks):
     seen.clear()
     fit(model, None, iterations=0, here=here)  # type: ignore[arg-type]
     assert not seen
+
+
+def test_a_twin_takes_over_what_the_parameter_did():
+    """The same world, with the parameter back at its data sheet."""
+    slopes = toys.smooth(1, 3)
+    slopes[..., 1] = slopes[..., 0]
+    there = toys.fitted(toys.evidence(slopes, 1, ["twin"], torch.tensor([0.0, 0.0]).double(), 0), std=0.05)
+    sheet = replace(there.model.parameters[0], value=math.exp)
+    model = replace(there.model, parameters=(sheet,)).at(torch.tensor([math.log(1.2)]).double())
+    twin = toys.hypothesis("twin", twin=sheet.name)
+    found = with_cause(replace(there, model=model, evidence=replace(there.evidence, hypotheses=[twin])), twin)
+    amplitude, coordinate = found.amplitudes[0], float(found.values[0])
+    assert amplitude + coordinate == pytest.approx(0.2, abs=0.1)
+    assert abs(coordinate) < 0.05 < 0.1 < amplitude
+
+
+def test_amplitudes_stop_where_a_world_ends():
+    model = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0)).model
+    ortho = toys.hypothesis("elas.ortho", high=0.9)
+    assert model.plus(ortho).at(torch.tensor([0.1, 1.5]).double()).amplitudes == (0.9,)
+    plain = replace(ortho, signed=False, low=0.1)
+    assert model.plus(plain).at(torch.tensor([0.1, -1.5]).double()).amplitudes == (0.1,)

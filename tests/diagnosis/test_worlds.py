@@ -9,7 +9,7 @@ import torch
 
 from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import base_model, together
-from torchcloth.diagnosis.evidence import gather, setting_of
+from torchcloth.diagnosis.evidence import gather, motions_of, setting_of
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
@@ -103,6 +103,16 @@ def test_what_a_recording_cannot_show_is_not_asked(made):
     model, _ = made
     asked = {h.name for h in catalogue(model, [replace(RECORDING, cameras={})])}
     assert asked.isdisjoint({"obs.depth_scale", "obs.depth_bias", "contact.mu"})
+
+
+def test_an_episode_that_names_no_motion_is_one_of_its_own():
+    """Also where several come from folders of one name, or from none."""
+    bare = replace(RECORDING, split={})
+    assert motions_of([bare, replace(RECORDING, split={"motion": "swing"}), bare]) == [
+        "episode 0",
+        "swing",
+        "episode 2",
+    ]
 
 
 def test_a_data_sheet_without_bending_is_asked_nothing_about_it():

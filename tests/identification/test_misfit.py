@@ -8,9 +8,10 @@ from torch import Tensor
 
 import torchcloth as tc
 from torchcloth.identification.episodes import Episode
+from torchcloth.identification.finer import finer_cloth
 from torchcloth.identification.misfit import HUBER, figures, huber, noise_scale
 from torchcloth.identification.null import rigid_carry
-from torchcloth.identification.sheet import patches_of
+from torchcloth.identification.sheet import patches_of, rim_of
 
 
 def seen(clouds: list[Tensor], motion=None, initial=None) -> Episode:
@@ -72,6 +73,29 @@ def test_patches_cover_the_fabric_in_equal_parts():
         extent = u[patch == p].amax(0) - u[patch == p].amin(0)
         assert float(extent[0]) <= 0.11
         assert float(extent[1]) <= 0.06
+
+
+@pytest.mark.parametrize("side", [0.2, 0.3, 0.35, 0.6])
+@pytest.mark.parametrize("resolution", [9, 13])
+@pytest.mark.parametrize("patterned", [True, False])
+def test_parts_and_rim_are_the_same_on_a_finer_mesh(side, resolution, patterned):
+    """Squares, of which no axis is the longer one, and pieces of the rim that are shorter than a coarse edge."""
+    coarse = tc.meshes.rectangle(side, side, resolution=(resolution, resolution))
+    coarse = tc.meshes.Mesh.build(coarse.vertices, coarse.faces, coarse.uv if patterned else None)
+    cloth = tc.Cloth(coarse, tc.materials.AEP(1e5, 0.3, thickness=1e-3), 0.2)
+    fine = finer_cloth(cloth).mesh
+    assert torch.equal(patches_of(fine)[: len(coarse.vertices)], patches_of(coarse))
+    length = side / 10
+    middles = []
+    for mesh in (coarse, fine):
+        rim = rim_of(mesh, None, length)
+        x = torch.as_tensor(mesh.vertices)
+        centre = 0.5 * (x[rim.edges[:, 0]] + x[rim.edges[:, 1]])
+        places = [centre[rim.piece == k].mean(0) for k in range(rim.count)]
+        middles.append(dict(zip(rim.label.tolist(), places, strict=True)))
+    one, other = middles
+    assert len(other) >= len(one) > 20
+    assert all(float((one[k] - other[k]).norm()) < side / (resolution - 1) for k in one)
 
 
 def turned(angle: float, axis=(0.3, -0.5, 0.8)) -> Tensor:

@@ -82,7 +82,9 @@ def _grouped(name: str, rows: Rows, episode: Episode, sheet: Sheet) -> Rows:
     """Rows whose patches tell axes apart; single markers join the part of the fabric that they are on."""
     patch = rows.patch
     if name == "markers" and episode.places is not None:
-        patch = 3 * sheet.patches[episode.places.corners[rows.patch // 3, 0]] + rows.patch % 3
+        places = episode.places
+        nearest = places.corners.gather(1, places.weights.argmax(1, keepdim=True)).squeeze(1)
+        patch = 3 * sheet.patches[nearest[rows.patch // 3]] + rows.patch % 3
     elif name in ("points", "edges"):
         patch = 3 * rows.patch
     return rows._replace(patch=patch)
@@ -135,7 +137,9 @@ def _places(name: str, sheet: Sheet, rest: Tensor) -> Tensor:
     if name in ("points", "markers"):
         return _middles(sheet.patches, rest)
     if name == "edges":
-        return _middles(sheet.rim.piece, 0.5 * (rest[sheet.rim.edges[:, 0]] + rest[sheet.rim.edges[:, 1]]))
+        rim, places = sheet.rim, torch.zeros(int(sheet.rim.label.max()) + 1, 3, dtype=rest.dtype)
+        places[rim.label] = _middles(rim.piece, 0.5 * (rest[rim.edges[:, 0]] + rest[rim.edges[:, 1]]))
+        return places
     return torch.zeros(1000, 3, dtype=rest.dtype)
 
 

@@ -35,6 +35,11 @@ def simply(question: Sequence[object], point: Tensor, work: Callable[[], Piece])
     return work()
 
 
+def motions_of(recordings: Sequence[Recording]) -> list[str]:
+    """What each episode says its motion is; one that does not say is a motion of its own."""
+    return [str(r.split.get("motion") or f"episode {k}") for k, r in enumerate(recordings)]
+
+
 @dataclass(frozen=True, eq=False)
 class Setting:
     """Episodes as tensors, and the surface that their points are compared with."""
@@ -52,7 +57,7 @@ class Setting:
     @property
     def names(self) -> list[str]:
         """Of the motions."""
-        return [str(r.split.get("motion") or e.name) for r, e in zip(self.recordings, self.episodes, strict=True)]
+        return motions_of(self.recordings)
 
 
 def setting_of(model: Model, recordings: Sequence[Recording]) -> Setting:

@@ -10,6 +10,7 @@ from ..meshes import Mesh
 from .world import Hypothesis, World
 
 MIDDLE = 1e-6  # m
+MOST = 0.9  # share by which one stiffness may fall short of another
 YIELD = 30.0  # 1/m, beyond which bent cloth keeps a crease
 
 
@@ -92,9 +93,9 @@ OF_BENDING = ("damp.bend", "plast.crease", "bend.aniso", "rest.curl")  # effects
 HYPOTHESES = (
     Hypothesis("damp.bend", "s", 0.05, lambda w, a: _bending(w, damping_time=a)),
     Hypothesis("plast.crease", "1/s", 5.0, lambda w, a: _bending(w, mobility=a)),
-    Hypothesis("bend.aniso", "-", -0.6, lambda w, a: _bending(w, weft=a), signed=True),
-    Hypothesis("elas.ortho", "-", 0.5, lambda w, a: _moduli(w, weft=a), signed=True),
-    Hypothesis("elas.shear", "-", -0.6, lambda w, a: _moduli(w, shear=a), signed=True),
+    Hypothesis("bend.aniso", "-", -0.6, lambda w, a: _bending(w, weft=a), signed=True, low=-MOST),
+    Hypothesis("elas.ortho", "-", 0.5, lambda w, a: _moduli(w, weft=a), signed=True, high=MOST),
+    Hypothesis("elas.shear", "-", -0.6, lambda w, a: _moduli(w, shear=a), signed=True, low=-MOST),
     Hypothesis("elas.stiffen", "-", 10.0, lambda w, a: _moduli(w, stiffening=a)),
     Hypothesis("rest.curl[warp]", "1/m", 3.0, lambda w, a: _bending(w, curl_warp=a), signed=True),
     Hypothesis("rest.curl[weft]", "1/m", 3.0, lambda w, a: _bending(w, curl_weft=a), signed=True),

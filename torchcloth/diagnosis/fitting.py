@@ -98,9 +98,18 @@ def weighed(model: Model, evidence: Evidence, noise: Noise) -> Fitted:
 
 
 def with_cause(found: Fitted, hypothesis: Hypothesis) -> Model:
-    """With one more cause, where one leap leads: the parameters make room for it."""
+    """With one more cause, where one leap leads: the parameters make room for it.
+
+    A parameter that is the cause's twin hands over what it does already.
+    """
     index = [h.name for h in found.evidence.hypotheses].index(hypothesis.name)
     model = found.model.plus(hypothesis)
+    names = [p.name for p in model.parameters]
+    if hypothesis.twin in names:
+        place, point = names.index(hypothesis.twin), model.point
+        value = model.parameters[place].value
+        point[-1], point[place] = value(float(point[place])) / value(0.0) - 1, 0.0
+        model = model.at(point)
     step, _ = leap_with(whitened(found.evidence, unfitted()), model, found.evidence.own + index)
     return model.at(model.point + step)
 

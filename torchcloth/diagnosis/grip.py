@@ -77,7 +77,7 @@ HYPOTHESES = (
     Hypothesis("grip.width", "m", 0.02, lambda w, a: _regrasped(w, wider=a), step=WHOLE),
     Hypothesis("robot.regrasp", "m", 0.017, lambda w, a: _regrasped(w, along=a), signed=True, step=WHOLE),
     Hypothesis("contact.mu", "-", 0.2, lambda w, a: _friction(w, more=a), signed=True, needs=_has_table),
-    Hypothesis("contact.aniso", "-", -0.5, lambda w, a: _friction(w, along=a), signed=True, needs=_has_table),
+    Hypothesis("contact.aniso", "-", -0.5, lambda w, a: _friction(w, along=a), signed=True, needs=_has_table, low=-0.9),
     Hypothesis("contact.stick", "-", 0.3, lambda w, a: _friction(w, excess=a), needs=_has_table),
     Hypothesis("contact.adhesion", "Pa", 1.5, _sticky, needs=_has_table),
 )

@@ -16,7 +16,7 @@ from ..errors import InvalidInput
 from ..identification.saved import mark
 from ..recordings import Recording
 from .base_model import base_model, together
-from .evidence import Progress, Setting, setting_of, staged
+from .evidence import Progress, Setting, motions_of, setting_of, staged
 from .gate import check, each_once
 from .hypotheses import catalogue
 from .keeping import kept_in
@@ -58,7 +58,7 @@ def diagnose(
         RecordingError: an episode that lacks what is needed.
         SimulationDiverged: the base model cannot be simulated.
     """
-    names = [str(r.split.get("motion") or f"episode {k}") for k, r in enumerate(recordings)]
+    names = motions_of(recordings)
     if len(set(names)) < 2:
         each_once(recordings)  # a copy needs no other name
         raise InvalidInput(

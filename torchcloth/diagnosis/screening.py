@@ -2,7 +2,9 @@
 
 With J_n the slopes along everything that is fitted anyway and J_j those along hypothesis j, both whitened,
 
-    S_j = J_j' M r,  V_j = J_j' M J_j,  M = 1 - J_n (J_n' J_n + P)^-1 J_n'
+    S_j = J_j' (M r - J_n (J_n' J_n + P)^-1 P t),  V_j = J_j' M J_j,  M = 1 - J_n (J_n' J_n + P)^-1 J_n'
+
+where t is how far what is fitted lies from the middle of its priors P,
 
 EPC_j = -S_j / V_j is the amplitude that the residuals ask for, S_j^2 / V_j what chi^2 would gain (Saris, Satorra and
 van der Veld 2009; Neyman's C(alpha)). Slopes are finite ones, at typical amplitudes: tangents at zero miss effects that
@@ -17,7 +19,7 @@ import torch
 from torch import Tensor
 
 from .cells import SEEN
-from .fitting import Fitted, leap, leap_with, prior_precision
+from .fitting import Fitted, curvature, leap, leap_with, prior_precision
 from .world import Hypothesis
 
 Decision = Literal["present", "absent", "inconclusive", "unresolvable"]
@@ -82,7 +84,7 @@ def screen(found: Fitted) -> list[Row]:
     own = found.evidence.own
     projected = projection(found)
     asked = projected(found.white.jacobian[:, own:])
-    value, numerics = projected(found.white.value), projected(_numerics(found))
+    value, numerics = projected(found.white.value, found.model.point), projected(_numerics(found))
     sizes, pulls = _sizes(found, 0, SEEN), _sizes(found, SEEN, SEEN + 1)
     _, alone = leap(found.white, found.model)
     rows, fitted = [], [p.name for p in found.model.parameters]
@@ -111,15 +113,19 @@ def _pulled(found: Fitted, index: int) -> bool:
 
 
 def projection(found: Fitted):
-    """M as a function of columns: what is left of them beside all that is fitted anyway, with its priors."""
+    """M as a function of columns: what is left of them beside all that is fitted anyway, with its priors.
+
+    Residuals have a second argument: where what is fitted lies, which its priors pull back from.
+    """
     prior = prior_precision(found.model).sqrt()
     own = torch.cat([found.white.jacobian[:, : found.evidence.own], torch.diag(prior)])
     basis, _ = torch.linalg.qr(own)
     rows = len(found.white.value)
 
-    def left(columns: Tensor) -> Tensor:
+    def left(columns: Tensor, point: Tensor | None = None) -> Tensor:
         wide = columns[:, None] if columns.ndim == 1 else columns
-        padded = torch.cat([wide, wide.new_zeros(len(prior), wide.shape[1])])
+        pulled = wide.new_zeros(len(prior), wide.shape[1]) if point is None else (prior * point)[:, None]
+        padded = torch.cat([wide, pulled])
         out = padded - basis @ (basis.mT @ padded)
         return out[:, 0] if columns.ndim == 1 else out
 
@@ -147,7 +153,10 @@ def _numerics(found: Fitted) -> Tensor:
 
 
 def _sizes(found: Fitted, first: int, end: int) -> Tensor:
-    """[hypotheses] RMS over cells of kinds from ``first`` to before ``end``; zero without any."""
+    """[hypotheses] RMS over cells of kinds from ``first`` to before ``end``; zero without any.
+
+    Beside what is fitted anyway, as far as its priors let it do the same; of a twin, beside the other parameters.
+    """
     own, count = found.evidence.own, len(found.evidence.hypotheses)
     typical = torch.tensor([h.typical for h in found.evidence.hypotheses], dtype=torch.float64)
     moved = []
@@ -157,6 +166,13 @@ def _sizes(found: Fitted, first: int, end: int) -> Tensor:
     stacked = torch.cat(moved)
     if not len(stacked):
         return typical.new_zeros(count)
-    fitted = torch.linalg.lstsq(stacked[:, :own], stacked[:, own:]).solution
+    slopes, names = found.white.jacobian, [p.name for p in found.model.parameters]
+    square, cross = curvature(found.white, found.model), slopes[:, :own].mT @ slopes[:, own:]
+    fitted = torch.linalg.solve(square, cross)
+    for j, h in enumerate(found.evidence.hypotheses):
+        if h.twin in names:
+            others = [k for k in range(own) if k != names.index(h.twin)]
+            fitted[:, j] = 0.0
+            fitted[others, j] = torch.linalg.solve(square[others][:, others], cross[others, j])
     left = stacked[:, own:] - stacked[:, :own] @ fitted
     return (left * typical).square().mean(0).sqrt()

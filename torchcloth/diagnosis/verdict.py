@@ -125,8 +125,8 @@ def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left
 
 
 def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
-    best, place = step.best, found.steps.index(step)
-    h, count, amplitude = best.hypothesis, len(found.end.model.parameters), found.amplitude(step)
+    best, h, count = step.best, step.best.hypothesis, len(found.end.model.parameters)
+    place, amplitude = found.end.model.place(h.name), found.amplitude(step)
     noise = float(found.end.covariance[count + place, count + place])
     motions = float(spread(found.end, names, best.alone)[count + place])
     std = (max(noise, motions**2) + best.row.bias**2) ** 0.5

@@ -109,7 +109,9 @@ class Hypothesis:
         step: of slopes beside an amplitude, as a share of the typical one.
         needs: what a recording must have for it to mean anything.
         kin: names that no experiment of this kind can tell from it, by structure.
-        twin: base parameter that is the same number; where that is fitted, its prior alone tells of the hypothesis.
+        twin: base parameter that is the same number, by which share it is off; where that is fitted, its prior alone
+            tells of the hypothesis.
+        low, high: amplitudes that a world can have.
     """
 
     name: str
@@ -122,6 +124,8 @@ class Hypothesis:
     needs: Callable[[Recording], bool] = lambda recording: True
     kin: tuple[str, ...] = ()
     twin: str = ""
+    low: float = -math.inf
+    high: float = math.inf
 
     @property
     def effect(self) -> str:
@@ -187,7 +191,7 @@ class Model:
         return torch.cat([self.values, torch.tensor(self.amplitudes, dtype=self.values.dtype)])
 
     def at(self, point: Tensor) -> Model:
-        """The same model elsewhere; coordinates stop at their ends, amplitudes without a sign at zero."""
+        """The same model elsewhere; coordinates and amplitudes stop at their ends, those without a sign at zero."""
         values = point.clamp(*self.ends)
         return replace(
             self, values=values[: len(self.parameters)], amplitudes=tuple(values[len(self.parameters) :].tolist())
@@ -197,7 +201,7 @@ class Model:
     def ends(self) -> tuple[Tensor, Tensor]:
         """(least, largest) of the coordinates [P + A]."""
         own = [(p.low, p.high) for p in self.parameters]
-        own += [(-math.inf if h.signed else 0.0, math.inf) for h in self.accepted]
+        own += [(h.low if h.signed else max(h.low, 0.0), h.high) for h in self.accepted]
         low, high = torch.tensor(own, dtype=self.values.dtype).reshape(-1, 2).unbind(-1)
         return low, high
 

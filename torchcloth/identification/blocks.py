@@ -49,7 +49,8 @@ def point_rows(scene: Scene) -> Rows | None:
             jacobian[:, beyond] += dot(turned, beside) / size[beyond]
             jacobian = jacobian.squeeze(-1).mT
         frame = torch.full((len(cloud),), t)
-        parts.append(Rows(value.squeeze(-1), jacobian, frame, scene.sheet.patches[hits.corners[:, 0]]))
+        nearest = hits.corners.gather(1, hits.weights.argmax(1, keepdim=True)).squeeze(1)
+        parts.append(Rows(value.squeeze(-1), jacobian, frame, scene.sheet.patches[nearest]))
     return joined(parts)
 
 

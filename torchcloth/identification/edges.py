@@ -56,7 +56,7 @@ def edge_rows(scene: Scene) -> Rows | None:
             pull = weight * dot(foot, _outward(x, rim)[pairs.edge]).squeeze(-1)
             pull = pull.new_zeros(len(pull), rim.count).index_add(1, piece, pull)
             jacobian = torch.where(shown, -pull / total - moved.edge[:, t, None], 0.0).mT
-        parts.append(Rows(value, jacobian, torch.full((rim.count,), t), torch.arange(rim.count)))
+        parts.append(Rows(value, jacobian, torch.full((rim.count,), t), rim.label))
     return joined(parts)
 
 

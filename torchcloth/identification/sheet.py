@@ -17,6 +17,7 @@ from .episodes import Episode
 BAND = 0.015  # m, along the rim, in which points tell where it is
 CORNER = 30.0  # degrees, the turn of a rim at which a piece of it ends
 SHORTEST = 0.03  # m, of a piece
+EQUAL = 0.02  # relative, of sizes along two axes
 PER_PIECE = 12  # points that a piece should have in a frame
 
 
@@ -27,7 +28,12 @@ class Rim(NamedTuple):
     opposite: Tensor  # [B] int64, the third vertex of the triangle
     piece: Tensor  # [B] int64
     distance: Tensor  # [V, B] m, of every vertex from every edge, at rest
-    count: int  # of pieces
+    label: Tensor  # [count] int64, the same for the same piece of the cloth on another mesh
+
+    @property
+    def count(self) -> int:
+        """Of pieces."""
+        return len(self.label)
 
 
 class Sheet(NamedTuple):
@@ -53,14 +59,29 @@ def sheet_of(mesh: Mesh, held: np.ndarray | None = None, length: float = SHORTES
 
 
 def patches_of(mesh: Mesh, across: int = 4) -> Tensor:
-    """[V] int64, which of across x across parts of the fabric a vertex belongs to, along its principal axes."""
-    rest = mesh.uv if mesh.uv is not None else mesh.vertices
-    centred = rest - rest.mean(0)
-    axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
-    place = centred @ axes.T
+    """[V] int64, which of across x across parts of the fabric a vertex belongs to, along the pattern's axes.
+
+    Where there is no pattern, along its principal ones: those of a square are anyone's guess, and differ from mesh to
+    mesh, so the two that span its plane are taken nearest to the world's.
+    """
+    place = mesh.uv if mesh.uv is not None else _flat(mesh.vertices)
     low, high = place.min(0), place.max(0)
-    cell = np.minimum((across * (place - low) / np.maximum(high - low, 1e-12)).astype(int), across - 1)
+    share = (place - low) / np.maximum(high - low, 1e-12) + 1e-9  # a vertex between two parts belongs to the next
+    cell = np.minimum((across * share).astype(int), across - 1)
     return torch.as_tensor(cell[:, 0] * across + cell[:, 1])
+
+
+def _flat(x: np.ndarray) -> np.ndarray:
+    """[V, 2] along the two longest principal axes, or, where these are as good as equal, nearest to the world's."""
+    centred = x - x.mean(0)
+    _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
+    plane, normal = axes[:2], axes[2]
+    if sizes[1] > (1 - EQUAL) * sizes[0]:
+        nearest = lambda lengths: int(np.round(np.abs(lengths), 6).argmax())  # noqa: E731 - rounding decides nothing
+        first = plane[:, nearest(np.linalg.norm(plane, axis=0))] @ plane
+        upwards = np.sign(normal[nearest(normal)]) * normal
+        plane = np.stack([first, np.cross(upwards, first)]) / np.linalg.norm(first)
+    return centred @ plane.T
 
 
 def rim_of(mesh: Mesh, held: np.ndarray | None, length: float) -> Rim:
@@ -74,10 +95,10 @@ def rim_of(mesh: Mesh, held: np.ndarray | None, length: float) -> Rim:
         piece[run] = count + (parts * (np.cumsum(size) - 0.5 * size) / size.sum()).astype(int)
         count += parts
     used = np.ones(len(edges), bool) if held is None else ~np.isin(edges, held).any(1)
-    _, number = np.unique(piece[used], return_inverse=True)
+    label, number = np.unique(piece[used], return_inverse=True)
     distance = torch.as_tensor(_distances(x, edges[used]), dtype=torch.get_default_dtype())
     kept, third, number = (torch.as_tensor(a) for a in (edges[used], opposite[used], number))
-    return Rim(kept, third, number, distance, int(number.max()) + 1 if len(number) else 0)
+    return Rim(kept, third, number, distance, torch.as_tensor(label))
 
 
 def _free_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
