@@ -102,6 +102,20 @@ def test_experiments_are_made_of_the_same_case_and_answered_with_all_episodes(ca
     assert hidden.experiments(tmp_path, "008", make, [], ANSWER, 19) == {"proposed": None, "random": None}
 
 
+def test_a_case_that_needs_no_experiment_tells_nothing_of_experiments():
+    seed = next(s for s in range(20) if module("hidden", "drawn").case(s).family == "next experiment")
+    truth = module("hidden", "reveal").truth(module("hidden", "drawn").case(seed))
+    (name,) = (e["hypothesis"] for e in truth["effects"] if not e["beside"])
+    cause = {"effect": name, "amplitude": 1.0, "class": [name], "rivals": [], "ci95": [0.0, 2.0]}
+    sure, unsure = ANSWER | {"causes": [cause]}, ANSWER | {"causes": [cause | {"rivals": [{"effect": "my.own"}]}]}
+    none = {"proposed": None, "random": None}
+    resolved = lambda answer, later: hidden.scored("1", {"truth": truth, "answer": answer, "next": later})["resolved"]  # noqa: E731
+    assert resolved(sure, none) is None
+    assert resolved(unsure, none) is False
+    assert resolved(unsure, {"proposed": sure, "random": unsure}) is True
+    assert resolved(unsure, {"proposed": unsure, "random": unsure}) is False
+
+
 def test_wrong_options_are_one_line(tmp_path, capsys):
     assert main(["hidden", "--out", str(tmp_path / "s"), "--cases", "0"]) == 2
     assert capsys.readouterr().err.startswith("studies: --cases")

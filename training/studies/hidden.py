@@ -185,7 +185,9 @@ def scored(name: str, case: Mapping[str, Any]) -> dict[str, Any]:
     rest: dict[str, Any] = {key: case.get(key) for key in ("seconds", "gain")}
     rest["shows"] = shows(truth, case.get("sizes"))
     if later is not None:
-        rest["resolved"] = later["proposed"] is not None and told_apart(truth, later["proposed"])
+        asked = later["proposed"] is not None
+        needless = not asked and told_apart(truth, case["answer"])
+        rest["resolved"] = None if needless else asked and told_apart(truth, later["proposed"])
         rest["random_resolved"] = None if later["random"] is None else told_apart(truth, later["random"])
     sealed = {"seed": truth["seed"], "sealed": truth["sealed"]}
     return {"name": name, **sealed, **judged(truth, case["answer"]), **rest}
