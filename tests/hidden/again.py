@@ -63,6 +63,10 @@ def main(arguments: list[str] | None = None) -> int:
 
     stepwise._compared = compared
     answer = diagnosis.diagnose(episodes, journal=journal, resume=journal.exists())
+    model, std = answer.model, answer.found.end.covariance.diagonal().sqrt()
+    for p, c, s in zip(model.parameters, model.values.tolist(), std.tolist(), strict=False):
+        pull = abs(c) / max(p.std**2 - s**2, 1e-12) ** 0.5
+        print(f"fitted: {p.name:22} {c:+.3f} +- {s:.3f}, prior {p.std:.3f}, pulled by {pull:.1f}")
     for row in sorted(answer.found.screened, key=lambda r: -r.worth)[:8]:
         print(f"left: {row.hypothesis.name:22} {row.amplitude:9.3g} +- {row.std:.2g}  {row.decision}")
     for row in answer.content["lack_of_fit"]:
