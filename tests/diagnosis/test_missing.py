@@ -11,7 +11,7 @@ from torchcloth.identification.replays import frames_of
 from torchcloth.pose.objective import joined
 
 BEGIN, END = 6, 9  # frames of 0.05 s
-PUSH = torch.tensor([0.0, 2.0, 0.0])  # m/s^2 on the lower left quarter: 0.4 Pa, a fifth of the weight
+PUSH = torch.tensor([0.0, 2.5, 0.0])  # m/s^2 on the lower left quarter: 0.5 Pa, a quarter of the weight
 STRETCH = 0.15  # s
 
 

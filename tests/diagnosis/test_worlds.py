@@ -9,12 +9,15 @@ import torch
 
 from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import base_model, together
+from torchcloth.diagnosis.cells import _places
 from torchcloth.diagnosis.evidence import gather, motions_of, setting_of
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
 from torchcloth.diagnosis.world import Hypothesis
 from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.identification.sheet import sheet_of
+from torchcloth.meshes import rectangle
 from torchcloth.recordings import Collider
 
 RECORDING = sheets.episode()
@@ -103,6 +106,15 @@ def test_what_a_recording_cannot_show_is_not_asked(made):
     model, _ = made
     asked = {h.name for h in catalogue(model, [replace(RECORDING, cameras={})])}
     assert asked.isdisjoint({"obs.depth_scale", "obs.depth_bias", "contact.mu"})
+
+
+def test_parts_of_the_fabric_that_have_no_vertex_are_where_the_nearest_is():
+    mesh = rectangle(0.3, 0.3, resolution=(3, 3))
+    rest = torch.as_tensor(mesh.vertices)
+    places = _places("points", sheet_of(mesh), rest)
+    assert places.shape == (16, 3)
+    assert sorted(places[[0, 2, 8, 10]].tolist()) == sorted(rest[[0, 1, 3, 4]].tolist())
+    assert places[5].tolist() in rest.tolist(), "between vertices on the coarse mesh"
 
 
 def test_an_episode_that_names_no_motion_is_one_of_its_own():

@@ -11,7 +11,7 @@ from torchcloth.identification.episodes import Episode
 from torchcloth.identification.finer import finer_cloth
 from torchcloth.identification.misfit import HUBER, figures, huber, noise_scale
 from torchcloth.identification.null import rigid_carry
-from torchcloth.identification.sheet import patches_of, rim_of
+from torchcloth.identification.sheet import patch_at, rim_of, share_of, sheet_of
 
 
 def seen(clouds: list[Tensor], motion=None, initial=None) -> Episode:
@@ -63,9 +63,13 @@ def test_noise_scale_is_robust_and_never_below_the_sensor():
     assert noise_scale(torch.zeros(5), None) > 0  # a perfect fit must not divide by zero
 
 
+def patches(mesh):
+    return patch_at(share_of(mesh))
+
+
 def test_patches_cover_the_fabric_in_equal_parts():
     mesh = tc.meshes.rectangle(0.4, 0.2, resolution=(17, 17))
-    patch, u = patches_of(mesh), torch.as_tensor(mesh.uv)
+    patch, u = patches(mesh), torch.as_tensor(mesh.uv)
     assert patch.shape == (17 * 17,)
     assert set(patch.tolist()) == set(range(16))
     assert int(torch.bincount(patch).min()) >= 16  # 17 = 4 + 4 + 4 + 5
@@ -84,7 +88,12 @@ def test_parts_and_rim_are_the_same_on_a_finer_mesh(side, resolution, patterned)
     coarse = tc.meshes.Mesh.build(coarse.vertices, coarse.faces, coarse.uv if patterned else None)
     cloth = tc.Cloth(coarse, tc.materials.AEP(1e5, 0.3, thickness=1e-3), 0.2)
     fine = finer_cloth(cloth).mesh
-    assert torch.equal(patches_of(fine)[: len(coarse.vertices)], patches_of(coarse))
+    assert torch.equal(patches(fine)[: len(coarse.vertices)], patches(coarse))
+    a, b, c = torch.as_tensor(coarse.faces).T
+    inside = torch.tensor([0.6, 0.3, 0.1]).expand(len(a), 3)
+    place = (inside[:, :, None] * torch.as_tensor(coarse.vertices)[torch.stack([a, b, c], 1)].to(inside)).sum(1)
+    every = (4 * place[:, :2] / side).long()
+    assert torch.equal(sheet_of(coarse).patches_on(torch.stack([a, b, c], 1), inside), 4 * every[:, 0] + every[:, 1])
     length = side / 10
     middles = []
     for mesh in (coarse, fine):

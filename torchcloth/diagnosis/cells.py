@@ -16,7 +16,7 @@ from ..identification.blocks import BLOCKS
 from ..identification.episodes import Episode
 from ..identification.replays import Frames
 from ..identification.rows import Rows, scene_of
-from ..identification.sheet import Sheet
+from ..identification.sheet import ACROSS, Sheet
 
 STRETCH = 0.2  # s
 OUTLIER = 5.0  # robust standard deviations within a cell
@@ -82,9 +82,8 @@ def _grouped(name: str, rows: Rows, episode: Episode, sheet: Sheet) -> Rows:
     """Rows whose patches tell axes apart; single markers join the part of the fabric that they are on."""
     patch = rows.patch
     if name == "markers" and episode.places is not None:
-        places = episode.places
-        nearest = places.corners.gather(1, places.weights.argmax(1, keepdim=True)).squeeze(1)
-        patch = 3 * sheet.patches[nearest[rows.patch // 3]] + rows.patch % 3
+        own = sheet.patches_on(episode.places.corners, episode.places.weights)
+        patch = 3 * own[rows.patch // 3] + rows.patch % 3
     elif name in ("points", "edges"):
         patch = 3 * rows.patch
     return rows._replace(patch=patch)
@@ -135,14 +134,18 @@ def _inliers(value: Tensor, index: Tensor, size: int) -> Tensor:
 def _places(name: str, sheet: Sheet, rest: Tensor) -> Tensor:
     """[patches, 3] m, the middle of each on the pattern; zero for what is felt."""
     if name in ("points", "markers"):
-        return _middles(sheet.patches, rest)
+        found = _middles(sheet.patches, rest, ACROSS**2)
+        ahead = (torch.arange(ACROSS).to(rest) + 0.5) / ACROSS
+        centres = torch.cartesian_prod(ahead, ahead)  # of parts without a vertex
+        nearest = rest[torch.cdist(centres, sheet.share.to(rest)).argmin(1)]
+        return torch.where(torch.isin(torch.arange(ACROSS**2), sheet.patches)[:, None], found, nearest)
     if name == "edges":
-        rim, places = sheet.rim, torch.zeros(int(sheet.rim.label.max()) + 1, 3, dtype=rest.dtype)
-        places[rim.label] = _middles(rim.piece, 0.5 * (rest[rim.edges[:, 0]] + rest[rim.edges[:, 1]]))
-        return places
+        rim = sheet.rim
+        middle = 0.5 * (rest[rim.edges[:, 0]] + rest[rim.edges[:, 1]])
+        return _middles(rim.label[rim.piece], middle, int(rim.label.max()) + 1)
     return torch.zeros(1000, 3, dtype=rest.dtype)
 
 
-def _middles(index: Tensor, place: Tensor) -> Tensor:
-    total = torch.zeros(int(index.max()) + 1, 3, dtype=place.dtype).index_add(0, index, place)
-    return total / torch.bincount(index).clamp(min=1)[:, None]
+def _middles(index: Tensor, place: Tensor, count: int) -> Tensor:
+    total = torch.zeros(count, 3, dtype=place.dtype).index_add(0, index, place)
+    return total / torch.bincount(index, minlength=count).clamp(min=1)[:, None]

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ..identification.sheet import ACROSS
 from .cells import NAMES, STRETCH
 from .evidence import Evidence, Setting
 
@@ -32,7 +33,7 @@ def misfit_maps(evidence: Evidence, setting: Setting, title: str = "", limit: fl
     """
     from matplotlib.figure import Figure
 
-    parts = 1 + int(setting.sheet.patches.max())
+    parts = ACROSS**2
     tiles = [_by_window(evidence, k, parts) for k in range(len(setting.episodes))]
     limit = limit or misfit_limit(evidence)
     rows, columns = len(tiles), 1 + max(max(t, default=0) for t in tiles)

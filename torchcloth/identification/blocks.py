@@ -49,8 +49,7 @@ def point_rows(scene: Scene) -> Rows | None:
             jacobian[:, beyond] += dot(turned, beside) / size[beyond]
             jacobian = jacobian.squeeze(-1).mT
         frame = torch.full((len(cloud),), t)
-        nearest = hits.corners.gather(1, hits.weights.argmax(1, keepdim=True)).squeeze(1)
-        parts.append(Rows(value.squeeze(-1), jacobian, frame, scene.sheet.patches[nearest]))
+        parts.append(Rows(value.squeeze(-1), jacobian, frame, scene.sheet.patches_on(hits.corners, hits.weights)))
     return joined(parts)
 
 

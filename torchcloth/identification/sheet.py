@@ -17,6 +17,7 @@ from .episodes import Episode
 BAND = 0.015  # m, along the rim, in which points tell where it is
 CORNER = 30.0  # degrees, the turn of a rim at which a piece of it ends
 SHORTEST = 0.03  # m, of a piece
+ACROSS = 4  # parts along either axis of the pattern
 EQUAL = 0.02  # relative, of sizes along two axes
 PER_PIECE = 12  # points that a piece should have in a frame
 
@@ -40,8 +41,17 @@ class Sheet(NamedTuple):
     """What residuals need to know of a mesh."""
 
     faces: Tensor  # [F, 3] int64
-    patches: Tensor  # [V] int64, part of the fabric
+    share: Tensor  # [V, 2] where a vertex is on the pattern, from 0 to 1 along each axis
     rim: Rim
+
+    @property
+    def patches(self) -> Tensor:
+        """[V] int64, part of the fabric."""
+        return patch_at(self.share)
+
+    def patches_on(self, corners: Tensor, weights: Tensor) -> Tensor:
+        """[N] int64, part of the fabric of points on triangles: ``corners`` [N, 3], barycentric ``weights`` [N, 3]."""
+        return patch_at((weights[..., None] * self.share.to(weights)[corners]).sum(1))
 
 
 def sheet_for(cloth: Cloth, episodes: Sequence[Episode]) -> Sheet:
@@ -55,20 +65,24 @@ def sheet_for(cloth: Cloth, episodes: Sequence[Episode]) -> Sheet:
 
 def sheet_of(mesh: Mesh, held: np.ndarray | None = None, length: float = SHORTEST) -> Sheet:
     """The surface of a cloth, its rim in pieces of about ``length`` [m], without vertices that are ``held``."""
-    return Sheet(torch.as_tensor(mesh.faces), patches_of(mesh), rim_of(mesh, held, length))
+    return Sheet(torch.as_tensor(mesh.faces), share_of(mesh), rim_of(mesh, held, length))
 
 
-def patches_of(mesh: Mesh, across: int = 4) -> Tensor:
-    """[V] int64, which of across x across parts of the fabric a vertex belongs to, along the pattern's axes.
+def share_of(mesh: Mesh) -> Tensor:
+    """[V, 2] where each vertex is between the ends of the fabric, along the pattern's axes.
 
     Where there is no pattern, along its principal ones: those of a square are anyone's guess, and differ from mesh to
     mesh, so the two that span its plane are taken nearest to the world's.
     """
     place = mesh.uv if mesh.uv is not None else _flat(mesh.vertices)
     low, high = place.min(0), place.max(0)
-    share = (place - low) / np.maximum(high - low, 1e-12) + 1e-9  # a vertex between two parts belongs to the next
-    cell = np.minimum((across * share).astype(int), across - 1)
-    return torch.as_tensor(cell[:, 0] * across + cell[:, 1])
+    return torch.as_tensor((place - low) / np.maximum(high - low, 1e-12))
+
+
+def patch_at(share: Tensor) -> Tensor:
+    """[N] int64, which of ACROSS x ACROSS parts of the fabric a place [N, 2] belongs to."""
+    cell = (ACROSS * (share + 1e-9)).long().clamp(0, ACROSS - 1)  # between two parts: the next, on every mesh
+    return cell[:, 0] * ACROSS + cell[:, 1]
 
 
 def _flat(x: np.ndarray) -> np.ndarray:
