@@ -225,8 +225,10 @@ def _step(
     if not fits:
         return None
     now = lambda fits: _compared(current, fits, setting.names, current.noise, current.evidence)  # noqa: E731
-    one_step = now(fits)
-    likely = [_better(*pair) for pair in zip(one_step, now(_settled(one_step, setting, progress)), strict=True)]
+    likely = now(fits)
+    settled = _settled(likely, setting, progress)
+    for k, after in zip(settled, now(list(settled.values())), strict=True):
+        likely[k] = _better(likely[k], after)
     likeliest = max(likely, key=lambda c: c.gain.density).fitted.evidence
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
     noise = fit_noise(likeliest)
@@ -244,19 +246,19 @@ def _step(
     return Step(best, chance, tried, rivals, screened, current)
 
 
-def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> list[tuple[Row, Fitted]]:
-    """The likelier ones where further steps lead: one step does for small effects only.
+def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> dict[int, tuple[Row, Fitted]]:
+    """The likelier ones, by number, where further steps lead: one step does for small effects only.
 
     Likely is what predicts well or still has far to go: a large effect that is half fitted predicts nothing.
     """
     hope = [c.gain.density + c.fitted.ahead for c in tried]
-    out = []
-    for c, expected in zip(tried, hope, strict=True):
+    out = {}
+    for k, (c, expected) in enumerate(zip(tried, hope, strict=True)):
         found = c.fitted
         if expected > max(0.0, 0.5 * max(hope)) and found.ahead > CLEAR:
             further = staged(progress, f"trying {c.hypothesis.name} further")
             found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
-        out.append((c.row, found))
+            out[k] = (c.row, found)
     return out
 
 
