@@ -12,6 +12,7 @@ from torchcloth.diagnosis.comparison import compare, predict, spread
 from torchcloth.diagnosis.fitting import step_of
 from torchcloth.diagnosis.noise import ROUGH, Noise, fit_noise, floor_of, whitened
 from torchcloth.diagnosis.screening import screen
+from torchcloth.diagnosis.verdict import _is_too_large, _too_large
 
 NAMES = ["a", "b", "c"]
 SLOPES = toys.smooth(1, 6)  # two parameters, three hypotheses, one nuisance
@@ -114,6 +115,14 @@ def test_what_cannot_be_seen_is_not_called_absent():
     faint = SLOPES.clone()
     faint[..., 4] *= 0.01  # a typical amplitude moves the cloth by 0.03 mm
     assert row(asked([0.0] * 5, slopes=faint), "c").decision == "unresolvable"
+
+
+def test_what_is_too_large_to_be_believed_is_said():
+    (small, large) = (asked([0.0, 0.0, 0.0, amplitude, 0.0]) for amplitude in (3.0, 6.0))
+    assert not any(map(_is_too_large, screen(small)))
+    (said,) = (_too_large(r) for r in screen(large) if _is_too_large(r))
+    assert said.startswith("b asks for ")
+    assert "more than 5 is not believed" in said
 
 
 def test_numerics_widen_the_error():

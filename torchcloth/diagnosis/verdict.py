@@ -14,11 +14,13 @@ from .glossary import GLOSSARY
 from .lacking import Left, lack_of_fit
 from .missing import MissingForce
 from .residual import Residual
-from .stepwise import Found, Step
+from .screening import Row
+from .stepwise import MUCH, PLAUSIBLE, Found, Step
 from .world import Model
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 NORMAL = 1.96
+NEARLY = 0.9  # of the largest amplitude that is believed: fits end a little beyond what slopes ask for
 OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
 
 
@@ -209,11 +211,27 @@ def _warnings(found: Found, names: Sequence[str], left: Sequence[Left]) -> list[
     folded = sorted({row.motion for row in left if not row.stable})
     if folded:
         out.append(f"the cloth folds in another way on another mesh in {', '.join(folded)}: no judgement there")
+    if not found.causes and any(row.lacking for row in left):
+        out += [_too_large(row) for row in found.screened if _is_too_large(row)][:1]
     if len(set(names)) < 3:
         out.append(f"{len(set(names))} kind(s) of motion: many causes look alike in them")
     if len(names) < 8:
         out.append(f"{len(names)} episodes show little of their own spread: intervals of the gain are doubled")
     return out
+
+
+def _is_too_large(row: Row) -> bool:
+    """It would mend much, if it were believed."""
+    asked = max(abs(row.amplitude), abs(row.reached))
+    return row.shows and row.worth > MUCH and asked > NEARLY * PLAUSIBLE * abs(row.hypothesis.typical)
+
+
+def _too_large(row: Row) -> str:
+    h = row.hypothesis
+    return (
+        f"{h.name} asks for {row.amplitude:.2g} {h.unit}, and more than {abs(PLAUSIBLE * h.typical):.2g} is not "
+        "believed: where that may be so, register a cause with a larger typical amplitude"
+    )
 
 
 def _finite(value: float) -> float | None:
