@@ -5,14 +5,13 @@ python tests/hidden/reveal.py --seed 12
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from dataclasses import asdict
 
 import beside  # noqa: F401
-from drawn import CONFOUNDED, REDUCED, SMALL, Case, Hidden, case
+from drawn import CONFOUNDED, Case, Hidden
 from partners import OUTSIDE, SINGLES
+from telling import told
 
 LIKE = {  # confounded cases: what else explains the data as well; what one may tell apart after all is "soft"
     "tilt or wind": {"like": ["env.gravity_tilt", "air.wind", "obs.rotation"], "soft": True},  # wind brings drag
@@ -66,19 +65,5 @@ def _forward(heading: float | None) -> float:
     return 1.0 if heading in (None, 0.0, 90.0) else -1.0
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--fast", action="store_true", help="as the case was made")
-    options = parser.parse_args(arguments)
-    try:
-        print(json.dumps(truth(case(options.seed, SMALL if options.fast else REDUCED)), indent=1))
-    except ValueError as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(told(__doc__, truth))

@@ -8,19 +8,18 @@ the sensor sees otherwise, or a robot that stands elsewhere, moves no cloth and 
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from dataclasses import replace
 
 import beside  # noqa: F401
 import numpy as np
-from drawn import REDUCED, SMALL, Case, case
+from drawn import Case
 from flex_sheet import grid
 from make import scenes
 from motions import motion
 from partners import SINGLES
 from scene import simulate
+from telling import told
 
 from torchcloth.errors import InvalidInput
 
@@ -88,19 +87,5 @@ def rms(found: Case, change: Array) -> tuple[float, float]:
     return float(SEEN * np.sqrt(np.mean(places**2))), float(FELT * np.sqrt(np.mean(forces**2)))
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--fast", action="store_true", help="as the case was made")
-    options = parser.parse_args(arguments)
-    try:
-        print(json.dumps(shown(case(options.seed, SMALL if options.fast else REDUCED)), indent=1))
-    except ValueError as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(told(__doc__, shown))

@@ -23,7 +23,7 @@ from torchcloth import recordings
 from torchcloth.diagnosis.hypotheses import known
 
 HERE = Path(__file__).parent
-MAKERS = ("beside", "drawn", "faults", "make", "partners", "reveal", "shows")
+MAKERS = ("beside", "drawn", "faults", "make", "partners", "reveal", "shows", "telling")
 
 
 @pytest.mark.parametrize("name", MAKERS)
