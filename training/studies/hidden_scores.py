@@ -60,11 +60,12 @@ def wanted(truth: Truth) -> list[Wanted]:
     """What should be found; what is too small to matter, or beyond the catalogue, is not."""
     if truth["family"] in NULLS:
         return []
-    return [
-        Wanted(frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"]))
-        for e in truth["effects"]
-        if e["names"] and not e["beside"]
-    ]
+    return [Wanted(frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"])) for e in _asked(truth)]
+
+
+def _asked(truth: Truth) -> list[Mapping[str, Any]]:
+    """Effects that have a name in the catalogue and are there for their own sake."""
+    return [e for e in truth["effects"] if e["names"] and not e["beside"]]
 
 
 def fine(truth: Truth) -> frozenset[str]:
@@ -106,7 +107,7 @@ def shows(truth: Truth, sizes: Sequence[Mapping[str, Any]] | None) -> list[bool]
     if sizes is None:
         return None
     left = {row["name"]: row["left_moves"] > MOVED or row["left_pulls"] > PULLED for row in sizes}
-    return [left.get(e["name"], True) for e in truth["effects"] if e["names"] and not e["beside"]]
+    return [left.get(e["name"], True) for e in _asked(truth)]
 
 
 def verdict(answer: Answer) -> str:
