@@ -87,8 +87,8 @@ def test_distances_are_those_of_two_columns():
     assert more > told
 
 
-def undecided(names):
-    """A search of a slow episode that ends with two causes of one class."""
+def undecided(names, said="causes"):
+    """A search of a slow episode that ends with two causes of one class, named or too small to matter."""
     recordings = [sheets.episode("slow", duration=0.4), sheets.episode("lift", duration=0.4)]
     model = base_model(recordings[0])
     setting = setting_of(model, recordings)
@@ -100,14 +100,16 @@ def undecided(names):
     step = SimpleNamespace(best=SimpleNamespace(hypothesis=hypothesis), before=found, screened=[])
     amplitudes = {h.name: h.typical for h in asked}
     rivals = [{"effect": names[1], "amplitude": amplitudes[names[1]]}]
-    cause = {"effect": names[0], "amplitude": amplitudes[names[0]], "rivals": rivals, "class": list(names)}
-    return SimpleNamespace(causes=[step], screened=[], end=found), [cause], setting
+    cause = {"effect": names[0], "amplitude": amplitudes[names[0]], "rivals": rivals}
+    steps, content = ({"causes": [], "minor": []} | {said: [one]} for one in (step, cause))
+    return SimpleNamespace(**steps, screened=[], end=found), content, setting
 
 
-def test_gravity_and_camera_are_told_apart_by_turning():
+@pytest.mark.parametrize("said", ["causes", "minor"])
+def test_gravity_and_camera_are_told_apart_by_turning(said):
     """A sheet that leans with the room and one that the camera sees leaning turn apart when the sheet is turned."""
-    found, causes, setting = undecided(("env.gravity_tilt[y]", "obs.rotation[x]"))
-    question = question_of(found, causes)
+    found, content, setting = undecided(("env.gravity_tilt[y]", "obs.rotation[x]"), said)
+    question = question_of(found, content)
     now = distances(question, information(question, []))
     told = {}
     for name in ("hang", "turn"):
@@ -119,4 +121,5 @@ def test_gravity_and_camera_are_told_apart_by_turning():
 
 def test_nothing_open_asks_for_nothing():
     end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
-    assert propose(SimpleNamespace(causes=[], screened=[], end=end), [], SimpleNamespace(recordings=()), print) is None
+    found, none = SimpleNamespace(causes=[], minor=[], screened=[], end=end), {"causes": [], "minor": []}
+    assert propose(found, none, SimpleNamespace(recordings=()), print) is None

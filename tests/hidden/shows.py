@@ -17,7 +17,7 @@ from drawn import Case
 from flex_sheet import grid
 from make import scenes
 from motions import motion
-from partners import SINGLES
+from partners import OUTSIDE, SINGLES
 from scene import simulate
 from telling import told
 
@@ -38,7 +38,7 @@ def shown(found: Case) -> list[dict[str, object]]:
     stiffness or areal density does, as far as a data sheet leaves them open.
     """
     found = replace(found, nodes=found.size.fit)
-    effects = [e for e in found.effects if e.name in SINGLES and not e.name.startswith(UNMOVED)]
+    effects = [e for e in found.effects if e.name in SINGLES | OUTSIDE and not e.name.startswith(UNMOVED)]
     if not effects:
         return []
     whole = means(found)

@@ -51,9 +51,9 @@ class Question:
     pairs: tuple[tuple[str, str], ...] = ()
 
 
-def propose(found: Found, causes: Sequence[dict[str, Any]], setting: Setting, progress: Progress) -> dict | None:
+def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress: Progress) -> dict | None:
     """The content of ``next_experiment``; None where nothing is open, or nothing can be done about it."""
-    question = question_of(found, causes)
+    question = question_of(found, content)
     if question is None:
         return None
     names = list(question.amplitudes)
@@ -87,18 +87,22 @@ def propose(found: Found, causes: Sequence[dict[str, Any]], setting: Setting, pr
     }
 
 
-def question_of(found: Found, causes: Sequence[dict[str, Any]]) -> Question | None:
-    """What a search leaves open: causes that have rivals, else causes that are not decided."""
-    for step, cause in zip(found.causes, causes, strict=True):
+def question_of(found: Found, content: Mapping[str, Any]) -> Question | None:
+    """What a search leaves open: causes that have rivals, else causes that are not decided.
+
+    ``content`` holds what was said of causes, and of what is too small to matter: that may have rivals that would.
+    """
+    said = [*content["causes"], *content["minor"]]
+    for step, cause in zip([*found.causes, *found.minor], said, strict=True):
         known = {h.name for h in step.before.evidence.hypotheses}
         amplitudes = {step.best.hypothesis.name: cause["amplitude"]}
         amplitudes |= {r["effect"]: r["amplitude"] for r in cause["rivals"] if r["effect"] in known}
         rows = {r.hypothesis.name: r.amplitude for r in step.screened}
-        amplitudes |= {name: rows[name] for name in cause["class"] if name in rows and name not in amplitudes}
+        amplitudes |= {name: rows[name] for name in cause.get("class", ()) if name in rows and name not in amplitudes}
         first, *others = amplitudes
         if others:
             return Question(step.before, amplitudes, tuple((first, other) for other in others))
-    if causes:
+    if found.causes:
         return None
     known = {h.name for h in found.end.evidence.hypotheses}
     open_rows = [r for r in found.screened if r.decision in ("present", "inconclusive") and r.hypothesis.name in known]

@@ -87,7 +87,7 @@ def diagnose(
         answer = judge(search(model, setting, asked, progress), setting.names)
         following = None
         if answer.verdict in OPEN:
-            following = propose(answer.found, answer.content["causes"], setting, staged(progress, "next experiment"))
+            following = propose(answer.found, answer.content, setting, staged(progress, "next experiment"))
         if any(row["lacking"] for row in answer.content["lack_of_fit"]):
             answer = _beyond(answer, answer.found.setting, progress)
     files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}

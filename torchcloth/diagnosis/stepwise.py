@@ -84,7 +84,12 @@ class Found:
     @property
     def causes(self) -> list[Step]:
         """Those that are large enough to matter; the others stay in the model, so that nothing stands in for them."""
-        return [s for s in self.steps if abs(self.amplitude(s)) > MATTERS * abs(s.best.hypothesis.smallest)]
+        return [s for s in self.steps if matters(s.best.hypothesis, self.amplitude(s))]
+
+    @property
+    def minor(self) -> list[Step]:
+        """Those that stay in the model without a name."""
+        return [s for s in self.steps if not matters(s.best.hypothesis, self.amplitude(s))]
 
     def amplitude(self, step: Step) -> float:
         """Of a step's cause in the end."""
@@ -95,6 +100,11 @@ class Found:
         """Share of the cells that jump."""
         jumping = sum(map(len, self.setting.unstable or ()))
         return jumping / (jumping + len(self.end.white.value))
+
+
+def matters(hypothesis: Hypothesis, amplitude: float) -> bool:
+    """Large enough to be named."""
+    return abs(amplitude) > MATTERS * abs(hypothesis.smallest)
 
 
 def search(

@@ -15,7 +15,7 @@ from .lacking import Left, lack_of_fit
 from .missing import MissingForce
 from .residual import Residual
 from .screening import Row
-from .stepwise import MUCH, PLAUSIBLE, Found, Step
+from .stepwise import MUCH, PLAUSIBLE, Candidate, Found, Step, matters
 from .world import Model
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
@@ -69,22 +69,20 @@ class Diagnosis:
 def judge(found: Found, names: Sequence[str]) -> Diagnosis:
     """The answer of a search over episodes with these motions."""
     causes = [_cause(found, step, names) for step in found.causes]
-    minor = [step for step in found.steps if step not in found.causes]
-    told = {step.best.hypothesis.name for step in minor}
+    minor = [_minor(found, step) for step in found.minor]
+    told = {name for m in minor for name in (m["effect"], *(r["effect"] for r in m["rivals"]))}
     told |= {name for c in causes for name in (*c["class"], *(r["effect"] for r in c["rivals"]))}
     rows = [r for r in found.screened if r.hypothesis.name not in told]
     left = lack_of_fit(found.end, names)
     lacking = any(row.lacking for row in left)
-    verdict = _verdict(found, causes, left)
+    doubtful = [r["effect"] for m in minor for r in m["rivals"]]
+    verdict = _verdict(found, causes, left, bool(doubtful))
     content = {
         "verdict": verdict,
         "causes": causes,
-        "minor": [
-            {"effect": s.best.hypothesis.name, "amplitude": found.amplitude(s), "unit": s.best.hypothesis.unit}
-            for s in minor
-        ],
+        "minor": minor,
         "ruled_out": [r.hypothesis.name for r in rows if r.decision == "absent"],
-        "undecided": [r.hypothesis.name for r in rows if r.decision in ("inconclusive", "present")],
+        "undecided": [*doubtful, *(r.hypothesis.name for r in rows if r.decision in ("inconclusive", "present"))],
         "unresolvable": [
             {"effect": r.hypothesis.name, "smallest_detectable": _finite(r.detectable), "unit": r.hypothesis.unit}
             for r in rows
@@ -115,7 +113,7 @@ def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
     return Diagnosis("invalid_data", {**content, "faults": said, "motions": list(names)}, None)
 
 
-def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left]) -> Verdict:
+def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left], doubtful: bool) -> Verdict:
     if causes:
         return "identified" if all(not c["rivals"] and len(c["class"]) == 1 for c in causes) else "ambiguous"
     if any(row.lacking for row in left):
@@ -123,7 +121,19 @@ def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left
     if not all(row.stable for row in left):
         return "numerics"
     undecided = [r for r in found.screened if r.decision == "present"]
-    return "inconclusive" if undecided else "adequate"
+    return "inconclusive" if undecided or doubtful else "adequate"
+
+
+def _minor(found: Found, step: Step) -> dict[str, Any]:
+    """What is too small to matter, and those of its rivals that would matter."""
+    h = step.best.hypothesis
+    rivals = [rival for c in step.rivals if matters(c.hypothesis, (rival := _rival(c))["amplitude"])]
+    return {"effect": h.name, "amplitude": found.amplitude(step), "unit": h.unit, "rivals": rivals}
+
+
+def _rival(c: Candidate) -> dict[str, Any]:
+    h = c.hypothesis
+    return {"effect": h.name, "amplitude": c.fitted.model.amplitudes[c.fitted.model.place(h.name)], "unit": h.unit}
 
 
 def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
@@ -141,10 +151,7 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
         "unit": h.unit,
         "ci95": [amplitude - NORMAL * std, amplitude + NORMAL * std],
         "class": sorted({h.name, *kin, *h.kin}),
-        "rivals": [
-            {"effect": c.hypothesis.name, "amplitude": c.fitted.model.amplitudes[-1], "unit": c.hypothesis.unit}
-            for c in step.rivals
-        ],
+        "rivals": [_rival(c) for c in step.rivals],
         "gain_mm": 1e3 * (best.gain.before - best.gain.after),
         "placebo": {"log_density": step.placebo.gain, "chance": step.placebo.chance},
         "share_of_explainable": _share(found, best.gain),
@@ -277,13 +284,19 @@ def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
         if content[key]:
             out.append(f"{label}: {', '.join(content[key])}.")
     if content["minor"]:
-        told = ", ".join(f"{m['effect']} = {m['amplitude']:.4g} {m['unit']}" for m in content["minor"])
-        out.append(f"In the model, but too small to matter: {told}.")
+        out.append(f"In the model, but too small to matter: {', '.join(map(_size, content['minor']))}.")
+    for m in content["minor"]:
+        if m["rivals"]:
+            out.append(f"  These data cannot tell it from {', '.join(map(_size, m['rivals']))}, which would matter.")
     if content["unresolvable"]:
         out.append(f"Cannot be seen in these data: {', '.join(r['effect'] for r in content['unresolvable'])}.")
     if content["next_experiment"]:
         out.append(f"Next experiment: {content['next_experiment']['why']}")
     return [*out, *(f"Warning: {text}." for text in content["warnings"])]
+
+
+def _size(row: dict[str, Any]) -> str:
+    return f"{row['effect']} = {row['amplitude']:.4g} {row['unit']}"
 
 
 def _lacking(content: dict[str, Any]) -> list[str]:

@@ -119,6 +119,7 @@ def one(out: Path, name: str, seed: int, fast: bool) -> dict[str, Any]:
         case["next"] = experiments(out, name, make, given, found, seed)
     if truth["family"] in ("single", "double") and not fast:
         case["gain"] = _gain(out, name, make, given, found, truth)
+    if truth["family"] in ("single", "double", "outside") and not fast:
         case["sizes"] = json.loads(_script("shows.py", "--seed", str(seed)))
     return case
 

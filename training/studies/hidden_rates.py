@@ -139,6 +139,7 @@ def further(cases: Sequence[Judged]) -> list[tuple[str, Rate | float | None]]:
         ("class identified, singles at typical size that show", rate(_shown(at(singles, "1")), _found)),
         ("class identified, singles at half that show", rate(_shown(at(singles, "0.5")), _found)),
         ("both of two effects that show", rate(_shown(doubles), lambda c: c["right"])),
+        ("outside the catalogue that show: unexplained", rate(_shown(of(cases, "outside")), lambda c: c["right"])),
         ("singles said to be invisible in these data, nothing named", Rate(len(singles) - len(seen), len(singles))),
         ("class identified, singles of all sizes but those", rate(seen, _found)),
         ("matched nulls with a named cause", rate(of(cases, "null"), lambda c: c["named"])),

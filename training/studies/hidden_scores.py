@@ -99,7 +99,7 @@ def judged(truth: Truth, answer: Answer) -> dict[str, Any]:
 
 
 def shows(truth: Truth, sizes: Sequence[Mapping[str, Any]] | None) -> list[bool] | None:
-    """Whether each effect that should be found changes what is recorded beside what the fabric's numbers do.
+    """Whether each effect that is there for its own sake changes what is recorded beside what the fabric's numbers do.
 
     ``sizes`` is what tests/hidden/shows.py prints; what is not there moves no cloth and is seen as it is. None: not
     known.
@@ -107,7 +107,7 @@ def shows(truth: Truth, sizes: Sequence[Mapping[str, Any]] | None) -> list[bool]
     if sizes is None:
         return None
     left = {row["name"]: row["left_moves"] > MOVED or row["left_pulls"] > PULLED for row in sizes}
-    return [left.get(e["name"], True) for e in _asked(truth)]
+    return [left.get(e["name"], True) for e in truth["effects"] if not e["beside"]]
 
 
 def verdict(answer: Answer) -> str:
