@@ -1,5 +1,7 @@
 """Stretches of time that go another way: weights against the formula, and what they are for."""
 
+from dataclasses import replace
+
 import linear_toys as toys
 import pytest
 import torch
@@ -74,3 +76,26 @@ def test_a_number_that_the_others_leave_open_is_no_failure_of_the_prediction():
     whole = compare(predict(toys.fitted(less), groups), predict(toys.fitted(ev, std=1.0), groups), 0.0)
     assert whole.density > 10.0  # that it may be anything is far better than that it is zero
     assert whole.calm[1] < whole.calm[0]
+
+
+def test_what_ripples_does_not_count_in_millimetres():
+    """Two windows that noise of roughness describes are centimetres off: with it the others are what one sees."""
+    away = drawn(0, 0.03)
+    rough = 0.02 * ((away.cells[0].window == 2) | (away.cells[0].window == 3)).double()
+    known = replace(away, cells=[away.cells[0]._replace(rough=rough), *away.cells[1:]])
+    plain, told = (predict(toys.fitted(ev), list("abcd")) for ev in (drawn(0), known))
+    assert float(told.smooth.min()) < 1e-3
+    assert float(told.smooth[told.episode > 0].min()) == 1.0
+    assert compare(told, told, 0.0).before > 3 * compare(plain, plain, 0.0).before
+    assert compare(told, told, 0.0).calm[0] < 1.2 * compare(plain, plain, 0.0).calm[0]
+
+
+def test_what_one_episode_tells_is_not_thinned_by_the_others():
+    """A millimetre is mended in one of four episodes."""
+    told = predict(toys.fitted(drawn(0)), list("abcd"))
+    first = (told.episode == 0).double()
+    wrong = told._replace(value=told.value + 1e-3 * first)
+    gain = compare(wrong, told, 0.0)
+    assert gain.mended[0] == pytest.approx(1e-3, rel=0.3)
+    assert (gain.calm[0] ** 2 - gain.calm[1] ** 2) ** 0.5 < 0.7 * gain.mended[0]
+    assert gain.mended[1] == 0.0

@@ -20,7 +20,7 @@ def told(values: list[torch.Tensor]) -> Predicted:
     size, every = len(values[0]), torch.cat(values)
     key = torch.arange(size).repeat(len(values))
     episode = torch.arange(len(values)).repeat_interleave(size)
-    return Predicted(every, every, 0 * every, key, episode, 0 * key, episode, 0 * key)
+    return Predicted(every, every, 0 * every, key, episode, 0 * key, episode, 0 * key, 1 + 0 * every)
 
 
 def test_the_floor_is_what_repetitions_differ_by_whatever_the_model_gets_wrong():

@@ -219,3 +219,13 @@ def test_a_wrong_cause_does_not_predict_them():
         groups = ["x", "y", "x", "y"]
         gains.append(compare(predict(toys.fitted(ev), groups), predict(toys.fitted(more), groups), 1e-3).ci95[0] > 0)
     assert sum(gains) <= 1
+
+
+def test_what_shows_in_one_episode_shows_however_many_others_there_are():
+    """Slopes of one of four episodes only: the size is theirs, and the means over all would be half of it."""
+    slopes = SLOPES.clone()
+    slopes[1:, :, 2] = 0.0
+    size = row(asked([0.0, 0.0, 0.0, 0.0, 0.0], slopes=slopes), "a").size
+    own = float(slopes[0, :, 2].square().mean().sqrt())
+    assert 0.5 * own < size <= own
+    assert size > 1.5 * float(slopes[..., 2].square().mean().sqrt())

@@ -1,4 +1,4 @@
-"""Causes tried from the data sheet, where the fitted model leads to none.
+"""Causes tried from the data sheet, where the fitted model leads to none, and fits begun there anew.
 
 A large effect bends the numbers that are fitted without it, until slopes there point away from it. The data sheet does
 not know of the effect, and is often nearer. What pulls and what pushes need not be alike, so signed causes are asked
@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import torch
 
+from .approach import approach
 from .evidence import Progress, Setting, staged
 from .fitting import Fitted, fit, leap_with, with_cause
 from .noise import unfitted, whitened
@@ -35,6 +36,22 @@ def afresh(
         likely.setdefault(name, found)
     named = {h.name: h for h in hypotheses}
     return [(named[name], with_cause(found, named[name])) for name, found in list(likely.items())[:tried]]
+
+
+def resettled(
+    found: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
+) -> Fitted | None:
+    """The same causes, fitted from the data sheet and asked about the others; None where that ends as far from it.
+
+    A number that has left its data sheet made up for causes that were not known then, and may hide the next one now.
+    """
+    model = found.model.at(
+        torch.cat([torch.zeros_like(found.model.values), found.model.point[len(found.model.values) :]])
+    )
+    near, _ = approach(model, setting, staged(progress, "causes, from the data sheet"))
+    left = model.others(hypotheses)
+    again = fit(near, setting, left, progress=staged(progress, "causes, anew"), before=found.evidence)
+    return None if again.model.strained else again
 
 
 def _promises(found: Fitted) -> list[tuple[float, str, Fitted]]:

@@ -38,6 +38,7 @@ class Predicted(NamedTuple):
     window: Tensor  # [C]
     stretch: Tensor  # [C] of time, whose cells err together
     kind: Tensor  # [C] of data, by number
+    smooth: Tensor  # [C] share of the noise's variance that is no roughness
 
     @property
     def seen(self) -> Tensor:
@@ -54,8 +55,12 @@ class Gain(NamedTuple):
     ci95: tuple[float, float]  # of the density's difference
     explained: float  # share of before^2 - floor^2
     explained_ci95: tuple[float, float]
-    calm: tuple[float, float]  # m RMS before and after, where stretches that neither describes count for less
-    pull: tuple[float, float]  # N, the same of forces; zero without
+    calm: tuple[
+        float, float
+    ]  # m RMS before and after, where stretches that neither describes, or that ripple, count less
+    mended: tuple[
+        float, float
+    ]  # m and N, RMS of what is gone of positions and forces from the episode where it is most
 
 
 def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> Predicted:
@@ -125,7 +130,10 @@ def _told(found: Fitted, likely: Tensor, white: Tensor, scale: Tensor) -> Predic
     cells, episode = found.evidence.cells, found.white.episode
     join = lambda name: torch.cat([getattr(c, name) for c in cells])  # noqa: E731
     value = torch.cat([_adjusted(found, k, likely[episode == k]) for k in range(len(cells))])
-    return Predicted(value, white, scale, join("key"), episode, join("window"), found.white.stretch, join("block"))
+    smooth = torch.cat([found.noise.smooth(c) for c in cells])
+    return Predicted(
+        value, white, scale, join("key"), episode, join("window"), found.white.stretch, join("block"), smooth
+    )
 
 
 def _folds(found: Fitted, groups: Sequence[str], halved: Collection[str]) -> list[Tensor]:
@@ -176,8 +184,9 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     total, share = float(density.sum()), _share(squares.sum(0), floor)
     few = 2.0 if len(set(owner.tolist())) < FEW else 1.0
     left, right = (share + few * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
-    calm, pull = (_calm(one, two, kinds) for kinds in (range(SEEN), (SEEN,)))
-    return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, (low, high), share, (left, right), calm, pull)
+    calm, felt = _calm(one, two, one.seen), 3**0.5 * _mended(one, two, one.kind == SEEN)  # a force has three cells
+    mended = (_mended(one, two, one.seen), felt)
+    return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, (low, high), share, (left, right), calm, mended)
 
 
 def _share(squares: np.ndarray, floor: float) -> float:
@@ -206,12 +215,17 @@ def _blocks(one: Predicted, two: Predicted) -> tuple[np.ndarray, np.ndarray, np.
     return (block // 1000).numpy(), sums(density), sums(squares)
 
 
-def _calm(one: Predicted, two: Predicted, kinds: Sequence[int]) -> tuple[float, float]:
-    """RMS before and after of kinds of data, where stretches that neither describes count for less."""
-    share = torch.maximum(*(weights(p.white, p.stretch) for p in (one, two)))
-    share = share * torch.isin(one.kind, torch.tensor(list(kinds)))
+def _calm(one: Predicted, two: Predicted, inside: Tensor) -> tuple[float, float]:
+    """RMS before and after of the cells inside; stretches that neither describes, or that ripple, count for less."""
+    share = inside * one.smooth * torch.maximum(*(weights(p.white, p.stretch) for p in (one, two)))
     rms = lambda p: float((share * p.value**2).sum() / share.sum().clamp(min=1e-12)) ** 0.5  # noqa: E731
     return rms(one), rms(two)
+
+
+def _mended(one: Predicted, two: Predicted, inside: Tensor) -> float:
+    """RMS of what is gone from the cells inside in the episode where that is most: others need not tell."""
+    both = (_calm(one, two, inside & (one.episode == e)) for e in one.episode.unique())
+    return max(0.0, *(before**2 - after**2 for before, after in both)) ** 0.5
 
 
 def _draw(owner: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -38,6 +38,11 @@ class Noise(NamedTuple):
         slow = (self.level[cells.block] ** 2 + rough).sqrt()
         return torch.diag(_white(cells) + rough) + slow[:, None] * _together(cells) * slow + moved @ moved.mT
 
+    def smooth(self, cells: Cells) -> Tensor:
+        """[C] share of the variance that is no roughness."""
+        plain = _white(cells) + self.level[cells.block] ** 2
+        return plain / (plain + _rough(cells))
+
 
 def least() -> Noise:
     """The sensor's and hardly more."""

@@ -24,7 +24,7 @@ from .world import Hypothesis
 
 Decision = Literal["present", "absent", "inconclusive", "unresolvable"]
 PRESENT = 2.5  # standard errors above the smallest amplitude of interest
-LEAST = 3e-4  # m or the same share of a cell's other units: a typical amplitude that moves less cannot be seen
+LEAST = 3e-4  # m: a typical amplitude that moves less cannot be seen
 LEAST_PULL = 1e-2  # N, the same of forces
 PULLED = 3.0  # standard deviations of its prior, from which a parameter does what its twin is asked about
 POWER = 1.64 + 0.84  # standard errors: found in 80 % of cases at 5 %
@@ -39,7 +39,8 @@ class Row(NamedTuple):
     std: float  # from the noise
     bias: float  # that numerics alone would ask for
     gain: float  # chi^2
-    size: float  # m, RMS by which a typical amplitude moves points beyond what is fitted anyway
+    size: float  # m, RMS by which a typical amplitude moves points of the episode in which it moves them most, beyond
+    # what is fitted anyway: others need not tell
     pull: float  # N, the same of forces
     reached: float  # amplitude where a leap leads (``fitting.leap_with``)
     worth: float  # log density that it should gain
@@ -85,7 +86,7 @@ def screen(found: Fitted) -> list[Row]:
     projected = projection(found)
     asked = projected(found.white.jacobian[:, own:])
     value, numerics = projected(found.white.value, found.model.point), projected(_numerics(found))
-    sizes, pulls = _sizes(found, 0, SEEN), _sizes(found, SEEN, SEEN + 1)
+    sizes, pulls = _sizes(found, 0, SEEN), 3**0.5 * _sizes(found, SEEN, SEEN + 1)  # a force has three cells
     _, alone = leap(found.white, found.model)
     rows, fitted = [], [p.name for p in found.model.parameters]
     for j, h in enumerate(found.evidence.hypotheses):
@@ -153,19 +154,12 @@ def _numerics(found: Fitted) -> Tensor:
 
 
 def _sizes(found: Fitted, first: int, end: int) -> Tensor:
-    """[hypotheses] RMS over cells of kinds from ``first`` to before ``end``; zero without any.
+    """[hypotheses] RMS over an episode's cells of kinds from ``first`` to before ``end``, of the largest; zero without.
 
     Beside what is fitted anyway, as far as its priors let it do the same; of a twin, beside the other parameters.
     """
     own, count = found.evidence.own, len(found.evidence.hypotheses)
     typical = torch.tensor([h.typical for h in found.evidence.hypotheses], dtype=torch.float64)
-    moved = []
-    for cells in found.evidence.cells:
-        kind = (cells.block >= first) & (cells.block < end)
-        moved.append(cells.jacobian[kind, : own + count])
-    stacked = torch.cat(moved)
-    if not len(stacked):
-        return typical.new_zeros(count)
     slopes, names = found.white.jacobian, [p.name for p in found.model.parameters]
     square, cross = curvature(found.white, found.model), slopes[:, :own].mT @ slopes[:, own:]
     fitted = torch.linalg.solve(square, cross)
@@ -174,5 +168,10 @@ def _sizes(found: Fitted, first: int, end: int) -> Tensor:
             others = [k for k in range(own) if k != names.index(h.twin)]
             fitted[:, j] = 0.0
             fitted[others, j] = torch.linalg.solve(square[others][:, others], cross[others, j])
-    left = stacked[:, own:] - stacked[:, :own] @ fitted
-    return (left * typical).square().mean(0).sqrt()
+    largest = typical.new_zeros(count)
+    for cells in found.evidence.cells:
+        moved = cells.jacobian[(cells.block >= first) & (cells.block < end), : own + count]
+        if len(moved):
+            left = moved[:, own:] - moved[:, :own] @ fitted
+            largest = torch.maximum(largest, (left * typical).square().mean(0).sqrt())
+    return largest

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from .afresh import afresh
+from .afresh import afresh, resettled
 from .approach import approach
 from .branches import unstable, without
 from .comparison import Gain, Predicted, compare, predict, spread, telling
@@ -34,8 +34,8 @@ MOSTLY, HALF = 1 / 3, 1 / 2  # of what is wrong: least that all causes, or a fur
 SURE = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26)
 SURE_OF_BEST = (50.92, 8.86, 5.39, 4.31, 3.81, 3.52, 3.34, 3.21, 3.11)
 NORMAL = 1.96  # the same of what mends most of all that is wrong
-WORTH_MM, WORTH_SHARE = 2e-4, 0.02  # m and share of the mean square, of a cause that is worth naming
-WORTH_PULL = 3e-3  # N, the same where it shows in forces
+WORTH_SHARE = 0.02  # of the mean square, that a cause that is worth naming mends, or
+WORTH_MM, WORTH_PULL = 3e-4, 5e-3  # m or N, RMS of what is gone from one episode
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +151,12 @@ def _chain(
     current, steps, step = start, [], first
     while len(steps) < MOST:
         if step is None:
+            other = resettled(current, setting, hypotheses, progress) if steps and current.model.strained else None
+            if other is not None and _predicts(other, current, setting.names) > 0:
+                current, other = other, None
             screened = screen(current)
-            begun = [(row, with_cause(current, row.hypothesis)) for row in _likely(screened)[:tried]]
+            begun = _begun(current, screened, tried)
+            begun += [] if other is None else _begun(other, screen(other), tried)
             step = _step(current, setting, begun, screened, progress)
         if step is None:
             break
@@ -169,6 +173,17 @@ def _chain(
         left = current.model.others(hypotheses)
         current = fit(current.model, setting, left, progress=staged(progress, "all"), before=current.evidence)
     return (start, []) if steps and _beside_the_point(start, current, setting.names, MOSTLY) else (current, steps)
+
+
+def _begun(found: Fitted, screened: Sequence[Row], tried: int) -> list[tuple[Row, Model]]:
+    """The likeliest causes, each with the model to which one leap leads."""
+    return [(row, with_cause(found, row.hypothesis)) for row in _likely(screened)[:tried]]
+
+
+def _predicts(one: Fitted, other: Fitted, names: Sequence[str]) -> float:
+    """Log density by which one fit of a model predicts motions held out better than another."""
+    first, second = (predict(renoised(f, other.noise, other.evidence), names) for f in (other, one))
+    return compare(first, second, 0.0).density
 
 
 def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> Found:
@@ -318,9 +333,9 @@ def _known(found: Fitted, name: str, names: Sequence[str], c: Candidate) -> bool
 
 
 def _worthwhile(gain: Gain) -> bool:
-    (before, after), (pulled, pulls) = gain.calm, gain.pull
-    seen = before - after > WORTH_MM or before**2 - after**2 > WORTH_SHARE * before**2
-    return (seen or pulled - pulls > WORTH_PULL) and gain.ci95[0] > 0
+    (before, after), (seen, felt) = gain.calm, gain.mended
+    mended = before**2 - after**2 > WORTH_SHARE * before**2 or seen > WORTH_MM or felt > WORTH_PULL
+    return mended and gain.ci95[0] > 0
 
 
 def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:

@@ -21,7 +21,6 @@ from .world import Model
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 NORMAL = 1.96
 NEARLY = 0.9  # of the largest amplitude that is believed: fits end a little beyond what slopes ask for
-OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,12 +200,10 @@ def _parameters(found: Found) -> dict[str, Any]:
 
 
 def _warnings(found: Found, names: Sequence[str], left: Sequence[Left]) -> list[str]:
-    out = []
-    for p, c in zip(found.end.model.parameters, found.end.model.values.tolist(), strict=True):
-        if abs(c) > OFTEN * p.std:
-            out.append(
-                f"{p.name} is {abs(c) / p.std:.1f} standard deviations from its data sheet: it does another's job"
-            )
+    out = [
+        f"{p.name} is {far:.1f} standard deviations from its data sheet: it does another's job"
+        for p, far in found.end.model.strained
+    ]
     if found.repeats is None:
         out.append("floor: sensor only; no episode repeats another, so what repetitions differ by is not known")
     if "bending" not in found.start.model.base.cloth.effects:

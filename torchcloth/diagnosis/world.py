@@ -18,6 +18,7 @@ from ..identification.replays import Frames, Replay, frames_of
 from ..materials import AbstractMaterial
 from ..recordings import Recording
 
+OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
 Motion = Callable[[Episode], Episode]  # what the robot really does, from what it says
 View = Callable[[Frames, Episode], Frames]  # what is seen, from what is there
 
@@ -204,6 +205,12 @@ class Model:
         own += [(h.low if h.signed else max(h.low, 0.0), h.high) for h in self.accepted]
         low, high = torch.tensor(own, dtype=self.values.dtype).reshape(-1, 2).unbind(-1)
         return low, high
+
+    @property
+    def strained(self) -> list[tuple[Parameter, float]]:
+        """Parameters farther from their data sheet than these are wrong, with prior standard deviations."""
+        away = [(p, abs(c) / p.std) for p, c in zip(self.parameters, self.values.tolist(), strict=True)]
+        return [(p, far) for p, far in away if far > OFTEN]
 
     def others(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Those that it has not accepted."""

@@ -1,0 +1,58 @@
+"""A number that has left its data sheet: the fit begins there again, with the causes that are known by now."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import linear_toys as toys
+import pytest
+import torch
+
+from torchcloth.diagnosis import afresh, stepwise
+from torchcloth.diagnosis.afresh import resettled
+from torchcloth.diagnosis.world import OFTEN
+
+CAUSE = toys.hypothesis("cause", 2.0)
+
+
+def found(far: float):
+    """A fit with one cause whose first number is ``far`` prior standard deviations from its data sheet."""
+    there = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], torch.tensor([0.4]).double(), 0), std=0.5)
+    model = there.model.plus(CAUSE, 1.5).at(torch.tensor([0.5 * far, 1.5]).double())
+    return replace(there, model=model)
+
+
+def test_a_number_is_strained_beyond_what_data_sheets_are_wrong_by():
+    ((p, far),) = found(OFTEN + 0.2).model.strained
+    assert p.name == "p0"
+    assert far == pytest.approx(OFTEN + 0.2)
+    assert found(OFTEN - 0.1).model.strained == []
+
+
+@pytest.mark.parametrize("ends", [0.3, OFTEN + 1])
+def test_it_begins_at_the_data_sheet_and_is_nothing_where_that_ends_as_far(monkeypatch, ends):
+    begun = []
+    monkeypatch.setattr(afresh, "approach", lambda model, setting, progress: (begun.append(model) or model, None))
+    monkeypatch.setattr(afresh, "fit", lambda *_, **__: found(ends))
+    again = resettled(found(OFTEN + 1), None, [CAUSE])  # type: ignore[arg-type]
+    assert begun[0].point.tolist() == [0.0, 1.5]
+    assert (again is None) == (ends > OFTEN)
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypatch, better):
+    """The first step ends strained; the second sees the causes of both fits, or those of the new one alone."""
+    strained, anew = found(OFTEN + 1), found(0.2)
+    looked, row = [], SimpleNamespace(hypothesis=CAUSE)
+    first = stepwise.Step(stepwise.Candidate(row, strained, None, None, set(), 0.0), None, [], [], [], strained)  # type: ignore[arg-type]
+    monkeypatch.setattr(stepwise, "resettled", lambda *_: anew)
+    monkeypatch.setattr(stepwise, "fit", lambda *_, **__: strained)
+    monkeypatch.setattr(stepwise, "_predicts", lambda *_: 1.0 if better else -1.0)
+    monkeypatch.setattr(stepwise, "screen", lambda f: [f])
+    monkeypatch.setattr(stepwise, "_begun", lambda f, screened, tried: [(row, f.model)])
+    monkeypatch.setattr(stepwise, "_step", lambda current, setting, begun, *_: looked.append((current, begun)))
+    monkeypatch.setattr(stepwise, "_pruned", lambda current, steps, *_: (current, steps))
+    monkeypatch.setattr(stepwise, "_beside_the_point", lambda *_: False)
+    end, _ = stepwise._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    ((current, begun),) = looked
+    assert current is end is (anew if better else strained)
+    assert [model for _, model in begun] == ([anew.model] if better else [strained.model, anew.model])
