@@ -87,11 +87,11 @@ def screen(found: Fitted) -> list[Row]:
     asked = projected(found.white.jacobian[:, own:])
     value, numerics = projected(found.white.value, found.model.point), projected(_numerics(found))
     sizes, pulls = _sizes(found, 0, SEEN), 3**0.5 * _sizes(found, SEEN, SEEN + 1)  # a force has three cells
-    _, alone = leap(found.white, found.model)
+    further, alone = leap(found.white, found.model)
     rows, fitted = [], [p.name for p in found.model.parameters]
     for j, h in enumerate(found.evidence.hypotheses):
         information = float(asked[:, j] @ asked[:, j])
-        as_fitted = h.twin in fitted and not _pulled(found, fitted.index(h.twin))
+        as_fitted = h.twin in fitted and not _pulled(found, further, fitted.index(h.twin))
         if as_fitted or information < 1e-12 / h.typical**2:
             rows.append(Row(h, 0.0, float("inf"), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "unresolvable"))
             continue
@@ -104,12 +104,12 @@ def screen(found: Fitted) -> list[Row]:
     return sorted(rows, key=lambda row: -row.gain)
 
 
-def _pulled(found: Fitted, index: int) -> bool:
+def _pulled(found: Fitted, further: Tensor, index: int) -> bool:
     """Data and data sheet disagree about a parameter: beside it, only its prior tells of what does the same.
 
-    A mean of both lies sqrt(prior variance - its own) from the sheet where they agree.
+    ``further`` is the step that leads from where the fit ended to the optimum. A mean of both lies sqrt(prior variance - its own) from the sheet where they agree.
     """
-    away, std = float(found.model.values[index]), found.model.parameters[index].std
+    away, std = float(found.model.values[index] + further[index]), found.model.parameters[index].std
     return away**2 > PULLED**2 * max(std**2 - float(found.covariance[index, index]), 0.0)
 
 
@@ -156,7 +156,7 @@ def _numerics(found: Fitted) -> Tensor:
 def _sizes(found: Fitted, first: int, end: int) -> Tensor:
     """[hypotheses] RMS over an episode's cells of kinds from ``first`` to before ``end``, of the largest; zero without.
 
-    Beside what is fitted anyway, as far as its priors let it do the same; of a twin, beside the other parameters.
+    Ripples count for less. Beside what is fitted anyway, as far as its priors let it do the same; of a twin, beside the other parameters.
     """
     own, count = found.evidence.own, len(found.evidence.hypotheses)
     typical = torch.tensor([h.typical for h in found.evidence.hypotheses], dtype=torch.float64)
@@ -170,8 +170,8 @@ def _sizes(found: Fitted, first: int, end: int) -> Tensor:
             fitted[others, j] = torch.linalg.solve(square[others][:, others], cross[others, j])
     largest = typical.new_zeros(count)
     for cells in found.evidence.cells:
-        moved = cells.jacobian[(cells.block >= first) & (cells.block < end), : own + count]
-        if len(moved):
-            left = moved[:, own:] - moved[:, :own] @ fitted
-            largest = torch.maximum(largest, (left * typical).square().mean(0).sqrt())
+        share = found.noise.smooth(cells) * ((cells.block >= first) & (cells.block < end))
+        if float(share.sum()):
+            moved = cells.jacobian[:, own : own + count] - cells.jacobian[:, :own] @ fitted
+            largest = torch.maximum(largest, (share @ (moved * typical).square() / share.sum()).sqrt())
     return largest

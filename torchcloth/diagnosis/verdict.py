@@ -75,7 +75,7 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
     left = lack_of_fit(found.end, names)
     lacking = any(row.lacking for row in left)
     doubtful = [r["effect"] for m in minor for r in m["rivals"]]
-    verdict = _verdict(found, causes, left, bool(doubtful))
+    verdict = _verdict(found, causes, left, bool(doubtful or found.end.model.strained))
     content = {
         "verdict": verdict,
         "causes": causes,
