@@ -1,10 +1,15 @@
 """How far motions must agree about a cause."""
 
+from dataclasses import replace
+
+import linear_toys as toys
 import pytest
+import torch
 from scipy.stats import t
 
 from torchcloth.diagnosis.comparison import Gain
-from torchcloth.diagnosis.stepwise import NORMAL, SURE, SURE_OF_BEST, TRIED, standard_errors
+from torchcloth.diagnosis.stepwise import NORMAL, SURE, SURE_OF_BEST, TRIED, Candidate, _known, standard_errors
+from torchcloth.diagnosis.world import Model
 
 
 def gain(after):
@@ -33,3 +38,14 @@ def test_the_numbers_are_those_of_students_distribution():
     for k, (sure, of_best) in enumerate(zip(SURE, SURE_OF_BEST, strict=True), 1):
         assert sure == pytest.approx(t.ppf(0.975, k), abs=0.006)
         assert of_best == pytest.approx(t.ppf(1 - 0.025 / TRIED, k), abs=0.006)
+
+
+@pytest.mark.parametrize(("asked", "known"), [(0.1, True), (-0.5, False)])
+def test_motions_that_all_take_a_cause_away_do_not_agree_that_it_is_there(asked, known):
+    """At zero, where an amplitude without a sign ends, they differ by nothing at all."""
+    ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.tensor([0.0, asked]).double(), 0)
+    there = toys.fitted(ev)
+    cause = replace(toys.hypothesis("cause"), signed=False)
+    model = Model(None, there.model.parameters[:1], torch.zeros(1).double(), (cause,), (0.3,))  # type: ignore[arg-type]
+    tried = Candidate(None, replace(there, model=model), None, None, set(), 2.57)  # type: ignore[arg-type]
+    assert _known(tried.fitted, "cause", list("abcd"), tried) == known

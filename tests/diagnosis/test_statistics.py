@@ -62,7 +62,7 @@ def disagreeing(seed, by):
     own, value = found.white.jacobian[:, :3], found.white.value
     estimate = -torch.linalg.lstsq(own, value[:, None]).solution[2, 0]
     motions = [str(k) for k in range(toys.EPISODES)]
-    return float(estimate) - 0.7, float(spread(found, motions)[2]), float(found.covariance[2, 2].sqrt())
+    return float(estimate) - 0.7, float(spread(found, motions)[1][2]), float(found.covariance[2, 2].sqrt())
 
 
 def test_motions_that_disagree_widen_an_error_and_those_that_agree_do_not():

@@ -99,14 +99,15 @@ def _by_others(found: Fitted, plain: Whitened, inside: Tensor) -> tuple[Tensor, 
     return likely[:, 0], white[:, 0], root.diagonal().log()
 
 
-def spread(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> Tensor:
-    """[P + A] standard errors of the model's coordinates by what they become without one group after the other.
+def spread(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> tuple[Tensor, Tensor]:
+    """([P + A] mean of the model's coordinates without one group after the other, standard errors by how these differ).
 
     The jackknife: motions that disagree about a number say by how much a law may differ from the model's, which the
     noise within a motion does not.
     """
     steps = torch.stack([step_of(_outside(found, i), found.model)[0] for i in _folds(found, groups, halved)])
-    return ((len(steps) - 1) * (steps - steps.mean(0)).square().mean(0)).sqrt()
+    std = ((len(steps) - 1) * (steps - steps.mean(0)).square().mean(0)).sqrt()
+    return found.model.point + steps.mean(0), std
 
 
 def _outside(found: Fitted, inside: Tensor) -> Whitened:

@@ -107,7 +107,8 @@ def screen(found: Fitted) -> list[Row]:
 def _pulled(found: Fitted, further: Tensor, index: int) -> bool:
     """Data and data sheet disagree about a parameter: beside it, only its prior tells of what does the same.
 
-    ``further`` is the step that leads from where the fit ended to the optimum. A mean of both lies sqrt(prior variance - its own) from the sheet where they agree.
+    ``further`` is the step that leads from where the fit ended to the optimum. A mean of both lies
+    sqrt(prior variance - its own) from the sheet where they agree.
     """
     away, std = float(found.model.values[index] + further[index]), found.model.parameters[index].std
     return away**2 > PULLED**2 * max(std**2 - float(found.covariance[index, index]), 0.0)
@@ -156,7 +157,8 @@ def _numerics(found: Fitted) -> Tensor:
 def _sizes(found: Fitted, first: int, end: int) -> Tensor:
     """[hypotheses] RMS over an episode's cells of kinds from ``first`` to before ``end``, of the largest; zero without.
 
-    Ripples count for less. Beside what is fitted anyway, as far as its priors let it do the same; of a twin, beside the other parameters.
+    Ripples count for less. Beside what is fitted anyway, as far as its priors let it do the same; of a
+    twin, beside the other parameters.
     """
     own, count = found.evidence.own, len(found.evidence.hypotheses)
     typical = torch.tensor([h.typical for h in found.evidence.hypotheses], dtype=torch.float64)

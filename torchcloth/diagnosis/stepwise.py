@@ -327,9 +327,9 @@ def _useful(c: Candidate, names: Sequence[str]) -> bool:
 def _known(found: Fitted, name: str, names: Sequence[str], c: Candidate) -> bool:
     """Of a size that makes sense, and that motions agree about so far that there is something."""
     place = found.model.place(name)
-    h, amplitude = found.model.accepted[place], abs(found.model.amplitudes[place])
-    std = float(spread(found, names, c.alone)[len(found.model.parameters) + place])
-    return c.sure * std < amplitude < PLAUSIBLE * abs(h.typical)
+    middle, std = (float(v[len(found.model.parameters) + place]) for v in spread(found, names, c.alone))
+    largest = PLAUSIBLE * abs(found.model.accepted[place].typical)
+    return c.sure * std < abs(middle) and abs(found.model.amplitudes[place]) < largest
 
 
 def _worthwhile(gain: Gain) -> bool:

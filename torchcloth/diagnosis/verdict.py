@@ -139,7 +139,7 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     best, h, count = step.best, step.best.hypothesis, len(found.end.model.parameters)
     place, amplitude = found.end.model.place(h.name), found.amplitude(step)
     noise = float(found.end.covariance[count + place, count + place])
-    motions = float(spread(found.end, names, best.alone)[count + place])
+    motions = float(spread(found.end, names, best.alone)[1][count + place])
     std = (max(noise, motions**2) + best.row.bias**2) ** 0.5
     beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
     others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in beaten]
