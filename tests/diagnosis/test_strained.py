@@ -10,6 +10,7 @@ import torch
 from torchcloth.diagnosis import afresh, stepwise
 from torchcloth.diagnosis.afresh import resettled
 from torchcloth.diagnosis.world import OFTEN
+from torchcloth.errors import SimulationDiverged
 
 CAUSE = toys.hypothesis("cause", 2.0)
 
@@ -36,6 +37,14 @@ def test_it_begins_at_the_data_sheet_and_is_nothing_where_that_ends_as_far(monke
     again = resettled(found(OFTEN + 1), None, [CAUSE])  # type: ignore[arg-type]
     assert begun[0].point.tolist() == [0.0, 1.5]
     assert (again is None) == (ends > OFTEN)
+
+
+def test_where_the_data_sheet_is_no_world_nothing_begins_there(monkeypatch):
+    def diverges(*_):
+        raise SimulationDiverged("x", got="nan", expected="numbers")
+
+    monkeypatch.setattr(afresh, "approach", diverges)
+    assert resettled(found(OFTEN + 1), None, [CAUSE]) is None  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("better", [True, False])

@@ -14,7 +14,7 @@ import torch
 
 from .approach import approach
 from .evidence import Progress, Setting, staged
-from .fitting import Fitted, fit, leap_with, with_cause
+from .fitting import IMPOSSIBLE, Fitted, fit, leap_with, with_cause
 from .noise import unfitted, whitened
 from .world import Hypothesis, Model
 
@@ -41,16 +41,18 @@ def afresh(
 def resettled(
     found: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
 ) -> Fitted | None:
-    """The same causes, fitted from the data sheet and asked about the others; None where that ends as far from it.
+    """The same causes, fitted from the data sheet and asked about the others.
 
+    None where that ends as far from it, or no world has the data sheet's numbers beside these causes.
     A number that has left its data sheet made up for causes that were not known then, and may hide the next one now.
     """
-    model = found.model.at(
-        torch.cat([torch.zeros_like(found.model.values), found.model.point[len(found.model.values) :]])
-    )
-    near, _ = approach(model, setting, staged(progress, "causes, from the data sheet"))
+    model = replace(found.model, values=torch.zeros_like(found.model.values))
     left = model.others(hypotheses)
-    again = fit(near, setting, left, progress=staged(progress, "causes, anew"), before=found.evidence)
+    try:
+        near, _ = approach(model, setting, staged(progress, "causes, from the data sheet"))
+        again = fit(near, setting, left, progress=staged(progress, "causes, anew"), before=found.evidence)
+    except IMPOSSIBLE:
+        return None
     return None if again.model.strained else again
 
 
