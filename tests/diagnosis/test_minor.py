@@ -10,9 +10,7 @@ from torchcloth.diagnosis.verdict import _minor, _sentences, _verdict
 
 
 def candidate(name, typical, amplitude):
-    h = toys.hypothesis(name, typical)
-    model = SimpleNamespace(place=lambda _: 0, amplitudes=(amplitude,))
-    return SimpleNamespace(hypothesis=h, fitted=SimpleNamespace(model=model))
+    return SimpleNamespace(hypothesis=toys.hypothesis(name, typical), amplitude=amplitude)
 
 
 def small(*rivals):

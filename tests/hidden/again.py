@@ -75,7 +75,10 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"lacking: {row['motion']} {row['kind']} {row['ratio']:.2f}")
     print(answer.verdict)
     for cause in answer.content["causes"]:
-        print("named:", json.dumps({key: cause[key] for key in ("effect", "amplitude", "ci95", "class", "rivals", "placebo")}))
+        print(
+            "named:",
+            json.dumps({key: cause[key] for key in ("effect", "amplitude", "ci95", "class", "rivals", "placebo")}),
+        )
     hidden = case(options.seed, SMALL if options.fast else REDUCED)
     print("hidden:", json.dumps([asdict(e) for e in hidden.effects]))
     return 0

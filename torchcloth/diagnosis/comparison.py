@@ -55,12 +55,8 @@ class Gain(NamedTuple):
     ci95: tuple[float, float]  # of the density's difference
     explained: float  # share of before^2 - floor^2
     explained_ci95: tuple[float, float]
-    calm: tuple[
-        float, float
-    ]  # m RMS before and after, where stretches that neither describes, or that ripple, count less
-    mended: tuple[
-        float, float
-    ]  # m and N, RMS of what is gone of positions and forces from the episode where it is most
+    calm: tuple[float, float]  # m RMS before and after, where what neither describes, or ripples, counts for less
+    mended: tuple[float, float]  # m and N RMS, so weighed, that are gone from the episode where most is
 
 
 def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> Predicted:

@@ -54,6 +54,11 @@ class Candidate:
         """What was added."""
         return self.row.hypothesis
 
+    @property
+    def amplitude(self) -> float:
+        """Of what was added."""
+        return self.fitted.model.amplitudes[self.fitted.model.place(self.hypothesis.name)]
+
 
 @dataclass(frozen=True, eq=False)
 class Step:

@@ -125,14 +125,12 @@ def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left
 
 def _minor(found: Found, step: Step) -> dict[str, Any]:
     """What is too small to matter, and those of its rivals that would matter."""
-    h = step.best.hypothesis
-    rivals = [rival for c in step.rivals if matters(c.hypothesis, (rival := _rival(c))["amplitude"])]
+    h, rivals = step.best.hypothesis, [_rival(c) for c in step.rivals if matters(c.hypothesis, c.amplitude)]
     return {"effect": h.name, "amplitude": found.amplitude(step), "unit": h.unit, "rivals": rivals}
 
 
 def _rival(c: Candidate) -> dict[str, Any]:
-    h = c.hypothesis
-    return {"effect": h.name, "amplitude": c.fitted.model.amplitudes[c.fitted.model.place(h.name)], "unit": h.unit}
+    return {"effect": c.hypothesis.name, "amplitude": c.amplitude, "unit": c.hypothesis.unit}
 
 
 def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from .checkout import module
 from .measured import VARIABLE, find, swings
 from .measured.swing_predictions import predict, summary
 
-GROUPS = 4
+GROUPS = 6
 SECONDS, FAST_SECONDS = 6.0, 3.0  # from when the tool starts: until then it stands for up to three
 FAST_ASKED = ("air.drag_n", "air.linear", "air.added_mass")
 
