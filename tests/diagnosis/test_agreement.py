@@ -8,7 +8,7 @@ import torch
 from scipy.stats import t
 
 from torchcloth.diagnosis.comparison import Gain
-from torchcloth.diagnosis.stepwise import NORMAL, SURE, SURE_OF_BEST, TRIED, Candidate, _known, standard_errors
+from torchcloth.diagnosis.stepwise import NORMAL, SURE, SURE_OF_BEST, TRIED, Candidate, _known, _ranked, standard_errors
 from torchcloth.diagnosis.world import Model
 
 
@@ -38,6 +38,15 @@ def test_the_numbers_are_those_of_students_distribution():
     for k, (sure, of_best) in enumerate(zip(SURE, SURE_OF_BEST, strict=True), 1):
         assert sure == pytest.approx(t.ppf(0.975, k), abs=0.006)
         assert of_best == pytest.approx(t.ppf(1 - 0.025 / TRIED, k), abs=0.006)
+
+
+def test_of_those_that_predict_alike_the_one_that_mends_most_comes_first():
+    tried = [
+        Candidate(None, None, None, gain(after)._replace(density=density), set(), 2.57)  # type: ignore[arg-type]
+        for after, density in ((0.5, 100.0), (0.3, 97.0), (0.1, 95.0), (0.4, 98.0))
+    ]
+    assert [c.gain.density for c in _ranked(tried)] == [97.0, 98.0, 100.0, 95.0]
+    assert _ranked([]) == []
 
 
 @pytest.mark.parametrize(("asked", "known"), [(0.1, True), (-0.5, False)])

@@ -263,7 +263,7 @@ def _step(
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
     noise = fit_noise(likeliest)
     tried = _compared(current, [(c.row, c.fitted) for c in likely], setting.names, noise, likeliest)
-    useful = sorted((c for c in tried if _useful(c, setting.names)), key=lambda c: -c.gain.density)
+    useful = _ranked([c for c in tried if _useful(c, setting.names)])
     beside = lambda c: placebo(renoised(c.fitted, noise, likeliest), setting.names, c.alone)  # noqa: E731
     chance = None
     while useful and not (chance := beside(useful[0])).passed:
@@ -274,6 +274,14 @@ def _step(
     alike = lambda c: predict(renoised(c.fitted, noise, likeliest), setting.names, best.alone)  # noqa: E731
     rivals = [c for c in useful if c is not best and _rival(c, alike(c), best)]
     return Step(best, chance, tried, rivals, screened, current)
+
+
+def _ranked(useful: Sequence[Candidate]) -> list[Candidate]:
+    """The likeliest first; of those that predict as well as that, the one that mends most."""
+    likeliest = max((c.gain.density for c in useful), default=0.0)
+    mended = lambda c: c.gain.calm[0] ** 2 - c.gain.calm[1] ** 2  # noqa: E731
+    alike = lambda c: c.gain.density > likeliest - CLEAR  # noqa: E731
+    return sorted(useful, key=lambda c: (0, -mended(c)) if alike(c) else (1, -c.gain.density))
 
 
 def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> dict[int, tuple[Row, Fitted]]:
