@@ -11,7 +11,7 @@ from torchcloth.diagnosis.classes import alike, correlations
 from torchcloth.diagnosis.comparison import compare, predict, spread
 from torchcloth.diagnosis.fitting import step_of
 from torchcloth.diagnosis.noise import ROUGH, Noise, fit_noise, floor_of, whitened
-from torchcloth.diagnosis.screening import screen
+from torchcloth.diagnosis.screening import Row, _decided, screen
 from torchcloth.diagnosis.verdict import _is_too_large, _too_large
 
 NAMES = ["a", "b", "c"]
@@ -229,3 +229,12 @@ def test_what_shows_in_one_episode_shows_however_many_others_there_are():
     own = float(slopes[0, :, 2].square().mean().sqrt())
     assert 0.5 * own < size <= own
     assert size > 1.5 * float(slopes[..., 2].square().mean().sqrt())
+
+
+@pytest.mark.parametrize(
+    ("reached", "worth", "said"), [(0.5, 20.0, "inconclusive"), (0.5, 2.0, "absent"), (0.3, 20.0, "absent")]
+)
+def test_what_a_leap_makes_large_is_not_ruled_out_by_slopes(reached, worth, said):
+    """Large effects bend the fit until slopes there ask for less than there is."""
+    asks = Row(toys.hypothesis("a"), 0.2, 0.01, 0.0, 400.0, 1e-2, 0.0, reached, worth, "absent")
+    assert _decided(asks) == said

@@ -26,6 +26,7 @@ Decision = Literal["present", "absent", "inconclusive", "unresolvable"]
 PRESENT = 2.5  # standard errors above the smallest amplitude of interest
 LEAST = 3e-4  # m: a typical amplitude that moves less cannot be seen
 LEAST_PULL = 1e-2  # N, the same of forces
+MUCH = 8.0  # log density, of a cause that is worth fitting
 PULLED = 3.0  # standard deviations of its prior, from which a parameter does what its twin is asked about
 POWER = 1.64 + 0.84  # standard errors: found in 80 % of cases at 5 %
 NUMERICS = 1 / 3  # of the difference between two meshes is left on the finer one (second order)
@@ -141,9 +142,9 @@ def _decided(row: Row) -> Decision:
         return "unresolvable"
     if row.excess > PRESENT:
         return "present"
-    if row.forward + 1.64 * row.total < abs(row.hypothesis.smallest):
-        return "absent"
-    return "inconclusive"
+    less = row.forward + 1.64 * row.total < abs(row.hypothesis.smallest)
+    leads = row.worth > MUCH and row._forward(row.reached) > abs(row.hypothesis.smallest)  # slopes ask for too little
+    return "absent" if less and not leads else "inconclusive"
 
 
 def _numerics(found: Fitted) -> Tensor:

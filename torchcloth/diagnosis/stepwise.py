@@ -16,7 +16,7 @@ from .lacking import explained, lack_of_fit
 from .noise import Noise, fit_noise, floor_of, unfitted
 from .placebo import Placebo, placebo
 from .repeats import Repeats, pairs_of, repeats
-from .screening import PRESENT, Row, screen
+from .screening import MUCH, PRESENT, Row, screen
 from .world import Hypothesis, Model
 
 MOST = 4  # causes
@@ -27,7 +27,6 @@ HARDLY = 0.2  # of what the better of two models gains, in density and squares, 
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
-MUCH = 8.0  # log density, of a cause that is worth fitting
 MOSTLY, HALF = 1 / 3, 1 / 2  # of what is wrong: least that all causes, or a further one, explain beside something else
 # standard errors between motions, from which they agree that there is something: 97.5 % of Student's t by one less than
 # there are motions; of the best of TRIED causes, with a fourth of that chance

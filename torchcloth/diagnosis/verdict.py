@@ -14,8 +14,8 @@ from .glossary import GLOSSARY
 from .lacking import Left, lack_of_fit
 from .missing import MissingForce
 from .residual import Residual
-from .screening import Row
-from .stepwise import MUCH, PLAUSIBLE, Candidate, Found, Step, matters
+from .screening import MUCH, Row
+from .stepwise import PLAUSIBLE, Candidate, Found, Step, matters
 from .world import Model
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
