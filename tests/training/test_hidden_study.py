@@ -28,6 +28,9 @@ def called(monkeypatch):
         elif out is not None:
             for name in ("e1", "e2"):
                 (out / name).mkdir(parents=True)
+        elif "shows.py" in commands[-1]:
+            sizes = [{"name": "x.jet", "left_moves": 1e-3, "left_pulls": 0.0}]
+            return Namespace(returncode=0, stdout=json.dumps(sizes), stderr="")
         else:  # what reveal.py prints
             seed = int(command[command.index("--seed") + 1])
             truth = module("hidden", "reveal").truth(module("hidden", "drawn").case(seed))
@@ -52,6 +55,12 @@ def test_the_truth_is_opened_after_the_answer_and_nothing_is_told(called, tmp_pa
     kept = json.loads((tmp_path / "s" / "cases" / "001.json").read_text())
     assert kept["truth"]["family"] == "null"
     assert kept["answer"] == ANSWER
+
+
+def test_what_the_catalogue_does_not_know_is_asked_whether_it_shows(called, tmp_path):
+    seed = next(s for s in range(20) if module("hidden", "drawn").case(s).family == "outside")
+    assert hidden.one(tmp_path, "001", seed, False)["sizes"][0]["name"] == "x.jet"
+    assert [c[0] for c in called].index("shows.py") > [c[0] for c in called].index("reveal.py")
 
 
 def test_finished_cases_are_not_repeated_and_more_may_be_added(called, tmp_path, capsys):
