@@ -1,14 +1,16 @@
 """How far motions must agree about a cause."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import linear_toys as toys
 import pytest
 import torch
 from scipy.stats import t
 
-from torchcloth.diagnosis.comparison import Gain
+from torchcloth.diagnosis.comparison import Gain, spread
 from torchcloth.diagnosis.stepwise import NORMAL, SURE, SURE_OF_BEST, TRIED, Candidate, _known, _ranked, standard_errors
+from torchcloth.diagnosis.verdict import _parameters
 from torchcloth.diagnosis.world import Model
 
 
@@ -58,3 +60,19 @@ def test_motions_that_all_take_a_cause_away_do_not_agree_that_it_is_there(asked,
     model = Model(None, there.model.parameters[:1], torch.zeros(1).double(), (cause,), (0.3,))  # type: ignore[arg-type]
     tried = Candidate(None, replace(there, model=model), None, None, set(), 2.57)  # type: ignore[arg-type]
     assert _known(tried.fitted, "cause", list("abcd"), tried) == known
+
+
+def test_a_numbers_interval_knows_of_what_motions_disagree_by():
+    """Each of four motions has a value of its own: one interval holds what noise allows, the other what they say."""
+    ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.zeros(2).double(), 0)
+    own = (0.3, -0.3, 0.2, -0.2)
+    cells = [c._replace(value=c.value - a * c.jacobian[:, 1]) for c, a in zip(ev.cells, own, strict=True)]
+    found = toys.fitted(replace(ev, cells=cells))
+    width = {
+        name: (row["ci95"][1] - row["ci95"][0]) / 3.92
+        for name, row in _parameters(SimpleNamespace(end=found), list("abcd")).items()  # type: ignore[arg-type]
+    }
+    noise, motions = found.covariance.diagonal().sqrt(), spread(found, list("abcd"))[1]
+    assert width["p1"] == pytest.approx(float(motions[1]))
+    assert width["p1"] > 3 * float(noise[1])
+    assert all(width[f"p{k}"] >= float(noise[k]) - 1e-12 for k in range(2))

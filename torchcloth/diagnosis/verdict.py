@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import torch
+
 from ..errors import InvalidInput
 from .classes import alike
 from .comparison import Gain, spread
@@ -94,7 +96,7 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
         "missing_force": None,
         "residual": None,
         "next_experiment": None,
-        "parameters": _parameters(found),
+        "parameters": _parameters(found, names),
         "warnings": _warnings(found, names, left),
         "motions": list(names),
     }
@@ -185,8 +187,10 @@ def _floor(found: Found) -> dict[str, Any]:
     return {**out, "source": "repetitions", "pairs": found.repeats.pairs}
 
 
-def _parameters(found: Found) -> dict[str, Any]:
-    model, std = found.end.model, found.end.covariance.diagonal().sqrt().tolist()
+def _parameters(found: Found, names: Sequence[str]) -> dict[str, Any]:
+    """Intervals are the wider of what noise allows and of what motions disagree by."""
+    noise, (_, motions) = found.end.covariance.diagonal().sqrt(), spread(found.end, names)
+    model, std = found.end.model, torch.maximum(noise, motions).tolist()
     return {
         p.name: {
             "value": p.value(c),
