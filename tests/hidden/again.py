@@ -27,11 +27,10 @@ from torchcloth.diagnosis.stepwise import Candidate
 def said(c: Candidate, names: list[str]) -> str:
     """One line on a cause that was tried."""
     place = c.fitted.model.place(c.hypothesis.name)
-    amplitude = c.fitted.model.amplitudes[place]
     middle, motions = (float(v[len(c.fitted.model.parameters) + place]) for v in spread(c.fitted, names, c.alone))
     (calm, after), (seen, felt), (low, high) = c.gain.calm, c.gain.mended, c.gain.ci95
     return (
-        f"  {c.hypothesis.name:22} {amplitude:9.3g} {c.hypothesis.unit:8} density {c.gain.density:8.1f} "
+        f"  {c.hypothesis.name:22} {c.amplitude:9.3g} {c.hypothesis.unit:8} density {c.gain.density:8.1f} "
         f"({low:.0f} to {high:.0f}), {1e3 * calm:.2f} -> {1e3 * after:.2f} mm, mended "
         f"{1e3 * seen:.2f} mm or {1e3 * felt:.1f} mN, {abs(middle) / max(motions, 1e-30):.1f} standard "
         f"errors between motions ({c.sure:.2f} asked), chi^2 {float(c.fitted.white.value.square().sum()):.0f}"

@@ -58,6 +58,11 @@ class Gain(NamedTuple):
     calm: tuple[float, float]  # m RMS before and after, where what neither describes, or ripples, counts for less
     mended: tuple[float, float]  # m and N RMS, so weighed, that are gone from the episode where most is
 
+    @property
+    def fallen(self) -> float:
+        """m^2, by which the mean square of what is ``calm`` falls."""
+        return self.calm[0] ** 2 - self.calm[1] ** 2
+
 
 def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> Predicted:
     """Residuals of every episode when its group of motions is left out of the fit.
@@ -181,8 +186,10 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     total, share = float(density.sum()), _share(squares.sum(0), floor)
     few = 2.0 if len(set(owner.tolist())) < FEW else 1.0
     left, right = (share + few * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
-    calm, felt = _calm(one, two, one.seen), 3**0.5 * _mended(one, two, one.kind == SEEN)  # a force has three cells
-    mended = (_mended(one, two, one.seen), felt)
+    counts = one.smooth * torch.maximum(*(weights(p.white, p.stretch) for p in (one, two)))
+    seen, felt = counts * one.seen, counts * (one.kind == SEEN)
+    calm = _calm(one, two, seen)
+    mended = (_mended(one, two, seen), 3**0.5 * _mended(one, two, felt))  # a force has three cells
     return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, (low, high), share, (left, right), calm, mended)
 
 
@@ -212,16 +219,15 @@ def _blocks(one: Predicted, two: Predicted) -> tuple[np.ndarray, np.ndarray, np.
     return (block // 1000).numpy(), sums(density), sums(squares)
 
 
-def _calm(one: Predicted, two: Predicted, inside: Tensor) -> tuple[float, float]:
-    """RMS before and after of the cells inside; stretches that neither describes, or that ripple, count for less."""
-    share = inside * one.smooth * torch.maximum(*(weights(p.white, p.stretch) for p in (one, two)))
+def _calm(one: Predicted, two: Predicted, share: Tensor) -> tuple[float, float]:
+    """RMS before and after of cells that count by a share [C]."""
     rms = lambda p: float((share * p.value**2).sum() / share.sum().clamp(min=1e-12)) ** 0.5  # noqa: E731
     return rms(one), rms(two)
 
 
-def _mended(one: Predicted, two: Predicted, inside: Tensor) -> float:
-    """RMS of what is gone from the cells inside in the episode where that is most: others need not tell."""
-    both = (_calm(one, two, inside & (one.episode == e)) for e in one.episode.unique())
+def _mended(one: Predicted, two: Predicted, share: Tensor) -> float:
+    """RMS of what is gone from such cells in the episode where that is most: others need not tell."""
+    both = (_calm(one, two, share * (one.episode == e)) for e in one.episode.unique())
     return max(0.0, *(before**2 - after**2 for before, after in both)) ** 0.5
 
 

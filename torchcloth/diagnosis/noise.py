@@ -40,8 +40,12 @@ class Noise(NamedTuple):
 
     def smooth(self, cells: Cells) -> Tensor:
         """[C] share of the variance that is no roughness."""
-        plain = _white(cells) + self.level[cells.block] ** 2
+        plain = self.plain(cells)
         return plain / (plain + _rough(cells))
+
+    def plain(self, cells: Cells) -> Tensor:
+        """[C] the other variance, but for what differs from episode to episode."""
+        return _white(cells) + self.level[cells.block] ** 2
 
 
 def least() -> Noise:
@@ -143,6 +147,6 @@ def floor_of(evidence: Evidence, noise: Noise) -> float:
     total, count = 0.0, 0
     for cells in evidence.cells:
         own = cells.block < SEEN
-        variance = (_white(cells) + noise.level[cells.block] ** 2)[own]
+        variance = noise.plain(cells)[own]
         total, count = total + float(variance.sum()), count + int(own.sum())
     return (total / count) ** 0.5

@@ -40,8 +40,9 @@ class Row(NamedTuple):
     std: float  # from the noise
     bias: float  # that numerics alone would ask for
     gain: float  # chi^2
-    size: float  # m, RMS by which a typical amplitude moves points of the episode in which it moves them most, beyond
-    # what is fitted anyway: others need not tell
+    size: (
+        float  # m, RMS by which a typical amplitude moves points beside what is fitted, in the episode that tells most
+    )
     pull: float  # N, the same of forces
     reached: float  # amplitude where a leap leads (``fitting.leap_with``)
     worth: float  # log density that it should gain
@@ -87,7 +88,7 @@ def screen(found: Fitted) -> list[Row]:
     projected = projection(found)
     asked = projected(found.white.jacobian[:, own:])
     value, numerics = projected(found.white.value, found.model.point), projected(_numerics(found))
-    sizes, pulls = _sizes(found, 0, SEEN), 3**0.5 * _sizes(found, SEEN, SEEN + 1)  # a force has three cells
+    sizes, pulls = _sizes(found)
     further, alone = leap(found.white, found.model)
     rows, fitted = [], [p.name for p in found.model.parameters]
     for j, h in enumerate(found.evidence.hypotheses):
@@ -155,11 +156,11 @@ def _numerics(found: Fitted) -> Tensor:
     return found.white.share * torch.cat(parts)
 
 
-def _sizes(found: Fitted, first: int, end: int) -> Tensor:
-    """[hypotheses] RMS over an episode's cells of kinds from ``first`` to before ``end``, of the largest; zero without.
+def _sizes(found: Fitted) -> Tensor:
+    """[2, hypotheses] RMS in m of positions and in N of forces, in the episode where that is most; zero without any.
 
-    Ripples count for less. Beside what is fitted anyway, as far as its priors let it do the same; of a
-    twin, beside the other parameters.
+    Ripples count for less. Beside what is fitted anyway, as far as its priors let it do the same; of a twin, beside the
+    other parameters.
     """
     own, count = found.evidence.own, len(found.evidence.hypotheses)
     typical = torch.tensor([h.typical for h in found.evidence.hypotheses], dtype=torch.float64)
@@ -171,10 +172,10 @@ def _sizes(found: Fitted, first: int, end: int) -> Tensor:
             others = [k for k in range(own) if k != names.index(h.twin)]
             fitted[:, j] = 0.0
             fitted[others, j] = torch.linalg.solve(square[others][:, others], cross[others, j])
-    largest = typical.new_zeros(count)
+    largest = typical.new_zeros(2, count)
     for cells in found.evidence.cells:
-        share = found.noise.smooth(cells) * ((cells.block >= first) & (cells.block < end))
-        if float(share.sum()):
-            moved = cells.jacobian[:, own : own + count] - cells.jacobian[:, :own] @ fitted
-            largest = torch.maximum(largest, (share @ (moved * typical).square() / share.sum()).sqrt())
-    return largest
+        moved = (cells.jacobian[:, own : own + count] - cells.jacobian[:, :own] @ fitted) * typical
+        share = found.noise.smooth(cells) * torch.stack([cells.block < SEEN, cells.block == SEEN])
+        counted = share.sum(1, keepdim=True)
+        largest = torch.maximum(largest, (share @ moved.square() / counted.clamp(min=1e-30)).sqrt())
+    return largest * typical.new_tensor([[1.0], [3**0.5]])  # a force has three cells

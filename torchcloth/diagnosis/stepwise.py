@@ -278,9 +278,8 @@ def _step(
 def _ranked(useful: Sequence[Candidate]) -> list[Candidate]:
     """The likeliest first; of those that predict as well as that, the one that mends most."""
     likeliest = max((c.gain.density for c in useful), default=0.0)
-    mended = lambda c: c.gain.calm[0] ** 2 - c.gain.calm[1] ** 2  # noqa: E731
     alike = lambda c: c.gain.density > likeliest - CLEAR  # noqa: E731
-    return sorted(useful, key=lambda c: (0, -mended(c)) if alike(c) else (1, -c.gain.density))
+    return sorted(useful, key=lambda c: (0, -c.gain.fallen) if alike(c) else (1, -c.gain.density))
 
 
 def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> dict[int, tuple[Row, Fitted]]:
@@ -345,8 +344,8 @@ def _known(found: Fitted, name: str, names: Sequence[str], c: Candidate) -> bool
 
 
 def _worthwhile(gain: Gain) -> bool:
-    (before, after), (seen, felt) = gain.calm, gain.mended
-    mended = before**2 - after**2 > WORTH_SHARE * before**2 or seen > WORTH_MM or felt > WORTH_PULL
+    seen, felt = gain.mended
+    mended = gain.fallen > WORTH_SHARE * gain.calm[0] ** 2 or seen > WORTH_MM or felt > WORTH_PULL
     return mended and gain.ci95[0] > 0
 
 
@@ -354,6 +353,6 @@ def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
     """Predicts about as well: the paired difference is not clear, or no more than what two engines may differ by."""
     if c.hypothesis.effect == best.hypothesis.effect:
         return False
-    over, mended = compare(predicted, best.predicted, 0.0), lambda gain: gain.calm[0] ** 2 - gain.calm[1] ** 2
-    hardly = over.density < HARDLY * best.gain.density and mended(over) < HARDLY * mended(best.gain)
+    over = compare(predicted, best.predicted, 0.0)
+    hardly = over.density < HARDLY * best.gain.density and over.fallen < HARDLY * best.gain.fallen
     return over.density < CLEAR or over.ci95[0] < 0 or hardly

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from ..errors import InvalidInput
 from .classes import alike
@@ -138,9 +139,7 @@ def _rival(c: Candidate) -> dict[str, Any]:
 def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     best, h, count = step.best, step.best.hypothesis, len(found.end.model.parameters)
     place, amplitude = found.end.model.place(h.name), found.amplitude(step)
-    noise = float(found.end.covariance[count + place, count + place])
-    motions = float(spread(found.end, names, best.alone)[1][count + place])
-    std = (max(noise, motions**2) + best.row.bias**2) ** 0.5
+    std = (float(_errors(found, names, best.alone)[count + place]) ** 2 + best.row.bias**2) ** 0.5
     beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
     others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in beaten]
     kin = [r.hypothesis.name for r in alike(step.before, best.row, others)]
@@ -155,6 +154,11 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
         "placebo": {"log_density": step.placebo.gain, "chance": step.placebo.chance},
         "share_of_explainable": _share(found, best.gain),
     }
+
+
+def _errors(found: Found, names: Sequence[str], alone: Collection[str] = ()) -> Tensor:
+    """[P + A] standard errors of the model's coordinates: the wider of what noise allows and motions disagree by."""
+    return torch.maximum(found.end.covariance.diagonal().sqrt(), spread(found.end, names, alone)[1])
 
 
 def _share(found: Found, gain: Gain) -> float | None:
@@ -188,9 +192,7 @@ def _floor(found: Found) -> dict[str, Any]:
 
 
 def _parameters(found: Found, names: Sequence[str]) -> dict[str, Any]:
-    """Intervals are the wider of what noise allows and of what motions disagree by."""
-    noise, (_, motions) = found.end.covariance.diagonal().sqrt(), spread(found.end, names)
-    model, std = found.end.model, torch.maximum(noise, motions).tolist()
+    model, std = found.end.model, _errors(found, names).tolist()
     return {
         p.name: {
             "value": p.value(c),

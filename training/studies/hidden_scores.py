@@ -60,12 +60,11 @@ def wanted(truth: Truth) -> list[Wanted]:
     """What should be found; what is too small to matter, or beyond the catalogue, is not."""
     if truth["family"] in NULLS:
         return []
-    return [Wanted(frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"])) for e in _asked(truth)]
-
-
-def _asked(truth: Truth) -> list[Mapping[str, Any]]:
-    """Effects that have a name in the catalogue and are there for their own sake."""
-    return [e for e in truth["effects"] if e["names"] and not e["beside"]]
+    return [
+        Wanted(frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"]))
+        for e in truth["effects"]
+        if e["names"] and not e["beside"]
+    ]
 
 
 def fine(truth: Truth) -> frozenset[str]:
