@@ -26,13 +26,14 @@ def test_rivals_that_would_matter_are_said_and_no_others():
 
 @pytest.mark.parametrize("doubtful", [True, False])
 def test_what_may_matter_is_not_called_adequate(doubtful):
-    right = SimpleNamespace(lacking=False, stable=True)
-    assert _verdict(SimpleNamespace(screened=[]), [], [right], doubtful) == ("inconclusive" if doubtful else "adequate")
+    told = _verdict(SimpleNamespace(screened=[]), [], lacking=False, stable=True, doubtful=doubtful)
+    assert told == ("inconclusive" if doubtful else "adequate")
 
 
 def test_the_summary_says_what_it_cannot_be_told_from():
     minor = [small(candidate("obs.depth_bias", 5e-3, -2.5e-3)), small()]
-    lists = {key: [] for key in ("causes", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "warnings")}
+    keys = ("causes", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "drifts", "warnings")
+    lists = {key: [] for key in keys}
     said = _sentences(
         "inconclusive", {**lists, **dict.fromkeys(("gain", "also_unexplained", "next_experiment")), "minor": minor}
     )

@@ -7,6 +7,7 @@
 from .base_model import base_model
 from .comparison import Gain, compare, predict
 from .confirming import Confirmation, confirm
+from .drifting import drifts
 from .evidence import gather, setting_of
 from .fitting import Fitted, fit
 from .gate import Fault, check, read_episodes
@@ -44,6 +45,7 @@ __all__ = [
     "compare",
     "confirm",
     "diagnose",
+    "drifts",
     "fit",
     "fit_noise",
     "gather",

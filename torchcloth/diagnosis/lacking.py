@@ -75,13 +75,10 @@ def explained(before: Sequence[Left], after: Sequence[Left]) -> float:
 
 
 def _episode(found: Fitted, k: int, name: str) -> list[Left]:
-    cells, stds = found.evidence.cells[k], found.evidence.stds[k]
-    uncertain = cells.jacobian[:, : found.evidence.own] @ torch.linalg.cholesky(found.covariance)
-    moved = torch.cat([uncertain, cells.jacobian[:, -len(stds) :] * stds], 1)
-    level, numerics = reference(cells, found.evidence.numerics[k])
+    cells = found.evidence.cells[k]
+    still, moved = right(found, k)
+    _, numerics = reference(cells, found.evidence.numerics[k])
     stable = float(numerics[:SEEN].max()) < FOLDED
-    one = moved.new_ones(moved.shape[1])
-    still = level.covariance(cells, moved[:, :0], one[:0])
     kept = torch.linalg.solve(still + moved @ moved.mT, still).mT  # S K^-1
     left, covariance = kept @ cells.value, kept @ still
     rows = []
@@ -105,6 +102,15 @@ def _episode(found: Fitted, k: int, name: str) -> list[Left]:
             )
         )
     return rows
+
+
+def right(found: Fitted, k: int) -> tuple[Tensor, Tensor]:
+    """(S [C, C], M [C, N]) of one episode by a right model."""
+    cells, stds = found.evidence.cells[k], found.evidence.stds[k]
+    uncertain = cells.jacobian[:, : found.evidence.own] @ torch.linalg.cholesky(found.covariance)
+    moved = torch.cat([uncertain, cells.jacobian[:, -len(stds) :] * stds], 1)
+    level, _ = reference(cells, found.evidence.numerics[k])
+    return level.covariance(cells, moved[:, :0], moved.new_zeros(0)), moved
 
 
 def reference(cells: Cells, difference: Tensor) -> tuple[Noise, Tensor]:

@@ -51,6 +51,7 @@ def _evidence(answer: Diagnosis) -> list[str]:
         _table(found.screened),
         "<h2>Lack of fit</h2>",
         _left(answer.content["lack_of_fit"]),
+        _drifts(answer.content["drifts"]),
         *_missing(answer),
         "<h2>What these motions can tell apart</h2>",
         _image(pictures.isolability(answer)),
@@ -101,6 +102,17 @@ def _left(rows: list[dict[str, Any]]) -> str:
         body += f"<tr>{''.join(f'<{tag}>{html.escape(c)}</{tag}>' for c in cells)}</tr>"
     head = ("motion", "data", "left", "a right model leaves", "of which numerics", "", "ratio", "chance")
     return f"<table><tr>{''.join(f'<th>{h}</th>' for h in head)}</tr>{body}</table>"
+
+
+def _drifts(rows: list[dict[str, Any]]) -> str:
+    """What forces drift by in all motions alike; lacking rows in bold."""
+    body = ""
+    for r in rows:
+        cells = [f"force, {r['axis']}", f"{1e3 * r['rate']:.1f}", f"{1e3 * r['std']:.1f}", "mN/s", f"{r['p']:.2g}"]
+        tag = "th" if r["lacking"] else "td"
+        body += f"<tr>{''.join(f'<{tag}>{c}</{tag}>' for c in cells)}</tr>"
+    head = ("in all motions alike", "grows by", "std. error", "", "chance")
+    return f"<table><tr>{''.join(f'<th>{h}</th>' for h in head)}</tr>{body}</table>" if rows else ""
 
 
 def _missing(answer: Diagnosis) -> list[str]:

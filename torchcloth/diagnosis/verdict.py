@@ -12,6 +12,7 @@ from torch import Tensor
 from ..errors import InvalidInput
 from .classes import alike
 from .comparison import Gain, spread
+from .drifting import drifts
 from .gate import Fault
 from .glossary import GLOSSARY
 from .lacking import Left, lack_of_fit
@@ -75,10 +76,11 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
     told = {name for m in minor for name in (m["effect"], *(r["effect"] for r in m["rivals"]))}
     told |= {name for c in causes for name in (*c["class"], *(r["effect"] for r in c["rivals"]))}
     rows = [r for r in found.screened if r.hypothesis.name not in told]
-    left = lack_of_fit(found.end, names)
-    lacking = any(row.lacking for row in left)
+    left, drifting = lack_of_fit(found.end, names), drifts(found.end)
+    lacking = any(row.lacking for row in (*left, *drifting))
     doubtful = [r["effect"] for m in minor for r in m["rivals"]]
-    verdict = _verdict(found, causes, left, bool(doubtful or found.end.model.strained))
+    stable = all(row.stable for row in left)
+    verdict = _verdict(found, causes, lacking, stable, bool(doubtful or found.end.model.strained))
     content = {
         "verdict": verdict,
         "causes": causes,
@@ -94,6 +96,7 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
         "also_unexplained": bool(causes) and lacking,
         "floor": _floor(found),
         "lack_of_fit": [row.as_dict() for row in left],
+        "drifts": [row.as_dict() for row in drifting],
         "missing_force": None,
         "residual": None,
         "next_experiment": None,
@@ -107,7 +110,8 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
 def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
     """The answer where episodes cannot be believed: what is wrong with them."""
     lists: dict[str, Any] = {
-        key: [] for key in ("causes", "minor", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "warnings")
+        key: []
+        for key in ("causes", "minor", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "drifts", "warnings")
     }
     none = dict.fromkeys(("gain", "missing_force", "residual", "next_experiment", "model"))
     said = [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults]
@@ -115,12 +119,12 @@ def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
     return Diagnosis("invalid_data", {**content, "faults": said, "motions": list(names)}, None)
 
 
-def _verdict(found: Found, causes: Sequence[dict[str, Any]], left: Sequence[Left], doubtful: bool) -> Verdict:
+def _verdict(found: Found, causes: Sequence[dict[str, Any]], lacking: bool, stable: bool, doubtful: bool) -> Verdict:
     if causes:
         return "identified" if all(not c["rivals"] and len(c["class"]) == 1 for c in causes) else "ambiguous"
-    if any(row.lacking for row in left):
+    if lacking:
         return "unexplained"
-    if not all(row.stable for row in left):
+    if not stable:
         return "numerics"
     undecided = [r for r in found.screened if r.decision == "present"]
     return "inconclusive" if undecided or doubtful else "adequate"
@@ -302,11 +306,17 @@ def _size(row: dict[str, Any]) -> str:
 
 def _lacking(content: dict[str, Any]) -> list[str]:
     """Where the fit is lacking, and what force would mend it."""
-    rows = [row for row in content["lack_of_fit"] if row["lacking"]]
+    drifting, rows = ([row for row in content[key] if row["lacking"]] for key in ("drifts", "lack_of_fit"))
+    told = [
+        f"Forces along {d['axis']} drift from the simulation's by {1e3 * d['rate']:.0f} mN/s (standard error "
+        f"{1e3 * d['std']:.0f}) in all motions alike: cloth that gains or loses weight, or sensors. Empty grippers, "
+        "recorded as long, would tell."
+        for d in drifting
+    ]
     if not rows:
-        return []
+        return told
     seen = ", ".join(f"{r['kind']} of {r['motion']} ({r['ratio']:.1f} times what is expected)" for r in rows)
-    out = [f"Lacking: {seen}."]
+    out = [*told, f"Lacking: {seen}."]
     missing = content["missing_force"] or {"motions": []}
     for m in (m for m in missing["motions"] if m["sure"]):
         where = ", ".join(f"{1e3 * c:.0f}" for c in m["at"])
