@@ -53,6 +53,7 @@ def _evidence(answer: Diagnosis) -> list[str]:
         _left(answer.content["lack_of_fit"]),
         _drifts(answer.content["drifts"]),
         *_missing(answer),
+        *_learned(answer.content["residual"]),
         "<h2>What these motions can tell apart</h2>",
         _image(pictures.isolability(answer)),
         "<h2>Parameters of the model</h2>",
@@ -122,21 +123,24 @@ def _missing(answer: Diagnosis) -> list[str]:
         "<h2>The force that is missing</h2>",
         "<p>Beside the model and its causes, where and when it is the surest in each motion. Names no cause.</p>",
         _image(pictures.missing_force(answer.missing)),
-        *_learned(answer.content["residual"]),
     ]
 
 
-def _learned(found: dict[str, Any]) -> list[str]:
-    """The laws of a residual force, if any was learned."""
+def _learned(found: dict[str, Any] | None) -> list[str]:
+    """The laws of a residual force, if any was looked for."""
+    if found is None:
+        return []
+    title = "<h2>Laws without a cause</h2>"
     if not found["terms"]:
-        return ["<p>No local law of it was found that would predict motions held out.</p>"]
+        return [title, "<p>No local law was found that would predict motions held out better.</p>"]
     gain, body = found["gain"], ""
     for t in found["terms"]:
         cells = [t["law"], f"{t['coefficient']:.3g}", t["unit"], t["told"]]
         body += f"<tr>{''.join(f'<td>{html.escape(c)}</td>' for c in cells)}</tr>"
     head = "".join(f"<th>{h}</th>" for h in ("law", "coefficient", "unit", "what it does"))
     return [
-        f"<p>Local laws that were learned from it: {1e3 * gain['rms_before']:.2f} to {1e3 * gain['rms_after']:.2f} mm "
+        title,
+        f"<p>Local laws that were learned: {1e3 * gain['rms_before']:.2f} to {1e3 * gain['rms_after']:.2f} mm "
         "on motions held out. They are part of the extended model and can be left out.</p>",
         f"<table><tr>{head}</tr>{body}</table>",
     ]

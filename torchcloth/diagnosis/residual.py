@@ -20,7 +20,7 @@ from ..effects.residual import LAWS, PLACES, describe
 from .comparison import Gain
 from .evidence import Progress, Setting
 from .fitting import Fitted, fit
-from .stepwise import Found, extend
+from .stepwise import Found, extend, instead
 from .world import Hypothesis, Model, World
 
 RESIDUAL = "residual"
@@ -95,6 +95,18 @@ class Residual:
 def is_residual(hypothesis: Hypothesis) -> bool:
     """Whether it is a law of a residual force, and no cause."""
     return hypothesis.name.startswith(f"{RESIDUAL}.")
+
+
+def doubted(found: Found, progress: Progress = lambda _: None) -> Found:
+    """A search with its causes, or without where one law does clearly more: something that nobody asked about.
+
+    What is not in the catalogue may be done in part by what is: a stiff patch by a wider grip.
+    """
+    if not found.causes:
+        return found
+    start, setting = found.start, found.setting
+    laws = fit(start.model, setting, start.model.others(TERMS), 0, progress, start.noise, start.evidence)
+    return instead(found, laws, TRIED, progress)
 
 
 def learn_residual(found: Fitted, setting: Setting, progress: Progress = lambda _: None) -> Residual:

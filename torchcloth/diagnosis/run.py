@@ -16,16 +16,17 @@ from ..errors import InvalidInput
 from ..identification.saved import mark
 from ..recordings import Recording
 from .base_model import base_model, together
-from .evidence import Progress, Setting, motions_of, setting_of, staged
+from .evidence import Progress, motions_of, setting_of, staged
 from .gate import check, each_once
 from .hypotheses import catalogue
 from .keeping import kept_in
+from .lacking import lack_of_fit
 from .missing import missing_force
 from .model_file import save_model
 from .next_experiment import propose
 from .report import write_report
-from .residual import learn_residual
-from .stepwise import search
+from .residual import doubted, learn_residual
+from .stepwise import Found, search
 from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
 
@@ -84,12 +85,11 @@ def diagnose(
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     with _one_thread_each():
-        answer = judge(search(model, setting, asked, progress), setting.names)
+        found = doubted(search(model, setting, asked, progress), staged(progress, "laws without a cause"))
+        answer = _judged(found, progress)
         following = None
         if answer.verdict in OPEN:
-            following = propose(answer.found, answer.content, setting, staged(progress, "next experiment"))
-        if any(row["lacking"] for row in answer.content["lack_of_fit"]):
-            answer = _beyond(answer, answer.found.setting, progress)
+            following = propose(found, answer.content, setting, staged(progress, "next experiment"))
     files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
     return replace(answer, content=answer.content | files | {"next_experiment": following})
 
@@ -105,12 +105,15 @@ def _one_thread_each() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _beyond(answer: Diagnosis, setting: Setting, progress: Progress) -> Diagnosis:
+def _judged(found: Found, progress: Progress) -> Diagnosis:
     """With what can be said of what no known cause explains."""
-    missing = missing_force(answer.found.end, setting, progress=progress)
-    residual = learn_residual(answer.found.end, setting, progress)
-    content = answer.content | {"missing_force": missing.as_dict(), "residual": residual.as_dict()}
-    return replace(answer, content=content, missing=missing, residual=residual)
+    left = lack_of_fit(found.end, found.setting.names)
+    lacking, stable = any(row.lacking for row in left), all(row.stable for row in left)
+    missing = missing_force(found.end, found.setting, progress=progress) if lacking else None
+    # laws tell of more than what is left: they know what it would look like
+    learned = lacking or (stable and not found.causes)
+    residual = learn_residual(found.end, found.setting, progress) if learned else None
+    return judge(found, found.setting.names, missing, residual)
 
 
 def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Path:

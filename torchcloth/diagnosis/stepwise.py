@@ -24,6 +24,7 @@ TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 2  # steps of the likelier ones among them
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
 HARDLY = 0.2  # of what the better of two models gains, in density and squares, that two engines may differ by
+VERY_MUCH = 25.0  # log density; nulls' causes that ask for too little to show reach 16, and 27 once
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
@@ -84,6 +85,7 @@ class Found:
     sensor: float  # m, of a cell: noise and slow errors
     repeats: Repeats | None  # None: no episode repeats another
     setting: Setting  # without the cells that jump between shapes
+    withdrawn: tuple[str, ...] = ()  # causes that were accepted, and that a law without a cause does more than
 
     @property
     def causes(self) -> list[Step]:
@@ -141,6 +143,28 @@ def extend(
     """As ``search``, from a fit that was asked about the hypotheses; each step fits the ``tried`` likeliest anew."""
     current, steps = _chain(start, setting, hypotheses, progress, tried)
     return _found(start, current, steps, setting)
+
+
+def instead(found: Found, laws: Fitted, tried: int, progress: Progress = lambda _: None) -> Found:
+    """The same without its causes where one of the laws alone does clearly more than all of them together.
+
+    Args:
+        found: a search with causes.
+        laws: where it started, asked about laws that are no causes.
+        tried: of them that are fitted anew.
+        progress: called with one line for each episode that is simulated.
+    """
+    screened, names = screen(laws), found.setting.names
+    step = _step(laws, found.setting, _begun(laws, screened, tried), screened, progress)
+    if step is None or found.whole is None:
+        return found
+    alone = {name for s in found.steps for name in s.best.alone}
+    law = renoised(step.best.fitted, found.end.noise, found.end.evidence)
+    over = compare(predict(found.end, names, alone), predict(law, names, alone), 0.0)
+    if over.ci95[0] < 0 or over.density < HALF * found.whole.density:
+        return found
+    withdrawn = tuple(s.best.hypothesis.name for s in found.causes)
+    return replace(_found(found.start, found.start, [], found.setting), withdrawn=withdrawn)
 
 
 def _chain(
@@ -205,10 +229,11 @@ def _likely(screened: Sequence[Row]) -> list[Row]:
     """What is present by slopes, or asks for so much that it would show and would matter or gain much.
 
     A typical amplitude need not show then. And a large effect bends the fitted parameters so far that slopes
-    there ask for less of it than there is.
+    there ask for less of it than there is; so what gains very much is fitted, however little it asks for.
     """
-    asks = lambda r: r.shows and abs(r.reached) < PLAUSIBLE * abs(r.hypothesis.typical)  # noqa: E731
-    likely = [r for r in screened if r.decision == "present" or (asks(r) and (r.worth > MUCH or r.excess > PRESENT))]
+    asks = lambda r: r.worth > VERY_MUCH or (r.shows and (r.worth > MUCH or r.excess > PRESENT))  # noqa: E731
+    sane = lambda r: abs(r.reached) < PLAUSIBLE * abs(r.hypothesis.typical)  # noqa: E731
+    likely = [r for r in screened if r.decision == "present" or (asks(r) and sane(r))]
     return sorted(likely, key=lambda r: -r.worth)
 
 

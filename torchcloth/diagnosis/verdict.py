@@ -39,7 +39,7 @@ class Diagnosis:
         content: all of it, as diagnosis.json has it.
         searched: the search; None of invalid data.
         missing: the force that is missing, where the fit is lacking.
-        residual: a force that was learned for what stays unexplained.
+        residual: laws of a force that were learned, where the fit is lacking or no cause is named.
     """
 
     verdict: Verdict
@@ -69,15 +69,18 @@ class Diagnosis:
         return "\n".join(_sentences(self.verdict, self.content))
 
 
-def judge(found: Found, names: Sequence[str]) -> Diagnosis:
-    """The answer of a search over episodes with these motions."""
+def judge(
+    found: Found, names: Sequence[str], missing: MissingForce | None = None, residual: Residual | None = None
+) -> Diagnosis:
+    """The answer of a search over episodes with these motions, and of what was learned beyond it."""
     causes = [_cause(found, step, names) for step in found.causes]
     minor = [_minor(found, step) for step in found.minor]
     told = {name for m in minor for name in (m["effect"], *(r["effect"] for r in m["rivals"]))}
     told |= {name for c in causes for name in (*c["class"], *(r["effect"] for r in c["rivals"]))}
     rows = [r for r in found.screened if r.hypothesis.name not in told]
     left, drifting = lack_of_fit(found.end, names), drifts(found.end)
-    lacking = any(row.lacking for row in (*left, *drifting))
+    learned = residual is not None and bool(residual.found.causes)
+    lacking = learned or any(row.lacking for row in (*left, *drifting))
     doubtful = [r["effect"] for m in minor for r in m["rivals"]]
     stable = all(row.stable for row in left)
     verdict = _verdict(found, causes, lacking, stable, bool(doubtful or found.end.model.strained))
@@ -97,14 +100,14 @@ def judge(found: Found, names: Sequence[str]) -> Diagnosis:
         "floor": _floor(found),
         "lack_of_fit": [row.as_dict() for row in left],
         "drifts": [row.as_dict() for row in drifting],
-        "missing_force": None,
-        "residual": None,
+        "missing_force": None if missing is None else missing.as_dict(),
+        "residual": None if residual is None else residual.as_dict(),
         "next_experiment": None,
         "parameters": _parameters(found, names),
         "warnings": _warnings(found, names, left),
         "motions": list(names),
     }
-    return Diagnosis(verdict, content, found)
+    return Diagnosis(verdict, content, found, missing, residual)
 
 
 def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
@@ -218,6 +221,8 @@ def _warnings(found: Found, names: Sequence[str], left: Sequence[Left]) -> list[
         out.append(
             "the data sheet says no bending stiffness: the model's cloth has none, and nothing is asked about it"
         )
+    if found.withdrawn:
+        out.append(f"one local law predicts much better than {', '.join(found.withdrawn)}: withdrawn")
     if found.left_out:
         out.append(f"{100 * found.left_out:.1f} % of the cells jump between shapes of the cloth and are left out")
     folded = sorted({row.motion for row in left if not row.stable})
@@ -313,10 +318,8 @@ def _lacking(content: dict[str, Any]) -> list[str]:
         "recorded as long, would tell."
         for d in drifting
     ]
-    if not rows:
-        return told
     seen = ", ".join(f"{r['kind']} of {r['motion']} ({r['ratio']:.1f} times what is expected)" for r in rows)
-    out = [*told, f"Lacking: {seen}."]
+    out = [*told, *([f"Lacking: {seen}."] if rows else [])]
     missing = content["missing_force"] or {"motions": []}
     for m in (m for m in missing["motions"] if m["sure"]):
         where = ", ".join(f"{1e3 * c:.0f}" for c in m["at"])

@@ -1,0 +1,58 @@
+"""Causes that stand in for what nobody asked about are withdrawn, where one law does clearly more."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import linear_toys as toys
+import pytest
+import torch
+
+from torchcloth.diagnosis import stepwise
+from torchcloth.diagnosis.comparison import compare, predict
+from torchcloth.diagnosis.fitting import renoised
+from torchcloth.diagnosis.stepwise import instead
+
+SLOPES = toys.smooth(1, 5)  # two parameters, a cause, a law, a nuisance
+NAMES = [f"motion {k}" for k in range(toys.EPISODES)]
+
+
+def models(cause, law):
+    """(start, end with the cause, with the law) of a world in which both have these amplitudes."""
+    every = toys.evidence(SLOPES, 4, [], torch.tensor([0.0, 0.0, cause, law]).double(), 0)
+
+    def model(*columns):
+        cells = [c._replace(jacobian=c.jacobian[:, [*columns, 4]]) for c in every.cells]
+        return toys.fitted(replace(every, cells=cells, own=len(columns)), std=5.0)
+
+    return model(0, 1), model(0, 1, 2), model(0, 1, 3)
+
+
+def doubted(monkeypatch, cause, law, useful=True):
+    start, end, other = models(cause, law)
+    best = SimpleNamespace(fitted=other, alone=set(), hypothesis=toys.hypothesis("a"))
+    own = SimpleNamespace(best=SimpleNamespace(alone=set(), hypothesis=toys.hypothesis("c")))
+    monkeypatch.setattr(stepwise, "_step", lambda *_: SimpleNamespace(best=best) if useful else None)
+    first = predict(renoised(start, end.noise, end.evidence), NAMES)
+    whole = compare(first, predict(end, NAMES), 0.0)
+    setting = SimpleNamespace(names=NAMES, recordings=(), episodes=())
+    found = SimpleNamespace(start=start, end=end, steps=[own], causes=[own], whole=whole, setting=setting)
+    return found, instead(found, start, 2)  # type: ignore[arg-type]
+
+
+def test_a_cause_that_only_stands_in_is_withdrawn(monkeypatch):
+    found, after = doubted(monkeypatch, cause=0.3, law=1.0)
+    assert found.whole.density > 0  # it was of use
+    assert after.withdrawn == ("c",)
+    assert after.steps == []
+    assert after.end is found.start
+
+
+@pytest.mark.parametrize(("cause", "law"), [(1.0, 0.0), (1.0, 0.3)])
+def test_a_cause_that_does_as_much_stays(monkeypatch, cause, law):
+    found, after = doubted(monkeypatch, cause, law)
+    assert after is found
+
+
+def test_a_cause_stays_where_no_law_is_of_use(monkeypatch):
+    found, after = doubted(monkeypatch, cause=0.3, law=1.0, useful=False)
+    assert after is found
