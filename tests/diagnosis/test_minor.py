@@ -6,7 +6,7 @@ import linear_toys as toys
 import pytest
 
 from torchcloth.diagnosis.stepwise import MATTERS
-from torchcloth.diagnosis.verdict import _minor, _sentences, _verdict
+from torchcloth.diagnosis.verdict import _minor, _verdict
 
 
 def candidate(name, typical, amplitude):
@@ -28,14 +28,3 @@ def test_rivals_that_would_matter_are_said_and_no_others():
 def test_what_may_matter_is_not_called_adequate(doubtful):
     told = _verdict(SimpleNamespace(screened=[]), [], lacking=False, stable=True, doubtful=doubtful)
     assert told == ("inconclusive" if doubtful else "adequate")
-
-
-def test_the_summary_says_what_it_cannot_be_told_from():
-    minor = [small(candidate("obs.depth_bias", 5e-3, -2.5e-3)), small()]
-    keys = ("causes", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "drifts", "warnings")
-    lists = {key: [] for key in keys}
-    said = _sentences(
-        "inconclusive", {**lists, **dict.fromkeys(("gain", "also_unexplained", "next_experiment")), "minor": minor}
-    )
-    assert sum("which would matter" in line for line in said) == 1
-    assert any("obs.depth_bias = -0.0025 " in line for line in said)

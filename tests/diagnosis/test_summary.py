@@ -1,0 +1,37 @@
+"""What a diagnosis says in words."""
+
+from torchcloth.diagnosis.verdict import _sentences
+
+LISTS = ("causes", "minor", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "drifts", "warnings")
+NONE = ("gain", "missing_force", "residual", "next_experiment")
+
+
+def summary(verdict, **content):
+    """With nothing else found."""
+    blank = {key: [] for key in LISTS} | dict.fromkeys(NONE) | {"also_unexplained": False}
+    return _sentences(verdict, blank | content)
+
+
+def test_what_is_minor_is_said_with_what_it_cannot_be_told_from():
+    scale = {"effect": "obs.depth_scale", "amplitude": -0.002, "unit": "-", "rivals": []}
+    bias = {"effect": "obs.depth_bias", "amplitude": -2.5e-3, "unit": "m"}
+    said = summary("inconclusive", minor=[scale | {"rivals": [bias]}, scale])
+    assert sum("which would matter" in line for line in said) == 1
+    assert any("obs.depth_bias = -0.0025 m" in line for line in said)
+
+
+def test_drifts_are_told_with_what_would_tell_more():
+    x = {"axis": "x", "rate": 0.001, "std": 0.004, "p": 1.0, "lacking": False}
+    z = {"axis": "z", "rate": -0.0196, "std": 0.0041, "p": 6e-6, "lacking": True}
+    (line,) = (line for line in summary("unexplained", drifts=[x, z]) if "drift" in line)
+    assert line.startswith("Forces along z drift from the simulation's by -20 mN/s (standard error 4)")
+    assert "Empty grippers" in line
+
+
+def test_a_law_is_told_though_nothing_else_is_lacking():
+    term = {"law": "bend@inside", "coefficient": 2.6e-4, "unit": "N m", "told": "opposes bending, far from the edges"}
+    gain = {"rms_before": 1.28e-3, "rms_after": 0.71e-3, "unit": "m"}
+    said = summary("unexplained", residual={"terms": [term], "path": [], "gain": gain})
+    assert any("opposes bending, far from the edges (0.00026 N m)" in line for line in said)
+    assert any("1.28 to 0.71 mm" in line for line in said)
+    assert not any(line.startswith("Lacking") for line in said)
