@@ -25,6 +25,7 @@ from .world import Hypothesis, Model, World
 
 RESIDUAL = "residual"
 TRIED = 2  # laws that are fitted at each step
+NEARLY_ALL = 0.9  # of what can be explained, beyond which no law does clearly more
 FITTED = ("mass", "bend")  # everywhere alike they are parameters of the base model
 
 
@@ -102,7 +103,7 @@ def doubted(found: Found, progress: Progress = lambda _: None) -> Found:
 
     What is not in the catalogue may be done in part by what is: a stiff patch by a wider grip.
     """
-    if not found.causes:
+    if not found.causes or found.whole is None or found.whole.explained > NEARLY_ALL:
         return found
     start, setting = found.start, found.setting
     laws = fit(start.model, setting, start.model.others(TERMS), 0, progress, start.noise, start.evidence)

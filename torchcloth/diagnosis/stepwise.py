@@ -154,14 +154,17 @@ def instead(found: Found, laws: Fitted, tried: int, progress: Progress = lambda 
         tried: of them that are fitted anew.
         progress: called with one line for each episode that is simulated.
     """
-    screened, names = screen(laws), found.setting.names
-    step = _step(laws, found.setting, _begun(laws, screened, tried), screened, progress)
-    if step is None or found.whole is None:
+    if found.whole is None:
+        return found
+    screened, names, gained = screen(laws), found.setting.names, found.whole.density
+    promising = [row for row in screened if row.worth > gained]
+    step = _step(laws, found.setting, _begun(laws, promising, tried), screened, progress)
+    if step is None:
         return found
     alone = {name for s in found.steps for name in s.best.alone}
     law = renoised(step.best.fitted, found.end.noise, found.end.evidence)
     over = compare(predict(found.end, names, alone), predict(law, names, alone), 0.0)
-    if over.ci95[0] < 0 or over.density < HALF * found.whole.density:
+    if over.ci95[0] < 0 or over.density < HALF * gained:
         return found
     withdrawn = tuple(s.best.hypothesis.name for s in found.causes)
     return replace(_found(found.start, found.start, [], found.setting), withdrawn=withdrawn)
