@@ -44,27 +44,29 @@ class Drift(NamedTuple):
 
 def drifts(found: Fitted) -> list[Drift]:
     """One for each axis; none where fewer than three episodes have forces."""
+    later = lambda c: bool(((c.block == SEEN) & (c.time > c.time.min())).any())  # noqa: E731
+    every = [_rates(found, k) for k, cells in enumerate(found.evidence.cells) if later(cells)]
+    if len(every) < FEWEST:
+        return []
+    rates, variances = (torch.stack(column) for column in zip(*every, strict=True))
     rows = []
-    for number, axis in enumerate(AXES):
-        each = torch.tensor([one for k in range(len(found.evidence.cells)) if (one := _rate(found, k, number))])
-        if len(each) >= FEWEST:
-            rate, std = _pooled(*each.double().unbind(1))
-            chance = float(torch.special.erfc(torch.tensor(abs(rate) / std / 2**0.5)))
-            rows.append(Drift(axis, rate, std, min(1.0, len(AXES) * chance)))
+    for axis, rate, variance in zip(AXES, rates.mT, variances.mT, strict=True):
+        mean, std = _pooled(rate, variance)
+        chance = float(torch.special.erfc(torch.tensor(abs(mean) / std / 2**0.5)))
+        rows.append(Drift(axis, mean, std, min(1.0, len(AXES) * chance)))
     return rows
 
 
-def _rate(found: Fitted, k: int, axis: int) -> tuple[float, float] | None:
-    """(rate, variance) of one episode, if its forces were measured."""
+def _rates(found: Fitted, k: int) -> tuple[Tensor, Tensor]:
+    """(rates, variances) [axes] of one episode with forces in more than one window."""
     cells = found.evidence.cells[k]
-    here = (cells.block == SEEN) & (cells.patch % 3 == axis)
-    since = torch.where(here, cells.time - cells.time.min(), 0.0)
-    if not since.any():
-        return None
+    axis = torch.arange(len(AXES))
+    here = (cells.block == SEEN)[:, None] & (cells.patch[:, None] % 3 == axis)
+    since = torch.where(here, (cells.time - cells.time.min())[:, None], 0.0)
     still, moved = right(found, k)
     weighed = torch.linalg.solve(still + moved @ moved.mT, since)
-    variance = 1 / (weighed @ since)
-    return float(variance * (weighed @ cells.value)), float(variance)
+    variance = 1 / (weighed * since).sum(0)
+    return variance * (weighed.mT @ cells.value), variance
 
 
 def _pooled(rate: Tensor, variance: Tensor) -> tuple[float, float]:

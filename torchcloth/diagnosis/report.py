@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,28 +93,35 @@ def _table(rows: list[Row]) -> str:
     return f"<p>{DECISIONS}</p><table><tr>{heads}</tr>{''.join(f'<tr>{row}</tr>' for row in body)}</table>"
 
 
+def _ruled(head: Sequence[str], rows: Iterable[tuple[Sequence[str], bool]]) -> str:
+    """A table of cells; rows that are marked stand in bold."""
+    body = ""
+    for cells, bold in rows:
+        tag = "th" if bold else "td"
+        body += f"<tr>{''.join(f'<{tag}>{html.escape(c)}</{tag}>' for c in cells)}</tr>"
+    return f"<table><tr>{''.join(f'<th>{h}</th>' for h in head)}</tr>{body}</table>"
+
+
 def _left(rows: list[dict[str, Any]]) -> str:
     """What remains, by motion and kind of data, beside what a right model would leave; lacking rows in bold."""
-    body = ""
-    for r in rows:
+
+    def told(r: dict[str, Any]) -> list[str]:
         scale, unit = {"m": (1e3, "mm"), "N": (1e3, "mN"), "N m": (1e3, "mN m")}[r["unit"]]
         numbers = [f"{scale * r[key]:.2f}" for key in ("left", "expected", "numerics")]
-        cells = [r["motion"], r["kind"], *numbers, unit, f"{r['ratio']:.2f}", f"{r['p']:.2g}"]
-        tag = "th" if r["lacking"] else "td"
-        body += f"<tr>{''.join(f'<{tag}>{html.escape(c)}</{tag}>' for c in cells)}</tr>"
+        return [r["motion"], r["kind"], *numbers, unit, f"{r['ratio']:.2f}", f"{r['p']:.2g}"]
+
     head = ("motion", "data", "left", "a right model leaves", "of which numerics", "", "ratio", "chance")
-    return f"<table><tr>{''.join(f'<th>{h}</th>' for h in head)}</tr>{body}</table>"
+    return _ruled(head, ((told(r), r["lacking"]) for r in rows))
 
 
 def _drifts(rows: list[dict[str, Any]]) -> str:
     """What forces drift by in all motions alike; lacking rows in bold."""
-    body = ""
-    for r in rows:
-        cells = [f"force, {r['axis']}", f"{1e3 * r['rate']:.1f}", f"{1e3 * r['std']:.1f}", "mN/s", f"{r['p']:.2g}"]
-        tag = "th" if r["lacking"] else "td"
-        body += f"<tr>{''.join(f'<{tag}>{c}</{tag}>' for c in cells)}</tr>"
+
+    def told(r: dict[str, Any]) -> list[str]:
+        return [f"force, {r['axis']}", f"{1e3 * r['rate']:.1f}", f"{1e3 * r['std']:.1f}", "mN/s", f"{r['p']:.2g}"]
+
     head = ("in all motions alike", "grows by", "std. error", "", "chance")
-    return f"<table><tr>{''.join(f'<th>{h}</th>' for h in head)}</tr>{body}</table>" if rows else ""
+    return _ruled(head, ((told(r), r["lacking"]) for r in rows)) if rows else ""
 
 
 def _missing(answer: Diagnosis) -> list[str]:
@@ -133,16 +141,13 @@ def _learned(found: dict[str, Any] | None) -> list[str]:
     title = "<h2>Laws without a cause</h2>"
     if not found["terms"]:
         return [title, "<p>No local law was found that would predict motions held out better.</p>"]
-    gain, body = found["gain"], ""
-    for t in found["terms"]:
-        cells = [t["law"], f"{t['coefficient']:.3g}", t["unit"], t["told"]]
-        body += f"<tr>{''.join(f'<td>{html.escape(c)}</td>' for c in cells)}</tr>"
-    head = "".join(f"<th>{h}</th>" for h in ("law", "coefficient", "unit", "what it does"))
+    gain, head = found["gain"], ("law", "coefficient", "unit", "what it does")
+    terms = (([t["law"], f"{t['coefficient']:.3g}", t["unit"], t["told"]], False) for t in found["terms"])
     return [
         title,
         f"<p>Local laws that were learned: {1e3 * gain['rms_before']:.2f} to {1e3 * gain['rms_after']:.2f} mm "
         "on motions held out. They are part of the extended model and can be left out.</p>",
-        f"<table><tr>{head}</tr>{body}</table>",
+        _ruled(head, terms),
     ]
 
 
