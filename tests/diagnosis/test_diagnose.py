@@ -11,6 +11,7 @@ from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, search, setting_of, write_diagnosis
 from torchcloth.diagnosis.pictures import residual_maps
+from torchcloth.diagnosis.verdict import judge
 from torchcloth.errors import InvalidInput
 
 ASKED = ("air.drag_n", "air.linear", "mass.hem", "rest.shrink[weft]", "obs.extrinsic[y]")
@@ -97,6 +98,8 @@ def test_where_nothing_is_hidden_nothing_is_named():
     assert answer.content["causes"] == []
     assert answer.verdict in ("adequate", "inconclusive")
     assert answer.content["gain"] is None
+    withdrawn = replace(answer.found, withdrawn=("air.drag_n",))  # a law did more, and then did not hold
+    assert judge(withdrawn, withdrawn.setting.names).verdict == "unexplained"
 
 
 def test_one_motion_is_refused(tmp_path, capsys):

@@ -80,7 +80,7 @@ def judge(
     rows = [r for r in found.screened if r.hypothesis.name not in told]
     left, drifting = lack_of_fit(found.end, names), drifts(found.end)
     learned = residual is not None and bool(residual.found.causes)
-    lacking = learned or any(row.lacking for row in (*left, *drifting))
+    lacking = learned or bool(found.withdrawn) or any(row.lacking for row in (*left, *drifting))
     doubtful = [r["effect"] for m in minor for r in m["rivals"]]
     stable = all(row.stable for row in left)
     verdict = _verdict(found, causes, lacking, stable, bool(doubtful or found.end.model.strained))
