@@ -9,7 +9,7 @@ import torch
 from scipy.stats import t
 
 from torchcloth.diagnosis.comparison import Gain, spread
-from torchcloth.diagnosis.stepwise import NORMAL, SURE, SURE_OF_BEST, TRIED, Candidate, _known, _ranked, standard_errors
+from torchcloth.diagnosis.trials import NORMAL, SURE, SURE_OF_BEST, TRIED, Candidate, _ranked, known, standard_errors
 from torchcloth.diagnosis.verdict import _parameters
 from torchcloth.diagnosis.world import Model
 
@@ -51,15 +51,15 @@ def test_of_those_that_predict_alike_the_one_that_mends_most_comes_first():
     assert _ranked([]) == []
 
 
-@pytest.mark.parametrize(("asked", "known"), [(0.1, True), (-0.5, False)])
-def test_motions_that_all_take_a_cause_away_do_not_agree_that_it_is_there(asked, known):
+@pytest.mark.parametrize(("asked", "agreed"), [(0.1, True), (-0.5, False)])
+def test_motions_that_all_take_a_cause_away_do_not_agree_that_it_is_there(asked, agreed):
     """At zero, where an amplitude without a sign ends, they differ by nothing at all."""
     ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.tensor([0.0, asked]).double(), 0)
     there = toys.fitted(ev)
     cause = replace(toys.hypothesis("cause"), signed=False)
     model = Model(None, there.model.parameters[:1], torch.zeros(1).double(), (cause,), (0.3,))  # type: ignore[arg-type]
     tried = Candidate(None, replace(there, model=model), None, None, set(), 2.57)  # type: ignore[arg-type]
-    assert _known(tried.fitted, "cause", list("abcd"), tried) == known
+    assert known(tried.fitted, "cause", list("abcd"), tried) == agreed
 
 
 def test_a_numbers_interval_knows_of_what_motions_disagree_by():

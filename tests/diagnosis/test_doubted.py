@@ -31,7 +31,7 @@ def doubted(monkeypatch, cause, law, useful=True):
     start, end, other = models(cause, law)
     best = SimpleNamespace(fitted=other, alone=set(), hypothesis=toys.hypothesis("a"))
     own = SimpleNamespace(best=SimpleNamespace(alone=set(), hypothesis=toys.hypothesis("c")))
-    monkeypatch.setattr(stepwise, "_step", lambda *_: SimpleNamespace(best=best) if useful else None)
+    monkeypatch.setattr(stepwise, "one_step", lambda *_: SimpleNamespace(best=best) if useful else None)
     first = predict(renoised(start, end.noise, end.evidence), NAMES)
     whole = compare(first, predict(end, NAMES), 0.0)
     setting = SimpleNamespace(names=NAMES, recordings=(), episodes=())

@@ -12,7 +12,7 @@ from torchcloth.diagnosis.comparison import compare, predict, spread
 from torchcloth.diagnosis.fitting import step_of
 from torchcloth.diagnosis.noise import ROUGH, Noise, fit_noise, floor_of, whitened
 from torchcloth.diagnosis.screening import Row, _decided, screen
-from torchcloth.diagnosis.verdict import _is_too_large, _too_large
+from torchcloth.diagnosis.wording import _is_too_large, _too_large
 
 NAMES = ["a", "b", "c"]
 SLOPES = toys.smooth(1, 6)  # two parameters, three hypotheses, one nuisance

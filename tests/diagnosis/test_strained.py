@@ -9,6 +9,7 @@ import torch
 
 from torchcloth.diagnosis import afresh, stepwise
 from torchcloth.diagnosis.afresh import resettled
+from torchcloth.diagnosis.trials import Candidate, Step
 from torchcloth.diagnosis.world import OFTEN
 from torchcloth.errors import SimulationDiverged
 
@@ -52,13 +53,13 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     """The first step ends strained; the second sees the causes of both fits, or those of the new one alone."""
     strained, anew = found(OFTEN + 1), found(0.2)
     looked, row = [], SimpleNamespace(hypothesis=CAUSE)
-    first = stepwise.Step(stepwise.Candidate(row, strained, None, None, set(), 0.0), None, [], [], [], strained)  # type: ignore[arg-type]
+    first = Step(Candidate(row, strained, None, None, set(), 0.0), None, [], [], [], strained)  # type: ignore[arg-type]
     monkeypatch.setattr(stepwise, "resettled", lambda *_: anew)
     monkeypatch.setattr(stepwise, "fit", lambda *_, **__: strained)
     monkeypatch.setattr(stepwise, "_predicts", lambda *_: 1.0 if better else -1.0)
     monkeypatch.setattr(stepwise, "screen", lambda f: [f])
-    monkeypatch.setattr(stepwise, "_begun", lambda f, screened, tried: [(row, f.model)])
-    monkeypatch.setattr(stepwise, "_step", lambda current, setting, begun, *_: looked.append((current, begun)))
+    monkeypatch.setattr(stepwise, "begun_with", lambda f, screened, tried: [(row, f.model)])
+    monkeypatch.setattr(stepwise, "one_step", lambda current, setting, begun, *_: looked.append((current, begun)))
     monkeypatch.setattr(stepwise, "_pruned", lambda current, steps, *_: (current, steps))
     monkeypatch.setattr(stepwise, "_beside_the_point", lambda *_: False)
     end, _ = stepwise._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]

@@ -1,6 +1,6 @@
 """What a diagnosis says in words."""
 
-from torchcloth.diagnosis.verdict import _sentences
+from torchcloth.diagnosis.wording import sentences
 
 LISTS = ("causes", "minor", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "drifts", "warnings")
 NONE = ("gain", "missing_force", "residual", "next_experiment")
@@ -9,7 +9,7 @@ NONE = ("gain", "missing_force", "residual", "next_experiment")
 def summary(verdict, **content):
     """With nothing else found."""
     blank = {key: [] for key in LISTS} | dict.fromkeys(NONE) | {"also_unexplained": False}
-    return _sentences(verdict, blank | content)
+    return sentences(verdict, blank | content)
 
 
 def test_what_is_minor_is_said_with_what_it_cannot_be_told_from():

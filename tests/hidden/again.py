@@ -19,9 +19,9 @@ import torch
 from drawn import DEVELOPMENT, REDUCED, SMALL, case
 
 from torchcloth import diagnosis, recordings
-from torchcloth.diagnosis import stepwise
+from torchcloth.diagnosis import trials
 from torchcloth.diagnosis.comparison import spread
-from torchcloth.diagnosis.stepwise import Candidate
+from torchcloth.diagnosis.trials import Candidate
 
 
 def said(c: Candidate, names: list[str]) -> str:
@@ -54,14 +54,14 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     episodes = [recordings.read(path) for path in sorted((folder / "episodes").iterdir())]
     journal = folder / "journal"
-    usual = stepwise._compared
+    usual = trials._compared
 
     def compared(current, fits, names, *how):
         found = usual(current, fits, names, *how)
         print("tried:", *(said(c, names) for c in found), sep="\n", flush=True)
         return found
 
-    stepwise._compared = compared
+    trials._compared = compared
     answer = diagnosis.diagnose(episodes, journal=journal, resume=journal.exists())
     model, std = answer.model, answer.found.end.covariance.diagonal().sqrt()
     for p, c, s in zip(model.parameters, model.values.tolist(), std.tolist(), strict=False):

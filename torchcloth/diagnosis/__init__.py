@@ -1,7 +1,7 @@
 """What a simulation gets wrong, why, and what mending it gains.
 
 ``diagnose`` runs all stages; each can be called alone: ``base_model``, ``setting_of``, ``gather``, ``fit_noise``,
-``fit``, ``screen``, ``predict``, ``compare``, ``search``, ``judge``. Read ``stepwise.py`` first.
+``fit``, ``screen``, ``predict``, ``compare``, ``search``, ``judge``. Read ``stepwise.py`` and ``trials.py`` first.
 """
 
 from .base_model import base_model

@@ -14,17 +14,16 @@ from .classes import alike
 from .comparison import Gain, spread
 from .drifting import drifts
 from .gate import Fault
-from .glossary import GLOSSARY
-from .lacking import Left, lack_of_fit
+from .lacking import lack_of_fit
 from .missing import MissingForce
 from .residual import Residual
-from .screening import MUCH, Row
-from .stepwise import PLAUSIBLE, Candidate, Found, Step, matters
+from .stepwise import Found, matters
+from .trials import Candidate, Step
+from .wording import sentences, warnings_of
 from .world import Model
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 NORMAL = 1.96
-NEARLY = 0.9  # of the largest amplitude that is believed: fits end a little beyond what slopes ask for
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +65,7 @@ class Diagnosis:
 
     def summary(self) -> str:
         """Plain language."""
-        return "\n".join(_sentences(self.verdict, self.content))
+        return "\n".join(sentences(self.verdict, self.content))
 
 
 def judge(
@@ -104,7 +103,7 @@ def judge(
         "residual": None if residual is None else residual.as_dict(),
         "next_experiment": None,
         "parameters": _parameters(found, names),
-        "warnings": _warnings(found, names, left),
+        "warnings": warnings_of(found, names, left),
         "motions": list(names),
     }
     return Diagnosis(verdict, content, found, missing, residual)
@@ -210,132 +209,5 @@ def _parameters(found: Found, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _warnings(found: Found, names: Sequence[str], left: Sequence[Left]) -> list[str]:
-    out = [
-        f"{p.name} is {far:.1f} standard deviations from its data sheet: it does another's job"
-        for p, far in found.end.model.strained
-    ]
-    if found.repeats is None:
-        out.append("floor: sensor only; no episode repeats another, so what repetitions differ by is not known")
-    if "bending" not in found.start.model.base.cloth.effects:
-        out.append(
-            "the data sheet says no bending stiffness: the model's cloth has none, and nothing is asked about it"
-        )
-    if found.withdrawn:
-        out.append(f"one local law predicts much better than {', '.join(found.withdrawn)}: withdrawn")
-    if found.left_out:
-        out.append(f"{100 * found.left_out:.1f} % of the cells jump between shapes of the cloth and are left out")
-    folded = sorted({row.motion for row in left if not row.stable})
-    if folded:
-        out.append(f"the cloth folds in another way on another mesh in {', '.join(folded)}: no judgement there")
-    if not found.causes and any(row.lacking for row in left):
-        out += [_too_large(row) for row in found.screened if _is_too_large(row)][:1]
-    if len(set(names)) < 3:
-        out.append(f"{len(set(names))} kind(s) of motion: many causes look alike in them")
-    if len(names) < 8:
-        out.append(f"{len(names)} episodes show little of their own spread: intervals of the gain are doubled")
-    return out
-
-
-def _is_too_large(row: Row) -> bool:
-    """It would mend much, if it were believed."""
-    asked = max(abs(row.amplitude), abs(row.reached))
-    return row.shows and row.worth > MUCH and asked > NEARLY * PLAUSIBLE * abs(row.hypothesis.typical)
-
-
-def _too_large(row: Row) -> str:
-    h = row.hypothesis
-    return (
-        f"{h.name} asks for {row.amplitude:.2g} {h.unit}, and more than {abs(PLAUSIBLE * h.typical):.2g} is not "
-        "believed: where that may be so, register a cause with a larger typical amplitude"
-    )
-
-
 def _finite(value: float) -> float | None:
     return value if value < float("inf") else None
-
-
-def _sentences(verdict: Verdict, content: dict[str, Any]) -> list[str]:
-    gain, out = content["gain"], []
-    if gain:
-        out.append(
-            f"On motions held out the simulation is {1e3 * gain['rms_before']:.2f} mm RMS off, "
-            f"{1e3 * gain['rms_after']:.2f} mm with the causes below; {1e3 * gain['floor']:.2f} mm would be expected "
-            f"({content['floor']['source']})."
-        )
-    for c in content["causes"]:
-        low, high = c["ci95"]
-        out.append(f"Cause: {c['effect']} = {c['amplitude']:.4g} {c['unit']} (95 %: {low:.4g} to {high:.4g}).")
-        others = [name for name in c["class"] if name != c["effect"]] + [r["effect"] for r in c["rivals"]]
-        out += [f"  {said}" for said in (GLOSSARY.get(c["effect"].partition("[")[0]),) if said]
-        if others:
-            out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
-    if content["causes"]:
-        out.append(
-            "These intervals know of noise, meshes and how far motions disagree, not of what is wrong in all alike."
-        )
-    words = {
-        "adequate": "No known cause is surely larger than what matters.",
-        "unexplained": "The fit is lacking, and no known cause mends it.",
-        "inconclusive": "Something may be wrong; these data cannot say what.",
-        "numerics": "Another mesh changes the motion by more than would be noticed of a cause: use a finer one.",
-        "invalid_data": "These episodes cannot be believed; nothing was simulated.",
-    }
-    if verdict in words:
-        out.append(words[verdict])
-    out += [f"{f['episode']}: {f['what']}. To do: {f['remedy']}." for f in content.get("faults", ())]
-    if content["also_unexplained"]:
-        out.append("Something beyond these causes remains unexplained.")
-    out += _lacking(content)
-    for label, key in (
-        ("Too small to matter, or of a sign that makes no sense", "ruled_out"),
-        ("Undecided", "undecided"),
-    ):
-        if content[key]:
-            out.append(f"{label}: {', '.join(content[key])}.")
-    if content["minor"]:
-        out.append(f"In the model, but too small to matter: {', '.join(map(_size, content['minor']))}.")
-    for m in content["minor"]:
-        if m["rivals"]:
-            out.append(f"  These data cannot tell it from {', '.join(map(_size, m['rivals']))}, which would matter.")
-    if content["unresolvable"]:
-        out.append(f"Cannot be seen in these data: {', '.join(r['effect'] for r in content['unresolvable'])}.")
-    if content["next_experiment"]:
-        out.append(f"Next experiment: {content['next_experiment']['why']}")
-    return [*out, *(f"Warning: {text}." for text in content["warnings"])]
-
-
-def _size(row: dict[str, Any]) -> str:
-    return f"{row['effect']} = {row['amplitude']:.4g} {row['unit']}"
-
-
-def _lacking(content: dict[str, Any]) -> list[str]:
-    """Where the fit is lacking, and what force would mend it."""
-    drifting, rows = ([row for row in content[key] if row["lacking"]] for key in ("drifts", "lack_of_fit"))
-    told = [
-        f"Forces along {d['axis']} drift from the simulation's by {1e3 * d['rate']:.0f} mN/s (standard error "
-        f"{1e3 * d['std']:.0f}) in all motions alike: cloth that gains or loses weight, or sensors. Empty grippers, "
-        "recorded as long, would tell."
-        for d in drifting
-    ]
-    seen = ", ".join(f"{r['kind']} of {r['motion']} ({r['ratio']:.1f} times what is expected)" for r in rows)
-    out = [*told, *([f"Lacking: {seen}."] if rows else [])]
-    missing = content["missing_force"] or {"motions": []}
-    for m in (m for m in missing["motions"] if m["sure"]):
-        where = ", ".join(f"{1e3 * c:.0f}" for c in m["at"])
-        size = sum(c * c for c in m["pressure"]) ** 0.5 / missing["weight"]
-        out.append(
-            f"  A force of {100 * size:.0f} % of the weight is missing in {m['motion']}, about "
-            f"({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
-        )
-    return out + _residual(content["residual"])
-
-
-def _residual(found: dict[str, Any] | None) -> list[str]:
-    """What a learned force does; no cause."""
-    if found is None or not found["terms"]:
-        return []
-    gain, terms = found["gain"], found["terms"]
-    told = "; ".join(f"{t['told']} ({abs(t['coefficient']):.2g} {t['unit']})" for t in terms)
-    before, after = 1e3 * gain["rms_before"], 1e3 * gain["rms_after"]
-    return [f"  A force that {told} would mend {before:.2f} to {after:.2f} mm on motions held out. It names no cause."]

@@ -1,0 +1,210 @@
+"""One step of the search: the likeliest causes are fitted anew and compared on motions held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+from .comparison import Gain, Predicted, compare, predict, spread, telling
+from .evidence import Evidence, Progress, Setting, staged
+from .fitting import IMPOSSIBLE, Fitted, fit, renoised, with_cause
+from .noise import Noise, fit_noise, unfitted
+from .placebo import Placebo, placebo
+from .screening import MUCH, PRESENT, Row
+from .world import Hypothesis, Model
+
+TRIED = 4  # hypotheses that are fitted at each step
+FURTHER = 2  # steps of the likelier ones among them
+HARDLY = 0.2  # of what the better of two models gains, in density and squares, that two engines may differ by
+VERY_MUCH = 25.0  # log density; nulls' causes that ask for too little to show reach 16, and 27 once
+CLEAR = 4.0  # log density below which two models predict alike
+PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
+MOSTLY = 1 / 3  # of what is wrong: least that all causes explain beside something else
+# standard errors between motions, from which they agree that there is something: 97.5 % of Student's t by one less than
+# there are motions; of the best of TRIED causes, with a fourth of that chance
+SURE = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26)
+SURE_OF_BEST = (50.92, 8.86, 5.39, 4.31, 3.81, 3.52, 3.34, 3.21, 3.11)
+NORMAL = 1.96  # the same of what mends most of all that is wrong
+WORTH_SHARE = 0.02  # of the mean square, that a cause that is worth naming mends, or
+WORTH_MM, WORTH_PULL = 3e-4, 5e-3  # m or N, RMS of what is gone from one episode
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A hypothesis that was fitted."""
+
+    row: Row  # as screened
+    fitted: Fitted
+    predicted: Predicted
+    gain: Gain  # over the model without it
+    alone: set[str]  # the motion that alone tells of it, if any
+    sure: float  # standard errors between motions that it must be away from zero
+
+    @property
+    def hypothesis(self) -> Hypothesis:
+        """What was added."""
+        return self.row.hypothesis
+
+    @property
+    def amplitude(self) -> float:
+        """Of what was added."""
+        return self.fitted.model.amplitudes[self.fitted.model.place(self.hypothesis.name)]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One accepted cause with what cannot be told from it."""
+
+    best: Candidate
+    placebo: Placebo  # that it passed
+    tried: list[Candidate]  # best among them
+    rivals: list[Candidate]
+    screened: list[Row]
+    before: Fitted  # the model without it, with slopes along everything that was asked about
+
+
+def _likely(screened: Sequence[Row]) -> list[Row]:
+    """What is present by slopes, or asks for so much that it would show and would matter or gain much.
+
+    A typical amplitude need not show then. And a large effect bends the fitted parameters so far that slopes
+    there ask for less of it than there is; so what gains very much is fitted, however little it asks for.
+    """
+    asks = lambda r: r.worth > VERY_MUCH or (r.shows and (r.worth > MUCH or r.excess > PRESENT))  # noqa: E731
+    sane = lambda r: abs(r.reached) < PLAUSIBLE * abs(r.hypothesis.typical)  # noqa: E731
+    likely = [r for r in screened if r.decision == "present" or (asks(r) and sane(r))]
+    return sorted(likely, key=lambda r: -r.worth)
+
+
+def begun_with(found: Fitted, screened: Sequence[Row], tried: int) -> list[tuple[Row, Model]]:
+    """The likeliest causes, each with the model to which one leap leads."""
+    return [(row, with_cause(found, row.hypothesis)) for row in _likely(screened)[:tried]]
+
+
+def one_step(
+    current: Fitted,
+    setting: Setting,
+    begun: Sequence[tuple[Row, Model]],
+    screened: list[Row],
+    progress: Progress,
+) -> Step | None:
+    """The best of what was ``begun`` that is worth its name, with what cannot be told from it; None: nothing is.
+
+    Args:
+        current: the model so far, asked about what was begun.
+        setting: the episodes.
+        begun: (row as screened, model to fit) of each.
+        screened: all rows, for the record.
+        progress: called with one line for each episode that is simulated.
+    """
+    fits: list[tuple[Row, Fitted]] = []
+    for row, model in begun:
+        trial = staged(progress, f"trying {row.hypothesis.name}")
+        with suppress(*IMPOSSIBLE):
+            fits.append((row, fit(model, setting, (), 0, trial, unfitted(), current.evidence)))
+    if not fits:
+        return None
+    now = lambda fits: _compared(current, fits, setting.names, current.noise, current.evidence)  # noqa: E731
+    likely = now(fits)
+    settled = _settled(likely, setting, progress)
+    for k, after in zip(settled, now(list(settled.values())), strict=True):
+        likely[k] = _better(likely[k], after)
+    likeliest = max(likely, key=lambda c: c.gain.density).fitted.evidence
+    # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
+    noise = fit_noise(likeliest)
+    tried = _compared(current, [(c.row, c.fitted) for c in likely], setting.names, noise, likeliest)
+    useful = _ranked([c for c in tried if _useful(c, setting.names)])
+    beside = lambda c: placebo(renoised(c.fitted, noise, likeliest), setting.names, c.alone)  # noqa: E731
+    chance = None
+    while useful and not (chance := beside(useful[0])).passed:
+        useful = useful[1:]
+    if not useful or chance is None:
+        return None
+    best = useful[0]
+    alike = lambda c: predict(renoised(c.fitted, noise, likeliest), setting.names, best.alone)  # noqa: E731
+    rivals = [c for c in useful if c is not best and _rival(c, alike(c), best)]
+    return Step(best, chance, tried, rivals, screened, current)
+
+
+def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> dict[int, tuple[Row, Fitted]]:
+    """The likelier ones, by number, where further steps lead: one step does for small effects only.
+
+    Likely is what predicts well or still has far to go: a large effect that is half fitted predicts nothing.
+    """
+    hope = [c.gain.density + c.fitted.ahead for c in tried]
+    out = {}
+    for k, (c, expected) in enumerate(zip(tried, hope, strict=True)):
+        found = c.fitted
+        if expected > max(0.0, 0.5 * max(hope)) and found.ahead > CLEAR:
+            further = staged(progress, f"trying {c.hypothesis.name} further")
+            found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
+            out[k] = (c.row, found)
+    return out
+
+
+def _better(before: Candidate, after: Candidate) -> Candidate:
+    """Further steps, unless they predict clearly worse."""
+    return before if after.gain.density < before.gain.density - HARDLY * abs(before.gain.density) else after
+
+
+def _compared(
+    current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise, like: Evidence
+) -> list[Candidate]:
+    """Each fit beside the model without it, on motions held out; all by one noise, as rough as ``like``."""
+    before, out = renoised(current, noise, like), []
+    for row, found in fits:
+        after = renoised(found, noise, like)
+        alone = telling(after, names)
+        predicted = predict(after, names, alone)
+        gain = compare(predict(before, names, alone), predicted, 0.0)
+        sure = standard_errors(gain, names, alone, not current.model.accepted)
+        out.append(Candidate(row, found, predicted, gain, alone, sure))
+    return out
+
+
+def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bool) -> float:
+    """Standard errors between motions from which they agree that there is something.
+
+    A further cause is the best of those tried on what a first one left, some of which is that one described badly.
+    """
+    motions = len(set(names))
+    # Of what mends that much of all that is wrong in motions it was not fitted to, predictions have said that it is
+    # there; real motions may then differ about its size. Two motions differ once, which tells nothing.
+    if first and motions > 2 and gain.before**2 - gain.after**2 > MOSTLY * gain.before**2:
+        return NORMAL
+    return (SURE if first else SURE_OF_BEST)[min(motions + len(alone) - 2, len(SURE) - 1)]
+
+
+def _useful(c: Candidate, names: Sequence[str]) -> bool:
+    return worthwhile(c.gain) and known(c.fitted, c.hypothesis.name, names, c)
+
+
+def known(found: Fitted, name: str, names: Sequence[str], c: Candidate) -> bool:
+    """Of a size that makes sense, and that motions agree about so far that there is something."""
+    place = found.model.place(name)
+    middle, std = (float(v[len(found.model.parameters) + place]) for v in spread(found, names, c.alone))
+    largest = PLAUSIBLE * abs(found.model.accepted[place].typical)
+    return c.sure * std < abs(middle) and abs(found.model.amplitudes[place]) < largest
+
+
+def worthwhile(gain: Gain) -> bool:
+    """Large enough to be noticed, and surely a gain."""
+    seen, felt = gain.mended
+    mended = gain.fallen > WORTH_SHARE * gain.calm[0] ** 2 or seen > WORTH_MM or felt > WORTH_PULL
+    return mended and gain.ci95[0] > 0
+
+
+def _ranked(useful: Sequence[Candidate]) -> list[Candidate]:
+    """The likeliest first; of those that predict as well as that, the one that mends most."""
+    likeliest = max((c.gain.density for c in useful), default=0.0)
+    alike = lambda c: c.gain.density > likeliest - CLEAR  # noqa: E731
+    return sorted(useful, key=lambda c: (0, -c.gain.fallen) if alike(c) else (1, -c.gain.density))
+
+
+def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
+    """Predicts about as well: the paired difference is not clear, or no more than what two engines may differ by."""
+    if c.hypothesis.effect == best.hypothesis.effect:
+        return False
+    over = compare(predicted, best.predicted, 0.0)
+    hardly = over.density < HARDLY * best.gain.density and over.fallen < HARDLY * best.gain.fallen
+    return over.density < CLEAR or over.ci95[0] < 0 or hardly
