@@ -5,9 +5,11 @@ from dataclasses import replace
 import linear_toys as toys
 import pytest
 import torch
+from scipy.stats import t as student
 
 from torchcloth.diagnosis import drifts
 from torchcloth.diagnosis.cells import NAMES, SEEN
+from torchcloth.diagnosis.drifting import _beyond, _pooled
 from torchcloth.diagnosis.lacking import SENSOR
 from torchcloth.diagnosis.noise import Noise
 
@@ -30,8 +32,8 @@ def evidence(seed, *rates):
     return replace(blank, cells=cells, stds=[std] * len(cells), numerics=blank.numerics[: len(cells)])
 
 
-def told(seed, *rates):
-    return drifts(toys.fitted(evidence(seed, *rates)))
+def told(seed, *rates, names="abcd"):
+    return drifts(toys.fitted(evidence(seed, *rates)), names)
 
 
 def test_a_right_model_drifts_by_chance_as_often_as_it_says():
@@ -52,9 +54,37 @@ def test_what_depends_on_the_motion_is_no_drift():
     assert not any(row.lacking for row in told(0, 0.2, -0.1, 0.1, -0.05))
 
 
-def test_two_episodes_may_be_alike_by_chance():
-    assert told(0, 0.2, 0.2) == []
+@pytest.mark.parametrize("spread", [0.0, 1.0, 3.0, 10.0])
+def test_motions_that_differ_at_random_seldom_pass_for_alike(spread):
+    """Of six; what they differ by is in units of what each is known to."""
+    rng = torch.Generator().manual_seed(0)
+    known = 0.6 * torch.rand(2000, 6, generator=rng).double() + 0.7
+    rates = torch.randn(2000, 6, generator=rng).double() * (known + spread**2).sqrt()
+    pooled = [_pooled(rate, variance) for rate, variance in zip(rates, known, strict=True)]
+    chances = [3 * _beyond(abs(mean) / std, freedom) for mean, std, freedom in pooled]
+    assert sum(p < 0.01 for p in chances) / 2000 < 0.02  # a normal distribution: 0.03 and more where they differ much
+
+
+def test_chances_are_those_of_student():
+    for size, freedom in ((2.0, 5.0), (5.2, 3.0), (4.7, 31.5), (9.0, 500.0), (3.0, 1e9)):
+        assert _beyond(size, freedom) == pytest.approx(2 * student.sf(size, freedom), rel=1e-3)
+
+
+def test_three_motions_may_be_alike_by_chance():
+    assert told(0, 0.2, 0.2, 0.2, names="abc") == []
+
+
+def test_repetitions_of_a_motion_are_no_other_motions():
+    assert told(0, *[-0.03] * toys.EPISODES, names="abca") == []
+
+
+def test_where_meshes_fold_apart_no_force_is_judged():
+    ev = evidence(0, *[-0.03] * toys.EPISODES)
+    seen = replace(ev, cells=[c._replace(block=torch.where(c.window == 0, 0, c.block)) for c in ev.cells])
+    assert drifts(toys.fitted(seen), "abcd") != []
+    apart = replace(seen, numerics=[torch.full_like(n, 1.0) for n in ev.numerics])
+    assert drifts(toys.fitted(apart), "abcd") == []
 
 
 def test_without_forces_nothing_is_said():
-    assert drifts(toys.fitted(toys.evidence(SLOPES, 1, [], torch.zeros(1).double(), 0))) == []
+    assert drifts(toys.fitted(toys.evidence(SLOPES, 1, [], torch.zeros(1).double(), 0)), "abcd") == []

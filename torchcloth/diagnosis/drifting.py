@@ -5,12 +5,15 @@ The rate c of a force c t, from each episode's start on, is in one episode
     c_k = d' K^-1 r / d' K^-1 d,  variance 1 / d' K^-1 d,
 
 with K what a right model leaves (``lacking.right``), which knows of tares, and d the time of the cells of that force.
-Episodes are pooled with what they differ by beyond that (DerSimonian and Laird 1986): what depends on the motion is no
-drift.
+Motions are pooled with what they differ by beyond that (DerSimonian and Laird 1986): what depends on the motion is no
+drift. What few of them differ by is not well known, so the mean has Student's distribution, with as many degrees of
+freedom as its variance has (Satterthwaite 1946).
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -18,9 +21,9 @@ from torch import Tensor
 
 from .cells import SEEN
 from .fitting import Fitted
-from .lacking import RARE, right
+from .lacking import RARE, right, stable
 
-FEWEST = 3  # episodes that can be alike
+FEWEST = 4  # motions that can be alike
 AXES = "xyz"
 
 
@@ -42,19 +45,28 @@ class Drift(NamedTuple):
         return {**self._asdict(), "unit": "N/s", "lacking": self.lacking}
 
 
-def drifts(found: Fitted) -> list[Drift]:
-    """One for each axis; none where fewer than three episodes have forces."""
+def drifts(found: Fitted, names: Sequence[str]) -> list[Drift]:
+    """One for each axis; none where fewer than four of the motions ``names`` have forces and can be judged."""
     later = lambda c: bool(((c.block == SEEN) & (c.time > c.time.min())).any())  # noqa: E731
-    every = [_rates(found, k) for k, cells in enumerate(found.evidence.cells) if later(cells)]
+    every: dict[str, list[tuple[Tensor, Tensor]]] = {}
+    for k, (name, cells) in enumerate(zip(names, found.evidence.cells, strict=True)):
+        if later(cells) and stable(found, k):
+            every.setdefault(name, []).append(_rates(found, k))
     if len(every) < FEWEST:
         return []
-    rates, variances = (torch.stack(column) for column in zip(*every, strict=True))
+    rates, variances = (torch.stack(column) for column in zip(*map(_together, every.values()), strict=True))
     rows = []
     for axis, rate, variance in zip(AXES, rates.mT, variances.mT, strict=True):
-        mean, std = _pooled(rate, variance)
-        chance = float(torch.special.erfc(torch.tensor(abs(mean) / std / 2**0.5)))
-        rows.append(Drift(axis, mean, std, min(1.0, len(AXES) * chance)))
+        mean, std, freedom = _pooled(rate, variance)
+        rows.append(Drift(axis, mean, std, min(1.0, len(AXES) * _beyond(abs(mean) / std, freedom))))
     return rows
+
+
+def _together(repeats: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """(rates, variances) [axes] of one motion: repetitions of it share whatever the model gets wrong there."""
+    known = [1 / variance for _, variance in repeats]
+    total = torch.stack(known).sum(0)
+    return torch.stack([w * rate for w, (rate, _) in zip(known, repeats, strict=True)]).sum(0) / total, 1 / total
 
 
 def _rates(found: Fitted, k: int) -> tuple[Tensor, Tensor]:
@@ -69,10 +81,21 @@ def _rates(found: Fitted, k: int) -> tuple[Tensor, Tensor]:
     return variance * (weighed.mT @ cells.value), variance
 
 
-def _pooled(rate: Tensor, variance: Tensor) -> tuple[float, float]:
-    """(mean, standard error) by what episodes are known to and what they differ by."""
+def _pooled(rate: Tensor, variance: Tensor) -> tuple[float, float, float]:
+    """(mean, standard error, its degrees of freedom) by what motions are known to and what they differ by."""
     known = 1 / variance
     over = (known * (rate - (known @ rate) / known.sum()) ** 2).sum() - (len(rate) - 1)
     between = float(over / (known.sum() - known.square().sum() / known.sum()))
     weight = 1 / (variance + max(0.0, between))
-    return float(weight @ rate / weight.sum()), float(weight.sum().rsqrt())
+    share = max(1 - float(weight.sum() / known.sum()), 1e-6)  # of the mean's variance, by what motions differ by
+    return float(weight @ rate / weight.sum()), float(weight.sum().rsqrt()), (len(rate) - 1) / share**2
+
+
+def _beyond(size: float, freedom: float) -> float:
+    """Chance that Student's t is farther from zero than this: with t = sqrt(n) tan(a), the integral of cos(a)^(n-1)."""
+    if freedom > 1e3:
+        return math.erfc(size / 2**0.5)
+    start, quarter = math.atan(size / freedom**0.5), 0.5 * math.pi
+    tail, whole = (torch.linspace(a, quarter, 10_001, dtype=torch.float64) for a in (start, 0.0))
+    area = lambda angle: float(torch.trapezoid(angle.cos().clamp(min=0.0) ** (freedom - 1), angle))  # noqa: E731
+    return area(tail) / area(whole)

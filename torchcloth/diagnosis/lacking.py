@@ -78,7 +78,7 @@ def _episode(found: Fitted, k: int, name: str) -> list[Left]:
     cells = found.evidence.cells[k]
     still, moved = right(found, k)
     _, numerics = reference(cells, found.evidence.numerics[k])
-    stable = float(numerics[:SEEN].max()) < FOLDED
+    stable = _is_stable(numerics)
     kept = torch.linalg.solve(still + moved @ moved.mT, still).mT  # S K^-1
     left, covariance = kept @ cells.value, kept @ still
     rows = []
@@ -102,6 +102,15 @@ def _episode(found: Fitted, k: int, name: str) -> list[Left]:
             )
         )
     return rows
+
+
+def stable(found: Fitted, k: int) -> bool:
+    """Whether both meshes agree about the motion of one episode."""
+    return _is_stable(reference(found.evidence.cells[k], found.evidence.numerics[k])[1])
+
+
+def _is_stable(numerics: Tensor) -> bool:
+    return float(numerics[:SEEN].max()) < FOLDED
 
 
 def right(found: Fitted, k: int) -> tuple[Tensor, Tensor]:

@@ -77,7 +77,7 @@ def judge(
     told = {name for m in minor for name in (m["effect"], *(r["effect"] for r in m["rivals"]))}
     told |= {name for c in causes for name in (*c["class"], *(r["effect"] for r in c["rivals"]))}
     rows = [r for r in found.screened if r.hypothesis.name not in told]
-    left, drifting = lack_of_fit(found.end, names), drifts(found.end)
+    left, drifting = lack_of_fit(found.end, names), drifts(found.end, names)
     learned = residual is not None and bool(residual.found.causes)
     lacking = learned or bool(found.withdrawn) or any(row.lacking for row in (*left, *drifting))
     doubtful = [r["effect"] for m in minor for r in m["rivals"]]
