@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -167,12 +167,16 @@ def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bo
 
     A further cause is the best of those tried on what a first one left, some of which is that one described badly.
     """
-    motions = len(set(names))
     # Of what mends that much of all that is wrong in motions it was not fitted to, predictions have said that it is
     # there; real motions may then differ about its size. Two motions differ once, which tells nothing.
-    if first and motions > 2 and gain.before**2 - gain.after**2 > MOSTLY * gain.before**2:
+    if first and len(set(names)) > 2 and gain.before**2 - gain.after**2 > MOSTLY * gain.before**2:
         return NORMAL
-    return (SURE if first else SURE_OF_BEST)[min(motions + len(alone) - 2, len(SURE) - 1)]
+    return between_motions(names, alone, SURE if first else SURE_OF_BEST)
+
+
+def between_motions(names: Sequence[str], alone: Collection[str] = (), table: Sequence[float] = SURE) -> float:
+    """Standard errors by which a mean over so few motions may be off; one that is ``alone`` counts as two."""
+    return table[min(len(set(names)) + len(alone) - 2, len(table) - 1)]
 
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:

@@ -18,12 +18,11 @@ from .lacking import lack_of_fit
 from .missing import MissingForce
 from .residual import Residual
 from .stepwise import Found, matters
-from .trials import Candidate, Step
+from .trials import NORMAL, Candidate, Step, between_motions
 from .wording import sentences, warnings_of
 from .world import Model
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
-NORMAL = 1.96
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +162,12 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _errors(found: Found, names: Sequence[str], alone: Collection[str] = ()) -> Tensor:
-    """[P + A] standard errors of the model's coordinates: the wider of what noise allows and motions disagree by."""
-    return torch.maximum(found.end.covariance.diagonal().sqrt(), spread(found.end, names, alone)[1])
+    """[P + A] standard errors of the model's coordinates: the wider of what noise allows and motions disagree by.
+
+    Few motions know little of what they disagree by: NORMAL of these errors is as wide as Student's interval.
+    """
+    widened = between_motions(names, alone) / NORMAL * spread(found.end, names, alone)[1]
+    return torch.maximum(found.end.covariance.diagonal().sqrt(), widened)
 
 
 def _share(found: Found, gain: Gain) -> float | None:
