@@ -13,8 +13,8 @@ from dataclasses import replace
 import torch
 
 from .approach import approach
-from .evidence import Progress, Setting, staged
-from .fitting import IMPOSSIBLE, Fitted, fit, leap_with, with_cause
+from .evidence import IMPOSSIBLE, Progress, Setting, staged
+from .fitting import Fitted, fit, leap_with, with_cause
 from .noise import unfitted, whitened
 from .world import Hypothesis, Model
 

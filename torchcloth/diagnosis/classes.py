@@ -26,6 +26,8 @@ def correlations(found: Fitted) -> Tensor:
 def alike(found: Fitted, row: Row, others: Sequence[Row]) -> list[Row]:
     """Those of ``others`` that cannot be told from ``row`` at its amplitude, of other effects."""
     index = {h.name: k for k, h in enumerate(found.evidence.hypotheses)}
+    if row.hypothesis.name not in index:  # no world could have it there
+        return []
     rho = correlations(found)[index[row.hypothesis.name]]
     out = []
     for other in others:

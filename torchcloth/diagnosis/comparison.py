@@ -53,7 +53,7 @@ class Gain(NamedTuple):
     after: float
     density: float  # log predictive density, second minus first
     ci95: tuple[float, float]  # of the density's difference
-    explained: float  # share of before^2 - floor^2
+    explained: float  # share of before^2 - floor^2, from -1 to 1
     explained_ci95: tuple[float, float]
     calm: tuple[float, float]  # m RMS before and after, where what neither describes, or ripples, counts for less
     mended: tuple[float, float]  # m and N RMS, so weighed, that are gone from the episode where most is
@@ -195,7 +195,8 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
 
 def _share(squares: np.ndarray, floor: float) -> float:
     before, after, n = squares
-    return float((before - after) / max(before - n * floor**2, 1e-12))
+    gone = before - after
+    return float(gone / max(before - n * floor**2, abs(gone), 1e-30))  # near the floor there is hardly anything to gain
 
 
 def _both(first: Predicted, second: Predicted) -> tuple[Predicted, Predicted]:

@@ -14,9 +14,9 @@ from ..identification.saved import alike, mark
 from ..recordings import Recording
 from .base_model import together
 from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
-from .evidence import Evidence, Progress, as_rough, gather, setting_of, staged
+from .evidence import Evidence, Progress, as_held, as_rough, gather, setting_of, staged
 from .fitting import Fitted
-from .gate import check, each_once
+from .gate import check, each_once, somewhere_seen
 from .model_file import ModelFile, read_model
 from .noise import Noise, fit_noise, floor_of, least, unfitted, whitened
 from .repeats import pairs_of, repeats
@@ -91,6 +91,7 @@ def confirm(
     if faults := check(recordings):
         raise RecordingError(str(faults[0]))
     each_once(recordings)
+    somewhere_seen(recordings)
     scene = together(recordings)
     files = [read_model(path, scene) for path in (base, extended)]
     _refuse_no_extension(*(file.model for file in files))
@@ -155,12 +156,12 @@ def _refuse_seen(recording: Recording, files: Sequence[ModelFile]) -> None:
 
 
 def _judged(model: Model, evidence: Evidence, noise: Noise, like: Evidence) -> Predicted:
-    """Density by ``noise``, the extended model's, as rough as that; what is left in metres by one that is nobody's.
+    """Density by ``noise``, as rough and with the nuisances of the extended model ``like``; metres by nobody's noise.
 
     So the base's figures are the same whatever it is compared with.
     """
     left = as_it_is(_as_fitted(model, evidence, unfitted()))
-    return left._replace(white=as_it_is(_as_fitted(model, as_rough(evidence, like), noise)).white)
+    return left._replace(white=as_it_is(_as_fitted(model, as_rough(as_held(evidence, like), like), noise)).white)
 
 
 def _as_fitted(model: Model, evidence: Evidence, noise: Noise) -> Fitted:

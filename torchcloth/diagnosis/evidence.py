@@ -13,16 +13,18 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from ..errors import SimulationDiverged, UnstableStep
+from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..identification.episodes import Episode, episode
 from ..identification.nuisances import Camera, Clock, Held, Rim, Tare
 from ..identification.replays import Frames
+from ..identification.replicates import keys_of
 from ..identification.sheet import Sheet, sheet_for
 from ..recordings import Recording
 from .cells import Cells, cells_of, directions, mean_over, stretches
 from .refined import refined
 from .world import Hypothesis, Model, World
 
+IMPOSSIBLE = (InvalidInput, SimulationDiverged, UnstableStep)  # no world has such values, or none that is stable
 CLOCK, SHIFT, TURN, GRASP, RIM, TARE = 3e-3, 5e-4, 1e-3, 1.5e-3, 2e-3, 0.1  # standard deviations between episodes
 Progress = Callable[[str], None]
 Kept = Callable[[Sequence[object], Tensor, Callable[[], "Piece"]], "Piece"]  # (question, point, work) -> answer
@@ -36,8 +38,14 @@ def simply(question: Sequence[object], point: Tensor, work: Callable[[], Piece])
 
 
 def motions_of(recordings: Sequence[Recording]) -> list[str]:
-    """What each episode says its motion is; one that does not say is a motion of its own."""
-    return [str(r.split.get("motion") or f"episode {k}") for k, r in enumerate(recordings)]
+    """What each episode says its motion is, or that of the one it repeats; one that does not say is one of its own."""
+    originals = {r.split.get("replicate_of") for r in recordings} - {None}
+    out = []
+    for k, (r, key) in enumerate(zip(recordings, keys_of(recordings), strict=True)):
+        original = r.path is not None and r.path.name in originals
+        says = original or r.split.get("motion") or r.split.get("replicate_of")
+        out.append(str(key) if says else f"episode {k}")
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +80,9 @@ def _setting(model: Model, recordings: Sequence[Recording]) -> Setting:
     pattern = torch.as_tensor(mesh.vertices).double()
     if mesh.uv is not None:
         pattern = torch.nn.functional.pad(torch.as_tensor(mesh.uv).double(), (0, 1))
+    else:  # its first two axes pass for u and v, so the thinnest comes last
+        thin = int((pattern.amax(0) - pattern.amin(0)).argmin())
+        pattern = pattern[:, [*(k for k in range(3) if k != thin), thin]]
     return Setting(model.base, tuple(recordings), episodes, sheet_for(cloth, episodes), pattern)
 
 
@@ -169,8 +180,11 @@ def _piece(
     shifts: Sequence[tuple[int, float]],
 ) -> Piece:
     """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
-    e, world, steps = setting.episodes[k], model.world(), [step for _, step in shifts]
-    beside = [shifted(model, coordinate, step).world() for coordinate, step in shifts]
+    e, world = setting.episodes[k], model.world()
+    near = [shifted(model, coordinate, step) for coordinate, step in shifts]
+    beside = [m.world() for m in near]
+    # to where it ended, which may be a bound: nothing is told by a step of no length
+    steps = [float((m.point - model.point)[c]) or step for m, (c, step) in zip(near, shifts, strict=True)]
     runs = _runs(model, world, setting, k, hypotheses, beside, with_held=known is None)
     able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
     typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
@@ -211,14 +225,17 @@ def _runs(
     beside = [partial(w.frames, e, dt) for w in near]
     modes = Held().modes(world.cloth, e) if with_held else ()
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m, settles=True), dt) for m in modes]
-    changed = [h.apply(world, h.typical) for h in hypotheses]
-    moves = [c.cloth is not world.cloth or c.motions is not world.motions for c in changed]
+    changed = [_if_possible(partial(h.apply, world, h.typical)) for h in hypotheses]
+    moves = [c is not None and (c.cloth is not world.cloth or c.motions is not world.motions) for c in changed]
     jobs = [partial(_finest, model, setting, k), partial(world.simulated, e, dt), *beside, *held]
-    tried = [partial(_tried, c, e, dt) for c, own in zip(changed, moves, strict=True) if own]
+    tried = [
+        partial(_if_possible, partial(c.frames, e, dt)) for c, own in zip(changed, moves, strict=True) if c and own
+    ]
     done: list[Any] = side_by_side(lambda job: job(), [*jobs, *tried])
     fine, plain, *sure = done[: len(jobs)]
     rest = iter(done[len(jobs) :])
-    trials = [next(rest) if own else c.seen(plain, e) for c, own in zip(changed, moves, strict=True)]
+    seen = lambda c: c and _if_possible(partial(c.seen, plain, e))  # noqa: E731
+    trials = [next(rest) if own else seen(c) for c, own in zip(changed, moves, strict=True)]
     return _Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials)
 
 
@@ -229,10 +246,10 @@ def _finest(model: Model, setting: Setting, k: int) -> Frames:
     return replace(model, base=setting.finer.base).world().frames(setting.finer.episodes[k], setting.finer.dt)
 
 
-def _tried(world: World, e: Episode, dt: float | None) -> Frames | None:
+def _if_possible(work: Callable[[], T]) -> T | None:
     try:
-        return world.frames(e, dt)
-    except (SimulationDiverged, UnstableStep):
+        return work()
+    except IMPOSSIBLE:
         return None
 
 
@@ -252,6 +269,16 @@ def aligned(key: Tensor, other: Tensor, columns: Tensor) -> Tensor:
     found = columns[place].clone()
     found[other[place] != key] = 0.0
     return found
+
+
+def as_held(evidence: Evidence, like: Evidence) -> Evidence:
+    """With another's slopes along nuisances: what episodes may differ by is the same for all models."""
+    cells = []
+    for k, own in enumerate(evidence.cells):
+        key, slopes, _ = _known_slopes(like, k)
+        kept = own.jacobian[:, : own.jacobian.shape[1] - len(evidence.stds[k])]
+        cells.append(own._replace(jacobian=torch.cat([kept, aligned(own.key, key, slopes)], 1)))
+    return replace(evidence, cells=cells, stds=like.stds)
 
 
 def as_rough(evidence: Evidence, like: Evidence) -> Evidence:
@@ -283,6 +310,14 @@ def both_ways(model: Model) -> list[tuple[int, float]]:
     here = model.point.tolist()
     every = [(k, sign * step) for k, step in step_sizes(model) for sign in (1.0, -1.0)]
     return [(k, step) for k, step in every if low[k] <= here[k] + step <= high[k]]
+
+
+def one_way(model: Model) -> list[tuple[int, float]]:
+    """(coordinate, step) along each of the model's own, back where there lies beyond an end."""
+    ways: dict[int, float] = {}
+    for k, step in [*both_ways(model), *step_sizes(model)]:
+        ways.setdefault(k, step)
+    return sorted(ways.items())
 
 
 def _central(cells: Cells, shifts: Sequence[tuple[int, float]], parameters: int) -> Cells:

@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..identification.bounds import bounded
 from .bursts import calmed, densities, unweighted
-from .evidence import Evidence, Progress, Setting, as_rough, gather, staged
+from .evidence import IMPOSSIBLE, Evidence, Progress, Setting, as_rough, gather, staged
 from .noise import Noise, Whitened, fit_noise, unfitted, whitened
 from .world import Hypothesis, Model
 
-IMPOSSIBLE = (InvalidInput, SimulationDiverged, UnstableStep)  # no world has such values, or none that is stable
 ENOUGH = 2.0  # log density that a further step is expected to gain, below which the search ends
 ITERATIONS = 5  # at most
 LONGEST = 1.0  # prior standard deviations, of a step

@@ -75,6 +75,17 @@ def each_once(recordings: Sequence[Recording]) -> None:
             )
 
 
+def somewhere_seen(recordings: Sequence[Recording]) -> None:
+    """Raises InvalidInput where nothing says where the cloth is: forces alone do not."""
+    if not any(r.points is not None or r.markers is not None for r in recordings):
+        raise InvalidInput(
+            "episodes",
+            got="none with points or markers",
+            expected="at least one that says where the cloth is",
+            remedy="record a depth camera or markers (docs/episode.md)",
+        )
+
+
 def read_episodes(folders: Sequence[str | Path]) -> tuple[list[Recording], list[Fault]]:
     """Episodes from disk, and what is wrong with the streams of those that cannot be read.
 
@@ -122,6 +133,8 @@ _DESCRIBED = {
     ),
     "areal density (kg/m^2)": lambda r: r.cloth.areal_density,
     "thickness (m)": lambda r: r.cloth.thickness,
+    "data sheet": lambda r: {name: value for name, value in sorted(r.cloth.nominal.items()) if name != "units"},
+    "gravity (m/s^2)": lambda r: r.gravity,
     "set of grasps": lambda r: sorted(r.grasps),
     "place of a grasp (m)": lambda r: [g.uv.tolist() for _, g in sorted(r.grasps.items()) if g.uv is not None],
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from ..boundaries import Coulomb, Elliptic, Grasp, Plane, Stribeck
 from ..effects import Adhesion, GripSlip
@@ -13,6 +14,7 @@ LEAST = 1e-3  # -, of friction
 HOLD = 0.3  # N, above which a loose grip yields
 SLOW = 0.01  # m/s, of slip at which the excess of friction has fallen to 1 / e
 REACH = 1e-3  # m, of a sticky table's pull
+STEEP = 0.99  # cosine, of a normal that is the world's x
 WHOLE = 1.0  # of typical: patches grow vertex by vertex, and a smaller step changes nothing
 
 
@@ -43,7 +45,7 @@ def _planes(world: World, change) -> World:
 
 
 def _friction(world: World, more: float = 0.0, along: float = 0.0, excess: float = 0.0) -> World:
-    """Everywhere by so much; for slip along the table's x by a share; before it slips by an excess.
+    """Everywhere by so much; for slip along one axis of the table by a share; before it slips by an excess.
 
     No law has both a direction and an excess: with the one, the other changes nothing.
     """
@@ -55,10 +57,20 @@ def _friction(world: World, more: float = 0.0, along: float = 0.0, excess: float
         sticky = excess + (law.excess.value.item() if isinstance(law, Stribeck) else 0.0)
         if (along or ratio != 1.0) and sticky:
             return plane
-        new = Elliptic(mu * (1 + along), mu * ratio) if along or ratio != 1.0 else mu
+        new = Elliptic(mu * (1 + along), mu * ratio, _axis(plane)) if along or ratio != 1.0 else mu
         return Plane(plane.point.tolist(), plane.normal.tolist(), Stribeck(mu, mu + sticky, SLOW) if sticky else new)
 
     return _planes(world, changed)
+
+
+def _axis(plane: Plane) -> list[float]:
+    """Of a direction-dependent friction that is there, else the world's x within the plane; of walls along x its y."""
+    if isinstance(plane.friction, Elliptic):
+        return plane.friction.axis.tolist()
+    normal = plane.normal.double()
+    x, y, _ = torch.eye(3, dtype=torch.float64)
+    aside = x if abs(float(normal[0])) < STEEP else y
+    return (aside - (aside @ normal) * normal).tolist()
 
 
 def _sticky(world: World, stress: float) -> World:

@@ -46,11 +46,11 @@ def _problem(model: Model, setting: Setting) -> list[object]:
     cloth = model.base.cloth
     data = [part for e in setting.episodes for part in _parts(e)]
     parts = [(p.name, p.step, p.std) for p in model.parameters]
-    fabric = [*cloth.state_dict().values(), cloth.mesh.rest.tobytes(), cloth.mesh.faces.tobytes()]
+    fabric = [*cloth.state_dict().values(), cloth.mesh.rest.tobytes(), cloth.mesh.faces.tobytes(), setting.rest]
     return [metadata.version("torchcloth"), setting.dt, parts, *digests(), *fabric, *data]
 
 
 def _parts(e: Episode) -> list[object]:
-    seen = [e.times, e.initial, *e.clouds, e.markers, e.noise]
-    moved = [part for name, m in e.motion.items() for part in (name, m.t, m.pose)]
+    seen = [e.times, e.initial, e.settles, *e.clouds, e.markers, *(e.places or ()), e.noise, e.eye]
+    moved = [part for name, m in e.motion.items() for part in (name, m.t, m.pose, m.closed)]
     return [*seen, *moved, *e.wrenches.values()]

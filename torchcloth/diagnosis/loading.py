@@ -15,7 +15,7 @@ from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from .base_model import together
 from .cells import directions
-from .evidence import shifted, side_by_side, step_sizes
+from .evidence import one_way, shifted, side_by_side
 from .model_file import ModelFile, load_model, of_fabric, read_model
 from .world import Model, World
 
@@ -96,7 +96,7 @@ def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
     """
     file = read_model(path, recording)
     model, world = file.model, file.model.world()
-    data, every = episode(world.cloth, recording), step_sizes(model)
+    data, every = episode(world.cloth, recording), one_way(model)
     covariance = torch.zeros(len(every), len(every)) if file.covariance is None else file.covariance
     shifts = every[: len(covariance)]  # a residual force, which comes last, has no errors
     worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]

@@ -25,7 +25,7 @@ from ..identification.nuisances import Held
 from ..identification.replays import Frames
 from ..recordings import Recording
 from .cells import Cells, cells_of, directions
-from .evidence import GRASP, Progress, Setting, joined, nuisances, shifted, side_by_side, step_sizes
+from .evidence import GRASP, Progress, Setting, joined, nuisances, one_way, shifted, side_by_side
 from .experiments import Experiment, planned, possible
 from .fitting import Fitted, prior_precision
 from .stepwise import Found
@@ -100,7 +100,7 @@ def question_of(found: Found, content: Mapping[str, Any]) -> Question | None:
         rows = {r.hypothesis.name: r.amplitude for r in step.screened}
         amplitudes |= {name: rows[name] for name in cause.get("class", ()) if name in rows and name not in amplitudes}
         first, *others = amplitudes
-        if others:
+        if others and first in known:
             return Question(step.before, amplitudes, tuple((first, other) for other in others))
     if found.causes:
         return None
@@ -143,7 +143,7 @@ def whitened_slopes(question: Question, recording: Recording, setting: Setting) 
     found, model = question.fitted, question.fitted.model
     hypotheses = [found.evidence.hypotheses[k] for k in _columns(question)]
     world, blank = model.world(), episode(model.base.cloth, recording)
-    shifts = step_sizes(model)
+    shifts = one_way(model)
     held = [replace(blank, initial=blank.initial + GRASP * m, settles=True) for m in Held().modes(world.cloth, blank)]
     worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]
     worlds += [h.apply(world, h.typical) for h in hypotheses]

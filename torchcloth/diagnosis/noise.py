@@ -94,7 +94,7 @@ def fit_noise(evidence: Evidence, sweeps: int = 2) -> Noise:
     factors = 10 ** torch.linspace(-0.5, 1.75, 10, dtype=torch.float64)
     for sweep in range(sweeps):
         for b in present:
-            tried = [*(FLOOR[NAMES[b]] * factors)] if sweep == 0 else [*(level[b] * factors[:4] ** 0.3), level[b]]
+            tried = [*(FLOOR[NAMES[b]] * factors)] if sweep == 0 else level[b] * factors[:4] ** 0.3
             best = max(tried, key=lambda v: _likelihood(evidence, _with(level, b, v)))
             level = _with(level, b, best)
     return Noise(level)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
-from .cells import STRETCH
+from .cells import NAMES, STRETCH, Cells
 from .classes import correlations
 from .comparison import Predicted
 from .evidence import Evidence
@@ -16,16 +17,29 @@ from .screening import Row
 from .verdict import Diagnosis
 
 COLOURS = {"present": "#b0653a", "inconclusive": "#c9a227", "absent": "#1f6f8b", "unresolvable": "#bbbbbb"}
+Own = Callable[[Cells], Tensor]  # [C] bool, of the cells of an episode
+MAPPED: dict[str, Own] = {  # what lies on the fabric, by what is shown of it
+    "along the normal": lambda c: c.block == NAMES.index("points"),
+    "upwards": lambda c: (c.block == NAMES.index("markers")) & (c.patch % 3 == 2),
+}
 FARTHEST = 2.2  # typical amplitudes that are shown
 
 
 def residual_maps(answer: Diagnosis) -> Any:
-    """Mean misfit by part of the fabric (rows, from the pattern's top down) and time of every episode; mm."""
+    """Mean misfit by part of the fabric (rows, from the pattern's top down) and time of every episode; mm.
+
+    Of the points, along the normal; upwards of markers where there are none, and None where there are neither.
+    """
     from matplotlib.figure import Figure
 
     found = answer.found
-    middles = _middles([found.start.evidence, found.end.evidence])
-    before, after = (_maps(e, list(middles)) for e in (found.start.evidence, found.end.evidence))
+    both = (found.start.evidence, found.end.evidence)
+    seen = [way for way, own in MAPPED.items() if all(any(own(c).any() for c in e.cells) for e in both)]
+    if not seen:
+        return None
+    own = MAPPED[seen[0]]
+    middles = _middles(both, own)
+    before, after = (_maps(e, list(middles), own) for e in both)
     told = [f"{100 * u:.0f}, {100 * v:.0f}" for u, v in middles.values()]
     names, count = answer.content["motions"], len(before)
     limit = max(float(np.nanquantile(np.abs(np.concatenate([m.ravel() for m in before])), 0.98)), 1e-6)
@@ -44,7 +58,7 @@ def residual_maps(answer: Diagnosis) -> Any:
     figure.colorbar(
         image,
         ax=axes,  # pyright: ignore[reportPossiblyUnbound]
-        label="measured minus simulated, along the normal, mm",
+        label=f"measured minus simulated, {seen[0]}, mm",
     )
     return figure
 
@@ -170,23 +184,23 @@ def _local(found: MissingForce, m: Missing) -> tuple[np.ndarray, np.ndarray]:
     return np.einsum("vc,vc->v", force, normal), np.einsum("vc,vck->vk", force, tangent)
 
 
-def _middles(found: Sequence[Evidence]) -> dict[int, tuple[float, float]]:
-    """(u, v) m of every part of the fabric that points were seen on, from the pattern's top down."""
+def _middles(found: Sequence[Evidence], mapped: Own) -> dict[int, tuple[float, float]]:
+    """(u, v) m of every part of the fabric that was seen, from the pattern's top down."""
     out = {}
     for cells in (c for evidence in found for c in evidence.cells):
-        own = cells.block == 0
+        own = mapped(cells)
         places = cells.place[own, :2].tolist()
         out.update(zip((cells.patch[own] // 3).tolist(), map(tuple, places), strict=True))
     return dict(sorted(out.items(), key=lambda part: (-round(part[1][1], 3), part[1][0])))
 
 
-def _maps(evidence: Evidence, parts: Sequence[int]) -> list[np.ndarray]:
+def _maps(evidence: Evidence, parts: Sequence[int], mapped: Own) -> list[np.ndarray]:
     """Per episode [parts, windows] mm; NaN where nothing was seen."""
     out, row = [], {part: k for k, part in enumerate(parts)}
     for cells in evidence.cells:
-        own = cells.block == 0
+        own = mapped(cells)
         patch, window = (cells.patch[own] // 3).tolist(), cells.window[own].numpy()
-        field = np.full((len(parts), window.max() + 1), np.nan)
+        field = np.full((len(parts), int(cells.window.max()) + 1), np.nan)
         field[[row[p] for p in patch], window] = 1e3 * cells.value[own].numpy()
         out.append(field)
     return out

@@ -43,7 +43,7 @@ def _evidence(answer: Diagnosis) -> list[str]:
     after = predict(found.end, motions) if found.steps else None
     return [
         "<h2>Where and when</h2>",
-        _image(pictures.residual_maps(answer)),
+        _image(maps) if (maps := pictures.residual_maps(answer)) else "<p>Neither points nor markers were seen.</p>",
         "<h2>Motions held out</h2>",
         _image(pictures.courses(answer, before, after)),
         "<h2>What the residuals of the base model ask for</h2>",

@@ -17,7 +17,7 @@ from ..identification.saved import mark
 from ..recordings import Recording
 from .base_model import base_model, together
 from .evidence import Progress, motions_of, setting_of, staged
-from .gate import check, each_once
+from .gate import check, each_once, somewhere_seen
 from .hypotheses import catalogue
 from .keeping import kept_in
 from .lacking import lack_of_fit
@@ -78,6 +78,7 @@ def diagnose(
     if faults := check(recordings):
         return refused(faults, names)
     each_once(recordings)
+    somewhere_seen(recordings)
     model = model or base_model(together(recordings))
     asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
     plan = hashlib.sha256(json.dumps([[h.name, h.typical, h.share] for h in asked]).encode()).hexdigest()[:16]
@@ -131,5 +132,6 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
         start, end = answer.found.start, answer.found.end
         save_model(folder / BASE, start.model, scene, start.covariance, episodes=said)
         save_model(folder / EXTENDED, end.model, scene, end.covariance, residual, said)
+    path = write_text(folder / RESULT, json.dumps(answer.content, indent=1, allow_nan=False) + "\n")
     write_report(answer, folder)
-    return write_text(folder / RESULT, json.dumps(answer.content, indent=1, allow_nan=False) + "\n")
+    return path

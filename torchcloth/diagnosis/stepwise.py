@@ -38,6 +38,7 @@ class Found:
     repeats: Repeats | None  # None: no episode repeats another
     setting: Setting  # without the cells that jump between shapes
     withdrawn: tuple[str, ...] = ()  # causes that were accepted, and that a law without a cause does more than
+    impossible: tuple[str, ...] = ()  # what was asked about and cannot be simulated beside the fitted model
 
     @property
     def causes(self) -> list[Step]:
@@ -82,7 +83,9 @@ def search(
         begun = [(rows[h.name], model) for h, model in afresh(start, setting, asked, TRIED, progress)]
         if first := one_step(start, setting, begun, screened, progress):
             current, steps = _chain(start, setting, hypotheses, progress, TRIED, first)
-    return _found(start, current, steps, setting)
+    known = {h.name for h in start.evidence.hypotheses}
+    impossible = tuple(h.name for h in model.others(hypotheses) if h.name not in known)
+    return replace(_found(start, current, steps, setting), impossible=impossible)
 
 
 def extend(
@@ -119,7 +122,8 @@ def instead(found: Found, laws: Fitted, tried: int, progress: Progress = lambda 
     if over.ci95[0] < 0 or over.density < HALF * gained:
         return found
     withdrawn = tuple(s.best.hypothesis.name for s in found.causes)
-    return replace(_found(found.start, found.start, [], found.setting), withdrawn=withdrawn)
+    none = _found(found.start, found.start, [], found.setting)
+    return replace(none, withdrawn=withdrawn, impossible=found.impossible)
 
 
 def _chain(

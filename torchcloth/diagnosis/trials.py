@@ -7,8 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from .comparison import Gain, Predicted, compare, predict, spread, telling
-from .evidence import Evidence, Progress, Setting, staged
-from .fitting import IMPOSSIBLE, Fitted, fit, renoised, with_cause
+from .evidence import IMPOSSIBLE, Evidence, Progress, Setting, staged
+from .fitting import Fitted, fit, renoised, with_cause
 from .noise import Noise, fit_noise, unfitted
 from .placebo import Placebo, placebo
 from .screening import MUCH, PRESENT, Row
@@ -122,8 +122,8 @@ def one_step(
         return None
     best = useful[0]
     alike = lambda c: predict(renoised(c.fitted, noise, likeliest), setting.names, best.alone)  # noqa: E731
-    rivals = [c for c in useful if c is not best and _rival(c, alike(c), best)]
-    return Step(best, chance, tried, rivals, screened, current)
+    rivals = {c.hypothesis.name: c for c in reversed(useful) if c is not best and _rival(c, alike(c), best)}
+    return Step(best, chance, tried, [*reversed(rivals.values())], screened, current)
 
 
 def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> dict[int, tuple[Row, Fitted]]:

@@ -173,7 +173,7 @@ def _errors(found: Found, names: Sequence[str], alone: Collection[str] = ()) -> 
 def _share(found: Found, gain: Gain) -> float | None:
     """Of what all causes explain together, by what each adds to the predictive density."""
     every = sum(step.best.gain.density for step in found.steps)
-    return None if found.whole is None else min(1.0, found.whole.explained) * gain.density / every
+    return None if found.whole is None else max(0.0, found.whole.explained) * gain.density / every
 
 
 def _gain(found: Found) -> dict[str, Any] | None:

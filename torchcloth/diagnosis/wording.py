@@ -113,6 +113,8 @@ def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> lis
         out.append(
             "the data sheet says no bending stiffness: the model's cloth has none, and nothing is asked about it"
         )
+    if found.impossible:
+        out.append(f"{', '.join(found.impossible)}: could not be simulated here, so nothing is said of it")
     if found.withdrawn:
         out.append(f"one local law predicts much better than {', '.join(found.withdrawn)}: withdrawn")
     if found.left_out:
@@ -125,7 +127,7 @@ def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> lis
     if len(set(names)) < 3:
         out.append(f"{len(set(names))} kind(s) of motion: many causes look alike in them")
     if len(names) < 8:
-        out.append(f"{len(names)} episodes show little of their own spread: intervals of the gain are doubled")
+        out.append(f"{len(names)} episodes show little of their own spread: the explained share's interval is doubled")
     return out
 
 

@@ -150,6 +150,8 @@ class Held(AbstractNuisance):
     def modes(self, cloth: Cloth, episode: Episode) -> Tensor:
         """Weights fall with the inverse square of the distance at rest; they add up to one."""
         held, rest = _held(cloth), _pattern(cloth).to(episode.initial)
+        if not held:
+            return rest.new_zeros(0, *rest.shape)
         distance = torch.stack([torch.cdist(rest, rest[index]).amin(1) for index in held.values()])
         inverse = 1 / (distance**2 + 1e-12)
         share = inverse / inverse.sum(0)
