@@ -35,7 +35,9 @@ def doubted(monkeypatch, cause, law, useful=True):
     first = predict(renoised(start, end.noise, end.evidence), NAMES)
     whole = compare(first, predict(end, NAMES), 0.0)
     setting = SimpleNamespace(names=NAMES, recordings=(), episodes=())
-    found = SimpleNamespace(start=start, end=end, steps=[own], causes=[own], whole=whole, setting=setting)
+    found = SimpleNamespace(
+        start=start, end=end, steps=[own], causes=[own], whole=whole, setting=setting, impossible=()
+    )
     return found, instead(found, start, 2)  # type: ignore[arg-type]
 
 

@@ -15,6 +15,7 @@ import torch
 from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import check, diagnose
+from torchcloth.diagnosis.gate import somewhere_seen
 from torchcloth.errors import InvalidInput
 
 GENERATE = Path(__file__).parents[1] / "independent" / "generate.py"
@@ -116,6 +117,12 @@ def test_episodes_of_two_cloths_are_refused(turned):
     uv = turned.cloth.uv * 1.5
     with pytest.raises(InvalidInput, match=r"another cloth.*got 0\.45 x 0\.45.*expected 0\.3 x 0\.3"):
         check([turned, replace(turned, cloth=replace(turned.cloth, uv=uv))])
+    for other in (
+        replace(turned, gravity=np.array([9.81, 0.0, 0.0])),
+        replace(turned, cloth=replace(turned.cloth, nominal={**turned.cloth.nominal, "membrane_stiffness": 1e4})),
+    ):
+        with pytest.raises(InvalidInput, match=r"another (gravity|data sheet)"):
+            check([turned, other])
     elsewhere = {name: rec.GraspInfo(g.uv * 0.5, g.radius) for name, g in turned.grasps.items()}
     with pytest.raises(InvalidInput, match="another place of a grasp"):
         check([turned, replace(turned, grasps=elsewhere)])
@@ -155,6 +162,13 @@ def test_what_was_not_searched_has_no_model(turned):
     assert answer.verdict == "invalid_data"
     with pytest.raises(InvalidInput, match="invalid data"):
         _ = answer.model
+
+
+def test_forces_alone_do_not_say_where_the_cloth_is(turned):
+    blind = [replace(turned, points=None, markers=None, split={"motion": m}) for m in "ab"]
+    with pytest.raises(InvalidInput, match="none with points or markers"):
+        somewhere_seen(blind)
+    somewhere_seen([turned, *blind])
 
 
 def test_small_episodes_of_the_same_engine_pass():

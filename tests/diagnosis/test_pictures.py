@@ -1,6 +1,7 @@
 """Pictures show what the numbers say, where they belong."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,9 +9,9 @@ import sheets
 import torch
 
 from torchcloth import diagnosis as dx
-from torchcloth.diagnosis.cells import STRETCH
+from torchcloth.diagnosis.cells import NAMES, STRETCH
 from torchcloth.diagnosis.fabric_maps import misfit_limit, misfit_maps
-from torchcloth.diagnosis.pictures import FARTHEST, screening
+from torchcloth.diagnosis.pictures import FARTHEST, residual_maps, screening
 from torchcloth.diagnosis.screening import Row
 
 
@@ -56,6 +57,27 @@ def test_parts_that_nobody_saw_are_grey(gathered):
     unseen = tile.images[1].get_array()[..., 3] > 0
     assert 0 < unseen.mean() < 0.15
     assert not (tile.images[0].get_array().filled(np.nan)[~unseen] == 0).any()
+
+
+def test_an_episode_without_points_has_an_empty_map_and_markers_do_as_well(gathered):
+    evidence, _ = gathered
+    cells = evidence.cells[0]
+    blind = type(cells)(*(column[cells.block != 0] for column in cells))
+    marked = cells._replace(
+        block=torch.where(cells.block == 0, NAMES.index("markers"), cells.block), patch=3 * cells.patch + 2
+    )
+
+    def maps(*every):
+        found = SimpleNamespace(evidence=replace(evidence, cells=list(every)))
+        searched = SimpleNamespace(start=found, end=found, steps=[])
+        return residual_maps(SimpleNamespace(found=searched, content={"motions": ["a", "b"]}))  # type: ignore[arg-type]
+
+    one, two, bar = maps(cells, blind).axes
+    assert not np.isnan(one.images[0].get_array().filled(np.nan)).all()
+    assert np.isnan(two.images[0].get_array().filled(np.nan)).all()
+    assert "normal" in bar.get_ylabel()
+    assert "upwards" in maps(marked, blind).axes[-1].get_ylabel()
+    assert maps(blind, blind) is None
 
 
 def test_amplitudes_beyond_the_picture_are_arrows_at_its_end():

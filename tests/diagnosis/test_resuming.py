@@ -1,8 +1,10 @@
 """A diagnosis that was stopped anywhere goes on where it was, and answers the same bit by bit."""
 
 import json
+from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import sheets
 import torch
@@ -65,6 +67,11 @@ def test_another_diagnosis_is_not_resumed(episodes, counted, tmp_path):
         diagnose(episodes, hypotheses=[], journal=tmp_path / "progress")
     with pytest.raises(InvalidInput, match="another fit"):
         diagnose(episodes[::-1], hypotheses=[], journal=tmp_path / "progress", resume=True)
+    camera = {name: replace(c, T_world_camera=c.T_world_camera + 0.1) for name, c in episodes[0].cameras.items()}
+    open_ = {n: replace(g, closed=np.zeros_like(g.closed)) for n, g in episodes[0].grippers.items()}
+    for edited in (replace(episodes[0], cameras=camera), replace(episodes[0], grippers=open_)):
+        with pytest.raises(InvalidInput, match="another fit"):
+            diagnose([edited, *episodes[1:]], hypotheses=[], journal=tmp_path / "progress", resume=True)
 
 
 def test_the_command_says_how_to_go_on(episodes, counted, tmp_path, capsys, monkeypatch):

@@ -207,6 +207,8 @@ def test_a_true_cause_predicts_motions_that_were_held_out():
     assert gain.explained > 0.8
     same = compare(without, without, floor)
     assert same.density == 0.0
+    assert compare(without, after, 2 * gain.before).explained == 1.0  # below the floor there is nothing more to gain
+    assert compare(after, without, 2 * gain.before).explained == -1.0
     assert same.explained == 0.0
 
 

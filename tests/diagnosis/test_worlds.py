@@ -10,7 +10,7 @@ import torch
 from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import base_model, together
 from torchcloth.diagnosis.cells import _places
-from torchcloth.diagnosis.evidence import gather, motions_of, setting_of
+from torchcloth.diagnosis.evidence import gather, motions_of, one_way, setting_of, step_sizes
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
@@ -125,6 +125,43 @@ def test_an_episode_that_names_no_motion_is_one_of_its_own():
         "swing",
         "episode 2",
     ]
+
+
+def test_a_repetition_is_of_the_motion_that_it_repeats(tmp_path):
+    own = lambda name, **split: replace(RECORDING, path=tmp_path / name, split=split)  # noqa: E731
+    every = [own("a"), own("b", replicate_of="a"), own("c", motion="swing"), own("d", replicate_of="c"), own("e")]
+    assert motions_of(every) == ["a", "a", "swing", "swing", "episode 4"]
+
+
+def test_what_no_world_can_have_is_not_asked_about(made):
+    """A patch of 15 mm that is 17 mm further along holds nothing at the edge."""
+    model, setting = made
+    (drag,) = (h for h in catalogue(model, [RECORDING]) if h.name == "air.drag_n")
+
+    def nowhere(world, amplitude):
+        raise InvalidInput("grasp", got="no vertex", expected="a patch with vertices")
+
+    far, unseen = (replace(drag, name=name, apply=nowhere) for name in ("user.far", "user.unseen"))
+    found = gather(model, setting, [far, drag, unseen])
+    assert [h.name for h in found.hypotheses] == ["air.drag_n"]
+    assert torch.equal(found.cells[0].jacobian, gather(model, setting, [drag]).cells[0].jacobian)
+
+
+def test_steps_end_at_bounds_and_slopes_know_it(made):
+    """Poisson's ratio at its largest value: a step on from there is none, one back tells."""
+    model, setting = made
+    place = [p.name for p in model.parameters].index("poisson_ratio")
+    end = model.at(model.point + 9.0 * torch.eye(len(model.point)).double()[place])
+    step = model.parameters[place].step
+    assert one_way(end) == [(k, -s if k == place else s) for k, s in step_sizes(end)]
+    near, _, back = (
+        gather(end, setting, (), shifts=[(place, s * step)]).cells[0].jacobian[:, 0] for s in (0.5, 1.0, -1.0)
+    )
+    assert not near.any()
+    assert back.any()
+    short = end.at(end.point - 0.25 * step * torch.eye(len(end.point)).double()[place])
+    on, off = (gather(short, setting, (), shifts=[(place, s * step)]).cells[0].jacobian[:, 0] for s in (1.0, 0.25))
+    assert torch.equal(on, off)  # both end at the bound, and are divided by the way to there
 
 
 def test_a_data_sheet_without_bending_is_asked_nothing_about_it():
@@ -245,3 +282,19 @@ def test_a_table_that_one_episode_names_is_there_in_all():
     high = replace(RECORDING, colliders={"table": replace(plane, point=np.array([0.0, 0.0, 1.1]))})
     with pytest.raises(InvalidInput, match=r"inside 'table', which only other episodes have"):
         together([RECORDING, high])
+    again = replace(RECORDING, colliders={"table": replace(plane, point=np.array([0.4, 0.0, 0.501]))})
+    assert together([with_table, again]).colliders["table"] is plane  # measured twice
+    for other in (replace(plane, point=np.array([0.0, 0.0, 0.3])), replace(plane, friction=0.9)):
+        with pytest.raises(InvalidInput, match=r"table 'table'.*in one episode.*in another"):
+            together([with_table, replace(RECORDING, colliders={"table": other})])
+
+
+@pytest.mark.parametrize("normal", [(0.002, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+def test_a_table_that_leans_or_stands_rubs_otherwise_along_an_axis_of_its_own(normal):
+    plane = Collider(np.zeros(3), np.array(normal) / np.linalg.norm(normal), 0.4)
+    model = base_model(replace(RECORDING, colliders={"table": plane}))
+    law = grip._friction(model.world(), along=-0.5).cloth.boundaries["table"].friction
+    assert abs(float(law.axis @ torch.as_tensor(plane.normal).to(law.axis))) < 1e-5
+    assert law.ratio.value.item() == pytest.approx(2.0)
+    again = grip._friction(grip._friction(model.world(), along=-0.5), more=0.1).cloth.boundaries["table"].friction
+    assert torch.allclose(again.axis, law.axis)
