@@ -146,6 +146,31 @@ def gather(
     return Evidence(cells, own if raw else len(model.point), possible, stds, numerics)
 
 
+def asked_about(
+    here: Evidence,
+    model: Model,
+    setting: Setting,
+    hypotheses: Sequence[Hypothesis],
+    progress: Progress = lambda _: None,
+) -> Evidence:
+    """``here``, the evidence at the model's point, with slopes along these hypotheses; only they are simulated."""
+    possible, pieces, began = list(hypotheses), [], time.monotonic()
+    for k, e in enumerate(setting.episodes):
+        progress(f"{e.name}, {k + 1} of {len(setting.episodes)}{_left(began, k, len(setting.episodes))}")
+        question = [k, "asked", [h.name for h in model.accepted], [(h.name, h.typical) for h in possible]]
+        piece = setting.kept(question, model.point, partial(_asked_piece, model, setting, k, possible))
+        pieces.append((piece, possible))
+        possible = [h for h, able in zip(possible, piece.able.tolist(), strict=True) if able]
+    cells = []
+    for own, std, (piece, asked) in zip(here.cells, here.stds, pieces, strict=True):
+        simulated = [h for h, able in zip(asked, piece.able.tolist(), strict=True) if able]
+        use = [i for i, h in enumerate(simulated) if h in possible]
+        slopes = aligned(own.key, piece.cells.key, piece.cells.jacobian[:, use])
+        parts = [own.jacobian[:, : here.own], slopes, own.jacobian[:, own.jacobian.shape[1] - len(std) :]]
+        cells.append(own._replace(jacobian=torch.cat(parts, 1)))
+    return replace(here, cells=cells, hypotheses=possible)
+
+
 def staged(progress: Progress, stage: str) -> Progress:
     """The same, with what all lines are about in front."""
     return lambda text: progress(f"{stage}: {text}")
@@ -181,10 +206,8 @@ def _piece(
 ) -> Piece:
     """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
     e, world = setting.episodes[k], model.world()
-    near = [shifted(model, coordinate, step) for coordinate, step in shifts]
-    beside = [m.world() for m in near]
-    # to where it ended, which may be a bound: nothing is told by a step of no length
-    steps = [float((m.point - model.point)[c]) or step for m, (c, step) in zip(near, shifts, strict=True)]
+    steps = [_taken(model, coordinate, step) for coordinate, step in shifts]
+    beside = [shifted(model, coordinate, step).world() for coordinate, step in shifts]
     runs = _runs(model, world, setting, k, hypotheses, beside, with_held=known is None)
     able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
     typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
@@ -202,10 +225,22 @@ def _piece(
     return Piece(kept, std, difference, able)
 
 
+def _asked_piece(model: Model, setting: Setting, k: int, hypotheses: Sequence[Hypothesis]) -> Piece:
+    """Slopes of the k-th episode along hypotheses alone."""
+    e, world = setting.episodes[k], model.world()
+    runs = _runs(model, world, setting, k, hypotheses, (), with_held=False, finer=False)
+    base, moved = world.seen(runs.plain, e), [t for t in runs.trials if t is not None]
+    able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
+    typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
+    slopes = directions(base, moved, typical) if moved else None
+    none = torch.zeros(0, dtype=torch.float64)
+    return Piece(cells_of(base, slopes, e, setting.sheet, setting.rest), none, none, able)
+
+
 class _Runs(NamedTuple):
     """All simulations of one episode."""
 
-    fine: Frames  # on the finer mesh
+    fine: Frames  # on the finer mesh; the plain ones where nobody asked
     plain: Frames  # what happens, whoever looks on
     beside: list[Frames]  # along the model's own coordinates
     held: list[Frames]  # with the held places off
@@ -220,6 +255,7 @@ def _runs(
     hypotheses: Sequence[Hypothesis],
     near: Sequence[World],
     with_held: bool,
+    finer: bool = True,
 ) -> _Runs:
     e, dt = setting.episodes[k], setting.dt
     beside = [partial(w.frames, e, dt) for w in near]
@@ -227,12 +263,14 @@ def _runs(
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m, settles=True), dt) for m in modes]
     changed = [_if_possible(partial(h.apply, world, h.typical)) for h in hypotheses]
     moves = [c is not None and (c.cloth is not world.cloth or c.motions is not world.motions) for c in changed]
-    jobs = [partial(_finest, model, setting, k), partial(world.simulated, e, dt), *beside, *held]
+    first = [partial(_finest, model, setting, k)] if finer else []  # it takes longest
+    jobs = [*first, partial(world.simulated, e, dt), *beside, *held]
     tried = [
         partial(_if_possible, partial(c.frames, e, dt)) for c, own in zip(changed, moves, strict=True) if c and own
     ]
     done: list[Any] = side_by_side(lambda job: job(), [*jobs, *tried])
-    fine, plain, *sure = done[: len(jobs)]
+    plain, *sure = done[len(first) : len(jobs)]
+    fine = done[0] if finer else plain
     rest = iter(done[len(jobs) :])
     seen = lambda c: c and _if_possible(partial(c.seen, plain, e))  # noqa: E731
     trials = [next(rest) if own else seen(c) for c, own in zip(changed, moves, strict=True)]
@@ -346,6 +384,14 @@ def shifted(model: Model, coordinate: int, step: float) -> Model:
     beside = model.point
     beside[coordinate] += step
     return model.at(beside)
+
+
+def _taken(model: Model, coordinate: int, step: float) -> float:
+    """The step as far as the coordinate's ends allow; one of no length tells nothing, whatever it is divided by."""
+    low, high = (float(end[coordinate]) for end in model.ends)
+    here = float(model.point[coordinate])
+    there = min(max(here + step, low), high)
+    return step if there == here + step else there - here or step
 
 
 def nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:

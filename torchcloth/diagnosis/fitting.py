@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..identification.bounds import bounded
 from .bursts import calmed, densities, unweighted
-from .evidence import IMPOSSIBLE, Evidence, Progress, Setting, as_rough, gather, staged
+from .evidence import IMPOSSIBLE, Evidence, Progress, Setting, as_held, as_rough, asked_about, gather, staged
 from .noise import Noise, Whitened, fit_noise, unfitted, whitened
 from .world import Hypothesis, Model
 
@@ -60,8 +60,8 @@ def fit(
     """Fit the model's parameters and amplitudes, then ask about the hypotheses there.
 
     Fits are compared with the same ``noise``; None: estimated. The nuisances' slopes are those of ``before``, if given.
-    ``here`` is the evidence at the model's point, where that is known already. A step into what is ``IMPOSSIBLE`` is
-    not taken.
+    ``here`` is the evidence at the model's point, where that is known already: nothing of it is simulated again. A step
+    into what is ``IMPOSSIBLE`` is not taken.
     """
     about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
 
@@ -84,7 +84,8 @@ def fit(
         except IMPOSSIBLE:
             break
     if hypotheses and not asked:
-        here = look(model, iterations)
+        here = here if before is None else as_held(here, before)
+        here = asked_about(here, model, setting, hypotheses, staged(progress, about))
     return weighed(model, here, noise or fit_noise(here))
 
 

@@ -106,7 +106,8 @@ def doubted(found: Found, progress: Progress = lambda _: None) -> Found:
     if not found.causes or found.whole is None or found.whole.explained > NEARLY_ALL:
         return found
     start, setting = found.start, found.setting
-    laws = fit(start.model, setting, start.model.others(TERMS), 0, progress, start.noise, start.evidence)
+    asked, known = start.model.others(TERMS), start.evidence
+    laws = fit(start.model, setting, asked, 0, progress, start.noise, known, known)
     return instead(found, laws, TRIED, progress)
 
 
@@ -119,5 +120,5 @@ def learn_residual(found: Fitted, setting: Setting, progress: Progress = lambda 
         progress: called with one line for each thing that is simulated.
     """
     laws = found.model.others(TERMS)
-    start = fit(found.model, setting, laws, 1, progress, before=found.evidence)
+    start = fit(found.model, setting, laws, 1, progress, before=found.evidence, here=found.evidence)
     return Residual(extend(start, setting, laws, progress, TRIED))

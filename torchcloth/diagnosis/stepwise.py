@@ -83,8 +83,8 @@ def search(
         begun = [(rows[h.name], model) for h, model in afresh(start, setting, asked, TRIED, progress)]
         if first := one_step(start, setting, begun, screened, progress):
             current, steps = _chain(start, setting, hypotheses, progress, TRIED, first)
-    known = {h.name for h in start.evidence.hypotheses}
-    impossible = tuple(h.name for h in model.others(hypotheses) if h.name not in known)
+    able = {h.name for h in start.evidence.hypotheses}
+    impossible = tuple(h.name for h in model.others(hypotheses) if h.name not in able)
     return replace(_found(start, current, steps, setting), impossible=impossible)
 
 
@@ -158,7 +158,8 @@ def _chain(
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
     if steps and current.ahead > FAR:
         left = current.model.others(hypotheses)
-        current = fit(current.model, setting, left, progress=staged(progress, "all"), before=current.evidence)
+        here, now = current.evidence, staged(progress, "all")
+        current = fit(current.model, setting, left, progress=now, before=here, here=here)
     return (start, []) if steps and _beside_the_point(start, current, setting.names, MOSTLY) else (current, steps)
 
 
@@ -196,7 +197,7 @@ def _pruned(
             continue
         steps = [s for s in steps if s is not step]
         left = less.model.others(hypotheses)
-        current = fit(less.model, setting, left, 1, progress, before=current.evidence)
+        current = fit(less.model, setting, left, 1, progress, before=current.evidence, here=less.evidence)
     return current, steps
 
 
