@@ -27,8 +27,8 @@ from .unknowns import available
 
 RESULT = "identification.json"
 SAME = 1e-5  # m, between the mean points of one episode, kept and read again
-SHORTEST, FINEST = 1e-7, 1e-5  # s, m: no fit ends that takes such steps, or has such a contact grid
 FAITHFUL = 0.02  # relative difference of Chamfer between the fit and its replay that other machines explain
+SHORTEST, FINEST = 1e-7, 1e-5  # s, m: no fit ends that takes such steps, or has such a contact grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +151,15 @@ def read_saved(path: str | Path) -> SavedModel:
     return read_result(path, RESULT, _model, expected, "run `torchcloth identify` again")
 
 
+def _contact(**kept: Any) -> Contact:
+    for name, least in {"spacing": FINEST, "subdivisions": 1, "damping": 0.0, "play": 0.0}.items():
+        if kept.get(name) is not None:
+            number(kept[name], least, f"contact {name}")
+    if not isinstance(kept.get("subdivisions"), int | None) or not isinstance(kept.get("everywhere", False), bool):
+        raise ValueError(f"contact {kept}")
+    return Contact(**kept)
+
+
 def _model(content: dict[str, Any]) -> SavedModel:
     model, said, correlation = (content[key] for key in ("model", "parameters", "correlation"))
     matrix = np.array([[number(row[name], -1.0) for name in correlation] for row in correlation.values()])
@@ -176,15 +185,6 @@ def _model(content: dict[str, Any]) -> SavedModel:
             for e in model["episodes"]
         ],
     )
-
-
-def _contact(**kept: Any) -> Contact:
-    for name, least in {"spacing": FINEST, "subdivisions": 1, "damping": 0.0, "play": 0.0}.items():
-        if kept.get(name) is not None:
-            number(kept[name], least, f"contact {name}")
-    if not isinstance(kept.get("subdivisions"), int | None) or not isinstance(kept.get("everywhere", False), bool):
-        raise ValueError(f"contact {kept}")
-    return Contact(**kept)
 
 
 def mark(recording: Recording) -> dict[str, Any]:
