@@ -29,8 +29,6 @@ def run(options: argparse.Namespace) -> int:
     threads = os.cpu_count() or 1 if options.threads is None else options.threads
     if threads < 1:
         raise InvalidInput("--threads", got=threads, expected="at least 1")
-    if options.out is not None and options.out.exists() and not options.out.is_dir():
-        raise InvalidInput("--out", got=f"{options.out}, a file", expected="a folder, new or existing")
     missing = absent() if options.peers else {}
     peers = tuple(name for name in PEERS if options.peers and name not in missing)
     plan = (Plan.quick if options.fast else Plan)(tuple(engines()), peers, threads)

@@ -20,6 +20,7 @@ from twins import doubles, first, twin
 
 from torchcloth import recordings
 from torchcloth.cli import main
+from torchcloth.cli.folders import check_file, check_folder
 from torchcloth.errors import InvalidInput
 
 COMMAND = [sys.executable, "-m", "torchcloth.cli"]
@@ -313,3 +314,68 @@ def test_a_folder_below_a_file_is_refused_at_once(verb, folder, tmp_path, capsys
     (tmp_path / "file").write_text("")
     assert main([verb, str(folder), "--out", str(tmp_path / "file" / "sub")]) == 2
     assert "file, a file; expected a folder" in one_line(capsys.readouterr().err)
+
+
+FIT = ("base.tcm", "extended.tcm")  # need not be there: where to write is asked first
+PLACED = {
+    "identify": [],
+    "pose": [],
+    "diagnose": [],
+    "inspect": [],
+    "simulate": ["--garment", "sheet", "--motion", "swing"],
+    "confirm": FIT,
+    "bench": ["--fast"],
+    "demo": [],
+    "predict": FIT[:1],
+    "view": [],
+}
+
+
+@pytest.mark.parametrize("verb", PLACED)
+def test_a_place_that_cannot_be_written_is_refused_at_once(verb, folder, tmp_path, capsys):
+    """Before anything is simulated or measured; and nothing of the trial is left."""
+    episode = [] if verb in ("simulate", "bench", "demo") else [str(folder)]
+    places = {tmp_path / "new" / ("x" * 300): "File name too long"}
+    if Path("/proc/self").exists():
+        places[Path("/proc/x")] = "No such file or directory"
+    for place, why in places.items():
+        out = place / "a.rrd" if verb == "view" else place
+        assert main([verb, *PLACED[verb], *episode, "--out", str(out)]) == 2
+        said = one_line(capsys.readouterr().err)
+        assert f"--out; got {place}, which cannot be written ({why}); expected a folder" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_episode_is_not_converted_to_where_it_cannot_be_written(folder, tmp_path, capsys):
+    assert main(["convert", str(folder), str(tmp_path / ("x" * 300) / "copy")]) == 2
+    assert "DST; got" in one_line(capsys.readouterr().err)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_that_can_be_written_is_left_as_it_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "old").mkdir()
+    (tmp_path / "dangling").symlink_to(tmp_path / "nothing")
+    for path in (Path("old"), Path("new/a/b"), tmp_path / "new" / ".." / "b", Path(".."), Path("old/../c")):
+        check_folder(path)
+    check_file(Path("new/a.gif"))
+    for path in (Path("dangling"), Path("dangling/a")):
+        with pytest.raises(InvalidInput, match="dangling, a file"):
+            check_folder(path)
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["dangling", "old"]
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (
+            PermissionError(13, "Permission denied", "/data/a.npz"),
+            "/data/a.npz; got Permission denied; expected a path th",
+        ),
+        (OSError(28, "No space left on device"), "the system refuses; got No space left on device"),
+        (OSError("broken picture"), "the system refuses; got broken picture"),
+    ],
+)
+def test_what_the_system_says_is_said_like_everything_else(folder, tmp_path, capsys, monkeypatch, error, said):
+    monkeypatch.setattr(recordings, "read", lambda *_, **__: (_ for _ in ()).throw(error))
+    assert f"torchcloth: {said}" in refuse(capsys, tmp_path / "out", "identify", folder)

@@ -92,6 +92,8 @@ def test_the_fitted_episode_is_no_prediction(swing, tmp_path, capsys):
 def test_wrong_input_is_one_line(strips, swing, tmp_path, capsys):
     fit, other = swing
     (tmp_path / "file").write_text("")
+    model = tmp_path / "m.tcm"
+    model.touch()
     table = recordings.write_tension(offaxis.readings(60, 0.0, np.random.default_rng(1)), tmp_path / "table")
     wrong = {
         ("nothing", "--angle", "30"): "FIT; got .*nothing; expected tension.json or identification.json",
@@ -100,7 +102,16 @@ def test_wrong_input_is_one_line(strips, swing, tmp_path, capsys):
         (strips, "--angle", "30", "--length", "-1"): "length; got -1.0",
         (strips, table, "--angle", "30"): "SEEN; got a table and a strip's numbers; expected one of them",
         (strips, other): "FIT; got tension.json with an episode to predict; expected identification.json",
-        (fit, "--angle", "30"): "with a strip to predict; expected tension.json; --angle and tables need a fit of tens",
+        (
+            fit,
+            "--angle",
+            "30",
+        ): "with a strip to predict; expected tension.json; tables and --angle, .* need a fit of t",
+        (fit, other, "--angle", "30"): "got identification.json with a strip to predict; expected tension.json",
+        (fit, other, "--length", "-1", "--strain", "nan"): "got identification.json with a strip to predict",
+        (fit, other, "--width", "0.02"): "got identification.json with a strip to predict",
+        (fit, other, "--preload", "0"): "got identification.json with a strip to predict",
+        (model, other, "--angle", "30"): "got m.tcm with a strip to predict; expected tension.json",
         (fit,): "SEEN; got none; expected an episode",
         (fit, tmp_path / "no"): "no",
     }

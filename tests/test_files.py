@@ -27,6 +27,13 @@ def test_a_block_that_fails_leaves_nothing(tmp_path):
     assert list((tmp_path / "new").iterdir()) == []
 
 
+def test_the_systems_errors_name_the_file_that_was_asked_for(tmp_path):
+    path = tmp_path / f"{'x' * 240}.txt"
+    with pytest.raises(OSError, match="File name too long") as caught:
+        write_text(path, "new")
+    assert caught.value.filename == str(path)
+
+
 def test_the_suffix_is_kept(tmp_path):
     """Libraries choose the format by it, and some add their own where there is none."""
     with atomically(tmp_path / "a.npz") as part:

@@ -8,7 +8,7 @@ import torch
 import twins
 
 from torchcloth import recordings
-from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.errors import InvalidInput, RecordingError, UnstableStep
 from torchcloth.identification import cloth_from, fitted, identify, predict_episode, replayed
 from torchcloth.identification.saved import read_saved
 from torchcloth.transfer import Contact
@@ -70,6 +70,58 @@ def test_a_damaged_error_is_refused_by_all_that_read_it(pair, recording, tmp_pat
     path.write_text(json.dumps(content))
     for read in (fitted, predict_episode, replayed):
         with pytest.raises(RecordingError, match="does not say which model was fitted; got"):
+            read(path, recording)
+
+
+def put(*path, value):
+    def change(content):
+        for key in path[:-1]:
+            content = content[key]
+        content[path[-1]] = value
+
+    return change
+
+
+CONTACT = {"spacing": 0.05, "subdivisions": None, "damping": 0.1, "play": 0.2, "everywhere": False}
+DAMAGE = {
+    "deep": (lambda content: "[" * 200_000, "unreadable; got .*recursion"),
+    "a number of 400 digits": (put("model", "values", "youngs_modulus", value=10**400), "youngs_modulus 1000.*0000 wh"),
+    "a number that is none": (put("model", "values", "youngs_modulus", value=True), "youngs_modulus True where"),
+    "contact spacing a word": (put("model", "contact", value={**CONTACT, "spacing": "x"}), "contact spacing 'x' where"),
+    "contact without width": (put("model", "contact", value={**CONTACT, "spacing": 0}), "contact spacing 0 where"),
+    "contact of halves": (put("model", "contact", value={**CONTACT, "subdivisions": 2.5}), "subdivisions"),
+    "contact that plays": (put("model", "contact", value={**CONTACT, "play": 2.0}), "contact play; got 2.0"),
+    "contact of nothing": (put("model", "contact", value={"gap": 0.1}), "unexpected keyword argument 'gap'"),
+    "no correlation": (put("correlation", value={}), "no fitted parameter in correlation"),
+    "no step": (put("model", "dt", value=0), "dt 0 where"),
+    "a step back": (put("model", "dt", value=-1.0), "dt -1.0 where"),
+    "a step without end": (put("model", "dt", value=1e-14), "dt 1e-14 where"),
+    "frames of a word": (put("model", "episodes", 0, "frames", value="x"), "frames 'x' where"),
+    "mean of nothing": (put("model", "episodes", 0, "mean", value=[float("nan")] * 3), "mean nan where"),
+    "no model": (lambda content: content.pop("model") and None, "got no 'model'"),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_damage_is_one_line_that_names_the_file(pair, recording, tmp_path, case):
+    change, said = DAMAGE[case]
+    path = pair.save(tmp_path)
+    content = json.loads(path.read_text())
+    path.write_text(change(content) or json.dumps(content))
+    for read in (fitted, predict_episode, replayed):
+        with pytest.raises(RecordingError, match=said) as caught:
+            read(path, recording)
+        assert str(caught.value).startswith(f"{path}: ")
+        assert str(caught.value).endswith("run `torchcloth identify` again")
+
+
+def test_a_step_that_is_too_long_for_an_episode_is_the_files(pair, recording, tmp_path):
+    path = pair.save(tmp_path)
+    content = json.loads(path.read_text())
+    content["model"]["dt"] = 0.5
+    path.write_text(json.dumps(content))
+    for read in (predict_episode, replayed):
+        with pytest.raises(UnstableStep, match=r"identification.json: dt; got 0.5 s; .*fit again without --dt"):
             read(path, recording)
 
 

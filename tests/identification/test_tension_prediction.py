@@ -163,10 +163,25 @@ def test_files_that_are_no_fit(fit, tmp_path):
         read_model(tmp_path)
     path = fit.save(tmp_path)
     content = json.loads(path.read_text())
-    for damage in ({}, {**content, "model": {}}, {**content, "model": {**content["model"], "covariance": [[1.0]]}}):
+    model = content["model"]
+    (table, *others), huge = model["tables"], 10**400
+    models = [
+        {},
+        [],
+        model | {"covariance": [[1.0]]},
+        model | {"covariance": [[huge] * len(model["fitted"])] * len(model["fitted"])},
+        model | {"covariance": [[1.0], []]},
+        model | {"values": model["values"] | {model["fitted"][0]: huge}},
+        model | {"tables": [table | {"length": "x"}, *others]},
+        model | {"tables": [table | {"width": 0}, *others]},
+        model | {"tables": [table | {"missed": {"force": -1.0}}, *others]},
+        model | {"material": []},
+    ]
+    for damage in ({}, *({**content, "model": m} for m in models)):
         path.write_text(json.dumps(damage))
-        with pytest.raises(RecordingError, match="does not say which model was fitted"):
+        with pytest.raises(RecordingError, match=r"tension\.json: does not say which model was fitted"):
             read_model(tmp_path)
-    path.write_text("{")
-    with pytest.raises(RecordingError, match="unreadable"):
-        read_model(tmp_path)
+    for text in ("{", "[" * 200_000):
+        path.write_text(text)
+        with pytest.raises(RecordingError, match="unreadable"):
+            read_model(tmp_path)

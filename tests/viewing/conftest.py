@@ -75,7 +75,8 @@ def short(tmp_path_factory, example):
     mark = {"name": "swing", "frames": FRAMES, "points": len(xyz), "mean": xyz.mean(0).tolist(), "chamfer": 0.001}
     fit = folder.parent / "identification.json"
     model = {"values": VALUES, "contact": None, "dt": None, "episodes": [mark]}
-    found = {"parameters": {}, "correlation": {}, "fit": {"rms_after": 0.0012}}
+    said = {"youngs_modulus": {"std": 100.0, "identifiable": True, "source": "data"}}
+    found = {"parameters": said, "correlation": {name: {name: 1.0} for name in said}, "fit": {"rms_after": 0.0012}}
     fit.write_text(json.dumps({**found, "model": model}))
     return folder, fit
 

@@ -22,6 +22,14 @@ WRONG = {
     "size without picture": (["--out", "a.rrd", "--size", "300x200"], "--size; got '300x200'"),
     "size without x": (["--out", "a.gif", "--size", "300"], "--size; got '300'; expected WIDTHxHEIGHT"),
     "tiny size": (["--out", "a.gif", "--size", "50x50"], "size; got 50x50; expected at least 120"),
+    "huge size": (
+        ["--out", "a.png", "--size", "9999x9999"],
+        "size; got 9999x9999; expected at least 120 and at most 40",
+    ),
+    "no folder for it": (
+        ["--out", "x" * 300 + "/a.gif"],
+        "which cannot be written (File name too long); expected a fo",
+    ),
     "fps of nothing": (["--out", "a.gif", "--fps", "0"], "--fps; got 0.0; expected a number > 0"),
     "fps that no GIF has": (["--out", "a.gif", "--fps", "90"], "rate; got 90.0; expected up to 50"),
     "port and file": (["--out", "a.gif", "--port", "9000"], "--port; got 9000; expected 1 to 65535, without --out"),
@@ -65,6 +73,15 @@ def test_options_of_a_gif(short, tmp_path, capsys):
     assert say(capsys, folder, "--fit", fit, "--fps", 10, "--size", "300x240", "--out", out)[0] == 0
     with Image.open(out) as gif:
         assert (gif.size, gif.n_frames) == ((300, 240), 3)  # 0.2 s
+
+
+@pytest.mark.filterwarnings("error::UserWarning")  # it is a single frame, too
+def test_a_fit_in_the_smallest_pictures(short, tmp_path, capsys):
+    folder, fit = short
+    arguments = ["--fit", fit, "--truth", "--fps", 3, "--size", "200x160", "--out", tmp_path / "a.gif"]
+    assert say(capsys, folder, *arguments)[0] == 0
+    with Image.open(tmp_path / "a.gif") as gif:
+        assert gif.size == (200, 160)
 
 
 def test_no_second_file_when_the_extra_is_missing(short, tmp_path, capsys, monkeypatch):

@@ -166,8 +166,9 @@ def test_durations_are_hundredths_whose_sum_is_right():
 def test_a_gif_has_at_most_fifty_frames_a_second(film, tmp_path):
     with pytest.raises(InvalidInput, match="rate; got 60"):
         animate(film, tmp_path / "a.gif", rate=60.0)
-    with pytest.raises(InvalidInput, match="got 60x400; expected at least 120"):
-        animate(film, tmp_path / "a.gif", size=(60, 400))
+    for size in ((60, 400), (400, 60), (400, 5000)):
+        with pytest.raises(InvalidInput, match=rf"got {size[0]}x{size[1]}; expected at least 120 and at most 4096"):
+            animate(film, tmp_path / "a.gif", size=size)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -208,6 +209,20 @@ def test_the_curve_of_distances_is_drawn_below(film):
     assert measured.camera.height < plain.camera.height
     below = measured.camera.height
     assert (measured.pixels(0)[below:] != measured.pixels(5)[below:]).any()  # the mark runs
+
+
+@pytest.mark.parametrize("size", [(120, 120), (200, 160), (400, 171)])
+def test_the_curve_has_its_place_also_on_the_smallest_picture(film, size):
+    """A seventh of a low picture is less than the curve's labels take."""
+    sheet = film.sheets["cloth"]
+    coloured = {"cloth": replace(sheet, values=np.ones(sheet.vertices.shape[:2], np.float32))}
+    curve = {"distance": Curve(film.times, np.linspace(1, 3, 6), "mm")}
+    stage = Stage(replace(film, sheets=coloured, curves=curve), size)
+    below = stage.camera.height
+    assert below > 0.5 * size[1]
+    first, last = stage.pixels(0), stage.pixels(5)
+    assert first.shape == (size[1], size[0], 3)
+    assert (first[below:] != last[below:]).any()
 
 
 def test_a_failure_leaves_nothing_behind(film, tmp_path, monkeypatch):

@@ -13,6 +13,15 @@ from torchcloth.viewing import View, with_cloth, write_rrd
 from torchcloth.viewing.colours import colours
 
 
+def test_a_file_that_cannot_be_made_is_named(film, tmp_path):
+    """Also where the name beside it, which nobody gave, is the one that the system refuses."""
+    path = tmp_path / f"{'x' * 240}.rrd"
+    with pytest.raises(OSError, match="File name too long") as caught:
+        write_rrd(film, path)
+    assert caught.value.filename == str(path)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.fixture
 def whole(film, tmp_path):
     """The film with a measured cloth, its truth, and a camera that saw two depth images."""

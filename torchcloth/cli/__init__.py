@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from importlib import metadata
 
-from ..errors import TorchclothError
+from ..errors import InvalidInput, TorchclothError
 from . import bench, confirm, convert, diagnose, doctor, identify, inspect, pose, predict, simulate, view
 
 VERBS = (
@@ -36,11 +36,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
             register_file(options.causes)
         return options.run(options)
     except (TorchclothError, OSError) as error:
-        print(f"torchcloth: {error}", file=sys.stderr)
+        said = error if isinstance(error, TorchclothError) else _of_system(error)
+        print(f"torchcloth: {said}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"torchcloth: stopped{getattr(options, 'stopped', '')}", file=sys.stderr)
         return 130
+
+
+def _of_system(error: OSError) -> TorchclothError:
+    """What the system says of a file, as everything else is said."""
+    said = error.strerror or str(error)
+    if error.filename is None:
+        return InvalidInput("the system refuses", got=said)
+    expected = "a path that can be read and written"
+    return InvalidInput(
+        f"{error.filename}", got=said, expected=expected, remedy="choose another, or change its permissions"
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from .folders import check_folder
+
 
 def add(verbs: Any) -> None:
     """The verb and its options."""
@@ -19,6 +21,8 @@ def add(verbs: Any) -> None:
 
 
 def _bench(options: argparse.Namespace) -> int:
+    if options.out is not None:
+        check_folder(options.out)
     from ..benchmarks import command  # pyright: ignore[reportMissingImports] - mapped from benchmarks/ at installation
 
     return command.run(options)

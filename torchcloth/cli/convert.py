@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
+from .folders import check_folder
 
 if TYPE_CHECKING:
     from ..recordings import Recording
@@ -58,8 +60,9 @@ def _check_target(options: argparse.Namespace) -> None:
     if target.suffix != MCAP and target.suffix.lower() in FILES.split():
         expected = f"a folder's name, or a file ending {MCAP}"
         raise InvalidInput(f"DST cannot be a {target.suffix} file", got=target, expected=expected)
-    if target.exists() and not options.overwrite:
+    if os.path.lexists(target) and not options.overwrite:
         raise InvalidInput("DST exists", got=target, expected="a new name", remedy="or --overwrite")
+    check_folder(target.parent, "DST")
 
 
 def _streams(recording: Recording) -> list[tuple[str, str, Any]]:

@@ -1,20 +1,42 @@
-"""Output folders."""
+"""Places to write to, tried before any work is done."""
 
 from __future__ import annotations
 
+import os
+import tempfile
 from pathlib import Path
 
 from ..errors import InvalidInput
 
 
-def check_folder(path: Path) -> None:
-    """Refuse, before any work is done, a folder that cannot be made.
+def check_folder(path: Path, option: str = "--out") -> None:
+    """Refuse, before any work is done, a folder that cannot be made or written to; leaves nothing behind.
 
     Raises:
-        InvalidInput: the path, or what should be a folder above it, is a file.
+        InvalidInput: the path, or what should be a folder above it, is a file, or the system lets nothing be made.
     """
-    for part in (path, *path.parents):
-        if part.exists():
-            if not part.is_dir():
-                raise InvalidInput("--out", got=f"{part}, a file", expected="a folder, new or existing")
-            return
+    above = next(part for part in (path, *path.parents) if os.path.lexists(part) or part == part.parent)
+    if not above.is_dir():
+        raise InvalidInput(option, got=f"{above}, a file", expected="a folder, new or existing")
+    plain = Path(os.path.abspath(path))
+    try:  # in a place of its own: two commands may make the same folder at once
+        with tempfile.TemporaryDirectory(prefix=".torchcloth-", dir=above) as trial:
+            (Path(trial) / plain.relative_to(os.path.abspath(above))).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInput(
+            option,
+            got=f"{path}, which cannot be written ({error.strerror})",
+            expected="a folder, new or existing, where files can be made",
+            remedy="choose another, or change its permissions",
+        ) from None
+
+
+def check_file(path: Path, option: str = "--out") -> None:
+    """Refuse, before any work is done, a file that cannot be written; leaves nothing behind.
+
+    Raises:
+        InvalidInput: it is a folder, or ``check_folder`` refuses its folder.
+    """
+    if os.path.isdir(path):
+        raise InvalidInput(option, got=f"{path}, a folder", expected="a file, new or existing")
+    check_folder(path.parent, option)

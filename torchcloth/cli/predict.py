@@ -13,6 +13,7 @@ from ..errors import InvalidInput
 from .folders import check_folder
 
 TABLE = "table.json"  # of a folder with readings of a tension machine
+STRIP = ("angle", "length", "width", "preload", "strain")  # options that no episode has
 
 
 def add(verbs: Any) -> None:
@@ -52,18 +53,20 @@ def _predict(options: argparse.Namespace) -> int:
     folder = options.fit if options.fit.is_dir() else options.fit.parent
     out = folder / "prediction" if options.out is None else options.out
     check_folder(out)
-    if options.fit.suffix == ".tcm":
+    given = any(getattr(options, name) is not None for name in STRIP)
+    of_strip = given or (options.seen is not None and (options.seen / TABLE).is_file())
+    if options.fit.suffix == ".tcm" and not of_strip:
         return _of_episode(options.fit, out, options)
     known = [name for name in (TENSION, RESULT) if (folder / name).is_file()]
-    if options.fit.name in (TENSION, RESULT):
+    if options.fit.name in (TENSION, RESULT) or options.fit.suffix == ".tcm":
         known = [options.fit.name] if options.fit.is_file() else []
     if not known:
         raise InvalidInput("FIT", got=options.fit, expected=f"{TENSION} or {RESULT}, or the folder that holds it")
-    of_table = options.angle is not None or (options.seen is not None and (options.seen / TABLE).is_file())
-    name = TENSION if of_table or (options.seen is None and known == [TENSION]) else RESULT
+    name = TENSION if of_strip or (options.seen is None and known == [TENSION]) else RESULT
     if name not in known:
-        what = "a strip" if of_table else "an episode"
-        fits = "--angle and tables need a fit of tension tables" if of_table else "episodes need a fit of episodes"
+        what = "a strip" if of_strip else "an episode"
+        numbers = ", ".join(f"--{name}" for name in STRIP)
+        fits = f"tables and {numbers} need a fit of tension tables" if of_strip else "episodes need a fit of episodes"
         raise InvalidInput("FIT", got=f"{known[0]} with {what} to predict", expected=name, remedy=fits)
     return (_of_strip if name == TENSION else _of_episode)(folder / name, out, options)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
+from .folders import check_file
 
 if TYPE_CHECKING:
     from ..viewing import Film
@@ -55,8 +56,8 @@ def _checked(options: argparse.Namespace) -> tuple[int, int] | None:
     suffix = None if out is None else out.suffix.lower()
     if out is not None and suffix not in PICTURES + OTHERS:
         raise InvalidInput("--out", got=repr(out.name), expected=f"a name with {', '.join(PICTURES + OTHERS)}")
-    if out is not None and out.is_dir():
-        raise InvalidInput("--out", got=f"{out}, a folder", expected="a file, new or existing")
+    if out is not None:
+        check_file(out)
     if options.port is not None and (out is not None or not 0 < options.port < 65536):
         raise InvalidInput("--port", got=options.port, expected="1 to 65535, without --out")
     if options.fps is not None and not 0 < options.fps < float("inf"):
@@ -66,7 +67,9 @@ def _checked(options: argparse.Namespace) -> tuple[int, int] | None:
     found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", options.size)
     if found is None or suffix not in PICTURES:
         raise InvalidInput("--size", got=repr(options.size), expected="WIDTHxHEIGHT in pixels, with a GIF or PNG")
-    return int(found[1]), int(found[2])
+    from ..viewing.stage import check_size
+
+    return check_size((int(found[1]), int(found[2])))
 
 
 def _film(options: argparse.Namespace) -> Film:

@@ -16,18 +16,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from .._files import atomically
-from ..errors import InvalidInput, RecordingError
-from ..recordings import ClothInfo, Collider, GraspInfo, Recording
+from ..errors import InvalidInput
+from ..recordings import GraspInfo, Recording
 from .base_model import base_model
 from .hypotheses import known
+from .model_content import ARRAYS, CONTENT, EXPECTED, FORMAT, damage, read_content
 from .residual import TERMS
 from .world import Model
 
-FORMAT = 1
 MESH = ("vertices", "faces", "uv")
 SAME_FABRIC = 0.01  # relative difference of areal density that rounding explains
 
@@ -71,8 +70,8 @@ def save_model(
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     with atomically(Path(path)) as part, zipfile.ZipFile(part, "w") as file:
-        file.writestr("model.json", json.dumps(content, indent=1, allow_nan=False))
-        file.writestr("mesh.npz", buffer.getvalue())
+        file.writestr(CONTENT, json.dumps(content, indent=1, allow_nan=False))
+        file.writestr(ARRAYS, buffer.getvalue())
     return Path(path)
 
 
@@ -110,28 +109,22 @@ def read_model(path: str | Path, scene: Recording | None = None, residual: bool 
     """
     path = Path(path)
     if not path.is_file():
-        raise InvalidInput("model", got=f"no file {path}", expected="a .tcm file of `torchcloth diagnose`")
-    try:
-        with zipfile.ZipFile(path) as file:
-            content = json.loads(file.read("model.json"))
-            with np.load(io.BytesIO(file.read("mesh.npz"))) as arrays:
-                mesh = {name: arrays[name] for name in arrays.files}
-        if content["format"] != FORMAT:
-            raise RecordingError(
-                f"{path}: format {content['format']}", expected=f"{FORMAT}", remedy="update torchcloth"
-            )
-        own = _recording(content["cloth"], mesh)
-        numbers = (content.get("residual") if residual else None) or content
-        coordinates = {name: float(p["coordinate"]) for name, p in numbers["parameters"].items()}
-        causes = [(str(c["effect"]), float(c["amplitude"])) for c in numbers["causes"]]
-        matrix, episodes = content["covariance"], list(content.get("episodes", ()))
-    except (zipfile.BadZipFile, KeyError, TypeError, ValueError, OSError) as error:
-        got = "no archive" if isinstance(error, zipfile.BadZipFile) else f"{type(error).__name__}: {error}"
-        raise RecordingError(f"{path}: unreadable", got=got, expected="a .tcm file of `torchcloth diagnose`") from None
-    model = base_model(own if scene is None else of_fabric(path, own, scene))
-    values = torch.tensor([coordinates[p.name] for p in model.parameters], dtype=torch.float64)
-    model = _extended(path, replace(model, values=values), causes)
-    return ModelFile(model, None if matrix is None else torch.tensor(matrix, dtype=torch.float64), episodes, own)
+        raise InvalidInput("model", got=f"no file {path}", expected=EXPECTED)
+    said = read_content(path)
+    if scene is None:
+        with damage(path):
+            model = base_model(said.scene)
+    else:
+        model = base_model(of_fabric(path, said.scene, scene))
+    numbers = said.residual if residual and said.residual is not None else said.numbers
+    with damage(path):
+        *_, values = (n.of(model.parameters) for n in (said.numbers, numbers))
+        model = replace(model, values=values)
+        covariance = said.covariance()
+    model = _extended(path, model, numbers.causes)
+    with damage(path):
+        model.world()  # refuses numbers that no such parameter or effect can have
+    return ModelFile(model, covariance, said.episodes, said.scene)
 
 
 def of_fabric(path: str | Path, own: Recording, scene: Recording) -> Recording:
@@ -168,28 +161,3 @@ def _extended(path: Path, model: Model, causes: Sequence[tuple[str, float]]) -> 
 def _grasp(grasp: GraspInfo) -> dict[str, Any]:
     lists = {name: None if (v := getattr(grasp, name)) is None else v.tolist() for name in ("uv", "vertices")}
     return {**lists, "radius": grasp.radius}
-
-
-def _recording(facts: dict[str, Any], mesh: dict[str, np.ndarray]) -> Recording:
-    array = lambda v: None if v is None else np.asarray(v)  # noqa: E731
-    cloth = ClothInfo(
-        areal_density=facts["areal_density"],
-        areal_density_std=facts["areal_density_std"],
-        thickness=facts["thickness"],
-        sheet=None if facts["sheet"] is None else tuple(facts["sheet"]),
-        nominal=facts["nominal"],
-        vertices=mesh.get("vertices"),
-        faces=mesh.get("faces"),
-        uv=mesh.get("uv"),
-    )
-    grasps = {
-        name: GraspInfo(uv=array(g["uv"]), radius=g["radius"], vertices=array(g["vertices"]))
-        for name, g in facts["grasps"].items()
-    }
-    colliders = {
-        name: Collider(np.asarray(c["point"]), np.asarray(c["normal"]), c["friction"])
-        for name, c in facts["colliders"].items()
-    }
-    return Recording(
-        cloth=cloth, provenance="model file", grasps=grasps, colliders=colliders, gravity=np.asarray(facts["gravity"])
-    )

@@ -20,7 +20,7 @@ from .misfit import figures, forces_rms
 from .null import no_force, rigid_carry
 from .replays import Frames, tangents
 from .result import or_none
-from .saved import SavedModel, read_saved, rebuilt
+from .saved import SavedModel, read_saved, rebuilt, step_of
 from .unknowns import Unknown, collect
 
 CONVENTION = (
@@ -95,7 +95,8 @@ def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction
     unknowns, covariance = _known(model, cloth)
     data = episode(cloth, recording)
     raw = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
-    frames, moved = tangents(cloth, unknowns, raw, data, model.dt)
+    with step_of(path):
+        frames, moved = tangents(cloth, unknowns, raw, data, model.dt)
     return with_errors(cloth, data, frames, moved, covariance, model.left)
 
 

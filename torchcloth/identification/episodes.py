@@ -131,7 +131,7 @@ def cloth_from(
     """
     mesh = mesh_of(recording)
     if effects is None:
-        effects = _effects(recording)
+        effects = effects_of(recording)
     boundaries = {}
     for name, collider in recording.colliders.items():
         friction = 0.4 if collider.friction is None else collider.friction
@@ -140,7 +140,7 @@ def cloth_from(
         held = None if grasp.vertices is None else grasp.vertices.tolist()
         boundaries[name] = Grasp(held) if grasp.uv is None else Grasp(uv=grasp.uv, radius=grasp.radius)
     density = recording.cloth.areal_density
-    return Cloth(mesh, material or _nominal(recording), density, effects, boundaries, contact)
+    return Cloth(mesh, material or material_of(recording), density, effects, boundaries, contact)
 
 
 def mesh_of(recording: Recording) -> Mesh:
@@ -278,7 +278,7 @@ def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[s
     return times[inside]
 
 
-def _effects(recording: Recording) -> dict[str, AbstractEffect]:
+def effects_of(recording: Recording) -> dict[str, AbstractEffect]:
     """Weight; bending at its data-sheet value, if there is one; drag of a flat plate, if there is air."""
     effects: dict[str, AbstractEffect] = {"gravity": Gravity(recording.gravity.tolist())}
     nominal = recording.cloth.nominal
@@ -290,7 +290,8 @@ def _effects(recording: Recording) -> dict[str, AbstractEffect]:
     return effects
 
 
-def _nominal(recording: Recording) -> AEP:
+def material_of(recording: Recording) -> AEP:
+    """At the episode's nominal values, or at a start in the middle of published fabrics."""
     nominal, h = recording.cloth.nominal, recording.cloth.thickness or 1e-3
     stiffness = _number(nominal, "membrane_stiffness", DEFAULT_STIFFNESS)
     youngs = _number(nominal, "youngs_modulus", stiffness / h)

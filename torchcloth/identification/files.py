@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import reprlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,6 +12,7 @@ from typing import Any, TypeVar
 from ..errors import InvalidInput, RecordingError
 
 T = TypeVar("T")
+LARGEST = 1e100  # stands for infinity: a whole number of any length can be compared with it, and not all be a float
 
 
 def read_result(path: str | Path, name: str, parse: Callable[[dict[str, Any]], T], expected: str, again: str) -> T:
@@ -37,22 +39,24 @@ def read_result(path: str | Path, name: str, parse: Callable[[dict[str, Any]], T
         raise InvalidInput(
             "fit", got=f"no {path}", expected=f"{name}, or the folder that holds it", remedy=remedy
         ) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise RecordingError(f"{path}: unreadable", got=error, remedy=again) from None
     try:
         return parse(content)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         said = f"{path}: does not say which model was fitted"
-        raise RecordingError(said, got=repr(error), expected=expected, remedy=again) from None
+        got = f"no {error}" if isinstance(error, KeyError) else error
+        raise RecordingError(said, got=got, expected=expected, remedy=again) from None
 
 
-def number(value: Any, least: float = -math.inf) -> float:
-    """A finite number, not below ``least``.
+def number(value: Any, least: float = -math.inf, name: str = "") -> float:
+    """A finite number, not below ``least``; ``name`` is for the message.
 
     Raises:
         ValueError: it is not.
-        TypeError: it is no number at all.
     """
-    if isinstance(value, str) or not least <= (out := float(value)) < math.inf:
-        raise ValueError(f"{value!r} where a finite number{'' if least == -math.inf else f' >= {least:g}'} should be")
-    return out
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    if not plain or not max(least, -LARGEST) <= value < LARGEST:
+        what = f"{name} {reprlib.repr(value)}".lstrip()
+        raise ValueError(f"{what} where a finite number{'' if least == -math.inf else f' >= {least:g}'} should be")
+    return float(value)

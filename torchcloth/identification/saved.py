@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..cloth import Cloth
-from ..errors import InvalidInput, RecordingError
+from ..errors import InvalidInput, RecordingError, UnstableStep
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from ..transfer import Contact
@@ -27,6 +28,7 @@ from .unknowns import available
 RESULT = "identification.json"
 SAME = 1e-5  # m, between the mean points of one episode, kept and read again
 FAITHFUL = 0.02  # relative difference of Chamfer between the fit and its replay that other machines explain
+SHORTEST, FINEST = 1e-7, 1e-5  # s, m: no fit ends that takes such steps, or has such a contact grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,7 @@ def replayed(path: str | Path, recording: Recording) -> Replayed:
     before = [kept["chamfer"] for kept in model.episodes if alike(kept, own)]
     cloth = rebuilt(path, model, recording)
     data = episode(cloth, recording)
-    with torch.no_grad():
+    with torch.no_grad(), step_of(path):
         frames = Replay(cloth)(data, model.dt).x
     found = figures([frames], [data], torch.as_tensor(cloth.mesh.faces))
     warning = ""
@@ -149,24 +151,35 @@ def read_saved(path: str | Path) -> SavedModel:
     return read_result(path, RESULT, _model, expected, "run `torchcloth identify` again")
 
 
+def _contact(**kept: Any) -> Contact:
+    for name, least in {"spacing": FINEST, "subdivisions": 1, "damping": 0.0, "play": 0.0}.items():
+        if kept.get(name) is not None:
+            number(kept[name], least, f"contact {name}")
+    if not isinstance(kept.get("subdivisions"), int | None) or not isinstance(kept.get("everywhere", False), bool):
+        raise ValueError(f"contact {kept}")
+    return Contact(**kept)
+
+
 def _model(content: dict[str, Any]) -> SavedModel:
     model, said, correlation = (content[key] for key in ("model", "parameters", "correlation"))
     matrix = np.array([[number(row[name], -1.0) for name in correlation] for row in correlation.values()])
+    if not len(matrix):
+        raise ValueError("no fitted parameter in correlation")
     if (np.abs(matrix) > 1 + 1e-9).any():
         raise ValueError("a correlation above 1")
     left = content["fit"]["rms_after"]
     return SavedModel(
-        {str(name): number(value) for name, value in model["values"].items()},
-        {name: number(said[name]["std"], 0.0) for name in correlation},
+        {str(name): number(value, name=name) for name, value in model["values"].items()},
+        {name: number(said[name]["std"], 0.0, f"{name}'s std") for name in correlation},
         [name for name in correlation if said[name]["identifiable"] and said[name]["source"] == "data"],
         matrix,
         math.nan if left is None else number(left, 0.0),
-        None if model["contact"] is None else Contact(**model["contact"]),
-        None if model["dt"] is None else number(model["dt"]),
+        None if model["contact"] is None else _contact(**model["contact"]),
+        None if model["dt"] is None else number(model["dt"], SHORTEST, "dt"),
         [
-            {"name": str(e["name"]), **{key: int(e[key]) for key in ("frames", "points")}}
+            {"name": str(e["name"]), **{key: int(number(e[key], 0, key)) for key in ("frames", "points")}}
             | {
-                "mean": np.asarray(e["mean"], float).reshape(3),
+                "mean": np.array([number(x, name="mean") for x in e["mean"]]).reshape(3),
                 "chamfer": math.nan if e["chamfer"] is None else number(e["chamfer"], 0.0),
             }
             for e in model["episodes"]
@@ -222,6 +235,16 @@ def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:
         except InvalidInput as error:
             raise RecordingError(f"{path}: {error}", remedy="run `torchcloth identify` again") from None
     return cloth
+
+
+@contextmanager
+def step_of(path: str | Path) -> Iterator[None]:
+    """A step that is too long for an episode's mesh is the file's: nobody who reads one has chosen it."""
+    try:
+        yield
+    except UnstableStep as error:
+        remedy = "fit again without --dt, or with a smaller one"
+        raise UnstableStep(f"{path}: dt", got=error.got, expected=error.expected, remedy=remedy) from None
 
 
 def _parameter(cloth: Cloth, path: str) -> PhysicalParameter:

@@ -21,6 +21,7 @@ from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial, curves
 
 RESULT = "tension.json"
 LAWS = {law.__name__: law for law in (AEP, OrthotropicAEP)}
+SHORTEST = 1e-6  # m, of a specimen
 SPECIMENS = {kind.__name__: kind for kind in (Uniaxial, Trellis)}
 
 
@@ -162,19 +163,33 @@ def read_model(path: str | Path) -> TensionModel:
 def _model(kept: dict[str, Any]) -> TensionModel:
     names = [str(name) for name in kept["fitted"]]
     values: dict[str, Any] = {
-        name: value if isinstance(value, str) else number(value) for name, value in kept["values"].items()
+        name: value if isinstance(value, str) else number(value, name=name) for name, value in kept["values"].items()
     }
     material = LAWS[kept["material"]](**values).to(torch.float64)
     for name in names:
         if not isinstance(getattr(material, name), PhysicalParameter):
             raise ValueError(f"{name} is no parameter")
-    covariance = torch.tensor(kept["covariance"], dtype=torch.float64)
-    if covariance.shape != (len(names), len(names)):
-        raise ValueError(f"a covariance of shape {tuple(covariance.shape)}")
-    tables = [Pulled(**table) for table in kept["tables"]]
-    if not tables or not bool(covariance.isfinite().all()):
-        raise ValueError("no tables, or a covariance that is not finite")
+    rows = [[number(value, name="covariance") for value in row] for row in kept["covariance"]]
+    if [len(row) for row in rows] != [len(names)] * len(names):
+        raise ValueError(f"a covariance of {len(rows)} rows, fitted are {len(names)} numbers")
+    covariance = torch.tensor(rows, dtype=torch.float64)
+    if bool((covariance.diagonal() < 0).any()):
+        raise ValueError("a negative variance")
+    tables = [_pulled(table) for table in kept["tables"]]
+    if not tables:
+        raise ValueError("no tables")
     return TensionModel(material, SPECIMENS[kept["specimen"]](), names, covariance, tables)
+
+
+def _pulled(kept: dict[str, Any]) -> Pulled:
+    number(kept["angle"], name="angle")
+    for name, least in {"length": SHORTEST, "width": SHORTEST, "preload": 0.0, "strain": 0.0}.items():
+        number(kept[name], least, name)
+    for missed in filter(None, (kept["missed"], kept.get("left_out"))):
+        for name, value in missed.items():
+            if value is not None:
+                number(value, 0.0, f"missed {name}")
+    return Pulled(**kept)
 
 
 def _arguments(law: type[AbstractMaterial]) -> list[str]:

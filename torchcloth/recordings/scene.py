@@ -39,17 +39,24 @@ def cloth(fields: Fields, folder: Folder) -> ClothInfo:
         )
     vertices, faces, uv = (None, None, None) if mesh is None else _mesh(folder, mesh)
     return ClothInfo(
-        areal_density=fields.number("areal_density", above=0, most=HEAVIEST, suspect="grams per square metre"),
-        areal_density_std=fields.maybe(fields.number, "areal_density_std", least=0, most=HEAVIEST, suspect="g/m^2"),
-        thickness=fields.maybe(fields.number, "thickness", above=0, most=THICKEST, suspect="millimetres"),
+        **fabric(fields),
         sheet=_sheet(sheet) if sheet.rest else None,
         vertices=vertices,
         faces=faces,
         uv=uv,
         initial_vertices=None if start is None else _initial(folder, start, vertices),
-        nominal=_nominal(fields.inside("nominal")),
         extra=fields.left(sheet=sheet),
     )
+
+
+def fabric(fields: Fields) -> dict[str, Any]:
+    """What is known of a cloth beside its shape, as `ClothInfo` names it."""
+    return {
+        "areal_density": fields.number("areal_density", above=0, most=HEAVIEST, suspect="grams per square metre"),
+        "areal_density_std": fields.maybe(fields.number, "areal_density_std", least=0, most=HEAVIEST, suspect="g/m^2"),
+        "thickness": fields.maybe(fields.number, "thickness", above=0, most=THICKEST, suspect="millimetres"),
+        "nominal": _nominal(fields.inside("nominal")),
+    }
 
 
 def grasp(fields: Fields) -> GraspInfo:

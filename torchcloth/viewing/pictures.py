@@ -43,7 +43,7 @@ def animate(
         ``path``.
 
     Raises:
-        InvalidInput: a rate that no GIF has, or a size too small.
+        InvalidInput: a rate that no GIF has, or a size too small or too large.
     """
     from PIL import Image
 

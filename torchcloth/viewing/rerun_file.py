@@ -38,6 +38,7 @@ def write_rrd(film: Film, path: str | Path) -> Path:
     """
     rr = _rerun()
     with atomically(Path(path)) as part:
+        part.touch()  # where nothing can be written, rerun's own error would not say which file
         stream = rr.RecordingStream("torchcloth")
         stream.save(part, default_blueprint=_layout(film))
         stream.send_recording_name(film.title)

@@ -16,7 +16,8 @@ from .projection import camera_for, polygons
 INK, FAINT, GRID, SHADE, PAPER = "#22262b", "#6d747c", "#dfe2e6", 0.86, "#ffffff"
 DPI = 100
 STRIP, BAR = 0.14, 0.13  # of the height, of the width, for the curve and the colour bar
-SMALLEST = 120  # pixels
+SMALLEST, LARGEST = 120, 4096  # pixels each way
+LABELS, CURVE = 24, 16  # pixels that the curve's labels take, and that it needs at least itself
 
 
 class Stage:
@@ -28,19 +29,17 @@ class Stage:
         look: (azimuth, elevation) degrees of the eye; None: chosen by the film.
 
     Raises:
-        InvalidInput: a size that is too small.
+        InvalidInput: a size that is too small or too large.
     """
 
     def __init__(self, film: Film, size: tuple[int, int], look: tuple[float, float] | None = None) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        if min(size) < SMALLEST:
-            raise InvalidInput("size", got=f"{size[0]}x{size[1]}", expected=f"at least {SMALLEST} pixels each way")
-        self.film, (width, height) = film, size
+        self.film, (width, height) = film, check_size(size)
         self.figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
         self.canvas: Any = FigureCanvasAgg(self.figure)
-        strip = STRIP if DISTANCE in film.curves else 0.0
+        strip = max(STRIP, (LABELS + CURVE) / height) if DISTANCE in film.curves else 0.0
         bar = BAR if film.measured else 0.0
         self.axes = self.figure.add_axes((0, strip, 1 - bar, 1 - strip))
         inner = (round(width * (1 - bar)), round(height * (1 - strip)))
@@ -161,10 +160,11 @@ class Stage:
         """A curve over the film's time, with a mark that runs along it."""
         curve = self.film.curves[DISTANCE]
         width, height = self.figure.get_size_inches() * DPI
-        left, low = 52 / width, 24 / height  # pixels that the labels take
+        left, low = 52 / width, LABELS / height
         place = self.figure.add_axes((left, low, 0.97 - left - (BAR if self.film.measured else 0), strip - low))
         place.plot(curve.t, curve.values, color=INK, linewidth=1)
-        place.set(xlim=(self.film.times[0], self.film.times[-1]), ylim=(0, 1.15 * float(np.nanmax(curve.values))))
+        first, last = self.film.times[[0, -1]]
+        place.set(xlim=(first, last if last > first else first + 1.0), ylim=(0, 1.15 * float(np.nanmax(curve.values))))
         place.tick_params(labelsize=7, colors=FAINT, length=2)
         place.locator_params(axis="y", nbins=2)
         place.spines[["top", "right"]].set_visible(False)
@@ -177,6 +177,19 @@ class Stage:
             place.draw_artist(mark)
 
         return draw
+
+
+def check_size(size: tuple[int, int]) -> tuple[int, int]:
+    """The size in pixels, if pictures can have it.
+
+    Raises:
+        InvalidInput: too small for what is written on them, or larger than any screen.
+    """
+    if not SMALLEST <= min(size) <= max(size) <= LARGEST:
+        raise InvalidInput(
+            "size", got=f"{size[0]}x{size[1]}", expected=f"at least {SMALLEST} and at most {LARGEST} pixels each way"
+        )
+    return size
 
 
 def _grid(plane: Plane) -> list[Array]:
