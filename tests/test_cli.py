@@ -79,7 +79,8 @@ WRONG = {
     "field of nothing": (["--fields", "stiffness"], "--fields; got 'stiffness'; expected one of .*youngs_modulus"),
     "fields and values": (["--fields", "youngs_modulus", "--fit", "air.normal"], "--fit; got a value, with --fields"),
     "contrast of nothing": (["--contrast", "2"], "--contrast; got 2.0; expected --fields beside it"),
-    "impossible contrast": (["--fields", "youngs_modulus", "--contrast", "-1"], "contrast; got .*-1"),
+    "impossible contrast": (["--fields", "youngs_modulus", "--contrast", "-1"], "contrast; got -1.0; expected a num"),
+    "fields without iterations": (["--fields", "youngs_modulus", "--iterations", "0"], "iterations; got 0; expected"),
 }
 
 
@@ -101,6 +102,13 @@ def test_wrong_options_are_one_line_and_exit_code_2(folder, tmp_path, capsys, ca
 def test_a_refused_run_does_not_even_make_its_folder(folder, tmp_path, capsys, case):
     main(["identify", str(folder), "--out", str(tmp_path / "deep" / "out"), *WRONG[case][0]])
     assert not (tmp_path / "deep").exists()
+
+
+@pytest.mark.parametrize("more", [[], ["--fields", "youngs_modulus"]])
+def test_one_episode_twice(folder, tmp_path, capsys, more):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    said = refuse(capsys, tmp_path / "out", "identify", folder, copy, *more)
+    assert "episodes; got 'copy' twice; expected each once" in said
 
 
 def test_a_missing_folder(tmp_path, capsys):

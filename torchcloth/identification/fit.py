@@ -16,6 +16,7 @@ from ..effects import AbstractEffect
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
+from ..recordings.marks import each_once
 from . import gauss_newton
 from .blocks import blocks_for
 from .considered import covariance_of
@@ -105,7 +106,7 @@ def identify(
         Estimates with standard errors, distances, warnings, frames.
 
     Raises:
-        InvalidInput: unknown names or options.
+        InvalidInput: unknown names or options, or one episode twice.
         RecordingError: a recording without motion, or with nothing seen or felt.
         SimulationDiverged: the start values cannot be simulated.
     """
@@ -114,6 +115,7 @@ def identify(
     episodes_in = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not episodes_in:
         raise InvalidInput("recordings", got="none", expected="at least one episode")
+    each_once(episodes_in)
     if refine and profile:
         raise InvalidInput("profile", got="refine as well", expected="one of them: a profile is that of the given mesh")
     if refine:
