@@ -78,6 +78,7 @@ WRONG = {
     "negative contact": (["--contact", "-0.01"], "spacing"),
     "field of nothing": (["--fields", "stiffness"], "--fields; got 'stiffness'; expected one of .*youngs_modulus"),
     "fields and values": (["--fields", "youngs_modulus", "--fit", "air.normal"], "--fit; got a value, with --fields"),
+    "prior of a distance": (["--method", "adam", "--prior", "youngs_modulus=1e6,1.01"], "priors; got youngs_modulus w"),
     "contrast of nothing": (["--contrast", "2"], "--contrast; got 2.0; expected --fields beside it"),
     "impossible contrast": (["--fields", "youngs_modulus", "--contrast", "-1"], "contrast; got -1.0; expected a num"),
     "fields without iterations": (["--fields", "youngs_modulus", "--iterations", "0"], "iterations; got 0; expected"),

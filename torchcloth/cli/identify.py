@@ -49,7 +49,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=["gauss-newton", "lbfgs", "adam", "gradient-descent"],
         default="gauss-newton",
-        help="default gauss-newton; the last two: on the paper's Chamfer distance, to compare",
+        help="default gauss-newton; the last two: on the paper's Chamfer distance alone, without priors, to compare",
     )
     parser.add_argument(
         "--stop", choices=["converged", "paper"], default="converged", help="paper: Chamfer below 1.5 cm"

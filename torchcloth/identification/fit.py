@@ -73,7 +73,8 @@ def identify(
         parameters: public names, e.g. ["youngs_modulus", "air.normal"]; None: all material parameters that the model
             contains, and the amplitudes of its effects.
         method: "gauss-newton" (robust residuals, forward-mode sensitivities) or "lbfgs" (the same, reverse mode);
-            "adam" or "gradient-descent" (the paper's Chamfer distance to vertices, reverse mode), for comparison.
+            "adam" or "gradient-descent" (the paper's Chamfer distance to vertices, reverse mode), for comparison: a
+            distance knows of no errors, so these take neither priors nor nuisances, and the density as exact.
         stop: "converged", or "paper": as soon as Chamfer (one-sided, cloud to surface) is below 1.5 cm.
         iterations: at most this many with all frames, and at most 10 with the early ones before: the beginning of the
             same motion, so that neither velocity nor rest shape is ever set anew.
@@ -111,6 +112,7 @@ def identify(
         SimulationDiverged: the start values cannot be simulated.
     """
     _check(method, stop, iterations, starts)
+    _check_priors(method, priors, nuisances)
     began = time.perf_counter()
     episodes_in = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not episodes_in:
@@ -121,7 +123,8 @@ def identify(
     if refine:
         finer_cloth(cloth)  # refuses now what it would refuse at the end
     names = default_parameters(cloth) if parameters is None else list(parameters)
-    unknowns = with_priors(collect(cloth, names, episodes_in[0].cloth.areal_density_std), priors or {})
+    measured = None if method in CHAMFER else episodes_in[0].cloth.areal_density_std  # joins as a prior only
+    unknowns = with_priors(collect(cloth, names, measured), priors or {})
     if not unknowns:
         raise InvalidInput("parameters", got="none", expected="at least one name")
     _check_profile(profile, [u.name for u in unknowns])
@@ -149,6 +152,21 @@ def _check(method: str, stop: str, iterations: int, starts: int) -> None:
     for name, number in (("iterations", iterations), ("starts", starts)):
         if number < 1:
             raise InvalidInput(name, got=number, expected="at least 1")
+
+
+def _check_priors(method: str, priors: Mapping[str, Any] | None, nuisances: Mapping[str, Any] | Sequence[str]) -> None:
+    """Refuse what a mean distance cannot be weighed against: it has no noise, in whose units priors are.
+
+    A search without them would go where they forbid, and report errors that have them in.
+    """
+    for name, given in (("priors", priors), ("nuisances", nuisances)):
+        if method in CHAMFER and given:
+            raise InvalidInput(
+                name,
+                got=f"{', '.join(given)} with method {method!r}",
+                expected="none: it follows the Chamfer distance alone",
+                remedy='method "gauss-newton" or "lbfgs"',
+            )
 
 
 def _check_profile(names: Sequence[str], fitted: Sequence[str]) -> None:
