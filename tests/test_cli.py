@@ -138,6 +138,20 @@ def test_millimetres_for_metres(spoiled, tmp_path, capsys, stream):
     assert path.name in said
 
 
+@pytest.mark.parametrize(
+    ("verb", "more"), [("identify", []), ("identify", ["--fields", "youngs_modulus"]), ("pose", [])]
+)
+def test_a_cloud_of_another_size(spoiled, tmp_path, capsys, verb, more):
+    """A wrong scale makes no larger scene, and so passes the reader."""
+    path = spoiled / "points.npz"
+    with np.load(path) as file:
+        np.savez(path, **{**file, "scale": file["scale"] * 1e-3})
+    said = refuse(capsys, tmp_path / "out", verb, spoiled, *more)
+    assert re.search(r"spoiled: the cloud is 0\.00\d+ times as long as the cloth.*check the unit of points", said)
+    assert main(["inspect", str(spoiled), "--json"]) == 0  # which is to show it
+    assert any("check the unit" in note for note in json.loads(capsys.readouterr().out)["notes"])
+
+
 def test_progress_of_another_fit_is_not_taken_up(folder, tmp_path, capsys):
     (tmp_path / "progress").mkdir()
     (tmp_path / "progress" / "problem").write_text("another")

@@ -21,6 +21,7 @@ from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter, to_value
 from ..recordings import Recording
+from ..recordings.extents import check_size
 from ..recordings.marks import each_once
 from .blocks import blocks_for
 from .descent import quasi_newton
@@ -114,6 +115,8 @@ def fit_fields(
     if iterations < 1:
         raise InvalidInput("iterations", got=iterations, expected="at least 1")
     each_once(given)
+    for recording in given:
+        check_size(recording)
     own = {name: _field(cloth, name) for name in parameters}
     objective = _Fields(cloth, own, [episode(cloth, r) for r in given], dt, blocks_for(use), contrast)
     if journal is not None:

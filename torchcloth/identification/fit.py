@@ -16,6 +16,7 @@ from ..effects import AbstractEffect
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
+from ..recordings.extents import check_size
 from ..recordings.marks import each_once
 from . import gauss_newton
 from .blocks import blocks_for
@@ -108,7 +109,7 @@ def identify(
 
     Raises:
         InvalidInput: unknown names or options, or one episode twice.
-        RecordingError: a recording without motion, or with nothing seen or felt.
+        RecordingError: a recording without motion, with nothing seen or felt, or seen in another unit than metres.
         SimulationDiverged: the start values cannot be simulated.
     """
     _check(method, stop, iterations, starts)
@@ -129,6 +130,8 @@ def identify(
         raise InvalidInput("parameters", got="none", expected="at least one name")
     _check_profile(profile, [u.name for u in unknowns])
     blocks = blocks_for(use)
+    for recording in episodes_in:
+        check_size(recording)
     episodes = [episode(cloth, r) for r in episodes_in]
     _check_seen(method, stop, episodes)
     own = chosen(nuisances, implied([block.name for block in blocks], episodes))
