@@ -40,6 +40,7 @@ from .unknowns import collect, with_priors
 
 LATEST = 2.0  # standard deviations of a clock's prior, for which the simulation goes on after the last frame
 PAPER_ITERATIONS = 35  # of the DiffCP paper's stop rule
+MOST_STARTS = 1000
 ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
 
 
@@ -155,6 +156,8 @@ def _check(method: str, stop: str, iterations: int, starts: int) -> None:
     for name, number in (("iterations", iterations), ("starts", starts)):
         if number < 1:
             raise InvalidInput(name, got=number, expected="at least 1")
+    if starts > MOST_STARTS:
+        raise InvalidInput("starts", got=starts, expected=f"at most {MOST_STARTS}")
 
 
 def _check_priors(method: str, priors: Mapping[str, Any] | None, nuisances: Mapping[str, Any] | Sequence[str]) -> None:
