@@ -38,7 +38,7 @@ def stable_step_of(model: Model, gradient: Tensor) -> float:
         shape = gradient if model.rest is None else grown_gradient(gradient, model.rest)
         try:
             step = stable_step(shape, model.areal_density, stiffness, spacing, elastic, damping)
-        except torch.linalg.LinAlgError as error:  # of what is not finite, or whose square is not
+        except RuntimeError as error:  # no eigenvalues of what is not finite, or whose square is not
             largest = max(float(t.max()) for t in stiffness)
             raise UnstableStep("stiffness", got=f"{largest:.3g} N/m", expected="a fabric's: the step is 0 s") from error
         _KNOWN[gradient] = hangs_on, step
