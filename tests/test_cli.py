@@ -79,8 +79,20 @@ WRONG = {
     "negative contact": (["--contact", "-0.01"], "spacing"),
     "field of nothing": (["--fields", "stiffness"], "--fields; got 'stiffness'; expected one of .*youngs_modulus"),
     "fields and values": (["--fields", "youngs_modulus", "--fit", "air.normal"], "--fit; got a value, with --fields"),
+    "endless step": (["--dt", "1e-12"], "dt; got 1e-12 s, that is .* substeps; expected at most 1e.07; raise dt"),
+    "endless stiffness": (["--start", "youngs_modulus=1e30"], "the stable substep; got .* substeps; .*check the units"),
+    "overflowing stiffness": (["--start", "youngs_modulus=1e300"], "stiffness; got .* N/m; expected a fabric's"),
+    "contact of atoms": (["--contact", "1e-7"], "contact spacing; got 1e-07 m, for which .*; expected 0.000"),
+    "contact of metres": (["--contact", "5"], "contact spacing; got 5 m; expected at most the length of the cloth, 0."),
+    "starts without end": (["--starts", "1000000000"], "starts; got 1000000000; expected at most 1000"),
+    "start twice": (["--start", "youngs_modulus=1e5", "youngs_modulus=2e5"], "--start; got 'youngs_modulus' twice"),
+    "start in two options": (["--start", "air.normal=1", "--start", "air.normal=2"], "--start; got 'air.normal' twice"),
+    "nuisance twice": (["--nuisance", "clock", "clock=0.1"], "--nuisance; got 'clock' twice; expected each name once"),
+    "prior twice": (["--prior", "air.normal=1,2", "air.normal=3,2"], "--prior; got 'air.normal' twice"),
+    "prior of a distance": (["--method", "adam", "--prior", "youngs_modulus=1e6,1.01"], "priors; got youngs_modulus w"),
     "contrast of nothing": (["--contrast", "2"], "--contrast; got 2.0; expected --fields beside it"),
-    "impossible contrast": (["--fields", "youngs_modulus", "--contrast", "-1"], "contrast; got .*-1"),
+    "impossible contrast": (["--fields", "youngs_modulus", "--contrast", "-1"], "contrast; got -1.0; expected a num"),
+    "fields without iterations": (["--fields", "youngs_modulus", "--iterations", "0"], "iterations; got 0; expected"),
 }
 
 
@@ -102,6 +114,13 @@ def test_wrong_options_are_one_line_and_exit_code_2(folder, tmp_path, capsys, ca
 def test_a_refused_run_does_not_even_make_its_folder(folder, tmp_path, capsys, case):
     main(["identify", str(folder), "--out", str(tmp_path / "deep" / "out"), *WRONG[case][0]])
     assert not (tmp_path / "deep").exists()
+
+
+@pytest.mark.parametrize("more", [[], ["--fields", "youngs_modulus"]])
+def test_one_episode_twice(folder, tmp_path, capsys, more):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    said = refuse(capsys, tmp_path / "out", "identify", folder, copy, *more)
+    assert "episodes; got 'copy' twice; expected each once" in said
 
 
 def test_a_missing_folder(tmp_path, capsys):
@@ -128,6 +147,20 @@ def test_millimetres_for_metres(spoiled, tmp_path, capsys, stream):
     said = refuse(capsys, tmp_path / "out", "identify", spoiled)
     assert "millimetres" in said
     assert path.name in said
+
+
+@pytest.mark.parametrize(
+    ("verb", "more"), [("identify", []), ("identify", ["--fields", "youngs_modulus"]), ("pose", [])]
+)
+def test_a_cloud_of_another_size(spoiled, tmp_path, capsys, verb, more):
+    """A wrong scale makes no larger scene, and so passes the reader."""
+    path = spoiled / "points.npz"
+    with np.load(path) as file:
+        np.savez(path, **{**file, "scale": file["scale"] * 1e-3})
+    said = refuse(capsys, tmp_path / "out", verb, spoiled, *more)
+    assert re.search(r"spoiled: the cloud is 0\.00\d+ times as long as the cloth.*check the unit of points", said)
+    assert main(["inspect", str(spoiled), "--json"]) == 0  # which is to show it
+    assert any("check the unit" in note for note in json.loads(capsys.readouterr().out)["notes"])
 
 
 def test_progress_of_another_fit_is_not_taken_up(folder, tmp_path, capsys):

@@ -94,6 +94,19 @@ def test_refuses_a_step_that_is_too_large_and_names_the_one_that_works():
             cloth(cloth.rest_state(), times=[0.0, 0.1], dt=dt)
 
 
+def test_refuses_a_simulation_without_end():
+    """1e-12 s asked for 800 GB of times; a stiffness of 1e40 Pa for more substeps than an integer holds."""
+    cloth = sheet()
+    state = cloth.rest_state()
+    with pytest.raises(InvalidInput, match=r"dt; got 1e-12 s, that is 1e\+11 substeps; expected at most 1e\+07"):
+        cloth(state, times=[0.0, 0.1], dt=1e-12)
+    for stiffness, said in ((1e40, "stable substep"), (1e300, "stiffness; got")):
+        cloth.material.youngs_modulus.set(stiffness)
+        for run in (lambda: cloth(state, times=[0.0, 0.1]), lambda: cloth.settle(state)):
+            with pytest.raises(UnstableStep, match=said):
+                run()
+
+
 def test_a_stiffness_changed_later_moves_the_limit():
     """A fit cannot cross it silently."""
     cloth = sheet()
@@ -132,6 +145,16 @@ def test_refuses_boundaries(boundary, message):
         (lambda: tc.effects.MassDamping(-1.0), "mass damping"),
         (lambda: tc.effects.Bending(-1.0), "bending"),
         (lambda: tc.Contact(spacing=0.0).resolve(tc.meshes.rectangle(1, 1)), "contact spacing"),
+        (
+            lambda: tc.Contact(spacing=1e-7).resolve(tc.meshes.rectangle(1, 1)),
+            "contact spacing; got 1e-07 m, for which",
+        ),
+        (lambda: tc.Contact(spacing=1e-300).resolve(tc.meshes.rectangle(1, 1)), "contact spacing; got 1e-300 m"),
+        (lambda: tc.Contact(spacing=5.0).grid(tc.meshes.rectangle(1, 1)), "contact spacing; got 5 m; expected at most"),
+        (
+            lambda: tc.Contact(subdivisions=10**9).resolve(tc.meshes.rectangle(1, 1)),
+            "contact subdivisions; got 1000000000",
+        ),
         (lambda: tc.Contact(spacing=0.01, subdivisions=1).resolve(tc.meshes.rectangle(1, 1)), "contact subdivisions"),
     ],
 )

@@ -31,6 +31,7 @@ from .validation import (
     check_motions,
     check_state,
     check_step,
+    check_substeps,
     check_times,
     check_transfer,
     expand_state,
@@ -160,7 +161,7 @@ class Cloth(nn.Module):
 
         Raises:
             InvalidInput: motion that does not fit the boundaries or the times.
-            UnstableStep: ``dt`` beyond the stability limit.
+            UnstableStep: ``dt`` beyond the stability limit, or a limit so low that the simulation would never end.
             SimulationDiverged: the state lost finiteness.
         """
         return run(self.plan(state, motion or {}, times, dt), checkpoint)
@@ -255,6 +256,7 @@ class Cloth(nn.Module):
         motion = check_motions(motion, self.boundaries, frames, self._area)
         model = self.model()
         limit = check_step(dt, stable_step_of(model, self._gradient))
+        check_substeps(frames[-1] - frames[0], limit, dt)
         counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
         return self._ready(model, state, motion, frames, counts)
 
@@ -265,7 +267,9 @@ class Cloth(nn.Module):
         frames = [start, start + duration]
         motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
         model = self.model()
-        count = int(np.ceil(duration * (1 / stable_step_of(model, self._gradient) + rate)))
+        step = stable_step_of(model, self._gradient)
+        check_substeps(duration, step)
+        count = int(np.ceil(duration * (1 / step + rate)))
         return self._ready(model, state, motion, frames, [count], rate)
 
     # -- parts of the above ---------------------------------------------------------------------------------------

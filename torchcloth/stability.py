@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from .errors import InvalidInput
+from .errors import InvalidInput, UnstableStep
 from .materials import Stiffness
 from .model import Model
 from .strain import grown_gradient
@@ -22,6 +22,7 @@ def stable_step_of(model: Model, gradient: Tensor) -> float:
 
     Raises:
         InvalidInput: a precision in which a substep is lost in rounding.
+        UnstableStep: stiffnesses that overflow.
     """
     if gradient.dtype not in (torch.float32, torch.float64):
         got = str(gradient.dtype).removeprefix("torch.")
@@ -35,7 +36,11 @@ def stable_step_of(model: Model, gradient: Tensor) -> float:
     before, step = _KNOWN.get(gradient) or (None, 0.0)
     if before != hangs_on:
         shape = gradient if model.rest is None else grown_gradient(gradient, model.rest)
-        step = stable_step(shape, model.areal_density, stiffness, spacing, elastic, damping)
+        try:
+            step = stable_step(shape, model.areal_density, stiffness, spacing, elastic, damping)
+        except RuntimeError as error:  # no eigenvalues of what is not finite, or whose square is not
+            largest = max(float(t.max()) for t in stiffness)
+            raise UnstableStep("stiffness", got=f"{largest:.3g} N/m", expected="a fabric's: the step is 0 s") from error
         _KNOWN[gradient] = hangs_on, step
     return step
 

@@ -17,6 +17,8 @@ from .model import Model
 from .transfer import Contact
 from .types import ClothState, Trajectory
 
+MOST_SUBSTEPS = 10_000_000  # of one simulation: a minute of the stiffest cloth; poses of more fill the memory
+
 
 def check_field(name: str, raw: Tensor, triangles: int) -> None:
     """Fields have one value per triangle; batches of scalars are [B, 1]."""
@@ -64,6 +66,18 @@ def check_step(dt: float | None, limit: float) -> float:
             remedy="lower dt, or leave it out",
         )
     return float(dt)
+
+
+def check_substeps(seconds: float, step: float, dt: float | None = None) -> None:
+    """Refuse a simulation that would never end, because of the user's ``dt`` or of a stable ``step`` [s] that tiny."""
+    count = seconds / step if step > 0 else float("inf")  # a step that overflowed is NaN
+    if count <= MOST_SUBSTEPS:
+        return
+    got, expected = f"{step:.3g} s, that is {count:.2g} substeps", f"at most {MOST_SUBSTEPS:g}"
+    if dt is not None:
+        raise InvalidInput("dt", got=got, expected=expected, remedy="raise dt, or leave it out")
+    remedy = f"check the units of stiffnesses, densities and mesh, or simulate less than {seconds:.3g} s at once"
+    raise UnstableStep("the stable substep", got=got, expected=expected, remedy=remedy)
 
 
 def check_transfer(transfer: str, contact: Contact | None) -> Contact:

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchcloth.errors import InvalidInput
 from torchcloth.types import Trajectory
 
+LONGEST = 3600.0  # s, of a move; slower is no manipulation, and its knots fill the memory
 PERIOD = 0.02  # s between knots; the layer interpolates in between
 Vector = tuple[float, float, float]
 Grips = Mapping[str, Sequence[float]]  # gripper -> [3] m, where it takes hold
@@ -65,7 +66,7 @@ def action(
         release: whether the grippers open at the end of the last move.
 
     Raises:
-        InvalidInput: a value that gives no motion, or a path through the table.
+        InvalidInput: a value that gives no motion, or none that ends, or a path through the table.
     """
     check(speed=limits.speed, acceleration=limits.acceleration, rest=rest)
     start = points(grips)
@@ -152,6 +153,13 @@ def _sample(moves: Sequence[Move], limits: Limits) -> tuple[Tensor, Tensor, Tens
     times, shifts, rolls, aparts = [zero], [torch.zeros(1, 3, dtype=torch.float64)], [zero], [zero[:, None]]
     for move in moves:
         duration = _least_time(move, limits)
+        if duration > LONGEST:
+            raise InvalidInput(
+                "speed or acceleration",
+                got=f"{limits.speed:g} m/s and {limits.acceleration:g} m/s^2, with which a move takes {duration:.3g} s",
+                expected=f"at most {LONGEST:g} s",
+                remedy="ask for more of them",
+            )
         s = _shares(max(4, math.ceil(duration / PERIOD)))
         times.append(times[-1][-1] + duration * torch.linspace(0, 1, len(s), dtype=s.dtype)[1:])
         shifts.append(shifts[-1][-1] + _way(move, s)[1:])

@@ -13,7 +13,7 @@ from torchcloth import diagnosis as dx
 from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.errors import InvalidInput
-from torchcloth.identification.saved import mark
+from torchcloth.recordings.marks import mark
 from torchcloth.viewing import film_of_fit
 
 TRUE = 1.5

@@ -215,6 +215,12 @@ def test_no_recordings_are_refused(model):
         identify(model, [])
 
 
+def test_one_episode_twice_is_no_evidence_more(model, recording):
+    """The stranger's: error bars fell by sqrt 2 for every copy."""
+    with pytest.raises(InvalidInput, match="episodes; got 'recording' twice; expected each once"):
+        identify(model, [recording, replace(recording, clock_offset=0.01)])
+
+
 def test_no_parameters_are_refused(model, recording):
     exact = with_cloth(recording, areal_density_std=None)
     with pytest.raises(InvalidInput, match="parameters"):

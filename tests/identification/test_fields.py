@@ -101,6 +101,29 @@ def test_what_is_no_field_is_refused(striped, name):
         fit_fields(start(recording), recording, [name])
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"iterations": 0}, "iterations; got 0; expected at least 1"),
+        ({"contrast": -1.0}, "contrast; got -1.0; expected a number > 0"),
+        ({"contrast": float("nan")}, "contrast; got nan"),
+    ],
+)
+def test_numbers_out_of_range_are_named(striped, options, said):
+    recording = striped(frames=4, points=50)
+    with pytest.raises(InvalidInput, match=f"^{said}"):
+        fit_fields(start(recording), recording, ["youngs_modulus"], **options)
+
+
+def test_no_episode_counts_twice(striped):
+    recording = striped(frames=4, points=50)
+    model = start(recording)
+    with pytest.raises(InvalidInput, match=r"^recordings; got none"):
+        fit_fields(model, [], ["youngs_modulus"])
+    with pytest.raises(InvalidInput, match=r"^episodes; got .* twice"):
+        fit_fields(model, [recording, recording], ["youngs_modulus"])
+
+
 def test_identify_says_who_fits_fields(striped):
     recording = striped(frames=4, points=50)
     with pytest.raises(InvalidInput, match="a value for each triangle: fit_fields"):

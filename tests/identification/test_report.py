@@ -10,10 +10,10 @@ from twins import at
 import torchcloth as tc
 from torchcloth.identification import gauss_newton, linearity
 from torchcloth.identification.misfit import Figures
-from torchcloth.identification.report import Found, estimates, warnings_of
+from torchcloth.identification.report import Found, estimates, warnings_of, withdraw
 from torchcloth.identification.result import Identification
 from torchcloth.identification.statements import Estimate
-from torchcloth.identification.unknowns import collect
+from torchcloth.identification.unknowns import collect, with_priors
 
 GOOD = Estimate(2.0, 0.1, (1.8, 2.2), "-", 1.0, True)
 LOST = Estimate(2.0, 1.9, (0.1, 9.0), "-", 1.0, False)
@@ -153,6 +153,19 @@ def test_an_amplitude_of_zero_can_be_known(recording):
     assert p.identifiable
     assert p.ci95[0] == 0.0
     assert p.ci95[1] == pytest.approx(0.196)
+
+
+def test_what_is_withdrawn_is_not_identified_by_its_prior_either(model):
+    """The fit took it to elsewhere, with the error of slopes that mean nothing: its prior's is what is known."""
+    unknowns = with_priors(collect(model, ["youngs_modulus", "poisson_ratio"], 0.005), {"youngs_modulus": (1e6, 1.01)})
+    raw = torch.tensor([u.start for u in unknowns])
+    fitted = estimates(model, unknowns, raw, torch.diag(torch.full((3,), 1e-12)))
+    assert fitted.parameters["youngs_modulus"].source == fitted.parameters["areal_density"].source == "prior"
+    p = withdraw(fitted, unknowns).parameters
+    assert not any(e.identifiable for e in p.values())
+    assert p["youngs_modulus"].std == pytest.approx(1e4, rel=0.01)
+    assert p["youngs_modulus"].ci95 == pytest.approx((8e4, 1.0197e6), rel=1e-3)
+    assert p["areal_density"].std == pytest.approx(0.005)
 
 
 # -- result ----------------------------------------------------------------------------------------------------------

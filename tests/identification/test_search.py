@@ -38,6 +38,22 @@ def test_plain_descent_goes_downhill_slowly(model, brief):
     first = torch.tensor([fit.history[1][n] - fit.history[0][n] for n in PAIR])
     assert float(first.abs().max()) > 0.0
     assert not fit.fit["converged"]
+    assert "areal_density" not in fit.parameters  # measured to 2 %, it went to 0.4 instead of 0.3: nothing held it
+    assert any(w.startswith("areal density was taken as exact") for w in fit.warnings)
+
+
+@pytest.mark.parametrize("method", ["adam", "gradient-descent"])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"priors": {"youngs_modulus": (1e6, 1.01)}}, "priors; got youngs_modulus with method .*; expected none"),
+        ({"nuisances": ["clock", "grasp"]}, "nuisances; got clock, grasp with method .*; expected none"),
+    ],
+)
+def test_a_distance_is_not_weighed_against_priors(model, brief, method, options, said):
+    """The stranger's: the prior was ignored by the search, and part of the error that was reported of it."""
+    with pytest.raises(InvalidInput, match=said):
+        identify(model, brief, PAIR, method=method, **options)
 
 
 @pytest.mark.parametrize("adam", [True, False])

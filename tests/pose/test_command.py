@@ -52,6 +52,7 @@ def test_takes_a_fit(scene, folder, tmp_path):
         ["--fit", "nowhere"],
         ["--uncertain", "colour=2"],
         ["--uncertain", "youngs_modulus=0.5"],
+        ["--uncertain", "youngs_modulus=2", "youngs_modulus=3"],
         ["--modes", "0"],
         ["--window", "-1"],
         ["--truth"],

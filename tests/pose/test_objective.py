@@ -74,6 +74,11 @@ def test_windows_cover_all_frames(times, length):
     assert all(before[1] == after[0] for before, after in pairwise(windows))
 
 
+def test_no_window_is_shorter_than_a_frame_however_short_is_asked_for():
+    """1e-9 s asked for a number for each nanosecond before."""
+    assert windows_of(torch.arange(4) / 10, 1e-9) == [(0, 1), (1, 2), (2, 3)]
+
+
 def test_a_part_is_the_beginning_of_the_same_motion(objective):
     part, raw = objective.part(0.5), objective.start + 0.3 * objective.prior_std
     torch.testing.assert_close(part.frames(raw)[0][:3], objective.frames(raw)[0][:3])  # the last has no end to lean on

@@ -110,7 +110,7 @@ def make_recording(tmp: Path) -> rec.Recording:
                 height=6,
                 K=np.array([[500.0, 0, 4], [0, 501, 3], [0, 0, 1]]),
                 T_world_camera=transform(1.0),
-                distortion=np.array([0.1, -0.2]),
+                distortion=np.array([0.1, -0.2, 1e-3, 2e-3]),
                 depth_scale=0.001,
                 **images,
                 extra={"serial": 12},

@@ -206,6 +206,11 @@ def test_minimum_jerk_is_at_rest_at_both_ends():
         (lambda: cover(TABLE, 0.5, rest=float("nan")), "rest"),
         (lambda: drag(TABLE, 0.3, heading=float("inf")), "heading"),
         (lambda: drag(TABLE, 0.3, limits=Limits(0.0, 1.0)), "speed"),
+        (
+            lambda: drag(TABLE, 0.3, limits=Limits(1e-9, 1.0)),
+            r"speed or acceleration; got 1e-09 m/s .*; expected at most",
+        ),
+        (lambda: drag(TABLE, 0.3, limits=Limits(1.0, 1e-12)), r"speed or acceleration"),
         (lambda: drag({}, 0.3), "grips"),
         (lambda: drag({"left": (0.0, float("nan"), 0.1)}, 0.3), "grips"),
         (lambda: drag({"left": (0.0, 0.1)}, 0.3), "grips"),

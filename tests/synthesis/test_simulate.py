@@ -136,7 +136,10 @@ def test_grippers_alone_go_as_fast_as_asked(tmp_path):
         (["--motion", "iron"], "motion; got 'iron'"),
         (["--fabric", "velcro"], "preset; got 'velcro'"),
         (["--triangles", "3"], "triangles; got 3"),
+        (["--triangles", "1000000000"], "triangles; got 1000000000; expected 50 to 100000"),
         (["--rate", "nan"], "rate; got nan"),
+        (["--rate", "1e9"], "rate; got 1000000000.0; expected a value > 0, at most 1000"),
+        (["--speed", "1e-9"], "speed or acceleration; got 1e-09 m/s"),
         (["--seed", "-1"], "seed"),
     ],
 )

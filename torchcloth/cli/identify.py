@@ -43,13 +43,18 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", metavar="MODEL", help="a .tcm file of `diagnose` to start from")
     parser.add_argument("--fit", nargs="+", metavar="NAME", help="parameters to fit (default: all of the model)")
     parser.add_argument(
-        "--start", nargs="+", default=[], metavar="NAME=VALUE", help="start values, SI units, e.g. youngs_modulus=2e5"
+        "--start",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME=VALUE",
+        help="start values, SI units, e.g. youngs_modulus=2e5",
     )
     parser.add_argument(
         "--method",
         choices=["gauss-newton", "lbfgs", "adam", "gradient-descent"],
         default="gauss-newton",
-        help="default gauss-newton; the last two: on the paper's Chamfer distance, to compare",
+        help="default gauss-newton; the last two: on the paper's Chamfer distance alone, without priors, to compare",
     )
     parser.add_argument(
         "--stop", choices=["converged", "paper"], default="converged", help="paper: Chamfer below 1.5 cm"
@@ -67,6 +72,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--nuisance",
         nargs="+",
+        action="extend",
         default=[],
         metavar="NAME[=STD]",
         help="of each episode: clock, camera, grasp, shape, tare; with the prior's standard deviation, e.g. clock=0.4",
@@ -74,6 +80,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--prior",
         nargs="+",
+        action="extend",
         default=[],
         metavar="NAME=VALUE,SPREAD",
         help="SPREAD: a factor for positive parameters, a standard deviation for others",
@@ -172,6 +179,7 @@ def say_what_is_beside(model: Model, remedy: str) -> None:
 
 def assignments(pairs: Sequence[str], option: str = "--start") -> dict[str, float]:
     """NAME=NUMBER pairs of an option."""
+    _each_once(pairs, option)
     out = {}
     for pair in pairs:
         name, _, value = pair.partition("=")
@@ -184,11 +192,21 @@ def assignments(pairs: Sequence[str], option: str = "--start") -> dict[str, floa
 
 def nuisances_of(given: Sequence[str]) -> dict[str, float | None]:
     """NAME or NAME=STD, None where no deviation is given."""
+    _each_once(given, "--nuisance")
     plain = dict.fromkeys(name for name in given if "=" not in name)
     return plain | assignments([pair for pair in given if "=" in pair], "--nuisance")
 
 
+def _each_once(pairs: Sequence[str], option: str) -> None:
+    """Of two values for one name either would be ignored."""
+    names = [pair.partition("=")[0] for pair in pairs]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise InvalidInput(option, got=f"{name!r} twice", expected="each name once")
+
+
 def _priors(pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
+    _each_once(pairs, "--prior")
     out = {}
     for pair in pairs:
         name, _, numbers = pair.partition("=")

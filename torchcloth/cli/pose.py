@@ -29,13 +29,14 @@ def add(verbs: Any) -> None:
     pose.add_argument(
         "--uncertain",
         nargs="+",
+        action="extend",
         default=[],
         metavar="NAME=SPREAD",
         help="fabric values known with an error: SPREAD is a factor for positive ones, else a standard deviation",
     )
     pose.add_argument("--window", type=float, default=0.15, metavar="SECONDS", help="of a constant force (0.15)")
     pose.add_argument("--modes", type=int, default=8, metavar="N", help="smooth fields of the force (8)")
-    pose.add_argument("--nuisance", nargs="+", default=[], metavar="NAME[=STD]", help="as of identify")
+    pose.add_argument("--nuisance", nargs="+", action="extend", default=[], metavar="NAME[=STD]", help="as of identify")
     pose.add_argument("--use", nargs="+", choices=["points", "markers", "force"], help="kinds of data (default: all)")
     pose.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
     pose.add_argument("--truth", action="store_true", help="show the true cloth of a synthetic episode in the picture")

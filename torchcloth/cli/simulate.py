@@ -118,7 +118,6 @@ def _told(facts: dict[str, Any], keys: list[str]) -> str:
 def _make(out: Path, order: Order) -> None:
     from .. import recordings, synthesis
 
-    out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="torchcloth-") as images, _progress(order.name) as advance:
         try:
             recording = synthesis.make(order, Path(images), advance)

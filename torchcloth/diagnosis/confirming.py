@@ -10,13 +10,13 @@ from typing import Any
 import torch
 
 from ..errors import InvalidInput, RecordingError
-from ..identification.saved import alike, mark
 from ..recordings import Recording
+from ..recordings.marks import alike, each_once, mark
 from .base_model import together
 from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
 from .evidence import Evidence, Progress, as_held, as_rough, gather, setting_of, staged
 from .fitting import Fitted
-from .gate import check, each_once, somewhere_seen
+from .gate import check, somewhere_seen
 from .model_file import ModelFile, read_model
 from .noise import Noise, fit_noise, floor_of, least, unfitted, whitened
 from .repeats import pairs_of, repeats

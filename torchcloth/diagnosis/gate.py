@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InvalidInput, RecordingError
-from ..identification.saved import alike, mark
 from ..recordings import Recording, checks, read
 from ..recordings.reading import EPISODE
 from ..recordings.ticks import times
@@ -56,23 +55,6 @@ def check(recordings: Sequence[Recording]) -> list[Fault]:
         name = name_of(recording, k)
         found += [Fault(name, what, remedy) for what, remedy in _faults(recording)]
     return found
-
-
-def each_once(recordings: Sequence[Recording]) -> None:
-    """One episode twice is no repetition, and no more evidence than once.
-
-    Raises:
-        InvalidInput: one is given twice.
-    """
-    marks = [mark(r) for r in recordings]
-    for k, own in enumerate(marks):
-        if any(alike(other, own) for other in marks[:k]):
-            raise InvalidInput(
-                "episodes",
-                got=f"{own['name']!r} twice",
-                expected="each once",
-                remedy="leave one out, or record another",
-            )
 
 
 def somewhere_seen(recordings: Sequence[Recording]) -> None:

@@ -14,11 +14,9 @@ from ..boundaries import Grasp
 from ..cloth import Cloth
 from ..identification.episodes import cloth_from, first_shape
 from ..losses import closest
-from ..recordings import Recording
-from ..recordings.extents import longest, size
+from ..recordings import Recording, extents
 from ..robots.paths import Path, paths  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
-TOO_WIDE, TOO_NARROW = 0.65, 0.03  # of the cloth's length: half of the points lie within so much of their middle
 FAR = 0.1  # m, of the first points from the first shape, half of them
 STRAY, REACH = 0.1, 1.1  # share of points, and lengths of the cloth from a gripper that holds it
 AWAY = 0.05  # m, of held places from their grippers: another order that halves it is the right one
@@ -26,9 +24,6 @@ FOLLOW, BETTER = 0.06, 0.4  # m by which the cloud leaves the grippers; share of
 TURNED = 0.5  # of that, by which a mirror must turn the grippers' motions to account for it
 NEAREST = 5  # points, whose mean distance from a gripper is looked at
 FIRST = 3  # frames
-SURELY = 1.5  # factor within which a unit is recognised
-LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
-SOME = 400  # points of a frame that are looked at
 
 
 class Seen:
@@ -38,8 +33,7 @@ class Seen:
         self.recording = recording
         stream = recording.points if recording.points is not None else recording.markers
         self.t = np.zeros(0) if stream is None else stream.t + recording.clock_offset
-        rng = np.random.default_rng(0)
-        self.clouds = [] if stream is None else [_thinned(c, rng) for c in _frames(recording)]
+        self.clouds = extents.seen(recording)
         self.paths: dict[str, Path] = paths(recording)
 
     @cached_property
@@ -55,7 +49,7 @@ class Seen:
     @cached_property
     def length(self) -> float:
         """m, of the cloth from corner to corner."""
-        return size(self.recording.cloth)[0] or float(longest(self.first.numpy()))
+        return extents.size(self.recording.cloth)[0] or float(extents.longest(self.first.numpy()))
 
     def off(self, clouds: Sequence[np.ndarray]) -> float:
         """m, median distance of the first points from the first shape."""
@@ -79,18 +73,6 @@ class Seen:
         return np.stack([path.at(self.t)[0] for path in self.paths.values()], 1)
 
 
-def _frames(recording: Recording) -> Iterator[np.ndarray]:
-    points, markers = recording.points, recording.markers
-    if points is not None:
-        yield from np.split(points.xyz, np.cumsum(points.counts)[:-1])
-    elif markers is not None:
-        yield from (m[np.isfinite(m).all(-1)] for m in markers.xyz)
-
-
-def _thinned(cloud: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    return cloud if len(cloud) <= SOME else cloud[rng.choice(len(cloud), SOME, replace=False)]
-
-
 def _nearest(cloud: np.ndarray, at: np.ndarray) -> np.ndarray:
     """[G] m, mean distance of the nearest points from each gripper."""
     if not len(cloud):
@@ -101,19 +83,8 @@ def _nearest(cloud: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def units(seen: Seen) -> Iterator[tuple[str, str]]:
     """A cloud that no cloth of this size could show."""
-    clouds = [c for c in seen.clouds if len(c)]
-    if not clouds:
-        return
-    spreads = [float(np.median(np.linalg.norm(c - np.median(c, axis=0), axis=1))) for c in clouds]
-    wide, narrow = (float(np.quantile(spreads, q)) / seen.length for q in (0.5, 0.9))
-    if wide > TOO_WIDE or narrow < TOO_NARROW:
-        factor = float(np.median([longest(c) for c in clouds])) / seen.length
-        unit = min(LENGTHS, key=lambda name: abs(np.log(factor * LENGTHS[name])))
-        guess = f", as if in {unit}" if abs(np.log(factor * LENGTHS[unit])) < np.log(SURELY) else ""
-        yield (
-            f"the cloud is {factor:.3g} times as long as the cloth{guess}",
-            "check the unit of points, of depth (depth_scale) and of the cloth's mesh, and leave out what is no cloth",
-        )
+    if (found := extents.other_unit(seen.clouds, seen.length)) is not None:
+        yield found
 
 
 def places(seen: Seen) -> Iterator[tuple[str, str]]:

@@ -13,11 +13,11 @@ import torch
 
 from .._files import write_text
 from ..errors import InvalidInput
-from ..identification.saved import mark
 from ..recordings import Recording
+from ..recordings.marks import each_once, mark
 from .base_model import base_model, together
 from .evidence import Progress, motions_of, setting_of, staged
-from .gate import check, each_once, somewhere_seen
+from .gate import check, somewhere_seen
 from .hypotheses import catalogue
 from .keeping import kept_in
 from .lacking import lack_of_fit

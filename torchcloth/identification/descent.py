@@ -23,8 +23,8 @@ def descend(
 ) -> Tensor:
     """Adam, or plain descent, on the unknowns [K] over their sizes; ``on_iterate(raw, objective)``: True to stop.
 
-    The loss is the DiffCP paper's one-sided Chamfer distance, cloud to nearest vertex. Plain descent divides by the
-    first gradient's length, so that its first step is ``rate`` long.
+    The loss is the DiffCP paper's one-sided Chamfer distance, cloud to nearest vertex, without any prior. Plain
+    descent divides by the first gradient's length, so that its first step is ``rate`` long.
     """
     sizes = objective.sizes  # drag moves by tenths, bending by millionths: one rate for both would stall or leap
     scaled, seen = (start / sizes).requires_grad_(), start

@@ -21,6 +21,8 @@ from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter, to_value
 from ..recordings import Recording
+from ..recordings.extents import check_size
+from ..recordings.marks import each_once
 from .blocks import blocks_for
 from .descent import quasi_newton
 from .episodes import Episode, episode
@@ -101,13 +103,20 @@ def fit_fields(
         dt, use, journal, resume, on_progress: as of ``identify``.
 
     Raises:
-        InvalidInput: names that are no fields of the material, or a contrast that is not positive.
+        InvalidInput: names that are no fields of the material, numbers out of range, or one episode twice.
         RecordingError: a recording without motion, or with nothing seen or felt.
     """
     began = time.perf_counter()
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    if not given or not (math.isfinite(contrast) and contrast > 0):
-        raise InvalidInput("recordings or contrast", got=(len(given), contrast), expected="some, and a number > 0")
+    if not given:
+        raise InvalidInput("recordings", got="none", expected="at least one episode")
+    if not (math.isfinite(contrast) and contrast > 0):
+        raise InvalidInput("contrast", got=contrast, expected="a number > 0")
+    if iterations < 1:
+        raise InvalidInput("iterations", got=iterations, expected="at least 1")
+    each_once(given)
+    for recording in given:
+        check_size(recording)
     own = {name: _field(cloth, name) for name in parameters}
     objective = _Fields(cloth, own, [episode(cloth, r) for r in given], dt, blocks_for(use), contrast)
     if journal is not None:

@@ -16,6 +16,8 @@ from ..effects import AbstractEffect
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
+from ..recordings.extents import check_size
+from ..recordings.marks import each_once
 from . import gauss_newton
 from .blocks import blocks_for
 from .considered import covariance_of
@@ -38,6 +40,7 @@ from .unknowns import collect, with_priors
 
 LATEST = 2.0  # standard deviations of a clock's prior, for which the simulation goes on after the last frame
 PAPER_ITERATIONS = 35  # of the DiffCP paper's stop rule
+MOST_STARTS = 1000
 ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
 
 
@@ -72,7 +75,8 @@ def identify(
         parameters: public names, e.g. ["youngs_modulus", "air.normal"]; None: all material parameters that the model
             contains, and the amplitudes of its effects.
         method: "gauss-newton" (robust residuals, forward-mode sensitivities) or "lbfgs" (the same, reverse mode);
-            "adam" or "gradient-descent" (the paper's Chamfer distance to vertices, reverse mode), for comparison.
+            "adam" or "gradient-descent" (the paper's Chamfer distance to vertices, reverse mode), for comparison: a
+            distance knows of no errors, so these take neither priors nor nuisances, and the density as exact.
         stop: "converged", or "paper": as soon as Chamfer (one-sided, cloud to surface) is below 1.5 cm.
         iterations: at most this many with all frames, and at most 10 with the early ones before: the beginning of the
             same motion, so that neither velocity nor rest shape is ever set anew.
@@ -105,25 +109,30 @@ def identify(
         Estimates with standard errors, distances, warnings, frames.
 
     Raises:
-        InvalidInput: unknown names or options.
-        RecordingError: a recording without motion, or with nothing seen or felt.
+        InvalidInput: unknown names or options, or one episode twice.
+        RecordingError: a recording without motion, with nothing seen or felt, or seen in another unit than metres.
         SimulationDiverged: the start values cannot be simulated.
     """
     _check(method, stop, iterations, starts)
+    _check_priors(method, priors, nuisances)
     began = time.perf_counter()
     episodes_in = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not episodes_in:
         raise InvalidInput("recordings", got="none", expected="at least one episode")
+    each_once(episodes_in)
     if refine and profile:
         raise InvalidInput("profile", got="refine as well", expected="one of them: a profile is that of the given mesh")
     if refine:
         finer_cloth(cloth)  # refuses now what it would refuse at the end
     names = default_parameters(cloth) if parameters is None else list(parameters)
-    unknowns = with_priors(collect(cloth, names, episodes_in[0].cloth.areal_density_std), priors or {})
+    measured = None if method in CHAMFER else episodes_in[0].cloth.areal_density_std  # joins as a prior only
+    unknowns = with_priors(collect(cloth, names, measured), priors or {})
     if not unknowns:
         raise InvalidInput("parameters", got="none", expected="at least one name")
     _check_profile(profile, [u.name for u in unknowns])
     blocks = blocks_for(use)
+    for recording in episodes_in:
+        check_size(recording)
     episodes = [episode(cloth, r) for r in episodes_in]
     _check_seen(method, stop, episodes)
     own = chosen(nuisances, implied([block.name for block in blocks], episodes))
@@ -147,6 +156,23 @@ def _check(method: str, stop: str, iterations: int, starts: int) -> None:
     for name, number in (("iterations", iterations), ("starts", starts)):
         if number < 1:
             raise InvalidInput(name, got=number, expected="at least 1")
+    if starts > MOST_STARTS:
+        raise InvalidInput("starts", got=starts, expected=f"at most {MOST_STARTS}")
+
+
+def _check_priors(method: str, priors: Mapping[str, Any] | None, nuisances: Mapping[str, Any] | Sequence[str]) -> None:
+    """Refuse what a mean distance cannot be weighed against: it has no noise, in whose units priors are.
+
+    A search without them would go where they forbid, and report errors that have them in.
+    """
+    for name, given in (("priors", priors), ("nuisances", nuisances)):
+        if method in CHAMFER and given:
+            raise InvalidInput(
+                name,
+                got=f"{', '.join(given)} with method {method!r}",
+                expected="none: it follows the Chamfer distance alone",
+                remedy='method "gauss-newton" or "lbfgs"',
+            )
 
 
 def _check_profile(names: Sequence[str], fitted: Sequence[str]) -> None:

@@ -77,15 +77,18 @@ def nuisance_estimates(
 
 
 def withdraw(found: Found, unknowns: Sequence[Unknown]) -> Found:
-    """No parameter counts as identified, because the model does not describe these data: errors are the priors'."""
+    """No parameter counts as identified, because the model does not describe these data: errors are the priors'.
+
+    Nor one that was measured beforehand: the fit's value of it is not the measured one.
+    """
     prior = {u.name: _absent(u, "data") for u in unknowns}
     parameters = dict(found.parameters)
     for name, e in found.parameters.items():
-        if e.source == "data" and name in prior:
+        if name in prior:
             p = prior[name]
             interval = (min(p.ci95[0], e.value), max(p.ci95[1], e.value))
             parameters[name] = replace(e, std=p.std, ci95=interval, identifiable=False)
-        elif e.source != "prior":
+        else:
             parameters[name] = replace(e, identifiable=False)
     if "membrane_stiffness" in parameters and "youngs_modulus" in parameters:
         thickness = found.parameters["membrane_stiffness"].value / found.parameters["youngs_modulus"].value
@@ -194,9 +197,9 @@ def _estimate(unknown: Unknown, raw: float, deviation: float) -> Estimate:
 
 def _absent(unknown: Unknown, source: str) -> Estimate:
     """A material parameter that was not fitted: only its prior is known."""
-    value, spread = unknown.value(unknown.start), 1.96 * unknown.prior_std
-    low, high = (unknown.value(unknown.clip(unknown.start + sign * spread)) for sign in (-1, 1))
-    std = unknown.slope(unknown.start) * unknown.prior_std
+    value, spread = unknown.value(unknown.middle), 1.96 * unknown.prior_std
+    low, high = (unknown.value(unknown.clip(unknown.middle + sign * spread)) for sign in (-1, 1))
+    std = unknown.slope(unknown.middle) * unknown.prior_std
     return Estimate(value, std, (low, high), unknown.parameter.unit, value, False, source)
 
 

@@ -17,6 +17,7 @@ from ..cloth import Cloth
 from ..errors import InvalidInput, RecordingError, UnstableStep
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
+from ..recordings.marks import alike, mark
 from ..transfer import Contact
 from .episodes import Episode, cloth_from, episode
 from .files import number, read_result
@@ -26,7 +27,6 @@ from .result import Identification, or_none
 from .unknowns import available
 
 RESULT = "identification.json"
-SAME = 1e-5  # m, between the mean points of one episode, kept and read again
 FAITHFUL = 0.02  # relative difference of Chamfer between the fit and its replay that other machines explain
 SHORTEST, FINEST = 1e-7, 1e-5  # s, m: no fit ends that takes such steps, or has such a contact grid
 
@@ -187,30 +187,9 @@ def _model(content: dict[str, Any]) -> SavedModel:
     )
 
 
-def mark(recording: Recording) -> dict[str, Any]:
-    """What an episode is recognised by, wherever it lies."""
-    name = recording.path.name if recording.path else "recording"
-    points, markers = recording.points, recording.markers
-    seen = [] if points is None else [points.xyz]
-    seen += [] if markers is None else [markers.xyz[np.isfinite(markers.xyz).all(-1)]]
-    frames = sum(len(stream.t) for stream in (points, markers) if stream is not None)
-    if not seen:
-        motions = (*recording.grippers.values(), *recording.joints.values())
-        seen = [motion.force for motion in motions if motion.force is not None]
-        frames = sum(map(len, seen))
-    every = np.concatenate(seen) if seen else np.zeros((1, 3))
-    return {"name": name, "frames": frames, "points": len(every), "mean": every.mean(0).tolist()}
-
-
 def is_fitted(path: str | Path, recording: Recording) -> bool:
     """Whether the fit used this episode: then nothing about it is a prediction, nor new."""
     return any(alike(kept, mark(recording)) for kept in read_saved(path).episodes)
-
-
-def alike(kept: dict[str, Any], own: dict[str, Any]) -> bool:
-    """Whether two marks are of one episode."""
-    counts = all(kept[key] == own[key] for key in ("frames", "points"))
-    return counts and bool(np.abs(np.subtract(kept["mean"], own["mean"])).max() < SAME)
 
 
 def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:

@@ -152,6 +152,6 @@ def _statement(e: Estimate) -> tuple[str, str, str]:
 
 
 def _remark(e: Estimate) -> str:
-    if e.source == "data" and not e.identifiable:
+    if e.source in ("data", "prior") and not e.identifiable:
         return "not identifiable"
     return REMARKS.get(e.source, "")

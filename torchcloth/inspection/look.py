@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import MissingDependency, TorchclothError
-from ..recordings import Recording, ticks
+from ..recordings import Recording, extents, ticks
 from ..recordings.ticks import Stream
 from ..robots.paths import Path, paths  # pyright: ignore[reportMissingImports] - mapped from robots/
 from . import frames, images, noise
@@ -140,6 +140,8 @@ def _remarks(recording: Recording, moved: dict[str, Path], late: Lag | None) -> 
             f"the clocks differ: observations come {late.value:.3f} s late, the recording says {late.stated:.3f} s; "
             f"set clock_offset to {-late.value:.3f} if the stamps are to blame"
         )
+    if (found := extents.of_another_size(recording)) is not None:
+        remarks.append("; ".join(found))
     if recording.points is None and recording.markers is None:
         remarks.append("no points and no markers: nothing to compare a simulation with")
     return remarks

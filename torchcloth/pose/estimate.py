@@ -21,6 +21,7 @@ from ..identification.null import rigid_carry
 from ..identification.report import estimates, nuisance_estimates
 from ..identification.unknowns import collect, with_priors
 from ..recordings import Recording
+from ..recordings.extents import check_size
 from .local import unexplained
 from .modes import Modes, modes_of
 from .objective import Corrected, Correction, pushable, windows_of
@@ -81,6 +82,7 @@ def estimate_pose(
     began = time.perf_counter()
     if not (math.isfinite(window) and window > 0):
         raise InvalidInput("window", got=window, expected="a time > 0 in s")
+    check_size(recording)
     data, fields = episode(cloth, recording), modes_of(cloth.mesh)
     coarse = modes_of(cloth.mesh, modes).fields.to(data.initial)
     density = recording.cloth.areal_density_std if uncertain else None

@@ -58,6 +58,8 @@ class Correction(NamedTuple):
 def windows_of(times: Tensor, length: float) -> list[tuple[int, int]]:
     """Windows of about ``length`` [s] that cover all frames, at least one frame interval each."""
     span = float(times[-1] - times[0])
+    if length < 0.5 * float(times.diff().min()):  # one for each interval; not as many as so small a length asks for
+        return list(pairwise(range(len(times))))
     wanted = torch.linspace(float(times[0]), float(times[-1]), max(1, round(span / length)) + 1).to(times)
     ends = (times[None] - wanted[:, None]).abs().argmin(1).unique().tolist()
     return list(pairwise(ends))

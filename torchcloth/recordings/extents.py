@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 
-from .types import ClothInfo
+from ..errors import RecordingError
+from .types import ClothInfo, Recording
+
+TOO_WIDE, TOO_NARROW = 0.65, 0.03  # of the cloth's length: half of the points lie within so much of their middle
+SURELY = 1.5  # factor within which a unit is recognised
+LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
+SOME = 400  # points of a frame that are looked at
+ENOUGH = 10  # points in a frame; fewer, as single markers, show no size
 
 
 def longest(cloud: np.ndarray) -> float:
@@ -26,3 +35,52 @@ def size(cloth: ClothInfo) -> tuple[float | None, float | None]:
     if cloth.sheet is not None:
         return float(np.hypot(*cloth.sheet)), float(np.prod(cloth.sheet))
     return None, None
+
+
+def seen(recording: Recording) -> list[np.ndarray]:
+    """Some points [N, 3] m of every frame: of clouds, or else of markers."""
+    rng = np.random.default_rng(0)
+    return [c if len(c) <= SOME else c[rng.choice(len(c), SOME, replace=False)] for c in _frames(recording)]
+
+
+def other_unit(clouds: Sequence[np.ndarray], length: float) -> tuple[str, str] | None:
+    """What is wrong with clouds that no cloth of this length [m] could show, and the remedy; None where nothing is."""
+    clouds = [c for c in clouds if len(c)]
+    if not clouds:
+        return None
+    spreads = [float(np.median(np.linalg.norm(c - np.median(c, axis=0), axis=1))) for c in clouds]
+    wide, narrow = (float(np.quantile(spreads, q)) / length for q in (0.5, 0.9))
+    if narrow >= TOO_NARROW and wide <= TOO_WIDE:
+        return None
+    factor = float(np.median([longest(c) for c in clouds])) / length
+    unit = min(LENGTHS, key=lambda name: abs(np.log(factor * LENGTHS[name]))) if factor > 0 else ""
+    guess = f", as if in {unit}" if unit and abs(np.log(factor * LENGTHS[unit])) < np.log(SURELY) else ""
+    return (
+        f"the cloud is {factor:.3g} times as long as the cloth{guess}",
+        "check the unit of points, of depth (depth_scale) and of the cloth's mesh, and leave out what is no cloth",
+    )
+
+
+def of_another_size(recording: Recording) -> tuple[str, str] | None:
+    """The same for an episode, where its frames show enough to tell."""
+    length = size(recording.cloth)[0]
+    return None if length is None else other_unit([c for c in seen(recording) if len(c) >= ENOUGH], length)
+
+
+def check_size(recording: Recording) -> None:
+    """Refuse what was seen in another unit than the cloth is described in.
+
+    Raises:
+        RecordingError: clouds that no such cloth could show.
+    """
+    if (found := of_another_size(recording)) is not None:
+        name = recording.path.name if recording.path else "recording"
+        raise RecordingError(f"{name}: {found[0]}", expected="points of the cloth, in metres", remedy=found[1])
+
+
+def _frames(recording: Recording) -> Iterator[np.ndarray]:
+    points, markers = recording.points, recording.markers
+    if points is not None:
+        yield from np.split(points.xyz, np.cumsum(points.counts)[:-1])
+    elif markers is not None:
+        yield from (m[np.isfinite(m).all(-1)] for m in markers.xyz)

@@ -17,6 +17,9 @@ from .types import Camera, GraspInfo, Recording
 EPISODE = "episode.json"
 FORMAT, VERSION = "torchcloth-recording", 1
 RIZON_JOINTS = 7
+STRONGEST_GRAVITY = 100.0  # m/s^2; above this it is in mm/s^2
+DENSEST_AIR = 100.0  # kg/m^3; above this it is in g/m^3, or water
+FEW_TICKS, FAR_LONGER = 5, 100.0  # of a stream, before its spacing says something; spans in one unit differ by less
 MARKER_SLACK = 0.01  # of the pattern's longer side: a marker's pattern coordinates are measured by hand
 
 
@@ -66,7 +69,7 @@ def assemble(
         held: the streams, by the names of `Recording`.
         images_of: finds the images of a camera by its name and (width, height).
     """
-    gravity = root.maybe(root.array, "gravity", 3)
+    gravity = _gravity(root)
     noise, air = root.inside("observation_noise"), root.inside("air")
 
     def camera(name: str, fields: Fields) -> Camera:
@@ -82,7 +85,7 @@ def assemble(
         observation_noise_std=noise.maybe(noise.number, "std", least=0, most=1, suspect="millimetres"),
         clock_offset=root.maybe(root.number, "clock_offset") or 0.0,
         gravity=np.array([0.0, 0.0, -9.81]) if gravity is None else gravity,
-        air_density=air.maybe(air.number, "density", least=0),
+        air_density=air.maybe(air.number, "density", least=0, most=DENSEST_AIR, suspect="g/m^3"),
         split=_split(root),
         licence=root.maybe(root.text, "licence"),
         extra=root.left(observation_noise=noise, air=air),
@@ -94,7 +97,20 @@ def assemble(
     _check_robots(recording, root.place, folder)
     _check_markers(recording, folder)
     _check_overlap(recording, folder)
+    _check_seconds(recording, folder)
     return recording
+
+
+def _gravity(root: Fields) -> np.ndarray | None:
+    gravity = root.maybe(root.array, "gravity", 3)
+    if gravity is not None and np.linalg.norm(gravity) > STRONGEST_GRAVITY:
+        raise RecordingError(
+            f"{root.at('gravity')} looks like mm/s^2",
+            got=gravity.tolist(),
+            expected=f"at most {STRONGEST_GRAVITY:g} m/s^2 in length",
+            remedy="use SI units",
+        )
+    return gravity
 
 
 def _refuse_no_episode(folder: Folder) -> None:
@@ -257,4 +273,23 @@ def _check_overlap(recording: Recording, folder: Folder) -> None:
             expected = f"some of {first:.6g} to {last:.6g} s"
             raise RecordingError(
                 f"{place}: t does not overlap the motion", got=got, expected=expected, remedy="set clock_offset"
+            )
+
+
+def _check_seconds(recording: Recording, folder: Folder) -> None:
+    """Streams of one motion last about as long: one that ticks more slowly than another lasts is in another unit."""
+    motions = {**recording.grippers, **recording.joints}
+    times = {f"{folder.place(streams.MOTION)}: {name}/t": motion.t for name, motion in motions.items()}
+    seen = {streams.POINTS: recording.points, streams.MARKERS: recording.markers}
+    times |= {f"{folder.place(file)}: t": stream.t for file, stream in seen.items() if stream is not None}
+    spans = {place: float(t[-1] - t[0]) for place, t in times.items() if len(t) > 1}
+    brief = min(spans, key=spans.__getitem__, default="")
+    for place, span in spans.items():
+        step = float(np.median(np.diff(times[place])))
+        if len(times[place]) >= FEW_TICKS and span > FAR_LONGER * spans[brief] and step > spans[brief]:
+            raise RecordingError(
+                f"{place} looks like milliseconds",
+                got=f"steps of {step:.4g}, while {brief} spans {spans[brief]:.4g}",
+                expected="seconds",
+                remedy="rescale it",
             )

@@ -19,14 +19,15 @@ from .types import Camera, ClothInfo, Collider, GraspInfo, RobotInfo
 HEAVIEST = 20.0  # kg/m^2; above this a density was given in g/m^2
 THICKEST = 0.05  # m
 WIDEST_GRASP = 1.0  # m
-NOMINAL = (
-    "membrane_stiffness",
-    "youngs_modulus",
-    "poisson_ratio",
-    "bending_stiffness",
-    "bending_damping_time",
-    "units",
-)
+NOMINAL: dict[str, dict[str, Any]] = {  # bounds; far above every fabric, where a number is in another unit
+    "membrane_stiffness": {"above": 0, "most": 1e9, "suspect": "another unit"},
+    "youngs_modulus": {"above": 0, "most": 1e13, "suspect": "another unit"},
+    "poisson_ratio": {"above": 0, "most": 0.499999, "suspect": "another measure"},
+    "bending_stiffness": {"least": 0, "most": 1.0, "suspect": "micronewton metres"},
+    "bending_damping_time": {"least": 0, "most": 100.0, "suspect": "milliseconds"},
+}
+NOTE = "units"  # of the data sheet, for people
+DISTORTIONS = (0, 4, 5, 8, 12, 14)  # coefficients in OpenCV's order: a calibration has no other number of them
 
 
 def cloth(fields: Fields, folder: Folder) -> ClothInfo:
@@ -105,11 +106,23 @@ def camera(fields: Fields, images_of: Callable[[tuple[int, int]], dict[Kind, Ima
         height=size[1],
         K=matrix,
         T_world_camera=_transform(fields, "T_world_camera"),
-        distortion=fields.array("distortion", "N") if fields.has("distortion") else np.zeros(0),
+        distortion=_distortion(fields),
         depth_scale=fields.maybe(fields.number, "depth_scale", above=0, most=0.1, suspect="units per metre"),
         **streams,
         extra=fields.rest,
     )
+
+
+def _distortion(fields: Fields) -> np.ndarray:
+    found = fields.array("distortion", "N") if fields.has("distortion") else np.zeros(0)
+    if len(found) not in DISTORTIONS:
+        raise RecordingError(
+            f"{fields.at('distortion')} is cut off",
+            got=f"{len(found)} numbers",
+            expected="0, 4, 5, 8, 12 or 14 in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6 s1..s4 tx ty",
+            remedy="append the zeros that were left out",
+        )
+    return found
 
 
 def _sheet(fields: Fields) -> tuple[float, float]:
@@ -153,12 +166,16 @@ def _initial(folder: Folder, file: str, vertices: np.ndarray | None) -> np.ndarr
 
 def _nominal(fields: Fields) -> dict[str, Any]:
     """Data-sheet values by name; an unknown one is refused, for a misspelt one would be ignored."""
-    for key in fields.rest:
-        if key not in NOMINAL:
-            raise RecordingError(
-                f"{fields.at(key)} is unknown", expected=f"one of {', '.join(NOMINAL)}", remedy="correct its spelling"
-            )
-    return fields.rest
+    found = {}
+    for key, value in list(fields.rest.items()):
+        if key not in (*NOMINAL, NOTE):
+            expected = f"one of {', '.join((*NOMINAL, NOTE))}"
+            raise RecordingError(f"{fields.at(key)} is unknown", expected=expected, remedy="correct its spelling")
+        if value is not None:
+            if key != NOTE:
+                fields.number(key, **NOMINAL[key])
+            found[key] = value  # as it is written, so that it is written so again
+    return found
 
 
 def _transform(fields: Fields, key: str) -> np.ndarray:

@@ -11,6 +11,8 @@ from .garments import GARMENTS
 
 MOTIONS = ("cover", "fling", "drag", "fold", "hang", "swing", "shake", "stretch")
 CAMERAS = ("azure_kinect", "d435")
+FEWEST, MOST = 50, 100_000  # triangles: fewer are no garment, more take days
+FASTEST = {"rate": 1000.0, "speed": 100.0, "acceleration": 1000.0}
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Order:
         acceleration: m/s^2, likewise; with arms, the joints' limits lower both.
 
     Raises:
-        InvalidInput: a name that is not known, or a number that is not positive.
+        InvalidInput: a name that is not known, or a number out of range.
     """
 
     garment: str
@@ -49,13 +51,13 @@ class Order:
             if getattr(self, name) not in known:
                 raise InvalidInput(name, got=repr(getattr(self, name)), expected=f"one of {', '.join(known)}")
         find(self.cloth_fabric)
-        if self.triangles < 50:
-            raise InvalidInput("triangles", got=self.triangles, expected="50 or more", remedy="a garment needs them")
+        if not FEWEST <= self.triangles <= MOST:
+            raise InvalidInput("triangles", got=self.triangles, expected=f"{FEWEST} to {MOST}")
         if self.seed < 0:
             raise InvalidInput("seed", got=self.seed, expected="0 or more")
-        for name in ("rate", "speed", "acceleration"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise InvalidInput(name, got=getattr(self, name), expected="a finite value > 0")
+        for name, most in FASTEST.items():
+            if not 0 < getattr(self, name) <= most:
+                raise InvalidInput(name, got=getattr(self, name), expected=f"a value > 0, at most {most:g}")
 
     @property
     def cloth_fabric(self) -> str:

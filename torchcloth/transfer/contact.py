@@ -20,6 +20,7 @@ FADING = 3.5  # and by how many they must approach for each unit of 1 - R33 (bot
 GAP = 1.4  # grid spacings between layers at rest, with the default play
 SPARSEST = 1.4  # grid spacings between corners of sub-triangles: no hole between the points exceeds 0.7 spacings
 ROOM = 1.6  # times the longest way along the cloth: the extent at which the grid wraps, so that layers never alias
+MOST = 100  # points along a triangle's edge: 10 000 in it
 TURNED = 1.7  # layers are folded on each other where the way along the cloth is that much longer than through space
 
 
@@ -103,12 +104,15 @@ class Contact:
         """Everything that mesh and contact fix, in the default precision.
 
         Raises:
-            InvalidInput: non-positive spacing, or points too sparse for it.
+            InvalidInput: a spacing that is not positive, or longer than the cloth, or points too sparse or many for it.
         """
         spacing, points = self.resolve(mesh)
         corner = mesh.rest - mesh.rest.mean(1, keepdims=True)
         reach = float((RANGE + SKIN) * spacing + 2 * np.linalg.norm(corner, axis=-1).max())
         longest = max(float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), mesh.extent)
+        if spacing > longest:
+            expected = f"at most the length of the cloth, {longest:.3g} m"
+            raise InvalidInput("contact spacing", got=f"{spacing:g} m", expected=expected)
         return Grid(
             points=torch.as_tensor(points, dtype=torch.get_default_dtype()),
             spacing=spacing,
@@ -124,14 +128,23 @@ class Contact:
         """(spacing [m], barycentric coordinates of the points of one triangle [S, 3]).
 
         Raises:
-            InvalidInput: non-positive spacing, or points too sparse for it.
+            InvalidInput: a spacing that is not positive, or points too sparse or many for it.
         """
         edge = mesh.mean_edge
         spacing = edge if self.spacing is None else float(self.spacing)
         if not spacing > 0:
             raise InvalidInput("contact spacing", got=f"{spacing:g} m", expected="a length > 0")
+        if not spacing * SPARSEST * MOST >= edge:
+            raise InvalidInput(
+                "contact spacing",
+                got=f"{spacing:g} m, for which a triangle needs {edge / (SPARSEST * spacing):.2g} points along an edge",
+                expected=f"{edge / (SPARSEST * MOST):.2g} m or more on this mesh",
+                remedy="refine the mesh, or give the grid's spacing in metres",
+            )
         needed = max(1, int(np.ceil(edge / (SPARSEST * spacing))))
         s = needed if self.subdivisions is None else int(self.subdivisions)
+        if s > MOST:
+            raise InvalidInput("contact subdivisions", got=s, expected=f"at most {MOST}")
         if s < needed:
             raise InvalidInput(
                 "contact subdivisions",

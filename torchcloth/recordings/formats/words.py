@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ...errors import RecordingError
-from ..scene import NOMINAL
+from ..scene import NOMINAL, NOTE
 
 FREE = ("notes", "extra")  # and x_...: kept in the episode as they are
 SCENE = [
@@ -15,7 +15,7 @@ SCENE = [
 OBJECTS = {
     "cloth": ["mesh", "sheet", "initial_vertices", "areal_density", "areal_density_std", "thickness", "nominal"],
     "cloth.sheet": ["width", "height"],
-    "cloth.nominal": list(NOMINAL),
+    "cloth.nominal": [*NOMINAL, NOTE],
     "observation_noise": ["std"],
     "air": ["density"],
 }
