@@ -86,6 +86,7 @@ CONTACT = {"spacing": 0.05, "subdivisions": None, "damping": 0.1, "play": 0.2, "
 DAMAGE = {
     "deep": (lambda content: "[" * 200_000, "unreadable; got .*recursion"),
     "a number of 400 digits": (put("model", "values", "youngs_modulus", value=10**400), "youngs_modulus 1000.*0000 wh"),
+    "a fabric of nothing": (put("model", "values", "youngs_modulus", value=1e40), "youngs_modulus 1e.40, beyond every"),
     "a number that is none": (put("model", "values", "youngs_modulus", value=True), "youngs_modulus True where"),
     "contact spacing a word": (put("model", "contact", value={**CONTACT, "spacing": "x"}), "contact spacing 'x' where"),
     "contact without width": (put("model", "contact", value={**CONTACT, "spacing": 0}), "contact spacing 0 where"),

@@ -123,8 +123,7 @@ def _scene(facts: Fields, arrays: Fields) -> Recording:
     mesh: dict[str, Any] = {}
     if sheet is None or arrays.rest:
         mesh = {"vertices": arrays.array("vertices", "V", 3), "faces": arrays.array("faces", "F", 3, kind="int")}
-        uv = arrays.rest.get("uv")
-        flat = uv is not None and np.ndim(uv) == 2
+        flat = np.ndim(arrays.rest.get("uv", 0.0)) == 2
         mesh["uv"] = arrays.maybe(arrays.array, "uv", *(("V", 2) if flat else ("F", 3, 2)))  # or of sewn panels
     cloth = ClothInfo(
         **scene.fabric(facts), sheet=None if sheet is None else (float(sheet[0]), float(sheet[1])), **mesh

@@ -28,6 +28,7 @@ from .unknowns import available
 
 RESULT = "identification.json"
 FAITHFUL = 0.02  # relative difference of Chamfer between the fit and its replay that other machines explain
+STIFFEST = 1e13  # in SI units: simulated, a fabric of more would take more steps than can be counted
 SHORTEST, FINEST = 1e-7, 1e-5  # s, m: no fit ends that takes such steps, or has such a contact grid
 
 
@@ -151,6 +152,12 @@ def read_saved(path: str | Path) -> SavedModel:
     return read_result(path, RESULT, _model, expected, "run `torchcloth identify` again")
 
 
+def _value(name: str, kept: Any) -> float:
+    if abs(found := number(kept, name=name)) > STIFFEST:
+        raise ValueError(f"{name} {found:g}, beyond every fabric in SI units")
+    return found
+
+
 def _contact(**kept: Any) -> Contact:
     for name, least in {"spacing": FINEST, "subdivisions": 1, "damping": 0.0, "play": 0.0}.items():
         if kept.get(name) is not None:
@@ -169,7 +176,7 @@ def _model(content: dict[str, Any]) -> SavedModel:
         raise ValueError("a correlation above 1")
     left = content["fit"]["rms_after"]
     return SavedModel(
-        {str(name): number(value, name=name) for name, value in model["values"].items()},
+        {str(name): _value(name, value) for name, value in model["values"].items()},
         {name: number(said[name]["std"], 0.0, f"{name}'s std") for name in correlation},
         [name for name in correlation if said[name]["identifiable"] and said[name]["source"] == "data"],
         matrix,
