@@ -41,7 +41,7 @@ def save_model(
 ) -> Path:
     """Write a model whose base is that of ``recording``, and the same with a residual force; returns the path.
 
-    ``episodes`` are the marks (``identification.saved.mark``) of those that it was fitted to.
+    ``episodes`` are the marks (``recordings.marks.mark``) of those that it was fitted to.
     """
     cloth = recording.cloth
     facts: dict[str, Any] = {
