@@ -7,9 +7,9 @@ import sheets
 import torch
 
 from torchcloth.diagnosis.base_model import base_model
-from torchcloth.diagnosis.evidence import setting_of
 from torchcloth.diagnosis.hypotheses import catalogue
 from torchcloth.diagnosis.screening import screen
+from torchcloth.diagnosis.setting import setting_of
 
 NAMES = ["a", "b", "c"]
 SLOPES = toys.smooth(1, 6)  # two parameters, three hypotheses, one nuisance

@@ -11,8 +11,8 @@ from torchcloth import recordings as rec
 from torchcloth.diagnosis import base_model
 from torchcloth.diagnosis.branches import _jumped, without
 from torchcloth.diagnosis.comparison import Predicted
-from torchcloth.diagnosis.evidence import setting_of
 from torchcloth.diagnosis.repeats import pairs_of, repeats
+from torchcloth.diagnosis.setting import setting_of
 
 
 def told(values: list[torch.Tensor]) -> Predicted:

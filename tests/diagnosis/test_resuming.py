@@ -29,7 +29,7 @@ def episodes():
 @pytest.fixture
 def counted(monkeypatch):
     """Calls of the simulations of an episode; ``stop`` interrupts after so many."""
-    work, state = evidence._piece, {"calls": 0, "stop": 10**9}
+    work, state = evidence.piece_of, {"calls": 0, "stop": 10**9}
 
     def piece(*arguments):
         if state["calls"] == state["stop"]:
@@ -37,7 +37,7 @@ def counted(monkeypatch):
         state["calls"] += 1
         return work(*arguments)
 
-    monkeypatch.setattr(evidence, "_piece", piece)
+    monkeypatch.setattr(evidence, "piece_of", piece)
     return state
 
 

@@ -10,10 +10,12 @@ import torch
 from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import base_model, together
 from torchcloth.diagnosis.cells import _places
-from torchcloth.diagnosis.evidence import gather, motions_of, one_way, setting_of, step_sizes
+from torchcloth.diagnosis.evidence import gather
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
+from torchcloth.diagnosis.setting import motions_of, setting_of
+from torchcloth.diagnosis.steps import one_way, step_sizes
 from torchcloth.diagnosis.world import Hypothesis
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification.sheet import sheet_of

@@ -8,7 +8,7 @@ from .base_model import base_model
 from .comparison import Gain, compare, predict
 from .confirming import Confirmation, confirm
 from .drifting import drifts
-from .evidence import gather, setting_of
+from .evidence import gather
 from .fitting import Fitted, fit
 from .gate import Fault, check, read_episodes
 from .hypotheses import catalogue, register
@@ -21,6 +21,7 @@ from .own_causes import register_file
 from .residual import Residual, learn_residual
 from .run import diagnose, write_diagnosis
 from .screening import screen
+from .setting import setting_of
 from .stepwise import search
 from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model, World

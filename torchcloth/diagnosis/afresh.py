@@ -13,9 +13,10 @@ from dataclasses import replace
 import torch
 
 from .approach import approach
-from .evidence import IMPOSSIBLE, Progress, Setting, staged
 from .fitting import Fitted, fit, leap_with, with_cause
 from .noise import unfitted, whitened
+from .pieces import IMPOSSIBLE
+from .setting import Progress, Setting, staged
 from .world import Hypothesis, Model
 
 

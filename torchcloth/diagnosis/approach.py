@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from .bursts import calmed
-from .evidence import Evidence, Progress, Setting, gather
+from .evidence import Evidence, gather
 from .fitting import prior_precision
 from .noise import unfitted, whitened
+from .setting import Progress, Setting
 from .world import Model
 
 SWEEPS = 2

@@ -14,10 +14,13 @@ import torch
 from torch import Tensor
 
 from ..errors import SimulationDiverged, UnstableStep
-from .cells import NAMES, Cells, cells_of
-from .evidence import Evidence, Progress, Setting, aligned, side_by_side, step_sizes
+from .cells import NAMES, Cells, aligned, cells_of
+from .evidence import Evidence
 from .fitting import Fitted, weighed
 from .noise import FLOOR, fit_noise
+from .pieces import side_by_side
+from .setting import Progress, Setting
+from .steps import step_sizes
 from .world import World
 
 DIRECTIONS = 2  # random ones, each there and back

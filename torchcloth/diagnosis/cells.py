@@ -45,10 +45,28 @@ class Cells(NamedTuple):
         return (self.block * 10_000 + self.patch) * 1000 + self.window
 
 
+class Piece(NamedTuple):
+    """What one episode says."""
+
+    cells: Cells  # columns: the model's own, the hypotheses that could be simulated, nuisances
+    std: Tensor  # of the nuisances
+    numerics: Tensor  # [C]
+    able: Tensor  # [hypotheses] bool, could be simulated
+
+
 def stretches(cells: Sequence[Cells]) -> Tensor:
     """[C] numbers that cells of one episode, kind of data and window share."""
     own = [torch.stack([torch.full_like(c.window, k), c.block, c.window], 1) for k, c in enumerate(cells)]
     return torch.cat(own).unique(dim=0, return_inverse=True)[1]
+
+
+def aligned(key: Tensor, other: Tensor, columns: Tensor) -> Tensor:
+    """Rows of ``columns`` [O, ...] of the cells ``other`` in the order of the cells ``key`` [C]; zero where missing."""
+    order = torch.argsort(other)
+    place = order[torch.searchsorted(other[order], key).clamp(max=len(other) - 1)]
+    found = columns[place].clone()
+    found[other[place] != key] = 0.0
+    return found
 
 
 def mean_over(stretch: Tensor, values: Tensor) -> Tensor:

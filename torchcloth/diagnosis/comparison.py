@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from .bursts import densities, unweighted, weights
-from .cells import SEEN
-from .evidence import aligned
+from .cells import SEEN, aligned
 from .fitting import Fitted, curvature, prior_precision, step_of
 from .noise import Whitened
 

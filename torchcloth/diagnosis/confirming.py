@@ -14,12 +14,13 @@ from ..recordings import Recording
 from ..recordings.marks import alike, each_once, mark
 from .base_model import together
 from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
-from .evidence import Evidence, Progress, as_held, as_rough, gather, setting_of, staged
+from .evidence import Evidence, as_held, as_rough, gather
 from .fitting import Fitted
 from .gate import check, somewhere_seen
 from .model_file import ModelFile, read_model
 from .noise import Noise, fit_noise, floor_of, least, unfitted, whitened
 from .repeats import pairs_of, repeats
+from .setting import Progress, setting_of, staged
 from .world import Model
 
 CONVENTION = (

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..identification.sheet import ACROSS
 from .cells import NAMES, STRETCH
-from .evidence import Evidence, Setting
+from .evidence import Evidence
+from .setting import Setting
 
 POINTS = NAMES.index("points")
 SHOWN = 0.98  # quantile of the misfit at the end of the colour bar

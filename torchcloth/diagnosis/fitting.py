@@ -10,8 +10,10 @@ from torch import Tensor
 
 from ..identification.bounds import bounded
 from .bursts import calmed, densities, unweighted
-from .evidence import IMPOSSIBLE, Evidence, Progress, Setting, as_held, as_rough, asked_about, gather, staged
+from .evidence import Evidence, as_held, as_rough, asked_about, gather
 from .noise import Noise, Whitened, fit_noise, unfitted, whitened
+from .pieces import IMPOSSIBLE
+from .setting import Progress, Setting, staged
 from .world import Hypothesis, Model
 
 ENOUGH = 2.0  # log density that a further step is expected to gain, below which the search ends

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from ..identification.episodes import Episode
 from ..identification.journal import Journal, digest
-from .cells import Cells
-from .evidence import Kept, Piece, Setting
+from .cells import Cells, Piece
 from .own_causes import digests
+from .setting import Kept, Setting
 from .world import Model
 
 FIELDS = len(Cells._fields)

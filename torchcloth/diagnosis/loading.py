@@ -15,8 +15,9 @@ from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from .base_model import together
 from .cells import directions
-from .evidence import one_way, shifted, side_by_side
 from .model_file import ModelFile, load_model, of_fabric, read_model
+from .pieces import side_by_side
+from .steps import one_way, shifted
 from .world import Model, World
 
 TOLD = 0.5  # of the prior's width: a parameter that is known better is known from data

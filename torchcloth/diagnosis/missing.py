@@ -18,11 +18,11 @@ from torch import Tensor
 from ..identification.replays import Frames
 from ..pose.modes import modes_of
 from ..pose.objective import windows_of
-from .cells import cells_of
-from .evidence import Progress, Setting, aligned
+from .cells import aligned, cells_of
 from .fitting import Fitted, prior_precision
 from .lacking import reference
 from .pushes import Pushes, pushed
+from .setting import Progress, Setting
 
 WINDOW, MODES = 0.2, 8  # s, fields for each axis
 LEVELS = 10 ** torch.linspace(-2.5, 1.5, 41, dtype=torch.float64)  # m/s^2, prior standard deviation of a field

@@ -25,9 +25,11 @@ from ..identification.nuisances import Held
 from ..identification.replays import Frames
 from ..recordings import Recording
 from .cells import Cells, cells_of, directions
-from .evidence import GRASP, Progress, Setting, joined, nuisances, one_way, shifted, side_by_side
 from .experiments import Experiment, planned, possible
 from .fitting import Fitted, prior_precision
+from .pieces import GRASP, joined, nuisances, side_by_side
+from .setting import Progress, Setting
+from .steps import one_way, shifted
 from .stepwise import Found
 
 NEEDED = (1.64 + 0.84) ** 2  # chi^2: told apart in 80 % of cases at 5 %

@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from .bursts import calmed, unweighted
-from .cells import Cells
+from .cells import Cells, aligned
 from .comparison import likelihood
-from .evidence import aligned
 from .fitting import Fitted, leap
 from .noise import Whitened
 from .world import Model

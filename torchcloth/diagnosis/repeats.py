@@ -17,8 +17,8 @@ from ..boundaries.motion import interpolate
 from ..identification.episodes import Episode
 from ..identification.replicates import keys_of
 from ..recordings import Recording
+from .cells import aligned
 from .comparison import Predicted
-from .evidence import aligned
 
 SAME = 0.01  # m, within which two grippers follow one command
 

@@ -18,8 +18,8 @@ from ..boundaries import Grasp
 from ..effects import ResidualForce
 from ..effects.residual import LAWS, PLACES, describe
 from .comparison import Gain
-from .evidence import Progress, Setting
 from .fitting import Fitted, fit
+from .setting import Progress, Setting
 from .stepwise import Found, extend, instead
 from .world import Hypothesis, Model, World
 

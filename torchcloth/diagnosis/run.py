@@ -16,7 +16,6 @@ from ..errors import InvalidInput
 from ..recordings import Recording
 from ..recordings.marks import each_once, mark
 from .base_model import base_model, together
-from .evidence import Progress, motions_of, setting_of, staged
 from .gate import check, somewhere_seen
 from .hypotheses import catalogue
 from .keeping import kept_in
@@ -26,6 +25,7 @@ from .model_file import save_model
 from .next_experiment import propose
 from .report import write_report
 from .residual import doubted, learn_residual
+from .setting import Progress, motions_of, setting_of, staged
 from .stepwise import Found, search
 from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model

@@ -9,12 +9,12 @@ from .afresh import afresh, resettled
 from .approach import approach
 from .branches import unstable, without
 from .comparison import Gain, compare, predict
-from .evidence import Progress, Setting, staged
 from .fitting import Fitted, fit, renoised, without_cause
 from .lacking import explained, lack_of_fit
 from .noise import floor_of
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
+from .setting import Progress, Setting, staged
 from .trials import FURTHER, MOSTLY, TRIED, Step, begun_with, known, one_step, worthwhile
 from .world import Hypothesis, Model
 

@@ -7,11 +7,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from .comparison import Gain, Predicted, compare, predict, spread, telling
-from .evidence import IMPOSSIBLE, Evidence, Progress, Setting, staged
+from .evidence import Evidence
 from .fitting import Fitted, fit, renoised, with_cause
 from .noise import Noise, fit_noise, unfitted
+from .pieces import IMPOSSIBLE
 from .placebo import Placebo, placebo
 from .screening import MUCH, PRESENT, Row
+from .setting import Progress, Setting, staged
 from .world import Hypothesis, Model
 
 TRIED = 4  # hypotheses that are fitted at each step

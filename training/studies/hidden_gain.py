@@ -17,8 +17,8 @@ from torchcloth.diagnosis import Hypothesis, Model, World, base_model, fit, load
 from torchcloth.diagnosis.approach import approach
 from torchcloth.diagnosis.base_model import together
 from torchcloth.diagnosis.cells import SEEN, cells_of
-from torchcloth.diagnosis.evidence import Setting
 from torchcloth.diagnosis.hypotheses import known
+from torchcloth.diagnosis.setting import Setting
 from torchcloth.recordings import read
 
 LEAST = 2e-4  # m: where an oracle gains less, there is nothing to be gained

@@ -22,8 +22,8 @@ from torchcloth._files import write_text
 from torchcloth.diagnosis import Hypothesis, base_model, catalogue, fit, screen, setting_of
 from torchcloth.diagnosis.approach import approach
 from torchcloth.diagnosis.base_model import together
-from torchcloth.diagnosis.cells import Cells
-from torchcloth.diagnosis.evidence import Evidence, aligned
+from torchcloth.diagnosis.cells import Cells, aligned
+from torchcloth.diagnosis.evidence import Evidence
 from torchcloth.diagnosis.fitting import Fitted, weighed
 from torchcloth.recordings import Camera, PointClouds, Recording
 

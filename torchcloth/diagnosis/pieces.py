@@ -1,0 +1,162 @@
+"""What one episode says at a point: all simulations of it, side by side, and the cells that they make."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInput, SimulationDiverged, UnstableStep
+from ..identification.episodes import Episode
+from ..identification.nuisances import Camera, Clock, Held, Rim, Tare
+from ..identification.replays import Frames
+from .cells import Cells, Piece, aligned, cells_of, directions
+from .setting import Setting
+from .steps import shifted, taken
+from .world import Hypothesis, Model, World
+
+IMPOSSIBLE = (InvalidInput, SimulationDiverged, UnstableStep)  # no world has such values, or none that is stable
+CLOCK, SHIFT, TURN, GRASP, RIM, TARE = 3e-3, 5e-4, 1e-3, 1.5e-3, 2e-3, 0.1  # standard deviations between episodes
+T = TypeVar("T")
+U = TypeVar("U")
+
+
+def piece_of(
+    model: Model,
+    setting: Setting,
+    k: int,
+    hypotheses: Sequence[Hypothesis],
+    known: Sequence[Tensor] | None,
+    shifts: Sequence[tuple[int, float]],
+) -> Piece:
+    """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
+    e, world = setting.episodes[k], model.world()
+    steps = [taken(model, coordinate, step) for coordinate, step in shifts]
+    beside = [shifted(model, coordinate, step).world() for coordinate, step in shifts]
+    runs = _runs(model, world, setting, k, hypotheses, beside, with_held=known is None)
+    able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
+    typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
+    base = world.seen(runs.plain, e)
+    moved = directions(base, [*runs.beside, *(t for t in runs.trials if t is not None)], [*steps, *typical])
+    if known is None:
+        other, std = nuisances(world, base, runs.held, e)
+        coarse = cells_of(base, joined(moved, other), e, setting.sheet, setting.rest)
+    else:
+        key, slopes, std = known
+        coarse = cells_of(base, moved, e, setting.sheet, setting.rest)
+        coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, aligned(coarse.key, key, slopes)], 1))
+    finer: Setting = setting.finer  # type: ignore[assignment]
+    kept, difference = _replaced(coarse, cells_of(runs.fine, None, finer.episodes[k], finer.sheet, finer.rest))
+    return Piece(kept, std, difference, able)
+
+
+def asked_piece(model: Model, setting: Setting, k: int, hypotheses: Sequence[Hypothesis]) -> Piece:
+    """Slopes of the k-th episode along hypotheses alone."""
+    e, world = setting.episodes[k], model.world()
+    runs = _runs(model, world, setting, k, hypotheses, (), with_held=False, finer=False)
+    base, moved = world.seen(runs.plain, e), [t for t in runs.trials if t is not None]
+    able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
+    typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
+    slopes = directions(base, moved, typical) if moved else None
+    none = torch.zeros(0, dtype=torch.float64)
+    return Piece(cells_of(base, slopes, e, setting.sheet, setting.rest), none, none, able)
+
+
+class _Runs(NamedTuple):
+    """All simulations of one episode."""
+
+    fine: Frames  # on the finer mesh; the plain ones where nobody asked
+    plain: Frames  # what happens, whoever looks on
+    beside: list[Frames]  # along the model's own coordinates
+    held: list[Frames]  # with the held places off
+    trials: list[Frames | None]  # with each hypothesis; None: cannot be simulated
+
+
+def _runs(
+    model: Model,
+    world: World,
+    setting: Setting,
+    k: int,
+    hypotheses: Sequence[Hypothesis],
+    near: Sequence[World],
+    with_held: bool,
+    finer: bool = True,
+) -> _Runs:
+    e, dt = setting.episodes[k], setting.dt
+    beside = [partial(w.frames, e, dt) for w in near]
+    modes = Held().modes(world.cloth, e) if with_held else ()
+    held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m, settles=True), dt) for m in modes]
+    changed = [_if_possible(partial(h.apply, world, h.typical)) for h in hypotheses]
+    moves = [c is not None and (c.cloth is not world.cloth or c.motions is not world.motions) for c in changed]
+    first = [partial(_finest, model, setting, k)] if finer else []  # it takes longest
+    jobs = [*first, partial(world.simulated, e, dt), *beside, *held]
+    tried = [
+        partial(_if_possible, partial(c.frames, e, dt)) for c, own in zip(changed, moves, strict=True) if c and own
+    ]
+    done: list[Any] = side_by_side(lambda job: job(), [*jobs, *tried])
+    plain, *sure = done[len(first) : len(jobs)]
+    fine = done[0] if finer else plain
+    rest = iter(done[len(jobs) :])
+    seen = lambda c: c and _if_possible(partial(c.seen, plain, e))  # noqa: E731
+    trials = [next(rest) if own else seen(c) for c, own in zip(changed, moves, strict=True)]
+    return _Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials)
+
+
+def _finest(model: Model, setting: Setting, k: int) -> Frames:
+    """The episode on the finer mesh."""
+    if setting.finer is None:
+        raise ValueError("a setting without a finer one")
+    return replace(model, base=setting.finer.base).world().frames(setting.finer.episodes[k], setting.finer.dt)
+
+
+def _if_possible(work: Callable[[], T]) -> T | None:
+    try:
+        return work()
+    except IMPOSSIBLE:
+        return None
+
+
+def side_by_side(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
+    """Results in order, on all cores: simulations are independent, and the engine leaves Python alone meanwhile."""
+    pool = ThreadPoolExecutor(os.cpu_count())
+    try:
+        return list(pool.map(work, items))
+    finally:
+        pool.shutdown(cancel_futures=True)  # when interrupted, what has begun ends and nothing else begins
+
+
+def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
+    """(cells that both have, with the slopes of the first and the values of the second; first minus second)."""
+    both = torch.isin(coarse.key, fine.key)
+    kept = Cells(*(column[both] for column in coarse))
+    order = torch.argsort(fine.key)
+    place = order[torch.searchsorted(fine.key[order], kept.key)]
+    return kept._replace(value=fine.value[place], spread=fine.spread[place]), kept.value - fine.value[place]
+
+
+def nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:
+    """Derivatives along what differs from episode to episode, and its standard deviations."""
+    moved, steps, stds = [], [], []
+    for kind, std in ((Clock(), [CLOCK]), (Camera(), [SHIFT] * 3 + [TURN] * 3), (Rim(), [RIM]), (Tare(), None)):
+        parts = len(kind.parts(world.cloth, e))
+        for k in range(parts):
+            own = TARE if std is None else std[k]
+            values = torch.zeros(parts, dtype=base.x.dtype)
+            values[k] = 0.5 * own
+            moved.append(kind.see(base, values, e))
+            steps.append(0.5 * own)
+            stds.append(own)
+    every = [GRASP] * len(held)
+    return directions(base, [*moved, *held], [*steps, *every]), torch.tensor([*stds, *every], dtype=torch.float64)
+
+
+def joined(a: Frames, b: Frames) -> Frames:
+    """Directions of both."""
+    wrench = {name: torch.cat([a.wrench[name], b.wrench[name]]) for name in a.wrench}
+    return Frames(torch.cat([a.x, b.x]), torch.cat([a.v, b.v]), wrench, torch.cat([a.edge, b.edge]))

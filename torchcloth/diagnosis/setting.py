@@ -1,0 +1,79 @@
+"""Episodes as tensors, and the surface that their points are compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ..identification.episodes import Episode, episode
+from ..identification.replicates import keys_of
+from ..identification.sheet import Sheet, sheet_for
+from ..recordings import Recording
+from .cells import Piece
+from .refined import refined
+from .world import Model, World
+
+Progress = Callable[[str], None]
+Kept = Callable[[Sequence[object], Tensor, Callable[[], Piece]], Piece]  # (question, point, work) -> answer
+
+
+def simply(question: Sequence[object], point: Tensor, work: Callable[[], Piece]) -> Piece:
+    """Keeps nothing."""
+    return work()
+
+
+def motions_of(recordings: Sequence[Recording]) -> list[str]:
+    """What each episode says its motion is, or that of the one it repeats; one that does not say is one of its own."""
+    originals = {r.split.get("replicate_of") for r in recordings} - {None}
+    out = []
+    for k, (r, key) in enumerate(zip(recordings, keys_of(recordings), strict=True)):
+        original = r.path is not None and r.path.name in originals
+        says = original or r.split.get("motion") or r.split.get("replicate_of")
+        out.append(str(key) if says else f"episode {k}")
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """Episodes as tensors, and the surface that their points are compared with."""
+
+    base: World
+    recordings: tuple[Recording, ...]
+    episodes: tuple[Episode, ...]
+    sheet: Sheet
+    rest: Tensor  # [V, 3] m, the pattern
+    dt: float | None = None
+    finer: Setting | None = None
+    unstable: tuple[Tensor, ...] = ()  # per episode, keys of cells that jump; empty: not looked for
+    kept: Kept = simply  # where finished episodes are kept
+
+    @property
+    def names(self) -> list[str]:
+        """Of the motions."""
+        return motions_of(self.recordings)
+
+
+def setting_of(model: Model, recordings: Sequence[Recording]) -> Setting:
+    """Checks the recordings against the model, and prepares the same on a mesh twice as fine."""
+    return replace(_setting(model, recordings), finer=_setting(*refined(model, recordings)))
+
+
+def _setting(model: Model, recordings: Sequence[Recording]) -> Setting:
+    cloth = model.base.cloth
+    episodes = tuple(episode(cloth, r) for r in recordings)
+    mesh = cloth.mesh
+    pattern = torch.as_tensor(mesh.vertices).double()
+    if mesh.uv is not None:
+        pattern = torch.nn.functional.pad(torch.as_tensor(mesh.uv).double(), (0, 1))
+    else:  # its first two axes pass for u and v, so the thinnest comes last
+        thin = int((pattern.amax(0) - pattern.amin(0)).argmin())
+        pattern = pattern[:, [*(k for k in range(3) if k != thin), thin]]
+    return Setting(model.base, tuple(recordings), episodes, sheet_for(cloth, episodes), pattern)
+
+
+def staged(progress: Progress, stage: str) -> Progress:
+    """The same, with what all lines are about in front."""
+    return lambda text: progress(f"{stage}: {text}")
