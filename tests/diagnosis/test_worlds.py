@@ -10,7 +10,7 @@ import torch
 from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import base_model, together
 from torchcloth.diagnosis.cells import _places
-from torchcloth.diagnosis.evidence import gather
+from torchcloth.diagnosis.evidence import asked_about, gather
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
@@ -147,6 +147,18 @@ def test_what_no_world_can_have_is_not_asked_about(made):
     found = gather(model, setting, [far, drag, unseen])
     assert [h.name for h in found.hypotheses] == ["air.drag_n"]
     assert torch.equal(found.cells[0].jacobian, gather(model, setting, [drag]).cells[0].jacobian)
+
+
+def test_who_asks_later_is_told_the_same(made):
+    model, setting = made
+    asked = [
+        h for h in catalogue(model, [RECORDING]) if h.name in ("bend.aniso", "air.drag_n", "obs.clock", "mass.hem")
+    ]
+    at_once, known = gather(model, setting, asked), gather(model, setting, asked[:1])
+    later = asked_about(known, model, setting, asked)
+    assert [h.name for h in later.hypotheses] == [h.name for h in at_once.hypotheses]
+    for a, b in zip(at_once.cells[0], later.cells[0], strict=True):
+        assert torch.equal(a, b)
 
 
 def test_steps_end_at_bounds_and_slopes_know_it(made):
