@@ -90,13 +90,15 @@ def screening(rows: Sequence[Row]) -> Any:
 
 
 def isolability(answer: Diagnosis) -> Any:
-    """Absolute correlation of efficient scores: dark pairs cannot be told apart by these motions."""
+    """Absolute correlation of efficient scores: dark pairs cannot be told apart by these motions. None of nothing."""
     from matplotlib.figure import Figure
 
     start = answer.found.start
     visible = {r.hypothesis.name for r in answer.found.screened if r.decision != "unresolvable"}
     visible |= {c["effect"] for c in answer.content["causes"]}
     index = [k for k, h in enumerate(start.evidence.hypotheses) if h.name in visible]
+    if not index:
+        return None
     names = [start.evidence.hypotheses[k].name for k in index]
     rho = correlations(start).abs().numpy()[np.ix_(index, index)]
     figure = Figure(figsize=(0.28 * len(index) + 2.6, 0.28 * len(index) + 2.0), layout="constrained")

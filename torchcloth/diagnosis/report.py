@@ -43,7 +43,7 @@ def _evidence(answer: Diagnosis) -> list[str]:
     after = predict(found.end, motions) if found.steps else None
     return [
         "<h2>Where and when</h2>",
-        _image(maps) if (maps := pictures.residual_maps(answer)) else "<p>Neither points nor markers were seen.</p>",
+        _image(pictures.residual_maps(answer), "Neither points nor markers were seen."),
         "<h2>Motions held out</h2>",
         _image(pictures.courses(answer, before, after)),
         "<h2>What the residuals of the base model ask for</h2>",
@@ -56,7 +56,7 @@ def _evidence(answer: Diagnosis) -> list[str]:
         *_missing(answer),
         *_learned(answer.content["residual"]),
         "<h2>What these motions can tell apart</h2>",
-        _image(pictures.isolability(answer)),
+        _image(pictures.isolability(answer), "Nothing that was asked about shows in them."),
         "<h2>Parameters of the model</h2>",
         _parameters(answer.content["parameters"]),
         "<h2>What the names mean</h2>",
@@ -64,7 +64,9 @@ def _evidence(answer: Diagnosis) -> list[str]:
     ]
 
 
-def _image(figure: Any) -> str:
+def _image(figure: Any, otherwise: str = "") -> str:
+    if figure is None:
+        return f"<p>{otherwise}</p>"
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return f'<img src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
