@@ -196,7 +196,8 @@ def _model(content: dict[str, Any]) -> SavedModel:
 
 def is_fitted(path: str | Path, recording: Recording) -> bool:
     """Whether the fit used this episode: then nothing about it is a prediction, nor new."""
-    return any(alike(kept, mark(recording)) for kept in read_saved(path).episodes)
+    own = mark(recording)
+    return any(alike(kept, own) for kept in read_saved(path).episodes)
 
 
 def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:

@@ -15,8 +15,11 @@ SAME = 1e-5  # m, between the mean points of one episode, kept and read again
 
 def mark(recording: Recording) -> dict[str, Any]:
     """Name, numbers of frames and points, and their mean [3] m; forces [3] N where nothing was seen."""
+    return _mark(recording, *_seen(recording))
+
+
+def _mark(recording: Recording, frames: int, every: np.ndarray) -> dict[str, Any]:
     name = recording.path.name if recording.path else "recording"
-    frames, every = _seen(recording)
     mean = every.mean(0) if len(every) else np.zeros(3)
     return {"name": name, "frames": frames, "points": max(len(every), 1), "mean": mean.tolist()}
 
@@ -35,7 +38,8 @@ def each_once(recordings: Sequence[Recording]) -> None:
     """
     known: list[tuple[dict[str, Any], np.ndarray]] = []
     for recording in recordings:
-        own, (_, every) = mark(recording), _seen(recording)
+        frames, every = _seen(recording)
+        own = _mark(recording, frames, every)
         # repetitions of one motion may have one mean, not the same noise
         if any(alike(other, own) and np.allclose(old, every, rtol=0, atol=SAME) for other, old in known):
             raise InvalidInput(
