@@ -31,7 +31,10 @@ WRONG = {
         "which cannot be written (File name too long); expected a fo",
     ),
     "fps of nothing": (["--out", "a.gif", "--fps", "0"], "--fps; got 0.0; expected a number > 0"),
-    "fps that no GIF has": (["--out", "a.gif", "--fps", "90"], "rate; got 90.0; expected up to 50"),
+    "fps that no GIF has, before a fit is simulated": (
+        ["--out", "a.gif", "--fps", "90", "--fit", "nowhere"],
+        "rate; got 90.0; expected up to 50",
+    ),
     "port and file": (["--out", "a.gif", "--port", "9000"], "--port; got 9000; expected 1 to 65535, without --out"),
     "impossible port": (["--port", "70000"], "--port; got 70000"),
     "no fit": (["--out", "a.gif", "--fit", "nowhere"], "fit; got no nowhere"),

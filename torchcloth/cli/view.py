@@ -62,6 +62,10 @@ def _checked(options: argparse.Namespace) -> tuple[int, int] | None:
         raise InvalidInput("--port", got=options.port, expected="1 to 65535, without --out")
     if options.fps is not None and not 0 < options.fps < float("inf"):
         raise InvalidInput("--fps", got=options.fps, expected="a number > 0")
+    if options.fps is not None and suffix == ".gif":
+        from ..viewing.pictures import check_rate
+
+        check_rate(options.fps)
     if options.size is None:
         return None
     found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", options.size)

@@ -14,7 +14,7 @@ from .film import Film
 from .geometry import Array
 from .stage import Stage
 
-RATE = 25.0  # 1/s; browsers slow a GIF of more than 50 down
+RATE, FASTEST = 25.0, 50.0  # 1/s; browsers slow a faster GIF down
 COLOURS = 96  # of a GIF
 GIF, MOMENT = (560, 420), (480, 420)  # pixels
 PANELS = 4  # moments on a PNG
@@ -47,8 +47,7 @@ def animate(
     """
     from PIL import Image
 
-    if not 0 < rate <= 50:
-        raise InvalidInput("rate", got=rate, expected="up to 50 frames a second, what a GIF can hold")
+    check_rate(rate)
     film = film.at_most(rate)
     stage = Stage(film, size or GIF, look)
     palette = _palette(stage)
@@ -64,6 +63,16 @@ def animate(
             part, format="GIF", save_all=True, append_images=images[1:], duration=steps, loop=0, optimize=True
         )
     return Path(path)
+
+
+def check_rate(rate: float) -> None:
+    """Refuse a rate that no GIF has.
+
+    Raises:
+        InvalidInput: it is not above 0 and at most 50 frames a second.
+    """
+    if not 0 < rate <= FASTEST:
+        raise InvalidInput("rate", got=rate, expected=f"up to {FASTEST:g} frames a second, what a GIF can hold")
 
 
 def picture(
