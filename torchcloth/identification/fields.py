@@ -21,11 +21,10 @@ from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter, to_value
 from ..recordings import Recording
-from ..recordings.extents import check_size
-from ..recordings.marks import each_once
 from .blocks import blocks_for
 from .descent import quasi_newton
 from .episodes import Episode, episode
+from .given import given
 from .journal import Journal
 from .misfit import figures
 from .objective import Objective
@@ -104,21 +103,16 @@ def fit_fields(
 
     Raises:
         InvalidInput: names that are no fields of the material, numbers out of range, or one episode twice.
-        RecordingError: a recording without motion, or with nothing seen or felt.
+        RecordingError: a recording without motion, with nothing seen or felt, or seen in another unit than metres.
     """
     began = time.perf_counter()
-    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    if not given:
-        raise InvalidInput("recordings", got="none", expected="at least one episode")
     if not (math.isfinite(contrast) and contrast > 0):
         raise InvalidInput("contrast", got=contrast, expected="a number > 0")
     if iterations < 1:
         raise InvalidInput("iterations", got=iterations, expected="at least 1")
-    each_once(given)
-    for recording in given:
-        check_size(recording)
+    every = given(recordings)
     own = {name: _field(cloth, name) for name in parameters}
-    objective = _Fields(cloth, own, [episode(cloth, r) for r in given], dt, blocks_for(use), contrast)
+    objective = _Fields(cloth, own, [episode(cloth, r) for r in every], dt, blocks_for(use), contrast)
     if journal is not None:
         objective.journal = Journal(journal, ["fields", *objective.identity()], resume)
     search = Search(objective, "converged", on_progress)

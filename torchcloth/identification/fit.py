@@ -16,13 +16,12 @@ from ..effects import AbstractEffect
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
-from ..recordings.extents import check_size
-from ..recordings.marks import each_once
 from . import gauss_newton
 from .blocks import blocks_for
 from .considered import covariance_of
 from .episodes import Episode, episode
 from .finer import LIMIT, OPEN, finer_cloth, mesh_step
+from .given import given
 from .identifiability import combinations, influences
 from .journal import Journal
 from .misfit import figures, forces_rms
@@ -116,10 +115,7 @@ def identify(
     _check(method, stop, iterations, starts)
     _check_priors(method, priors, nuisances)
     began = time.perf_counter()
-    episodes_in = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    if not episodes_in:
-        raise InvalidInput("recordings", got="none", expected="at least one episode")
-    each_once(episodes_in)
+    episodes_in = given(recordings)
     if refine and profile:
         raise InvalidInput("profile", got="refine as well", expected="one of them: a profile is that of the given mesh")
     if refine:
@@ -131,8 +127,6 @@ def identify(
         raise InvalidInput("parameters", got="none", expected="at least one name")
     _check_profile(profile, [u.name for u in unknowns])
     blocks = blocks_for(use)
-    for recording in episodes_in:
-        check_size(recording)
     episodes = [episode(cloth, r) for r in episodes_in]
     _check_seen(method, stop, episodes)
     own = chosen(nuisances, implied([block.name for block in blocks], episodes))
@@ -165,11 +159,11 @@ def _check_priors(method: str, priors: Mapping[str, Any] | None, nuisances: Mapp
 
     A search without them would go where they forbid, and report errors that have them in.
     """
-    for name, given in (("priors", priors), ("nuisances", nuisances)):
-        if method in CHAMFER and given:
+    for name, asked in (("priors", priors), ("nuisances", nuisances)):
+        if method in CHAMFER and asked:
             raise InvalidInput(
                 name,
-                got=f"{', '.join(given)} with method {method!r}",
+                got=f"{', '.join(asked)} with method {method!r}",
                 expected="none: it follows the Chamfer distance alone",
                 remedy='method "gauss-newton" or "lbfgs"',
             )

@@ -1,0 +1,26 @@
+"""What a fit is given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ..errors import InvalidInput
+from ..recordings import Recording
+from ..recordings.extents import check_size
+from ..recordings.marks import each_once
+
+
+def given(recordings: Recording | Sequence[Recording]) -> list[Recording]:
+    """The episodes of a fit.
+
+    Raises:
+        InvalidInput: none, or one twice.
+        RecordingError: one was seen in another unit than metres.
+    """
+    found = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    if not found:
+        raise InvalidInput("recordings", got="none", expected="at least one episode")
+    each_once(found)
+    for recording in found:
+        check_size(recording)
+    return found
