@@ -102,7 +102,8 @@ def undecided(names, said="causes"):
     rivals = [{"effect": names[1], "amplitude": amplitudes[names[1]]}]
     cause = {"effect": names[0], "amplitude": amplitudes[names[0]], "rivals": rivals}
     steps, content = ({"causes": [], "minor": []} | {said: [one]} for one in (step, cause))
-    return SimpleNamespace(**steps, screened=[], end=found), content, setting
+    alike = [(h, h.typical) for name in names for h in asked if h.name == name]
+    return SimpleNamespace(**steps, screened=[], end=found, alike=lambda _: alike), content, setting
 
 
 @pytest.mark.parametrize("said", ["causes", "minor"])

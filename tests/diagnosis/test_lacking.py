@@ -86,3 +86,6 @@ def test_what_is_explained_is_counted_beyond_what_a_right_model_leaves():
     better = [other[0]._replace(left=1e-3)]
     assert explained(rows(9e-3, False) + other, rows(5e-3) + better) == pytest.approx(1.0)  # of what both can judge
     assert explained(rows(9e-3) + other, rows(5e-3, False) + better) == pytest.approx(1.0)
+    calm = [Left("hang", "points", "m", 1e-3, 9e-3, 0.0, 50.0, 0.0, True)]
+    assert explained(rows(5e-3) + calm, rows(13**0.5 * 1e-3) + calm) == pytest.approx(0.5)  # calm makes up for nothing
+    assert explained(calm, calm + rows(5e-3)) == 0.0

@@ -1,30 +1,76 @@
-"""What is too small to matter has no name, but what it may stand for is said."""
+"""What is too small to matter has no name, but what it may stand for is said; nor has what may be too small."""
 
 from types import SimpleNamespace
 
 import linear_toys as toys
 import pytest
 
-from torchcloth.diagnosis.stepwise import MATTERS
+from torchcloth.diagnosis import stepwise
+from torchcloth.diagnosis.stepwise import Found
+from torchcloth.diagnosis.trials import Step, _rival
 from torchcloth.diagnosis.verdict import _minor, _verdict
+from torchcloth.diagnosis.world import MATTERS, Model
+
+SCALE, BIAS = ("obs.depth_scale", 0.015, -0.002), ("obs.depth_bias", 5e-3, -2.5e-3)
+HEM = ("mass.hem", 0.02, 0.39 * MATTERS * 0.02)
 
 
-def candidate(name, typical, amplitude):
-    return SimpleNamespace(hypothesis=toys.hypothesis(name, typical), amplitude=amplitude)
+def candidate(name, typical, amplitude, **options):
+    return SimpleNamespace(hypothesis=toys.hypothesis(name, typical, **options), amplitude=amplitude)
 
 
-def small(*rivals):
-    step = SimpleNamespace(best=candidate("obs.depth_scale", 0.015, -0.002), rivals=rivals)
-    return _minor(SimpleNamespace(amplitude=lambda _: -0.002), step)
+def ended(best, *rivals):
+    """A search with one cause and what predicts as well."""
+    best, *rivals = (candidate(*one) for one in (best, *rivals))
+    step = Step(best, None, [best, *rivals], rivals, [], None)  # type: ignore[arg-type]
+    model = Model(None, (), toys.torch.zeros(0), (best.hypothesis,), (best.amplitude,))  # type: ignore[arg-type]
+    return Found(None, SimpleNamespace(model=model), [step], [], None, 0.0, 0.0, None, None)  # type: ignore[arg-type]
 
 
-def test_rivals_that_would_matter_are_said_and_no_others():
-    found = small(candidate("obs.depth_bias", 5e-3, -2.5e-3), candidate("mass.hem", 0.02, 0.39 * MATTERS * 0.02))
-    assert found["effect"] == "obs.depth_scale"
-    assert [(r["effect"], r["amplitude"]) for r in found["rivals"]] == [("obs.depth_bias", -2.5e-3)]
+@pytest.mark.parametrize("order", [(SCALE, BIAS, HEM), (BIAS, SCALE, HEM)])
+def test_rivals_that_would_matter_are_said_and_no_others(order):
+    """Whichever of them happens to do a little more."""
+    found = ended(*order)
+    assert (found.causes, found.minor) == ([], found.steps)
+    told = _minor(found, found.steps[0])
+    assert told["effect"] == "obs.depth_scale"
+    assert [(r["effect"], r["amplitude"]) for r in told["rivals"]] == [("obs.depth_bias", -2.5e-3)]
+
+
+def test_what_matters_with_all_its_rivals_is_a_cause():
+    found = ended(BIAS, ("obs.extrinsic[x]", 4e-3, 2.5e-3))
+    assert (found.causes, found.minor) == (found.steps, [])
 
 
 @pytest.mark.parametrize("doubtful", [True, False])
 def test_what_may_matter_is_not_called_adequate(doubtful):
     told = _verdict(SimpleNamespace(screened=[]), [], lacking=False, stable=True, doubtful=doubtful)
     assert told == ("inconclusive" if doubtful else "adequate")
+
+
+def test_what_brings_another_along_is_no_rival_of_it_where_nothing_else_is_left():
+    drag, wind = candidate("air.drag_n", 1.2, 1.2), candidate("air.wind[y]", 0.3, 0.01, brings="air.drag_n")
+    assert not _rival(wind, None, drag)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("left", "over", "named"),
+    [(0.01, 0.0, "air.drag_n"), (0.01, 5.0, "air.wind[y]"), (0.3, 0.0, "air.wind[y]"), (0.01, -9.0, "air.drag_n")],
+)
+def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, left, over, named):
+    """Where hardly any wind is left, and the drag alone predicts about as well."""
+    drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, brings="air.drag_n")
+    camera = toys.hypothesis("obs.extrinsic[y]", 4e-3)
+    base = Model(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
+    current = SimpleNamespace(model=base.plus(wind.hypothesis, left), evidence=None)
+    step = Step(wind, None, [wind, drag], [drag], [], None)  # type: ignore[arg-type]
+    monkeypatch.setattr(stepwise, "without_cause", lambda found, name: found.model.without(name))
+    monkeypatch.setattr(stepwise, "fit", lambda model, *_, **__: SimpleNamespace(model=model))
+    monkeypatch.setattr(stepwise, "_predicts", lambda *_: over)
+    asked = (SimpleNamespace(names=[]), [camera, wind.hypothesis, drag.hypothesis], lambda _: None)
+    end, (then,) = stepwise._plainer(current, [step], *asked)  # type: ignore[arg-type]
+    assert then.best.hypothesis.name == named
+    assert [h.name for h in end.model.accepted] == ["obs.extrinsic[y]", named]
+    if named == "air.drag_n":
+        assert end.model.amplitudes == (4e-3, 1.2)  # what the wind brings
+        assert then.rivals == []

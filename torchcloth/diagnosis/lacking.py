@@ -64,14 +64,15 @@ def lack_of_fit(found: Fitted, names: Sequence[str]) -> list[Left]:
 def explained(before: Sequence[Left], after: Sequence[Left]) -> float:
     """Share of what a right model would not leave of points, edges and markers that is gone; 1 of nothing.
 
-    Where both meshes do not agree, before or after, nothing is counted on
-    either side: what vacuum folds away would come back as if a cause had brought it.
+    Motions in which less is left than that make up for none in which it is more. Where both meshes do not agree, before
+    or after, nothing is counted on either side: what vacuum folds away would come back as if a cause had brought it.
     """
     folded = {(row.motion, row.kind) for row in (*before, *after) if not row.stable}
     over = lambda rows: sum(  # noqa: E731
-        r.left**2 - r.expected**2 for r in rows if r.unit == "m" and (r.motion, r.kind) not in folded
+        max(0.0, r.left**2 - r.expected**2) for r in rows if r.unit == "m" and (r.motion, r.kind) not in folded
     )
-    return 1.0 - over(after) / over(before) if over(before) > 0 else 1.0
+    first, last = over(before), over(after)
+    return 1.0 - last / first if first > 0 else float(last == 0)
 
 
 def _episode(found: Fitted, k: int, name: str) -> list[Left]:

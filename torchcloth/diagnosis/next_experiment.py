@@ -97,12 +97,12 @@ def question_of(found: Found, content: Mapping[str, Any]) -> Question | None:
     said = [*content["causes"], *content["minor"]]
     for step, cause in zip([*found.causes, *found.minor], said, strict=True):
         known = {h.name for h in step.before.evidence.hypotheses}
-        amplitudes = {step.best.hypothesis.name: cause["amplitude"]}
-        amplitudes |= {r["effect"]: r["amplitude"] for r in cause["rivals"] if r["effect"] in known}
+        open_to = known & {cause["effect"], *(r["effect"] for r in cause["rivals"])}
+        amplitudes = {h.name: a for h, a in found.alike(step) if h.name in open_to}
         rows = {r.hypothesis.name: r.amplitude for r in step.screened}
         amplitudes |= {name: rows[name] for name in cause.get("class", ()) if name in rows and name not in amplitudes}
-        first, *others = amplitudes
-        if others and first in known:
+        first, *others = amplitudes or [""]
+        if others and first == step.best.hypothesis.name:
             return Question(step.before, amplitudes, tuple((first, other) for other in others))
     if found.causes:
         return None

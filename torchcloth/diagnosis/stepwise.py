@@ -15,12 +15,11 @@ from .noise import floor_of
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
 from .setting import Progress, Setting, staged
-from .trials import FURTHER, MOSTLY, TRIED, Step, begun_with, known, one_step, worthwhile
+from .trials import CLEAR, FURTHER, MOSTLY, TRIED, Step, begun_with, known, one_step, worthwhile
 from .world import Hypothesis, Model
 
 MOST = 4  # causes
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
-MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
 HALF = 0.5  # of what is wrong, that a further cause explains beside something else; of what is gained, a law more
 
 
@@ -43,12 +42,16 @@ class Found:
     @property
     def causes(self) -> list[Step]:
         """Those that are large enough to matter; the others stay in the model, so that nothing stands in for them."""
-        return [s for s in self.steps if matters(s.best.hypothesis, self.amplitude(s))]
+        return [s for s in self.steps if all(h.matters(a) for h, a in self.alike(s))]
 
     @property
     def minor(self) -> list[Step]:
-        """Those that stay in the model without a name."""
-        return [s for s in self.steps if not matters(s.best.hypothesis, self.amplitude(s))]
+        """Those that stay in the model without a name: they, or what predicts as well, are too small to matter."""
+        return [s for s in self.steps if s not in self.causes]
+
+    def alike(self, step: Step) -> list[tuple[Hypothesis, float]]:
+        """A step's cause in the end and its rivals, with amplitudes."""
+        return [(step.best.hypothesis, self.amplitude(step)), *((c.hypothesis, c.amplitude) for c in step.rivals)]
 
     def amplitude(self, step: Step) -> float:
         """Of a step's cause in the end."""
@@ -59,11 +62,6 @@ class Found:
         """Share of the cells that jump."""
         jumping = sum(map(len, self.setting.unstable or ()))
         return jumping / (jumping + len(self.end.white.value))
-
-
-def matters(hypothesis: Hypothesis, amplitude: float) -> bool:
-    """Large enough to be named."""
-    return abs(amplitude) > MATTERS * abs(hypothesis.smallest)
 
 
 def search(
@@ -156,6 +154,7 @@ def _chain(
             break
         steps, step = [*steps, step], None
     current, steps = _pruned(current, steps, setting, hypotheses, progress)
+    current, steps = _plainer(current, steps, setting, hypotheses, progress)
     if steps and current.ahead > FAR:
         left = current.model.others(hypotheses)
         here, now = current.evidence, staged(progress, "all")
@@ -198,6 +197,27 @@ def _pruned(
         steps = [s for s in steps if s is not step]
         left = less.model.others(hypotheses)
         current = fit(less.model, setting, left, 1, progress, before=current.evidence, here=less.evidence)
+    return current, steps
+
+
+def _plainer(
+    current: Fitted, steps: list[Step], setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
+) -> tuple[Fitted, list[Step]]:
+    """With what a cause brings along instead of it, where nothing of its own that matters is left.
+
+    Drag that comes with wind, where the wind stood for a camera that is off until that was found.
+    """
+    for k, step in enumerate(steps):
+        h = step.best.hypothesis
+        other = step.instead(h.brings)
+        if other is None or h.matters(current.model.amplitudes[current.model.place(h.name)]):
+            continue
+        brought = other.best.hypothesis
+        plain = without_cause(current, h.name).plus(brought, brought.typical)  # what is there when h has gone
+        left, now = plain.others(hypotheses), staged(progress, f"{h.brings} instead of {h.name}")
+        found = fit(plain, setting, left, FURTHER, now, before=current.evidence)
+        if _predicts(current, found, setting.names) < CLEAR:
+            current, steps = found, [*steps[:k], other, *steps[k + 1 :]]
     return current, steps
 
 

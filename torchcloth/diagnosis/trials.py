@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .comparison import Gain, Predicted, compare, predict, spread, telling
 from .evidence import Evidence
@@ -64,6 +64,14 @@ class Step:
     rivals: list[Candidate]
     screened: list[Row]
     before: Fitted  # the model without it, with slopes along everything that was asked about
+
+    def instead(self, name: str) -> Step | None:
+        """With another of the causes that were tried; None: it was not."""
+        best = next((c for c in self.tried if c.hypothesis.name == name), None)
+        if best is None:
+            return None
+        others = [c for c in self.rivals if c is not best and c.hypothesis.brings != name]
+        return replace(self, best=best, rivals=others)
 
 
 def _likely(screened: Sequence[Row]) -> list[Row]:
@@ -209,7 +217,8 @@ def _ranked(useful: Sequence[Candidate]) -> list[Candidate]:
 
 def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
     """Predicts about as well: the paired difference is not clear, or no more than what two engines may differ by."""
-    if c.hypothesis.effect == best.hypothesis.effect:
+    h = c.hypothesis
+    if h.effect == best.hypothesis.effect or (h.brings == best.hypothesis.name and not h.matters(c.amplitude)):
         return False
     over = compare(predicted, best.predicted, 0.0)
     hardly = over.density < HARDLY * best.gain.density and over.fallen < HARDLY * best.gain.fallen

@@ -17,10 +17,10 @@ from .gate import Fault
 from .lacking import lack_of_fit
 from .missing import MissingForce
 from .residual import Residual
-from .stepwise import Found, matters
-from .trials import NORMAL, Candidate, Step, between_motions
+from .stepwise import Found
+from .trials import NORMAL, Step, between_motions
 from .wording import sentences, warnings_of
-from .world import Model
+from .world import Hypothesis, Model
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 
@@ -132,13 +132,14 @@ def _verdict(found: Found, causes: Sequence[dict[str, Any]], lacking: bool, stab
 
 
 def _minor(found: Found, step: Step) -> dict[str, Any]:
-    """What is too small to matter, and those of its rivals that would matter."""
-    h, rivals = step.best.hypothesis, [_rival(c) for c in step.rivals if matters(c.hypothesis, c.amplitude)]
-    return {"effect": h.name, "amplitude": found.amplitude(step), "unit": h.unit, "rivals": rivals}
+    """What is too small to matter, and what cannot be told from it and would matter."""
+    alike = found.alike(step)
+    small = next(pair for pair in alike if not pair[0].matters(pair[1]))
+    return {**_told(*small), "rivals": [_told(h, a) for h, a in alike if h.matters(a)]}
 
 
-def _rival(c: Candidate) -> dict[str, Any]:
-    return {"effect": c.hypothesis.name, "amplitude": c.amplitude, "unit": c.hypothesis.unit}
+def _told(hypothesis: Hypothesis, amplitude: float) -> dict[str, Any]:
+    return {"effect": hypothesis.name, "amplitude": amplitude, "unit": hypothesis.unit}
 
 
 def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
@@ -154,7 +155,7 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
         "unit": h.unit,
         "ci95": [amplitude - NORMAL * std, amplitude + NORMAL * std],
         "class": sorted({h.name, *kin, *h.kin}),
-        "rivals": [_rival(c) for c in step.rivals],
+        "rivals": [_told(c.hypothesis, c.amplitude) for c in step.rivals],
         "gain_mm": 1e3 * (best.gain.before - best.gain.after),
         "placebo": {"log_density": step.placebo.gain, "chance": step.placebo.chance},
         "share_of_explainable": _share(found, best.gain),

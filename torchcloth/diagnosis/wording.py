@@ -54,7 +54,7 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
         if content[key]:
             out.append(f"{label}: {', '.join(content[key])}.")
     if content["minor"]:
-        out.append(f"In the model, but too small to matter: {', '.join(map(_size, content['minor']))}.")
+        out.append(f"There, but too small to matter: {', '.join(map(_size, content['minor']))}.")
     for m in content["minor"]:
         if m["rivals"]:
             out.append(f"  These data cannot tell it from {', '.join(map(_size, m['rivals']))}, which would matter.")

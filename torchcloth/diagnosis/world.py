@@ -18,6 +18,7 @@ from ..identification.replays import Frames, Replay, frames_of
 from ..materials import AbstractMaterial
 from ..recordings import Recording
 
+MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
 OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
 Motion = Callable[[Episode], Episode]  # what the robot really does, from what it says
 View = Callable[[Frames, Episode], Frames]  # what is seen, from what is there
@@ -113,6 +114,7 @@ class Hypothesis:
         twin: base parameter that is the same number, by which share it is off; where that is fitted, its prior alone
             tells of the hypothesis.
         low, high: amplitudes that a world can have.
+        brings: another hypothesis, which comes along at its typical amplitude where the world has none of it.
     """
 
     name: str
@@ -127,6 +129,7 @@ class Hypothesis:
     twin: str = ""
     low: float = -math.inf
     high: float = math.inf
+    brings: str = ""
 
     @property
     def effect(self) -> str:
@@ -137,6 +140,10 @@ class Hypothesis:
     def smallest(self) -> float:
         """Of interest."""
         return self.share * self.typical
+
+    def matters(self, amplitude: float) -> bool:
+        """Large enough to be named."""
+        return abs(amplitude) > MATTERS * abs(self.smallest)
 
 
 @dataclass(frozen=True)
