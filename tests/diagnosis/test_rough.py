@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchcloth.diagnosis import fitting, noise
-from torchcloth.diagnosis.evidence import Evidence, _central
+from torchcloth.diagnosis.evidence import Evidence, central
 from torchcloth.diagnosis.fitting import fit
 
 TRUTH, STEP = 0.3, 0.1
@@ -34,7 +34,7 @@ def rippling(monkeypatch):
             down, here, up = (seen(k, at + step) for step in (-STEP, 0.0, STEP))
             sides = torch.stack([(up - here) / STEP, (here - down) / STEP], 1)
             sided = c._replace(value=here, jacobian=torch.cat([sides, c.jacobian[:, 1:]], 1))
-            cells.append(_central(sided, [(0, STEP), (0, -STEP)], 1))
+            cells.append(central(sided, [(0, STEP), (0, -STEP)], 1))
         return replace(there.evidence, cells=cells)
 
     monkeypatch.setattr(fitting, "gather", gather)

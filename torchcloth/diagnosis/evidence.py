@@ -68,7 +68,7 @@ def gather(
         stable = ~torch.isin(piece.cells.key, setting.unstable[k]) if setting.unstable else slice(None)
         found = Cells(*(column[stable] for column in piece.cells))
         found = found._replace(jacobian=found.jacobian[:, use])
-        cells.append(found if raw else _central(found, shifts, len(model.parameters)))
+        cells.append(found if raw else central(found, shifts, len(model.parameters)))
         numerics.append(piece.numerics[stable])
         stds.append(piece.std)
     return Evidence(cells, own if raw else len(model.point), possible, stds, numerics)
@@ -147,7 +147,7 @@ def as_rough(evidence: Evidence, like: Evidence) -> Evidence:
     return replace(evidence, cells=cells)
 
 
-def _central(cells: Cells, shifts: Sequence[tuple[int, float]], parameters: int) -> Cells:
+def central(cells: Cells, shifts: Sequence[tuple[int, float]], parameters: int) -> Cells:
     """One column for each coordinate, from those for each shift; ``parameters`` come first and tell of roughness.
 
     Of ripples that are strangers at -h, 0 and h, a central slope has a third of the mean square of the difference of

@@ -2,11 +2,12 @@
 
 With V the information on causes that is left beside everything that is fitted anyway,
 
-    D_ij = a_i^2 V_ii (1 - rho_ij^2)
+    D_ij = a_i^2 V_ii (1 - rho_ij^2 - h)
 
-is the chi^2 by which cause i at amplitude a_i is told from j at its best amplitude. An experiment adds its own slopes,
-as the present model has them, to those of the data (T-optimal design, linearised: Chen and Asprey 2003); of all
-experiments the one is proposed whose smallest D over the pairs is largest.
+is the chi^2 by which cause i at amplitude a_i is told from j at its best amplitude, beyond the share h by which two
+engines may differ (``trials.HARDLY``). An experiment adds its own slopes, as the present model has them, to those of
+the data (T-optimal design, linearised: Chen and Asprey 2003), as noisy as a right model would be there: ripples tell
+little. Of all experiments the one is proposed whose smallest D over the pairs is largest.
 """
 
 from __future__ import annotations
@@ -24,13 +25,17 @@ from ..identification.episodes import Episode, episode
 from ..identification.nuisances import Held
 from ..identification.replays import Frames
 from ..recordings import Recording
-from .cells import Cells, cells_of, directions
+from .cells import cells_of, directions
+from .evidence import central
 from .experiments import Experiment, planned, possible
 from .fitting import Fitted, prior_precision
+from .lacking import reference
+from .noise import Noise
 from .pieces import GRASP, joined, nuisances, side_by_side
 from .setting import Progress, Setting
-from .steps import one_way, shifted
+from .steps import both_ways, shifted
 from .stepwise import Found
+from .trials import HARDLY
 
 NEEDED = (1.64 + 0.84) ** 2  # chi^2: told apart in 80 % of cases at 5 %
 MOST_REPEATS = 10
@@ -136,7 +141,7 @@ def distances(question: Question, left: Tensor) -> dict[tuple[str, ...], float]:
     for a, b in question.pairs:
         i, j = index[a], index[b]
         alike = float(left[i, j] ** 2 / (left[i, i] * left[j, j]).clamp(min=1e-30))
-        out[(a, b)] = min(alone[a], alone[b]) * max(1 - alike, 0.0)
+        out[(a, b)] = min(alone[a], alone[b]) * max(1 - alike - HARDLY, 0.0)
     return out
 
 
@@ -145,7 +150,7 @@ def whitened_slopes(question: Question, recording: Recording, setting: Setting) 
     found, model = question.fitted, question.fitted.model
     hypotheses = [found.evidence.hypotheses[k] for k in _columns(question)]
     world, blank = model.world(), episode(model.base.cloth, recording)
-    shifts = one_way(model)
+    shifts = both_ways(model)
     held = [replace(blank, initial=blank.initial + GRASP * m, settles=True) for m in Held().modes(world.cloth, blank)]
     worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]
     worlds += [h.apply(world, h.typical) for h in hypotheses]
@@ -156,7 +161,12 @@ def whitened_slopes(question: Question, recording: Recording, setting: Setting) 
     moved = directions(base, rest[:count], [*(s for _, s in shifts), *(h.typical for h in hypotheses)])
     other, std = nuisances(world, base, rest[count:], seen)
     cells = cells_of(base, joined(moved, other), seen, setting.sheet, setting.rest)
-    return _white(found, cells, count, std)
+    cells = central(cells, shifts, len(model.parameters))
+    count += len(model.point) - len(shifts)
+    level, _ = reference(cells, torch.zeros_like(cells.value))
+    noise = Noise(torch.maximum(level.level, found.noise.level))
+    root = torch.linalg.cholesky(noise.covariance(cells, cells.jacobian[:, count:], std))
+    return torch.linalg.solve_triangular(root, cells.jacobian[:, :count], upper=False)
 
 
 def as_seen(frames: Frames, blank: Episode, setting: Setting, seed: int = 0) -> Episode:
@@ -175,11 +185,6 @@ def as_seen(frames: Frames, blank: Episode, setting: Setting, seed: int = 0) -> 
         on = (weight[..., None] * x[face]).sum(1)
         clouds.append(on + noise * torch.randn(many, 3, generator=rng).to(x))
     return replace(blank, clouds=clouds, wrenches={name: frames.wrench[name] for name in blank.wrenches})
-
-
-def _white(found: Fitted, cells: Cells, count: int, std: Tensor) -> Tensor:
-    covariance = found.noise.covariance(cells, cells.jacobian[:, count:], std)
-    return torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), cells.jacobian[:, :count], upper=False)
 
 
 def _columns(question: Question) -> list[int]:
