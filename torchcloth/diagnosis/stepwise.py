@@ -153,8 +153,8 @@ def _chain(
             current = before
             break
         steps, step = [*steps, step], None
-    current, steps = _pruned(current, steps, setting, hypotheses, progress)
     current, steps = _plainer(current, steps, setting, hypotheses, progress)
+    current, steps = _pruned(current, steps, setting, hypotheses, progress)
     if steps and current.ahead > FAR:
         left = current.model.others(hypotheses)
         here, now = current.evidence, staged(progress, "all")
