@@ -77,6 +77,8 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
         return None
     told = [distances(question, information(question, [slopes])) for _, slopes in tried]
     best = max(range(len(tried)), key=lambda k: _worth(told[k], question))
+    if max(told[best].values()) <= 0:
+        return None
     middle = sorted(range(len(tried)), key=lambda k: _worth(told[k], question))[len(tried) // 2]
     experiment, slopes = tried[best]
     repeats = _repeats(question, slopes)
@@ -196,11 +198,10 @@ def _weakest(told: Mapping[tuple[str, ...], float]) -> float:
     return min(told.values())
 
 
-def _worth(told: Mapping[tuple[str, ...], float], question: Question) -> float:
-    """Of pairs the weakest; of single causes how many are seen, since one that never is must not decide."""
-    if question.pairs:
-        return _weakest(told)
-    return sum(min(d / NEEDED, 1.0) + 1e-3 * math.log1p(d) for d in told.values())
+def _worth(told: Mapping[tuple[str, ...], float], question: Question) -> tuple[float, float]:
+    """Of pairs the weakest, then all; of single causes how many are seen, since one that never is must not decide."""
+    every = sum(math.log1p(d) for d in told.values())
+    return (_weakest(told) if question.pairs else sum(min(d / NEEDED, 1.0) for d in told.values()), every)
 
 
 def _repeats(question: Question, slopes: Tensor) -> int | None:
