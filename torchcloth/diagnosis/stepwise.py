@@ -15,12 +15,12 @@ from .noise import floor_of
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
 from .setting import Progress, Setting, staged
-from .trials import CLEAR, FURTHER, MOSTLY, TRIED, Step, begun_with, known, one_step, worthwhile
+from .trials import CLEAR, FURTHER, TRIED, Step, begun_with, known, one_step, worthwhile
 from .world import Hypothesis, Model
 
 MOST = 4  # causes
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
-HALF = 0.5  # of what is wrong, that a further cause explains beside something else; of what is gained, a law more
+HALF = 0.5  # of what is wrong, that causes explain beside something else; of what is gained, a law more
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ def _chain(
         left = best.model.others(hypotheses)
         now = staged(progress, f"with {step.best.hypothesis.name}")
         current = fit(best.model, setting, left, FURTHER, now, before=start.evidence, here=best.evidence)
-        if steps and _beside_the_point(before, current, setting.names, HALF):
+        if steps and _beside_the_point(before, current, setting.names):
             current = before
             break
         steps, step = [*steps, step], None
@@ -159,7 +159,7 @@ def _chain(
         left = current.model.others(hypotheses)
         here, now = current.evidence, staged(progress, "all")
         current = fit(current.model, setting, left, progress=now, before=here, here=here)
-    return (start, []) if steps and _beside_the_point(start, current, setting.names, MOSTLY) else (current, steps)
+    return (start, []) if steps and _beside_the_point(start, current, setting.names) else (current, steps)
 
 
 def _predicts(one: Fitted, other: Fitted, names: Sequence[str]) -> float:
@@ -221,7 +221,7 @@ def _plainer(
     return current, steps
 
 
-def _beside_the_point(start: Fitted, end: Fitted, names: Sequence[str], share: float) -> bool:
+def _beside_the_point(start: Fitted, end: Fitted, names: Sequence[str]) -> bool:
     """More of what is wrong is still there: whatever makes it may well do what passed for the causes, too."""
     left = lack_of_fit(end, names)
-    return any(row.lacking for row in left) and explained(lack_of_fit(start, names), left) < share
+    return any(row.lacking for row in left) and explained(lack_of_fit(start, names), left) < HALF

@@ -22,7 +22,7 @@ HARDLY = 0.2  # of what the better of two models gains, in density and squares, 
 VERY_MUCH = 25.0  # log density; nulls' causes that ask for too little to show reach 16, and 27 once
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
-MOSTLY = 1 / 3  # of what is wrong: least that all causes explain beside something else
+MUCH_OF_ALL = 1 / 3  # that is wrong, of which predictions say that it is there
 # standard errors between motions, from which they agree that there is something: 97.5 % of Student's t by one less than
 # there are motions; of the best of TRIED causes, with a fourth of that chance
 SURE = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26)
@@ -179,7 +179,7 @@ def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bo
     """
     # Of what mends that much of all that is wrong in motions it was not fitted to, predictions have said that it is
     # there; real motions may then differ about its size. Two motions differ once, which tells nothing.
-    if first and len(set(names)) > 2 and gain.before**2 - gain.after**2 > MOSTLY * gain.before**2:
+    if first and len(set(names)) > 2 and gain.before**2 - gain.after**2 > MUCH_OF_ALL * gain.before**2:
         return NORMAL
     return between_motions(names, alone, SURE if first else SURE_OF_BEST)
 
