@@ -57,6 +57,7 @@ FAULTS = {
     "the stamps of points does not increase": lambda r: stamped(r, lambda t: np.where(np.arange(len(t)) == 9, t[8], t)),
     "the stamps of points jump by 0.4": lambda r: stamped(r, lambda t: t + 0.4 * (np.arange(len(t)) > 30)),
     "the stamps of points jump by 0.18": lambda r: stamped(r, lambda t: t + 0.15 * (np.arange(len(t)) > 30)),
+    "points come every": lambda r: stamped(r, lambda t: 1e3 * t),
     "camera and robot do not overlap": lambda r: stamped(r, lambda t: t + 100.0),
     "jump by 0.53": lambda r: thinned(r, 5),
     "the grippers are swapped": renamed,

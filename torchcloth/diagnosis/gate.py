@@ -22,6 +22,7 @@ from .gate_clouds import Seen, handed, places, units
 JUMP, LEAST_JUMP = 8.0, 0.2  # usual intervals and s: a longer one is no dropped frame any more
 TICKS, EVEN, BEAT = 8, 0.05, 0.15  # frames to either side that tick evenly; usual intervals, of a tick and of a jump
 DROPPED = 0.5  # share of the frames
+SLOWEST = 3.0  # s between frames: 240 Hz in milliseconds are 4
 COVERED = 0.5  # share of the frames that the motion must cover
 
 
@@ -153,6 +154,12 @@ def _stamps(recording: Recording) -> Iterator[tuple[str, str]]:
         if not len(between):
             continue
         usual = float(np.median(between))
+        if usual > SLOWEST:
+            yield (
+                f"{name} come every {usual:.3g} s: no cloth stays in a motion for so long",
+                "stamps are seconds: divide those in milliseconds by 1000 (docs/episode.md)",
+            )
+            continue
         jump = _set_clock(t, usual)
         worst = int(between.argmax()) if jump is None else jump
         if jump is not None or between[worst] > max(JUMP * usual, LEAST_JUMP):
