@@ -54,18 +54,29 @@ def test_what_brings_another_along_is_no_rival_of_it_where_nothing_else_is_left(
 
 
 @pytest.mark.parametrize(
-    ("left", "over", "named"),
-    [(0.01, 0.0, "air.drag_n"), (0.01, 5.0, "air.wind[y]"), (0.3, 0.0, "air.wind[y]"), (0.01, -9.0, "air.drag_n")],
+    ("left", "over", "passed", "named"),
+    [
+        (0.01, 0.0, True, "air.drag_n"),
+        (0.01, -9.0, True, "air.drag_n"),
+        (0.01, 5.0, True, "air.wind[y]"),
+        (0.3, 0.0, True, "air.wind[y]"),
+        (0.01, 0.0, False, "air.wind[y]"),
+    ],
 )
-def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, left, over, named):
-    """Where hardly any wind is left, and the drag alone predicts about as well."""
+def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, left, over, passed, named):
+    """Where hardly any wind is left, and the drag alone predicts about as well and better than its placebos."""
     drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, brings="air.drag_n")
+    drag.fitted, drag.alone = None, set()
     camera = toys.hypothesis("obs.extrinsic[y]", 4e-3)
     base = Model(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
     current = SimpleNamespace(model=base.plus(wind.hypothesis, left), evidence=None)
     step = Step(wind, None, [wind, drag], [drag], [], None)  # type: ignore[arg-type]
     monkeypatch.setattr(stepwise, "without_cause", lambda found, name: found.model.without(name))
-    monkeypatch.setattr(stepwise, "fit", lambda model, *_, **__: SimpleNamespace(model=model))
+    monkeypatch.setattr(
+        stepwise, "fit", lambda model, *_, **__: SimpleNamespace(model=model, noise=None, evidence=None)
+    )
+    monkeypatch.setattr(stepwise, "renoised", lambda found, *_: found)
+    monkeypatch.setattr(stepwise, "placebo", lambda *_: SimpleNamespace(passed=passed))
     monkeypatch.setattr(stepwise, "_predicts", lambda *_: over)
     asked = (SimpleNamespace(names=[]), [camera, wind.hypothesis, drag.hypothesis], lambda _: None)
     end, (then,) = stepwise._plainer(current, [step], *asked)  # type: ignore[arg-type]
@@ -74,3 +85,13 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
     if named == "air.drag_n":
         assert end.model.amplitudes == (4e-3, 1.2)  # what the wind brings
         assert then.rivals == []
+        assert then.placebo.passed
+
+
+def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
+    drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, brings="air.drag_n")
+    model = Model(None, (), toys.torch.zeros(0), (wind.hypothesis, drag.hypothesis), (0.01, 1.4))  # type: ignore[arg-type]
+    steps = [Step(c, None, [wind, drag], [], [], None) for c in (wind, drag)]  # type: ignore[arg-type]
+    monkeypatch.delattr(stepwise, "fit")
+    current = SimpleNamespace(model=model)
+    assert stepwise._plainer(current, steps, None, [], print) == (current, steps)  # type: ignore[arg-type]

@@ -81,7 +81,7 @@ def cells_of(frames: Frames, moved: Frames | None, episode: Episode, sheet: Shee
     parts = []
     for b, block in enumerate(BLOCKS):
         rows = block.rows(scene)
-        rows = None if rows is None else _told(block.name, rows)
+        rows = None if rows is None else _shown(block.name, rows)
         if rows is not None and len(rows.value):
             parts.append(_averaged(_grouped(block.name, rows, episode, sheet), b, episode, sheet, rest))
     return Cells(*(torch.cat(column) for column in zip(*parts, strict=True)))
@@ -97,7 +97,7 @@ def directions(base: Frames, shifted: Sequence[Frames], steps: Sequence[float]) 
     return Frames(slope(lambda f: f.x), slope(lambda f: f.v), wrench, slope(lambda f: f.edge))
 
 
-def _told(name: str, rows: Rows) -> Rows:
+def _shown(name: str, rows: Rows) -> Rows:
     """Without pieces of the rim that do not show: their zeros are no measurements."""
     if name != "edges":
         return rows

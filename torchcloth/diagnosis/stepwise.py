@@ -12,6 +12,7 @@ from .comparison import Gain, compare, predict
 from .fitting import Fitted, fit, renoised, without_cause
 from .lacking import explained, lack_of_fit
 from .noise import floor_of
+from .placebo import placebo
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
 from .setting import Progress, Setting, staged
@@ -208,16 +209,21 @@ def _plainer(
     Drag that comes with wind, where the wind stood for a camera that is off until that was found.
     """
     for k, step in enumerate(steps):
-        h = step.best.hypothesis
+        h, model = step.best.hypothesis, current.model
         other = step.instead(h.brings)
-        if other is None or h.matters(current.model.amplitudes[current.model.place(h.name)]):
+        if (
+            other is None
+            or h.matters(model.amplitudes[model.place(h.name)])
+            or h.brings in (o.name for o in model.accepted)
+        ):
             continue
-        brought = other.best.hypothesis
+        brought, alone = other.best.hypothesis, other.best.alone
         plain = without_cause(current, h.name).plus(brought, brought.typical)  # what is there when h has gone
         left, now = plain.others(hypotheses), staged(progress, f"{h.brings} instead of {h.name}")
         found = fit(plain, setting, left, FURTHER, now, before=current.evidence)
-        if _predicts(current, found, setting.names) < CLEAR:
-            current, steps = found, [*steps[:k], other, *steps[k + 1 :]]
+        chance = placebo(renoised(other.best.fitted, found.noise, found.evidence), setting.names, alone)
+        if chance.passed and _predicts(current, found, setting.names) < CLEAR:
+            current, steps = found, [*steps[:k], replace(other, placebo=chance), *steps[k + 1 :]]
     return current, steps
 
 
