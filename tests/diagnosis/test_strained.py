@@ -66,3 +66,21 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     ((current, begun),) = looked
     assert current is end is (anew if better else strained)
     assert [model for _, model in begun] == ([anew.model] if better else [strained.model, anew.model])
+
+
+@pytest.mark.parametrize("ahead", [0.0, stepwise.FAR + 1])
+def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
+    """A fit that still has far to go may take back what a cause was accepted for."""
+    far, near = replace(found(0.1), ahead=ahead), found(0.1)
+    row = SimpleNamespace(hypothesis=CAUSE)
+    first = Step(Candidate(row, far, None, None, set(), 0.0), None, [], [], [], far)  # type: ignore[arg-type]
+    doubted, fits = [], iter([far, near])
+    monkeypatch.setattr(stepwise, "fit", lambda *_, **__: next(fits))
+    monkeypatch.setattr(stepwise, "screen", lambda f: [])
+    monkeypatch.setattr(stepwise, "begun_with", lambda *_: [])
+    monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
+    monkeypatch.setattr(stepwise, "_pruned", lambda current, steps, *_: (doubted.append(current) or current, steps))
+    monkeypatch.setattr(stepwise, "_beside_the_point", lambda *_: False)
+    end, _ = stepwise._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    assert doubted == ([far, near] if ahead else [far])
+    assert end is doubted[-1]

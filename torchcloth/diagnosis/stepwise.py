@@ -160,6 +160,7 @@ def _chain(
         left = current.model.others(hypotheses)
         here, now = current.evidence, staged(progress, "all")
         current = fit(current.model, setting, left, progress=now, before=here, here=here)
+        current, steps = _pruned(current, steps, setting, hypotheses, progress)
     return (start, []) if steps and _beside_the_point(start, current, setting.names) else (current, steps)
 
 
