@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .cells import Cells, Piece, aligned, mean_over, stretches
-from .pieces import asked_piece, piece_of
+from .pieces import asked_piece, overlapping, piece_of
 from .setting import Progress, Setting
 from .steps import both_ways
 from .world import Hypothesis, Model
@@ -103,14 +104,17 @@ def _pieces(
     progress: Progress,
     ask: Callable[[int, list[Hypothesis]], Piece],
 ) -> tuple[list[tuple[Piece, list[Hypothesis]]], list[Hypothesis]]:
-    """([(answer of an episode, hypotheses that could be simulated there)], those that could in all)."""
-    possible, out, began = list(hypotheses), [], time.monotonic()
-    for k, e in enumerate(setting.episodes):
-        progress(f"{e.name}, {k + 1} of {len(setting.episodes)}{_left(began, k, len(setting.episodes))}")
-        piece = ask(k, possible)
-        possible = [h for h, able in zip(possible, piece.able.tolist(), strict=True) if able]
-        out.append((piece, possible))
-    return out, possible
+    """([(answer of an episode, hypotheses that could be simulated there)], those that could in all).
+
+    Episodes overlap: while cells of one are computed, others are simulated.
+    """
+    asked, out, began, count = list(hypotheses), [], time.monotonic(), len(setting.episodes)
+    with closing(overlapping(lambda k: ask(k, asked), range(count))) as pieces:
+        for k, e in enumerate(setting.episodes):
+            progress(f"{e.name}, {k + 1} of {count}{_left(began, k, count)}")
+            piece = next(pieces)
+            out.append((piece, [h for h, able in zip(asked, piece.able.tolist(), strict=True) if able]))
+    return out, [h for h in asked if all(h in able for _, able in out)]
 
 
 def _told(hypotheses: Sequence[Hypothesis]) -> list[tuple[str, float]]:

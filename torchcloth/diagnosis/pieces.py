@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -124,9 +124,15 @@ def _if_possible(work: Callable[[], T]) -> T | None:
 
 def side_by_side(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
     """Results in order, on all cores: simulations are independent, and the engine leaves Python alone meanwhile."""
-    pool = ThreadPoolExecutor(os.cpu_count())
+    return list(overlapping(work, items))
+
+
+def overlapping(work: Callable[[T], U], items: Sequence[T]) -> Generator[U, None, None]:
+    """The same, one after the other as they are asked for."""
+    # of torch's threads, a new thread has as many as there are cores
+    pool = ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(torch.get_num_threads(),))
     try:
-        return list(pool.map(work, items))
+        yield from pool.map(work, items)
     finally:
         pool.shutdown(cancel_futures=True)  # when interrupted, what has begun ends and nothing else begins
 

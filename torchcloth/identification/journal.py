@@ -80,7 +80,7 @@ class Journal:
 
     def _write(self, path: Path, answer: tuple) -> None:
         if not self.folder.exists():
-            self.folder.mkdir(parents=True)
+            self.folder.mkdir(parents=True, exist_ok=True)  # several answers may come at once
             (self.folder / "problem").write_text(self.key)
         with atomically(path) as part:
             torch.save(answer, part)
