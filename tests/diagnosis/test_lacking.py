@@ -1,12 +1,13 @@
 """Lack of fit on linear toys: what a right model leaves is called so, what it does not is not."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import linear_toys as toys
 import pytest
 import torch
 
-from torchcloth.diagnosis import lack_of_fit
+from torchcloth.diagnosis import doubts, lack_of_fit
 from torchcloth.diagnosis.lacking import RARE, SENSOR, Left, explained
 
 NAMES = ["a"]
@@ -89,3 +90,24 @@ def test_what_is_explained_is_counted_beyond_what_a_right_model_leaves():
     calm = [Left("hang", "points", "m", 1e-3, 9e-3, 0.0, 50.0, 0.0, True)]
     assert explained(rows(5e-3) + calm, rows(13**0.5 * 1e-3) + calm) == pytest.approx(0.5)  # calm makes up for nothing
     assert explained(calm, calm + rows(5e-3)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("lacking", "gains", "said"),
+    [(("a",), True, False), (("a",), False, True), (("a", "b"), False, False), ((), False, True)],
+)
+def test_motions_that_fit_are_asked_about_causes_where_others_do_not(monkeypatch, lacking, gains, said):
+    """Where none fits, none is asked; a motion that is out of order has no vote."""
+    asked = []
+    row = lambda motion: Left(motion, "points", "m", 1.0 + 9 * (motion in lacking), 1.0, 0.0, 50.0, 0.0, True)  # noqa: E731
+    end = SimpleNamespace(noise=None, evidence=None)
+    monkeypatch.setattr(doubts, "lack_of_fit", lambda _, names: [row(name) for name in names])
+    monkeypatch.setattr(doubts, "renoised", lambda found, *_: found)
+    monkeypatch.setattr(doubts, "predict", lambda found, names, alone: (found, sorted(alone)))
+    monkeypatch.setattr(doubts, "of_episodes", lambda p, which: asked.append((p[1], which)))
+    monkeypatch.setattr(doubts, "compare", lambda *_: None)
+    monkeypatch.setattr(doubts, "worthwhile", lambda _: gains)
+    steps = [SimpleNamespace(best=SimpleNamespace(alone={"c"}))]
+    assert doubts.unheard("start", end, steps, ["a", "b", "a"]) == said  # type: ignore[arg-type]
+    fit = [k for k, name in enumerate(["a", "b", "a"]) if name not in lacking]
+    assert asked == ([(["c"], fit)] * 2 if fit else [])

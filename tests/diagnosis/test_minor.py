@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import linear_toys as toys
 import pytest
 
-from torchcloth.diagnosis import stepwise
+from torchcloth.diagnosis import doubts
 from torchcloth.diagnosis.stepwise import Found
 from torchcloth.diagnosis.trials import Step, _rival
 from torchcloth.diagnosis.verdict import _minor, _verdict
@@ -71,15 +71,13 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
     base = Model(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
     current = SimpleNamespace(model=base.plus(wind.hypothesis, left), evidence=None)
     step = Step(wind, None, [wind, drag], [drag], [], None)  # type: ignore[arg-type]
-    monkeypatch.setattr(stepwise, "without_cause", lambda found, name: found.model.without(name))
-    monkeypatch.setattr(
-        stepwise, "fit", lambda model, *_, **__: SimpleNamespace(model=model, noise=None, evidence=None)
-    )
-    monkeypatch.setattr(stepwise, "renoised", lambda found, *_: found)
-    monkeypatch.setattr(stepwise, "placebo", lambda *_: SimpleNamespace(passed=passed))
-    monkeypatch.setattr(stepwise, "_predicts", lambda *_: over)
+    monkeypatch.setattr(doubts, "without_cause", lambda found, name: found.model.without(name))
+    monkeypatch.setattr(doubts, "fit", lambda model, *_, **__: SimpleNamespace(model=model, noise=None, evidence=None))
+    monkeypatch.setattr(doubts, "renoised", lambda found, *_: found)
+    monkeypatch.setattr(doubts, "placebo", lambda *_: SimpleNamespace(passed=passed))
+    monkeypatch.setattr(doubts, "predicts_better", lambda *_: over)
     asked = (SimpleNamespace(names=[]), [camera, wind.hypothesis, drag.hypothesis], lambda _: None)
-    end, (then,) = stepwise._plainer(current, [step], *asked)  # type: ignore[arg-type]
+    end, (then,) = doubts.plainer(current, [step], *asked)  # type: ignore[arg-type]
     assert then.best.hypothesis.name == named
     assert [h.name for h in end.model.accepted] == ["obs.extrinsic[y]", named]
     if named == "air.drag_n":
@@ -92,6 +90,6 @@ def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
     drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, brings="air.drag_n")
     model = Model(None, (), toys.torch.zeros(0), (wind.hypothesis, drag.hypothesis), (0.01, 1.4))  # type: ignore[arg-type]
     steps = [Step(c, None, [wind, drag], [], [], None) for c in (wind, drag)]  # type: ignore[arg-type]
-    monkeypatch.delattr(stepwise, "fit")
+    monkeypatch.delattr(doubts, "fit")
     current = SimpleNamespace(model=model)
-    assert stepwise._plainer(current, steps, None, [], print) == (current, steps)  # type: ignore[arg-type]
+    assert doubts.plainer(current, steps, None, [], print) == (current, steps)  # type: ignore[arg-type]

@@ -56,12 +56,13 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     first = Step(Candidate(row, strained, None, None, set(), 0.0), None, [], [], [], strained)  # type: ignore[arg-type]
     monkeypatch.setattr(stepwise, "resettled", lambda *_: anew)
     monkeypatch.setattr(stepwise, "fit", lambda *_, **__: strained)
-    monkeypatch.setattr(stepwise, "_predicts", lambda *_: 1.0 if better else -1.0)
+    monkeypatch.setattr(stepwise, "predicts_better", lambda *_: 1.0 if better else -1.0)
     monkeypatch.setattr(stepwise, "screen", lambda f: [f])
     monkeypatch.setattr(stepwise, "begun_with", lambda f, screened, tried: [(row, f.model)])
     monkeypatch.setattr(stepwise, "one_step", lambda current, setting, begun, *_: looked.append((current, begun)))
-    monkeypatch.setattr(stepwise, "_pruned", lambda current, steps, *_: (current, steps))
-    monkeypatch.setattr(stepwise, "_beside_the_point", lambda *_: False)
+    monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
+    monkeypatch.setattr(stepwise, "beside_the_point", lambda *_: False)
+    monkeypatch.setattr(stepwise, "unheard", lambda *_: False)
     end, _ = stepwise._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     ((current, begun),) = looked
     assert current is end is (anew if better else strained)
@@ -79,8 +80,9 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     monkeypatch.setattr(stepwise, "screen", lambda f: [])
     monkeypatch.setattr(stepwise, "begun_with", lambda *_: [])
     monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
-    monkeypatch.setattr(stepwise, "_pruned", lambda current, steps, *_: (doubted.append(current) or current, steps))
-    monkeypatch.setattr(stepwise, "_beside_the_point", lambda *_: False)
+    monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (doubted.append(current) or current, steps))
+    monkeypatch.setattr(stepwise, "beside_the_point", lambda *_: False)
+    monkeypatch.setattr(stepwise, "unheard", lambda *_: False)
     end, _ = stepwise._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert doubted == ([far, near] if ahead else [far])
     assert end is doubted[-1]

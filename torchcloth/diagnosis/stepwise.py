@@ -9,19 +9,20 @@ from .afresh import afresh, resettled
 from .approach import approach
 from .branches import unstable, without
 from .comparison import Gain, compare, predict
-from .fitting import Fitted, fit, renoised, without_cause
-from .lacking import explained, lack_of_fit
+from .doubts import beside_the_point, plainer, predicts_better, pruned, unheard
+from .fitting import Fitted, fit, renoised
+from .lacking import lack_of_fit
 from .noise import floor_of
-from .placebo import placebo
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
 from .setting import Progress, Setting, staged
-from .trials import CLEAR, FURTHER, TRIED, Step, begun_with, known, one_step, worthwhile
+from .trials import FURTHER, TRIED, Step, begun_with, one_step
 from .world import Hypothesis, Model
 
 MOST = 4  # causes
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
-HALF = 0.5  # of what is wrong, that causes explain beside something else; of what is gained, a law more
+LEAST = 1 / 3  # of what is wrong, that all causes explain beside something else
+HALF = 0.5  # the same of a further cause, and of what only motions tell that do not fit; of what is gained, a law more
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +139,7 @@ def _chain(
     while len(steps) < MOST:
         if step is None:
             other = resettled(current, setting, hypotheses, progress) if steps and current.model.strained else None
-            if other is not None and _predicts(other, current, setting.names) > 0:
+            if other is not None and predicts_better(other, current, setting.names) > 0:
                 current, other = other, None
             screened = screen(current)
             begun = begun_with(current, screened, tried)
@@ -150,24 +151,19 @@ def _chain(
         left = best.model.others(hypotheses)
         now = staged(progress, f"with {step.best.hypothesis.name}")
         current = fit(best.model, setting, left, FURTHER, now, before=start.evidence, here=best.evidence)
-        if steps and _beside_the_point(before, current, setting.names):
+        if steps and beside_the_point(before, current, setting.names, HALF):
             current = before
             break
         steps, step = [*steps, step], None
-    current, steps = _plainer(current, steps, setting, hypotheses, progress)
-    current, steps = _pruned(current, steps, setting, hypotheses, progress)
+    current, steps = plainer(current, steps, setting, hypotheses, progress)
+    current, steps = pruned(current, steps, setting, hypotheses, progress)
     if steps and current.ahead > FAR:
         left = current.model.others(hypotheses)
         here, now = current.evidence, staged(progress, "all")
         current = fit(current.model, setting, left, progress=now, before=here, here=here)
-        current, steps = _pruned(current, steps, setting, hypotheses, progress)
-    return (start, []) if steps and _beside_the_point(start, current, setting.names) else (current, steps)
-
-
-def _predicts(one: Fitted, other: Fitted, names: Sequence[str]) -> float:
-    """Log density by which one fit of a model predicts motions held out better than another."""
-    first, second = (predict(renoised(f, other.noise, other.evidence), names) for f in (other, one))
-    return compare(first, second, 0.0).density
+        current, steps = pruned(current, steps, setting, hypotheses, progress)
+    needed = HALF if steps and unheard(start, current, steps, setting.names) else LEAST
+    return (start, []) if steps and beside_the_point(start, current, setting.names, needed) else (current, steps)
 
 
 def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> Found:
@@ -179,56 +175,3 @@ def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) 
     first = predict(renoised(start, current.noise, current.evidence), setting.names, alone)
     whole = compare(first, last, floor) if steps else None
     return Found(start, current, steps, screened, whole, floor, sensor, repeated, setting)
-
-
-def _pruned(
-    current: Fitted, steps: list[Step], setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
-) -> tuple[Fitted, list[Step]]:
-    """Less the causes that the others have made needless."""
-    for step in steps:
-        name, last = step.best.hypothesis.name, step is steps[-1]
-        sure = known(current, name, setting.names, step.best)
-        if sure and last:  # it has just been tried
-            continue
-        less = without_cause(current, name)
-        less = fit(less, setting, (), 0, staged(progress, f"without {name}"), current.noise, current.evidence)
-        plain, alone = renoised(less, current.noise, current.evidence), step.best.alone
-        gain = compare(predict(plain, setting.names, alone), predict(current, setting.names, alone), 0.0)
-        if sure and worthwhile(gain):
-            continue
-        steps = [s for s in steps if s is not step]
-        left = less.model.others(hypotheses)
-        current = fit(less.model, setting, left, 1, progress, before=current.evidence, here=less.evidence)
-    return current, steps
-
-
-def _plainer(
-    current: Fitted, steps: list[Step], setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
-) -> tuple[Fitted, list[Step]]:
-    """With what a cause brings along instead of it, where nothing of its own that matters is left.
-
-    Drag that comes with wind, where the wind stood for a camera that is off until that was found.
-    """
-    for k, step in enumerate(steps):
-        h, model = step.best.hypothesis, current.model
-        other = step.instead(h.brings)
-        if (
-            other is None
-            or h.matters(model.amplitudes[model.place(h.name)])
-            or h.brings in (o.name for o in model.accepted)
-        ):
-            continue
-        brought, alone = other.best.hypothesis, other.best.alone
-        plain = without_cause(current, h.name).plus(brought, brought.typical)  # what is there when h has gone
-        left, now = plain.others(hypotheses), staged(progress, f"{h.brings} instead of {h.name}")
-        found = fit(plain, setting, left, FURTHER, now, before=current.evidence)
-        chance = placebo(renoised(other.best.fitted, found.noise, found.evidence), setting.names, alone)
-        if chance.passed and _predicts(current, found, setting.names) < CLEAR:
-            current, steps = found, [*steps[:k], replace(other, placebo=chance), *steps[k + 1 :]]
-    return current, steps
-
-
-def _beside_the_point(start: Fitted, end: Fitted, names: Sequence[str]) -> bool:
-    """More of what is wrong is still there: whatever makes it may well do what passed for the causes, too."""
-    left = lack_of_fit(end, names)
-    return any(row.lacking for row in left) and explained(lack_of_fit(start, names), left) < HALF

@@ -1,0 +1,84 @@
+"""What a search has accepted is doubted: causes that others make needless, or that stand for something unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from .comparison import compare, of_episodes, predict
+from .fitting import Fitted, fit, renoised, without_cause
+from .lacking import explained, lack_of_fit
+from .placebo import placebo
+from .setting import Progress, Setting, staged
+from .trials import CLEAR, FURTHER, Step, known, worthwhile
+from .world import Hypothesis
+
+
+def pruned(
+    current: Fitted, steps: list[Step], setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
+) -> tuple[Fitted, list[Step]]:
+    """Less the causes that the others have made needless."""
+    for step in steps:
+        name, last = step.best.hypothesis.name, step is steps[-1]
+        sure = known(current, name, setting.names, step.best)
+        if sure and last:  # it has just been tried
+            continue
+        less = without_cause(current, name)
+        less = fit(less, setting, (), 0, staged(progress, f"without {name}"), current.noise, current.evidence)
+        plain, alone = renoised(less, current.noise, current.evidence), step.best.alone
+        gain = compare(predict(plain, setting.names, alone), predict(current, setting.names, alone), 0.0)
+        if sure and worthwhile(gain):
+            continue
+        steps = [s for s in steps if s is not step]
+        left = less.model.others(hypotheses)
+        current = fit(less.model, setting, left, 1, progress, before=current.evidence, here=less.evidence)
+    return current, steps
+
+
+def plainer(
+    current: Fitted, steps: list[Step], setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
+) -> tuple[Fitted, list[Step]]:
+    """With what a cause brings along instead of it, where nothing of its own that matters is left.
+
+    Drag that comes with wind, where the wind stood for a camera that is off until that was found.
+    """
+    for k, step in enumerate(steps):
+        h, model = step.best.hypothesis, current.model
+        other = step.instead(h.brings)
+        if (
+            other is None
+            or h.matters(model.amplitudes[model.place(h.name)])
+            or h.brings in (o.name for o in model.accepted)
+        ):
+            continue
+        brought, alone = other.best.hypothesis, other.best.alone
+        plain = without_cause(current, h.name).plus(brought, brought.typical)  # what is there when h has gone
+        left, now = plain.others(hypotheses), staged(progress, f"{h.brings} instead of {h.name}")
+        found = fit(plain, setting, left, FURTHER, now, before=current.evidence)
+        chance = placebo(renoised(other.best.fitted, found.noise, found.evidence), setting.names, alone)
+        if chance.passed and predicts_better(current, found, setting.names) < CLEAR:
+            current, steps = found, [*steps[:k], replace(other, placebo=chance), *steps[k + 1 :]]
+    return current, steps
+
+
+def beside_the_point(start: Fitted, end: Fitted, names: Sequence[str], share: float) -> bool:
+    """More of what is wrong is still there: whatever makes it may well do what passed for the causes, too."""
+    left = lack_of_fit(end, names)
+    return any(row.lacking for row in left) and explained(lack_of_fit(start, names), left) < share
+
+
+def unheard(start: Fitted, end: Fitted, steps: Sequence[Step], names: Sequence[str]) -> bool:
+    """Of the causes, motions that fit in the end say nothing, where some do."""
+    lacking = {row.motion for row in lack_of_fit(end, names) if row.lacking}
+    sound = [k for k, name in enumerate(names) if name not in lacking]
+    alone = {name for step in steps for name in step.best.alone}
+    if not sound:
+        return False
+    first, last = (predict(f, names, alone) for f in (renoised(start, end.noise, end.evidence), end))
+    return not worthwhile(compare(of_episodes(first, sound), of_episodes(last, sound), 0.0))
+
+
+def predicts_better(one: Fitted, other: Fitted, names: Sequence[str]) -> float:
+    """Log density by which one fit of a model predicts motions held out better than another."""
+    first, second = (predict(renoised(f, other.noise, other.evidence), names) for f in (other, one))
+    return compare(first, second, 0.0).density
