@@ -61,8 +61,7 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     monkeypatch.setattr(stepwise, "begun_with", lambda f, screened, tried: [(row, f.model)])
     monkeypatch.setattr(stepwise, "one_step", lambda current, setting, begun, *_: looked.append((current, begun)))
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
-    monkeypatch.setattr(stepwise, "beside_the_point", lambda *_: False)
-    monkeypatch.setattr(stepwise, "unheard", lambda *_: False)
+    monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
     end, _ = stepwise._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     ((current, begun),) = looked
     assert current is end is (anew if better else strained)
@@ -81,8 +80,7 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     monkeypatch.setattr(stepwise, "begun_with", lambda *_: [])
     monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (doubted.append(current) or current, steps))
-    monkeypatch.setattr(stepwise, "beside_the_point", lambda *_: False)
-    monkeypatch.setattr(stepwise, "unheard", lambda *_: False)
+    monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
     end, _ = stepwise._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert doubted == ([far, near] if ahead else [far])
     assert end is doubted[-1]

@@ -10,7 +10,7 @@ from .fitting import Fitted, fit, renoised, without_cause
 from .lacking import explained, lack_of_fit
 from .placebo import placebo
 from .setting import Progress, Setting, staged
-from .trials import CLEAR, FURTHER, Step, known, worthwhile
+from .trials import CLEAR, FURTHER, Step, alone_in, known, worthwhile
 from .world import Hypothesis
 
 
@@ -61,17 +61,20 @@ def plainer(
     return current, steps
 
 
-def beside_the_point(start: Fitted, end: Fitted, names: Sequence[str], share: float) -> bool:
-    """More of what is wrong is still there: whatever makes it may well do what passed for the causes, too."""
+def mended(start: Fitted, end: Fitted, names: Sequence[str]) -> float:
+    """Share of what is wrong that is gone; 1 where nothing is lacking any more.
+
+    Of less than half, more is still there: whatever makes it may well do what passed for the causes, too.
+    """
     left = lack_of_fit(end, names)
-    return any(row.lacking for row in left) and explained(lack_of_fit(start, names), left) < share
+    return explained(lack_of_fit(start, names), left) if any(row.lacking for row in left) else 1.0
 
 
 def unheard(start: Fitted, end: Fitted, steps: Sequence[Step], names: Sequence[str]) -> bool:
     """Of the causes, motions that fit in the end say nothing, where some do."""
     lacking = {row.motion for row in lack_of_fit(end, names) if row.lacking}
     sound = [k for k, name in enumerate(names) if name not in lacking]
-    alone = {name for step in steps for name in step.best.alone}
+    alone = alone_in(steps)
     if not sound:
         return False
     first, last = (predict(f, names, alone) for f in (renoised(start, end.noise, end.evidence), end))

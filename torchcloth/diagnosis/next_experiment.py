@@ -108,9 +108,10 @@ def question_of(found: Found, content: Mapping[str, Any]) -> Question | None:
         amplitudes = {h.name: a for h, a in found.alike(step) if h.name in open_to}
         rows = {r.hypothesis.name: r.amplitude for r in step.screened}
         amplitudes |= {name: rows[name] for name in cause.get("class", ()) if name in rows and name not in amplitudes}
-        first, *others = amplitudes or [""]
-        if others and first == step.best.hypothesis.name:
-            return Question(step.before, amplitudes, tuple((first, other) for other in others))
+        best = step.best.hypothesis.name
+        pairs = tuple((best, other) for other in amplitudes if other != best)
+        if best in amplitudes and pairs:
+            return Question(step.before, amplitudes, pairs)
     if found.causes:
         return None
     known = {h.name for h in found.end.evidence.hypotheses}
@@ -159,12 +160,12 @@ def whitened_slopes(question: Question, recording: Recording, setting: Setting) 
     jobs = [(w, blank) for w in worlds] + [(world, off) for off in held]
     base, *rest = side_by_side(lambda job: job[0].frames(job[1], setting.dt), jobs)
     seen = as_seen(base, blank, setting)
-    count = len(shifts) + len(hypotheses)
-    moved = directions(base, rest[:count], [*(s for _, s in shifts), *(h.typical for h in hypotheses)])
-    other, std = nuisances(world, base, rest[count:], seen)
+    beside = len(shifts) + len(hypotheses)
+    moved = directions(base, rest[:beside], [*(s for _, s in shifts), *(h.typical for h in hypotheses)])
+    other, std = nuisances(world, base, rest[beside:], seen)
     cells = cells_of(base, joined(moved, other), seen, setting.sheet, setting.rest)
     cells = central(cells, shifts, len(model.parameters))
-    count += len(model.point) - len(shifts)
+    count = len(model.point) + len(hypotheses)
     level, _ = reference(cells, torch.zeros_like(cells.value))
     noise = Noise(torch.maximum(level.level, found.noise.level))
     root = torch.linalg.cholesky(noise.covariance(cells, cells.jacobian[:, count:], std))

@@ -9,14 +9,14 @@ from .afresh import afresh, resettled
 from .approach import approach
 from .branches import unstable, without
 from .comparison import Gain, compare, predict
-from .doubts import beside_the_point, plainer, predicts_better, pruned, unheard
+from .doubts import mended, plainer, predicts_better, pruned, unheard
 from .fitting import Fitted, fit, renoised
 from .lacking import lack_of_fit
 from .noise import floor_of
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
 from .setting import Progress, Setting, staged
-from .trials import FURTHER, TRIED, Step, begun_with, one_step
+from .trials import FURTHER, TRIED, Step, alone_in, begun_with, one_step
 from .world import Hypothesis, Model
 
 MOST = 4  # causes
@@ -116,7 +116,7 @@ def instead(found: Found, laws: Fitted, tried: int, progress: Progress = lambda 
     step = one_step(laws, found.setting, begun_with(laws, promising, tried), screened, progress)
     if step is None:
         return found
-    alone = {name for s in found.steps for name in s.best.alone}
+    alone = alone_in(found.steps)
     law = renoised(step.best.fitted, found.end.noise, found.end.evidence)
     over = compare(predict(found.end, names, alone), predict(law, names, alone), 0.0)
     if over.ci95[0] < 0 or over.density < HALF * gained:
@@ -151,7 +151,7 @@ def _chain(
         left = best.model.others(hypotheses)
         now = staged(progress, f"with {step.best.hypothesis.name}")
         current = fit(best.model, setting, left, FURTHER, now, before=start.evidence, here=best.evidence)
-        if steps and beside_the_point(before, current, setting.names, HALF):
+        if steps and mended(before, current, setting.names) < HALF:
             current = before
             break
         steps, step = [*steps, step], None
@@ -162,13 +162,15 @@ def _chain(
         here, now = current.evidence, staged(progress, "all")
         current = fit(current.model, setting, left, progress=now, before=here, here=here)
         current, steps = pruned(current, steps, setting, hypotheses, progress)
-    needed = HALF if steps and unheard(start, current, steps, setting.names) else LEAST
-    return (start, []) if steps and beside_the_point(start, current, setting.names, needed) else (current, steps)
+    share = mended(start, current, setting.names) if steps else 1.0
+    if share < LEAST or (share < HALF and unheard(start, current, steps, setting.names)):
+        return start, []
+    return current, steps
 
 
 def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> Found:
     screened = screen(current)
-    alone = {name for step in steps for name in step.best.alone}
+    alone = alone_in(steps)
     last, sensor = predict(current, setting.names, alone), floor_of(current.evidence, current.noise)
     repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
     floor = sensor if repeated is None else repeated.rms

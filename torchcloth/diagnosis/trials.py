@@ -74,6 +74,11 @@ class Step:
         return replace(self, best=best, rivals=others)
 
 
+def alone_in(steps: Sequence[Step]) -> set[str]:
+    """Motions that alone tell of one of the causes."""
+    return {name for step in steps for name in step.best.alone}
+
+
 def _likely(screened: Sequence[Row]) -> list[Row]:
     """What is present by slopes, or asks for so much that it would show and would matter or gain much.
 

@@ -150,12 +150,10 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in beaten]
     kin = [r.hypothesis.name for r in alike(step.before, best.row, others)]
     return {
-        "effect": h.name,
-        "amplitude": amplitude,
-        "unit": h.unit,
+        **_told(h, amplitude),
         "ci95": [amplitude - NORMAL * std, amplitude + NORMAL * std],
         "class": sorted({h.name, *kin, *h.kin}),
-        "rivals": [_told(c.hypothesis, c.amplitude) for c in step.rivals],
+        "rivals": [_told(rival, a) for rival, a in found.alike(step)[1:]],
         "gain_mm": 1e3 * (best.gain.before - best.gain.after),
         "placebo": {"log_density": step.placebo.gain, "chance": step.placebo.chance},
         "share_of_explainable": _share(found, best.gain),
