@@ -4,11 +4,26 @@ import pytest
 import torch
 
 import torchcloth as tc
+from torchcloth.engine.building import Unbuilt
+from torchcloth.engine.library import library
 from torchcloth.losses import chamfer_to_surface, chamfer_to_vertices, closest, residuals
+from torchcloth.losses import nearest as search
 from torchcloth.testing import check_gradients
 
 MESH = tc.meshes.rectangle(0.3, 0.2, resolution=(5, 4))
 FACES = torch.as_tensor(MESH.faces)
+
+
+@pytest.fixture(params=["compiled", "torch"], autouse=True)
+def searched_by(request, monkeypatch):
+    """Both searches answer alike."""
+    if request.param == "torch":
+        monkeypatch.setattr(search, "at_hand", lambda: None)
+        return
+    try:
+        library()
+    except Unbuilt as miss:
+        pytest.skip(str(miss))
 
 
 @pytest.fixture
@@ -65,6 +80,23 @@ def test_weights_are_barycentric_and_chunks_change_nothing(vertices, points):
     for chunk in (1, 1000):
         again = closest(points, vertices, FACES, chunk=chunk)
         assert all(torch.equal(a, b) for a, b in zip(again, hits, strict=True))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_both_searches_find_the_same_places(vertices, points, dtype):
+    """Of two triangles that share the place, rounding decides."""
+    points, corners = points.to(dtype), vertices.to(dtype)[FACES]
+    found = search.nearest(points, corners, 10**6), search._closest(points, corners)
+    one, other = ((weights[..., None] * corners[face]).sum(1) for face, weights in found)
+    torch.testing.assert_close(one, other, rtol=0, atol=20 * torch.finfo(dtype).eps)
+    assert float((found[0][0] == found[1][0]).double().mean()) > 0.9
+
+
+def test_no_place_is_near_to_what_is_not_finite(vertices, points):
+    for where in (points, vertices):
+        where[0] = torch.nan
+        with pytest.raises(IndexError):
+            closest(points, vertices, FACES)
 
 
 def test_residuals_of_a_flat_sheet():

@@ -30,3 +30,24 @@ def test_threads_do_not_disturb_each_other():
         together = list(pool.map(lambda case: fallen(*case), cases))
     for case, found in zip(cases, together, strict=True):
         assert torch.equal(found, fallen(*case)), case
+
+
+def folded(stiffness: float) -> list[torch.Tensor]:
+    """Values and gradients of cloth in contact with itself; one program for all stiffnesses."""
+    material = tc.materials.AEP(stiffness, 0.3)
+    effects = {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(1.0)}
+    layer = tc.Cloth(tc.meshes.rectangle(0.2, 0.2, resolution=(9, 9)), material, 0.2, effects, engine="fused")
+    start = layer.rest_state()
+    crumpled = start.x + 0.02 * torch.sin(40 * start.x[..., [1, 2, 0]])
+    out = layer(layer.state(crumpled), {}, [0.0, 0.01, 0.02])
+    out.x[-1].square().sum().backward()
+    return [out.x.detach(), layer.material.youngs_modulus.raw.grad]
+
+
+def test_one_program_serves_many_at_once():
+    cases = [1e4 * (1 + k % 3) for k in range(12)]
+    with ThreadPoolExecutor(6, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        together = list(pool.map(folded, cases))
+    alone = {stiffness: folded(stiffness) for stiffness in set(cases)}
+    for stiffness, found in zip(cases, together, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(found, alone[stiffness], strict=True)), stiffness

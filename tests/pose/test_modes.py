@@ -14,7 +14,8 @@ def test_a_rectangle_has_cosines():
     mesh = tc.meshes.rectangle(0.6, 0.4, resolution=(31, 21))
     modes = modes_of(mesh, 4)
     exact = [0.0, math.pi / 0.6, math.pi / 0.4, math.hypot(math.pi / 0.6, math.pi / 0.4)]
-    torch.testing.assert_close(modes.wave, torch.tensor(exact), rtol=0.005, atol=1e-6)
+    # squares are exact to rounding of the largest, some 1e4 / m^2: the root of a zero is not
+    torch.testing.assert_close(modes.wave, torch.tensor(exact), rtol=0.005, atol=1e-5)
     shape = torch.cos(math.pi * torch.as_tensor(mesh.uv)[:, 0] / 0.6)
     assert abs(float(torch.corrcoef(torch.stack([modes.fields[1], shape]))[0, 1])) > 0.999
 

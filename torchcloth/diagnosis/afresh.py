@@ -13,6 +13,7 @@ from dataclasses import replace
 import torch
 
 from .approach import approach
+from .evidence import asked_about
 from .fitting import Fitted, fit, leap_with, with_cause
 from .noise import unfitted, whitened
 from .pieces import IMPOSSIBLE
@@ -26,11 +27,10 @@ def afresh(
     """The ``tried`` causes that promise most, each with the model to which one joint step from the data sheet leads."""
     sheet = start.model.at(torch.zeros_like(start.model.point))
     away = [replace(h, typical=-h.typical) for h in hypotheses if h.signed]
-    ways = [
-        fit(sheet, setting, asked, 0, staged(progress, f"from the data sheet, {way}"), before=start.evidence)
-        for way, asked in (("causes", hypotheses), ("causes the other way", away))
-        if asked
-    ]
+    about = staged(progress, "from the data sheet, causes")
+    there = fit(sheet, setting, hypotheses, 0, about, before=start.evidence)
+    back = asked_about(there.evidence, sheet, setting, away, staged(progress, "from the data sheet, the other way"))
+    ways = [there, replace(there, evidence=back)]
     promised = sorted((pair for found in ways for pair in _promises(found)), key=lambda pair: -pair[0])
     likely: dict[str, Fitted] = {}
     for _, name, found in promised:

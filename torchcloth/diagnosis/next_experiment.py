@@ -65,14 +65,16 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
         return None
     names = list(question.amplitudes)
     now = distances(question, information(question, []))
-    tried: list[tuple[Experiment, Tensor]] = []
-    for experiment, template in possible(setting.recordings):
+
+    def ask(choice: tuple[Experiment, Recording]) -> tuple[Experiment, Tensor] | None:
+        experiment, template = choice
         progress(str(experiment))
         try:
-            slopes = whitened_slopes(question, planned(experiment, template), setting)
+            return experiment, whitened_slopes(question, planned(experiment, template), setting)
         except (TorchclothError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
-            continue  # it cannot be simulated, so it says nothing
-        tried.append((experiment, slopes))
+            return None  # it cannot be simulated, so it says nothing
+
+    tried = [answer for answer in side_by_side(ask, possible(setting.recordings)) if answer is not None]
     if not tried:
         return None
     told = [distances(question, information(question, [slopes])) for _, slopes in tried]

@@ -60,6 +60,14 @@ def library() -> ctypes.CDLL:
     return found
 
 
+def at_hand() -> ctypes.CDLL | None:
+    """The same where it was built before; builds nothing."""
+    if not _found.cache_info().currsize and not _built():
+        return None
+    found = _found()
+    return None if isinstance(found, Unbuilt) else found
+
+
 @cache
 def kernels() -> dict[str, tuple[int, int, int]]:
     """By name: (number, inputs, outputs)."""
@@ -72,13 +80,24 @@ def kernels() -> dict[str, tuple[int, int, int]]:
 
 def status() -> str:
     """Whether it is built, or can be, in a line; builds nothing."""
-    for folder in (PACKAGED / building.file_name(), building.cached()):
-        if folder is not None and folder.exists():
-            return f"built: {folder}"
+    if (file := _there()) is not None:
+        return f"built: {file}"
     try:
         return f"will be built at first use, with {building.version(building.compiler())}"
     except Unbuilt as miss:
         return f"not available, the torch reference serves: {miss}; {miss.remedy}"
+
+
+def _there() -> Path | None:
+    """The file, if it was built."""
+    packaged = PACKAGED / building.file_name()
+    return packaged if packaged.exists() else building.cached()
+
+
+@cache
+def _built() -> bool:
+    """When a process first asks."""
+    return _there() is not None
 
 
 @cache
@@ -124,6 +143,7 @@ def _declare(lib: ctypes.CDLL, letter: str) -> None:
         "size": (ctypes.c_int64, [pointer, number]),
         "records": (ctypes.c_int64, [pointer, ctypes.c_int64, ctypes.c_int64]),
         "run": (number, [pointer, ctypes.POINTER(Call), number]),
+        "nearest": (None, [pointer, ctypes.c_int64, pointer, ctypes.c_int64, pointer, pointer]),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(lib, f"tc_{name}_{letter}")

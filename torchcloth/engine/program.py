@@ -44,7 +44,6 @@ class Program:
         self._stages: list[Loop | Stencil | Sieve | Layers | PerMass] = []
         self._lists = 0
         self._written: list[tuple[str, tuple]] = []
-        self._running = Lock()
 
     def __del__(self) -> None:
         if self._handle is not None:
@@ -193,10 +192,8 @@ class Program:
         return self._call("records", substeps, every)
 
     def run(self, call, mode: int) -> None:
-        """0: values, 1: adjoint, 2: tangents. One call at a time: the engine's work space belongs to the program."""
-        with self._running:
-            code = self._call("run", ctypes.byref(call), mode)
-        _check(code)
+        """0: values, 1: adjoint, 2: tangents."""
+        _check(self._call("run", ctypes.byref(call), mode))
 
     def _api(self, name: str) -> Callable[..., int]:
         """Stands for a function of the library: what it is called with (numbers and arrays) is written down."""

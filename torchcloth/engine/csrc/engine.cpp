@@ -5,6 +5,7 @@
 #include "kernels/kernels.h"
 #include "derivatives.h"
 #include "loop.h"
+#include "nearest.h"
 #include "per_mass.h"
 #include "run.h"
 #include "sieve.h"
@@ -163,6 +164,10 @@ struct Engine {
             tc::Run<R> run(static_cast<Engine<R>*>(e)->program, *call);                                                \
             mode == 0 ? run.forward() : mode == 1 ? run.reverse() : run.tangent();                                     \
         });                                                                                                            \
+    }                                                                                                                  \
+    TC_API void tc_nearest_##s(const R* points, int64_t many, const R* corners, int64_t count, int64_t* face,          \
+                               R* weights) {                                                                           \
+        tc::nearest(points, many, corners, count, face, weights);                                                      \
     }
 
 TC_BOTH(float, f)
