@@ -14,17 +14,22 @@ import torch
 
 from .approach import approach
 from .evidence import asked_about
-from .fitting import Fitted, fit, leap_with, with_cause
+from .fitting import Fitted, fit, leap, leap_with, with_cause
 from .noise import unfitted, whitened
 from .pieces import IMPOSSIBLE
 from .setting import Progress, Setting, staged
 from .world import Hypothesis, Model
 
+WORTH_TRYING = 0.5  # of what the best promises
+
 
 def afresh(
     start: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], tried: int, progress: Progress = lambda _: None
 ) -> list[tuple[Hypothesis, Model]]:
-    """The ``tried`` causes that promise most, each with the model to which one joint step from the data sheet leads."""
+    """The ``tried`` causes that promise most, each with the model to which one joint step from the data sheet leads.
+
+    Without those that promise little beside the best.
+    """
     sheet = start.model.at(torch.zeros_like(start.model.point))
     away = [replace(h, typical=-h.typical) for h in hypotheses if h.signed]
     about = staged(progress, "from the data sheet, causes")
@@ -33,8 +38,9 @@ def afresh(
     ways = [there, replace(there, evidence=back)]
     promised = sorted((pair for found in ways for pair in _promises(found)), key=lambda pair: -pair[0])
     likely: dict[str, Fitted] = {}
-    for _, name, found in promised:
-        likely.setdefault(name, found)
+    for gained, name, found in promised:
+        if gained > WORTH_TRYING * promised[0][0]:
+            likely.setdefault(name, found)
     named = {h.name: h for h in hypotheses}
     return [(named[name], with_cause(found, named[name])) for name, found in list(likely.items())[:tried]]
 
@@ -58,10 +64,11 @@ def resettled(
 
 
 def _promises(found: Fitted) -> list[tuple[float, str, Fitted]]:
-    """(log density that one leap with a cause should gain, its name, the fit), where the leap goes its way."""
+    """(log density that a cause adds to what one leap should gain, its name, the fit), where the leap goes its way."""
     white, out = whitened(found.evidence, unfitted()), []
+    _, without = leap(white, found.model)
     for j, h in enumerate(found.evidence.hypotheses):
         step, gained = leap_with(white, found.model.plus(h), found.evidence.own + j)
         if float(step[-1]) * h.typical > 0:
-            out.append((gained, h.name, found))
+            out.append((gained - without, h.name, found))
     return out

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -22,7 +21,6 @@ from ..pose.objective import windows_of
 from .cells import aligned, cells_of
 from .fitting import Fitted, prior_precision
 from .lacking import reference
-from .pieces import side_by_side
 from .pushes import Pushes, pushed
 from .setting import Progress, Setting
 
@@ -119,7 +117,7 @@ def missing_force(
     """
     world = found.model.world()
     fields = modes_of(world.cloth.mesh, modes).fields
-    parts = side_by_side(partial(_asked, found, setting, fields, window, progress), range(len(setting.episodes)))
+    parts = [_asked(found, setting, k, fields, window, progress) for k in range(len(setting.episodes))]
     gain, answer = _likeliest(parts, found, 3 * modes)
     area = torch.as_tensor(world.cloth.mesh.vertex_area).to(fields)
     density = world.cloth.model().mass.to(fields)[:, 0] / area  # kg/m^2 where it pushes
@@ -141,7 +139,7 @@ class _Asked(NamedTuple):
     x: Tensor  # [W, V, 3]
 
 
-def _asked(found: Fitted, setting: Setting, fields: Tensor, window: float, progress: Progress, k: int) -> _Asked:
+def _asked(found: Fitted, setting: Setting, k: int, fields: Tensor, window: float, progress: Progress) -> _Asked:
     e = setting.episodes[k]
     progress(f"{e.name}: missing force")
     windows = windows_of(e.times, window)

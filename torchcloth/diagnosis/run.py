@@ -85,9 +85,10 @@ def diagnose(
     setting = setting_of(model, recordings)
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
-    with _one_thread_each():
+    many = torch.get_num_threads()
+    with _threads(1):  # simulations run side by side: threads for the small arrays of each would wait for each other
         found = doubted(search(model, setting, asked, progress), staged(progress, "laws without a cause"))
-        answer = _judged(found, progress)
+        answer = _judged(found, many, progress)
         following = None
         if answer.verdict in OPEN:
             following = propose(found, answer.content, setting, staged(progress, "next experiment"))
@@ -96,21 +97,24 @@ def diagnose(
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Simulations run side by side: threads of torch's for the small arrays of each would only wait for each other."""
+def _threads(count: int) -> Iterator[None]:
+    """So many of torch's."""
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     try:
         yield
     finally:
         torch.set_num_threads(before)
 
 
-def _judged(found: Found, progress: Progress) -> Diagnosis:
+def _judged(found: Found, threads: int, progress: Progress) -> Diagnosis:
     """With what can be said of what no known cause explains."""
     left = lack_of_fit(found.end, found.setting.names)
     lacking, stable = any(row.lacking for row in left), all(row.stable for row in left)
-    missing = missing_force(found.end, found.setting, progress=progress) if lacking else None
+    missing = None
+    if lacking:
+        with _threads(threads):  # an episode at a time, whose directions the threads share
+            missing = missing_force(found.end, found.setting, progress=progress)
     # laws tell of more than what is left: they know what it would look like
     learned = lacking or (stable and not found.causes)
     residual = learn_residual(found.end, found.setting, progress) if learned else None

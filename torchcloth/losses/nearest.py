@@ -8,7 +8,6 @@ from torch import Tensor
 from .._math import cross
 from ..engine.library import at_hand
 
-
 LETTERS = {torch.float32: "f", torch.float64: "d"}
 
 
