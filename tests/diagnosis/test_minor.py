@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import linear_toys as toys
 import pytest
 
-from torchcloth.diagnosis import doubts
+from torchcloth.diagnosis import doubts, trials
 from torchcloth.diagnosis.stepwise import Found
-from torchcloth.diagnosis.trials import Step, _rival
+from torchcloth.diagnosis.trials import Step, _open, _rival
 from torchcloth.diagnosis.verdict import _minor, _verdict
 from torchcloth.diagnosis.world import MATTERS, Model
 
@@ -51,6 +51,26 @@ def test_what_may_matter_is_not_called_adequate(doubtful):
 def test_what_brings_another_along_is_no_rival_of_it_where_nothing_else_is_left():
     drag, wind = candidate("air.drag_n", 1.2, 1.2), candidate("air.wind[y]", 0.3, 0.01, brings="air.drag_n")
     assert not _rival(wind, None, drag)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "amplitude", "over", "ci95", "open_"),
+    [
+        ("air.drag_n", 1.4, -80.0, (-120.0, -40.0), True),
+        ("air.drag_n", 1.4, -80.0, (-170.0, 10.0), False),  # not surely
+        ("air.drag_n", 1.4, -3.0, (-3.5, -2.5), False),  # hardly
+        ("air.drag_n", 6.1, -80.0, (-120.0, -40.0), False),  # of no size that makes sense
+        ("air.linear[x]", 1.4, -80.0, (-120.0, -40.0), False),  # the same along another axis
+        ("air.wind[y]", 0.01, -80.0, (-120.0, -40.0), False),  # it stands for what it brought along
+    ],
+)
+def test_what_predicts_better_and_motions_disagree_about_is_a_rival(monkeypatch, name, amplitude, over, ci95, open_):
+    brings = "air.drag_n" if name == "air.wind[y]" else ""
+    better, best = candidate(name, 1.2, amplitude, brings=brings), candidate("air.linear", 2.0, 1.7)
+    better.gain = best.predicted = None
+    monkeypatch.setattr(trials, "worthwhile", lambda _: True)
+    monkeypatch.setattr(trials, "compare", lambda *_: SimpleNamespace(density=over, ci95=ci95))
+    assert _open(better, None, best) == open_  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

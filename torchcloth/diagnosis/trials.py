@@ -129,6 +129,7 @@ def one_step(
     noise = fit_noise(likeliest)
     tried = _compared(current, [(c.row, c.fitted) for c in likely], setting.names, noise, likeliest)
     useful = _ranked([c for c in tried if _useful(c, setting.names)])
+    others = [c for c in tried if c not in useful]
     beside = lambda c: placebo(renoised(c.fitted, noise, likeliest), setting.names, c.alone)  # noqa: E731
     chance = None
     while useful and not (chance := beside(useful[0])).passed:
@@ -138,6 +139,7 @@ def one_step(
     best = useful[0]
     alike = lambda c: predict(renoised(c.fitted, noise, likeliest), setting.names, best.alone)  # noqa: E731
     rivals = {c.hypothesis.name: c for c in reversed(useful) if c is not best and _rival(c, alike(c), best)}
+    rivals |= {c.hypothesis.name: c for c in others if _open(c, alike(c), best)}
     return Step(best, chance, tried, [*reversed(rivals.values())], screened, current)
 
 
@@ -192,6 +194,20 @@ def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bo
 def between_motions(names: Sequence[str], alone: Collection[str] = (), table: Sequence[float] = SURE) -> float:
     """Standard errors by which a mean over so few motions may be off; one that is ``alone`` counts as two."""
     return table[min(len(set(names)) + len(alone) - 2, len(table) - 1)]
+
+
+def _open(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
+    """Predicts clearly better, though motions do not agree how large it is: the best of the others is not the cause."""
+    h = c.hypothesis
+    stands_in = bool(h.brings) and not h.matters(c.amplitude)
+    if h.effect == best.hypothesis.effect or stands_in or not (worthwhile(c.gain) and _plausible(c)):
+        return False
+    over = compare(predicted, best.predicted, 0.0)
+    return over.density < -CLEAR and over.ci95[1] < 0
+
+
+def _plausible(c: Candidate) -> bool:
+    return abs(c.amplitude) < PLAUSIBLE * abs(c.hypothesis.typical)
 
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:
