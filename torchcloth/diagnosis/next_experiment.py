@@ -20,9 +20,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import TorchclothError
+from ..errors import InvalidInput, TorchclothError
 from ..identification.episodes import Episode, episode
-from ..identification.nuisances import Held
 from ..identification.replays import Frames
 from ..recordings import Recording
 from .cells import cells_of, directions
@@ -31,7 +30,7 @@ from .experiments import Experiment, planned, possible
 from .fitting import Fitted, prior_precision
 from .lacking import reference
 from .noise import Noise
-from .pieces import GRASP, joined, nuisances, side_by_side
+from .pieces import joined, nuisances, runs, side_by_side
 from .setting import Progress, Setting
 from .steps import both_ways, shifted
 from .stepwise import Found
@@ -156,15 +155,15 @@ def whitened_slopes(question: Question, recording: Recording, setting: Setting) 
     hypotheses = [found.evidence.hypotheses[k] for k in _columns(question)]
     world, blank = model.world(), episode(model.base.cloth, recording)
     shifts = both_ways(model)
-    held = [replace(blank, initial=blank.initial + GRASP * m, settles=True) for m in Held().modes(world.cloth, blank)]
-    worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]
-    worlds += [h.apply(world, h.typical) for h in hypotheses]
-    jobs = [(w, blank) for w in worlds] + [(world, off) for off in held]
-    base, *rest = side_by_side(lambda job: job[0].frames(job[1], setting.dt), jobs)
+    near = [shifted(model, k, step).world() for k, step in shifts]
+    done = runs(world, blank, setting.dt, hypotheses, near, with_held=True)
+    trials = [t for t in done.trials if t is not None]
+    if len(trials) < len(hypotheses):
+        raise InvalidInput("experiment", got="a cause that it cannot be simulated with", expected="another experiment")
+    base = world.seen(done.plain, blank)
     seen = as_seen(base, blank, setting)
-    beside = len(shifts) + len(hypotheses)
-    moved = directions(base, rest[:beside], [*(s for _, s in shifts), *(h.typical for h in hypotheses)])
-    other, std = nuisances(world, base, rest[beside:], seen)
+    moved = directions(base, [*done.beside, *trials], [*(s for _, s in shifts), *(h.typical for h in hypotheses)])
+    other, std = nuisances(world, base, done.held, seen)
     cells = cells_of(base, joined(moved, other), seen, setting.sheet, setting.rest)
     cells = central(cells, shifts, len(model.parameters))
     count = len(model.point) + len(hypotheses)

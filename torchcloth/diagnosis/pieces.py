@@ -39,36 +39,37 @@ def piece_of(
     e, world = setting.episodes[k], model.world()
     steps = [taken(model, coordinate, step) for coordinate, step in shifts]
     beside = [shifted(model, coordinate, step).world() for coordinate, step in shifts]
-    runs = _runs(model, world, setting, k, hypotheses, beside, with_held=known is None)
-    able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
-    typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
-    base = world.seen(runs.plain, e)
-    moved = directions(base, [*runs.beside, *(t for t in runs.trials if t is not None)], [*steps, *typical])
+    fine = partial(_finest, model, setting, k)
+    found = runs(world, e, setting.dt, hypotheses, beside, with_held=known is None, finer=fine)
+    able = torch.tensor([t is not None for t in found.trials], dtype=torch.bool)
+    typical = [h.typical for h, t in zip(hypotheses, found.trials, strict=True) if t is not None]
+    base = world.seen(found.plain, e)
+    moved = directions(base, [*found.beside, *(t for t in found.trials if t is not None)], [*steps, *typical])
     if known is None:
-        other, std = nuisances(world, base, runs.held, e)
+        other, std = nuisances(world, base, found.held, e)
         coarse = cells_of(base, joined(moved, other), e, setting.sheet, setting.rest)
     else:
         key, slopes, std = known
         coarse = cells_of(base, moved, e, setting.sheet, setting.rest)
         coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, aligned(coarse.key, key, slopes)], 1))
     finer: Setting = setting.finer  # type: ignore[assignment]
-    kept, difference = _replaced(coarse, cells_of(runs.fine, None, finer.episodes[k], finer.sheet, finer.rest))
+    kept, difference = _replaced(coarse, cells_of(found.fine, None, finer.episodes[k], finer.sheet, finer.rest))
     return Piece(kept, std, difference, able)
 
 
 def asked_piece(model: Model, setting: Setting, k: int, hypotheses: Sequence[Hypothesis]) -> Piece:
     """Slopes of the k-th episode along hypotheses alone."""
     e, world = setting.episodes[k], model.world()
-    runs = _runs(model, world, setting, k, hypotheses, (), with_held=False, finer=False)
-    base, moved = world.seen(runs.plain, e), [t for t in runs.trials if t is not None]
-    able = torch.tensor([t is not None for t in runs.trials], dtype=torch.bool)
-    typical = [h.typical for h, t in zip(hypotheses, runs.trials, strict=True) if t is not None]
+    found = runs(world, e, setting.dt, hypotheses, (), with_held=False)
+    base, moved = world.seen(found.plain, e), [t for t in found.trials if t is not None]
+    able = torch.tensor([t is not None for t in found.trials], dtype=torch.bool)
+    typical = [h.typical for h, t in zip(hypotheses, found.trials, strict=True) if t is not None]
     slopes = directions(base, moved, typical) if moved else None
     none = torch.zeros(0, dtype=torch.float64)
     return Piece(cells_of(base, slopes, e, setting.sheet, setting.rest), none, none, able)
 
 
-class _Runs(NamedTuple):
+class Runs(NamedTuple):
     """All simulations of one episode."""
 
     fine: Frames  # on the finer mesh; the plain ones where nobody asked
@@ -78,34 +79,33 @@ class _Runs(NamedTuple):
     trials: list[Frames | None]  # with each hypothesis; None: cannot be simulated
 
 
-def _runs(
-    model: Model,
+def runs(
     world: World,
-    setting: Setting,
-    k: int,
+    e: Episode,
+    dt: float | None,
     hypotheses: Sequence[Hypothesis],
     near: Sequence[World],
     with_held: bool,
-    finer: bool = True,
-) -> _Runs:
-    e, dt = setting.episodes[k], setting.dt
+    finer: Callable[[], Frames] | None = None,
+) -> Runs:
+    """An episode in a world, in those ``near``, with every hypothesis and with held places off, side by side."""
     beside = [partial(w.frames, e, dt) for w in near]
     modes = Held().modes(world.cloth, e) if with_held else ()
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m, settles=True), dt) for m in modes]
     changed = [_if_possible(partial(h.apply, world, h.typical)) for h in hypotheses]
     moves = [c is not None and (c.cloth is not world.cloth or c.motions is not world.motions) for c in changed]
-    first = [partial(_finest, model, setting, k)] if finer else []  # it takes longest
+    first = [] if finer is None else [finer]  # it takes longest
     jobs = [*first, partial(world.simulated, e, dt), *beside, *held]
     tried = [
         partial(_if_possible, partial(c.frames, e, dt)) for c, own in zip(changed, moves, strict=True) if c and own
     ]
     done: list[Any] = side_by_side(lambda job: job(), [*jobs, *tried])
     plain, *sure = done[len(first) : len(jobs)]
-    fine = done[0] if finer else plain
+    fine = plain if finer is None else done[0]
     rest = iter(done[len(jobs) :])
     seen = lambda c: c and _if_possible(partial(c.seen, plain, e))  # noqa: E731
     trials = [next(rest) if own else seen(c) for c, own in zip(changed, moves, strict=True)]
-    return _Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials)
+    return Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials)
 
 
 def _finest(model: Model, setting: Setting, k: int) -> Frames:
