@@ -13,11 +13,10 @@ enum class Shape : int { plain, transposed, symmetric };
 // plain, and its own transpose. The weights lie as [count, N, V]; a parameter among them gets its derivative.
 template <class R>
 struct Stencil : Stage<R> {
-    static constexpr int TOGETHER = LANES<R> / 4;  // vertices in a pack
-    using P = Wide<R>;
     using D = Along<R>;
     const Program<R>& program;
     std::vector<int> others;  // vertices, laid out like the weights
+    std::vector<int> used;    // of these, by group: the rest are the vertices themselves
     int weight;               // field
     int x, y;                 // fields of 3, and 3 count, components
     int vertices, near, groups, count;
@@ -29,6 +28,10 @@ struct Stencil : Stage<R> {
         others.assign(size_t(groups) * near * 4, 0);
         for (int n = 0; n < near; n++)
             for (int v = 0; v < vertices; v++) others[at(0, v, n)] = p.tables[table][size_t(n) * vertices + v];
+        used.assign(groups, 0);
+        for (int v = 0; v < vertices; v++)
+            for (int n = used[v / 4]; n < near; n++)
+                if (other(v, n) != v) used[v / 4] = n + 1;
     }
 
     void forward(Scene<R>& s) const override {
@@ -94,11 +97,11 @@ struct Stencil : Stage<R> {
         for (int c = 0; c < count; c++) {
             int v = 0;
             if constexpr (K == 1)
-                for (; v + TOGETHER <= vertices; v += TOGETHER) together(w, from, to, sign, c, v);
+                for (; v + 4 <= vertices; v += 4) together(w, from, to, sign, c, v);
             for (; v < vertices; v++) {
                 Row<K> sum, own = vector<K>(from, v);
                 for (int k = 0; k < PACKS<K>; k++) sum.part[k] = Part<K>(0.0);
-                for (int n = 0; n < near; n++) {
+                for (int n = 0; n < used[v / 4]; n++) {
                     const Part<K> weight = all<Part<K>>(w[at(c, v, n)]);
                     const Row<K>& there = vector<K>(from, other(v, n));
                     for (int k = 0; k < PACKS<K>; k++) sum.part[k] = sum.part[k] + weight * (there.part[k] - own.part[k]);
@@ -107,27 +110,18 @@ struct Stencil : Stage<R> {
             }
         }
     }
-    // Several vertices side by side: four times fewer operations in float, two in double.
+    // A group side by side: one vertex alone waits for its sum at every neighbour.
     void together(const R* w, const R* from, R* to, R sign, int c, int v) const {
-        P own = *reinterpret_cast<const P*>(from + size_t(v) * 4), sum(0.0);
+        Row<1> own[4], sum[4];
+        for (int i = 0; i < 4; i++) own[i] = vector<1>(from, v + i), sum[i].part[0] = Quad<R>(0.0);
         const R* weights = w + at(c, v, 0);
         const int* index = others.data() + at(0, v, 0);
-        for (int n = 0; n < near; n++) sum = sum + each(weights + 4 * n) * (vectors(from, index + 4 * n) - own);
-        Row<1> parts[TOGETHER];
-        std::memcpy(parts, &sum, sizeof(sum));
-        for (int i = 0; i < TOGETHER; i++) add<1>(to, c, v + i, parts[i], sign);
-    }
-    P vectors(const R* from, const int* k) const {
-        if constexpr (TOGETHER == 4) return joined(quad(from, k[0]), quad(from, k[1]), quad(from, k[2]), quad(from, k[3]));
-        else return joined(quad(from, k[0]), quad(from, k[1]));
-    }
-    static P each(const R* w) {  // each weight four times
-        if constexpr (TOGETHER == 4) {
-            Quad<R> q;
-            std::memcpy(&q, w, sizeof(q));
-            const P all = joined(q, q, q, q);  // a widening shuffle would go through memory
-            return P(__builtin_shufflevector(all.v, all.v, 0, 0, 0, 0, 5, 5, 5, 5, 10, 10, 10, 10, 15, 15, 15, 15));
-        } else return joined(all<Quad<R>>(w[0]), all<Quad<R>>(w[1]));
+        for (int n = 0; n < used[v / 4]; n++)
+            for (int i = 0; i < 4; i++) {
+                const Quad<R> step = quad(from, index[4 * n + i]) - own[i].part[0];
+                sum[i].part[0] = sum[i].part[0] + all<Quad<R>>(weights[4 * n + i]) * step;
+            }
+        for (int i = 0; i < 4; i++) add<1>(to, c, v + i, sum[i], sign);
     }
 
     template <int K>
@@ -136,7 +130,7 @@ struct Stencil : Stage<R> {
             for (int v = 0; v < vertices; v++) {
                 const Row<K> moment = given<K>(from, c, v, sign);
                 Row<K> own{};
-                for (int n = 0; n < near; n++) {
+                for (int n = 0; n < used[v / 4]; n++) {
                     const Part<K> weight = all<Part<K>>(w[at(c, v, n)]);
                     Row<K>& there = vector<K>(to, other(v, n));
                     for (int k = 0; k < PACKS<K>; k++) {
@@ -159,7 +153,7 @@ struct Stencil : Stage<R> {
                     own[i] = quad(from, std::min(v + i, vertices - 1));
                     moment[i] = v + i < vertices ? given<1>(on, c, v + i, sign).part[0] : Quad<R>(0.0);
                 }
-                for (int n = 0; n < near; n++) {
+                for (int n = 0; n < used[v / 4]; n++) {
                     const int* index = others.data() + at(0, v, n);
                     Quad<R> work[4];
                     for (int i = 0; i < 4; i++) work[i] = (quad(from, index[i]) - own[i]) * moment[i];
@@ -197,8 +191,8 @@ struct Stencil : Stage<R> {
     template <class F>
     void each_weight(F work) const {
         for (int c = 0; c < count; c++)
-            for (int n = 0; n < near; n++)
-                for (int v = 0; v < vertices; v++) work(at(c, v, n), c, v, other(v, n));
+            for (int v = 0; v < vertices; v++)
+                for (int n = 0; n < used[v / 4]; n++) work(at(c, v, n), c, v, other(v, n));
     }
 };
 
