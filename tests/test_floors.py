@@ -21,7 +21,7 @@ FLOORS = (
     ("materials", "effects", "boundaries", "transfer"),
     ("model",),
     ("self_contact", "strain", "dynamics"),
-    ("apic",),
+    ("apic", "relaxation"),
     ("functional", "stability", "recordings", "engine"),
     ("losses",),
     ("observe", "validation"),

@@ -21,7 +21,7 @@ from .meshes import Mesh
 from .model import Geometry, Model, vertex_mass
 from .parameters import PhysicalParameter
 from .sensitivities import Directions, sensitivities
-from .stability import stable_step_of
+from .stability import Limits, limits_of
 from .strain import inverse_growth
 from .transfer import Contact, Grid
 from .types import ClothState, Rollout, Trajectory
@@ -125,6 +125,8 @@ class Cloth(nn.Module):
         """What computes the substeps: "fused", "fused, with effects.NAME in torch", or "reference (and why)"."""
         with torch.no_grad():
             model = self.model()
+            limits = self._limits(model)
+            model = model._replace(stages=limits.stages(limits.step))
             return str(self._choice(model, likeness(model, self._vertices)))
 
     # -- states ---------------------------------------------------------------------------------------------------
@@ -221,7 +223,7 @@ class Cloth(nn.Module):
 
     def stable_step(self) -> float:
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
-        return stable_step_of(self.model(), self._gradient)
+        return self._limits(self.model()).step
 
     def model(self) -> Model:
         """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
@@ -255,10 +257,11 @@ class Cloth(nn.Module):
         frames = check_times(times)
         motion = check_motions(motion, self.boundaries, frames, self._area)
         model = self.model()
-        limit = check_step(dt, stable_step_of(model, self._gradient))
+        limits = self._limits(model)
+        limit = check_step(dt, limits.step)
         check_substeps(frames[-1] - frames[0], limit, dt)
         counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
-        return self._ready(model, state, motion, frames, counts)
+        return self._ready(model._replace(stages=limits.stages(limit)), state, motion, frames, counts)
 
     def settling(
         self, state: ClothState, motion: Mapping[str, Trajectory], start: float, duration: float, rate: float
@@ -267,10 +270,10 @@ class Cloth(nn.Module):
         frames = [start, start + duration]
         motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
         model = self.model()
-        step = stable_step_of(model, self._gradient)
-        check_substeps(duration, step)
-        count = int(np.ceil(duration * (1 / step + rate)))
-        return self._ready(model, state, motion, frames, [count], rate)
+        limits = self._limits(model)
+        check_substeps(duration, limits.step)
+        count = int(np.ceil(duration * (1 / limits.step + rate)))
+        return self._ready(model._replace(stages=limits.stages(limits.step)), state, motion, frames, [count], rate)
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
@@ -280,6 +283,13 @@ class Cloth(nn.Module):
     def grid(self) -> Grid | None:
         """The contact grid; None without contact."""
         return None if self._grid is None else self._grid._replace(points=self._points, apart=self._apart)
+
+    def _limits(self, model: Model) -> Limits:
+        """What bounds the substep; the usual material point method knows no stages."""
+        limits = limits_of(model, self._gradient)
+        if self.transfer == "mesh":
+            return limits
+        return limits._replace(damping=limits.damping + limits.viscous, viscous=0.0)
 
     def _ready(
         self,

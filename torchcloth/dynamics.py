@@ -26,7 +26,7 @@ def added(total: Impulses, more: Impulses) -> Impulses:
 def vertex_forces(
     model: Model, state: ClothState, s: Surface, memory: Memory, columns: tuple[Tensor, Tensor]
 ) -> Tensor:
-    """Internal forces and effects, assembled on the vertices [..., V, 3] N."""
+    """Internal forces and effects, assembled on the vertices [..., V, 3] N; without what acts in stages."""
     g = model.geometry
     p1, p2 = columns
     second = -g.area * (g.warp[0] * p1 + g.weft[0] * p2)
@@ -34,9 +34,12 @@ def vertex_forces(
     first = -(second + third)
     direct = None
     for name, (effect, c) in model.effects.items():
-        force = force_of(name, effect, c, Moment(state.x, state.v, s, model.mass, memory.get(f"effects.{name}")))
+        now = Moment(state.x, state.v, s, model.mass, memory.get(f"effects.{name}"))
+        force = force_of(name, effect, c, now)
         if force is None:
             continue
+        later = effect.viscous(c, now) if model.stages else None
+        force = force if later is None else force - later
         if effect.acts_on == "triangles":
             part = force / 3
             first, second, third = first + part, second + part, third + part

@@ -1,9 +1,9 @@
 """The algorithm on one page. Read this file first.
 
-One substep:  internal variables -> forces on the mesh -> velocities -> contact through the grid -> boundaries ->
-positions -> directors. Elasticity and effects act on the vertices, which carry all the mass; the grid carries only
-contact. That split is what makes the solution converge when the step is halved: forces that pass through the grid
-are filtered at every step.
+One substep: internal variables -> forces on the mesh, stiff viscous ones in stages -> velocities -> contact through the
+grid -> boundaries -> positions -> directors. Elasticity and effects act on the vertices, which carry all the mass; the
+grid carries only contact. That split is what makes the solution converge when the step is halved: forces that pass
+through the grid are filtered at every step.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from ._math import dot
 from .boundaries import Drive
 from .dynamics import Impulses, added, constrain, resistance_of, resisted, vertex_forces
 from .model import Geometry, Model, surface
+from .relaxation import relaxed
 from .self_contact import Layers, add_columns, director_energy, follow, near_layers, pressure, repulsion
 from .strain import elastic, evolve, membrane_stress
 from .types import ClothState
@@ -40,7 +41,8 @@ def step(
 
     resistance = resistance_of(model, s, state.x)
     force = vertex_forces(model, state, s, memory, columns)
-    free = state.v + dt * resisted(resistance, force / model.mass)
+    v = relaxed(model, state, s, memory, dt, drives, substep, resistance)
+    free = v + dt * resisted(resistance, force / model.mass)
     if grid is not None and layers is not None and press is not None:
         free = free + resisted(resistance, repulsion(model, grid, layers, press, s, free, dt))
     v, impulses = constrain(model, state.x, free, dt, drives, substep, resistance)

@@ -44,6 +44,7 @@ class Model(NamedTuple):
     grid: Grid | None = None  # of the contact between layers; None without contact
     transfer: Literal["mesh", "apic"] = "mesh"  # where elastic forces act: on the vertices, or through the grid
     rest: Tensor | None = None  # [..., E or 1, 4]: F_E = F A for a rest shape that differs from the pattern
+    stages: int = 0  # in which viscous forces act, see relaxation.py; 0: with all other forces
 
 
 def vertex_mass(geometry: Geometry, density: Tensor, share: Tensor) -> Tensor:

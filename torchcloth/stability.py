@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
@@ -9,14 +11,47 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from .errors import InvalidInput, UnstableStep
 from .materials import Stiffness
 from .model import Model
+from .relaxation import MOST, Polynomial
 from .strain import grown_gradient
 
 SAFETY = 0.7  # of the linear limit: leaves room for tangents that double beyond what the material states
+STAGE = 0.4  # of a substep's cost, for a stage: 0.3 of bending, 0.45 of the membrane
+
+
+class Limits(NamedTuple):
+    """What bounds a substep of the symplectic Euler scheme."""
+
+    squared: float  # 1/s^2, of the highest frequency omega
+    damping: float  # 1/s, linear damping rate of what acts in one piece
+    viscous: float  # 1/s, of what may act in stages, see relaxation.py
+
+    def longest(self, stages: int) -> float:
+        """Stable substep [s]: SAFETY x 2 / omega, less where there is damping."""
+        if stages == 0:
+            return self._explicit(4, self.damping + self.viscous)
+        reach = SAFETY * Polynomial.of(stages).reach / self.viscous
+        return min(self._explicit(2, self.damping), reach)
+
+    def _explicit(self, room: float, c: float) -> float:
+        """SAFETY times the step for which room - 2 c dt - omega^2 dt^2 = 0."""
+        return SAFETY * ((c**2 + room * self.squared) ** 0.5 - c) / self.squared
+
+    @property
+    def step(self) -> float:
+        """The stable substep [s] with which a simulation costs least."""
+        return max((self.longest(n) / (1 + STAGE * n), self.longest(n)) for n in self._stages())[1]
+
+    def stages(self, dt: float) -> int:
+        """Fewest with which ``dt`` [s], of at most ``step``, is stable."""
+        return next(n for n in self._stages() if dt <= self.longest(n) * (1 + 1e-9))
+
+    def _stages(self) -> range | list[int]:
+        return [0, *range(2, MOST + 1)] if self.viscous > 0 else [0]
 
 
 @torch.no_grad()
-def stable_step_of(model: Model, gradient: Tensor) -> float:
-    """``stable_step`` of a cloth with all its parts; ``gradient``: of the shape functions of the pattern.
+def limits_of(model: Model, gradient: Tensor) -> Limits:
+    """Those of a cloth with all its parts; ``gradient``: of the shape functions of the pattern.
 
     What was found last for a mesh is remembered, with all numbers that it hangs on.
 
@@ -30,33 +65,27 @@ def stable_step_of(model: Model, gradient: Tensor) -> float:
     spacing = None if model.grid is None else model.grid.spacing
     extra = [effect.rates(c, model.mass) for effect, c in model.effects.values()]
     elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
+    viscous = sum(float(effect.viscous_rate(c, model.mass)) for effect, c in model.effects.values())
     stiffness = model.material.stiffness(model.coefficients)
     numbers = (*stiffness, model.areal_density, *([] if model.rest is None else [model.rest]))
-    hangs_on = (gradient._version, spacing, elastic, damping, *((t.dtype, t.detach().tolist()) for t in numbers))
-    before, step = _KNOWN.get(gradient) or (None, 0.0)
+    hangs_on = (gradient._version, spacing, *((t.dtype, t.detach().tolist()) for t in numbers))
+    before, squared = _KNOWN.get(gradient) or (None, 0.0)
     if before != hangs_on:
         shape = gradient if model.rest is None else grown_gradient(gradient, model.rest)
         try:
-            step = stable_step(shape, model.areal_density, stiffness, spacing, elastic, damping)
+            squared = squared_frequency(shape, model.areal_density, stiffness, spacing)
         except RuntimeError as error:  # no eigenvalues of what is not finite, or whose square is not
             largest = max(float(t.max()) for t in stiffness)
             raise UnstableStep("stiffness", got=f"{largest:.3g} N/m", expected="a fabric's: the step is 0 s") from error
-        _KNOWN[gradient] = hangs_on, step
-    return step
+        _KNOWN[gradient] = hangs_on, squared
+    return Limits(squared + elastic, max(0.0, damping - viscous), viscous)
 
 
 _KNOWN: WeakTensorKeyDictionary = WeakTensorKeyDictionary()  # by the gradient, which belongs to one mesh
 
 
-def stable_step(
-    gradient: Tensor,
-    density: Tensor,
-    stiffness: Stiffness,
-    spacing: float | None,
-    elastic: float = 0.0,
-    damping: float = 0.0,
-) -> float:
-    """Stable substep [s] of the symplectic Euler scheme, SAFETY x 2 / omega_max, less where there is linear damping.
+def squared_frequency(gradient: Tensor, density: Tensor, stiffness: Stiffness, spacing: float | None) -> float:
+    """Bound on omega^2 [1/s^2] of the mesh and its directors.
 
     The highest frequency of the mesh is bounded by that of its stiffest free element with lumped mass
     (Irons and Treharne 1971). The director adds its own: a contact point alone in its grid cell sees
@@ -67,8 +96,6 @@ def stable_step(
         density: [..., E or 1, 1] kg/m^2.
         stiffness: tangents [N/m].
         spacing: contact grid [m]; None without contact.
-        elastic: squared frequency that the effects add [1/s^2].
-        damping: linear damping rate c that the effects add [1/s]; the step must obey 4 - 2 c dt - omega^2 dt^2 > 0.
     """
     gx, gy = gradient[..., 0], gradient[..., 1]
     zero = torch.zeros_like(gx)
@@ -81,8 +108,7 @@ def stable_step(
     if spacing is not None:
         grid = 4 * torch.maximum(stiffness.normal, stiffness.shear) / spacing**2
         squared = torch.maximum(squared, (grid + 3 * stiffness.shear * steepest) / density)
-    omega2 = float(squared.max()) + elastic
-    return SAFETY * ((damping**2 + 4 * omega2) ** 0.5 - damping) / omega2
+    return float(squared.max())
 
 
 def _root(stiffness: Stiffness) -> Tensor:

@@ -38,10 +38,11 @@ def agree(
     substeps: int = 100,
     dt: float = 1e-4,
     marks: tuple[float, float] = (VALUES, GRADIENTS),
+    stages: int = 0,
 ) -> dict[str, float]:
     """Demand agreement; the largest differences by name are returned for reports."""
-    reference = outcome(in_chunks, cloth, motion, state, substeps, dt)
-    engine = outcome(fused.rollout, cloth, motion, state, substeps, dt)
+    reference = outcome(in_chunks, cloth, motion, state, substeps, dt, stages)
+    engine = outcome(fused.rollout, cloth, motion, state, substeps, dt, stages)
     found = {name: difference(engine.values[name], value) for name, value in reference.values.items()}
     worse = {name: value for name, value in found.items() if not value <= marks[0]}
     assert set(engine.values) == set(reference.values)
@@ -53,7 +54,7 @@ def agree(
             found[f"d/d {name}"] = difference(other, value)
     worse = {name: value for name, value in found.items() if not value <= marks[1]}
     assert not worse, worse
-    found["tangents"] = tangents_transpose(cloth, motion, state, substeps, dt)
+    found["tangents"] = tangents_transpose(cloth, motion, state, substeps, dt, stages)
     assert found["tangents"] <= marks[1], found["tangents"]
     return found
 
@@ -67,12 +68,13 @@ def in_chunks(model, state, dt, drives, substeps):
     return state, total
 
 
-def outcome(rollout, cloth, motion, state: ClothState, substeps: int, dt: float) -> Outcome:
+def outcome(rollout, cloth, motion, state: ClothState, substeps: int, dt: float, stages: int = 0) -> Outcome:
     """Of one of the engines."""
     cloth.zero_grad()
     leaf = state.map(lambda t: t.clone().requires_grad_())
     poses = {name: trajectory.pose.clone().requires_grad_() for name, trajectory in motion.items()}
-    end, impulses = rollout(cloth.model(), leaf, dt, drives_of(motion, substeps, dt, poses), substeps)
+    model = cloth.model()._replace(stages=stages)
+    end, impulses = rollout(model, leaf, dt, drives_of(motion, substeps, dt, poses), substeps)
     values = {
         "displacement": end.x - state.x,
         "v": end.v,
@@ -117,11 +119,11 @@ def _columns(value: Tensor) -> Tensor:
     return value.reshape(-1, value.shape[-1] if value.ndim > 1 else 1)
 
 
-def tangents_transpose(cloth, motion, state: ClothState, substeps: int, dt: float, directions: int = 9) -> float:
+def tangents_transpose(cloth, motion, state: ClothState, substeps: int, dt: float, stages: int, directions=9) -> float:
     """Relative error of <seed, J dot> = <J^T seed, dot> of the engine, for random dots of all inputs."""
     with torch.no_grad():
         drives = drives_of(motion, substeps, dt, {name: t.pose for name, t in motion.items()})
-        engine = fused.Fused(cloth.model(), state, drives)
+        engine = fused.Fused(cloth.model()._replace(stages=stages), state, drives)
         assert engine.torch_parts is None, f"not on the engine: {engine.torch_parts.parts}"
         job = engine.job(state, dt, drives, substeps)
         varied = {field for field in job.inputs if field != engine.low.dt}  # the step itself is not differentiated

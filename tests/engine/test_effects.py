@@ -122,6 +122,35 @@ def test_all_together_in_a_batch():
     agree(cloth, {}, remembering(moving(cloth, (2,))))
 
 
+@pytest.mark.parametrize("air", [False, True], ids=["vacuum", "air"])
+@pytest.mark.parametrize("stages", [2, 5])
+def test_viscous_forces_in_stages(stages, air):
+    effects = {
+        **standard(),
+        "woven": E.Bending(field(1e-5, 1e-3), 0.02, weft_ratio=0.5),
+        "elastic": E.Bending(1e-5),
+        "viscous": E.KelvinVoigt(field(0.1, 0.3)),
+        "rest": E.ResidualForce({"across": 0.5, "strain_rate@edge": 0.2}),
+    }
+    cloth = sheet(
+        effects | ({"mass": E.AddedMass(0.1)} if air else {}), {"hand": tc.boundaries.Grasp.corner("upper-left")}
+    )
+    agree(cloth, {"hand": held(0.01)}, moving(cloth), stages=stages)
+
+
+def test_an_effect_of_ones_own_that_is_viscous_in_stages_is_for_the_reference():
+    class Thicker(E.KelvinVoigt):
+        pass
+
+    own, known = sheet({"it": Thicker(5.0)}), sheet({"it": E.KelvinVoigt(5.0)})
+    assert "'it' (Thicker), which is viscous in stages" in own.engine_in_use
+    state = moving(known)
+    with torch.no_grad():
+        one, other = (cloth(state, times=[0.0, 0.01]).x[-1] - state.x for cloth in (own, known))
+    assert difference(one, other) < 1e-10
+    assert known.engine_in_use == "fused"
+
+
 def test_no_air_that_moves_along_changes_nothing_bitwise():
     state = moving(sheet({}))
     with_none, _ = fused.rollout(sheet({"air": E.AddedMass(0.0)}).model(), state, 1e-4, {}, 50)

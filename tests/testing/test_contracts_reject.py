@@ -152,6 +152,16 @@ class SilentlyStiff(tc.effects.Bending):
         return mass.new_zeros(()), mass.new_zeros(())
 
 
+class TwiceAsViscous(tc.effects.KelvinVoigt):
+    def viscous(self, c, now):
+        return 2 * super().viscous(c, now)
+
+
+class ViscousWithoutRate(tc.effects.KelvinVoigt):
+    def viscous_rate(self, c, mass):
+        return mass.new_zeros(())
+
+
 class StiffAtZero(tc.effects.MassDamping):
     def rates(self, c, mass):
         return mass.new_full((), 1e9), c.amax()
@@ -171,6 +181,8 @@ class MixesTheBatch(tc.effects.MassDamping):
         (OffByOneInTenThousand, "test_gradients"),
         (RootOfSpeed, "test_gradients_are_finite_at_rest"),
         (SilentlyStiff, "test_rates_bound_the_spectrum_at_rest"),
+        (TwiceAsViscous, "test_viscous_is_the_part_of_the_force_that_it_says"),
+        (ViscousWithoutRate, "test_viscous_is_the_part_of_the_force_that_it_says"),
         (MixesTheBatch, "test_batches_equal_loops"),
     ],
 )

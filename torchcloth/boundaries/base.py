@@ -34,6 +34,10 @@ class AbstractBoundary(nn.Module, ABC):
             InvalidInput: the boundary does not fit the mesh.
         """
 
+    def held(self, drive: Drive | None, substep: int) -> Tensor | None:
+        """Indices of the vertices whose velocities it dictates whatever they are; None: of none."""
+        return None
+
     @abstractmethod
     def apply(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
         """New velocities [..., V, 3] from positions at the start of the substep and velocities free of the boundary."""

@@ -92,6 +92,10 @@ class Grasp(AbstractBoundary):
             )
         return self
 
+    def held(self, drive: Drive | None, substep: int) -> Tensor | None:
+        """All while it is closed."""
+        return self.index if drive is not None and drive.closed[substep] else None
+
     def apply(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
         """Held vertices arrive exactly where the body carries them."""
         if drive is None or not drive.closed[substep]:

@@ -67,6 +67,13 @@ class AbstractEffect(nn.Module, ABC):
         """[..., V, 3] or [..., E, 3] N (see ``acts_on``)."""
         return None
 
+    def viscous(self, c: Any, now: Moment) -> Tensor | None:
+        """[..., V, 3] N: the part of ``force`` that is linear in velocity, if it may be stiff; then it costs no steps.
+
+        At fixed positions it is -C v with C symmetric and not negative. ``viscous_rate`` must be there as well.
+        """
+        return None
+
     def mass(self, c: Any) -> Tensor | None:
         """[..., V, 1] kg, carried along by the vertices."""
         return None
@@ -97,6 +104,10 @@ class AbstractEffect(nn.Module, ABC):
     def rates(self, c: Any, mass: Tensor) -> tuple[Tensor, Tensor]:
         """(bound on omega^2 [1/s^2], bound on the linear damping rate [1/s]) that this effect adds; limits the step."""
         return mass.new_zeros(()), mass.new_zeros(())
+
+    def viscous_rate(self, c: Any, mass: Tensor) -> Tensor:
+        """What of that damping rate [1/s] is ``viscous``."""
+        return mass.new_zeros(())
 
 
 def remembered(now: Moment) -> Tensor:

@@ -166,14 +166,21 @@ class Bending(AbstractEffect):
         field = c.stiffness * now.x
         if self.damping_time is not None:
             field = field + c.viscosity * now.v
-        if c.operator is None:
-            force = (self.operator * differences(field, self.columns)).sum(-3)
-        else:
-            operator = c.operator.unflatten(-2, self.woven.columns.shape)
-            force = (operator * differences(field, self.woven.columns)).sum(-3)
+        force = self._straightened(c, field)
         if c.curl is None or c.plate is None:
             return force
         return force - self.sheet.force(self.sheet.see(now.x), c.plate.moment(self.rest_curvature(c.curl, now)))
+
+    def viscous(self, c: Coefficients, now: Moment) -> Tensor | None:
+        """-Q damping_time v."""
+        return None if self.damping_time is None else self._straightened(c, c.viscosity * now.v)
+
+    def _straightened(self, c: Coefficients, field: Tensor) -> Tensor:
+        """-Q field."""
+        if c.operator is None:
+            return (self.operator * differences(field, self.columns)).sum(-3)
+        operator = c.operator.unflatten(-2, self.woven.columns.shape)
+        return (operator * differences(field, self.woven.columns)).sum(-3)
 
     def rest_curvature(self, curl: Tensor, now: Moment) -> Tensor:
         """[..., V or 1, 3] 1/m along ww, ff, sqrt 2 wf; ``curl`` is that of the virgin sheet."""
@@ -190,16 +197,21 @@ class Bending(AbstractEffect):
 
     def rates(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
         """B times the largest eigenvalue of Q over the vertices' masses, bounded by that for equal areal density."""
-        if c.operator is None or c.plate is None:
-            stiffness = c.stiffness.amax() * (self.bound / mass).amax()
-            damping = c.viscosity.amax() * (self.bound / mass).amax()
-        else:
-            stiffness = c.plate.largest() * self.sheet.bend_rate(mass)
-            damping = c.viscosity.amax() * stiffness
+        stiffness = c.stiffness.amax() * self._spectrum(c, mass)
         if c.curl is not None and c.plate is not None:
             moment = c.plate.moment(c.curl).square().sum(-1).amax().sqrt()
             stiffness = stiffness + moment * self.sheet.turn_rate(mass)
-        return stiffness, damping
+        return stiffness, self.viscous_rate(c, mass)
+
+    def viscous_rate(self, c: Coefficients, mass: Tensor) -> Tensor:
+        """All damping there is."""
+        return c.viscosity.amax() * self._spectrum(c, mass)
+
+    def _spectrum(self, c: Coefficients, mass: Tensor) -> Tensor:
+        """Largest eigenvalue of Q over the masses, times the stiffness where ``c.operator`` holds it."""
+        if c.operator is None or c.plate is None:
+            return (self.bound / mass).amax()
+        return c.plate.largest() * self.sheet.bend_rate(mass)
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""

@@ -17,7 +17,7 @@ from ..types import Moment
 from ._bent import BentSheet
 from ._triangles import Triangles
 from .base import AbstractEffect, Amplitude
-from .viscous import largest_strain_rate
+from .viscous import largest_strain_rate, strain_rate_force
 
 
 class Law(NamedTuple):
@@ -135,16 +135,17 @@ class ResidualForce(AbstractEffect):
         total = torch.zeros_like(now.x)
         if c.drags:
             total = self._dragged(c, now)
-        if c.strain_rate is not None:
-            f1, f2 = now.surface.f1, now.surface.f2
-            rate1, rate2 = self.triangles.columns(now.v)
-            e11, e22, e12 = dot(f1, rate1), dot(f2, rate2), 0.5 * (dot(f1, rate2) + dot(f2, rate1))
-            viscous = c.strain_rate
-            total = total + self.triangles.force(viscous * (e11 * f1 + e12 * f2), viscous * (e12 * f1 + e22 * f2))
+        viscous = self.viscous(c, now)
+        if viscous is not None:
+            total = total + viscous
         if c.bend is not None:
             bent = self.sheet.see(now.x)
             total = total + self.sheet.force(bent, c.bend * bent.curvature)
         return total
+
+    def viscous(self, c: Coefficients, now: Moment) -> Tensor | None:
+        """Of the strain rate."""
+        return None if c.strain_rate is None else strain_rate_force(self.triangles, c.strain_rate, now)
 
     def _dragged(self, c: Coefficients, now: Moment) -> Tensor:
         surface = now.surface
@@ -160,8 +161,11 @@ class ResidualForce(AbstractEffect):
         """Of a sheet at rest: the laws of speed squared are 0 there."""
         largest = lambda part: mass.new_zeros(()) if part is None else part.abs().amax()  # noqa: E731
         slowed = (largest(c.across) + largest(c.along)) * (self.share / mass).amax()
-        slowed = slowed + largest(c.strain_rate) * (self.bound / mass).amax()
-        return largest(c.bend) * self.sheet.bend_rate(mass), slowed
+        return largest(c.bend) * self.sheet.bend_rate(mass), slowed + self.viscous_rate(c, mass)
+
+    def viscous_rate(self, c: Coefficients, mass: Tensor) -> Tensor:
+        """Of the strain rate."""
+        return mass.new_zeros(()) if c.strain_rate is None else c.strain_rate.abs().amax() * (self.bound / mass).amax()
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""

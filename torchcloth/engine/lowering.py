@@ -57,6 +57,7 @@ class Lowering:
         memory: internal variables by key, as in ``ClothState.memory``.
         force: [V, 3], to be added to.
         pulls: kernels that give each vertex a force of its own, and the fields whose rows they take; see ``pull``.
+        viscous: each adds the viscous force of velocities to a field, both [V, 3]; where the model has stages.
         resistance: [V, 6] kg, mass of the air that moves along (xx, xy, xz, yy, yz, zz), to be added to; None without.
         triangles: the loop over triangles that comes first; ``Triangles`` has what is computed there already.
         sheets: how the sheet is bent at its vertices, by the weights of the derivatives.
@@ -81,11 +82,12 @@ class Lowering:
         self.mass = self.parameter(model.mass)
         self.force = self.program.temporary(self.vertices, 3)
         self.pulls: list[tuple[str, tuple[Field, ...]]] = []
+        self.viscous: list[Callable[[Field, Field], None]] = []
         self.torch_force = self._forces_from_torch() if in_torch else None
         self.resistance: Field | None = None
         order = scattered(self.faces)
         self.corners = [self.program.table(c[order]) for c in array(model.geometry.corners).reshape(3, -1)]
-        self.triangles = Triangles(self, order)
+        self.triangles = Triangles(self)
         self.sheets: dict[Field, Sheet] = {}
         drive = self.program.drive
         self.drives = {name: Motion(drive(16), drive(16), drive(1)) for name in drives}
@@ -188,10 +190,17 @@ def _part(name: str, lower: Callable[[], None]) -> None:
 
 
 def _kick(low: Lowering) -> Velocities:
-    loop = low.loop(low.vertices)
-    dt, v, force, mass = (loop.load(field) for field in (low.dt, low.v.now, low.force, low.mass))
+    from .parts.relaxation import relaxed
+
+    loop, v = relaxed(low) if low.viscous else _as_they_are(low)
+    dt, force, mass = (loop.load(field) for field in (low.dt, low.force, low.mass))
     for kernel, fields in low.pulls:
         loop.call(kernel, *(loop.load(field) for field in fields), into=force)
     if low.resistance is None:
         return Velocities(low, loop, loop.call("kick", dt, v, force, mass))
     return Velocities(low, loop, loop.call("kick_in_air", dt, v, force, mass, loop.load(low.resistance)))
+
+
+def _as_they_are(low: Lowering) -> tuple[Loop, list[int]]:
+    loop = low.loop(low.vertices)
+    return loop, loop.load(low.v.now)

@@ -21,12 +21,20 @@ TOGETHER = 16  # packs
 
 
 class Triangles:
-    """The loop over triangles; what several parts need is computed once."""
+    """A loop over triangles; what several parts need is computed once.
 
-    def __init__(self, lowering: Lowering, order: np.ndarray) -> None:
+    Args:
+        lowering: the program.
+        velocity: [V, 3], of the vertices; None: the cloth's.
+        force: [V, 3], to be added to; None: the force on the cloth.
+    """
+
+    def __init__(self, lowering: Lowering, velocity: Field | None = None, force: Field | None = None) -> None:
         self._lowering = lowering
+        self._velocity = lowering.v.now if velocity is None else velocity
+        self._force = lowering.force if force is None else force
         g = lowering.model.geometry
-        self.loop = lowering.program.loop(lowering.faces, order)
+        self.loop = lowering.program.loop(lowering.faces, scattered(lowering.faces))
         program = lowering.program
         self.shape = self.loop.load(program.constant(torch.cat([*g.warp, *g.weft], dim=-1)))  # a1, a2, b1, b2
         self.area = self.loop.load(program.constant(g.area))
@@ -45,7 +53,7 @@ class Triangles:
     @property
     def v(self) -> list[list[int]]:
         """The corners' velocities."""
-        return self._corners("v", self._lowering.v.now)
+        return self._corners("v", self._velocity)
 
     @property
     def surface(self) -> list[int]:
@@ -74,7 +82,7 @@ class Triangles:
         """Give the corners the sum of all that acts: one scatter, however many effects there are."""
         if self._forces is not None:
             for k, corner in enumerate(self._lowering.corners):
-                self.loop.add(self._forces[3 * k : 3 * k + 3], self._lowering.force, corner)
+                self.loop.add(self._forces[3 * k : 3 * k + 3], self._force, corner)
 
     def _corners(self, name: str, field: Field) -> list[list[int]]:
         flat = self._once(name, lambda: [r for c in self._lowering.corners for r in self.loop.load(field, c)])

@@ -70,6 +70,8 @@ def _obstacle(model: Model, part: str) -> str | None:
     if part == MATERIAL:
         return None if model.grid is None else "whose directors meet other layers"
     effect = type(model.effects[part.removeprefix("effects.")][0])
+    if model.stages and effect.viscous is not AbstractEffect.viscous:
+        return "which is viscous in stages"
     for hook, what in (("inertia", "adds inertia"), ("loosen", "loosens a grasp")):
         if getattr(effect, hook) is not getattr(AbstractEffect, hook):
             return f"which {what}"

@@ -84,6 +84,7 @@ class EffectContract(Contract):
             loose = effect.loosen(c, index, v, held, mass, 1e-3)
             found = {
                 "force": effect.force(c, now),
+                "viscous": effect.viscous(c, now),
                 "mass": effect.mass(c),
                 "inertia": effect.inertia(c, now.surface),
                 "growth": effect.growth(c),
@@ -93,6 +94,9 @@ class EffectContract(Contract):
             return {name: value for name, value in found.items() if value is not None}
 
         return answers
+
+    def _viscous(self, effect: AbstractEffect, x: Tensor, v: Tensor) -> Tensor:
+        return self._answers()(effect, x, v).get("viscous", torch.zeros_like(x))
 
     def _on_vertices(self, effect: AbstractEffect, x: Tensor, v: Tensor) -> Tensor:
         force = self._answers()(effect, x, v).get("force", torch.zeros_like(x))
@@ -188,6 +192,27 @@ class EffectContract(Contract):
             largest = float(torch.linalg.eigvals(matrix).real.max())
             allowed = float(bound.detach()) * (1 + 1e-9) + 1e-9
             demand(largest <= allowed, f"rates() bounds the {name} by {allowed:.4g}, it is {largest:.4g}")
+
+    def test_viscous_is_the_part_of_the_force_that_it_says(self) -> None:
+        """It may act in stages: linear in velocity, symmetric, never driving, within its rate; so is what is left."""
+        effect, state = self._effect(), self._state()
+        x, v = state["x"], state["v"]
+        once, twice = (self._viscous(effect, x, factor * v).detach() for factor in (1.0, 2.0))
+        close(twice, 2 * once, 1e-12, "viscous() is not linear in velocity")
+        mass = self._cloth({}).model().mass.detach()
+        root = mass.sqrt().expand_as(x).reshape(-1)
+        c = effect.coefficients()
+        whole, rate = (float(value.detach()) for value in (effect.rates(c, mass)[1], effect.viscous_rate(c, mass)))
+        rest = torch.as_tensor(self.mesh().vertices)
+        found = -torch.autograd.functional.jacobian(lambda moved: self._viscous(effect, rest, moved), rest * 0)  # type: ignore[operator]
+        matrix = found.reshape(len(root), -1) / root[:, None] / root
+        close(matrix, matrix.mT, 1e-9, "viscous() is not symmetric")
+        slowest, fastest = torch.linalg.eigvalsh(matrix)[[0, -1]].tolist()
+        demand(slowest >= -1e-9 * max(1.0, fastest), "viscous() drives some motion")
+        demand(fastest <= rate * (1 + 1e-9) + 1e-9, f"viscous_rate() says {rate:.4g}, it is {fastest:.4g}")
+        left = self._damping(effect, rest, rest * 0).reshape(len(root), -1) / root[:, None] / root + matrix
+        largest = float(torch.linalg.eigvals(-left).real.max())
+        demand(largest <= whole * (1 + 1e-9) - rate + 1e-9, "rates() must bound what is not viscous by the difference")
 
     def _stiffness(self, effect: AbstractEffect, x: Tensor, v: Tensor) -> Tensor:
         return torch.autograd.functional.jacobian(lambda moved: self._on_vertices(effect, moved, v), x)  # type: ignore[return-value]

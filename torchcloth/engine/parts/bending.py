@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import cast
 
 from torch import Tensor
@@ -10,6 +11,7 @@ from ...effects import Bending, BendingFriction, CreasingBending, SaturatingBend
 from ...effects._plate import Plate
 from ...effects.bending import Coefficients
 from ...effects.saturating import Coefficients as Saturating
+from ..fields import Field
 from ..lowering import Lowering
 from ..shared_loops import Sheet
 from ..stages import Shape
@@ -58,11 +60,19 @@ def _matrix(low: Lowering, effect: Bending, c: Coefficients) -> None:
     else:
         columns = effect.woven.columns.cpu().numpy()
         weight = low.parameter(c.operator, near=len(columns))
-    bent = low.program.temporary(low.vertices, 3, kept=c.operator is not None)
-    loop = low.loop(low.vertices)
-    parts = [low.parameter(c.stiffness), low.parameter(c.viscosity), low.x.now, low.v.now]
-    loop.put(loop.call("bent", *(loop.load(field) for field in parts)), bent)
-    low.program.stencil(columns, weight, bent, low.force, Shape.SYMMETRIC)
+
+    def straighten(kernel: str, inputs: Sequence[Field], force: Field) -> None:
+        bent = low.program.temporary(low.vertices, 3, kept=c.operator is not None)
+        loop = low.loop(low.vertices)
+        loop.put(loop.call(kernel, *(loop.load(field) for field in inputs)), bent)
+        low.program.stencil(columns, weight, bent, force, Shape.SYMMETRIC)
+
+    stiffness, viscosity = low.parameter(c.stiffness), low.parameter(c.viscosity)
+    if low.model.stages and effect.damping_time is not None:
+        straighten("scaled3", [stiffness, low.x.now], low.force)
+        low.viscous.append(lambda v, force: straighten("scaled3", [viscosity, v], force))
+    else:
+        straighten("bent", [stiffness, viscosity, low.x.now, low.v.now], low.force)
 
 
 def _rest_moment(sheet: Sheet, low: Lowering, c: Coefficients, rest: list[int]) -> None:

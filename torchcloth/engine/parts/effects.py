@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from ...effects import (
     AbstractEffect,
@@ -27,7 +28,9 @@ from ...effects import (
     ShearFriction,
 )
 from ...effects.residual import Coefficients as Residual
+from ..fields import Field
 from ..lowering import Lowering, Unfused
+from ..shared_loops import Triangles
 from . import bending
 
 
@@ -68,8 +71,25 @@ def _added_mass(low: Lowering, name: str, effect: AddedMass, c: Any) -> None:
 
 
 def _kelvin_voigt(low: Lowering, name: str, effect: KelvinVoigt, c: Any) -> None:
-    t = low.triangles
-    t.stress(t.loop.call("kelvin_voigt", t.surface[:6], *t.v, t.shape, t.parameter(c)))
+    _strain_rate(low, c)
+
+
+def _strain_rate(low: Lowering, viscosity: Tensor) -> None:
+    def resist(t: Triangles, columns: list[int]) -> None:
+        t.stress(t.loop.call("kelvin_voigt", columns, *t.v, t.shape, t.parameter(viscosity)))
+
+    columns = low.triangles.surface[:6]
+    if not low.model.stages:
+        return resist(low.triangles, columns)
+    strained = low.program.temporary(low.faces, 6)
+    low.triangles.loop.put(columns, strained)
+
+    def later(v: Field, force: Field) -> None:
+        triangles = Triangles(low, v, force)
+        resist(triangles, triangles.loop.load(strained))
+        triangles.close()
+
+    low.viscous.append(later)
 
 
 def _shear_friction(low: Lowering, name: str, effect: ShearFriction, c: Any) -> None:
@@ -87,7 +107,7 @@ def _residual(low: Lowering, name: str, effect: ResidualForce, c: Residual) -> N
         laws = [none if part is None else t.parameter(part) for part in c[:4]]
         t.push("local_drag", *t.x, *t.v, *laws, t.area)
     if c.strain_rate is not None:
-        t.stress(t.loop.call("kelvin_voigt", t.surface[:6], *t.v, t.shape, t.parameter(c.strain_rate)))
+        _strain_rate(low, c.strain_rate)
     if c.bend is not None:
         sheet = low.sheet(effect.sheet)
         sheet.moment(sheet.loop.call("scaled3", sheet.loop.load(low.parameter(c.bend)), sheet.curvature))

@@ -43,6 +43,37 @@ struct KickInAir {
     }
 };
 
+// dt, w_0, w_1, how often held, velocity, before, viscous force, own mass -> the next Chebyshev polynomial of velocities.
+// relaxation.py
+struct Stage {
+    static constexpr const char* name = "stage";
+    static constexpr int inputs = 14, outputs = 3;
+    static constexpr auto fixed = bits(0, 4);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T dt = r.number(), first = r.number(), slope = r.number(), held = r.number();
+        const auto v = r.vec(), before = r.vec(), force = r.vec();
+        const T mass = r.number(), share = select(less(held, 0.5), slope * dt, 0.0);
+        Write<T>{out}.vec(first * v + share * (force / mass) - before);
+    }
+};
+
+// The same in the air that moves along.
+struct StageInAir {
+    static constexpr const char* name = "stage_in_air";
+    static constexpr int inputs = 20, outputs = 3;
+    static constexpr auto fixed = bits(0, 4);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T dt = r.number(), first = r.number(), slope = r.number(), held = r.number();
+        const auto v = r.vec(), before = r.vec(), force = r.vec();
+        const T mass = r.number(), share = select(less(held, 0.5), slope * dt, 0.0);
+        Write<T>{out}.vec(first * v + share * resisted(r.symmetric(), mass, force / mass) - before);
+    }
+};
+
 // Mass of the air, own mass, change of velocity -> what the two were given. dynamics.py
 struct Loaded {
     static constexpr const char* name = "loaded";
@@ -107,6 +138,6 @@ struct CopyStress : Copied<15> { static constexpr const char* name = "copy15"; }
 
 }  // namespace
 
-TC_KERNELS(surface_kernels, Surface, Assemble, Kick, KickInAir, Loaded, Scaled, Plus, Drift, Copy, CopyStress)
+TC_KERNELS(surface_kernels, Surface, Assemble, Kick, KickInAir, Stage, StageInAir, Loaded, Scaled, Plus, Drift, Copy, CopyStress)
 
 }  // namespace tc

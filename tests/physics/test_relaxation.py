@@ -1,0 +1,130 @@
+"""Viscous forces in stages: the polynomial, its accuracy, its stability, and what it must leave as it is."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+import torchcloth as tc
+from torchcloth import functional
+from torchcloth.relaxation import MOST, PEAK, Polynomial
+from torchcloth.stability import Limits
+
+E = tc.effects
+
+
+@pytest.fixture(autouse=True)
+def _values_only():
+    with torch.no_grad():
+        yield
+
+
+def sheet(effects, n=7, boundaries=None):
+    mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(n, n))
+    return tc.Cloth(mesh, tc.materials.AEP(3e5, 0.3), 0.2, effects, boundaries, contact=None)
+
+
+def limits(cloth):
+    return cloth._limits(cloth.model())
+
+
+@pytest.mark.parametrize("stages", range(2, MOST + 1))
+def test_the_polynomial_is_between_nothing_and_half_where_it_damps_fast(stages):
+    first, slope = Polynomial.of(stages)
+    reach = Polynomial.of(stages).reach
+    z = np.linspace(0, reach, 4001)
+    values = (1 + np.polynomial.chebyshev.chebval(first - slope * z, [0] * stages + [1])) / (1 + PEAK)
+    assert values[0] == pytest.approx(1, abs=1e-12)
+    step = 1e-4
+    near = (1 + np.polynomial.chebyshev.chebval(first - slope * np.array([-step, step]), [0] * stages + [1])) / 4
+    assert (near[1] - near[0]) / (2 * step) == pytest.approx(-1, abs=1e-6)  # exp(-z) to first order
+    assert values.min() >= -1e-12
+    assert values[z > math.log(4)].max() <= 2 / (1 + PEAK) + 1e-9
+    assert 0.8 * stages**2 < reach < stages**2
+
+
+def test_one_step_is_the_polynomial_of_the_viscous_force():
+    """Against powers of the matrix, with air that moves along."""
+    cloth = sheet({"viscous": E.KelvinVoigt(1.0), "bending": E.Bending(1e-4, 0.05), "air": E.AddedMass(0.3)}, 4)
+    torch.manual_seed(0)
+    state = cloth.state(cloth.rest_state().x @ torch.linalg.qr(torch.randn(3, 3))[0], torch.randn(16, 3))
+    dt, stages = 1e-3, 5
+    still = state._replace(v=torch.zeros_like(state.v))
+
+    def after(begin, stages):
+        return functional.step(cloth.model()._replace(stages=stages), begin, dt, {}, 0)[0].v
+
+    pushed = after(still, 0)  # elastic forces alone
+    unit = torch.eye(48).reshape(48, 16, 3)
+    minus_D = torch.stack([after(still._replace(v=u), 0) - u - pushed for u in unit]).reshape(48, 48).T
+    first, slope = Polynomial.of(stages)
+    before, now = torch.eye(48), first * torch.eye(48) + slope * minus_D
+    for _ in range(stages - 1):
+        before, now = now, 2 * (first * now + slope * minus_D @ now) - before
+    expected = ((torch.eye(48) + now) / (1 + PEAK) @ state.v.flatten()).reshape(16, 3) + pushed
+    torch.testing.assert_close(after(state, stages), expected, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("effects", [
+    {"viscous": E.KelvinVoigt(3.0)},
+    {"bending": E.Bending(1e-3, 0.3)},
+    {"viscous": E.KelvinVoigt(0.3), "bending": E.Bending(1e-4, 0.3), "damping": E.MassDamping(3.0)},
+], ids=["membrane", "bending", "both"])  # fmt: skip
+def test_the_stable_step_is_stable_and_loses_energy_only(effects):
+    cloth = sheet(effects)
+    found = limits(cloth)
+    assert found.stages(found.step) > 0
+    torch.manual_seed(0)
+    state = cloth.state(cloth.rest_state().x, 0.05 * torch.randn(49, 3))
+    out = cloth(state, times=torch.linspace(0, 2000 * found.step, 21))
+    energies = cloth.energy(tc.ClothState(out.x, out.v, out.x[..., :0, :]))
+    total = energies["kinetic"] + energies["membrane"]
+    assert (total[1:] < 1.01 * total[:-1]).all()
+
+
+def swung(cloth):
+    """By an edge, to and fro by 0.1 m: (motion, frame times)."""
+    t = torch.linspace(0, 0.3, 5)
+    pose = torch.eye(4).repeat(5, 1, 1)
+    pose[:, 0, 3] = 0.1 * torch.sin(2 * math.pi * t / 0.3)
+    return {"hand": tc.Trajectory(t, pose, torch.ones(5, dtype=bool))}, t
+
+
+@pytest.mark.parametrize("viscosity", [1.0, 3.0])
+def test_a_sheet_in_a_hand_moves_as_it_does_with_short_steps(viscosity):
+    """To first order in the step, 0.17 mm off; three times that if the vertices in the hand yielded to the stages."""
+    effects = {"viscous": E.KelvinVoigt(viscosity), "gravity": E.Gravity()}
+    cloth = sheet(effects, boundaries={"hand": tc.boundaries.Grasp(range(7))})
+    motion, t = swung(cloth)
+    found = limits(cloth)
+    exact = cloth(cloth.rest_state(), motion, t, dt=found.longest(0) / 8).x
+    steps = [found.step / 2**k for k in range(3)]
+    assert found.step > 5 * found.longest(0)
+    assert all(found.stages(dt) > 0 for dt in steps)
+    errors = [float((cloth(cloth.rest_state(), motion, t, dt=dt).x - exact).square().mean().sqrt()) for dt in steps]
+    assert errors[0] < 2.5e-4
+    assert errors[0] > 1.5 * errors[1] > 1.5**2 * errors[2]
+
+
+def test_no_stages_where_nothing_is_viscous_or_the_step_is_short():
+    plain = sheet({"gravity": E.Gravity(), "damping": E.MassDamping(1.0)})
+    assert limits(plain).stages(limits(plain).step) == 0
+    thick = limits(sheet({"viscous": E.KelvinVoigt(1.0)}))
+    assert thick.stages(thick.step) > thick.stages(0.5 * thick.step) > thick.stages(thick.longest(0)) == 0
+
+
+def test_the_step_costs_as_the_root_of_the_viscosity():
+    rates = [1e4, 4e4, 16e4, 64e4]
+    found = [Limits(1e7, 0.0, rate) for rate in rates]
+    assert [f.stages(f.step) for f in found] == sorted(f.stages(f.step) for f in found)
+    cost = [f.stages(f.step) / f.step for f in found]
+    assert all(later < 2.6 * before for before, later in pairwise(cost))
+    assert found[-1].step > 20 * found[-1].longest(0)
+
+
+def test_the_usual_material_point_method_knows_no_stages():
+    mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(4, 4))
+    cloth = tc.Cloth(mesh, tc.materials.AEP(3e5, 0.3), 0.2, {"viscous": E.KelvinVoigt(3.0)}, transfer="apic")
+    assert cloth.stable_step() == limits(cloth).longest(0)
