@@ -332,6 +332,11 @@ class NeverOpens(tc.boundaries.Grasp):
         return super().apply(x, v, dt, drive._replace(closed=(True,) * len(drive.closed)), substep)
 
 
+class KeepsQuiet(tc.boundaries.Grasp):
+    def held(self, drive, substep):
+        return None
+
+
 class Undriven(tc.boundaries.Grasp):
     driven = False
 
@@ -341,6 +346,7 @@ class Undriven(tc.boundaries.Grasp):
     [
         (Drifts, "test_held_vertices_follow_the_pose_exactly"),
         (NeverOpens, "test_an_open_gripper_lets_go"),
+        (KeepsQuiet, "test_says_what_it_holds"),
         (Undriven, "test_is_driven"),
     ],
 )

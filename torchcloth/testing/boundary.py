@@ -169,6 +169,13 @@ class GraspContract(BoundaryContract):
         expected = (start - pose[0, :3, 3]) @ turn.mT + pose[-1, :3, 3]
         close(x[held], expected, 1e-12, "held vertices do not follow the pose")
 
+    def test_says_what_it_holds(self) -> None:
+        """While it is closed, and nothing while it is open."""
+        boundary, pose = self._boundary(), self._pose()
+        index = boundary.held(self._drive(pose), 0)
+        demand(index is not None and sorted(index.tolist()) == sorted(self.held()), "held() names other vertices")
+        demand(boundary.held(self._drive(pose, False), 0) is None, "an open gripper says that it holds")
+
     def test_an_open_gripper_lets_go(self) -> None:
         """Velocities pass untouched."""
         x, v = self.sample()
