@@ -21,7 +21,7 @@ from .meshes import Mesh
 from .model import Geometry, Model, vertex_mass
 from .parameters import PhysicalParameter
 from .sensitivities import Directions, sensitivities
-from .stability import Limits, limits_of
+from .stability import limits_of
 from .strain import inverse_growth
 from .transfer import Contact, Grid
 from .types import ClothState, Rollout, Trajectory
@@ -124,9 +124,7 @@ class Cloth(nn.Module):
     def engine_in_use(self) -> str:
         """What computes the substeps: "fused", "fused, with effects.NAME in torch", or "reference (and why)"."""
         with torch.no_grad():
-            model = self.model()
-            limits = self._limits(model)
-            model = model._replace(stages=limits.stages(limits.step))
+            model, _ = self._stepping()
             return str(self._choice(model, likeness(model, self._vertices)))
 
     # -- states ---------------------------------------------------------------------------------------------------
@@ -223,7 +221,7 @@ class Cloth(nn.Module):
 
     def stable_step(self) -> float:
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
-        return self._limits(self.model()).step
+        return self._stepping()[1]
 
     def model(self) -> Model:
         """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
@@ -256,12 +254,10 @@ class Cloth(nn.Module):
         """What ``forward`` does, checked."""
         frames = check_times(times)
         motion = check_motions(motion, self.boundaries, frames, self._area)
-        model = self.model()
-        limits = self._limits(model)
-        limit = check_step(dt, limits.step)
+        model, limit = self._stepping(dt)
         check_substeps(frames[-1] - frames[0], limit, dt)
         counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
-        return self._ready(model._replace(stages=limits.stages(limit)), state, motion, frames, counts)
+        return self._ready(model, state, motion, frames, counts)
 
     def settling(
         self, state: ClothState, motion: Mapping[str, Trajectory], start: float, duration: float, rate: float
@@ -269,11 +265,10 @@ class Cloth(nn.Module):
         """What ``settle`` does, checked."""
         frames = [start, start + duration]
         motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
-        model = self.model()
-        limits = self._limits(model)
-        check_substeps(duration, limits.step)
-        count = int(np.ceil(duration * (1 / limits.step + rate)))
-        return self._ready(model._replace(stages=limits.stages(limits.step)), state, motion, frames, [count], rate)
+        model, step = self._stepping()
+        check_substeps(duration, step)
+        count = int(np.ceil(duration * (1 / step + rate)))
+        return self._ready(model, state, motion, frames, [count], rate)
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
@@ -284,12 +279,12 @@ class Cloth(nn.Module):
         """The contact grid; None without contact."""
         return None if self._grid is None else self._grid._replace(points=self._points, apart=self._apart)
 
-    def _limits(self, model: Model) -> Limits:
-        """What bounds the substep; the usual material point method knows no stages."""
+    def _stepping(self, dt: float | None = None) -> tuple[Model, float]:
+        """The parts, with the stages that the step needs, and the step [s]: the stable one, or the user's."""
+        model = self.model()
         limits = limits_of(model, self._gradient)
-        if self.transfer == "mesh":
-            return limits
-        return limits._replace(damping=limits.damping + limits.viscous, viscous=0.0)
+        step = check_step(dt, limits.step)
+        return model._replace(stages=limits.stages(step)), step
 
     def _ready(
         self,

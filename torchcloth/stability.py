@@ -42,10 +42,10 @@ class Limits(NamedTuple):
         return max((self.longest(n) / (1 + STAGE * n), self.longest(n)) for n in self._stages())[1]
 
     def stages(self, dt: float) -> int:
-        """Fewest with which ``dt`` [s], of at most ``step``, is stable."""
-        return next(n for n in self._stages() if dt <= self.longest(n) * (1 + 1e-9))
+        """Fewest with which ``dt`` [s], of at most ``step``, is stable; 0 for a step that overflowed."""
+        return next((n for n in self._stages() if dt <= self.longest(n) * (1 + 1e-9)), 0)
 
-    def _stages(self) -> range | list[int]:
+    def _stages(self) -> list[int]:
         return [0, *range(2, MOST + 1)] if self.viscous > 0 else [0]
 
 
@@ -65,7 +65,8 @@ def limits_of(model: Model, gradient: Tensor) -> Limits:
     spacing = None if model.grid is None else model.grid.spacing
     extra = [effect.rates(c, model.mass) for effect, c in model.effects.values()]
     elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
-    viscous = sum(float(effect.viscous_rate(c, model.mass)) for effect, c in model.effects.values())
+    staged = model.effects.values() if model.transfer == "mesh" else ()
+    viscous = sum(float(effect.viscous_rate(c, model.mass)) for effect, c in staged)
     stiffness = model.material.stiffness(model.coefficients)
     numbers = (*stiffness, model.areal_density, *([] if model.rest is None else [model.rest]))
     hangs_on = (gradient._version, spacing, *((t.dtype, t.detach().tolist()) for t in numbers))
@@ -108,7 +109,7 @@ def squared_frequency(gradient: Tensor, density: Tensor, stiffness: Stiffness, s
     if spacing is not None:
         grid = 4 * torch.maximum(stiffness.normal, stiffness.shear) / spacing**2
         squared = torch.maximum(squared, (grid + 3 * stiffness.shear * steepest) / density)
-    return float(squared.max())
+    return float(squared.detach().max())
 
 
 def _root(stiffness: Stiffness) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 import torchcloth as tc
 from torchcloth import functional
 from torchcloth.relaxation import MOST, PEAK, Polynomial
-from torchcloth.stability import Limits
+from torchcloth.stability import Limits, limits_of
 
 E = tc.effects
 
@@ -27,7 +27,7 @@ def sheet(effects, n=7, boundaries=None):
 
 
 def limits(cloth):
-    return cloth._limits(cloth.model())
+    return limits_of(cloth.model(), cloth._gradient)
 
 
 @pytest.mark.parametrize("stages", range(2, MOST + 1))
@@ -38,7 +38,9 @@ def test_the_polynomial_is_between_nothing_and_half_where_it_damps_fast(stages):
     values = (1 + np.polynomial.chebyshev.chebval(first - slope * z, [0] * stages + [1])) / (1 + PEAK)
     assert values[0] == pytest.approx(1, abs=1e-12)
     step = 1e-4
-    near = (1 + np.polynomial.chebyshev.chebval(first - slope * np.array([-step, step]), [0] * stages + [1])) / 4
+    near = (1 + np.polynomial.chebyshev.chebval(first - slope * np.array([-step, step]), [0] * stages + [1])) / (
+        1 + PEAK
+    )
     assert (near[1] - near[0]) / (2 * step) == pytest.approx(-1, abs=1e-6)  # exp(-z) to first order
     assert values.min() >= -1e-12
     assert values[z > math.log(4)].max() <= 2 / (1 + PEAK) + 1e-9
@@ -122,6 +124,13 @@ def test_the_step_costs_as_the_root_of_the_viscosity():
     cost = [f.stages(f.step) / f.step for f in found]
     assert all(later < 2.6 * before for before, later in pairwise(cost))
     assert found[-1].step > 20 * found[-1].longest(0)
+
+
+def test_a_step_that_overflows_is_told():
+    cloth = sheet({"viscous": E.KelvinVoigt(1e307)})
+    assert "stable step" in str(cloth)
+    with pytest.raises(tc.errors.UnstableStep, match="substep"):
+        cloth(cloth.rest_state(), times=[0.0, 0.1])
 
 
 def test_the_usual_material_point_method_knows_no_stages():

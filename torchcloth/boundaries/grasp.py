@@ -98,7 +98,7 @@ class Grasp(AbstractBoundary):
 
     def apply(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
         """Held vertices arrive exactly where the body carries them."""
-        if drive is None or not drive.closed[substep]:
+        if drive is None or self.held(drive, substep) is None:
             return v
         motion = drive.increment[..., substep, :, :]
         held = x.index_select(-2, self.index)

@@ -192,15 +192,10 @@ def _part(name: str, lower: Callable[[], None]) -> None:
 def _kick(low: Lowering) -> Velocities:
     from .parts.relaxation import relaxed
 
-    loop, v = relaxed(low) if low.viscous else _as_they_are(low)
+    loop, v = relaxed(low)
     dt, force, mass = (loop.load(field) for field in (low.dt, low.force, low.mass))
     for kernel, fields in low.pulls:
         loop.call(kernel, *(loop.load(field) for field in fields), into=force)
     if low.resistance is None:
         return Velocities(low, loop, loop.call("kick", dt, v, force, mass))
     return Velocities(low, loop, loop.call("kick_in_air", dt, v, force, mass, loop.load(low.resistance)))
-
-
-def _as_they_are(low: Lowering) -> tuple[Loop, list[int]]:
-    loop = low.loop(low.vertices)
-    return loop, loop.load(low.v.now)

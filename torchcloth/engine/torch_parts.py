@@ -70,9 +70,8 @@ def _obstacle(model: Model, part: str) -> str | None:
     if part == MATERIAL:
         return None if model.grid is None else "whose directors meet other layers"
     effect = type(model.effects[part.removeprefix("effects.")][0])
-    if model.stages and effect.viscous is not AbstractEffect.viscous:
-        return "which is viscous in stages"
-    for hook, what in (("inertia", "adds inertia"), ("loosen", "loosens a grasp")):
+    hooks = {"inertia": "adds inertia", "loosen": "loosens a grasp"}
+    for hook, what in (hooks | ({"viscous": "is viscous in stages"} if model.stages else {})).items():
         if getattr(effect, hook) is not getattr(AbstractEffect, hook):
             return f"which {what}"
     return None

@@ -182,14 +182,10 @@ class EffectContract(Contract):
         """A stiff or strongly damping effect must say so, or the step that the layer chooses is not stable."""
         effect = self._effect()
         mass = self._cloth({}).model().mass.detach()
-        x = torch.as_tensor(self.mesh().vertices)
-        still = torch.zeros_like(x)
-        root = mass.sqrt().expand_as(x).reshape(-1)
         bounds = effect.rates(effect.coefficients(), mass)
         pairs = zip(("omega^2", "damping rate"), bounds, (self._stiffness, self._damping), strict=True)
         for name, bound, jacobian in pairs:
-            matrix = -jacobian(effect, x, still).reshape(len(root), -1) / root[:, None] / root
-            largest = float(torch.linalg.eigvals(matrix).real.max())
+            largest = float(torch.linalg.eigvals(self._rates(effect, jacobian)).real.max())
             allowed = float(bound.detach()) * (1 + 1e-9) + 1e-9
             demand(largest <= allowed, f"rates() bounds the {name} by {allowed:.4g}, it is {largest:.4g}")
 
@@ -199,26 +195,30 @@ class EffectContract(Contract):
         x, v = state["x"], state["v"]
         once, twice = (self._viscous(effect, x, factor * v).detach() for factor in (1.0, 2.0))
         close(twice, 2 * once, 1e-12, "viscous() is not linear in velocity")
-        mass = self._cloth({}).model().mass.detach()
-        root = mass.sqrt().expand_as(x).reshape(-1)
-        c = effect.coefficients()
+        mass, c = self._cloth({}).model().mass.detach(), effect.coefficients()
         whole, rate = (float(value.detach()) for value in (effect.rates(c, mass)[1], effect.viscous_rate(c, mass)))
-        rest = torch.as_tensor(self.mesh().vertices)
-        found = -torch.autograd.functional.jacobian(lambda moved: self._viscous(effect, rest, moved), rest * 0)  # type: ignore[operator]
-        matrix = found.reshape(len(root), -1) / root[:, None] / root
+        matrix = self._rates(effect, self._thickness)
         close(matrix, matrix.mT, 1e-9, "viscous() is not symmetric")
         slowest, fastest = torch.linalg.eigvalsh(matrix)[[0, -1]].tolist()
         demand(slowest >= -1e-9 * max(1.0, fastest), "viscous() drives some motion")
         demand(fastest <= rate * (1 + 1e-9) + 1e-9, f"viscous_rate() says {rate:.4g}, it is {fastest:.4g}")
-        left = self._damping(effect, rest, rest * 0).reshape(len(root), -1) / root[:, None] / root + matrix
-        largest = float(torch.linalg.eigvals(-left).real.max())
+        largest = float(torch.linalg.eigvals(self._rates(effect, self._damping) - matrix).real.max())
         demand(largest <= whole * (1 + 1e-9) - rate + 1e-9, "rates() must bound what is not viscous by the difference")
+
+    def _rates(self, effect: AbstractEffect, jacobian: Callable[..., Tensor]) -> Tensor:
+        """Minus a force's derivative at rest, over the roots of the masses on both sides."""
+        x = torch.as_tensor(self.mesh().vertices)
+        root = self._cloth({}).model().mass.detach().sqrt().expand_as(x).reshape(-1)
+        return -jacobian(effect, x, torch.zeros_like(x)).reshape(len(root), -1) / root[:, None] / root
 
     def _stiffness(self, effect: AbstractEffect, x: Tensor, v: Tensor) -> Tensor:
         return torch.autograd.functional.jacobian(lambda moved: self._on_vertices(effect, moved, v), x)  # type: ignore[return-value]
 
     def _damping(self, effect: AbstractEffect, x: Tensor, v: Tensor) -> Tensor:
         return torch.autograd.functional.jacobian(lambda moved: self._on_vertices(effect, x, moved), v)  # type: ignore[return-value]
+
+    def _thickness(self, effect: AbstractEffect, x: Tensor, v: Tensor) -> Tensor:
+        return torch.autograd.functional.jacobian(lambda moved: self._viscous(effect, x, moved), v)  # type: ignore[return-value]
 
     def test_batches_equal_loops(self) -> None:
         """Batched states and parameters give what a loop gives."""

@@ -11,6 +11,9 @@ from ..lowering import Lowering
 
 def relaxed(low: Lowering) -> tuple[Loop, list[int]]:
     """A loop over the vertices, and in it their velocities after what the parts put into ``low.viscous``."""
+    if not low.viscous:
+        loop = low.loop(low.vertices)
+        return loop, loop.load(low.v.now)
     first, slope = Polynomial.of(low.model.stages)
     before, now, held = low.program.constant([[0.0, 0.0, 0.0]]), low.v.now, _held(low)
     loop, after = _stage(low, before, now, (first, slope), held)

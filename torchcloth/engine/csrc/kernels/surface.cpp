@@ -5,21 +5,6 @@
 namespace tc {
 namespace {
 
-// dt, velocity, force, mass -> velocity free of the boundaries.
-struct Kick {
-    static constexpr const char* name = "kick";
-    static constexpr int inputs = 8, outputs = 3;
-    static constexpr auto fixed = bits(0, 1);
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const T dt = r.number();
-        const auto v = r.vec(), force = r.vec();
-        const T mass = r.number();
-        Write<T>{out}.vec(v + dt * (force / mass));
-    }
-};
-
 // What is left of a change of velocity in the air that moves along, so written that no air changes nothing, bitwise.
 // dynamics.py
 template <class T>
@@ -27,52 +12,48 @@ constexpr Vec<T> resisted(Symmetric<T> air, T mass, Vec<T> change) {
     const auto b = air / mass;
     return change - solve(Symmetric<T>{b.xx + 1.0, b.xy, b.xz, b.yy + 1.0, b.yz, b.zz + 1.0}, b * change);
 }
+// Force, own mass, mass of the air if there is any -> change of velocity in unit time.
+template <bool AIR, class T>
+constexpr Vec<T> accelerated(Read<T>& r) {
+    const auto force = r.vec();
+    const T mass = r.number();
+    if constexpr (AIR) return resisted(r.symmetric(), mass, force / mass);
+    else return force / mass;
+}
 
-// dt, velocity, force, own mass, mass of the air -> velocity free of the boundaries.
-struct KickInAir {
-    static constexpr const char* name = "kick_in_air";
-    static constexpr int inputs = 14, outputs = 3;
+// dt, velocity, force, mass(es) -> velocity free of the boundaries.
+template <bool AIR>
+struct Kicked {
+    static constexpr int inputs = AIR ? 14 : 8, outputs = 3;
     static constexpr auto fixed = bits(0, 1);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
         const T dt = r.number();
-        const auto v = r.vec(), force = r.vec();
-        const T mass = r.number();
-        Write<T>{out}.vec(v + dt * resisted(r.symmetric(), mass, force / mass));
+        const auto v = r.vec();
+        Write<T>{out}.vec(v + dt * accelerated<AIR>(r));
     }
 };
+struct Kick : Kicked<false> { static constexpr const char* name = "kick"; };
+struct KickInAir : Kicked<true> { static constexpr const char* name = "kick_in_air"; };
 
-// dt, w_0, w_1, how often held, velocity, before, viscous force, own mass -> the next Chebyshev polynomial of velocities.
+// dt, w_0, w_1, how often held, velocity, before, viscous force, mass(es) -> the next Chebyshev polynomial of velocities.
 // relaxation.py
-struct Stage {
-    static constexpr const char* name = "stage";
-    static constexpr int inputs = 14, outputs = 3;
+template <bool AIR>
+struct Staged {
+    static constexpr int inputs = AIR ? 20 : 14, outputs = 3;
     static constexpr auto fixed = bits(0, 4);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
         const T dt = r.number(), first = r.number(), slope = r.number(), held = r.number();
-        const auto v = r.vec(), before = r.vec(), force = r.vec();
-        const T mass = r.number(), share = select(less(held, 0.5), slope * dt, 0.0);
-        Write<T>{out}.vec(first * v + share * (force / mass) - before);
+        const auto v = r.vec(), before = r.vec();
+        const T share = select(less(held, 0.5), slope * dt, 0.0);
+        Write<T>{out}.vec(first * v + share * accelerated<AIR>(r) - before);
     }
 };
-
-// The same in the air that moves along.
-struct StageInAir {
-    static constexpr const char* name = "stage_in_air";
-    static constexpr int inputs = 20, outputs = 3;
-    static constexpr auto fixed = bits(0, 4);
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const T dt = r.number(), first = r.number(), slope = r.number(), held = r.number();
-        const auto v = r.vec(), before = r.vec(), force = r.vec();
-        const T mass = r.number(), share = select(less(held, 0.5), slope * dt, 0.0);
-        Write<T>{out}.vec(first * v + share * resisted(r.symmetric(), mass, force / mass) - before);
-    }
-};
+struct Stage : Staged<false> { static constexpr const char* name = "stage"; };
+struct StageInAir : Staged<true> { static constexpr const char* name = "stage_in_air"; };
 
 // Mass of the air, own mass, change of velocity -> what the two were given. dynamics.py
 struct Loaded {
