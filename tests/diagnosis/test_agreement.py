@@ -9,6 +9,7 @@ import torch
 from scipy.stats import t
 
 from torchcloth.diagnosis.comparison import Gain, spread
+from torchcloth.diagnosis.screening import Row
 from torchcloth.diagnosis.trials import NORMAL, SURE, SURE_OF_BEST, TRIED, Candidate, _ranked, known, standard_errors
 from torchcloth.diagnosis.verdict import _parameters
 from torchcloth.diagnosis.world import Model
@@ -54,12 +55,25 @@ def test_of_those_that_predict_alike_the_one_that_mends_most_comes_first():
 @pytest.mark.parametrize(("asked", "agreed"), [(0.1, True), (-0.5, False)])
 def test_motions_that_all_take_a_cause_away_do_not_agree_that_it_is_there(asked, agreed):
     """At zero, where an amplitude without a sign ends, they differ by nothing at all."""
+    tried = candidate(asked, numerics=0.0)
+    assert known(tried.fitted, "cause", list("abcd"), tried) == agreed
+
+
+@pytest.mark.parametrize(("numerics", "agreed"), [(0.02, True), (-0.02, True), (0.5, False), (-0.5, False)])
+def test_what_another_mesh_would_ask_for_is_no_cause(numerics, agreed):
+    """Motions agree about what the same mesh does to all of them."""
+    tried = candidate(0.1, numerics)
+    assert known(tried.fitted, "cause", list("abcd"), tried) == agreed
+
+
+def candidate(asked, numerics):
+    """A cause in the model of four motions that ask for so much of it, of which numerics alone would ask for a part."""
     ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.tensor([0.0, asked]).double(), 0)
     there = toys.fitted(ev)
     cause = replace(toys.hypothesis("cause"), signed=False)
     model = Model(None, there.model.parameters[:1], torch.zeros(1).double(), (cause,), (0.3,))  # type: ignore[arg-type]
-    tried = Candidate(None, replace(there, model=model), None, None, set(), 2.57)  # type: ignore[arg-type]
-    assert known(tried.fitted, "cause", list("abcd"), tried) == agreed
+    row = Row(cause, asked, 0.01, numerics, 0.0, 0.0, 0.0, asked, 0.0, "present")
+    return Candidate(row, replace(there, model=model), None, None, set(), 2.57)  # type: ignore[arg-type]
 
 
 def test_a_numbers_interval_knows_of_what_motions_disagree_by():

@@ -73,23 +73,49 @@ def test_where_meshes_fold_apart_nothing_is_judged():
     assert not any(row.stable or row.lacking for row in rows)
 
 
+def row(motion, left, expected=1e-3, kind="points", unit="m", stable=True, stretches=8):
+    """As much left in each of some stretches of time."""
+    shares = {w: (left**2 / stretches, expected**2 / stretches) for w in range(stretches)}
+    return Left(motion, kind, unit, left, expected, 0.0, 50.0, 0.0, stable, shares)
+
+
 def test_what_is_explained_is_counted_beyond_what_a_right_model_leaves():
     def rows(left, stable=True):
-        return [Left("swing", "points", "m", left, 1e-3, 0.0, 50.0, 0.0, stable), row("force", 9.0)]
+        return [row("swing", left, stable=stable), row("swing", 9.0, 1e-2, "force", "N")]
 
-    row = lambda kind, left: Left("swing", kind, "N", left, 1e-2, 0.0, 50.0, 0.0, True)  # noqa: E731
     assert explained(rows(5e-3), rows(1e-3)) == pytest.approx(1.0)  # forces are no part of it
     assert explained(rows(5e-3), rows(13**0.5 * 1e-3)) == pytest.approx(0.5)
     assert explained(rows(5e-3), rows(7e-3)) < 0
     assert explained(rows(0.9e-3), rows(0.8e-3)) == 1.0  # nothing was wrong
     assert explained(rows(5e-3, False), rows(1e-3, False)) == 1.0  # nothing can be said
-    other = [Left("hang", "points", "m", 2e-3, 1e-3, 0.0, 50.0, 0.0, True)]
-    better = [other[0]._replace(left=1e-3)]
+    other, better = [row("hang", 2e-3)], [row("hang", 1e-3)]
     assert explained(rows(9e-3, False) + other, rows(5e-3) + better) == pytest.approx(1.0)  # of what both can judge
     assert explained(rows(9e-3) + other, rows(5e-3, False) + better) == pytest.approx(1.0)
-    calm = [Left("hang", "points", "m", 1e-3, 9e-3, 0.0, 50.0, 0.0, True)]
+    calm = [row("hang", 1e-3, 9e-3)]
     assert explained(rows(5e-3) + calm, rows(13**0.5 * 1e-3) + calm) == pytest.approx(0.5)  # calm makes up for nothing
     assert explained(calm, calm + rows(5e-3)) == 0.0
+
+
+def snapped(found, at, stretches=8):
+    """A row of which one stretch is 20 mm off."""
+    (left, expected), off = found.stretches[at], 4e-4 / stretches
+    more = {**found.stretches, at: (off, expected)}
+    return found._replace(left=(found.left**2 - left + off) ** 0.5, stretches=more)
+
+
+def test_a_stretch_in_which_cloth_snaps_to_another_side_counts_for_nothing():
+    before, after = row("swing", 2e-3), row("swing", 1e-3)
+    assert explained([snapped(before, 7)], [snapped(after, 7)]) == pytest.approx(1.0)
+    assert explained([before], [snapped(after, 7)]) == pytest.approx(1.0)
+    few = [row("swing", left, stretches=3) for left in (2e-3, 1e-3)]
+    assert explained([snapped(few[0], 2, 3)], [snapped(few[1], 2, 3)]) < 0.1  # of so few, none is left out
+
+
+def test_the_worst_stretch_is_told_and_what_the_others_leave():
+    told = snapped(row("swing", 1.5e-3), 7).as_dict()
+    assert told["worst"] == pytest.approx({"from": 1.4, "to": 1.6, "ratio_elsewhere": 1.5})
+    assert told["ratio"] > 7
+    assert row("swing", 1e-3, stretches=3).as_dict()["worst"] is None
 
 
 @pytest.mark.parametrize(
@@ -99,9 +125,9 @@ def test_what_is_explained_is_counted_beyond_what_a_right_model_leaves():
 def test_motions_that_fit_are_asked_about_causes_where_others_do_not(monkeypatch, lacking, gains, said):
     """Where none fits, none is asked; a motion that is out of order has no vote."""
     asked = []
-    row = lambda motion: Left(motion, "points", "m", 1.0 + 9 * (motion in lacking), 1.0, 0.0, 50.0, 0.0, True)  # noqa: E731
     end = SimpleNamespace(noise=None, evidence=None)
-    monkeypatch.setattr(doubts, "lack_of_fit", lambda _, names: [row(name) for name in names])
+    rows = [row(name, 10.0 if name in lacking else 1.0, 1.0) for name in ("a", "b", "a")]
+    monkeypatch.setattr(doubts, "lack_of_fit", lambda *_: rows)
     monkeypatch.setattr(doubts, "renoised", lambda found, *_: found)
     monkeypatch.setattr(doubts, "predict", lambda found, names, alone: (found, sorted(alone)))
     monkeypatch.setattr(doubts, "of_episodes", lambda p, which: asked.append((p[1], which)))

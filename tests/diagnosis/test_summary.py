@@ -35,3 +35,13 @@ def test_a_law_is_told_though_nothing_else_is_lacking():
     assert any("opposes bending, far from the edges (0.00026 N m)" in line for line in said)
     assert any("1.28 to 0.71 mm" in line for line in said)
     assert not any(line.startswith("Lacking") for line in said)
+
+
+def test_what_lacks_in_one_stretch_of_time_only_is_said_to():
+    def told(elsewhere):
+        worst = {"from": 1.4, "to": 1.6, "ratio_elsewhere": elsewhere}
+        row = {"motion": "swing", "kind": "points", "ratio": 6.5, "lacking": True, "worst": worst}
+        return summary("unexplained", lack_of_fit=[row], drifts=[], missing_force=None, residual=None)
+
+    assert "Lacking: points of swing (6.5 times what is expected, 1.2 but for 1.4 to 1.6 s)." in told(1.2)
+    assert "Lacking: points of swing (6.5 times what is expected)." in told(4.0)

@@ -7,17 +7,20 @@ mean square is held against the one to be expected, tr(S K^-1 S) / n, for every 
 model the quotient follows a chi^2 with the effective number of cells for degrees of freedom (Satterthwaite 1946), which
 says what cannot be chance. Two engines never agree exactly, so what counts as a lack of fit must also be ``TOLERATED``
 times as large as expected. Where both meshes fold the cloth in different ways nothing can be judged.
+
+Cloth that snaps to another side is centimetres off from then on, and no cause makes or mends that: of what is wrong in
+a motion, the worst stretch of time counts for nothing where causes are asked how much of it they explain.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from .cells import NAMES, SEEN, Cells
+from .cells import NAMES, SEEN, STRETCH, Cells
 from .fitting import Fitted
 from .noise import Noise
 from .screening import NUMERICS
@@ -26,6 +29,7 @@ SENSOR = {"points": 5e-4, "edges": 8e-4, "markers": 3e-4, "force": 1e-2, "torque
 TOLERATED = 2.25  # times the expected RMS
 FOLDED = 3e-3  # m, that the finer mesh leaves of the difference: both meshes fold the cloth in different ways
 RARE = 0.01  # probability of a right model's leaving more
+FEW = 4  # stretches of time, of fewer none is left out
 
 
 class Left(NamedTuple):
@@ -40,6 +44,7 @@ class Left(NamedTuple):
     cells: float  # effective number of independent ones
     p: float  # of a right model's leaving as much
     stable: bool  # both meshes agree about the motion
+    stretches: Mapping[int, tuple[float, float]]  # of time: shares of left^2 and expected^2, by window
 
     @property
     def ratio(self) -> float:
@@ -51,9 +56,28 @@ class Left(NamedTuple):
         """More than a right model would leave."""
         return self.stable and self.ratio > TOLERATED and self.p < RARE
 
+    @property
+    def worst(self) -> int | None:
+        """The stretch in which most is left beyond what is expected; None of few."""
+        beyond = {window: left - expected for window, (left, expected) in self.stretches.items()}
+        return max(beyond, key=lambda w: beyond[w]) if len(beyond) >= FEW else None
+
+    def rest(self, but: Collection[int | None]) -> tuple[float, float]:
+        """Shares of ``left`` and ``expected``, squared, of all stretches but some."""
+        left, expected = zip((0.0, 0.0), *(share for w, share in self.stretches.items() if w not in but), strict=True)
+        return sum(left), sum(expected)
+
     def as_dict(self) -> dict[str, Any]:
         """As diagnosis.json has it."""
-        return {**self._asdict(), "ratio": self.ratio, "lacking": self.lacking}
+        row = {key: value for key, value in self._asdict().items() if key != "stretches"}
+        return {**row, "ratio": self.ratio, "lacking": self.lacking, "worst": self._worst()}
+
+    def _worst(self) -> dict[str, float] | None:
+        if self.worst is None:
+            return None
+        left, expected = self.rest([self.worst])
+        start, end = self.worst * STRETCH, (self.worst + 1) * STRETCH
+        return {"from": start, "to": end, "ratio_elsewhere": (left / expected) ** 0.5}
 
 
 def lack_of_fit(found: Fitted, names: Sequence[str]) -> list[Left]:
@@ -66,11 +90,16 @@ def explained(before: Sequence[Left], after: Sequence[Left]) -> float:
 
     Motions in which less is left than that make up for none in which it is more. Where both meshes do not agree, before
     or after, nothing is counted on either side: what vacuum folds away would come back as if a cause had brought it.
+    Nor is the stretch of each motion that is the worst after.
     """
     folded = {(row.motion, row.kind) for row in (*before, *after) if not row.stable}
-    over = lambda rows: sum(  # noqa: E731
-        max(0.0, r.left**2 - r.expected**2) for r in rows if r.unit == "m" and (r.motion, r.kind) not in folded
-    )
+    worst = {(row.motion, row.kind): row.worst for row in after}
+
+    def over(rows: Sequence[Left]) -> float:
+        judged = [r for r in rows if r.unit == "m" and (r.motion, r.kind) not in folded]
+        rests = [r.rest([worst.get((r.motion, r.kind))]) for r in judged]
+        return sum(max(0.0, left - expected) for left, expected in rests)
+
     first, last = over(before), over(after)
     return 1.0 - last / first if first > 0 else float(last == 0)
 
@@ -89,6 +118,11 @@ def _episode(found: Fitted, k: int, name: str) -> list[Left]:
         count, total, squares = int(here.sum()), float(own.trace()), float(own.square().sum())
         freedom = total**2 / squares
         seen = float(left[here].square().sum())
+        when = {
+            w: (float(left[now].square().sum()) / count, float(covariance.diagonal()[now].sum()) / count)
+            for w in cells.window[here].unique().tolist()
+            for now in [here & (cells.window == w)]
+        }
         rows.append(
             Left(
                 name,
@@ -100,6 +134,7 @@ def _episode(found: Fitted, k: int, name: str) -> list[Left]:
                 freedom,
                 float(torch.special.gammaincc(torch.tensor(freedom / 2), torch.tensor(freedom * seen / total / 2))),
                 stable,
+                when,
             )
         )
     return rows

@@ -215,11 +215,12 @@ def _useful(c: Candidate, names: Sequence[str]) -> bool:
 
 
 def known(found: Fitted, name: str, names: Sequence[str], c: Candidate) -> bool:
-    """Of a size that makes sense, and that motions agree about so far that there is something."""
+    """Of a size that makes sense and that numerics do not ask for, and motions agree so far that there is something."""
     place = found.model.place(name)
     middle, std = (float(v[len(found.model.parameters) + place]) for v in spread(found, names, c.alone))
     largest = PLAUSIBLE * abs(found.model.accepted[place].typical)
-    return c.sure * std < abs(middle) and abs(found.model.amplitudes[place]) < largest
+    least = max(c.sure * std, NORMAL * abs(c.row.bias))
+    return least < abs(middle) and abs(found.model.amplitudes[place]) < largest
 
 
 def worthwhile(gain: Gain) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from .glossary import GLOSSARY
-from .lacking import Left
+from .lacking import TOLERATED, Left
 from .screening import MUCH, Row
 from .stepwise import Found
 from .trials import PLAUSIBLE
@@ -78,8 +78,7 @@ def _lacking(content: dict[str, Any]) -> list[str]:
         "recorded as long, would tell."
         for d in drifting
     ]
-    seen = ", ".join(f"{r['kind']} of {r['motion']} ({r['ratio']:.1f} times what is expected)" for r in rows)
-    out = [*told, *([f"Lacking: {seen}."] if rows else [])]
+    out = [*told, *([f"Lacking: {', '.join(map(_left, rows))}."] if rows else [])]
     missing = content["missing_force"] or {"motions": []}
     for m in (m for m in missing["motions"] if m["sure"]):
         where = ", ".join(f"{1e3 * c:.0f}" for c in m["at"])
@@ -89,6 +88,14 @@ def _lacking(content: dict[str, Any]) -> list[str]:
             f"({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
         )
     return out + _residual(content["residual"])
+
+
+def _left(row: dict[str, Any]) -> str:
+    """What lacks, and when, if that is one stretch of time."""
+    worst, but = row["worst"], ""
+    if worst is not None and worst["ratio_elsewhere"] < TOLERATED:
+        but = f", {worst['ratio_elsewhere']:.1f} but for {worst['from']:.1f} to {worst['to']:.1f} s"
+    return f"{row['kind']} of {row['motion']} ({row['ratio']:.1f} times what is expected{but})"
 
 
 def _residual(found: dict[str, Any] | None) -> list[str]:
