@@ -1,5 +1,6 @@
 """What is too small to matter has no name, but what it may stand for is said; nor has what may be too small."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import linear_toys as toys
@@ -12,6 +13,7 @@ from torchcloth.diagnosis.verdict import _minor, _verdict
 from torchcloth.diagnosis.world import MATTERS, Model
 
 SCALE, BIAS = ("obs.depth_scale", 0.015, -0.002), ("obs.depth_bias", 5e-3, -2.5e-3)
+SCALE_LARGE, EXTRINSIC = ("obs.depth_scale", 0.015, 0.01), ("obs.extrinsic[x]", 4e-3, 2.5e-3)
 HEM = ("mass.hem", 0.02, 0.39 * MATTERS * 0.02)
 
 
@@ -38,8 +40,19 @@ def test_rivals_that_would_matter_are_said_and_no_others(order):
 
 
 def test_what_matters_with_all_its_rivals_is_a_cause():
-    found = ended(BIAS, ("obs.extrinsic[x]", 4e-3, 2.5e-3))
+    found = ended(BIAS, EXTRINSIC)
     assert (found.causes, found.minor) == (found.steps, [])
+
+
+def test_a_rival_that_joins_the_model_beside_a_cause_is_none_any_more():
+    """Neither could be dropped then: they are two."""
+    found = ended(SCALE_LARGE, BIAS, EXTRINSIC)
+    other = candidate(*BIAS)
+    model = Model(None, (), toys.torch.zeros(0), (*found.end.model.accepted, other.hypothesis), (0.01, BIAS[2]))  # type: ignore[arg-type]
+    second = Step(other, None, [other], [], [], None)  # type: ignore[arg-type]
+    both = replace(found, end=SimpleNamespace(model=model), steps=[*found.steps, second])  # type: ignore[arg-type]
+    assert [h.name for h, _ in found.alike(found.steps[0])] == ["obs.depth_scale", "obs.depth_bias", "obs.extrinsic[x]"]
+    assert [h.name for h, _ in both.alike(both.steps[0])] == ["obs.depth_scale", "obs.extrinsic[x]"]
 
 
 @pytest.mark.parametrize("doubtful", [True, False])

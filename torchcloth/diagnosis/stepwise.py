@@ -52,8 +52,10 @@ class Found:
         return [s for s in self.steps if s not in self.causes]
 
     def alike(self, step: Step) -> list[tuple[Hypothesis, float]]:
-        """A step's cause in the end and its rivals, with amplitudes."""
-        return [(step.best.hypothesis, self.amplitude(step)), *((c.hypothesis, c.amplitude) for c in step.rivals)]
+        """A step's cause in the end and its rivals, with amplitudes; no rival is what joined the model beside it."""
+        there = {s.best.hypothesis.name for s in self.steps}
+        rivals = [(c.hypothesis, c.amplitude) for c in step.rivals if c.hypothesis.name not in there]
+        return [(step.best.hypothesis, self.amplitude(step)), *rivals]
 
     def amplitude(self, step: Step) -> float:
         """Of a step's cause in the end."""
