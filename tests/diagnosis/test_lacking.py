@@ -73,10 +73,10 @@ def test_where_meshes_fold_apart_nothing_is_judged():
     assert not any(row.stable or row.lacking for row in rows)
 
 
-def row(motion, left, expected=1e-3, kind="points", unit="m", stable=True, stretches=8):
+def row(motion, left, expected=1e-3, kind="points", unit="m", stable=True, stretches=8, episode=0):
     """As much left in each of some stretches of time."""
     shares = {w: (left**2 / stretches, expected**2 / stretches) for w in range(stretches)}
-    return Left(motion, kind, unit, left, expected, 0.0, 50.0, 0.0, stable, shares)
+    return Left(episode, motion, kind, unit, left, expected, 0.0, 50.0, 0.0, stable, shares)
 
 
 def test_what_is_explained_is_counted_beyond_what_a_right_model_leaves():
@@ -107,6 +107,9 @@ def test_a_stretch_in_which_cloth_snaps_to_another_side_counts_for_nothing():
     before, after = row("swing", 2e-3), row("swing", 1e-3)
     assert explained([snapped(before, 7)], [snapped(after, 7)]) == pytest.approx(1.0)
     assert explained([before], [snapped(after, 7)]) == pytest.approx(1.0)
+    again = [row("swing", left, episode=1) for left in (2e-3, 1e-3)]  # each repetition has its own
+    first, last = ([snapped(a, 7), snapped(b, 3)] for a, b in zip((before, after), again, strict=True))
+    assert explained(first, last) == pytest.approx(1.0)
     few = [row("swing", left, stretches=3) for left in (2e-3, 1e-3)]
     assert explained([snapped(few[0], 2, 3)], [snapped(few[1], 2, 3)]) < 0.1  # of so few, none is left out
 

@@ -14,7 +14,7 @@ a motion, the worst stretch of time counts for nothing where causes are asked ho
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -35,6 +35,7 @@ FEW = 4  # stretches of time, of fewer none is left out
 class Left(NamedTuple):
     """One kind of data in one motion."""
 
+    episode: int
     motion: str
     kind: str
     unit: str
@@ -62,9 +63,9 @@ class Left(NamedTuple):
         beyond = {window: left - expected for window, (left, expected) in self.stretches.items()}
         return max(beyond, key=lambda w: beyond[w]) if len(beyond) >= FEW else None
 
-    def rest(self, but: Collection[int | None]) -> tuple[float, float]:
-        """Shares of ``left`` and ``expected``, squared, of all stretches but some."""
-        left, expected = zip((0.0, 0.0), *(share for w, share in self.stretches.items() if w not in but), strict=True)
+    def rest(self, but: int | None) -> tuple[float, float]:
+        """Shares of ``left`` and ``expected``, squared, of all stretches but one."""
+        left, expected = zip((0.0, 0.0), *(share for w, share in self.stretches.items() if w != but), strict=True)
         return sum(left), sum(expected)
 
     def as_dict(self) -> dict[str, Any]:
@@ -75,7 +76,7 @@ class Left(NamedTuple):
     def _worst(self) -> dict[str, float] | None:
         if self.worst is None:
             return None
-        left, expected = self.rest([self.worst])
+        left, expected = self.rest(self.worst)
         start, end = self.worst * STRETCH, (self.worst + 1) * STRETCH
         return {"from": start, "to": end, "ratio_elsewhere": (left / expected) ** 0.5}
 
@@ -93,11 +94,11 @@ def explained(before: Sequence[Left], after: Sequence[Left]) -> float:
     Nor is the stretch of each motion that is the worst after.
     """
     folded = {(row.motion, row.kind) for row in (*before, *after) if not row.stable}
-    worst = {(row.motion, row.kind): row.worst for row in after}
+    worst = {(row.episode, row.motion, row.kind): row.worst for row in after}
 
     def over(rows: Sequence[Left]) -> float:
         judged = [r for r in rows if r.unit == "m" and (r.motion, r.kind) not in folded]
-        rests = [r.rest([worst.get((r.motion, r.kind))]) for r in judged]
+        rests = [r.rest(worst.get((r.episode, r.motion, r.kind))) for r in judged]
         return sum(max(0.0, left - expected) for left, expected in rests)
 
     first, last = over(before), over(after)
@@ -125,6 +126,7 @@ def _episode(found: Fitted, k: int, name: str) -> list[Left]:
         }
         rows.append(
             Left(
+                k,
                 name,
                 NAMES[b],
                 "m" if b < SEEN else "N" if NAMES[b] == "force" else "N m",
