@@ -88,10 +88,10 @@ def test_what_is_explained_is_counted_beyond_what_a_right_model_leaves():
     assert explained(rows(5e-3), rows(7e-3)) < 0
     assert explained(rows(0.9e-3), rows(0.8e-3)) == 1.0  # nothing was wrong
     assert explained(rows(5e-3, False), rows(1e-3, False)) == 1.0  # nothing can be said
-    other, better = [row("hang", 2e-3)], [row("hang", 1e-3)]
+    other, better = [row("hang", 2e-3, episode=1)], [row("hang", 1e-3, episode=1)]
     assert explained(rows(9e-3, False) + other, rows(5e-3) + better) == pytest.approx(1.0)  # of what both can judge
     assert explained(rows(9e-3) + other, rows(5e-3, False) + better) == pytest.approx(1.0)
-    calm = [row("hang", 1e-3, 9e-3)]
+    calm = [row("hang", 1e-3, 9e-3, episode=1)]
     assert explained(rows(5e-3) + calm, rows(13**0.5 * 1e-3) + calm) == pytest.approx(0.5)  # calm makes up for nothing
     assert explained(calm, calm + rows(5e-3)) == 0.0
 

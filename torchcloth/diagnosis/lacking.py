@@ -74,11 +74,15 @@ class Left(NamedTuple):
         return {**row, "ratio": self.ratio, "lacking": self.lacking, "worst": self._worst()}
 
     def _worst(self) -> dict[str, float] | None:
-        if self.worst is None:
+        window = self.worst
+        if window is None:
             return None
-        left, expected = self.rest(self.worst)
-        start, end = self.worst * STRETCH, (self.worst + 1) * STRETCH
-        return {"from": start, "to": end, "ratio_elsewhere": (left / expected) ** 0.5}
+        left, expected = self.rest(window)
+        return {
+            "from": window * STRETCH,
+            "to": (window + 1) * STRETCH,
+            "ratio_elsewhere": (left / expected) ** 0.5,
+        }
 
 
 def lack_of_fit(found: Fitted, names: Sequence[str]) -> list[Left]:
@@ -94,11 +98,11 @@ def explained(before: Sequence[Left], after: Sequence[Left]) -> float:
     Nor is the stretch of each motion that is the worst after.
     """
     folded = {(row.motion, row.kind) for row in (*before, *after) if not row.stable}
-    worst = {(row.episode, row.motion, row.kind): row.worst for row in after}
+    worst = {(row.episode, row.kind): row.worst for row in after}
 
     def over(rows: Sequence[Left]) -> float:
         judged = [r for r in rows if r.unit == "m" and (r.motion, r.kind) not in folded]
-        rests = [r.rest(worst.get((r.episode, r.motion, r.kind))) for r in judged]
+        rests = [r.rest(worst.get((r.episode, r.kind))) for r in judged]
         return sum(max(0.0, left - expected) for left, expected in rests)
 
     first, last = over(before), over(after)

@@ -12,6 +12,7 @@ constexpr Vec<T> resisted(Symmetric<T> air, T mass, Vec<T> change) {
     const auto b = air / mass;
     return change - solve(Symmetric<T>{b.xx + 1.0, b.xy, b.xz, b.yy + 1.0, b.yz, b.zz + 1.0}, b * change);
 }
+
 // Force, own mass, mass of the air if there is any -> change of velocity in unit time.
 template <bool AIR, class T>
 constexpr Vec<T> accelerated(Read<T>& r) {
