@@ -47,7 +47,7 @@ def test_nothing_at_zero_and_twice_as_much_at_twice(made, name):
     base = model.world().frames(e)
     assert torch.equal(model.world([(h, 0.0)]).frames(e).x, base.x)
     assert not any(p.requires_grad for p in model.world([(h, h.typical)]).cloth.parameters())
-    if h.effect in ("grip.width", "robot.regrasp", "air.wind"):  # whole vertices are held; wind brings its drag along
+    if h.effect == "air.wind":  # brings its drag along
         return
     share = (0.05, 0.1)
     moved = [(model.world([(h, s * h.typical)]).frames(e), s) for s in share]

@@ -18,7 +18,7 @@ from flex_sheet import grid
 from make import scenes
 from motions import motion
 from partners import OUTSIDE, SINGLES
-from scene import simulate
+from scene import evenly, simulate
 from telling import told
 
 from torchcloth.errors import InvalidInput
@@ -70,11 +70,12 @@ def means(found: Case, name: str = "", change: float = 0.0) -> Array:
         scene, _ = scenes(found, take)
         moved = motion(take.motion, scene.sheet, take.heading, take.speed)
         result = simulate(scene, moved)
+        x = evenly(scene, result.x)
         uv = grid(scene.sheet)[0] / [scene.sheet.width, scene.sheet.height]
         patch = np.minimum((uv * PATCHES).astype(int), PATCHES - 1) @ [PATCHES, 1]
         window = (moved.t / WINDOW).astype(int)
         for k in range(window[-1] + 1):
-            now = result.x[window == k].mean(0)
+            now = x[window == k].mean(0)
             places += [now[patch == p].mean(0) for p in range(PATCHES**2)]
             forces += [force[window == k].mean(0) for force in result.force.values()]
     return np.concatenate([np.concatenate(places) / SEEN, np.concatenate(forces) / FELT * found.forces])

@@ -28,6 +28,7 @@ class SheetSpec:
         diagonals: "alternating" (union jack) or "parallel".
         shrink_u, shrink_v: -, share by which the cloth at rest is shorter than its pattern.
         skew: rad, by which the angle between u and v at rest is less than a right one.
+        lines_u, lines_v: m, where the vertices lie along either axis, both ends included; empty: at even distances.
     """
 
     width: float = 0.40
@@ -45,12 +46,26 @@ class SheetSpec:
     shrink_u: float = 0.0
     shrink_v: float = 0.0
     skew: float = 0.0
+    lines_u: tuple[float, ...] = ()
+    lines_v: tuple[float, ...] = ()
+
+    @property
+    def lines(self) -> tuple[Array, Array]:
+        """Places of the vertices along u and along v, m."""
+        even = (np.linspace(0, size, n) for size, n in zip((self.width, self.height), self.nodes, strict=True))
+        u, v = (np.asarray(own) if own else line for own, line in zip((self.lines_u, self.lines_v), even, strict=True))
+        return u, v
+
+    @property
+    def shortest(self) -> float:
+        """Least distance of neighbours along an axis, m."""
+        return float(min(np.diff(line).min() for line in self.lines))
 
 
 def grid(spec: SheetSpec) -> tuple[Array, Array]:
     """Material coordinates [V, 2] m (v varies slowest) and triangles [F, 3] of the sheet's mesh."""
     nu, nv = spec.nodes
-    v, u = np.meshgrid(np.linspace(0, spec.height, nv), np.linspace(0, spec.width, nu), indexing="ij")
+    v, u = np.meshgrid(*reversed(spec.lines), indexing="ij")
     faces = []
     for j in range(nv - 1):
         for i in range(nu - 1):
@@ -71,12 +86,16 @@ def bilinear(sheet: SheetSpec, values: Array, uv: Array) -> tuple[Array, Array, 
     """Values [V, C] of a sheet's grid at material points [N, 2]: [N, C], and their differences along u and along v."""
     nu, nv = sheet.nodes
     table = values.reshape(nv, nu, -1)
-    a, b = uv[:, 0] / sheet.width * (nu - 1), uv[:, 1] / sheet.height * (nv - 1)
-    i, j = np.minimum(a.astype(int), nu - 2), np.minimum(b.astype(int), nv - 2)
-    a, b = (a - i)[:, None], (b - j)[:, None]
+    (i, a), (j, b) = (_between(line, place) for line, place in zip(sheet.lines, uv.T, strict=True))
     p, q, r, s = table[j, i], table[j, i + 1], table[j + 1, i], table[j + 1, i + 1]
     along_u, along_v = (q - p) * (1 - b) + (s - r) * b, (r - p) * (1 - a) + (s - q) * a
     return (1 - b) * ((1 - a) * p + a * q) + b * ((1 - a) * r + a * s), along_u, along_v
+
+
+def _between(line: Array, place: Array) -> tuple[Array, Array]:
+    """(the line before each place [N], how far on to the next [N, 1], from 0 to 1)."""
+    i = np.clip(np.searchsorted(line, place, side="right") - 1, 0, len(line) - 2)
+    return i, ((place - line[i]) / (line[i + 1] - line[i]))[:, None]
 
 
 def vertex_masses(spec: SheetSpec) -> Array:
@@ -89,7 +108,7 @@ def vertex_masses(spec: SheetSpec) -> Array:
 
 def largest_step(spec: SheetSpec) -> float:
     """A safe step in s for the explicit integration: 0.8 of the limit of the mesh's stiffest mode, damping included."""
-    h = min(spec.width / (spec.nodes[0] - 1), spec.height / (spec.nodes[1] - 1))
+    h = spec.shortest
     # a pressure wave from vertex to vertex: omega^2 = 8 c^2 / h^2; a plate wave: 64 D / (rho h^4)
     membrane = 8 * spec.membrane_stiffness / (1 - spec.poisson_ratio**2) / (spec.areal_density * h**2)
     bending = 64 * spec.bending_stiffness / (spec.areal_density * h**4)

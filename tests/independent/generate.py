@@ -55,6 +55,7 @@ def record(
         exact: no noise at all: points on the surface, first positions and forces as they are.
         said: whose values the data sheet, grasps and table are said to have; None: the effect-free fabric's.
     """
+    scene = scene.gripped  # whose vertices the positions are of
     seen, first, touch = (np.random.default_rng([*np.atleast_1d(seed), k]) for k in range(3))
     nominal, sensor = said or Scene(), replace(scene.sensor, noise=0.0) if exact else scene.sensor
     noise = {key: 0.0 if exact else value for key, value in (("force", FORCE_NOISE), ("torque", TORQUE_NOISE))}

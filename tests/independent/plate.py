@@ -59,30 +59,28 @@ class Stencils:
 
     def __init__(self, sheet: SheetSpec) -> None:
         nu, nv = sheet.nodes
-        hu = sheet.width * (1 - sheet.shrink_u) / (nu - 1)
-        hv = sheet.height * (1 - sheet.shrink_v) / (nv - 1)
+        hu, hv = (np.diff(own) * (1 - s) for own, s in zip(sheet.lines, (sheet.shrink_u, sheet.shrink_v), strict=True))
         one_u, one_v = diags([np.ones(nu)], [0]), diags([np.ones(nv)], [0])
-        blocks = [
-            kron(one_v, _second(nu, hu)),
-            kron(_second(nv, hv), one_u),
-            np.sqrt(2) * kron(_first(nv, hv), _first(nu, hu)),
-        ]
+        blocks = [kron(one_v, _second(hu)), kron(_second(hv), one_u), np.sqrt(2) * kron(_first(hv), _first(hu))]
         means = [kron(one_v, _inner(nu)), kron(_inner(nv), one_u), kron(_middle(nv), _middle(nu))]
         areas = [
-            np.kron(_spans(nv, hv), _inner_spans(nu, hu)),
-            np.kron(_inner_spans(nv, hv), _spans(nu, hu)),
-            np.full((nu - 1) * (nv - 1), hu * hv),
+            np.kron(_spans(hv), _inner_spans(hu)),
+            np.kron(_inner_spans(hv), _spans(hu)),
+            np.kron(hv, hu),
         ]
         self.rows, self.place = csr_matrix(vstack(blocks)), csr_matrix(vstack(means))
         self.area, self.kind = np.concatenate(areas), np.repeat([0, 1, 2], [len(a) for a in areas])
 
 
-def _second(n: int, h: float) -> csr_matrix:
-    return diags([1 / h**2, -2 / h**2, 1 / h**2], [0, 1, 2], shape=(n - 2, n))
+def _second(h: Array) -> csr_matrix:
+    before, after = h[:-1], h[1:]
+    both = 0.5 * (before + after)
+    rows = [1 / (before * both), -2 / (before * after), 1 / (after * both)]
+    return diags(rows, [0, 1, 2], shape=(len(h) - 1, len(h) + 1))
 
 
-def _first(n: int, h: float) -> csr_matrix:
-    return diags([-1 / h, 1 / h], [0, 1], shape=(n - 1, n))
+def _first(h: Array) -> csr_matrix:
+    return diags([-1 / h, 1 / h], [0, 1], shape=(len(h), len(h) + 1))
 
 
 def _inner(n: int) -> csr_matrix:
@@ -93,16 +91,14 @@ def _middle(n: int) -> csr_matrix:
     return diags([0.5, 0.5], [0, 1], shape=(n - 1, n))
 
 
-def _spans(n: int, h: float) -> Array:
-    out = np.full(n, h)
-    out[[0, -1]] = h / 2
-    return out
+def _spans(h: Array) -> Array:
+    return 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
 
 
-def _inner_spans(n: int, h: float) -> Array:
-    out = np.full(n - 2, h)
-    out[[0, -1]] += h / 2
-    return out
+def _inner_spans(h: Array) -> Array:
+    out = _spans(h)
+    out[[1, -2]] += out[[0, -1]]
+    return out[1:-1]
 
 
 class Plate(Hook):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from air import AddedMass, AirSpec, Drag, LinearDrag
-from flex_sheet import SheetSpec, grid
+from flex_sheet import SheetSpec, bilinear, grid
 from hooks import Hook
 from membrane import Membrane, MembraneSpec
 from motions import Motion
@@ -29,7 +29,7 @@ class GripSpec:
     """How the robot holds and moves the cloth.
 
     Attributes:
-        radius: m, of the patch that is said to be held; ``wider`` m more are held.
+        radius: m, of the patch that is said to be held; its edge lies ``wider`` m farther out.
         slip: m/(s N), mobility of the patch under a pull above ``hold`` N.
         regrasp: m, by which the patches lie further along u than said.
         backlash: m, play between the commanded and the true place, along each axis.
@@ -67,6 +67,30 @@ class Scene:
     grip: GripSpec = field(default_factory=GripSpec)
     sensor: SensorSpec = field(default_factory=SensorSpec)
 
+    @property
+    def gripped(self) -> Scene:
+        """The same, its vertices moved to where the patches end that are wider or lie further along than said.
+
+        What is held are whole vertices: without this, a shift by half an edge would be none or one by a whole edge.
+
+        Raises:
+            InvalidInput: patches too small for that.
+        """
+        grip, sheet = self.grip, self.sheet
+        if not (grip.wider or grip.regrasp):
+            return self
+        (u, v), reach = replace(sheet, lines_u=(), lines_v=()).lines, grip.radius + 1e-9
+        left, right = u[u <= reach].max(), u[u >= sheet.width - reach].min()
+        below = v[v >= sheet.height - reach].min()
+        wider, along = grip.wider, grip.regrasp
+        ends_u = [0.0, left + along + wider, right + along - wider, sheet.width]
+        ends_v = [0.0, below - wider, sheet.height]
+        if min(left, sheet.height - below) == 0 or min(*np.diff(ends_u), *np.diff(ends_v)) < 0.2 * left:
+            raise InvalidInput("grip", got=f"patches of {grip.radius:g} m, {along:g} m along and {wider:g} m wider")
+        lines_u = np.interp(u, [0.0, left, right, sheet.width], ends_u)
+        lines_v = np.interp(v, [0.0, below, sheet.height], ends_v)
+        return replace(self, sheet=replace(sheet, lines_u=tuple(lines_u), lines_v=tuple(lines_v)))
+
 
 def hooks(scene: Scene, table: bool) -> list[Hook]:
     """What acts on the cloth besides MuJoCo's membrane and weight; what is at zero is left out.
@@ -98,7 +122,7 @@ def hooks(scene: Scene, table: bool) -> list[Hook]:
 def stable_step(scene: Scene) -> float:
     """A safe step in s: 0.8 of the limit of the stiffest membrane and plate waves together, damping included."""
     sheet, plate, membrane = scene.sheet, scene.plate, scene.membrane
-    h = min(sheet.width / (sheet.nodes[0] - 1), sheet.height / (sheet.nodes[1] - 1))
+    h = sheet.shortest
     stiffer = 1 + max(membrane.shear, 0.0) + 0.2 * membrane.stiffening  # up to a strain of 10 %
     young = stiffer * sheet.membrane_stiffness + membrane.friction / membrane.threshold
     light = 1 + min(scene.weight.density, 0.0) + min(scene.weight.moisture, 0.0)
@@ -112,10 +136,11 @@ def stable_step(scene: Scene) -> float:
 
 
 def simulate(scene: Scene, motion: Motion, step: float | None = None) -> Result:
-    """The cloth at the motion's knots, brought to rest first."""
+    """The cloth at the motion's knots, brought to rest first; vertices as in ``scene.gripped``."""
+    scene = scene.gripped
     dt = stable_step(scene) if step is None else step
     uv, _ = grid(scene.sheet)
-    grips = {name: _grip(scene.grip, uv, motion, name) for name in motion.pose}
+    grips = {name: _grip(scene, motion, name) for name in motion.pose}
     # what remembers or slips starts at the first frame
     steady = replace(scene, weight=replace(scene.weight, moisture=0.0))
     settling = [hook for hook in hooks(steady, motion.table) if hook.settles]
@@ -128,11 +153,19 @@ def simulate(scene: Scene, motion: Motion, step: float | None = None) -> Result:
     return MujocoCloth(scene.sheet, dt, hooks(scene, motion.table)).run(rest, motion.t, grips)
 
 
-def _grip(spec: GripSpec, uv: Array, motion: Motion, name: str) -> Grip:
-    middle = motion.held[name] + [spec.regrasp, 0.0]
-    held = np.flatnonzero(np.linalg.norm(uv - middle, axis=1) <= spec.radius + spec.wider + 1e-9)
+def evenly(scene: Scene, x: Array) -> Array:
+    """Positions [K, V, 3] m of a simulated scene at vertices that lie at even distances: places to compare."""
+    uv, _ = grid(replace(scene.sheet, lines_u=(), lines_v=()))
+    found = bilinear(scene.gripped.sheet, np.moveaxis(x, 0, 1).reshape(len(uv), -1), uv)[0]
+    return np.moveaxis(found.reshape(len(uv), len(x), 3), 1, 0)
+
+
+def _grip(scene: Scene, motion: Motion, name: str) -> Grip:
+    spec = scene.grip
+    said, _ = grid(replace(scene.sheet, lines_u=(), lines_v=()))
+    held = np.flatnonzero(np.linalg.norm(said - motion.held[name], axis=1) <= spec.radius + 1e-9)
     if not len(held):
-        raise InvalidInput(f"grip {name!r} holds nothing", got=f"radius {spec.radius + spec.wider:g} m")
+        raise InvalidInput(f"grip {name!r} holds nothing", got=f"radius {spec.radius:g} m")
     pose = motion.pose[name].copy()
     pose[:, :3, 3] = play(pose[:, :3, 3], spec.backlash)
     return Grip(held, motion.t, pose, Slip(spec.slip, spec.hold) if spec.slip else None)

@@ -12,7 +12,7 @@ import numpy as np
 from effects import CATALOGUE, hide
 from motions import Motion, motion
 from mujoco_cloth import Result
-from scene import Scene, believed, simulate
+from scene import Scene, believed, evenly, simulate
 from sensor import see
 
 from torchcloth.errors import InvalidInput
@@ -37,12 +37,13 @@ def size(name: str, plain: Run | None = None) -> tuple[float, float, Run]:
     hidden = hide(scene, name, effect.typical)
     # what only changes the recording leaves the cloth alone
     other = result if effect.part == "sensor" or effect.name == "base" else simulate(hidden, moved)
-    return rms(other.x - result.x), rms(points(hidden, moved, other) - points(scene, moved, result)), plain
+    seen = points(hidden, moved, other) - points(scene, moved, result)
+    return rms(evenly(hidden, other.x) - evenly(scene, result.x)), rms(seen), plain
 
 
 def points(scene: Scene, moved: Motion, result: Result) -> np.ndarray:
     """Noise-free points [N, 3] m of all frames, from where the left gripper is recorded to be at first."""
-    clouds = see(replace(scene.sensor, noise=0.0), scene.sheet, moved.t, result.x, np.random.default_rng(0))
+    clouds = see(replace(scene.sensor, noise=0.0), scene.gripped.sheet, moved.t, result.x, np.random.default_rng(0))
     return clouds.xyz - believed(scene.grip, moved.pose["left"])[0, :3, 3]
 
 

@@ -12,7 +12,7 @@ import generate
 from effects import CATALOGUE, hide, parse
 from flex_sheet import SheetSpec, grid, rest_points
 from motions import GRIPPERS, NAMES, minimum_jerk, motion
-from scene import GripSpec, Scene, believed, hooks, play, stable_step
+from scene import GripSpec, Scene, _grip, believed, evenly, hooks, play, stable_step
 from sensor import EYE, SensorSpec, see
 from sizes import size
 
@@ -63,6 +63,35 @@ def test_shrinking_and_skewing_change_lengths_and_angle():
     assert np.linalg.norm(v) == pytest.approx(0.97 * 0.3)
     assert np.arccos(u @ v / np.linalg.norm(u) / np.linalg.norm(v)) == pytest.approx(np.pi / 2 - 0.1)
     np.testing.assert_array_equal(rest_points(SHEET), uv)
+
+
+@pytest.mark.parametrize("along", [8.5e-3, -8.5e-3])
+def test_patches_end_where_they_are_hidden_to_end_and_not_at_the_next_vertex(along):
+    plain = replace(Scene(), sheet=replace(SHEET, nodes=(19, 19)), grip=GripSpec(radius=0.0505))
+    other = replace(plain, grip=replace(plain.grip, regrasp=along, wider=5e-3))
+    assert plain.gripped is plain
+    moved = other.gripped
+    assert moved.gripped == moved
+    here, (u, v) = np.linspace(0, 0.3, 19), moved.sheet.lines
+    at = {"left": (3, along + 5e-3), "right": (-4, along - 5e-3)}  # lines at 50 and 250 mm
+    for k, shift in at.values():
+        assert u[k] == pytest.approx(here[k] + shift)
+    assert v[-4] == pytest.approx(0.25 - 5e-3)
+    np.testing.assert_allclose(np.diff(u)[4:-4], np.diff(u)[4:-4].mean())
+    hung = motion("hang", SHEET)
+    for name in at:
+        held = [_grip(scene, hung, name).vertices for scene in (plain, moved)]
+        np.testing.assert_array_equal(*held)
+    with pytest.raises(InvalidInput, match=r"grip; got patches of 0.0505 m, -0.048 m along"):
+        replace(plain, grip=replace(plain.grip, regrasp=-0.048)).gripped  # noqa: B018
+
+
+def test_positions_at_even_distances_are_those_of_the_material():
+    scene = replace(Scene(), sheet=replace(SHEET, nodes=(19, 19)), grip=GripSpec(radius=0.0505, regrasp=7e-3))
+    uv, even = grid(scene.gripped.sheet)[0], grid(scene.sheet)[0]
+    assert np.abs(uv - even).max() == pytest.approx(7e-3)
+    x = np.stack([np.column_stack([uv @ [1.0, 2.0], uv[:, 0] * 3, uv[:, 1]])] * 2)
+    np.testing.assert_allclose(evenly(scene, x)[1, :, 0], even @ [1.0, 2.0], atol=1e-12)
 
 
 def test_a_minimum_jerk_leg_has_its_known_peak_speed():

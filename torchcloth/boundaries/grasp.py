@@ -40,7 +40,7 @@ class Grasp(AbstractBoundary):
         super().__init__()
         if (vertices is None) == (uv is None):
             raise InvalidInput("Grasp", got="both or neither of vertices and uv", expected="exactly one of them")
-        self._uv, self.radius = uv, float(radius)
+        self._uv, self.radius, self._stays = uv, float(radius), False
         self._corner: Corner | None = None
         self._place: str | None = None
         self.register_buffer("index", torch.as_tensor([] if vertices is None else list(vertices), dtype=torch.long))
@@ -67,8 +67,23 @@ class Grasp(AbstractBoundary):
         grasp._place = place
         return grasp
 
+    @property
+    def uv(self) -> ArrayLike | None:
+        """[G, 2] m, pattern coordinates of the patch's centres; None where it is known by its vertices or its name."""
+        return self._uv
+
+    def moved(self, wider: float, along: float) -> Grasp:
+        """The same vertices, where a mesh has them ``wider`` [m] farther out and ``along`` [m] further along u."""
+        if self._uv is None:
+            raise InvalidInput("Grasp.moved", got="a patch without a place", expected="one that was given by uv")
+        grasp = Grasp(uv=np.asarray(self._uv, float) + np.array([along, 0.0]), radius=self.radius + wider)
+        grasp.index, grasp._stays = self.index.clone(), True
+        return grasp
+
     def bind(self, mesh: Mesh) -> Grasp:
         """Find the held vertices in the mesh's pattern coordinates, or among its places."""
+        if self._stays:
+            return self
         if self._place is not None:
             self.index = torch.as_tensor(mesh.around(self._place, self.radius), device=self.index.device)
         if self._corner is not None:

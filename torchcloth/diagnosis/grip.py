@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 
 from ..boundaries import Coulomb, Elliptic, Grasp, Plane, Stribeck
 from ..effects import Adhesion, GripSlip
 from ..recordings import Recording
+from .regripped import regripped
 from .world import Hypothesis, World
 
 LEAST = 1e-3  # -, of friction
@@ -15,7 +15,6 @@ HOLD = 0.3  # N, above which a loose grip yields
 SLOW = 0.01  # m/s, of slip at which the excess of friction has fallen to 1 / e
 REACH = 1e-3  # m, of a sticky table's pull
 STEEP = 0.99  # cosine, of a normal that is the world's x
-WHOLE = 1.0  # of typical: patches grow vertex by vertex, and a smaller step changes nothing
 
 
 def _grasps(world: World) -> dict[str, Grasp]:
@@ -24,16 +23,6 @@ def _grasps(world: World) -> dict[str, Grasp]:
 
 def _slip(world: World, mobility: float) -> World:
     return world.with_cloth({f"slip_{name}": GripSlip(name, mobility, HOLD) for name in _grasps(world)})
-
-
-def _regrasped(world: World, wider: float = 0.0, along: float = 0.0) -> World:
-    """Patches of another radius, or further along u, where they are known by their place."""
-    parts = {}
-    for name, grasp in _grasps(world).items():
-        if grasp._uv is not None:
-            uv = np.asarray(grasp._uv, float) + np.array([along, 0.0])
-            parts[name] = Grasp(uv=uv, radius=grasp.radius + wider)
-    return world.with_cloth(boundaries=parts) if parts else world
 
 
 def _planes(world: World, change) -> World:
@@ -86,8 +75,8 @@ def _has_table(recording: Recording) -> bool:
 
 HYPOTHESES = (
     Hypothesis("grip.slip", "m/(N s)", 0.05, _slip),
-    Hypothesis("grip.width", "m", 0.02, lambda w, a: _regrasped(w, wider=a), step=WHOLE),
-    Hypothesis("robot.regrasp", "m", 0.017, lambda w, a: _regrasped(w, along=a), signed=True, step=WHOLE),
+    Hypothesis("grip.width", "m", 0.02, lambda w, a: regripped(w, wider=a), high=0.05),
+    Hypothesis("robot.regrasp", "m", 0.017, lambda w, a: regripped(w, along=a), signed=True, low=-0.04, high=0.04),
     Hypothesis("contact.mu", "-", 0.2, lambda w, a: _friction(w, more=a), signed=True, needs=_has_table),
     Hypothesis("contact.aniso", "-", -0.5, lambda w, a: _friction(w, along=a), signed=True, needs=_has_table, low=-0.9),
     Hypothesis("contact.stick", "-", 0.3, lambda w, a: _friction(w, excess=a), needs=_has_table),

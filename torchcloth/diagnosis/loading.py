@@ -97,7 +97,7 @@ def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
     """
     file = read_model(path, recording)
     model, world = file.model, file.model.world()
-    data, every = episode(world.cloth, recording), one_way(model)
+    data, every = episode(model.base.cloth, recording), one_way(model)
     covariance = torch.zeros(len(every), len(every)) if file.covariance is None else file.covariance
     shifts = every[: len(covariance)]  # a residual force, which comes last, has no errors
     worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]

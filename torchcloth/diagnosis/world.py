@@ -16,6 +16,7 @@ from ..effects import AbstractEffect
 from ..identification.episodes import Episode
 from ..identification.replays import Frames, Replay, frames_of
 from ..materials import AbstractMaterial
+from ..meshes import Mesh
 from ..recordings import Recording
 
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
@@ -81,11 +82,12 @@ def rebuilt(
     effects: Mapping[str, AbstractEffect],
     material: AbstractMaterial | None,
     boundaries: Mapping[str, AbstractBoundary],
+    mesh: Mesh | None = None,
 ) -> Cloth:
     """A new cloth with some parts replaced or added, which nobody trains; it shares the mesh alone with the old one."""
     kept = copied(cloth)
     found = Cloth(
-        kept.mesh,
+        mesh or kept.mesh,
         material or kept.material,
         kept.areal_density.value.detach().clone(),
         {**dict(kept.effects.items()), **effects},  # type: ignore[dict-item]

@@ -49,8 +49,8 @@ def film_of_fit(recording: Recording, fit: str | Path, *, truth: bool = False) -
 
 def _film_of_model(recording: Recording, path: str | Path, truth: bool) -> Film:
     """As ``film_of_fit``, with the cloth, robot and observer of a model file."""
-    world = read_model(path, recording).model.world()
-    data = episode(world.cloth, recording)
+    model = read_model(path, recording).model
+    world, data = model.world(), episode(model.base.cloth, recording)
     film = film_of(recording, truth=truth, times=data.times.numpy())
     x = world.frames(data).x.numpy()
     film = with_cloth(film, x, world.cloth.mesh.faces, noise=recording.observation_noise_std)

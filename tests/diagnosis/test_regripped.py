@@ -1,0 +1,110 @@
+"""Patches that end between vertices."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sheets
+import torch
+
+from torchcloth import diagnosis as dx
+from torchcloth import recordings as rec
+from torchcloth.boundaries import Grasp
+from torchcloth.diagnosis.regripped import regripped
+from torchcloth.diagnosis.setting import setting_of
+from torchcloth.errors import InvalidInput
+from torchcloth.identification.episodes import episode
+from torchcloth.identification.replays import Frames
+
+RADIUS = 0.051  # m, of sheets.py: 1.5 edges of the mesh
+
+
+@pytest.fixture(scope="module")
+def made():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    blank = sheets.episode()
+    model = dx.base_model(blank)
+    yield model, setting_of(model, [blank]).episodes[0], blank
+    torch.set_default_dtype(before)
+
+
+def held(world, name):
+    return world.cloth.mesh.uv[world.cloth.boundaries[name].index.numpy()]
+
+
+@pytest.mark.parametrize("along", [-0.012, 0.007])
+def test_the_edge_of_a_patch_goes_along_and_the_outline_stays(made, along):
+    world = made[0].world()
+    moved, before = regripped(world, along=along), world.cloth.mesh
+    after = moved.cloth.mesh
+    for name in ("left", "right"):
+        assert torch.equal(moved.cloth.boundaries[name].index, world.cloth.boundaries[name].index)
+    reach = lambda w: (held(w, "left")[:, 0].max(), held(w, "right")[:, 0].min())  # noqa: E731
+    shift = np.subtract(reach(moved), reach(world))
+    np.testing.assert_allclose(shift, along * held(world, "left")[:, 0].max() / RADIUS)  # in proportion, from the rim
+    np.testing.assert_array_equal(held(moved, "left")[:, 1], held(world, "left")[:, 1])
+    assert after.area.sum() == pytest.approx(before.area.sum(), rel=1e-12)
+    assert after.area.min() > 0.4 * before.area.min()
+    np.testing.assert_allclose(after.vertices[:, :2], after.uv, atol=1e-12)
+
+
+def test_a_wider_patch_grows_on_all_sides_and_the_next_grows_from_there(made):
+    world = made[0].world()
+    wider = regripped(world, wider=0.01)
+    far = lambda w: np.linalg.norm(held(w, "left") - [0.0, sheets.SIDE], axis=1)  # noqa: E731
+    np.testing.assert_allclose(far(wider), far(world) * (RADIUS + 0.01) / RADIUS)
+    both = regripped(wider, wider=0.01)
+    np.testing.assert_allclose(far(both), far(world) * (RADIUS + 0.02) / RADIUS)
+    assert both.cloth.boundaries["left"].radius == pytest.approx(RADIUS + 0.02)
+
+
+def test_little_does_little_and_twice_as_much_twice_as_much(made):
+    """Whole vertices would do nothing, and then all at once."""
+    model, e, blank = made
+    by = {h.name: h for h in dx.catalogue(model, [blank])}
+    base = model.world().frames(e).x
+    for name in ("grip.width", "robot.regrasp"):
+        moved = [float((model.world([(by[name], a)]).frames(e).x - base).norm()) for a in (1e-4, 1e-3, 2e-3)]
+        assert moved[0] > 1e-6
+        assert moved[1] / moved[0] == pytest.approx(10.0, rel=0.2)
+        assert moved[2] / moved[1] == pytest.approx(2.0, rel=0.2)
+
+
+def test_nobody_sees_another_mesh(made):
+    """A first shape that goes to the other mesh and comes back is what it was, if it is as smooth as a parabola."""
+    world, e = made[0].world(), made[1]
+    u, v = torch.as_tensor(world.cloth.mesh.uv).T
+    shape = torch.stack([u - u * u, 3 * u * v, v + 2 * v * v], 1)
+    other = regripped(world, wider=0.01, along=0.005)
+    there = other.driven(replace(e, initial=shape)).initial
+    assert float((there - shape).norm(dim=1).max()) > 5e-3
+    still = Frames(there[None], 2 * there[None], {}, torch.zeros(1))
+    seen = other.seen(still, e)
+    torch.testing.assert_close(seen.x[0], shape, atol=1e-8, rtol=0)
+    torch.testing.assert_close(seen.v[0], 2 * shape, atol=1e-8, rtol=0)
+
+
+def test_a_model_of_an_episode_starts_where_the_episode_says(made, tmp_path):
+    model, _, blank = made
+    by = {h.name: h for h in dx.catalogue(model, [blank])}
+    path = dx.save_model(tmp_path / "held.tcm", model.plus(by["robot.regrasp"], 0.008), blank)
+    cloth = dx.cloth_for(path, blank)
+    first = episode(cloth, blank).initial
+    u, bulge, v = (first - torch.tensor([0.0, 0.0, 1.0])).T.numpy()
+    np.testing.assert_allclose(np.stack([u, v], 1), cloth.mesh.uv, atol=1e-6)
+    np.testing.assert_allclose(bulge, 0.01 * np.sin(8 * cloth.mesh.uv[:, 0]), atol=1e-4)
+    seen = sheets.recorded("fast", lambda world: world, 3)
+    found = dx.predicted(path, rec.read(rec.write(seen, tmp_path / "fast")))
+    world = dx.load_world(path)
+    torch.testing.assert_close(found.frames.x, world.frames(episode(model.base.cloth, seen)).x)
+
+
+def test_grips_without_a_place_and_patterns_without_room(made):
+    world = made[0].world()
+    named = world.with_cloth(boundaries={n: Grasp(held.index.tolist()) for n, held in world.cloth.boundaries.items()})
+    assert regripped(named, wider=0.01) is named
+    with pytest.raises(InvalidInput, match="150 mm further along; expected as much"):
+        regripped(world, along=0.15)
+    with pytest.raises(InvalidInput, match=r"without a place.*given by uv"):
+        Grasp([0, 1]).moved(0.01, 0.0)
