@@ -135,6 +135,22 @@ def test_a_repetition_is_of_the_motion_that_it_repeats(tmp_path):
     assert motions_of(every) == ["a", "a", "swing", "swing", "episode 4"]
 
 
+def test_what_a_parameter_does_already_has_its_slopes(made):
+    """By the share of its value, wherever that is; it is not simulated."""
+    model, setting = made
+    by, place = {h.name: h for h in catalogue(model, [RECORDING])}, [p.name for p in model.parameters]
+    there = model.at(torch.full_like(model.point, 0.1))
+    asked = [by["mass.density"], by["air.drag_n"]]
+    at_once, before = gather(there, setting, asked), gather(there, setting)
+    later = asked_about(before, there, setting, asked)
+    for found in (at_once, later):
+        assert [h.name for h in found.hypotheses] == ["air.drag_n", "mass.density"]
+        slopes = found.cells[0].jacobian
+        own = slopes[:, place.index("areal_density")]
+        torch.testing.assert_close(slopes[:, found.own + 1], own, rtol=2e-3, atol=0)  # of a logarithm, by differences
+        assert float(own.abs().max()) > 0
+
+
 def test_what_no_world_can_have_is_not_asked_about(made):
     """A patch of 15 mm that is 17 mm further along holds nothing at the edge."""
     model, setting = made

@@ -15,7 +15,7 @@ from .cells import Cells, Piece, aligned, mean_over, stretches
 from .pieces import asked_piece, overlapping, piece_of
 from .setting import Progress, Setting
 from .steps import both_ways
-from .world import Hypothesis, Model
+from .world import Hypothesis, Model, Parameter
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ def gather(
         question = [k, [h.name for h in model.accepted], _told(asked), shifts, *(slopes or ())]
         return setting.kept(question, model.point, partial(piece_of, model, setting, k, asked, slopes, shifts))
 
-    pieces, possible = _pieces(setting, hypotheses, progress, ask)
+    pieces, possible = _pieces(setting, _of_their_own(model, hypotheses), progress, ask)
     cells, stds, numerics = [], [], []
     for k, (piece, simulated) in enumerate(pieces):
         use = [*range(own), *(own + i for i, h in enumerate(simulated) if h in possible)]
@@ -72,7 +72,7 @@ def gather(
         cells.append(found if raw else central(found, shifts, len(model.parameters)))
         numerics.append(piece.numerics[stable])
         stds.append(piece.std)
-    return Evidence(cells, own if raw else len(model.point), possible, stds, numerics)
+    return _with_twins(Evidence(cells, own if raw else len(model.point), possible, stds, numerics), model, hypotheses)
 
 
 def asked_about(
@@ -88,14 +88,38 @@ def asked_about(
         question = [k, "asked", [h.name for h in model.accepted], _told(asked)]
         return setting.kept(question, model.point, partial(asked_piece, model, setting, k, asked))
 
-    pieces, possible = _pieces(setting, hypotheses, progress, ask)
+    pieces, possible = _pieces(setting, _of_their_own(model, hypotheses), progress, ask)
     cells = []
     for own, std, (piece, simulated) in zip(here.cells, here.stds, pieces, strict=True):
         use = [i for i, h in enumerate(simulated) if h in possible]
         slopes = aligned(own.key, piece.cells.key, piece.cells.jacobian[:, use])
         parts = [own.jacobian[:, : here.own], slopes, own.jacobian[:, own.jacobian.shape[1] - len(std) :]]
         cells.append(own._replace(jacobian=torch.cat(parts, 1)))
-    return replace(here, cells=cells, hypotheses=possible)
+    return _with_twins(replace(here, cells=cells, hypotheses=possible), model, hypotheses)
+
+
+def _of_their_own(model: Model, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Those that no parameter of the model does already."""
+    fitted = {p.name for p in model.parameters}
+    return [h for h in hypotheses if h.twin not in fitted]
+
+
+def _with_twins(evidence: Evidence, model: Model, hypotheses: Sequence[Hypothesis]) -> Evidence:
+    """The others have their parameter's slopes: simulated beside it, ripples would seem to tell one from the other."""
+    rest = [h for h in hypotheses if h not in _of_their_own(model, hypotheses)]
+    names, cells, after = [p.name for p in model.parameters], [], evidence.own + len(evidence.hypotheses)
+    places = [names.index(h.twin) for h in rest]
+    shares = torch.tensor([_by_share(model.parameters[k], float(model.values[k])) for k in places])
+    for own in evidence.cells:
+        first, last = own.jacobian[:, :after], own.jacobian[:, after:]
+        cells.append(own._replace(jacobian=torch.cat([first, first[:, places] * shares.to(first), last], 1)))
+    return replace(evidence, cells=cells, hypotheses=[*evidence.hypotheses, *rest])
+
+
+def _by_share(parameter: Parameter, coordinate: float) -> float:
+    """Derivative of the coordinate by the share of its value."""
+    up, down = (parameter.value(coordinate + sign * parameter.step) for sign in (1.0, -1.0))
+    return 2 * parameter.step * parameter.value(coordinate) / (up - down)
 
 
 def _pieces(

@@ -21,7 +21,7 @@ from ..meshes import Mesh
 from ..meshes.mesh import signed_area
 from .world import World, rebuilt
 
-TAPER = 2.0  # radii, over which the pattern around a patch makes room for it
+TAPER = 1.0  # radii, over which the pattern around a patch makes room for it: farther out, meshes differ by more
 SQUEEZED = 0.1  # of a triangle's area, the least that may be left
 
 
