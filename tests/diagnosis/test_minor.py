@@ -8,7 +8,7 @@ import pytest
 
 from torchcloth.diagnosis import doubts, trials
 from torchcloth.diagnosis.stepwise import Found
-from torchcloth.diagnosis.trials import Step, _open, _rival
+from torchcloth.diagnosis.trials import Step, _open, _rival, _themselves
 from torchcloth.diagnosis.verdict import _minor, _verdict
 from torchcloth.diagnosis.world import MATTERS, Model
 
@@ -64,6 +64,19 @@ def test_what_may_matter_is_not_called_adequate(doubtful):
 def test_what_brings_another_along_is_no_rival_of_it_where_nothing_else_is_left():
     drag, wind = candidate("air.drag_n", 1.2, 1.2), candidate("air.wind[y]", 0.3, 0.01, brings="air.drag_n")
     assert not _rival(wind, None, drag)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "density", "named"),
+    [(0.01, 1472.0, ["air.drag_n"]), (0.2, 1472.0, ["air.drag_n", "air.wind[y]"]), (0.01, 900.0, None)],
+)
+def test_wind_that_does_not_matter_is_not_named_for_the_drag_that_it_brings(amplitude, density, named):
+    """Unless it predicts clearly better all the same."""
+    drag, wind = candidate("air.drag_n", 1.2, 1.2), candidate("air.wind[y]", 0.3, amplitude, brings="air.drag_n")
+    drag.gain, wind.gain = SimpleNamespace(density=density), SimpleNamespace(density=1477.0)
+    found = [c.hypothesis.name for c in _themselves([drag, wind])]  # type: ignore[list-item]
+    assert found == (named or ["air.drag_n", "air.wind[y]"])
+    assert _themselves([wind]) == [wind]  # type: ignore[list-item]
 
 
 @pytest.mark.parametrize(

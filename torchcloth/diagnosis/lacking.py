@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 
 from .cells import NAMES, SEEN, STRETCH, Cells
+from .evidence import NUMERICS
 from .fitting import Fitted
 from .noise import Noise
-from .screening import NUMERICS
 
 SENSOR = {"points": 5e-4, "edges": 8e-4, "markers": 3e-4, "force": 1e-2, "torque": 1.5e-3}  # m, N, N m: slow errors
 TOLERATED = 2.25  # times the expected RMS
@@ -159,7 +159,7 @@ def right(found: Fitted, k: int) -> tuple[Tensor, Tensor]:
     """(S [C, C], M [C, N]) of one episode by a right model."""
     cells, stds = found.evidence.cells[k], found.evidence.stds[k]
     uncertain = cells.jacobian[:, : found.evidence.own] @ torch.linalg.cholesky(found.covariance)
-    moved = torch.cat([uncertain, cells.jacobian[:, -len(stds) :] * stds], 1)
+    moved = torch.cat([uncertain, cells.jacobian[:, -len(stds) : -1] * stds[:-1]], 1)  # numerics are in the level
     level, _ = reference(cells, found.evidence.numerics[k])
     return level.covariance(cells, moved[:, :0], moved.new_zeros(0)), moved
 

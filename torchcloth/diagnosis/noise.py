@@ -2,11 +2,11 @@
 
     K = diag(spread^2 / n + r^2 / 2) + (level^2 + r^2 / 2) R + N P N',  r = ROUGH rough
 
-R falls with distance on the fabric and with time; N are the slopes along clock, camera, grasp, rim and tare, and P
-their variances, so that these are neither fixed nor free. The levels, one for each kind of data, come from restricted
-maximum likelihood after everything that is asked about is projected out: an effect must not pass as noise. How rough
-a stretch of time is (``evidence.gather``) is known beforehand; ripples neither agree with their neighbours nor do they
-not.
+R falls with distance on the fabric and with time; N are the slopes along clock, camera, grasp, rim, tare and mesh (the
+difference between two, of which the truth may have more or less), and P their variances, so that these are neither
+fixed nor free. The levels, one for each kind of data, come from restricted maximum likelihood after everything that is
+asked about is projected out: an effect must not pass as noise. How rough a stretch of time is (``evidence.gather``) is
+known beforehand; ripples neither agree with their neighbours nor do they not.
 """
 
 from __future__ import annotations

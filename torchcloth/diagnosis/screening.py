@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from .cells import SEEN
+from .evidence import NUMERICS
 from .fitting import Fitted, curvature, leap, leap_with, prior_precision
 from .world import Hypothesis
 
@@ -29,7 +30,6 @@ LEAST_PULL = 1e-2  # N, the same of forces
 MUCH = 8.0  # log density, of a cause that is worth fitting
 PULLED = 3.0  # standard deviations of its prior, from which a parameter does what its twin is asked about
 POWER = 1.64 + 0.84  # standard errors: found in 80 % of cases at 5 %
-NUMERICS = 1 / 3  # of the difference between two meshes is left on the finer one (second order)
 
 
 class Row(NamedTuple):

@@ -128,7 +128,7 @@ def one_step(
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
     noise = fit_noise(likeliest)
     tried = _compared(current, [(c.row, c.fitted) for c in likely], setting.names, noise, likeliest)
-    useful = _ranked([c for c in tried if _useful(c, setting.names)])
+    useful = _ranked(_themselves([c for c in tried if _useful(c, setting.names)]))
     others = [c for c in tried if c not in useful]
     beside = lambda c: placebo(renoised(c.fitted, noise, likeliest), setting.names, c.alone)  # noqa: E731
     chance = None
@@ -228,6 +228,14 @@ def worthwhile(gain: Gain) -> bool:
     seen, felt = gain.mended
     mended = gain.fallen > WORTH_SHARE * gain.calm[0] ** 2 or seen > WORTH_MM or felt > WORTH_PULL
     return mended and gain.ci95[0] > 0
+
+
+def _themselves(useful: Sequence[Candidate]) -> list[Candidate]:
+    """Less those that matter by what they bring along alone, which then predicts about as well without them."""
+    found = {c.hypothesis.name: c for c in useful}
+    brought = lambda c: None if c.hypothesis.matters(c.amplitude) else found.get(c.hypothesis.brings)  # noqa: E731
+    alike = lambda c, other: other.gain.density > (1 - HARDLY) * c.gain.density  # noqa: E731
+    return [c for c in useful if (other := brought(c)) is None or not alike(c, other)]
 
 
 def _ranked(useful: Sequence[Candidate]) -> list[Candidate]:
