@@ -25,8 +25,7 @@ class Evidence:
     """Of every episode: cells, and the columns of their derivatives.
 
     Attributes:
-        cells: one entry per episode; columns are the model's own point first, then ``hypotheses``, then nuisances, the
-            last of which is the difference between the meshes.
+        cells: one entry per episode; columns are the model's own point first, then ``hypotheses``, then nuisances.
         own: number of the model's columns.
         hypotheses: those that were asked about and could be simulated everywhere.
         stds: per episode, of its nuisances [N_e].
@@ -71,11 +70,10 @@ def gather(
         use += range(own + len(simulated), piece.cells.jacobian.shape[1])
         stable = ~torch.isin(piece.cells.key, setting.unstable[k]) if setting.unstable else slice(None)
         found = Cells(*(column[stable] for column in piece.cells))
-        numerics.append(piece.numerics[stable])
-        meshes = numerics[-1][:, None] if before is None else _between_meshes(before, k, found.key)
-        found = found._replace(jacobian=torch.cat([found.jacobian[:, use], meshes], 1))
+        found = found._replace(jacobian=found.jacobian[:, use])
         cells.append(found if raw else central(found, shifts, len(model.parameters)))
-        stds.append(torch.cat([piece.std, piece.std.new_tensor([NUMERICS])]))
+        numerics.append(piece.numerics[stable])
+        stds.append(piece.std)
     return _with_twins(Evidence(cells, own if raw else len(model.point), possible, stds, numerics), model, hypotheses)
 
 
@@ -155,33 +153,27 @@ def _left(began: float, done: int, total: int) -> str:
 
 
 def _known_slopes(before: Evidence, k: int) -> tuple[Tensor, Tensor, Tensor]:
-    """(keys [C], slopes [C, N] along the nuisances that are simulated, their standard deviations [N])."""
+    """(keys [C], slopes [C, N] along the nuisances, their standard deviations [N])."""
     std = before.stds[k]
-    return before.cells[k].key, before.cells[k].jacobian[:, -len(std) : -1], std[:-1]
-
-
-def _between_meshes(before: Evidence, k: int, key: Tensor) -> Tensor:
-    """[C, 1], as it was there: models are compared by the same covariance."""
-    return aligned(key, before.cells[k].key, before.cells[k].jacobian[:, -1:])
+    return before.cells[k].key, before.cells[k].jacobian[:, -len(std) :], std
 
 
 def as_held(evidence: Evidence, like: Evidence) -> Evidence:
     """With another's slopes along nuisances: what episodes may differ by is the same for all models."""
     cells = []
     for k, own in enumerate(evidence.cells):
-        key, slopes = like.cells[k].key, like.cells[k].jacobian[:, -len(like.stds[k]) :]
+        key, slopes, _ = _known_slopes(like, k)
         kept = own.jacobian[:, : own.jacobian.shape[1] - len(evidence.stds[k])]
         cells.append(own._replace(jacobian=torch.cat([kept, aligned(own.key, key, slopes)], 1)))
     return replace(evidence, cells=cells, stds=like.stds)
 
 
 def as_rough(evidence: Evidence, like: Evidence) -> Evidence:
-    """With another's roughness: densities of models are compared by the same covariance only."""
-    cells = [
-        own._replace(rough=aligned(own.key, other.key, other.rough))
-        for own, other in zip(evidence.cells, like.cells, strict=True)
-    ]
-    return replace(evidence, cells=cells)
+    """With another's roughness and numerics: densities of models are compared by the same covariance only."""
+    both = list(zip(evidence.cells, like.cells, strict=True))
+    cells = [own._replace(rough=aligned(own.key, other.key, other.rough)) for own, other in both]
+    numerics = [aligned(own.key, other.key, n) for (own, other), n in zip(both, like.numerics, strict=True)]
+    return replace(evidence, cells=cells, numerics=numerics)
 
 
 def central(cells: Cells, shifts: Sequence[tuple[int, float]], parameters: int) -> Cells:

@@ -159,7 +159,7 @@ def right(found: Fitted, k: int) -> tuple[Tensor, Tensor]:
     """(S [C, C], M [C, N]) of one episode by a right model."""
     cells, stds = found.evidence.cells[k], found.evidence.stds[k]
     uncertain = cells.jacobian[:, : found.evidence.own] @ torch.linalg.cholesky(found.covariance)
-    moved = torch.cat([uncertain, cells.jacobian[:, -len(stds) : -1] * stds[:-1]], 1)  # numerics are in the level
+    moved = torch.cat([uncertain, cells.jacobian[:, -len(stds) :] * stds], 1)
     level, _ = reference(cells, found.evidence.numerics[k])
     return level.covariance(cells, moved[:, :0], moved.new_zeros(0)), moved
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .cells import NAMES, SEEN, Cells, mean_over, stretches
-from .evidence import Evidence
+from .evidence import NUMERICS, Evidence
 
 REACH, MEMORY = 0.1, 0.3  # m, s, over which slow errors agree
 FLOOR = {"points": 1e-4, "edges": 3e-4, "markers": 1e-4, "force": 5e-3, "torque": 5e-4}  # m, N, N m: of one cell
@@ -75,7 +75,8 @@ def whitened(evidence: Evidence, noise: Noise) -> Whitened:
     values, slopes, index, logs, roots = [], [], [], [], []
     count = evidence.own + len(evidence.hypotheses)
     for k, (cells, std) in enumerate(zip(evidence.cells, evidence.stds, strict=True)):
-        root = torch.linalg.cholesky(noise.covariance(cells, cells.jacobian[:, count:], std))
+        nuisance = torch.cat([cells.jacobian[:, count:], evidence.numerics[k][:, None]], 1)
+        root = torch.linalg.cholesky(noise.covariance(cells, nuisance, torch.cat([std, std.new_tensor([NUMERICS])])))
         both = torch.cat([cells.value[:, None], cells.jacobian[:, :count]], 1)
         both = torch.linalg.solve_triangular(root, both, upper=False)
         values.append(both[:, 0])
