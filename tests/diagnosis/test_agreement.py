@@ -10,7 +10,17 @@ from scipy.stats import t
 
 from torchcloth.diagnosis.comparison import Gain, spread
 from torchcloth.diagnosis.screening import Row
-from torchcloth.diagnosis.trials import NORMAL, SURE, SURE_OF_BEST, TRIED, Candidate, _ranked, known, standard_errors
+from torchcloth.diagnosis.trials import (
+    NORMAL,
+    SURE,
+    SURE_OF_BEST,
+    TRIED,
+    Candidate,
+    _agreed,
+    _ranked,
+    known,
+    standard_errors,
+)
 from torchcloth.diagnosis.verdict import _parameters
 from torchcloth.diagnosis.world import Model
 
@@ -64,6 +74,21 @@ def test_what_another_mesh_would_ask_for_is_no_cause(numerics, agreed):
     """Motions agree about what the same mesh does to all of them."""
     tried = candidate(0.1, numerics)
     assert known(tried.fitted, "cause", list("abcd"), tried) == agreed
+
+
+def test_less_is_asked_of_a_rival_than_of_a_cause():
+    """Ten standard errors of the thirteen that three motions ask for, one of which tells alone, rule nothing out."""
+    tried = candidate(0.1, 0.0)
+    cells = tried.fitted.evidence.cells
+    for k, c in enumerate(cells):  # each asks for a little more or less
+        cells[k] = c._replace(value=c.value - (0.03, -0.03, 0.02, -0.02)[k] * c.jacobian[:, 1])
+    tried = replace(tried, fitted=toys.fitted(tried.fitted.evidence), sure=1e3)
+    model = replace(tried.fitted.model, accepted=(tried.hypothesis,), amplitudes=(0.3,))
+    model = replace(model, parameters=model.parameters[:1], values=torch.zeros(1).double())
+    tried = replace(tried, fitted=replace(tried.fitted, model=model))
+    assert not known(tried.fitted, "cause", list("abcd"), tried)
+    assert _agreed(tried, list("abcd"))
+    assert not _agreed(replace(tried, row=tried.row._replace(bias=5.0)), list("abcd"))
 
 
 def candidate(asked, numerics):

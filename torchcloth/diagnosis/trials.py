@@ -138,7 +138,8 @@ def one_step(
         return None
     best = useful[0]
     alike = lambda c: predict(renoised(c.fitted, noise, likeliest), setting.names, best.alone)  # noqa: E731
-    rivals = {c.hypothesis.name: c for c in reversed(useful) if c is not best and _rival(c, alike(c), best)}
+    possible = [*useful, *(c for c in others if worthwhile(c.gain) and _agreed(c, setting.names))]
+    rivals = {c.hypothesis.name: c for c in reversed(possible) if c is not best and _rival(c, alike(c), best)}
     rivals |= {c.hypothesis.name: c for c in others if _open(c, alike(c), best)}
     return Step(best, chance, tried, [*reversed(rivals.values())], screened, current)
 
@@ -212,6 +213,11 @@ def _plausible(c: Candidate) -> bool:
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:
     return worthwhile(c.gain) and known(c.fitted, c.hypothesis.name, names, c)
+
+
+def _agreed(c: Candidate, names: Sequence[str]) -> bool:
+    """Of what predicts as well as a cause, less is asked than of a cause: it need not be there, it cannot be told."""
+    return known(c.fitted, c.hypothesis.name, names, replace(c, sure=NORMAL))
 
 
 def known(found: Fitted, name: str, names: Sequence[str], c: Candidate) -> bool:
