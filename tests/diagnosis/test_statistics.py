@@ -125,6 +125,23 @@ def test_what_is_too_large_to_be_believed_is_said():
     assert "more than 5 is not believed" in said
 
 
+@pytest.mark.parametrize("share", [-0.3, 0.3])
+def test_what_a_further_mesh_has_more_or_less_of_is_no_cause(share):
+    """The truth lies a third of the way to the coarser mesh, or beyond the finer: that looks like a hypothesis."""
+    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 0)
+    generator = torch.Generator().manual_seed(3)
+    numerics = []
+    for c in ev.cells:  # mostly what "b" does, and something of its own
+        own = torch.randn(len(c.value), generator=generator).double() * c.jacobian[:, 3].std()
+        numerics.append(3.0 * (c.jacobian[:, 3] + 0.3 * own))
+    cells = [c._replace(value=c.value + share * n) for c, n in zip(ev.cells, numerics, strict=True)]
+    blind = row(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.stds, ev.numerics)), "b")
+    aware = row(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.stds, numerics)), "b")
+    assert abs(blind.amplitude) > 10 * blind.std
+    assert abs(aware.amplitude) < 2.5 * aware.std
+    assert aware.std < 2 * abs(share) * 3.0 / toys.EPISODES**0.5  # episodes have their own share each
+
+
 def test_numerics_widen_the_error():
     ev = toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.0, 0.6, 0.0]).double(), 2)
     shifted = [-3 * 0.5 * c.jacobian[:, 3] for c in ev.cells]  # the coarser mesh errs like b at 1.5
