@@ -68,15 +68,15 @@ class Grasp(AbstractBoundary):
         return grasp
 
     @property
-    def uv(self) -> ArrayLike | None:
+    def uv(self) -> np.ndarray | None:
         """[G, 2] m, pattern coordinates of the patch's centres; None where it is known by its vertices or its name."""
-        return self._uv
+        return None if self._uv is None else np.atleast_2d(self._uv)
 
     def moved(self, wider: float, along: float) -> Grasp:
         """The same vertices, where a mesh has them ``wider`` [m] farther out and ``along`` [m] further along u."""
-        if self._uv is None:
+        if self.uv is None:
             raise InvalidInput("Grasp.moved", got="a patch without a place", expected="one that was given by uv")
-        grasp = Grasp(uv=np.asarray(self._uv, float) + np.array([along, 0.0]), radius=self.radius + wider)
+        grasp = Grasp(uv=self.uv + np.array([along, 0.0]), radius=self.radius + wider)
         grasp.index, grasp._stays = self.index.clone(), True
         return grasp
 

@@ -8,13 +8,15 @@ ends. What comes out is carried back to where the vertices were: nobody sees ano
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..boundaries import Grasp
 from ..errors import InvalidInput
-from ..identification.carried import between
+from ..identification.carried import between, carried
 from ..identification.episodes import Episode
 from ..identification.replays import Frames
 from ..meshes import Mesh
@@ -22,7 +24,13 @@ from ..meshes.mesh import signed_area
 from .world import World, rebuilt
 
 TAPER = 1.0  # radii, over which the pattern around a patch makes room for it: farther out, meshes differ by more
+STRAIGHT = 0.03  # 1 - cos of the turn at a vertex of the rim along which it may go: 14 degrees
 SQUEEZED = 0.1  # of a triangle's area, the least that may be left
+
+
+class _Patch(NamedTuple):
+    centres: np.ndarray  # [G, 2] m
+    radius: float  # m
 
 
 def regripped(world: World, wider: float = 0.0, along: float = 0.0) -> World:
@@ -31,37 +39,39 @@ def regripped(world: World, wider: float = 0.0, along: float = 0.0) -> World:
     Raises:
         InvalidInput: more than the pattern around the patches has room for.
     """
-    before = world.cloth.mesh
-    grasps = {name: part for name, part in world.cloth.boundaries.items() if isinstance(part, Grasp)}
-    placed = {name: part for name, part in grasps.items() if part.uv is not None}
-    if before.uv is None or not placed:
+    before, parts, patches = world.cloth.mesh, {}, []
+    for name, part in world.cloth.boundaries.items():
+        if isinstance(part, Grasp) and part.uv is not None:
+            parts[name] = part.moved(wider, along)
+            patches.append(_Patch(part.uv, part.radius))
+    if before.uv is None or not patches:
         return world
-    mesh = _stretched(before, list(placed.values()), wider, along)
-    there, back = between(before, mesh.uv), between(mesh, before.uv)
-    parts = {name: part.moved(wider, along) for name, part in placed.items()}
+    uv = _stretched(before, before.uv, patches, wider, along)
+    there = between(before, uv)
+    vertices = carried(there, torch.as_tensor(before.vertices)).numpy()
+    mesh = Mesh.build(vertices, before.faces, uv, before.places)
+    back = between(mesh, before.uv)
     cloth = rebuilt(world.cloth, {}, None, parts, mesh)
     motion = lambda e: _begun(e, there)  # noqa: E731
-    view = lambda frames, _: _carried(frames, back)  # noqa: E731
+    view = lambda frames, _: _seen(frames, back)  # noqa: E731
     return World(cloth, (*world.motions, motion), (view, *world.views))
 
 
 def _begun(episode: Episode, there: Tensor) -> Episode:
-    return replace(episode, initial=there.to(episode.initial) @ episode.initial)
+    return replace(episode, initial=carried(there, episode.initial))
 
 
-def _carried(frames: Frames, back: Tensor) -> Frames:
-    back = back.to(frames.x)
-    return frames._replace(x=back @ frames.x, v=back @ frames.v)
+def _seen(frames: Frames, back: Tensor) -> Frames:
+    return frames._replace(x=carried(back, frames.x), v=carried(back, frames.v))
 
 
-def _stretched(mesh: Mesh, grasps: list[Grasp], wider: float, along: float) -> Mesh:
-    """Vertices within a patch go with its edge, those around it less and less; the rim stays the rim."""
-    uv: np.ndarray = mesh.uv  # type: ignore[assignment]
+def _stretched(mesh: Mesh, uv: np.ndarray, patches: list[_Patch], wider: float, along: float) -> np.ndarray:
+    """[V, 2] m: vertices in a patch go with its edge, those around it less and less; the rim stays the rim."""
     move = np.zeros_like(uv)
     beside = np.minimum(uv[:, 0] - uv[:, 0].min(), uv[:, 0].max() - uv[:, 0])  # to the nearer end of the fabric
-    for k, grasp in enumerate(grasps):
-        centres, radius = np.atleast_2d(grasp.uv), grasp.radius
-        room = min([TAPER * radius, *(_gap(grasp, other) for other in grasps[:k] + grasps[k + 1 :])])
+    for k, patch in enumerate(patches):
+        centres, radius = patch
+        room = min([TAPER * radius, *(_gap(patch, other) for other in patches[:k] + patches[k + 1 :])])
         offset = uv - centres[np.linalg.norm(uv[:, None] - centres, axis=-1).argmin(1)]
         far = np.linalg.norm(offset, axis=1)
         share = np.clip(1 - (far - radius) / room, 0.0, 1.0)[:, None]
@@ -72,13 +82,13 @@ def _stretched(mesh: Mesh, grasps: list[Grasp], wider: float, along: float) -> M
     if (signed_area(placed[mesh.faces]) / signed_area(uv[mesh.faces])).min() < SQUEEZED:
         got = f"patches {1e3 * wider:g} mm wider and {1e3 * along:g} mm further along"
         raise InvalidInput("grip", got=got, expected="as much as the pattern around them has room for")
-    return Mesh.build(between(mesh, placed).numpy() @ mesh.vertices, mesh.faces, placed, mesh.places)
+    return placed
 
 
-def _gap(one: Grasp, other: Grasp) -> float:
+def _gap(one: _Patch, other: _Patch) -> float:
     """Of the pattern between two patches [m]; without bound where there is none."""
-    between_centres = np.linalg.norm(np.atleast_2d(one.uv)[:, None] - np.atleast_2d(other.uv), axis=-1).min()
-    gap = float(between_centres) - one.radius - other.radius
+    apart = np.linalg.norm(one.centres[:, None] - other.centres, axis=-1).min()
+    gap = float(apart) - one.radius - other.radius
     return gap if gap > 0 else np.inf
 
 
@@ -90,6 +100,6 @@ def _along_rim(mesh: Mesh, uv: np.ndarray, move: np.ndarray) -> np.ndarray:
     across = np.zeros((len(uv), 2, 2))
     for end in edges.T:
         np.add.at(across, end, normal[:, :, None] * normal[:, None, :])
-    size, axes = np.linalg.eigh(across)  # along an axis of size 0 a vertex is free
-    free = np.einsum("vik,vk,vjk->vij", axes, size < 1e-6, axes)
+    size, axes = np.linalg.eigh(across)
+    free = np.einsum("vik,vk,vjk->vij", axes, size < STRAIGHT, axes)
     return np.einsum("vij,vj->vi", free, move)

@@ -1,4 +1,4 @@
-"""Values between a mesh's vertices, as a matrix, exact where they are a quadratic function of the pattern.
+"""Values between a mesh's vertices, exact where they are a quadratic function of the pattern.
 
 Linear interpolation lies on a bent cloth's chords: carried half an edge on and back, a vertex would be off by more than
 what a patch found elsewhere changes, and by as much in either direction. With the gradients G of the corners and the
@@ -15,10 +15,11 @@ from ..meshes import Mesh
 from .streams import on_pattern
 
 SLIGHT = 1e-9  # ridge, of unit neighbourhoods: four neighbours in a cross leave the mixed derivative open
+THERE = 1e-9  # m, within which a place is a vertex
 
 
 def between(mesh: Mesh, uv: np.ndarray) -> Tensor:
-    """[N, V] weights of the vertices in values at pattern points [N, 2] m.
+    """[N, V] sparse, weights of the vertices in values at pattern points [N, 2] m.
 
     Raises:
         InvalidInput: a point that is not on the pattern, or a mesh without pattern coordinates.
@@ -26,35 +27,48 @@ def between(mesh: Mesh, uv: np.ndarray) -> Tensor:
     own: np.ndarray = mesh.uv  # type: ignore[assignment]
     hits = on_pattern(mesh, uv)
     corners, weights = hits.corners.numpy(), hits.weights.double().numpy()
-    gradients = _gradients(own, _near(mesh.faces, len(own)))
-    out = np.zeros((len(uv), len(own)))
-    for corner, weight in zip(corners.T, weights.T, strict=True):
-        out[np.arange(len(uv)), corner] += weight
-        out += 0.5 * weight[:, None] * np.einsum("nc,ncv->nv", uv - own[corner], gradients[corner])
-    return torch.as_tensor(out)
+    points = np.repeat(np.arange(len(uv)), 3)
+    bent = (weights * np.linalg.norm(uv[:, None] - own[corners], axis=-1)).ravel() > THERE
+    used, which = np.unique(corners.ravel()[bent], return_inverse=True)
+    near = _two_rings(mesh.faces, used)
+    gradients = _gradients(own, near)
+    offset = (uv[points] - own[corners.ravel()])[bent]
+    share = 0.5 * weights.ravel()[bent, None] * np.einsum("nc,nck->nk", offset, gradients[which])
+    rows = np.concatenate([points, np.repeat(points[bent], near.shape[1])])
+    columns = np.concatenate([corners.ravel(), near[which].ravel()])
+    values = np.concatenate([weights.ravel(), share.ravel()])
+    index = torch.as_tensor(np.stack([rows, columns]))
+    size = len(uv), len(own)
+    return torch.sparse_coo_tensor(index, torch.as_tensor(values), size, check_invariants=True).coalesce()
 
 
-def _near(faces: np.ndarray, count: int) -> np.ndarray:
-    """[V, V] bool: neighbours and theirs."""
-    next_to = np.zeros((count, count), bool)
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        next_to[faces[:, a], faces[:, b]] = next_to[faces[:, b], faces[:, a]] = True
-    near = next_to | (next_to.astype(np.float32) @ next_to.astype(np.float32) > 0)
-    np.fill_diagonal(near, False)
-    return near
+def carried(weights: Tensor, x: Tensor) -> Tensor:
+    """[..., N, C], by the weights [N, V] of ``between``, of values [..., V, C]."""
+    flat = x.movedim(-2, 0)
+    out = torch.sparse.mm(weights.to(x), flat.reshape(len(flat), -1))
+    return out.reshape(len(weights), *flat.shape[1:]).movedim(0, -2)
+
+
+def _two_rings(faces: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """[S, K] of the vertices used: themselves, neighbours and theirs; themselves again where there are fewer."""
+    pairs = np.unique(faces[:, [0, 1, 1, 2, 2, 0, 1, 0, 2, 1, 0, 2]].reshape(-1, 2), axis=0)
+    first = np.searchsorted(pairs[:, 0], np.arange(faces.max() + 1))
+    place = np.arange(len(pairs)) - first[pairs[:, 0]]
+    ring = np.tile(np.arange(len(first))[:, None], (1, place.max() + 1))
+    ring[pairs[:, 0], place] = pairs[:, 1]
+    return np.concatenate([used[:, None], ring[used], ring[ring[used]].reshape(len(used), ring.shape[1] ** 2)], 1)
 
 
 def _gradients(uv: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """[V, 2, V] 1/m: of a quadratic through each vertex that fits those near it, nearer ones more."""
-    offset = uv[None] - uv[:, None]
-    size = np.sqrt((near[..., None] * offset**2).sum((1, 2)) / near.sum(1))
+    """[S, 2, K] 1/m: of a quadratic through the first of the vertices [S, K] that fits the others, nearer ones more."""
+    offset, other = uv[near] - uv[near[:, :1]], near != near[:, :1]
+    size = np.sqrt((offset**2).sum((1, 2)) / other.sum(1))
     u, v = np.moveaxis(offset / size[:, None, None], -1, 0)
-    weight = near / np.maximum(u**2 + v**2, 1e-12) ** 2
-    basis = np.stack([u, v, u * u, u * v, v * v], 1)  # [V, 5, V]
+    weight = other / np.maximum(u**2 + v**2, 1e-12) ** 2
+    basis = np.stack([u, v, u * u, u * v, v * v], 1)  # [S, 5, K]
     weighted = basis * weight[:, None]
     normal = weighted @ basis.transpose(0, 2, 1)
     normal += SLIGHT * normal.trace(axis1=1, axis2=2)[:, None, None] * np.eye(5)
     found = np.linalg.solve(normal, weighted)[:, :2] / size[:, None, None]
-    itself = np.arange(len(uv))
-    found[itself, :, itself] -= found.sum(2)
+    found[:, :, 0] = -found.sum(2)  # the vertex itself comes first
     return found

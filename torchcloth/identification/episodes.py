@@ -23,7 +23,7 @@ from ..robots import replay  # pyright: ignore[reportMissingImports] - mapped fr
 from ..transfer import Contact
 from ..types import Trajectory
 from . import streams
-from .carried import between
+from .carried import between, carried
 
 DEFAULT_STIFFNESS = 300.0  # N/m, a start in the middle of the published fabrics, where an episode names none
 DEFAULT_POISSON = 0.2
@@ -240,16 +240,16 @@ def first_shape(name: str, cloth: Cloth, recording: Recording) -> Tensor:
             expected=f"{len(cloth.mesh.vertices)}, one per vertex",
             remedy="give the mesh that the initial vertices belong to",
         )
-    return torch.as_tensor(vertices) if initial is None else _carried(cloth.mesh, recording, torch.as_tensor(initial))
+    return torch.as_tensor(vertices) if initial is None else _on_mesh(cloth.mesh, recording, torch.as_tensor(initial))
 
 
-def _carried(mesh: Mesh, recording: Recording, initial: Tensor) -> Tensor:
+def _on_mesh(mesh: Mesh, recording: Recording, initial: Tensor) -> Tensor:
     info = recording.cloth
     if info.vertices is None or info.faces is None or info.uv is None or mesh.uv is None:
         return initial
     if np.array_equal(info.uv, mesh.uv) or not np.array_equal(info.faces, mesh.faces):
         return initial
-    return between(Mesh.build(info.vertices, info.faces, info.uv), mesh.uv) @ initial.double()
+    return carried(between(Mesh.build(info.vertices, info.faces, info.uv), mesh.uv), initial.double())
 
 
 def _check_place(name: str, cloth: Cloth, motion: Mapping[str, Trajectory], x: Tensor, start: float) -> None:
