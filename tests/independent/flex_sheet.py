@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -55,6 +55,11 @@ class SheetSpec:
         even = (np.linspace(0, size, n) for size, n in zip((self.width, self.height), self.nodes, strict=True))
         u, v = (np.asarray(own) if own else line for own, line in zip((self.lines_u, self.lines_v), even, strict=True))
         return u, v
+
+    @property
+    def even(self) -> SheetSpec:
+        """The same, its vertices at even distances."""
+        return replace(self, lines_u=(), lines_v=())
 
     @property
     def shortest(self) -> float:

@@ -79,7 +79,7 @@ class Scene:
         grip, sheet = self.grip, self.sheet
         if not (grip.wider or grip.regrasp):
             return self
-        (u, v), reach = replace(sheet, lines_u=(), lines_v=()).lines, grip.radius + 1e-9
+        (u, v), reach = sheet.even.lines, grip.radius + 1e-9
         left, right = u[u <= reach].max(), u[u >= sheet.width - reach].min()
         below = v[v >= sheet.height - reach].min()
         wider, along = grip.wider, grip.regrasp
@@ -155,14 +155,14 @@ def simulate(scene: Scene, motion: Motion, step: float | None = None) -> Result:
 
 def evenly(scene: Scene, x: Array) -> Array:
     """Positions [K, V, 3] m of a simulated scene at vertices that lie at even distances: places to compare."""
-    uv, _ = grid(replace(scene.sheet, lines_u=(), lines_v=()))
+    uv, _ = grid(scene.sheet.even)
     found = bilinear(scene.gripped.sheet, np.moveaxis(x, 0, 1).reshape(len(uv), -1), uv)[0]
     return np.moveaxis(found.reshape(len(uv), len(x), 3), 1, 0)
 
 
 def _grip(scene: Scene, motion: Motion, name: str) -> Grip:
     spec = scene.grip
-    said, _ = grid(replace(scene.sheet, lines_u=(), lines_v=()))
+    said, _ = grid(scene.sheet.even)
     held = np.flatnonzero(np.linalg.norm(said - motion.held[name], axis=1) <= spec.radius + 1e-9)
     if not len(held):
         raise InvalidInput(f"grip {name!r} holds nothing", got=f"radius {spec.radius:g} m")

@@ -69,7 +69,10 @@ class Grasp(AbstractBoundary):
 
     @property
     def uv(self) -> np.ndarray | None:
-        """[G, 2] m, pattern coordinates of the patch's centres; None where it is known by its vertices or its name."""
+        """[G, 2] m, pattern coordinates of the patch's centres; None where it is known by its vertices or its name.
+
+        Of a ``corner``, once it is bound to a mesh.
+        """
         return None if self._uv is None else np.atleast_2d(self._uv)
 
     def moved(self, wider: float, along: float) -> Grasp:

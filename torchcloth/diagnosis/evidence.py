@@ -108,8 +108,8 @@ def _of_their_own(model: Model, hypotheses: Sequence[Hypothesis]) -> list[Hypoth
 
 def _with_twins(evidence: Evidence, model: Model, hypotheses: Sequence[Hypothesis]) -> Evidence:
     """The others have their parameter's slopes: simulated beside it, ripples would seem to tell one from the other."""
-    rest = [h for h in hypotheses if h not in _of_their_own(model, hypotheses)]
     names, cells, after = [p.name for p in model.parameters], [], evidence.own + len(evidence.hypotheses)
+    rest = [h for h in hypotheses if h.twin in names]
     places = [names.index(h.twin) for h in rest]
     shares = torch.tensor([_by_share(model.parameters[k], float(model.values[k])) for k in places])
     for own in evidence.cells:

@@ -26,9 +26,9 @@ TOLD = 0.5  # of the prior's width: a parameter that is known better is known fr
 def load(path: str | Path) -> Cloth:
     """The model of a ``.tcm`` file as a layer, with its fitted values and effects, ready to be called with motions.
 
-    What the robot and the observer do otherwise is no part of a cloth: ``diagnosis.load_world`` has both beside it. Where
-    a cause has moved the patches that are held, vertices lie elsewhere on the pattern (``mesh.uv``) than an episode's;
-    ``identification.episode`` carries its first shape over.
+    What the robot and the observer do otherwise is no part of a cloth: ``diagnosis.load_world`` has both beside it.
+    Where a cause has moved the patches that are held, vertices lie elsewhere on the pattern (``mesh.uv``) than an
+    episode's; ``identification.episode`` carries its first shape over.
 
     Raises:
         InvalidInput: no such file, or a cause that is not in the catalogue.

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..meshes import Mesh
+from ..meshes import Mesh, topology
 from .streams import on_pattern
 
 SLIGHT = 1e-9  # ridge, of unit neighbourhoods: four neighbours in a cross leave the mixed derivative open
@@ -51,7 +51,8 @@ def carried(weights: Tensor, x: Tensor) -> Tensor:
 
 def _two_rings(faces: np.ndarray, used: np.ndarray) -> np.ndarray:
     """[S, K] of the vertices used: themselves, neighbours and theirs; themselves again where there are fewer."""
-    pairs = np.unique(faces[:, [0, 1, 1, 2, 2, 0, 1, 0, 2, 1, 0, 2]].reshape(-1, 2), axis=0)
+    ends, _ = topology.edges(faces)
+    pairs = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
     first = np.searchsorted(pairs[:, 0], np.arange(faces.max() + 1))
     place = np.arange(len(pairs)) - first[pairs[:, 0]]
     ring = np.tile(np.arange(len(first))[:, None], (1, place.max() + 1))
