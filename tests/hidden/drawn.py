@@ -32,15 +32,16 @@ class Size:
     Attributes:
         nodes: vertices along the truth's sides; fit: along those of the recordings' mesh.
         free, table: motions in the air, and with one on a table.
-        pad: m, that grippers hold: as many whole edges on the truth's mesh, on the recordings' and on the next finer.
-            Else each holds another length, and a few millimetres of pad are a cause.
+        pad: m, within which the truth holds vertices: three of its edges and beside them one, the roundest of patches.
+        pads: m, between which grippers hold; lines of the truth's vertices are moved to where that ends.
     """
 
     nodes: int
     fit: int
     free: tuple[Plan, ...]
     table: tuple[Plan, ...]
-    pad: float = 0.0505
+    pad: float = 0.053
+    pads: tuple[float, float] = (0.042, 0.058)
 
 
 _COMMON: tuple[Plan, ...] = (
@@ -52,7 +53,7 @@ _COMMON: tuple[Plan, ...] = (
 )
 REDUCED = Size(19, 13, (*_COMMON, ("shake", 0.0, 1.5)), (*_COMMON, ("drag-fast", 0.0, 1.0)))
 _FAST: Plan = ("swing-fast", 0.0, 1.3)
-SMALL = Size(13, 9, (_FAST, ("turn", 0.0, 3.0)), (_FAST, ("drag-fast", 0.0, 1.3)), 0.0755)
+SMALL = Size(13, 9, (_FAST, ("turn", 0.0, 3.0)), (_FAST, ("drag-fast", 0.0, 1.3)), 0.0795, (0.075, 0.075))
 FOLDING = 1.3  # speed
 UNSEEN: Plan = ("swing", 45.0, 1.4)  # of no case
 
@@ -88,6 +89,7 @@ class Case:
         takes: the episodes, in the order in which they are written.
         fabric: values of the true fabric; said: data sheet's values over them.
         bias, occlusion: of the sensor; diagonals: of the truth's mesh.
+        pad: m, that grippers hold.
         forces: measured.
         fault: of the recording, or "".
     """
@@ -104,6 +106,7 @@ class Case:
     occlusion: float = 0.0
     nodes: int = REDUCED.nodes
     diagonals: str = "alternating"
+    pad: float = 0.05
     forces: bool = True
     fault: str = ""
 
@@ -143,7 +146,8 @@ def case(seed: int, size: Size = REDUCED) -> Case:
     parts.pop("regrasp", None)
     order = rng.permutation(len(takes))
     given = {"nodes": size.nodes, "fabric": _fabric(rng), "said": _sheet(rng, 0.15)} | parts
-    return Case(seed, family, size=size, takes=tuple(takes[k] for k in order), **given)
+    pad = float(np.random.default_rng([seed, 17]).uniform(*size.pads))
+    return Case(seed, family, size=size, takes=tuple(takes[k] for k in order), pad=pad, **given)
 
 
 def sealed(secret: int, count: int) -> list[int]:

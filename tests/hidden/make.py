@@ -39,10 +39,10 @@ def scenes(found: Case, take: Take) -> tuple[Scene, Scene]:
     )
     plate = replace(plain.plate, stiffness=fabric["bending_stiffness"])
     sensor = replace(plain.sensor, bias=found.bias, occlusion=found.occlusion)
-    grip = replace(plain.grip, radius=found.size.pad)
-    true = replace(plain, sheet=sheet, plate=plate, sensor=sensor, grip=grip)
+    true = replace(plain, sheet=sheet, plate=plate, sensor=sensor, grip=replace(plain.grip, radius=found.size.pad))
     said = replace(
         true,
+        grip=replace(plain.grip, radius=found.pad),
         sheet=replace(
             sheet,
             areal_density=fabric["areal_density"] * found.said["areal_density"],
@@ -52,7 +52,9 @@ def scenes(found: Case, take: Take) -> tuple[Scene, Scene]:
     )
     for effect in (*found.effects, *take.own):
         true = _hidden(true, effect)
-    return true, said
+    (u, _), grip = sheet.even.lines, true.grip
+    beyond = found.pad - u[u <= grip.radius].max()
+    return replace(true, grip=replace(grip, wider=grip.wider + beyond)), said
 
 
 def _hidden(scene: Scene, effect: Hidden) -> Scene:

@@ -11,7 +11,8 @@ from twins import at, shifted
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import cloth_from, episode, identify
-from torchcloth.identification.episodes import mesh_of
+from torchcloth.identification.episodes import first_shape, mesh_of
+from torchcloth.identification.finer import finer_cloth, finer_recording
 from torchcloth.identification.objective import Objective
 from torchcloth.identification.unknowns import available, collect
 
@@ -47,6 +48,27 @@ def test_without_initial_vertices_the_mesh_is_the_first_frame(recording):
     seen = episode(model, placed)
     assert not seen.settles
     np.testing.assert_array_equal(seen.initial.numpy(), model.mesh.vertices)
+
+
+def test_patches_end_where_they_are_said_to_and_the_first_shape_is_carried_there(recording):
+    """Whole vertices would hold 33 mm of them: edges are as long."""
+    corner = np.array([[0.0, 0.0]])
+    bent = lambda uv: np.column_stack([uv, 0.2 + uv[:, 0] ** 2 - 2 * uv[:, 0] * uv[:, 1]])  # noqa: E731
+    given = with_cloth(recording, initial_vertices=bent(recording.cloth.uv))
+    for radius in (0.036, 0.045):
+        held = replace(given, grasps={**given.grasps, "left": rec.GraspInfo(corner, radius)})
+        cloth = cloth_from(held)
+        fine = finer_cloth(cloth)
+        for model, episode_ in ((cloth, held), (fine, finer_recording(held, cloth.mesh, fine.mesh))):
+            uv = model.mesh.uv
+            mine = uv[model.boundaries["left"].index.numpy()]
+            assert mine[mine[:, 1] == 0, 0].max() == pytest.approx(radius, rel=1e-9)
+            assert mine[mine[:, 0] == 0, 1].max() == pytest.approx(radius, rel=1e-9)
+            assert model.mesh.area.sum() == pytest.approx(twins.SIDE**2)
+            reached = first_shape("", model, episode_).numpy()
+            np.testing.assert_allclose(reached[:, :2], uv, atol=1e-9)
+            if model is cloth:  # of the finer mesh, vertices lie on the coarse one's chords
+                np.testing.assert_allclose(reached, bent(uv), atol=1e-9)
 
 
 def test_a_cloth_far_from_its_grippers_is_refused(recording, model):

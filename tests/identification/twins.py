@@ -22,8 +22,8 @@ from torchcloth.robots import replay
 SIDE = 0.3  # m
 THICKNESS = 1e-3  # m
 EDGES = {"left": 0.0, "right": SIDE}  # u of the edge that each gripper's jaw holds in its whole length
-JAW = np.linspace(0.0, SIDE, 25)
-RADIUS = 0.0101  # m, holds the edge's vertices and no others
+JAW = np.linspace(0.0, SIDE, 61)
+RADIUS = 0.0018  # m, holds the edge's vertices and no others, of any mesh used here
 TRUTH, FIT = (11, 11), (7, 7)  # vertices along the sides
 NOISE = 1e-3  # m
 FRAMES, RATE = 15, 20.0  # 0.7 s
@@ -58,7 +58,7 @@ def cloth(fabric: Fabric, resolution: tuple[int, int], drag: bool = True) -> tc.
 
 
 def jaw(name: str) -> np.ndarray:
-    """[25, 2] m, pattern points along an edge."""
+    """[61, 2] m, pattern points along an edge."""
     return np.stack([np.full_like(JAW, EDGES[name]), JAW], axis=1)
 
 

@@ -8,7 +8,6 @@ ends. What comes out is carried back to where the vertices were: nobody sees ano
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,16 +20,11 @@ from ..identification.episodes import Episode
 from ..identification.replays import Frames
 from ..meshes import Mesh
 from ..meshes.mesh import signed_area
+from ..meshes.patches import Patch, along_rim
 from .world import World, rebuilt
 
 TAPER = 1.0  # radii, over which the pattern around a patch makes room for it: farther out, meshes differ by more
-STRAIGHT = 0.03  # 1 - cos of the turn at a vertex of the rim along which it may go: 14 degrees
 SQUEEZED = 0.1  # of a triangle's area, the least that may be left
-
-
-class _Patch(NamedTuple):
-    centres: np.ndarray  # [G, 2] m
-    radius: float  # m
 
 
 def regripped(world: World, wider: float = 0.0, along: float = 0.0) -> World:
@@ -43,7 +37,7 @@ def regripped(world: World, wider: float = 0.0, along: float = 0.0) -> World:
     for name, part in world.cloth.boundaries.items():
         if isinstance(part, Grasp) and part.uv is not None:
             parts[name] = part.moved(wider, along)
-            patches.append(_Patch(part.uv, part.radius))
+            patches.append(Patch(part.uv, part.radius))
     if before.uv is None or not patches:
         return world
     uv = _stretched(before, before.uv, patches, wider, along)
@@ -65,41 +59,27 @@ def _seen(frames: Frames, back: Tensor) -> Frames:
     return frames._replace(x=carried(back, frames.x), v=carried(back, frames.v))
 
 
-def _stretched(mesh: Mesh, uv: np.ndarray, patches: list[_Patch], wider: float, along: float) -> np.ndarray:
+def _stretched(mesh: Mesh, uv: np.ndarray, patches: list[Patch], wider: float, along: float) -> np.ndarray:
     """[V, 2] m: vertices in a patch go with its edge, those around it less and less; the rim stays the rim."""
     move = np.zeros_like(uv)
     beside = np.minimum(uv[:, 0] - uv[:, 0].min(), uv[:, 0].max() - uv[:, 0])  # to the nearer end of the fabric
     for k, patch in enumerate(patches):
-        centres, radius = patch
+        radius, offset = patch.radius, patch.offset(uv)
         room = min([TAPER * radius, *(_gap(patch, other) for other in patches[:k] + patches[k + 1 :])])
-        offset = uv - centres[np.linalg.norm(uv[:, None] - centres, axis=-1).argmin(1)]
         far = np.linalg.norm(offset, axis=1)
         share = np.clip(1 - (far - radius) / room, 0.0, 1.0)[:, None]
         outwards = offset / np.maximum(far, radius)[:, None]
         sideways = np.stack([np.minimum(beside / radius, 1.0), np.zeros(len(uv))], 1)
         move += share * (wider * outwards + along * sideways)
-    placed = uv + _along_rim(mesh, uv, move)
+    placed = uv + np.einsum("vij,vj->vi", along_rim(mesh, uv), move)
     if (signed_area(placed[mesh.faces]) / signed_area(uv[mesh.faces])).min() < SQUEEZED:
         got = f"patches {1e3 * wider:g} mm wider and {1e3 * along:g} mm further along"
         raise InvalidInput("grip", got=got, expected="as much as the pattern around them has room for")
     return placed
 
 
-def _gap(one: _Patch, other: _Patch) -> float:
+def _gap(one: Patch, other: Patch) -> float:
     """Of the pattern between two patches [m]; without bound where there is none."""
     apart = np.linalg.norm(one.centres[:, None] - other.centres, axis=-1).min()
     gap = float(apart) - one.radius - other.radius
     return gap if gap > 0 else np.inf
-
-
-def _along_rim(mesh: Mesh, uv: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """The same displacements [V, 2], those of the rim along it; where it turns, none."""
-    edges = mesh.boundary_edges
-    side = uv[edges[:, 1]] - uv[edges[:, 0]]
-    normal = np.stack([-side[:, 1], side[:, 0]], 1) / np.linalg.norm(side, axis=1, keepdims=True)
-    across = np.zeros((len(uv), 2, 2))
-    for end in edges.T:
-        np.add.at(across, end, normal[:, :, None] * normal[:, None, :])
-    size, axes = np.linalg.eigh(across)
-    free = np.einsum("vik,vk,vjk->vij", axes, size < STRAIGHT, axes)
-    return np.einsum("vij,vj->vi", free, move)

@@ -49,6 +49,14 @@ def carried(weights: Tensor, x: Tensor) -> Tensor:
     return out.reshape(len(weights), *flat.shape[1:]).movedim(0, -2)
 
 
+def at_places(mesh: Mesh, uv: np.ndarray) -> Mesh:
+    """The same cloth and triangles, with vertices at other places [V, 2] m of the pattern."""
+    if np.array_equal(uv, mesh.uv):  # type: ignore[arg-type]
+        return mesh
+    vertices = carried(between(mesh, uv), torch.as_tensor(mesh.vertices)).numpy()
+    return Mesh.build(vertices, mesh.faces, uv, mesh.places)
+
+
 def _two_rings(faces: np.ndarray, used: np.ndarray) -> np.ndarray:
     """[S, K] of the vertices used: themselves, neighbours and theirs; themselves again where there are fewer."""
     ends, _ = topology.edges(faces)

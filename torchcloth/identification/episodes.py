@@ -18,12 +18,13 @@ from ..errors import InvalidInput, RecordingError
 from ..losses import Hits
 from ..materials import AEP, AbstractMaterial
 from ..meshes import Mesh, rectangle
+from ..meshes.patches import Patch, fitted_to
 from ..recordings import Recording
 from ..robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..transfer import Contact
 from ..types import Trajectory
 from . import streams
-from .carried import between, carried
+from .carried import at_places, between, carried
 
 DEFAULT_STIFFNESS = 300.0  # N/m, a start in the middle of the published fabrics, where an episode names none
 DEFAULT_POISSON = 0.2
@@ -145,11 +146,17 @@ def cloth_from(
 
 
 def mesh_of(recording: Recording) -> Mesh:
-    """The episode's rest mesh, or its rectangular sheet.
+    """The episode's rest mesh, or its rectangular sheet, its vertices moved to where patches end that have a radius.
 
     Raises:
         RecordingError: neither is given.
     """
+    mesh = _mesh_as_said(recording)
+    patches = [Patch(np.atleast_2d(g.uv), g.radius) for g in recording.grasps.values() if g.uv is not None]
+    return mesh if mesh.uv is None else at_places(mesh, fitted_to(mesh, patches))
+
+
+def _mesh_as_said(recording: Recording) -> Mesh:
     cloth = recording.cloth
     if cloth.vertices is not None and cloth.faces is not None:
         return Mesh.build(cloth.vertices, cloth.faces, cloth.uv)
@@ -240,10 +247,11 @@ def first_shape(name: str, cloth: Cloth, recording: Recording) -> Tensor:
             expected=f"{len(cloth.mesh.vertices)}, one per vertex",
             remedy="give the mesh that the initial vertices belong to",
         )
-    return torch.as_tensor(vertices) if initial is None else _on_mesh(cloth.mesh, recording, torch.as_tensor(initial))
+    return torch.as_tensor(vertices) if initial is None else on_mesh(cloth.mesh, recording, torch.as_tensor(initial))
 
 
-def _on_mesh(mesh: Mesh, recording: Recording, initial: Tensor) -> Tensor:
+def on_mesh(mesh: Mesh, recording: Recording, initial: Tensor) -> Tensor:
+    """[V, 3] m, positions of the vertices of an episode's mesh, carried to a mesh with the same triangles elsewhere."""
     info = recording.cloth
     if info.vertices is None or info.faces is None or info.uv is None or mesh.uv is None:
         return initial

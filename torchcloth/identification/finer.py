@@ -9,7 +9,7 @@ away, and a third of d is added to the standard errors for what the extrapolatio
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -21,10 +21,12 @@ from ..boundaries import AbstractBoundary, Grasp
 from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..meshes import Mesh
+from ..meshes.patches import Patch, fitted_to
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from . import gauss_newton
-from .episodes import episode
+from .carried import at_places, between, carried
+from .episodes import episode, on_mesh
 from .objective import Objective
 
 LIMIT, OPEN = 4 / 3, 1 / 3  # of the step between two meshes, whose edges are as 2 to 1
@@ -41,9 +43,12 @@ def finer_cloth(cloth: Cloth) -> Cloth:
             expected = "one number for all triangles"
             raise InvalidInput(f"a finer mesh: {name}", got=f"shape {tuple(part.raw.shape)}", expected=expected)
     mesh, kept = cloth.mesh, copy.deepcopy(cloth, {id(cloth.mesh): cloth.mesh})
-    ends, faces = _divided(mesh.faces)
-    fine = Mesh.build(_between(mesh.vertices, ends), faces, None if mesh.uv is None else _between(mesh.uv, ends))
-    parts = cast("Iterable[tuple[str, AbstractBoundary]]", kept.boundaries.items())
+    ends, _ = _divided(mesh.faces)
+    fine = _divided_mesh(mesh)
+    parts = cast("list[tuple[str, AbstractBoundary]]", list(kept.boundaries.items()))
+    patches = [Patch(p.uv, p.radius) for _, p in parts if isinstance(p, Grasp) and p.uv is not None]
+    if fine.uv is not None:
+        fine = at_places(fine, fitted_to(fine, patches))  # rounder than the coarse mesh has them
     boundaries = {name: _regripped(part, ends, len(mesh.vertices)) for name, part in parts}
     return Cloth(
         fine,
@@ -58,10 +63,12 @@ def finer_cloth(cloth: Cloth) -> Cloth:
 
 
 def finer_recording(recording: Recording, coarse: Mesh, fine: Mesh) -> Recording:
-    """The episode for the finer mesh of ``finer_cloth``: its first shape has the new vertices halfway between."""
-    ends, first = _divided(coarse.faces)[0], recording.cloth.initial_vertices
+    """The episode for the finer mesh of ``finer_cloth``: its first shape has the new vertices between the others."""
+    first = recording.cloth.initial_vertices
     if first is not None and first.ndim == 2:  # else a sheet's grid
-        first = _between(first, ends)
+        first = _between(on_mesh(coarse, recording, torch.as_tensor(first)).numpy(), _divided(coarse.faces)[0])
+        if fine.uv is not None:
+            first = carried(between(_divided_mesh(coarse), fine.uv), torch.as_tensor(first)).numpy()
     info = replace(recording.cloth, vertices=fine.vertices, faces=fine.faces, uv=fine.uv, initial_vertices=first)
     return replace(recording, cloth=info)
 
@@ -82,6 +89,11 @@ def mesh_step(objective: Objective, final: gauss_newton.Iterate, recordings: Seq
             changed[own] = rows.value[other] - linear.value[own]
     weighted = final.influence()[0][:, None] * linear.jacobian
     return -torch.linalg.solve(gauss_newton.information(objective.problem(), final), weighted.mT @ changed)
+
+
+def _divided_mesh(mesh: Mesh) -> Mesh:
+    ends, faces = _divided(mesh.faces)
+    return Mesh.build(_between(mesh.vertices, ends), faces, None if mesh.uv is None else _between(mesh.uv, ends))
 
 
 def _regripped(part: AbstractBoundary, ends: np.ndarray, before: int) -> AbstractBoundary:
