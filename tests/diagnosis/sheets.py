@@ -11,6 +11,7 @@ import torch
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import World, base_model
+from torchcloth.identification.carried import between, carried
 from torchcloth.identification.episodes import Episode
 from torchcloth.identification.episodes import episode as tensors
 from torchcloth.identification.replays import Frames
@@ -81,17 +82,18 @@ def recorded(
 ) -> rec.Recording:
     """What a noisy sensor has of a world that is changed, played on a finer mesh; the first shape is settled."""
     blank, rng = episode(motion, TRUTH, (FRAMES - 1) / RATE + 0.01), np.random.default_rng(seed)
-    world = change(base_model(blank).world())
+    plain = base_model(blank).world()
+    world, even = change(plain), np.asarray(blank.cloth.uv)
     with torch.no_grad():
         data = tensors(world.cloth, blank)
         state = world.cloth.settle(world.cloth.state(data.initial), data.motion, duration=1.0, rate=15.0)
-        settled = replace(blank, cloth=replace(blank.cloth, initial_vertices=state.x.numpy()))
+        start = carried(between(world.cloth.mesh, even), state.x)
+        settled = replace(blank, cloth=replace(blank.cloth, initial_vertices=start.numpy()))
         found = play(world, tensors(world.cloth, settled))
+        x = carried(between(plain.cloth.mesh, even), found.x).numpy()
     coarse = episode(motion, FIT, (FRAMES - 1) / RATE + 0.01)
-    clouds = [_seen(x, rng) for x in found.x.numpy()]
-    first = _bilinear(found.x[0].numpy(), np.asarray(coarse.cloth.uv)) + 2e-4 * rng.standard_normal(
-        (len(coarse.cloth.uv), 3)
-    )
+    clouds = [_seen(frame, rng) for frame in x]
+    first = _bilinear(x[0], np.asarray(coarse.cloth.uv)) + 2e-4 * rng.standard_normal((len(coarse.cloth.uv), 3))
     return replace(
         coarse,
         cloth=replace(coarse.cloth, initial_vertices=first),
