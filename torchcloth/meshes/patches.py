@@ -1,8 +1,8 @@
 """Held patches that end where they are said to, and not at the nearest whole vertices.
 
-A patch holds the vertices within its radius. Of 25 mm edges and a radius of 40 mm that is one edge or two, by the place
-of the mesh, and 15 mm of grip move a swinging cloth by millimetres. Here vertices near the patch's edge are moved onto
-it, in the pattern, and those around make room.
+A patch holds the vertices within its radius: where edges are of 25 mm, one of 36 mm would hold 25 mm of the rim, and
+11 mm of grip move a swinging cloth by millimetres. Here vertices near the patch's edge are moved onto it, in the
+pattern, and those around make room.
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ class Patch(NamedTuple):
 
 
 def fitted_to(mesh: Mesh, patches: Sequence[Patch]) -> np.ndarray:
-    """[V, 2] m, pattern coordinates by which no edge crosses a patch's, where half of it is enough; the rim stays.
+    """[V, 2] m, pattern coordinates by which no edge of a triangle crosses a patch's; the rim of the cloth stays.
 
-    The mesh needs ``uv``. Where triangles would be squeezed to less than a quarter, vertices stay where they are.
+    The mesh needs ``uv``. Where an end of the edge would have to go too far, or a triangle were squeezed too much,
+    vertices stay where they are.
     """
     uv: np.ndarray = mesh.uv  # type: ignore[assignment]
     free = along_rim(mesh, uv)
