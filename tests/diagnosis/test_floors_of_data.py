@@ -9,10 +9,11 @@ import torch
 
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import base_model
-from torchcloth.diagnosis.branches import _jumped, without
+from torchcloth.diagnosis.branches import FIRST, _begun, _jumped, without
 from torchcloth.diagnosis.comparison import Predicted
 from torchcloth.diagnosis.repeats import pairs_of, repeats
 from torchcloth.diagnosis.setting import setting_of
+from torchcloth.meshes import topology
 
 
 def told(values: list[torch.Tensor]) -> Predicted:
@@ -52,6 +53,23 @@ def test_repetitions_are_of_one_command(tmp_path):
     ]
     setting = setting_of(base_model(recordings[0]), recordings)
     assert pairs_of(setting.recordings, setting.episodes) == [(0, 1), (0, 3), (1, 3)]
+
+
+def test_first_shapes_are_off_by_smooth_fields_along_the_normal_there_and_back():
+    blank = sheets.episode()
+    model = base_model(blank)
+    (e,) = setting_of(model, [blank]).episodes
+    begun = _begun(e, model.world(), torch.Generator().manual_seed(0))
+    off = [b.initial - e.initial for b in begun]
+    assert all(b.settles for b in begun)
+    assert torch.equal(begun[0].initial, _begun(e, model.world(), torch.Generator().manual_seed(0))[0].initial)
+    torch.testing.assert_close(off[1], -off[0])
+    assert (off[0] - off[2]).norm() > 0.5 * off[0].norm()
+    edges = torch.as_tensor(topology.edges(model.base.cloth.mesh.faces)[0])
+    for field in (off[0], off[2]):
+        assert float(field.square().sum(1).mean().sqrt()) == pytest.approx(FIRST)
+        assert float(field[:, 1].square().mean().sqrt()) == pytest.approx(FIRST, rel=0.01)  # the sheet hangs in x and z
+        assert float((field[edges[:, 0]] - field[edges[:, 1]]).square().sum(1).mean().sqrt()) < FIRST
 
 
 def test_a_cell_that_does_not_follow_its_slope_is_left_out():
