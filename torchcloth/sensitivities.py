@@ -84,17 +84,25 @@ class _Walk:
                 impulses.append(j)
         return values, tangents
 
-    def _within(self, k: int, work: Callable[[Model], Any]) -> Any:
-        """``work`` on the model, dual along direction k of the parameters; nothing where none of them changes."""
-        if not any(bool(tangent[k].any()) for tangent in self.along.parameters.values()):
+    def _within(self, work: Callable[[Model], dict[Any, Tensor]]) -> dict[Any, Tensor]:
+        """Tangents [K, ...] of what ``work`` makes of the model, of those that have any."""
+        given = self.along.parameters
+        changes = torch.zeros(self.count, dtype=torch.bool)
+        for tangent in given.values():
+            changes |= (tangent != 0).reshape(self.count, -1).any(1).cpu()
+        if not changes.any():
             return {}
-        values = dict(self.cloth.named_parameters())
+        values, batch = dict(self.cloth.named_parameters()), self.plan.state.x.ndim - 2
         with forward_ad.dual_level(), real_tangents():
-            entries = {
-                f"cloth.{name}": forward_ad.make_dual(values[name].detach(), tangent[k].to(values[name]).contiguous())
-                for name, tangent in self.along.parameters.items()
-            }
-            return functional_call(_Built(self.cloth, self.build, work), entries, ())
+            entries = _dual_copies(values, {name: t[changes] for name, t in given.items()}, batch)
+            found = functional_call(_Built(self.cloth, self.build, work), entries, ())
+            some = {key: forward_ad.unpack_dual(t).tangent for key, t in found.items()}
+        full = {}
+        for key, tangent in some.items():
+            if tangent is not None:
+                full[key] = tangent.new_zeros(self.count, *tangent.shape[1:])
+                full[key][changes] = tangent
+        return full
 
 
 class _Built(nn.Module):
@@ -146,10 +154,7 @@ def _by_copies(
     """K dual copies side by side: what every engine can do."""
     state, batch, values = plan.state, plan.state.x.ndim - 2, dict(cloth.named_parameters())
     with forward_ad.dual_level(), real_tangents():
-        entries = {
-            f"cloth.{name}": forward_ad.make_dual(*_copies(values[name], tangent, count, batch))
-            for name, tangent in along.parameters.items()
-        }
+        entries = _dual_copies(values, along.parameters, batch)
         many = state.map(lambda field: field.expand(count, *field.shape).contiguous())
         if along.state is not None:
             many = _both(many, _tangent_of(state, along, count), forward_ad.make_dual)
@@ -171,6 +176,14 @@ class _Replay(nn.Module):
         if settle:
             state = self.cloth.settle(state, motion, start=frames[0], duration=settle, rate=RATE)
         return self.cloth(state, motion, frames, dt=dt)
+
+
+def _dual_copies(values: Mapping[str, Tensor], along: Mapping[str, Tensor], batch: int) -> dict[str, Tensor]:
+    """Parameters as K copies in front of ``batch`` other axes, each dual along its direction."""
+    return {
+        f"cloth.{name}": forward_ad.make_dual(*_copies(values[name], tangent, len(tangent), batch))
+        for name, tangent in along.items()
+    }
 
 
 def _copies(value: Tensor, tangent: Tensor, count: int, batch: int) -> tuple[Tensor, Tensor]:

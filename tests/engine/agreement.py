@@ -56,7 +56,30 @@ def agree(
     assert not worse, worse
     found["tangents"] = tangents_transpose(cloth, motion, state, substeps, dt, stages)
     assert found["tangents"] <= marks[1], found["tangents"]
+    if not stages:
+        found["layer"] = layer_transposes(cloth, motion, state, substeps, dt)
+        assert found["layer"] <= marks[1], found["layer"]
     return found
+
+
+def layer_transposes(
+    cloth: tc.Cloth, motion: Mapping[str, Trajectory], state: ClothState, substeps: int, dt: float
+) -> float:
+    """``Cloth.sensitivities`` along changes of all parameters against gradients: the largest relative difference."""
+    cloth.zero_grad()
+    generator, limit = torch.Generator().manual_seed(2), dt * (1 + 1e-9)
+    named, times = dict(cloth.named_parameters()), (0.0, substeps * dt)
+    along = {name: torch.randn(3, *p.shape, generator=generator, dtype=p.dtype) for name, p in named.items()}
+    for change in along.values():
+        change[1] = 0.0  # nothing changes along one of them
+    out = cloth(state, motion, times, dt=limit)
+    weight = torch.randn(out.x.shape, generator=generator, dtype=out.x.dtype)
+    (weight * out.x).sum().backward()
+    _, moved = cloth.sensitivities(state, motion, times, along=tc.Directions(along), dt=limit)
+    gradients = {name: torch.zeros_like(p) if p.grad is None else p.grad for name, p in named.items()}
+    reverse = torch.stack([(along[name] * gradient).reshape(3, -1).sum(1) for name, gradient in gradients.items()])
+    forward = (weight * moved.x).reshape(3, -1).sum(1)
+    return float(((forward - reverse.sum(0)).abs() / (reverse.abs().sum(0) + 1e-12)).max())
 
 
 def in_chunks(model, state, dt, drives, substeps):

@@ -7,6 +7,7 @@ import torch
 from clothes import close, opening, sheet, start
 
 import torchcloth as tc
+from torchcloth.engine import tangents
 from torchcloth.errors import InvalidInput
 from torchcloth.sensitivities import Directions
 
@@ -155,3 +156,11 @@ def test_without_gradients_and_graph():
     value, moved = cloth.sensitivities(start(cloth), opening(END), (0.0, 0.005), along=along)
     assert not value.x.requires_grad
     assert not moved.x.requires_grad
+
+
+def test_all_directions_share_one_look_at_the_parts(monkeypatch):
+    """Parts are asked once for the tangents of their coefficients, not once for each direction."""
+    asked, lower = [], tangents.lower
+    monkeypatch.setattr(tangents, "lower", lambda *parts: asked.append(parts) or lower(*parts))
+    both(count=7)
+    assert len(asked) == 1

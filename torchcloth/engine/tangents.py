@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import torch
-import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from ..boundaries import Drive
@@ -18,8 +17,8 @@ from .fused import Fused
 from .lowering import lower
 from .operators import ops
 
-Coefficients = dict[Field, Tensor | None]
-Within = Callable[[int, Callable[[Model], Coefficients]], Coefficients]  # work on the model that is dual along k
+Coefficients = dict[Field, Tensor]
+Within = Callable[[Callable[[Model], Coefficients]], Coefficients]
 
 
 class FusedTangents:
@@ -27,8 +26,7 @@ class FusedTangents:
 
     Args:
         fused: without parts in torch.
-        within: calls a function with the model that is dual along direction k, in a level of forward mode; its answer
-            may be empty where the parameters do not change along k.
+        within: gives the tangents [K, ...] of what a function makes of the model, where there are any.
         count: K.
     """
 
@@ -67,18 +65,5 @@ class FusedTangents:
     def _inputs(self, state: ClothState, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
         """Tangents [K, ..., rows, comps] of the coefficients that have any."""
         if self._known is None:
-            inputs = self.fused.low.inputs
-
-            def found_in(model: Model) -> Coefficients:
-                found = lower(model, state, drives).inputs
-                return {f: forward_ad.unpack_dual(t).tangent for f, t in found.items()}
-
-            every = [self.within(k, found_in) for k in range(self.count)]
-            moved = [f for f in inputs if any(found.get(f) is not None for found in every)]
-            full = {f: [_or_zero(found.get(f), inputs[f]) for found in every] for f in moved}
-            self._known = {f: torch.stack(tangents) for f, tangents in full.items()}
+            self._known = self.within(lambda model: lower(model, state, drives).inputs)
         return self._known
-
-
-def _or_zero(tangent: Tensor | None, like: Tensor) -> Tensor:
-    return torch.zeros_like(like) if tangent is None else tangent.detach()

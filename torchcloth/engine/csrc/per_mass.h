@@ -39,26 +39,23 @@ struct PerMass : Stage<R> {
     void tangent(Scene<R>& s) const override {
         forward(s);
         if (!join(s, s.dot[given], DIRECTIONS)) return;
-        const R *m = s.value[mass], *quotient = s.value[out];
-        const Node *m_dot = node(s.dot[mass]), *from = node(s.dot[given]);
-        Node* to = node(s.dot[out]);
+        const P *m = at(s.value[mass]), *quotient = at(s.value[out]), *m_dot = at(s.dot[mass]), *from = at(s.dot[given]);
+        P* to = at(s.dot[out]);
         over_blocks(s, [&](int first, int last) {
-            for (int n = 4 * first; n < 4 * last; n++) {
-                const R own = m[n * ON_NODE];
-                const bool counts = own > least;
-                const Node moved = counts ? m_dot[n] : Node(0.0);
-                const Quad<R> by_mass = first_of(moved), there = reinterpret_cast<const Quad<R>*>(quotient)[n];
-                const Node change = (from[n] - widened(there) * repeated(by_mass)) * alike(counts ? 1 / own : R(1));
-                to[n] = without_mass(change);
-            }
+            for (int block = first; block < last; block++)
+                for (int p = 0; p < PACKS; p++) {
+                    const P own = m[PACKS * block + p], over = inverse(own), each = over * counts(own) * quotient[PACKS * block + p];
+                    for (int d = 0; d < DIRECTIONS; d++) {
+                        const size_t i = size_t(PACKS) * (block * DIRECTIONS + d) + p;
+                        to[i] = vectors(from[i] * over - masses(m_dot[i]) * each);
+                    }
+                }
         });
     }
 
   private:
-    using Node = Pack<R, ON_NODE * DIRECTIONS>;  // four directions of each of the four numbers
     static constexpr int PACKS = ON_BLOCK / LANES<R>;
     static P* at(R* field) { return reinterpret_cast<P*>(field); }
-    static Node* node(R* field) { return reinterpret_cast<Node*>(field); }
 
     // The last two nodes of a block are the first two of the one above, and threads may have copies of both: all get the
     // sum. False: there are no points.
@@ -71,8 +68,10 @@ struct PerMass : Stage<R> {
                 if (over < 0) continue;
                 if (nodes.twin[b] == 0 && (over == 0 || nodes.twin[over] == 0)) {
                     if (over == 0) continue;
-                    Half *upper = half(field, b, 1, depth), *lower = half(field, over, 0, depth);
-                    for (int k = 0; k < depth; k++) upper[k].numbers = lower[k].numbers = upper[k].numbers + lower[k].numbers;
+                    for (int k = 0; k < depth; k++) {
+                        Half &upper = half(field, b, 1, k, depth), &lower = half(field, over, 0, k, depth);
+                        upper = lower = upper + lower;
+                    }
                     continue;
                 }
                 join_copies(nodes, field, depth, b, over);
@@ -81,22 +80,20 @@ struct PerMass : Stage<R> {
         });
         return true;
     }
-    struct Half {
-        Pack<R, 8> numbers;
-    };
-    static Half* half(R* field, int block, int which, int depth) {
-        return reinterpret_cast<Half*>(field + (size_t(block) * ON_BLOCK + which * (ON_BLOCK / 2)) * depth);
+    using Half = Pack<R, ON_BLOCK / 2>;
+    static Half& half(R* field, int block, int which, int k, int depth) {
+        return *reinterpret_cast<Half*>(field + (size_t(block) * depth + k) * ON_BLOCK + which * (ON_BLOCK / 2));
     }
     // Upper halves of the copies of one block, and lower halves of those of another; 0: none.
     static void join_copies(const Nodes<R>& nodes, R* field, int depth, int below, int over) {
         for (int k = 0; k < depth; k++) {
-            Pack<R, 8> sum(0.0);
+            Half sum(0.0);
             auto each = [&](auto f) {
-                if (below) nodes.copies(below, [&](int b) { f(half(field, b, 1, depth)[k].numbers); });
-                if (over) nodes.copies(over, [&](int b) { f(half(field, b, 0, depth)[k].numbers); });
+                if (below) nodes.copies(below, [&](int b) { f(half(field, b, 1, k, depth)); });
+                if (over) nodes.copies(over, [&](int b) { f(half(field, b, 0, k, depth)); });
             };
-            each([&](auto& numbers) { sum = sum + numbers; });
-            each([&](auto& numbers) { numbers = sum; });
+            each([&](Half& numbers) { sum = sum + numbers; });
+            each([&](Half& numbers) { numbers = sum; });
         }
     }
     static P masses(P a) {
@@ -123,15 +120,6 @@ struct PerMass : Stage<R> {
                              __builtin_shufflevector(a.v, a.v, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
             return P(__builtin_shufflevector(sum, none, 0, 16, 16, 16, 4, 16, 16, 16, 8, 16, 16, 16, 12, 16, 16, 16));
         }
-    }
-    static Quad<R> first_of(Node a) {
-        if constexpr (HALVED<R, ON_BLOCK>) return chunk<0>(a.low);
-        else return chunk<0>(a);
-    }
-    static Node without_mass(Node a) {
-        const typename P::Lanes none{};
-        if constexpr (HALVED<R, ON_BLOCK>) return {P(__builtin_shufflevector(a.low.v, none, 8, 8, 8, 8, 4, 5, 6, 7)), a.high};
-        else return Node(__builtin_shufflevector(a.v, none, 16, 16, 16, 16, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
     }
 };
 

@@ -34,20 +34,26 @@ using Block = Pack<R, ON_BLOCK>;
 
 template <class R>
 TC_INLINE Block<R> alike(R number) { return Block<R>(double(number)); }
-template <class R>
-TC_INLINE Block<R> repeated(Quad<R> a) {  // one after the other
-    if constexpr (HALVED<R, ON_BLOCK>) return {joined(a, a), joined(a, a)};
-    else return joined(a, a, a, a);
+// Quad K of a block, for each of its nodes.
+template <int K, class R>
+TC_INLINE Block<R> part(const Block<R>& a) {
+    constexpr int first = 4 * K % LANES<R>;
+#define TC_QUAD first, first + 1, first + 2, first + 3
+    if constexpr (HALVED<R, ON_BLOCK>) {
+        const auto half = K < 2 ? a.low.v : a.high.v;
+        const Wide<R> both(__builtin_shufflevector(half, half, TC_QUAD, TC_QUAD));
+        return {both, both};
+    } else return Block<R>(__builtin_shufflevector(a.v, a.v, TC_QUAD, TC_QUAD, TC_QUAD, TC_QUAD));
+#undef TC_QUAD
 }
+// The four numbers that lie there, each four times. Reads a whole pack: a widening shuffle would go through memory.
 template <class R>
-TC_INLINE Block<R> widened(Quad<R> a) {  // each number four times
-    const auto b = __builtin_shufflevector(a.v, a.v, 0, 1, 2, 3, 0, 1, 2, 3);  // in two steps: a widening shuffle would go through memory
+TC_INLINE Block<R> widened(const Quad<R>* there) {
+    Wide<R> a;
+    std::memcpy(&a, there, sizeof(a));
     if constexpr (HALVED<R, ON_BLOCK>)
-        return {Wide<R>(__builtin_shufflevector(b, b, 0, 0, 0, 0, 1, 1, 1, 1)), Wide<R>(__builtin_shufflevector(b, b, 2, 2, 2, 2, 3, 3, 3, 3))};
-    else {
-        const auto all = repeated(a).v;
-        return Block<R>(__builtin_shufflevector(all, all, 0, 0, 0, 0, 5, 5, 5, 5, 10, 10, 10, 10, 15, 15, 15, 15));
-    }
+        return {Wide<R>(__builtin_shufflevector(a.v, a.v, 0, 0, 0, 0, 1, 1, 1, 1)), Wide<R>(__builtin_shufflevector(a.v, a.v, 2, 2, 2, 2, 3, 3, 3, 3))};
+    else return Block<R>(__builtin_shufflevector(a.v, a.v, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3));
 }
 // Quad k: the sum of the four of argument k.
 template <class R>
@@ -114,6 +120,30 @@ TC_INLINE void to_registers(const Block<R>* rows, Wide<R>* regs) {
     for (int b = 0; b < 4; b++) gather_quads([&](int lane) { return reinterpret_cast<const R*>(rows + lane) + 4 * b; }, regs + 4 * b);
 }
 
+// What the points of a pack see: factors along x and y, and along z at the four nodes of a block.
+template <class R, By BY, int KINDS>  // of those along z: f, g, and their slopes
+struct Sight {
+    using P = Wide<R>;
+    Axis<P> axes[2];
+    Quad<R> rows[KINDS + 1][LANES<R>];  // one more, as `widened` reads beyond
+
+    explicit Sight(const P* offset) {
+        for (int d = 0; d < 2; d++) see(BY, offset[d], axes[d]);
+        const P second = begins(offset);
+        Axis<P> three;
+        see(BY, offset[2] - second, three);
+        const P *factor[4] = {three.f, three.g, three.f_slope, three.g_slope}, none(0.0);
+        for (int q = 0; q < KINDS; q++) {
+            const P* n = factor[q];
+            P quad[4] = {select(second, none, n[0]), select(second, n[0], n[1]), select(second, n[1], n[2]), select(second, n[2], none)};
+            scatter_quads(quad, [&](int lane, Quad<R> numbers) { rows[q][lane] = numbers; });
+        }
+    }
+    TC_INLINE Factors<R> x(int i, int lane) const { return Factors<R>(axes[0], i, lane); }
+    TC_INLINE Factors<R> y(int j, int lane) const { return Factors<R>(axes[1], j, lane); }
+    TC_INLINE Block<R> z(int q, int lane) const { return widened(&rows[q][lane]); }
+};
+
 template <class R, By BY>
 struct Transfer {
     static constexpr int L = LANES<R>;
@@ -123,18 +153,18 @@ struct Transfer {
     int lanes;          // that are points
 
     void spread(const P* offset, const P* share, R* grid) const {
-        const Sight<2> sight(offset);
+        const Sight<R, BY, 2> sight(offset);
         B shares[L];
         to_lanes<R>(share, shares);
         for (int lane = 0; lane < lanes; lane++) {
-            const B f = sight.z(0, lane), g = sight.z(1, lane), *own = shares + lane;
-            const B a = f * part(own, 0) + g * part(own, 3), b = f * part(own, 1), c = f * part(own, 2);
+            const B f = sight.z(0, lane), g = sight.z(1, lane), own = shares[lane];
+            const B a = f * part<0>(own) + g * part<3>(own), b = f * part<1>(own), c = f * part<2>(own);
             const int* block = around + lane * AROUND;
             for (int i = 0; i < 3; i++) {
-                const Factors<R> x(sight.axes[0], i, lane);
+                const Factors<R> x = sight.x(i, lane);
                 const B u = alike(x.f) * a + alike(x.g) * b, v = alike(x.f) * c;
                 for (int j = 0; j < 3; j++) {
-                    const Factors<R> y(sight.axes[1], j, lane);
+                    const Factors<R> y = sight.y(j, lane);
                     B& at = reinterpret_cast<B*>(grid)[block[3 * i + j]];
                     at = at + alike(y.f) * u + alike(y.g) * v;
                 }
@@ -144,7 +174,7 @@ struct Transfer {
     }
 
     void collect(const P* offset, P* share, const R* grid) const {
-        const Sight<2> sight(offset);
+        const Sight<R, BY, 2> sight(offset);
         B shares[L];
         for (int lane = 0; lane < lanes; lane++) {
             B a(0.0), b(0.0), c(0.0);
@@ -152,11 +182,11 @@ struct Transfer {
             for (int i = 0; i < 3; i++) {
                 B u(0.0), v(0.0);
                 for (int j = 0; j < 3; j++) {
-                    const Factors<R> y(sight.axes[1], j, lane);
+                    const Factors<R> y = sight.y(j, lane);
                     const B& at = reinterpret_cast<const B*>(grid)[block[3 * i + j]];
                     u = u + alike(y.f) * at, v = v + alike(y.g) * at;
                 }
-                const Factors<R> x(sight.axes[0], i, lane);
+                const Factors<R> x = sight.x(i, lane);
                 a = a + alike(x.f) * u, b = b + alike(x.g) * u, c = c + alike(x.f) * v;
             }
             const B f = sight.z(0, lane), g = sight.z(1, lane);
@@ -178,46 +208,24 @@ struct Transfer {
     }
 
   private:
-    // Factors along x and y, and along z at the four nodes of a block.
-    template <int KINDS>  // of those along z: f, g, and their slopes
-    struct Sight {
-        Axis<P> axes[2];
-        Quad<R> rows[KINDS][L];
-
-        explicit Sight(const P* offset) {
-            for (int d = 0; d < 2; d++) see(BY, offset[d], axes[d]);
-            const P second = begins(offset);
-            Axis<P> three;
-            see(BY, offset[2] - second, three);
-            const P *factor[4] = {three.f, three.g, three.f_slope, three.g_slope}, none(0.0);
-            for (int q = 0; q < KINDS; q++) {
-                const P* n = factor[q];
-                P quad[4] = {select(second, none, n[0]), select(second, n[0], n[1]), select(second, n[1], n[2]), select(second, n[2], none)};
-                scatter_quads(quad, [&](int lane, Quad<R> numbers) { rows[q][lane] = numbers; });
-            }
-        }
-        TC_INLINE B z(int q, int lane) const { return widened(rows[q][lane]); }
-    };
-    static TC_INLINE B part(const B* share, int b) { return repeated(reinterpret_cast<const Quad<R>*>(share)[b]); }
-
     template <bool SPREADS, bool COLLECTS>
     TC_INLINE void look(const P* offset, const P* share, R* grid_bar, const R* grid, P* collected, P* offset_bar) const {
         constexpr bool g_is_slope = BY == By::slopes;  // of f: some sums are then others
-        const Sight<4> sight(offset);
+        const Sight<R, BY, 4> sight(offset);
         B shares[L], found[L], ways[L];
         to_lanes<R>(share, shares);
         for (int lane = 0; lane < lanes; lane++) {
             const B f = sight.z(0, lane), g = sight.z(1, lane), f_slope = sight.z(2, lane), g_slope = sight.z(3, lane);
-            const B *own = shares + lane, s0 = part(own, 0), s1 = part(own, 1), s2 = part(own, 2), s3 = part(own, 3);
+            const B own = shares[lane], s0 = part<0>(own), s1 = part<1>(own), s2 = part<2>(own), s3 = part<3>(own);
             const B first = f * s0 + g * s3, second = f * s1, third = f * s2;
             B a(0.0), b(0.0), c(0.0), ax(0.0), bx(0.0), cx(0.0), ay(0.0), by(0.0), cy(0.0);
             const int* block = around + lane * AROUND;
             for (int i = 0; i < 3; i++) {
-                const Factors<R> x(sight.axes[0], i, lane);
+                const Factors<R> x = sight.x(i, lane);
                 const B to_f = alike(x.f) * first + alike(x.g) * second, to_g = alike(x.f) * third;
                 B u(0.0), v(0.0), uy(0.0), vy(0.0);
                 for (int j = 0; j < 3; j++) {
-                    const Factors<R> y(sight.axes[1], j, lane);
+                    const Factors<R> y = sight.y(j, lane);
                     const B& at = reinterpret_cast<const B*>(grid)[block[3 * i + j]];
                     u = u + alike(y.f) * at, v = v + alike(y.g) * at, vy = vy + alike(y.g_slope) * at;
                     if (!g_is_slope) uy = uy + alike(y.f_slope) * at;

@@ -1,4 +1,4 @@
-// Tangents of transfer.h: a point after the other, with the four numbers of a node, and their directions, side by side.
+// Tangents of transfer.h: a point after the other, and of a block what each direction does to it, one after the other.
 #pragma once
 
 #include "transfer.h"
@@ -9,39 +9,44 @@ template <class R, By BY>
 struct TransferAlong {
     static constexpr int L = LANES<R>;
     using P = Wide<R>;
+    using B = Block<R>;
     using D = Along<R>;
-    using Row = Pack<R, ON_NODE * DIRECTIONS>;
     const int* around;  // [L, AROUND]
     int lanes;
 
     void spread(const P* offset, const D* offset_dot, const P* share, const D* share_dot, R* grid_dot) const {
-        Point p(offset, offset_dot);
-        Block<R> own[L];
-        to_lanes<R>(share, own);
+        const Sight<R, BY, 4> sight(offset);
+        B shares[L];
+        to_lanes<R>(share, shares);
         for (int lane = 0; lane < lanes; lane++) {
-            p.go_to(lane);
-            Row s[4], t[4];
-            for (int b = 0; b < 4; b++) {
-                s[b] = widened(reinterpret_cast<const Quad<R>*>(own + lane)[b]);
-                t[b] = joined_rows(share_dot + size_t(4 * b) * L + lane, L);
+            const B f = sight.z(0, lane), g = sight.z(1, lane), f_slope = sight.z(2, lane), g_slope = sight.z(3, lane);
+            const B own = shares[lane], s0 = part<0>(own), s1 = part<1>(own), s2 = part<2>(own), s3 = part<3>(own);
+            const B a = f * s0 + g * s3, b = f * s1, c = f * s2;
+            const B a_slope = f_slope * s0 + g_slope * s3, b_slope = f_slope * s1, c_slope = f_slope * s2;
+            const R *way_x = way(offset_dot, 0, lane), *way_y = way(offset_dot, 1, lane), *way_z = way(offset_dot, 2, lane);
+            B moved[DIRECTIONS], ad[DIRECTIONS], bd[DIRECTIONS], cd[DIRECTIONS];
+            each_way(share_dot + lane, moved);
+            for (int d = 0; d < DIRECTIONS; d++) {
+                const B z = alike(way_z[d]);
+                ad[d] = f * part<0>(moved[d]) + g * part<3>(moved[d]) + z * a_slope;
+                bd[d] = f * part<1>(moved[d]) + z * b_slope, cd[d] = f * part<2>(moved[d]) + z * c_slope;
             }
             const int* block = around + lane * AROUND;
-            const int begin = int(p.second[lane]);
             for (int i = 0; i < 3; i++) {
-                const auto x = p.at(0, i);
-                const Row u = x.f * s[0] + x.g * s[1], v = x.f * s[2], w = x.f * s[3];
-                const Row ud = x.f * t[0] + x.g * t[1] + (x.f_slope * s[0] + x.g_slope * s[1]) * p.way[0];
-                const Row turn = x.f_slope * p.way[0], vd = x.f * t[2] + turn * s[2], wd = x.f * t[3] + turn * s[3];
+                const Factors<R> x = sight.x(i, lane);
+                const B u = alike(x.f) * a + alike(x.g) * b, v = alike(x.f) * c;
+                const B u_slope = alike(x.f_slope) * a + alike(x.g_slope) * b, v_slope = alike(x.f_slope) * c;
+                B ud[DIRECTIONS], vd[DIRECTIONS];
+                for (int d = 0; d < DIRECTIONS; d++) {
+                    ud[d] = alike(x.f) * ad[d] + alike(x.g) * bd[d] + alike(way_x[d]) * u_slope;
+                    vd[d] = alike(x.f) * cd[d] + alike(way_x[d]) * v_slope;
+                }
                 for (int j = 0; j < 3; j++) {
-                    const auto y = p.at(1, j);
-                    const Row a = (y.f * u + y.g * v) * p.way[2], b = y.f * w * p.way[2];
-                    const Row ad = y.f * ud + y.g * vd + (y.f_slope * u + y.g_slope * v) * p.way[1];
-                    const Row bd = y.f * wd + y.f_slope * w * p.way[1];
-                    Row* at = reinterpret_cast<Row*>(grid_dot) + size_t(block[3 * i + j]) * 4 + begin;
-                    for (int k = 0; k < 3; k++, at++) {
-                        const auto z = p.at(2, k);
-                        *at = *at + z.f * ad + z.g * bd + z.f_slope * a + z.g_slope * b;
-                    }
+                    const Factors<R> y = sight.y(j, lane);
+                    const B slope = alike(y.f_slope) * u + alike(y.g_slope) * v;
+                    B* at = reinterpret_cast<B*>(grid_dot) + size_t(block[3 * i + j]) * DIRECTIONS;
+                    for (int d = 0; d < DIRECTIONS; d++)
+                        at[d] = at[d] + alike(y.f) * ud[d] + alike(y.g) * vd[d] + alike(way_y[d]) * slope;
                 }
             }
         }
@@ -49,69 +54,63 @@ struct TransferAlong {
     }
 
     void collect(const P* offset, const D* offset_dot, D* share_dot, const R* grid, const R* grid_dot) const {
-        Point p(offset, offset_dot);
+        constexpr bool g_is_slope = BY == By::slopes;  // of f: some sums are then others
+        const Sight<R, BY, 4> sight(offset);
         for (int lane = 0; lane < lanes; lane++) {
-            p.go_to(lane);
-            Row t[4] = {Row(0.0), Row(0.0), Row(0.0), Row(0.0)};
+            B a(0.0), b(0.0), c(0.0), ax(0.0), bx(0.0), cx(0.0), ay(0.0), by(0.0), cy(0.0);
+            B ad[DIRECTIONS], bd[DIRECTIONS], cd[DIRECTIONS];
+            for (int d = 0; d < DIRECTIONS; d++) ad[d] = bd[d] = cd[d] = B(0.0);
             const int* block = around + lane * AROUND;
-            const int begin = int(p.second[lane]);
             for (int i = 0; i < 3; i++) {
-                Quad<R> u(0.0), v(0.0), w(0.0);
-                Row ud(0.0), vd(0.0), wd(0.0);
+                B u(0.0), v(0.0), uy(0.0), vy(0.0), ud[DIRECTIONS], vd[DIRECTIONS];
+                for (int d = 0; d < DIRECTIONS; d++) ud[d] = vd[d] = B(0.0);
                 for (int j = 0; j < 3; j++) {
-                    Quad<R> a(0.0), b(0.0), a_slope(0.0), b_slope(0.0);
-                    Row ad(0.0), bd(0.0);
-                    for (int k = 0; k < 3; k++) {
-                        const auto z = p.at(2, k);
-                        const size_t node = size_t(block[3 * i + j]) * 4 + begin + k;
-                        const auto& g = *reinterpret_cast<const Quad<R>*>(grid + node * ON_NODE);
-                        const auto& gd = *reinterpret_cast<const Row*>(grid_dot + node * ON_NODE * DIRECTIONS);
-                        a = a + z.f * g, b = b + z.g * g, a_slope = a_slope + z.f_slope * g, b_slope = b_slope + z.g_slope * g;
-                        ad = ad + z.f * gd, bd = bd + z.g * gd;
-                    }
-                    const auto y = p.at(1, j);
-                    const Row turn = y.f_slope * p.way[1], wide = widened(a);
-                    ad = ad + widened(a_slope) * p.way[2], bd = bd + widened(b_slope) * p.way[2];
-                    ud = ud + y.f * ad + turn * wide, vd = vd + y.g * ad + y.g_slope * p.way[1] * wide;
-                    wd = wd + y.f * bd + turn * widened(b);
-                    u = u + y.f * a, v = v + y.g * a, w = w + y.f * b;
+                    const Factors<R> y = sight.y(j, lane);
+                    const size_t number = block[3 * i + j];
+                    const B &at = reinterpret_cast<const B*>(grid)[number], *along = reinterpret_cast<const B*>(grid_dot) + number * DIRECTIONS;
+                    u = u + alike(y.f) * at, v = v + alike(y.g) * at, vy = vy + alike(y.g_slope) * at;
+                    if (!g_is_slope) uy = uy + alike(y.f_slope) * at;
+                    for (int d = 0; d < DIRECTIONS; d++) ud[d] = ud[d] + alike(y.f) * along[d], vd[d] = vd[d] + alike(y.g) * along[d];
                 }
-                const auto x = p.at(0, i);
-                const Row turn = x.f_slope * p.way[0], wide = widened(u);
-                t[0] = t[0] + x.f * ud + turn * wide, t[1] = t[1] + x.g * ud + x.g_slope * p.way[0] * wide;
-                t[2] = t[2] + x.f * vd + turn * widened(v), t[3] = t[3] + x.f * wd + turn * widened(w);
+                const Factors<R> x = sight.x(i, lane);
+                a = a + alike(x.f) * u, b = b + alike(x.g) * u, c = c + alike(x.f) * v;
+                bx = bx + alike(x.g_slope) * u, cx = cx + alike(x.f_slope) * v, cy = cy + alike(x.f) * vy;
+                if (!g_is_slope) ax = ax + alike(x.f_slope) * u, ay = ay + alike(x.f) * uy, by = by + alike(x.g) * uy;
+                for (int d = 0; d < DIRECTIONS; d++)
+                    ad[d] = ad[d] + alike(x.f) * ud[d], bd[d] = bd[d] + alike(x.g) * ud[d], cd[d] = cd[d] + alike(x.f) * vd[d];
             }
-            for (int b = 0; b < 4; b++) {
-                D numbers[4];
-                std::memcpy(numbers, &t[b], sizeof(numbers));
-                for (int c = 0; c < 4; c++) share_dot[(4 * b + c) * L + lane] = numbers[c];
-            }
+            if (g_is_slope) ax = b, ay = c, by = cx;
+            const B f = sight.z(0, lane), g = sight.z(1, lane), f_slope = sight.z(2, lane), g_slope = sight.z(3, lane);
+            const B by_x = summed(f * ax, f * bx, f * cx, g * ax), by_y = summed(f * ay, f * by, f * cy, g * ay);
+            const B by_z = summed(f_slope * a, f_slope * b, f_slope * c, g_slope * a);
+            const R *way_x = way(offset_dot, 0, lane), *way_y = way(offset_dot, 1, lane), *way_z = way(offset_dot, 2, lane);
+            B found[DIRECTIONS];
+            for (int d = 0; d < DIRECTIONS; d++)
+                found[d] = summed(f * ad[d], f * bd[d], f * cd[d], g * ad[d]) +
+                           (alike(way_x[d]) * by_x + alike(way_y[d]) * by_y + alike(way_z[d]) * by_z);
+            together(found, share_dot + lane);
         }
     }
 
   private:
-    // Where a point is, and where it goes along each direction.
-    struct Point {
-        Axis<P> axes[3];
-        P second;
-        const D* dot;
-        int lane = 0;
-        Row way[3];
-
-        Point(const P* offset, const D* offset_dot) : second(begins(offset)), dot(offset_dot) {
-            for (int d = 0; d < 3; d++) see(BY, d == 2 ? offset[2] - second : offset[d], axes[d]);
-        }
-        TC_INLINE void go_to(int next) {
-            lane = next;
-            for (int d = 0; d < 3; d++) way[d] = joined_rows(dot + size_t(d) * L + lane, 0);
-        }
-        TC_INLINE Factors<R> at(int d, int i) const { return Factors<R>(axes[d], i, lane); }
-    };
-    static TC_INLINE Row joined_rows(const D* from, int step) {
-        const D four[4] = {from[0], from[step], from[2 * step], from[3 * step]};
-        Row out;
-        std::memcpy(&out, four, sizeof(out));
-        return out;
+    static_assert(DIRECTIONS == 4);  // as many as numbers in a quad
+    static TC_INLINE const R* way(const D* offset_dot, int axis, int lane) { return reinterpret_cast<const R*>(offset_dot + size_t(axis) * L + lane); }
+    // The numbers' tangents, one number after the other, into those of each direction; and back.
+    static TC_INLINE void each_way(const D* from, B* to) {
+        auto at = [from](int number) { return from + size_t(number) * L; };
+        if constexpr (HALVED<R, ON_BLOCK>) {
+            P low[DIRECTIONS], high[DIRECTIONS];
+            gather_quads(at, low), gather_quads([at](int number) { return at(number + L); }, high);
+            for (int d = 0; d < DIRECTIONS; d++) to[d] = {low[d], high[d]};
+        } else gather_quads(at, to);
+    }
+    static TC_INLINE void together(B* from, D* to) {
+        auto give = [to](int number, D tangent) { to[size_t(number) * L] = tangent; };
+        if constexpr (HALVED<R, ON_BLOCK>) {
+            P low[DIRECTIONS], high[DIRECTIONS];
+            for (int d = 0; d < DIRECTIONS; d++) low[d] = from[d].low, high[d] = from[d].high;
+            scatter_quads(low, give), scatter_quads(high, [give](int number, D tangent) { give(number + L, tangent); });
+        } else scatter_quads(from, give);
     }
 };
 
