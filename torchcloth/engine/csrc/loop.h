@@ -158,18 +158,28 @@ struct Loop : Stage<R>, Shares<R> {
                 }
             for (int first = begin; first < end; first += L) {
                 pick(all, at.picked, first);
-                for (const Instruction& i : code)
-                    if (i.code == Instruction::call) kernels[i.kernel].tangent(at.regs, at.dots, i.in.data(), i.out.data());
-                    else compute(s, at, i, first, all), compute_along(at, i, first, all);
+                for (const Instruction& i : code) compute_along(s, at, i, first, all);
             }
         });
     }
-    TC_INLINE void compute_along(const View<R>& at, const Instruction& i, int first, const Span& all) const {
-        R* along = at.dot[i.field];
-        const P* regs = at.regs;
+    TC_INLINE void compute_along(const Scene<R>& s, const View<R>& at, const Instruction& i, int first, const Span& all) const {
+        R *field = i.field >= 0 ? at.value[i.field] : nullptr, *along = i.field >= 0 ? at.dot[i.field] : nullptr;
+        P* regs = at.regs;
         D* dots = at.dots;
-        const bool moves = i.code == Instruction::spread || i.code == Instruction::collect;
-        D *offset = moves ? dots + i.in[0] * L : nullptr, *share = moves ? dots + i.in[1] * L : nullptr;
+        switch (i.code) {
+            case Instruction::call: kernels[i.kernel].tangent(regs, dots, i.in.data(), i.out.data()); return;
+            case Instruction::spread:
+                transfer<TransferAlong>(i, first, all, [&](auto t) {
+                    t.spread(regs + i.in[0], dots + i.in[0] * L, regs + i.in[1], dots + i.in[1] * L, field, along);
+                });
+                return;
+            case Instruction::collect:
+                transfer<TransferAlong>(i, first, all, [&](auto t) {
+                    t.collect(regs + i.in[0], dots + i.in[0] * L, regs + i.in[1], dots + i.in[1] * L, field, along);
+                });
+                return;
+            default: compute(s, at, i, first, all);
+        }
         switch (i.code) {
             case Instruction::load: if (!is_shared(i)) gather_along(i, along, dots, first, all); break;
             case Instruction::add: scatter_along(i, along, dots, first, true, all); break;
@@ -177,13 +187,7 @@ struct Loop : Stage<R>, Shares<R> {
             case Instruction::lookup:
                 for (int k = 0; k < CELL * L; k++) dots[i.out[0] * L + k] = k < 3 * L ? dots[i.in[0] * L + k] : D(0.0);
                 break;
-            case Instruction::spread:
-                transfer<TransferAlong>(i, first, all, [&](auto t) { t.spread(regs + i.in[0], offset, regs + i.in[1], share, along); });
-                break;
-            case Instruction::collect:
-                transfer<TransferAlong>(i, first, all, [&](auto t) { t.collect(regs + i.in[0], offset, share, at.value[i.field], along); });
-                break;
-            case Instruction::call: break;
+            default: break;
         }
     }
 };

@@ -1,4 +1,5 @@
-// Tangents of transfer.h: a point after the other, and of a block what each direction does to it, one after the other.
+// transfer.h with its tangents: a point after the other, and of a block what each direction does to it, one after the
+// other.
 #pragma once
 
 #include "transfer.h"
@@ -14,7 +15,7 @@ struct TransferAlong {
     const int* around;  // [L, AROUND]
     int lanes;
 
-    void spread(const P* offset, const D* offset_dot, const P* share, const D* share_dot, R* grid_dot) const {
+    void spread(const P* offset, const D* offset_dot, const P* share, const D* share_dot, R* grid, R* grid_dot) const {
         const Sight<R, BY, 4> sight(offset);
         B shares[L];
         to_lanes<R>(share, shares);
@@ -44,18 +45,21 @@ struct TransferAlong {
                 for (int j = 0; j < 3; j++) {
                     const Factors<R> y = sight.y(j, lane);
                     const B slope = alike(y.f_slope) * u + alike(y.g_slope) * v;
-                    B* at = reinterpret_cast<B*>(grid_dot) + size_t(block[3 * i + j]) * DIRECTIONS;
+                    const size_t number = block[3 * i + j];
+                    B &at = reinterpret_cast<B*>(grid)[number], *along = reinterpret_cast<B*>(grid_dot) + number * DIRECTIONS;
+                    at = at + alike(y.f) * u + alike(y.g) * v;
                     for (int d = 0; d < DIRECTIONS; d++)
-                        at[d] = at[d] + alike(y.f) * ud[d] + alike(y.g) * vd[d] + alike(way_y[d]) * slope;
+                        along[d] = along[d] + alike(y.f) * ud[d] + alike(y.g) * vd[d] + alike(way_y[d]) * slope;
                 }
             }
         }
-        is_written(grid_dot);
+        is_written(grid), is_written(grid_dot);
     }
 
-    void collect(const P* offset, const D* offset_dot, D* share_dot, const R* grid, const R* grid_dot) const {
+    void collect(const P* offset, const D* offset_dot, P* share, D* share_dot, const R* grid, const R* grid_dot) const {
         constexpr bool g_is_slope = BY == By::slopes;  // of f: some sums are then others
         const Sight<R, BY, 4> sight(offset);
+        B shares[L];
         for (int lane = 0; lane < lanes; lane++) {
             B a(0.0), b(0.0), c(0.0), ax(0.0), bx(0.0), cx(0.0), ay(0.0), by(0.0), cy(0.0);
             B ad[DIRECTIONS], bd[DIRECTIONS], cd[DIRECTIONS];
@@ -81,6 +85,7 @@ struct TransferAlong {
             }
             if (g_is_slope) ax = b, ay = c, by = cx;
             const B f = sight.z(0, lane), g = sight.z(1, lane), f_slope = sight.z(2, lane), g_slope = sight.z(3, lane);
+            shares[lane] = summed(f * a, f * b, f * c, g * a);
             const B by_x = summed(f * ax, f * bx, f * cx, g * ax), by_y = summed(f * ay, f * by, f * cy, g * ay);
             const B by_z = summed(f_slope * a, f_slope * b, f_slope * c, g_slope * a);
             const R *way_x = way(offset_dot, 0, lane), *way_y = way(offset_dot, 1, lane), *way_z = way(offset_dot, 2, lane);
@@ -90,6 +95,8 @@ struct TransferAlong {
                            (alike(way_x[d]) * by_x + alike(way_y[d]) * by_y + alike(way_z[d]) * by_z);
             together(found, share_dot + lane);
         }
+        for (int lane = lanes; lane < L; lane++) shares[lane] = B(0.0);
+        to_registers<R>(shares, share);
     }
 
   private:
