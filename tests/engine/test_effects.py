@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from agreement import agree, difference, held, moving, noise, outcome
+from agreement import GRADIENTS, agree, difference, held, layer_transposes, moving, noise, outcome
 
 import torchcloth as tc
 from torchcloth import functional
@@ -136,6 +136,17 @@ def test_viscous_forces_in_stages(stages, air):
         effects | ({"mass": E.AddedMass(0.1)} if air else {}), {"hand": tc.boundaries.Grasp.corner("upper-left")}
     )
     agree(cloth, {"hand": held(0.01)}, moving(cloth), stages=stages)
+
+
+@pytest.mark.parametrize("viscosity", [1.0, 30.0])
+def test_tangents_of_a_step_that_has_stages(viscosity):
+    """Coefficients of what acts in stages have other places in the program than where everything acts at once."""
+    effects = {**standard(), "viscous": E.KelvinVoigt(viscosity), "elastic": E.Bending(1e-5)}
+    cloth = sheet(effects, {"hand": tc.boundaries.Grasp.corner("upper-left")})
+    state, dt = moving(cloth), cloth.stable_step()
+    motion = {"hand": held(20 * dt)}
+    assert cloth.plan(state, motion, (0.0, 10 * dt), None).model.stages > 1
+    assert layer_transposes(cloth, motion, state, 10, dt) < GRADIENTS
 
 
 def test_an_effect_of_ones_own_that_is_viscous_in_stages_is_for_the_reference():

@@ -65,5 +65,13 @@ class FusedTangents:
     def _inputs(self, state: ClothState, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
         """Tangents [K, ..., rows, comps] of the coefficients that have any."""
         if self._known is None:
-            self._known = self.within(lambda model: lower(model, state, drives).inputs)
+            own = self.fused
+
+            def inputs(model: Model) -> Coefficients:
+                low = lower(model._replace(stages=own.model.stages), state, drives)
+                if low.program.fields != own.low.program.fields:
+                    raise RuntimeError("along the directions, the parts make another program")
+                return low.inputs
+
+            self._known = self.within(inputs)
         return self._known
