@@ -87,22 +87,19 @@ class _Walk:
     def _within(self, work: Callable[[Model], dict[Any, Tensor]]) -> dict[Any, Tensor]:
         """Tangents [K, ...] of what ``work`` makes of the model, of those that have any."""
         given = self.along.parameters
-        changes = torch.zeros(self.count, dtype=torch.bool)
-        for tangent in given.values():
-            changes |= (tangent != 0).reshape(self.count, -1).any(1).cpu()
-        if not changes.any():
+        changes = [k for k in range(self.count) if any(bool(tangent[k].any()) for tangent in given.values())]
+        if not changes:
             return {}
         values, batch = dict(self.cloth.named_parameters()), self.plan.state.x.ndim - 2
         with forward_ad.dual_level(), real_tangents():
-            entries = _dual_copies(values, {name: t[changes] for name, t in given.items()}, batch)
+            entries = _dual_copies(values, {name: tangent[changes] for name, tangent in given.items()}, batch)
             found = functional_call(_Built(self.cloth, self.build, work), entries, ())
             some = {key: forward_ad.unpack_dual(t).tangent for key, t in found.items()}
-        full = {}
-        for key, tangent in some.items():
-            if tangent is not None:
-                full[key] = tangent.new_zeros(self.count, *tangent.shape[1:])
-                full[key][changes] = tangent
-        return full
+        moved = {key: t for key, t in some.items() if t is not None}
+        every = {key: t.new_zeros(self.count, *t.shape[1:]) for key, t in moved.items()}
+        for key, tangent in moved.items():
+            every[key][changes] = tangent
+        return every
 
 
 class _Built(nn.Module):

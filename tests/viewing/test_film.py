@@ -8,10 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from torchcloth import meshes
 from torchcloth.errors import InvalidInput
+from torchcloth.meshes.mesh import vertex_normals
 from torchcloth.observe import solid_mesh
 from torchcloth.viewing import Film
 from torchcloth.viewing.film import ground_of, placed
-from torchcloth.viewing.geometry import edges_of, hems_of, nearest, quaternions, soft_normals, vertex_normals
+from torchcloth.viewing.geometry import edges_of, hems_of, nearest, quaternions, soft_normals
 
 
 def test_parts_must_have_the_films_frames(film):

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..errors import SimulationDiverged, UnstableStep
 from ..identification.episodes import Episode
+from ..meshes.mesh import vertex_normals
 from .cells import NAMES, Cells, aligned, cells_of
 from .evidence import Evidence
 from .fitting import Fitted, weighed
@@ -58,12 +59,7 @@ def unstable(found: Fitted, setting: Setting, progress: Progress = lambda _: Non
 
 def _begun(e: Episode, world: World, rng: torch.Generator) -> list[Episode]:
     """The episode from shapes that are off, along the normal, by smooth random fields and by their opposites."""
-    faces = torch.as_tensor(world.cloth.mesh.faces)
-    a, b, c = e.initial[faces].unbind(1)
-    normal = torch.zeros_like(e.initial).index_add(
-        0, faces.ravel(), torch.linalg.cross(b - a, c - a).repeat_interleave(3, 0)
-    )
-    normal = torch.nn.functional.normalize(normal, dim=1)
+    normal = torch.as_tensor(vertex_normals(e.initial.numpy(), world.cloth.mesh.faces))
     size = float((e.initial.amax(0) - e.initial.amin(0)).max())
     out = []
     for _ in range(DIRECTIONS):

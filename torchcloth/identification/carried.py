@@ -7,11 +7,14 @@ offsets d of the place from them, sum w (x + G d / 2) has no such error (Taylor'
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..meshes import Mesh, topology
+from ..meshes.patches import Patch, fitted_to
 from .streams import on_pattern
 
 SLIGHT = 1e-9  # ridge, of unit neighbourhoods: four neighbours in a cross leave the mixed derivative open
@@ -49,9 +52,12 @@ def carried(weights: Tensor, x: Tensor) -> Tensor:
     return out.reshape(len(weights), *flat.shape[1:]).movedim(0, -2)
 
 
-def at_places(mesh: Mesh, uv: np.ndarray) -> Mesh:
-    """The same cloth and triangles, with vertices at other places [V, 2] m of the pattern."""
-    if np.array_equal(uv, mesh.uv):  # type: ignore[arg-type]
+def with_patches(mesh: Mesh, patches: Sequence[Patch]) -> Mesh:
+    """The same cloth and triangles, with vertices where patches end; as it is without pattern coordinates."""
+    if mesh.uv is None:
+        return mesh
+    uv = fitted_to(mesh, patches)
+    if np.array_equal(uv, mesh.uv):
         return mesh
     vertices = carried(between(mesh, uv), torch.as_tensor(mesh.vertices)).numpy()
     return Mesh.build(vertices, mesh.faces, uv, mesh.places)

@@ -18,13 +18,13 @@ from ..errors import InvalidInput, RecordingError
 from ..losses import Hits
 from ..materials import AEP, AbstractMaterial
 from ..meshes import Mesh, rectangle
-from ..meshes.patches import Patch, fitted_to
+from ..meshes.patches import Patch
 from ..recordings import Recording
 from ..robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..transfer import Contact
 from ..types import Trajectory
 from . import streams
-from .carried import at_places, between, carried
+from .carried import between, carried, with_patches
 
 DEFAULT_STIFFNESS = 300.0  # N/m, a start in the middle of the published fabrics, where an episode names none
 DEFAULT_POISSON = 0.2
@@ -153,7 +153,7 @@ def mesh_of(recording: Recording) -> Mesh:
     """
     mesh = _mesh_as_said(recording)
     patches = [Patch(np.atleast_2d(g.uv), g.radius) for g in recording.grasps.values() if g.uv is not None]
-    return mesh if mesh.uv is None else at_places(mesh, fitted_to(mesh, patches))
+    return with_patches(mesh, patches)
 
 
 def _mesh_as_said(recording: Recording) -> Mesh:

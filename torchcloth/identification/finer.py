@@ -21,11 +21,11 @@ from ..boundaries import AbstractBoundary, Grasp
 from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..meshes import Mesh
-from ..meshes.patches import Patch, fitted_to
+from ..meshes.patches import Patch
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from . import gauss_newton
-from .carried import at_places, between, carried
+from .carried import between, carried, with_patches
 from .episodes import episode, on_mesh
 from .objective import Objective
 
@@ -47,8 +47,7 @@ def finer_cloth(cloth: Cloth) -> Cloth:
     fine = _divided_mesh(mesh)
     parts = cast("list[tuple[str, AbstractBoundary]]", list(kept.boundaries.items()))
     patches = [Patch(p.uv, p.radius) for _, p in parts if isinstance(p, Grasp) and p.uv is not None]
-    if fine.uv is not None:
-        fine = at_places(fine, fitted_to(fine, patches))  # rounder than the coarse mesh has them
+    fine = with_patches(fine, patches)  # rounder than the coarse mesh has them
     boundaries = {name: _regripped(part, ends, len(mesh.vertices)) for name, part in parts}
     return Cloth(
         fine,

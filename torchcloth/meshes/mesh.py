@@ -235,3 +235,11 @@ def _flatten(corners: np.ndarray) -> np.ndarray:
     across = np.linalg.norm(b - along[:, None] * warp, axis=-1)
     zero = np.zeros_like(length)
     return np.stack([np.stack([zero, zero], -1), np.stack([length, zero], -1), np.stack([along, across], -1)], axis=1)
+
+
+def vertex_normals(x: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[V, 3] unit normals, the mean of the triangles' around, weighted by area."""
+    a, b, c = x[faces[:, 0]], x[faces[:, 1]], x[faces[:, 2]]
+    total = np.zeros_like(x)
+    np.add.at(total, faces, np.cross(b - a, c - a)[:, None])
+    return total / np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-12)

@@ -38,14 +38,6 @@ def soft_normals(x: Array, faces: Array) -> Array:
     return unit(agreed[faces].sum(1) + unit(own))
 
 
-def vertex_normals(x: Array, faces: Array) -> Array:
-    """[V, 3] unit normals, the mean of the triangles' around, weighted by area."""
-    a, b, c = x[faces[:, 0]], x[faces[:, 1]], x[faces[:, 2]]
-    total = np.zeros_like(x)
-    np.add.at(total, faces, np.cross(b - a, c - a)[:, None])
-    return unit(total)
-
-
 def nearest(times: Array, wanted: Array) -> Array:
     """[N] index into ``times`` [K], increasing, of the entry nearest to each of ``wanted`` [N]."""
     after = np.clip(np.searchsorted(times, wanted), 1, max(1, len(times) - 1))

@@ -9,9 +9,10 @@ import numpy as np
 
 from .._files import atomically
 from ..errors import MissingDependency
+from ..meshes.mesh import vertex_normals
 from .colours import colours
 from .film import Film, Solid, Trace, View
-from .geometry import Array, quaternions, vertex_normals
+from .geometry import Array, quaternions
 from .projection import camera_for
 
 TIME = "time"  # the timeline, s on the motion clock

@@ -167,27 +167,30 @@ struct Loop : Stage<R>, Shares<R> {
         P* regs = at.regs;
         D* dots = at.dots;
         switch (i.code) {
-            case Instruction::call: kernels[i.kernel].tangent(regs, dots, i.in.data(), i.out.data()); return;
+            case Instruction::call: kernels[i.kernel].tangent(regs, dots, i.in.data(), i.out.data()); break;
             case Instruction::spread:
                 transfer<TransferAlong>(i, first, all, [&](auto t) {
                     t.spread(regs + i.in[0], dots + i.in[0] * L, regs + i.in[1], dots + i.in[1] * L, field, along);
                 });
-                return;
+                break;
             case Instruction::collect:
                 transfer<TransferAlong>(i, first, all, [&](auto t) {
                     t.collect(regs + i.in[0], dots + i.in[0] * L, regs + i.in[1], dots + i.in[1] * L, field, along);
                 });
-                return;
-            default: compute(s, at, i, first, all);
-        }
-        switch (i.code) {
-            case Instruction::load: if (!is_shared(i)) gather_along(i, along, dots, first, all); break;
-            case Instruction::add: scatter_along(i, along, dots, first, true, all); break;
-            case Instruction::put: scatter_along(i, along, dots, first, false, all); break;
+                break;
+            case Instruction::load:
+                compute(s, at, i, first, all);
+                if (!is_shared(i)) gather_along(i, along, dots, first, all);
+                break;
+            case Instruction::add:
+            case Instruction::put:
+                compute(s, at, i, first, all);
+                scatter_along(i, along, dots, first, i.code == Instruction::add, all);
+                break;
             case Instruction::lookup:
+                compute(s, at, i, first, all);
                 for (int k = 0; k < CELL * L; k++) dots[i.out[0] * L + k] = k < 3 * L ? dots[i.in[0] * L + k] : D(0.0);
                 break;
-            default: break;
         }
     }
 };
