@@ -1,5 +1,8 @@
 """Threads share the work of batches and directions, and change no bit of the results; within a scene, the last ones."""
 
+import os
+import signal
+
 import pytest
 import torch
 from agreement import agree, held, moving
@@ -73,6 +76,31 @@ def test_a_team_repeats_itself_bit_by_bit(contact):
     state, motion = start(cloth), opening(0.03)
     runs = [_all(cloth, state, motion) for _ in range(3)]
     assert all(torch.equal(a, b) for other in runs[1:] for a, b in zip(runs[0], other, strict=True))
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="needs Linux to count threads")
+def test_helpers_stay_for_the_next_call_and_a_fork_gets_its_own(team):
+    cloth = sheet(n=9)
+    state, motion = start(cloth), opening(0.03)
+
+    def run() -> torch.Tensor:
+        with torch.no_grad():
+            return cloth(state, motion, [0.0, 0.03], dt=1e-4).x
+
+    first = run()
+    threads = thread_count()
+    assert all(torch.equal(run(), first) for _ in range(3))
+    assert thread_count() == threads
+    child = os.fork()
+    if child == 0:
+        signal.alarm(30)  # ends what waits for a thread that only the parent has
+        os._exit(0 if torch.equal(run(), first) and (thread_count() > 1) == (min(team, os.cpu_count() or 1) > 1) else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def thread_count() -> int:
+    """Threads of this process, whoever began them."""
+    return len(os.listdir("/proc/self/task"))
 
 
 def _all(cloth, state, motion) -> list[torch.Tensor]:

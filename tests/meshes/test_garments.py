@@ -75,17 +75,27 @@ def test_it_is_one_oriented_surface_with_its_openings(garment):
 
 def test_front_and_back_are_the_same_panels_mirrored(garment):
     _, mesh = garment
-    front, back = np.split(mesh.faces, 2)
     x = mesh.vertices
-    np.testing.assert_allclose(x[front][..., :2], x[back][:, ::-1, :2], atol=1e-12)
     normal = np.cross(x[mesh.faces[:, 1]] - x[mesh.faces[:, 0]], x[mesh.faces[:, 2]] - x[mesh.faces[:, 0]])[:, 2]
-    assert (normal[: len(front)] > 0).all()  # outward: the front looks up
-    assert (normal[len(front) :] < 0).all()
+    middle = x[mesh.faces].mean(1)
+    front, back = normal > 0, normal < 0  # outward: the front looks up
+    assert front.sum() == back.sum() == len(mesh.faces) / 2
+    assert (middle[front, 2] >= 0).all()
+    assert (middle[back, 2] <= 0).all()
+    corners = [{tuple(np.sort(t, axis=None)) for t in np.round(x[mesh.faces[s]][..., :2], 9)} for s in (front, back)]
+    assert corners[0] == corners[1]
     assert x[:, 2].max() == pytest.approx(0.005)
     assert x[:, 2].min() == pytest.approx(-0.005)
     np.testing.assert_allclose(x.min(0) + x.max(0), 0.0, atol=1e-12)
     mirrored = {tuple(row) for row in np.round(x * [-1e6, 1e6, 1e6]).astype(int).tolist()}
     assert mirrored == {tuple(row) for row in np.round(x * 1e6).astype(int).tolist()}  # left as right
+
+
+def test_numbers_follow_the_longest_side(garment):
+    _, mesh = garment
+    axis = np.ptp(mesh.vertices, axis=0).argmax()
+    assert (np.diff(mesh.vertices[:, axis]) >= 0).all()
+    assert (np.diff(mesh.vertices[mesh.faces][..., axis].sum(1)) >= -1e-12).all()
 
 
 def test_seams_fit_and_only_openings_and_seams_part_panels(garment):

@@ -82,7 +82,7 @@ def sew(drawing: Drawing, triangles: int, gap: float) -> Mesh:
     front = np.column_stack([flat.points, lift])
     vertices = np.vstack([front, (front * [1.0, 1.0, -1.0])[~shared]])
     vertices[:, :2] -= (vertices[:, :2].min(0) + vertices[:, :2].max(0)) / 2
-    return Mesh.build(vertices, faces, _pattern(flat), _places(drawing, flat, behind))
+    return Mesh.build(vertices, faces, _pattern(flat), _places(drawing, flat, behind)).in_order()
 
 
 def _flatten(drawing: Drawing, triangles: int) -> _Flat:

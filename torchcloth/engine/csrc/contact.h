@@ -113,7 +113,7 @@ struct Contact : Stage<R> {
         const R* now = s.value[x];
         near.reference.reset(program.fields[x].size());
         std::copy(now, now + program.fields[x].size(), near.reference.data);
-        search.look(now, near.mask);
+        search.look(now, near.mask, s.parts, s.team);
     }
 
     void list_woken(Scene<R>& s, Layers<R>& near, const Mask& before) const {

@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "rows.h"
+#include "team.h"
 
 namespace tc {
 
@@ -40,7 +41,7 @@ struct Search {
         apart.assign(distant, distant + size_t(count) * patches);
     }
 
-    void look(const R* x, Mask& mask) const {
+    void look(const R* x, Mask& mask, int parts, Team* team) const {
         if (everywhere) {
             for (int t = 0; t < triangles; t++) set(mask, t);
             return;
@@ -51,28 +52,36 @@ struct Search {
         const int patches = int(starts.size()) - 1;
         std::vector<int> sorted(patches);
         std::iota(sorted.begin(), sorted.end(), 0);
-        std::vector<R> low[3], high[3], gap(patches);
+        std::vector<R> low[3], high[3];
         std::vector<R> first(patches);
         for (int p = 0; p < patches; p++) first[p] = *std::min_element(&centre[0][starts[p]], &centre[0][starts[p + 1]]);
         std::sort(sorted.begin(), sorted.end(), [&](int a, int b) { return first[a] < first[b]; });
         boxes(centre, sorted, low, high);
         const std::vector<Together> together = side_by_side(centre);
-        for (int i = 0; i < patches; i++) {
-            const int end = int(std::upper_bound(low[0].begin() + i, low[0].end(), high[0][i] + reach) - low[0].begin());
-            std::fill(gap.begin() + i, gap.begin() + end, R(0));
-            for (int d = 0; d < 3; d++) {
-                const R near = low[d][i], far = high[d][i], *lows = low[d].data(), *highs = high[d].data();
-                for (int j = i; j < end; j++) {
-                    const R between = std::max(R(0), std::max(lows[j] - far, near - highs[j]));
-                    gap[j] += between * between;
+        auto search = [&](int part, Mask& found) {
+            std::vector<R> gap(patches);
+            for (int i = part; i < patches; i += parts) {
+                const int end = int(std::upper_bound(low[0].begin() + i, low[0].end(), high[0][i] + reach) - low[0].begin());
+                std::fill(gap.begin() + i, gap.begin() + end, R(0));
+                for (int d = 0; d < 3; d++) {
+                    const R near = low[d][i], far = high[d][i], *lows = low[d].data(), *highs = high[d].data();
+                    for (int j = i; j < end; j++) {
+                        const R between = std::max(R(0), std::max(lows[j] - far, near - highs[j]));
+                        gap[j] += between * between;
+                    }
                 }
+                for (int j = i; j < end; j++)
+                    if (gap[j] < reach * reach && meet[size_t(sorted[i]) * patches + sorted[j]] && near(together, sorted[i], sorted[j])) {
+                        compare(centre, sorted[i], sorted[j], found);
+                        compare(centre, sorted[j], sorted[i], found);
+                    }
             }
-            for (int j = i; j < end; j++)
-                if (gap[j] < reach * reach && meet[size_t(sorted[i]) * patches + sorted[j]] && near(together, sorted[i], sorted[j])) {
-                    compare(centre, sorted[i], sorted[j], mask);
-                    compare(centre, sorted[j], sorted[i], mask);
-                }
-        }
+        };
+        if (parts == 1) return search(0, mask);
+        std::vector<Mask> found(parts, mask);
+        team->run(parts, [&](int m) { search(m, found[m]); });
+        for (const Mask& own : found)
+            for (size_t w = 0; w < mask.size(); w++) mask[w] |= own[w];
     }
 
     static constexpr int MOST = 8;  // triangles of a patch: engine/stages.py

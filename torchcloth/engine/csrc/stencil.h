@@ -36,22 +36,22 @@ struct Stencil : Stage<R> {
 
     void forward(Scene<R>& s) const override {
         if (shape == Shape::transposed) spread<1>(s.value[weight], s.value[y], s.value[x], R(1));
-        else differences<1>(s.value[weight], s.value[x], s.value[y], R(1));
+        else differences<1>(s, s.value[weight], s.value[x], s.value[y], R(1));
     }
     void reverse(Scene<R>& s) const override {
         if (shape == Shape::transposed) {
-            differences<1>(s.value[weight], s.bar[x], s.bar[y], R(-1));
-            if (s.bar[weight]) weigh(s.bar[x], s.value[y], s.bar[weight], R(-1));
+            differences<1>(s, s.value[weight], s.bar[x], s.bar[y], R(-1));
+            if (s.bar[weight]) weigh(s, s.bar[x], s.value[y], s.bar[weight], R(-1));
         } else {
-            if (shape == Shape::symmetric) differences<1>(s.value[weight], s.bar[y], s.bar[x], R(1));
+            if (shape == Shape::symmetric) differences<1>(s, s.value[weight], s.bar[y], s.bar[x], R(1));
             else spread<1>(s.value[weight], s.bar[y], s.bar[x], R(-1));
-            if (s.bar[weight]) weigh(s.value[x], s.bar[y], s.bar[weight], R(1));
+            if (s.bar[weight]) weigh(s, s.value[x], s.bar[y], s.bar[weight], R(1));
         }
     }
     void tangent(Scene<R>& s) const override {
         forward(s);
         if (shape == Shape::transposed) spread<DIRECTIONS>(s.value[weight], s.dot[y], s.dot[x], R(1));
-        else differences<DIRECTIONS>(s.value[weight], s.dot[x], s.dot[y], R(1));
+        else differences<DIRECTIONS>(s, s.value[weight], s.dot[x], s.dot[y], R(1));
         if (s.dot[weight] == nullptr) return;
         if (shape == Shape::transposed) spread_weights(s);
         else difference_weights(s);
@@ -93,12 +93,11 @@ struct Stencil : Stage<R> {
     }
 
     template <int K>
-    void differences(const R* w, const R* from, R* to, R sign) const {
-        for (int c = 0; c < count; c++) {
-            int v = 0;
+    void differences(const Scene<R>& s, const R* w, const R* from, R* to, R sign) const {
+        over_vertices(s, [&](int c, int v, int last) {
             if constexpr (K == 1)
-                for (; v + 4 <= vertices; v += 4) together(w, from, to, sign, c, v);
-            for (; v < vertices; v++) {
+                for (; v + 4 <= last; v += 4) together(w, from, to, sign, c, v);
+            for (; v < last; v++) {
                 Row<K> sum, own = vector<K>(from, v);
                 for (int k = 0; k < PACKS<K>; k++) sum.part[k] = Part<K>(0.0);
                 for (int n = 0; n < used[v / 4]; n++) {
@@ -108,7 +107,14 @@ struct Stencil : Stage<R> {
                 }
                 add<K>(to, c, v, sum, sign);
             }
-        }
+        });
+    }
+    // f(component, first vertex, behind the last one): whole groups, by the thread that has these rows.
+    template <class F>
+    void over_vertices(const Scene<R>& s, F f) const {
+        over_rows(s, groups, [&](int first, int last) {
+            for (int c = 0; c < count; c++) f(c, 4 * first, std::min(4 * last, vertices));
+        });
     }
     // A group side by side: one vertex alone waits for its sum at every neighbour.
     void together(const R* w, const R* from, R* to, R sign, int c, int v) const {
@@ -145,9 +151,9 @@ struct Stencil : Stage<R> {
     }
 
     // Work that the differences of X do on Y, per unit of each weight; the weights of a group lie side by side.
-    void weigh(const R* from, const R* on, R* to, R sign) const {
-        for (int c = 0; c < count; c++)
-            for (int v = 0; v < vertices; v += 4) {
+    void weigh(const Scene<R>& s, const R* from, const R* on, R* to, R sign) const {
+        over_vertices(s, [&](int c, int v, int last) {
+            for (; v < last; v += 4) {
                 Quad<R> own[4], moment[4];
                 for (int i = 0; i < 4; i++) {
                     own[i] = quad(from, std::min(v + i, vertices - 1));
@@ -161,6 +167,7 @@ struct Stencil : Stage<R> {
                     place = place + sums(work);
                 }
             }
+        });
     }
     static Quad<R> sums(const Quad<R>* a) {  // of each quad's numbers
         const auto ab = __builtin_shufflevector(a[0].v, a[1].v, 0, 4, 2, 6) + __builtin_shufflevector(a[0].v, a[1].v, 1, 5, 3, 7);

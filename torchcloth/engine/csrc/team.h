@@ -6,8 +6,9 @@
 #include <atomic>
 #include <chrono>
 #include <cstdint>
-#include <memory>
+#include <mutex>
 #include <thread>
+#include <unistd.h>
 #include <vector>
 
 namespace tc {
@@ -55,19 +56,89 @@ class Seats {
     ~Seats() { taken() -= own; }
 };
 
+// A thread that works for one team after the other and sleeps in between: a new one takes milliseconds to come to a
+// processor of its own. It ends with the process.
+class Member {
+    struct alignas(64) {
+        std::atomic<int64_t> piece{1};  // even: offered, odd: somebody has taken it
+        const void* work = nullptr;
+        void (*call)(const void*, int) = nullptr;
+        int part = 0;
+    } offer;
+    struct alignas(64) {
+        std::atomic<int64_t> piece{1};  // the last one that the thread did
+    } done;
+    alignas(64) int64_t piece = 0;  // that was offered last: for the giver alone
+
+  public:
+    Member() { std::thread([this] { serve(); }).detach(); }
+
+    void give(const void* work, void (*call)(const void*, int), int part) {
+        offer.work = work, offer.call = call, offer.part = part;
+        offer.piece.store(piece += 2, std::memory_order_release);
+        offer.piece.notify_one();
+    }
+    bool is_done() const { return done.piece.load(std::memory_order_acquire) == piece; }
+    // Whether the thread has not begun; the caller does the work then.
+    bool take_back() { return take(piece); }
+
+    static constexpr int64_t WATCH = 100000;  // some 50 us
+    static void rest(int64_t k) {
+        if (k > WATCH) std::this_thread::yield();
+#if defined(__x86_64__)
+        else if (k % 256 == 0) __builtin_ia32_pause();  // seldom: who pauses on and on is put aside by a virtual machine's host
+#endif
+    }
+
+  private:
+    bool take(int64_t wanted) { return offer.piece.compare_exchange_strong(wanted, wanted + 1, std::memory_order_acq_rel); }
+    void serve() {
+        [[maybe_unused]] const Flush flush;
+        for (;;) {
+            int64_t next = offer.piece.load(std::memory_order_acquire);
+            for (int64_t k = 0; next % 2 != 0; k++, next = offer.piece.load(std::memory_order_acquire))
+                if (k > WATCH) offer.piece.wait(next);
+                else rest(k);
+            if (!take(next)) continue;
+            offer.call(offer.work, offer.part);
+            done.piece.store(next, std::memory_order_release);
+        }
+    }
+};
+
+// The members that no team has now.
+class Pool {
+    std::mutex guard;
+    std::vector<Member*> free;
+    const pid_t process = getpid();
+
+  public:
+    // A process that was forked off has none of its parent's threads, and perhaps a lock that nobody will open.
+    static Pool& own() {
+        static std::atomic<Pool*> pool{nullptr};
+        Pool* now = pool.load();
+        if (now != nullptr && now->process == getpid()) return *now;
+        Pool* fresh = new Pool;
+        if (pool.compare_exchange_strong(now, fresh)) return *fresh;
+        delete fresh;
+        return *now;
+    }
+    Member* hire() {
+        std::lock_guard<std::mutex> lock(guard);
+        if (free.empty()) return new Member;
+        Member* one = free.back();
+        free.pop_back();
+        return one;
+    }
+    void leave(const std::vector<Member*>& members) {
+        std::lock_guard<std::mutex> lock(guard);
+        free.insert(free.end(), members.begin(), members.end());
+    }
+};
+
 class Team {
     using Clock = std::chrono::steady_clock;
-    struct alignas(64) Word {
-        std::atomic<int64_t> at{0};
-    };
-    struct Member {
-        Word offer, done;  // even: a piece of work, odd: somebody has taken it; the last piece that the member did
-        std::thread thread;
-    };
-    std::vector<std::unique_ptr<Member>> others;  // there from the first work for several on
-    int64_t round = 0;
-    const void* work = nullptr;
-    void (*call)(const void*, int) = nullptr;
+    std::vector<Member*> others;  // from the first work for several on
 
   public:
     const int size;
@@ -77,11 +148,7 @@ class Team {
         : size(int(size)), habit(habit), seats(int(size) - 1, Seats::Free{}), began(Clock::now()) {}
     Team(const Team&) = delete;
     Team& operator=(const Team&) = delete;
-    ~Team() {
-        call = nullptr;
-        offer(1 + int(others.size()));
-        for (auto& member : others) member->thread.join();
-    }
+    ~Team() { Pool::own().leave(others); }
 
     // job(part) for parts 0 to parts - 1 at once, by as many threads as there are seats. What nobody has begun when the
     // caller is done with its own part, the caller does; and all of it for a while when it had to wait for a thread that
@@ -94,17 +161,15 @@ class Team {
             return;
         }
         delayed = false;
-        while (int(others.size()) < helped - 1) hire();
-        work = &job, call = [](const void* to, int part) { (*static_cast<const F*>(to))(part); };
-        offer(helped);
+        while (int(others.size()) < helped - 1) others.push_back(Pool::own().hire());
+        auto call = [](const void* to, int part) { (*static_cast<const F*>(to))(part); };
+        for (int part = 1; part < helped; part++) others[part - 1]->give(&job, call, part);
         [&]() noexcept {  // the others may be at it still
             job(0);
             for (int part = helped; part < parts; part++) job(part);
-            for (int part = 1; part < helped; part++) {
-                Member& other = *others[part - 1];
-                if (take(other, round)) job(part);
+            for (int part = 1; part < helped; part++)
+                if (Member& other = *others[part - 1]; !other.is_done() && other.take_back()) job(part);
                 else await(other);
-            }
         }();
     }
 
@@ -127,7 +192,6 @@ class Team {
     }
 
   private:
-    static constexpr int64_t WATCH = 100000;  // some 50 us
     const Seats seats;
     Clock::time_point began;  // the present round
     bool delayed = false;
@@ -140,49 +204,13 @@ class Team {
     }
 
     void await(const Member& other) {
-        auto done = [&] { return other.done.at.load(std::memory_order_acquire) == round; };
-        for (int64_t k = 0; k < WATCH && !done(); k++) rest(k);
-        if (done()) return;
+        for (int64_t k = 0; k < Member::WATCH && !other.is_done(); k++) Member::rest(k);
+        if (other.is_done()) return;
         const auto before = Clock::now();
-        while (!done()) std::this_thread::yield();
+        while (!other.is_done()) std::this_thread::yield();
         const auto now = Clock::now();
         patience = before - delayed_until < 10 * (now - before) ? std::min(2 * patience, 64) : 1;
         delayed = true, delayed_until = now + patience * (now - before);
-    }
-    static void rest(int64_t k) {
-        if (k > WATCH) std::this_thread::yield();
-#if defined(__x86_64__)
-        else if (k % 256 == 0) __builtin_ia32_pause();  // seldom: who pauses on and on is put aside by a virtual machine's host
-#endif
-    }
-    void offer(int parts) {
-        round += 2;
-        for (int part = 1; part < parts; part++) {
-            others[part - 1]->offer.at.store(round, std::memory_order_release);
-            others[part - 1]->offer.at.notify_one();
-        }
-    }
-    static bool take(Member& member, int64_t piece) {
-        return member.offer.at.compare_exchange_strong(piece, piece + 1, std::memory_order_acq_rel);
-    }
-    void hire() {
-        const int part = int(others.size()) + 1;
-        others.push_back(std::make_unique<Member>());
-        Member& own = *others.back();
-        own.offer.at = round + 1;
-        own.thread = std::thread([this, part, &own] {
-            [[maybe_unused]] const Flush flush;
-            for (;;) {
-                int64_t piece = own.offer.at.load(std::memory_order_acquire);
-                for (int64_t k = 0; piece % 2 != 0; k++, piece = own.offer.at.load(std::memory_order_acquire))
-                    if (k > WATCH) own.offer.at.wait(piece);
-                    else rest(k);
-                if (!take(own, piece)) continue;
-                if (call == nullptr) return;
-                call(work, part);
-                own.done.at.store(piece, std::memory_order_release);
-            }
-        });
     }
 };
 
