@@ -1,9 +1,11 @@
-"""Small vector algebra with finite derivatives at the states that occur (flat, at rest, zero friction)."""
+"""Small vector algebra with finite derivatives at the states that occur (flat, at rest, zero friction); curves."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+AT_ONCE = 200  # torch's SEARCHSORTED_GRAIN_SIZE: a search for more wakes its threads, which then keep processors busy
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -21,3 +23,24 @@ def safe_norm(a: Tensor) -> Tensor:
     squared = dot(a, a)
     zero = squared == 0
     return torch.where(zero, torch.zeros_like(squared), torch.where(zero, 1.0, squared).sqrt())
+
+
+def last_knot(t: Tensor, times: Tensor) -> Tensor:
+    """[N] index of the last of the knots ``t`` [K], increasing, at or before each of ``times`` [N]; -1: none."""
+    return torch.cat([torch.searchsorted(t, some, right=True) for some in times.detach().split(AT_ONCE)]) - 1
+
+
+def hermite(t: Tensor, value: Tensor, slope: Tensor, times: Tensor) -> Tensor:
+    """[..., N, A, B] at ``times`` [N] of cubics between knots ``t`` [K], constant beyond.
+
+    ``value`` and ``slope``, its derivative, are [..., K, A, B].
+    """
+    k = last_knot(t, times).clamp(0, len(t) - 2)
+    step = (t[k + 1] - t[k])[:, None, None]
+    s = ((times - t[k])[:, None, None] / step).clamp(0.0, 1.0)
+    return (
+        (2 * s**3 - 3 * s**2 + 1) * value.index_select(-3, k)
+        + (s**3 - 2 * s**2 + s) * step * slope.index_select(-3, k)
+        + (3 * s**2 - 2 * s**3) * value.index_select(-3, k + 1)
+        + (s**3 - s**2) * step * slope.index_select(-3, k + 1)
+    )

@@ -94,8 +94,8 @@ class _Walk:
         with forward_ad.dual_level(), real_tangents():
             entries = _dual_copies(values, {name: tangent[changes] for name, tangent in given.items()}, batch)
             found = functional_call(_Built(self.cloth, self.build, work), entries, ())
-            some = {key: forward_ad.unpack_dual(t).tangent for key, t in found.items()}
-        moved = {key: t for key, t in some.items() if t is not None}
+            tangents = ((key, forward_ad.unpack_dual(dual).tangent) for key, dual in found.items())
+            moved = {key: tangent for key, tangent in tangents if tangent is not None}
         every = {key: t.new_zeros(self.count, *t.shape[1:]) for key, t in moved.items()}
         for key, tangent in moved.items():
             every[key][changes] = tangent

@@ -1,16 +1,18 @@
-"""Trajectories at knots, resolved on the integrator's substeps."""
+"""Trajectories at knots, resolved on the integrator's substeps.
+
+By operations that wake no threads of torch's (others do for a few hundred numbers: its search, indexing, square roots,
+determinants): those keep processors from the engine for milliseconds.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from .._math import cross, dot
+from .._math import cross, dot, hermite, last_knot
 from ..errors import InvalidInput
 from ..types import Trajectory
 from .base import Drive
-
-AT_ONCE = 200  # torch's SEARCHSORTED_GRAIN_SIZE
 
 
 def check(trajectory: Trajectory, name: str) -> None:
@@ -71,18 +73,7 @@ def interpolate(trajectory: Trajectory, times: Tensor) -> Tensor:
     C1, so that the held cloth sees no velocity jumps at the knots; differentiable in the knots' poses.
     """
     t, pose = trajectory.t.to(times), trajectory.pose
-    last = len(t) - 1
-    k = _knots(t, times).clamp(0, last - 1)
-    step = t[k + 1] - t[k]
-    s = ((times - t[k]) / step).clamp(0.0, 1.0)[:, None, None]
-    slope = _slopes(t, pose)
-    step = step[:, None, None]
-    mixed = (
-        (2 * s**3 - 3 * s**2 + 1) * pose.index_select(-3, k)
-        + (s**3 - 2 * s**2 + s) * step * slope.index_select(-3, k)
-        + (3 * s**2 - 2 * s**3) * pose.index_select(-3, k + 1)
-        + (s**3 - s**2) * step * slope.index_select(-3, k + 1)
-    )
+    mixed = hermite(t, pose, _slopes(t, pose), times)
     first = mixed[..., :3, 0]
     first = first * dot(first, first).rsqrt()
     second = mixed[..., :3, 1]
@@ -100,17 +91,9 @@ def drive(trajectory: Trajectory, times: Tensor) -> Drive:
     turn = after[..., :3, :3] @ before[..., :3, :3].mT
     shift = after[..., :3, 3:] - turn @ before[..., :3, 3:]
     increment = torch.cat([torch.cat([turn, shift], dim=-1), after[..., 3:, :]], dim=-2)
-    knot = _knots(trajectory.t.to(times), times[:-1] + 1e-9).clamp(min=0)
+    knot = last_knot(trajectory.t.to(times), times[:-1] + 1e-9).clamp(min=0)
     closed = trajectory.closed.cpu()[knot.cpu()]
     return Drive(increment, after, tuple(closed.tolist()))
-
-
-def _knots(t: Tensor, times: Tensor) -> Tensor:
-    """The last knot at or before each of the times; -1: none.
-
-    A search for more at once wakes torch's threads, which then keep processors from the engine for milliseconds.
-    """
-    return torch.cat([torch.searchsorted(t, some, right=True) for some in times.split(AT_ONCE)]) - 1
 
 
 def _slopes(t: Tensor, pose: Tensor) -> Tensor:

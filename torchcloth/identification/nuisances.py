@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .._math import hermite
 from ..boundaries import Grasp
 from ..cloth import Cloth
 from ..errors import InvalidInput
@@ -66,16 +67,7 @@ class Clock(AbstractNuisance):
     def see(self, frames: Frames, values: Tensor, episode: Episode) -> Frames:
         """Cubic between frames, by their velocities; at rest before the first and after the last."""
         t = episode.times.to(frames.x)
-        at = t + values[0]
-        k = (torch.searchsorted(t, at.detach(), right=True) - 1).clamp(0, len(t) - 2)
-        step = (t[k + 1] - t[k])[:, None, None]
-        s = ((at - t[k])[:, None, None] / step).clamp(0.0, 1.0)
-        x = (
-            (2 * s**3 - 3 * s**2 + 1) * frames.x[k]
-            + (s**3 - 2 * s**2 + s) * step * frames.v[k]
-            + (3 * s**2 - 2 * s**3) * frames.x[k + 1]
-            + (s**3 - s**2) * step * frames.v[k + 1]
-        )
+        x = hermite(t, frames.x, frames.v, t + values[0])
         return frames._replace(x=x)
 
 

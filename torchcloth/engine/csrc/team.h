@@ -79,18 +79,21 @@ class Member {
         offer.piece.notify_one();
     }
     bool is_done() const { return done.piece.load(std::memory_order_acquire) == piece; }
+    // Whether it is, after watching for a while.
+    bool is_done_soon() const {
+        for (int64_t k = 0; k < WATCH && !is_done(); k++) rest(k);
+        return is_done();
+    }
     // Whether the thread has not begun; the caller does the work then.
     bool take_back() { return take(piece); }
 
+  private:
     static constexpr int64_t WATCH = 100000;  // some 50 us
-    static void rest(int64_t k) {
-        if (k > WATCH) std::this_thread::yield();
+    static void rest([[maybe_unused]] int64_t k) {
 #if defined(__x86_64__)
-        else if (k % 256 == 0) __builtin_ia32_pause();  // seldom: who pauses on and on is put aside by a virtual machine's host
+        if (k % 256 == 0) __builtin_ia32_pause();  // seldom: who pauses on and on is put aside by a virtual machine's host
 #endif
     }
-
-  private:
     bool take(int64_t wanted) { return offer.piece.compare_exchange_strong(wanted, wanted + 1, std::memory_order_acq_rel); }
     void serve() {
         [[maybe_unused]] const Flush flush;
@@ -204,8 +207,7 @@ class Team {
     }
 
     void await(const Member& other) {
-        for (int64_t k = 0; k < Member::WATCH && !other.is_done(); k++) Member::rest(k);
-        if (other.is_done()) return;
+        if (other.is_done_soon()) return;
         const auto before = Clock::now();
         while (!other.is_done()) std::this_thread::yield();
         const auto now = Clock::now();
