@@ -12,8 +12,8 @@ HEAD = """# Verification
 
 `make verify` measures what stands here and writes this page; it exits with 1 when a figure misses its mark. Truth comes
 from outside the simulator: closed forms, symmetry, conservation, finite differences, and for convergence the same scene
-computed finer. Figures are in float64 on one CPU core; below a thousandth of the mark only that is said, and where a
-sheet crumples the last digits may differ between machines.
+computed finer. Figures are in float64 on one CPU core unless the case says otherwise; below a thousandth of the mark
+only that is said, and where a sheet crumples the last digits may differ between machines.
 
 Marks are those of the design (issue 3) unless the case says otherwise; a *finding* is reported and has no mark.
 *Absent*: what the case measures is not built yet; *failed*: the case gave no figure. Both count as missed.

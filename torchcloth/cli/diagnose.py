@@ -45,7 +45,7 @@ def _diagnose(options: argparse.Namespace) -> int:
         if options.model is not None:
             model, episodes = diagnosis.begin_with(options.model, episodes)
         print(
-            f"{len(episodes)} episodes: a quarter of a minute each second of them, up to one and a half with causes",
+            f"{len(episodes)} episodes: a third of a minute each second of them, up to one and a half with causes",
             flush=True,
         )
         with progress_line() as progress:

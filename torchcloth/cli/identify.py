@@ -41,7 +41,9 @@ def add(verbs: Any) -> None:
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", metavar="MODEL", help="a .tcm file of `diagnose` to start from")
-    parser.add_argument("--fit", nargs="+", metavar="NAME", help="parameters to fit (default: all of the model)")
+    parser.add_argument(
+        "--fit", nargs="+", metavar="NAME", help="parameters to fit (default: of the fabric, and each effect's first)"
+    )
     parser.add_argument(
         "--start",
         nargs="+",

@@ -1,9 +1,9 @@
 """The same cloth on a mesh twice as fine, and what that changes in a fit: numerics, no physics.
 
-A bending, wrinkling sheet of coarse triangles is a little stiffer than the cloth. What a fit makes up for that in its
-parameters is found from one simulation on the finer mesh: with residuals r and r' of the two meshes at the solution, it
-asks for the step d = -(J' W J + P)^-1 J' W (r' - r). Errors fall with the square of the edges, so the limit is 4/3 d
-away, and a third of d is added to the standard errors for what the extrapolation leaves open.
+A sheet of coarse triangles does not bend and wrinkle as the cloth does. What a fit makes up for that in its parameters
+is found from one simulation on the finer mesh: with residuals r and r' of the two meshes at the solution, it asks for
+the step d = -(J' W J + P)^-1 J' W (r' - r). Errors fall with the square of the edges, so the limit is 4/3 d away, and a
+third of d is added to the standard errors for what the extrapolation leaves open.
 """
 
 from __future__ import annotations
