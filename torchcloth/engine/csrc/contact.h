@@ -138,7 +138,7 @@ struct Contact : Stage<R> {
             const size_t count = points ? packed * f.comps : size_t(near.nodes.count()) * ON_BLOCK;
             s.value[grid[i]] = room(near.value[i], count);
             if (s.bars.size) s.bar[grid[i]] = room(near.bar[i], count);
-            if (s.dots.size) s.dot[grid[i]] = room(near.dot[i], count * DIRECTIONS);
+            if (s.dots.size) s.dot[grid[i]] = room(near.dot[i], count * s.directions);
             if (points && s.bars.size) std::fill_n(s.bar[grid[i]], count, R(0));
         }
         over_blocks(s, [&](int first, int last) {
@@ -150,7 +150,7 @@ struct Contact : Stage<R> {
                 const bool adds = i < 2;
                 if (adds) clear(s.value[grid[i]], 1);
                 if (s.bars.size) clear(s.bar[grid[i]], 1);
-                if (adds && s.dots.size) clear(s.dot[grid[i]], DIRECTIONS);
+                if (adds && s.dots.size) clear(s.dot[grid[i]], s.directions);
             }
         });
     }

@@ -59,7 +59,6 @@ struct BothWays {
 
 template <class R>
 struct Derivatives : Stage<R> {
-    using D = Along<R>;
     using Row = Pack<R, 16>;  // five vectors and a zero
     const Program<R>& program;
     std::shared_ptr<const BothWays<R>> links;
@@ -83,8 +82,12 @@ struct Derivatives : Stage<R> {
     }
     void tangent(Scene<R>& s) const override {
         forward(s);
-        if (transposed) answer_along(s, s.dot[y], s.dot[x]);
-        else see_along(s, s.dot[x], s.dot[y]);
+        at_once(s.directions, [&](auto n) {
+            using D = Along<R, n>;
+            D *in = reinterpret_cast<D*>(s.dot[x]), *out = reinterpret_cast<D*>(s.dot[y]);
+            if (transposed) answer_along(s, out, in);
+            else see_along(s, in, out);
+        });
     }
 
   private:
@@ -152,9 +155,9 @@ struct Derivatives : Stage<R> {
             }
         });
     }
-    void see_along(const Scene<R>& s, const R* from, R* to) const {
+    template <class D>
+    void see_along(const Scene<R>& s, const D* from, D* to) const {
         const Links<R>& l = *links->seeing;
-        const D* in = reinterpret_cast<const D*>(from);
         over_rows(s, vertices(), [&](int begin, int end) {
             for (int v = begin; v < end; v++) {
                 D sum[15];  // in registers until the vertex is done
@@ -162,28 +165,28 @@ struct Derivatives : Stage<R> {
                 for (int k = l.first[v]; k < l.first[v + 1]; k++) {
                     const R* w = l.weight.data + 8 * size_t(k);
                     for (int i = 0; i < 3; i++) {
-                        const D d = in[l.other[k] * 4 + i] - in[v * 4 + i];
+                        const D d = from[l.other[k] * 4 + i] - from[v * 4 + i];
                         for (int c = 0; c < 5; c++) sum[3 * c + i] = sum[3 * c + i] + d * w[c];
                     }
                 }
-                D* target = reinterpret_cast<D*>(to) + size_t(v) * 16;
+                D* target = to + size_t(v) * 16;
                 for (int c = 0; c < 15; c++) target[c] = target[c] + sum[c];
             }
         });
     }
-    void answer_along(const Scene<R>& s, const R* from, R* to) const {
+    template <class D>
+    void answer_along(const Scene<R>& s, const D* from, D* to) const {
         const Links<R>& l = *links->seen;
-        const D* in = reinterpret_cast<const D*>(from);
         over_rows(s, vertices(), [&](int begin, int end) {
             for (int v = begin; v < end; v++) {
                 D sum[3] = {D(0.0), D(0.0), D(0.0)};
                 for (int k = l.first[v]; k < l.first[v + 1]; k++) {
                     const R* w = l.weight.data + 8 * size_t(k);
-                    const D* given = in + size_t(l.other[k]) * 16;
+                    const D* given = from + size_t(l.other[k]) * 16;
                     for (int c = 0; c < 5; c++)
                         for (int i = 0; i < 3; i++) sum[i] = sum[i] + given[3 * c + i] * w[c];
                 }
-                D* target = reinterpret_cast<D*>(to) + size_t(v) * 4;
+                D* target = to + size_t(v) * 4;
                 for (int i = 0; i < 3; i++) target[i] = target[i] + sum[i];
             }
         });

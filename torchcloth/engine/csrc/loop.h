@@ -9,7 +9,6 @@ namespace tc {
 template <class R>
 struct Loop : Stage<R>, Shares<R> {
     using typename Moves<R>::P;
-    using typename Moves<R>::D;
     using Shares<R>::share, Shares<R>::work;
     using Moves<R>::L, Moves<R>::program, Moves<R>::code, Moves<R>::index, Moves<R>::span, Moves<R>::count;
     using Moves<R>::pick, Moves<R>::fix, Moves<R>::copy, Moves<R>::packed, Moves<R>::look;
@@ -144,37 +143,49 @@ struct Loop : Stage<R>, Shares<R> {
     }
     void tangent(Scene<R>& s) const override {
         if (flat) return forward(s);
+        at_once(s.directions, [&](auto n) { tangent_along<n>(s); });
+    }
+    template <int N>
+    void tangent_along(Scene<R>& s) const {
+        using D = Along<R, N>;
         const Span all = span(s);
         if (all.items == 0) return;
         fix(s, all);
         share(s, all, Way::tangent, [&](const View<R>& at, const Span& all, int begin, int end) {
+            D* dots = reinterpret_cast<D*>(at.dots);
             for (const Instruction& i : code)  // what has no tangent
                 if (i.code == Instruction::load && at.dot[i.field] == nullptr)
-                    std::memset(static_cast<void*>(at.dots + size_t(i.reg) * L), 0, size_t(i.comps) * L * sizeof(D));
+                    std::memset(static_cast<void*>(dots + size_t(i.reg) * L), 0, size_t(i.comps) * L * sizeof(D));
             for (const Instruction& i : code)
                 if (is_shared(i)) {
                     gather(i, at.value[i.field], at.regs, 0, all);
-                    gather_along(i, at.dot[i.field], at.dots, 0, all);
+                    gather_along(i, at.dot[i.field], dots, 0, all);
                 }
             for (int first = begin; first < end; first += L) {
                 pick(all, at.picked, first);
-                for (const Instruction& i : code) compute_along(s, at, i, first, all);
+                for (const Instruction& i : code) compute_along<N>(s, at, dots, i, first, all);
             }
         });
     }
-    TC_INLINE void compute_along(const Scene<R>& s, const View<R>& at, const Instruction& i, int first, const Span& all) const {
+    template <int N>
+    struct Ahead {
+        template <class T, By BY>
+        using Transfer = TransferAlong<T, BY, N>;
+    };
+    template <int N>
+    TC_INLINE void compute_along(const Scene<R>& s, const View<R>& at, Along<R, N>* dots, const Instruction& i, int first, const Span& all) const {
+        using D = Along<R, N>;
         R *field = i.field >= 0 ? at.value[i.field] : nullptr, *along = i.field >= 0 ? at.dot[i.field] : nullptr;
         P* regs = at.regs;
-        D* dots = at.dots;
         switch (i.code) {
             case Instruction::call: kernels[i.kernel].tangent(regs, dots, i.in.data(), i.out.data()); break;
             case Instruction::spread:
-                transfer<TransferAlong>(i, first, all, [&](auto t) {
+                transfer<Ahead<N>::template Transfer>(i, first, all, [&](auto t) {
                     t.spread(regs + i.in[0], dots + i.in[0] * L, regs + i.in[1], dots + i.in[1] * L, field, along);
                 });
                 break;
             case Instruction::collect:
-                transfer<TransferAlong>(i, first, all, [&](auto t) {
+                transfer<Ahead<N>::template Transfer>(i, first, all, [&](auto t) {
                     t.collect(regs + i.in[0], dots + i.in[0] * L, regs + i.in[1], dots + i.in[1] * L, field, along);
                 });
                 break;

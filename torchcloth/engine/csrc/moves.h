@@ -40,7 +40,6 @@ template <class R>
 struct Moves {
     static constexpr int L = LANES<R>;
     using P = Wide<R>;
-    using D = Along<R>;
 
     const Program<R>& program;
     int items, list;  // list: of a sieve; -1: all items
@@ -230,6 +229,7 @@ struct Moves {
         if (i.comps == 3) f(std::integral_constant<int, 3>{});
         else f(i.comps);
     }
+    template <class D>
     TC_APART void gather_along(const Instruction& i, const R* from, D* dots, int first, const Span& s) const {
         if (from == nullptr) return;
         const D* source = reinterpret_cast<const D*>(from);
@@ -244,6 +244,7 @@ struct Moves {
             });
         });
     }
+    template <class D>
     TC_APART void scatter_along(const Instruction& i, R* to, const D* dots, int first, bool adds, const Span& s) const {
         D* target = reinterpret_cast<D*>(to);
         const D* from = dots + size_t(i.reg) * L;

@@ -38,15 +38,15 @@ struct PerMass : Stage<R> {
     }
     void tangent(Scene<R>& s) const override {
         forward(s);
-        if (!join(s, s.dot[given], DIRECTIONS)) return;
+        if (!join(s, s.dot[given], s.directions)) return;
         const P *m = at(s.value[mass]), *quotient = at(s.value[out]), *m_dot = at(s.dot[mass]), *from = at(s.dot[given]);
         P* to = at(s.dot[out]);
         over_blocks(s, [&](int first, int last) {
             for (int block = first; block < last; block++)
                 for (int p = 0; p < PACKS; p++) {
                     const P own = m[PACKS * block + p], over = inverse(own), each = over * counts(own) * quotient[PACKS * block + p];
-                    for (int d = 0; d < DIRECTIONS; d++) {
-                        const size_t i = size_t(PACKS) * (block * DIRECTIONS + d) + p;
+                    for (int d = 0; d < s.directions; d++) {
+                        const size_t i = size_t(PACKS) * (block * s.directions + d) + p;
                         to[i] = vectors(from[i] * over - masses(m_dot[i]) * each);
                     }
                 }

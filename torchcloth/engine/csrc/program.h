@@ -87,7 +87,7 @@ template <class R>
 struct View {
     R *const *value, *const *bar, *const *dot;
     Wide<R>*regs, *bars;
-    Along<R>* dots;  // [register][lane]
+    R* dots;         // [register][lane][direction]
     int* picked;     // rows of the items of a pack, by table of the loop
 };
 
@@ -103,7 +103,7 @@ struct Desk {
     std::vector<Share> values, bars, dots;  // by field
     std::vector<Share*> used;               // in the present loop
     Buffer<Wide<R>> own_regs, own_bars;
-    Buffer<Along<R>> own_dots;
+    Buffer<R> own_dots;
     std::vector<int> picked;
     View<R> view() { return {value.data(), bar.data(), dot.data(), own_regs.data, own_bars.data, own_dots.data, picked.data()}; }
 };
@@ -113,7 +113,8 @@ template <class R>
 struct Scene {
     std::vector<R*> value, bar, dot;  // by field; null where there is none
     Buffer<Wide<R>> regs, bars;
-    Buffer<Along<R>> dots;
+    Buffer<R> dots;
+    int directions = 0;  // in it
     std::vector<int> picked;
     View<R> view() { return {value.data(), bar.data(), dot.data(), regs.data, bars.data, dots.data, picked.data()}; }
     Team* team = nullptr;

@@ -42,7 +42,6 @@ size_t records_size(const Program<R>& p, int64_t substeps, int64_t every) {
 
 template <class R>
 class Run {
-    using D = Along<R>;
     static constexpr int64_t LONG = 4;  // substeps that are worth the start of a second thread
     const Program<R>& program;
     const Call& call;
@@ -60,7 +59,7 @@ class Run {
 
     void forward() {
         each(call.scenes, [&](int64_t scene) {
-            Memory m = memory(scene, Mode::value);
+            Memory m = memory(scene, Mode::value, call.scenes);
             R* first = call.every ? record(scene, 0) : nullptr;
             if (call.every) clear_records(scene);
             m.rows.reset(2 * program.record_size);
@@ -79,7 +78,7 @@ class Run {
 
     void reverse() {
         each(call.scenes, [&](int64_t scene) {
-            Memory m = memory(scene, Mode::reverse);
+            Memory m = memory(scene, Mode::reverse, call.scenes);
             seed(m, scene);
             const int64_t every = call.every;
             if (every > 1) m.rows.reset((every + 1) * program.record_size);
@@ -98,10 +97,13 @@ class Run {
     }
 
     void tangent() {
-        each(tasks(Mode::tangent), [&](int64_t task) {
-            const int64_t scene = task / chunks(), chunk = task % chunks();
-            Memory m = memory(scene, Mode::tangent);
-            load_dots(m, scene, chunk);
+        const std::vector<Group> all = groups();
+        const int64_t count = int64_t(all.size());
+        each(call.scenes * count, [&](int64_t task) {
+            const int64_t scene = task / count;
+            const Group& group = all[task % count];
+            Memory m = memory(scene, Mode::tangent, call.scenes * count, group.size);
+            load_dots(m, scene, group);
             m.rows.reset(2 * program.record_size);
             R *row = m.rows.data, *after = nullptr;
             start(m, scene, row);
@@ -113,8 +115,8 @@ class Run {
                     if (program.next[f] >= 0) std::swap(m.scene.dot[f], m.scene.dot[program.next[f]]);
                 row = after;
             }
-            if (chunk == 0) finish(m, scene, row);
-            save_dots(m, scene, chunk);
+            if (group.first == 0) finish(m, scene, row);
+            save_dots(m, scene, group);
             learn(m, Mode::tangent);
         });
     }
@@ -166,7 +168,8 @@ class Run {
     static bool is_within(Kind kind) { return kind == Kind::temporary || kind == Kind::kept; }
     size_t size_of(const Field& f) const { return f.kind == Kind::drive ? size_t(call.substeps) * f.comps : f.size(); }
 
-    Memory memory(int64_t scene, Mode mode) const {
+    // Of one of so many tasks; with tangents along so many directions.
+    Memory memory(int64_t scene, Mode mode, int64_t tasks, int directions = 0) const {
         Memory m;
         const size_t count = program.fields.size();
         m.scene.value.assign(count, nullptr), m.scene.bar.assign(count, nullptr), m.scene.dot.assign(count, nullptr);
@@ -177,7 +180,7 @@ class Run {
         m.scene.regs.reset(program.registers), m.scene.lists.resize(program.lists);
         m.scene.fixed.resize(program.fixed);
         if (mode == Mode::reverse) m.scene.bars.reset(program.registers);
-        if (mode == Mode::tangent) m.scene.dots.reset(size_t(program.registers) * LANES<R>);
+        if (mode == Mode::tangent) m.scene.directions = directions, m.scene.dots.reset(size_t(program.registers) * LANES<R> * directions);
         for (size_t f = 0; f < count; f++) {
             const Field& field = program.fields[f];
             if (field.kind == Kind::constant) { m.scene.value[f] = program.constants[f].data; continue; }
@@ -193,11 +196,11 @@ class Run {
                 m.scene.bar[f] = m.bars[f].data;
             }
             if (mode == Mode::tangent && (!is_input(field.kind) || call.ports[f].dot)) {
-                m.dots[f].reset(size_of(field) * DIRECTIONS);
+                m.dots[f].reset(size_of(field) * directions);
                 m.scene.dot[f] = m.dots[f].data;
             }
         }
-        if (const int64_t threads = call.threads / tasks(mode); threads > 1 && call.substeps >= LONG) {
+        if (const int64_t threads = call.threads / tasks; threads > 1 && call.substeps >= LONG) {
             std::lock_guard<std::mutex> lock(program.guard);
             m.team = std::make_unique<Team>(threads, program.habits[int(mode)]);
             m.scene.team = m.team.get(), m.scene.worth = call.worth, m.scene.desks.resize(threads - 1);
@@ -215,8 +218,17 @@ class Run {
         std::lock_guard<std::mutex> lock(program.guard);
         program.habits[int(mode)] = m.team->habit;
     }
-    int64_t chunks() const { return (call.directions + DIRECTIONS - 1) / DIRECTIONS; }
-    int64_t tasks(Mode mode) const { return call.scenes * (mode == Mode::tangent ? chunks() : 1); }
+
+    struct Group {  // of directions that go together, some of the last one empty
+        int64_t first;
+        int size;
+    };
+    std::vector<Group> groups() const {
+        std::vector<Group> out;
+        for (int64_t first = 0; first < call.directions; first += out.back().size)
+            out.push_back({first, call.directions - first > FEW ? MANY : FEW});
+        return out;
+    }
 
     // Between the caller's [rows, components] and ours, which has pitches; `depth` numbers each.
     void load(R* to, const Field& f, const void* from, int64_t at, int depth, int which = 0) const {
@@ -275,13 +287,13 @@ class Run {
             if (field.kind == Kind::drive) {
                 m.scene.value[f] = m.values[f].data + k * field.comps;
                 if (m.bars[f].data) m.scene.bar[f] = m.bars[f].data + k * field.comps;
-                if (m.dots[f].data) m.scene.dot[f] = m.dots[f].data + k * field.comps * DIRECTIONS;
+                if (m.dots[f].data) m.scene.dot[f] = m.dots[f].data + k * field.comps * m.scene.directions;
             }
         }
         clear(m.scene, [&](auto zero) {
             for (size_t f : m.temporaries) {
                 zero(m.scene.value[f], program.fields[f].size());
-                if (m.scene.dot[f]) zero(m.scene.dot[f], program.fields[f].size() * DIRECTIONS);
+                if (m.scene.dot[f]) zero(m.scene.dot[f], program.fields[f].size() * m.scene.directions);
             }
         });
     }
@@ -330,27 +342,27 @@ class Run {
         }
     }
 
-    void load_dots(Memory& m, int64_t scene, int64_t chunk) const {
-        each_dot(chunk, [&](size_t f, int64_t direction, int which) {
+    void load_dots(Memory& m, int64_t scene, const Group& group) const {
+        each_dot(group, [&](size_t f, int64_t direction, int which) {
             const Field& field = program.fields[f];
             const Port& port = call.ports[f];
             if ((is_input(field.kind) || field.kind == Kind::state) && port.dot)
-                load(m.dots[f].data, field, port.dot, scene * port.dot_stride + direction * outer(field), DIRECTIONS, which);
+                load(m.dots[f].data, field, port.dot, scene * port.dot_stride + direction * outer(field), group.size, which);
         });
     }
-    void save_dots(Memory& m, int64_t scene, int64_t chunk) const {
-        each_dot(chunk, [&](size_t f, int64_t direction, int which) {
+    void save_dots(Memory& m, int64_t scene, const Group& group) const {
+        each_dot(group, [&](size_t f, int64_t direction, int which) {
             const Field& field = program.fields[f];
             const int64_t at = (scene * call.directions + direction) * outer(field);
-            if (program.next[f] >= 0) unload(call.ports[program.next[f]].dot_result, at, field, m.scene.dot[f], DIRECTIONS, which);
-            if (field.kind == Kind::sum) unload(call.ports[f].dot_result, at, field, m.scene.dot[f], DIRECTIONS, which);
+            if (program.next[f] >= 0) unload(call.ports[program.next[f]].dot_result, at, field, m.scene.dot[f], group.size, which);
+            if (field.kind == Kind::sum) unload(call.ports[f].dot_result, at, field, m.scene.dot[f], group.size, which);
         });
     }
     template <class F>
-    void each_dot(int64_t chunk, F work) const {
-        const int64_t first = chunk * DIRECTIONS, last = std::min(first + DIRECTIONS, call.directions);
-        for (int64_t direction = first; direction < last; direction++)
-            for (size_t f = 0; f < program.fields.size(); f++) work(f, direction, int(direction - first));
+    void each_dot(const Group& group, F work) const {
+        const int64_t last = std::min(group.first + group.size, call.directions);
+        for (int64_t direction = group.first; direction < last; direction++)
+            for (size_t f = 0; f < program.fields.size(); f++) work(f, direction, int(direction - group.first));
     }
 };
 

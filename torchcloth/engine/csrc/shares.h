@@ -56,7 +56,7 @@ struct Shares : Moves<R> {
             const size_t pitch = program.fields[i.field].pitch;
             if (way != Way::reverse) f(i, s.value[i.field], d.value[i.field], d.values[i.field], pitch);
             else if (s.bar[i.field]) f(i, s.bar[i.field], d.bar[i.field], d.bars[i.field], pitch);
-            if (way == Way::tangent) f(i, s.dot[i.field], d.dot[i.field], d.dots[i.field], pitch * DIRECTIONS);
+            if (way == Way::tangent) f(i, s.dot[i.field], d.dot[i.field], d.dots[i.field], pitch * s.directions);
         }
     }
     void lend(Scene<R>& s, Desk<R>& d, Way way) const {

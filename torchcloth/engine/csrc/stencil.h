@@ -13,7 +13,6 @@ enum class Shape : int { plain, transposed, symmetric };
 // plain, and its own transpose. The weights lie as [count, N, V]; a parameter among them gets its derivative.
 template <class R>
 struct Stencil : Stage<R> {
-    using D = Along<R>;
     const Program<R>& program;
     std::vector<int> others;  // vertices, laid out like the weights
     std::vector<int> used;    // of these, by group: the rest are the vertices themselves
@@ -50,11 +49,14 @@ struct Stencil : Stage<R> {
     }
     void tangent(Scene<R>& s) const override {
         forward(s);
-        if (shape == Shape::transposed) spread<DIRECTIONS>(s.value[weight], s.dot[y], s.dot[x], R(1));
-        else differences<DIRECTIONS>(s, s.value[weight], s.dot[x], s.dot[y], R(1));
-        if (s.dot[weight] == nullptr) return;
-        if (shape == Shape::transposed) spread_weights(s);
-        else difference_weights(s);
+        at_once(s.directions, [&](auto n) {
+            using D = Along<R, n>;
+            if (shape == Shape::transposed) spread<n>(s.value[weight], s.dot[y], s.dot[x], R(1));
+            else differences<n>(s, s.value[weight], s.dot[x], s.dot[y], R(1));
+            if (s.dot[weight] == nullptr) return;
+            if (shape == Shape::transposed) spread_weights<D>(s);
+            else difference_weights<D>(s);
+        });
     }
 
   private:
@@ -174,22 +176,24 @@ struct Stencil : Stage<R> {
         const auto cd = __builtin_shufflevector(a[2].v, a[3].v, 0, 4, 2, 6) + __builtin_shufflevector(a[2].v, a[3].v, 1, 5, 3, 7);
         return Quad<R>(__builtin_shufflevector(ab, cd, 0, 1, 4, 5) + __builtin_shufflevector(ab, cd, 2, 3, 6, 7));
     }
+    template <class D>
     void difference_weights(Scene<R>& s) const {
         const R* from = s.value[x];
+        const D* along = reinterpret_cast<const D*>(s.dot[weight]);
         each_weight([&](size_t at, int c, int v, int other) {
             const Quad<R> d = quad(from, other) - quad(from, v);
-            const D& change = *reinterpret_cast<const D*>(s.dot[weight] + at * DIRECTIONS);
             D* to = reinterpret_cast<D*>(s.dot[y]) + v * pitch() + 3 * c;
-            for (int k = 0; k < 3; k++) to[k] = to[k] + change * all<D>(d.v[k]);
+            for (int k = 0; k < 3; k++) to[k] = to[k] + along[at] * all<D>(d.v[k]);
         });
     }
+    template <class D>
     void spread_weights(Scene<R>& s) const {
+        const D* along = reinterpret_cast<const D*>(s.dot[weight]);
         D* to = reinterpret_cast<D*>(s.dot[x]);
         each_weight([&](size_t at, int c, int v, int other) {
             const Quad<R> whole = given<1>(s.value[y], c, v, R(1)).part[0];
-            const D& change = *reinterpret_cast<const D*>(s.dot[weight] + at * DIRECTIONS);
             for (int k = 0; k < 3; k++) {
-                const D share = change * all<D>(whole.v[k]);
+                const D share = along[at] * all<D>(whole.v[k]);
                 to[v * 4 + k] = to[v * 4 + k] + share;
                 to[other * 4 + k] = to[other * 4 + k] - share;
             }

@@ -251,25 +251,33 @@ void adjoint(const Wide<R>* regs, Wide<R>* bar, const int* in, const int* out) {
 
 // ---- forward tangents ----------------------------------------------------------------------------------------------
 
-constexpr int DIRECTIONS = 4;  // at once
-template <class R>
-using Along = Pack<R, DIRECTIONS>;
+// So many directions at once. Values are computed beside each group of them, and of few directions many would be empty.
+constexpr int FEW = 4, MANY = 8;
+template <class R, int N>
+using Along = Pack<R, N>;
+
+// f(constant) with a number of directions as a constant.
+template <class F>
+TC_INLINE void at_once(int directions, F f) {
+    if (directions == FEW) f(std::integral_constant<int, FEW>{});
+    else f(std::integral_constant<int, MANY>{});
+}
 
 // So many items have their directions side by side in a pack.
-template <class R>
-constexpr int BESIDE = LANES<R> / DIRECTIONS;
+template <class R, int N>
+constexpr int BESIDE = LANES<R> / N;
 
 // Each direction gets the number of its item: lanes `first`, first + 1, ... of a pack.
-template <class R>
+template <class R, int N>
 struct Spread {
     typedef std::conditional_t<sizeof(R) == 4, int32_t, int64_t> Index;
     typedef Index Indices __attribute__((vector_size(WIDTH)));
     Indices index;
     explicit Spread(int first) {
-        for (int i = 0; i < LANES<R>; i++) index[i] = first + i / DIRECTIONS;
+        for (int i = 0; i < LANES<R>; i++) index[i] = first + i / N;
     }
     Wide<R> operator()(const Wide<R>& pack) const {
-        if constexpr (BESIDE<R> == 1) return Wide<R>(typename Wide<R>::Lanes{} + pack.v[index[0]]);
+        if constexpr (BESIDE<R, N> == 1) return Wide<R>(typename Wide<R>::Lanes{} + pack.v[index[0]]);
         else return Wide<R>(__builtin_shuffle(pack.v, index));
     }
 };
@@ -320,8 +328,8 @@ TC_INLINE void all_along(const P* v, const P* p, const P* q, Number number, P* t
     (along<K, I>(v, p, q, number, t), ...);
 }
 
-template <class K, class R>
-void tangent(Wide<R>* regs, Along<R>* dots, const int* in, const int* out) {
+template <class K, class R, int N>
+void tangent(Wide<R>* regs, Along<R, N>* dots, const int* in, const int* out) {
     using P = Wide<R>;
     constexpr const Trace& k = traced<K>;
     constexpr int L = LANES<R>;
@@ -330,10 +338,10 @@ void tangent(Wide<R>* regs, Along<R>* dots, const int* in, const int* out) {
     all_forward<K>(v, Operations<K>{});
     all_partials<K>(v, p, q, Operations<K>{});
     auto place = [&](int reg, int lane) -> P& { return *reinterpret_cast<P*>(dots + reg * L + lane); };
-    for (int lane = 0; lane < L; lane += BESIDE<R>) {
+    for (int lane = 0; lane < L; lane += BESIDE<R, N>) {
         P t[k.tape.size];
         for (int i = 0; i < K::inputs; i++) if (k.varies[i]) t[i] = place(in[i], lane);
-        all_along<K>(v, p, q, Spread<R>(lane), t, Operations<K>{});
+        all_along<K>(v, p, q, Spread<R, N>(lane), t, Operations<K>{});
         for (int i = 0; i < K::outputs; i++) {
             const P result = k.varies[k.out[i]] ? t[k.out[i]] : P(0.0);
             P& there = place(out[i] >= 0 ? out[i] : ~out[i], lane);
@@ -353,12 +361,15 @@ struct Kernel {
     int inputs, outputs, flops;
     void (*value)(Wide<R>*, const int*, const int*);
     void (*adjoint)(const Wide<R>*, Wide<R>*, const int*, const int*);
-    void (*tangent)(Wide<R>*, Along<R>*, const int*, const int*);
+    void (*few)(Wide<R>*, Along<R, FEW>*, const int*, const int*);
+    void (*many)(Wide<R>*, Along<R, MANY>*, const int*, const int*);
+    void tangent(Wide<R>* regs, Along<R, FEW>* dots, const int* in, const int* out) const { few(regs, dots, in, out); }
+    void tangent(Wide<R>* regs, Along<R, MANY>* dots, const int* in, const int* out) const { many(regs, dots, in, out); }
 };
 
 template <class K, class R>
 constexpr Kernel<R> kernel() {
-    return {K::name, K::inputs, K::outputs, traced<K>.flops, value<K, R>, adjoint<K, R>, tangent<K, R>};
+    return {K::name, K::inputs, K::outputs, traced<K>.flops, value<K, R>, adjoint<K, R>, tangent<K, R, FEW>, tangent<K, R, MANY>};
 }
 
 }  // namespace tc
