@@ -17,6 +17,7 @@ from torchcloth.diagnosis import (
     setting_of,
     write_diagnosis,
 )
+from torchcloth.diagnosis.lacking import lack_of_fit
 from torchcloth.diagnosis.residual import RESIDUAL, TERMS
 from torchcloth.effects import AirDrag
 
@@ -49,6 +50,15 @@ def test_it_predicts_motions_that_were_held_out(without_air):
     assert [step["kept"] for step in told["path"]] == list(answer.residual.terms)
     assert "It names no cause." in answer.summary()
     assert answer.content["causes"] == []
+
+
+@pytest.mark.slow
+def test_laws_are_asked_about_until_nothing_is_lacking(without_air):
+    _, answer = without_air
+    found = answer.residual.found
+    lacking = any(row.lacking for row in lack_of_fit(found.end, found.setting.names))
+    assert any(row.lacking for row in lack_of_fit(found.start, found.setting.names))
+    assert bool(found.screened) == lacking
 
 
 @pytest.mark.slow

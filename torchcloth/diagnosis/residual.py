@@ -27,6 +27,7 @@ RESIDUAL = "residual"
 TRIED = 2  # laws that are fitted at each step
 NEARLY_ALL = 0.9  # of what can be explained, beyond which no law does clearly more
 FITTED = ("mass", "bend")  # everywhere alike they are parameters of the base model
+AT = {"inside": 2.0}  # of a law's typical coefficient: this weight's mean square is a fourth of "@edge"'s
 
 
 def _with(term: str, world: World, coefficient: float) -> World:
@@ -41,7 +42,7 @@ def _with(term: str, world: World, coefficient: float) -> World:
 def _term(law: str, place: str) -> Hypothesis:
     term = f"{law}@{place}".rstrip("@")
     change: Callable[[World, float], World] = partial(_with, term)
-    return Hypothesis(f"{RESIDUAL}.{term}", LAWS[law].unit, LAWS[law].typical, change, signed=True)
+    return Hypothesis(f"{RESIDUAL}.{term}", LAWS[law].unit, LAWS[law].typical * AT.get(place, 1.0), change, signed=True)
 
 
 TERMS = tuple(_term(law, place) for law in LAWS for place in PLACES if place or law not in FITTED)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from .afresh import afresh, resettled
@@ -97,8 +97,12 @@ def extend(
     progress: Progress = lambda _: None,
     tried: int = TRIED,
 ) -> Found:
-    """As ``search``, from a fit that was asked about the hypotheses; each step fits the ``tried`` likeliest anew."""
-    current, steps = _chain(start, setting, hypotheses, progress, tried)
+    """As ``search``, from a fit that was asked about the hypotheses, until nothing is lacking any more.
+
+    Each step fits the ``tried`` likeliest anew.
+    """
+    sound = lambda found: not any(row.lacking for row in lack_of_fit(found, setting.names))  # noqa: E731
+    current, steps = _chain(start, setting, hypotheses, progress, tried, enough=sound)
     return _found(start, current, steps, setting)
 
 
@@ -135,10 +139,16 @@ def _chain(
     progress: Progress,
     tried: int,
     first: Step | None = None,
+    enough: Callable[[Fitted], bool] = lambda _: False,
 ) -> tuple[Fitted, list[Step]]:
-    """(the model with all causes, the steps that led to it), after ``first`` if that is known."""
+    """(the model with all causes, the steps that led to it), after ``first`` if known, until it is ``enough``."""
+
+    def asked(found: Fitted, progress: Progress) -> Fitted:
+        left = () if enough(found) else found.model.others(hypotheses)
+        return fit(found.model, setting, left, 0, progress, before=start.evidence, here=found.evidence)
+
     current, steps, step = start, [], first
-    while len(steps) < MOST:
+    while len(steps) < MOST and not (steps and enough(current)):
         if step is None:
             other = resettled(current, setting, hypotheses, progress) if steps and current.model.strained else None
             if other is not None and predicts_better(other, current, setting.names) > 0:
@@ -150,19 +160,17 @@ def _chain(
         if step is None:
             break
         best, before = step.best.fitted, current
-        left = best.model.others(hypotheses)
         now = staged(progress, f"with {step.best.hypothesis.name}")
-        current = fit(best.model, setting, left, FURTHER, now, before=start.evidence, here=best.evidence)
+        current = fit(best.model, setting, (), FURTHER, now, before=start.evidence, here=best.evidence)
         if steps and mended(before, current, setting.names) < HALF:
             current = before
             break
-        steps, step = [*steps, step], None
+        current, steps, step = asked(current, now), [*steps, step], None
     current, steps = plainer(current, steps, setting, hypotheses, progress)
     current, steps = pruned(current, steps, setting, hypotheses, progress)
     if steps and current.ahead > FAR:
-        left = current.model.others(hypotheses)
         here, now = current.evidence, staged(progress, "all")
-        current = fit(current.model, setting, left, progress=now, before=here, here=here)
+        current = asked(fit(current.model, setting, progress=now, before=here, here=here), now)
         current, steps = pruned(current, steps, setting, hypotheses, progress)
     share = mended(start, current, setting.names) if steps else 1.0
     if share < LEAST or (share < HALF and unheard(start, current, steps, setting.names)):
