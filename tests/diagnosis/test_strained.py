@@ -74,7 +74,7 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     far, near = replace(found(0.1), ahead=ahead), found(0.1)
     row = SimpleNamespace(hypothesis=CAUSE)
     first = Step(Candidate(row, far, None, None, set(), 0.0), None, [], [], [], far)  # type: ignore[arg-type]
-    doubted, fits = [], iter([far, near])
+    doubted, fits = [], iter([far, far, near, near])  # fitted, then asked about the other causes
     monkeypatch.setattr(stepwise, "fit", lambda *_, **__: next(fits))
     monkeypatch.setattr(stepwise, "screen", lambda f: [])
     monkeypatch.setattr(stepwise, "begun_with", lambda *_: [])
