@@ -17,7 +17,7 @@ from torchcloth.diagnosis import (
     setting_of,
     write_diagnosis,
 )
-from torchcloth.diagnosis.lacking import lack_of_fit
+from torchcloth.diagnosis.lacking import is_lacking
 from torchcloth.diagnosis.residual import RESIDUAL, TERMS
 from torchcloth.effects import AirDrag
 
@@ -56,9 +56,8 @@ def test_it_predicts_motions_that_were_held_out(without_air):
 def test_laws_are_asked_about_until_nothing_is_lacking(without_air):
     _, answer = without_air
     found = answer.residual.found
-    lacking = any(row.lacking for row in lack_of_fit(found.end, found.setting.names))
-    assert any(row.lacking for row in lack_of_fit(found.start, found.setting.names))
-    assert bool(found.screened) == lacking
+    assert is_lacking(found.start, found.setting.names)
+    assert bool(found.screened) == is_lacking(found.end, found.setting.names)
 
 
 @pytest.mark.slow

@@ -90,6 +90,11 @@ def lack_of_fit(found: Fitted, names: Sequence[str]) -> list[Left]:
     return [row for k, name in enumerate(names) for row in _episode(found, k, name)]
 
 
+def is_lacking(found: Fitted, names: Sequence[str]) -> bool:
+    """Whether any kind of data in any motion is."""
+    return any(row.lacking for row in lack_of_fit(found, names))
+
+
 def explained(before: Sequence[Left], after: Sequence[Left]) -> float:
     """Share of what a right model would not leave of points, edges and markers that is gone; 1 of nothing.
 

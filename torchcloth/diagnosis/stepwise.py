@@ -11,7 +11,7 @@ from .branches import unstable, without
 from .comparison import Gain, compare, predict
 from .doubts import mended, plainer, predicts_better, pruned, unheard
 from .fitting import Fitted, fit, renoised
-from .lacking import lack_of_fit
+from .lacking import is_lacking
 from .noise import floor_of
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
@@ -78,7 +78,7 @@ def search(
     if any(map(len, jumping)):
         setting, start = replace(setting, unstable=jumping), without(start, jumping)
     current, steps = _chain(start, setting, hypotheses, progress, TRIED)
-    if not steps and any(row.lacking for row in lack_of_fit(start, setting.names)):
+    if not steps and is_lacking(start, setting.names):
         screened = screen(start)
         rows = {row.hypothesis.name: row for row in screened}
         asked = [row.hypothesis for row in screened if row.sight]
@@ -101,7 +101,7 @@ def extend(
 
     Each step fits the ``tried`` likeliest anew.
     """
-    sound = lambda found: not any(row.lacking for row in lack_of_fit(found, setting.names))  # noqa: E731
+    sound = lambda found: not is_lacking(found, setting.names)  # noqa: E731
     current, steps = _chain(start, setting, hypotheses, progress, tried, enough=sound)
     return _found(start, current, steps, setting)
 
@@ -144,11 +144,11 @@ def _chain(
     """(the model with all causes, the steps that led to it), after ``first`` if known, until it is ``enough``."""
 
     def asked(found: Fitted, progress: Progress) -> Fitted:
-        left = () if enough(found) else found.model.others(hypotheses)
+        left = found.model.others(hypotheses)
         return fit(found.model, setting, left, 0, progress, before=start.evidence, here=found.evidence)
 
     current, steps, step = start, [], first
-    while len(steps) < MOST and not (steps and enough(current)):
+    while len(steps) < MOST:
         if step is None:
             other = resettled(current, setting, hypotheses, progress) if steps and current.model.strained else None
             if other is not None and predicts_better(other, current, setting.names) > 0:
@@ -165,12 +165,16 @@ def _chain(
         if steps and mended(before, current, setting.names) < HALF:
             current = before
             break
-        current, steps, step = asked(current, now), [*steps, step], None
+        steps, step = [*steps, step], None
+        if enough(current):
+            break
+        current = asked(current, now)
     current, steps = plainer(current, steps, setting, hypotheses, progress)
     current, steps = pruned(current, steps, setting, hypotheses, progress)
     if steps and current.ahead > FAR:
         here, now = current.evidence, staged(progress, "all")
-        current = asked(fit(current.model, setting, progress=now, before=here, here=here), now)
+        current = fit(current.model, setting, progress=now, before=here, here=here)
+        current = current if enough(current) else asked(current, now)
         current, steps = pruned(current, steps, setting, hypotheses, progress)
     share = mended(start, current, setting.names) if steps else 1.0
     if share < LEAST or (share < HALF and unheard(start, current, steps, setting.names)):
