@@ -7,14 +7,12 @@ import pytest
 
 from torchcloth.cli import main
 
-pytestmark = pytest.mark.slow
-
 TRUTH = {"membrane_stiffness": 50.0, "air.normal": 1.2, "bending.stiffness": 3e-5}
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
-    """(output folder, identification.json); some 2 minutes on a free core."""
+    """(output folder, identification.json); some 20 seconds."""
     out = tmp_path_factory.mktemp("demo") / "out"
     assert main(["demo", "--out", str(out)]) == 0
     return out, json.loads((out / "identification.json").read_text())
@@ -44,7 +42,7 @@ def test_poissons_ratio_is_not_claimed(done):
 
 def test_the_demo_leaves_pictures(done):
     assert {p.name for p in done[0].iterdir()} == {
-        "identification.json", "fit.png", "distances.png", "parameters.png"
+        "identification.json", "fit.png", "distances.png", "forces.png", "parameters.png"
     }  # fmt: skip
 
 

@@ -33,6 +33,7 @@ Array = np.ndarray
 ROOT = Path(__file__).resolve().parents[2]
 CORNER = {"left": (0.0, 0.40), "right": (0.40, 0.40)}  # m, material coordinates
 RADIUS = 0.026  # m, a finger pad of 15 x 38 mm across its diagonal
+DIAGONAL = RADIUS / 2**0.5  # m, a vertex there makes the held patch round
 NOMINAL = {  # a data sheet: a start for fits, wrong in stiffness and Poisson ratio
     "membrane_stiffness": 150.0,
     "youngs_modulus": 1.5e5,
@@ -47,10 +48,26 @@ NOMINAL = {  # a data sheet: a start for fits, wrong in stiffness and Poisson ra
         "bending_damping_time": "s",
     },
 }
-# bending and damping, as fabric has: without them wrinkles as fine as the mesh grow, and no time step converges
-SHEET = SheetSpec(
-    areal_density=0.35, membrane_stiffness=50.0, drag_normal=1.2, bending_stiffness=3e-5, damping_time=5e-3
-)
+
+
+def knit(nodes: int) -> SheetSpec:
+    """The cloth, with lines of its ``nodes`` x ``nodes`` vertices where the held patches end, so that these are round.
+
+    Bending and damping, as fabric has: without them wrinkles as fine as the mesh grow, and no time step converges.
+    """
+    width = height = 0.40
+    return SheetSpec(
+        width,
+        height,
+        nodes=(nodes, nodes),
+        areal_density=0.35,
+        membrane_stiffness=50.0,
+        drag_normal=1.2,
+        bending_stiffness=3e-5,
+        damping_time=5e-3,
+        lines_u=(0.0, DIAGONAL, *np.linspace(RADIUS, width - RADIUS, nodes - 4), width - DIAGONAL, width),
+        lines_v=(*np.linspace(0.0, height - RADIUS, nodes - 2), height - DIAGONAL, height),
+    )
 
 
 @dataclass(frozen=True)
@@ -58,7 +75,7 @@ class Plan:
     """All choices that make the episode."""
 
     seed: int = 0
-    sheet: SheetSpec = field(default_factory=lambda: SHEET)
+    sheet: SheetSpec = field(default_factory=lambda: knit(25))
     step: float = 5e-5  # s
     settling: float = 2.0  # s
     swing: Swing = field(default_factory=lambda: Swing(stretch=0.02))
@@ -76,7 +93,7 @@ def simulate(plan: Plan, t: Array, poses: dict[str, Array], rng: np.random.Gener
     x0 = hanging(plan, uv, rng)
     grips = {}
     for name, pose in poses.items():
-        held = np.flatnonzero(np.linalg.norm(uv - CORNER[name], axis=1) <= RADIUS)
+        held = np.flatnonzero(np.linalg.norm(uv - CORNER[name], axis=1) <= RADIUS * (1 + 1e-9))
         grips[name] = Grip(held, t, pose)
     rest = settle(plan.sheet, x0, grips, plan.settling)
     return MujocoCloth(plan.sheet, plan.step).run(rest, t, grips), faces

@@ -30,7 +30,7 @@ def open3d():
 
 
 def small_plan(**changes):
-    sheet = replace(make_example.SHEET, nodes=(9, 9))
+    sheet = make_example.knit(9).even
     return make_example.Plan(
         sheet=sheet, step=2e-4, settling=0.5, swing=Swing(duration=0.4), every=10, fit_nodes=5, **changes
     )
@@ -178,7 +178,7 @@ def test_the_whole_episode_converges_in_time_step_and_mesh():
 
     base = run(plan)
     assert rms(base, run(replace(plan, step=plan.step / 2))) < 1e-5
-    finer = replace(plan.sheet, nodes=(37, 37))
+    finer = make_example.knit(37)
     fine = run(replace(plan, sheet=finer, step=2e-5))
     uv, _ = grid(plan.sheet)
     assert rms(base, np.stack([bilinear(finer, x, uv)[0] for x in fine])) < 5e-3
