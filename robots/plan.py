@@ -28,6 +28,7 @@ from .ways import Load, Task, Way, dense, follow, load, ways
 ACCELERATION = 3.0  # rad/s^2
 KEPT = 3  # ways of each arm that are tried with those of the others
 EASE = 1.002  # slower than the limits ask for by that much, for what lies between the samples
+SAME = 1e-9  # s
 
 
 class Plan(NamedTuple):
@@ -93,6 +94,10 @@ def plan(
     for name, value in {"acceleration": acceleration, "clearance": clearance, "period": period}.items():
         if not (math.isfinite(value) and value > 0):
             raise InvalidInput(name, got=value, expected="a finite value > 0")
+    spans = {name: path.t[[0, -1]].tolist() for name, path in action.motion.items()}
+    if any(max(ends) - min(ends) > SAME for ends in zip(*spans.values(), strict=True)):
+        told = ", ".join(f"{name} {first:g} to {last:g} s" for name, (first, last) in spans.items())
+        raise InvalidInput("paths of the action", got=told, expected="one beginning and one end for all arms")
     for name, path in action.motion.items():
         _check_reach(scene[name], name, path)
     options = {
@@ -162,13 +167,17 @@ def _timed(scene: Scene, action: Action, chosen: dict[str, Way], gap: Gap, slow_
     splines = {key: way.spline.slower(slower) for key, way in chosen.items()}
     path = dense(next(iter(action.motion.values())))
     t = Spline(slower * path.t, path.t[:, None], path.t[:, None]).finer(period)
-    knot = torch.searchsorted(slower * path.t, t + 1e-9, right=True) - 1
-    never = torch.zeros_like(path.closed)
-    held = {key: dense(action.motion[key]).closed if key in action.motion else never for key in chosen}
+
+    def closed(name: str) -> Tensor:
+        if name not in action.motion:
+            return torch.zeros(len(t), dtype=torch.bool)
+        own = action.motion[name]
+        return own.closed[torch.searchsorted(slower * own.t, t + 1e-9, right=True) - 1]
+
     return Plan(
         t=t,
         q={key: spline.at(t)[0] for key, spline in splines.items()},
-        closed={key: closed[knot] for key, closed in held.items()},
+        closed={key: closed(key) for key in chosen},
         release=slower * action.release,
         slower=slower,
         limiting=f"{scene[name].joint_names[hardest.load.joint]} of {name}: {hardest.load.what}",

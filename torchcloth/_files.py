@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+PROGRESS = "progress"  # folder in an output folder, while the work is not done
+
 
 @contextmanager
 def atomically(path: Path) -> Iterator[Path]:

@@ -51,8 +51,8 @@ def held(motion: Mapping[str, Trajectory], start: float, end: float) -> dict[str
     found, span = {}, torch.tensor([start, end], dtype=torch.float64)
     for name, trajectory in motion.items():
         check(trajectory, name)
-        pose = interpolate(trajectory, span[:1].to(trajectory.pose))
-        closed = drive(trajectory, span[:1].repeat(2).to(trajectory.pose)).closed[0]
+        pose = interpolate(trajectory, span[:1])
+        closed = drive(trajectory, span[:1].repeat(2)).closed[0]
         found[name] = Trajectory(span, pose.expand(*pose.shape[:-3], 2, 4, 4), torch.tensor([closed, closed]))
     return found
 

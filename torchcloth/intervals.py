@@ -51,7 +51,7 @@ class Interval(NamedTuple):
 
 
 def _drives(motion: Mapping[str, Trajectory], times: Tensor) -> dict[str, Drive]:
-    return {name: drive(trajectory, times.to(trajectory.pose)) for name, trajectory in motion.items()}
+    return {name: drive(trajectory, times) for name, trajectory in motion.items()}
 
 
 def _part(whole: Drive, first: int, last: int) -> Drive:

@@ -7,7 +7,8 @@ forces are left 2 of the 4 in 4 - 2 (1 - P) - omega^2 dt^2 > 0; and with T_n(w_0
 is damped fast (van der Houwen and Sommeijer 1980 leave 95 %).
 
 P acts on the velocities that the boundaries left, beside the other forces and not after them: these push the held
-vertices as well, and stages would carry that on to their neighbours.
+vertices as well, and stages would carry that on to their neighbours. To these a held vertex keeps its velocity from
+stage to stage; what it is given itself is summed beside that, for who holds it feels it.
 """
 
 from __future__ import annotations
@@ -63,12 +64,14 @@ def relaxed(
     first, slope = Polynomial.of(model.stages)
     loose = _loose(model, drives, substep)
     before, now, often = torch.zeros_like(state.v), state.v, 1.0
+    given_before, given = before, now
     for _ in range(model.stages):
         force = _viscous_forces(model, s, state.x, now, memory)
-        change = dt * loose * resisted(resistance, force / model.mass)
-        before, now = now, often * (first * now + slope * change) - before
+        change = dt * slope * resisted(resistance, force / model.mass)
+        before, now = now, often * (first * now + loose * change) - before
+        given_before, given = given, often * (first * given + change) - given_before
         often = 2.0
-    return (state.v + now) / (1 + PEAK)
+    return (state.v + given) / (1 + PEAK)
 
 
 def _loose(model: Model, drives: Mapping[str, Drive], substep: int) -> Tensor:

@@ -204,3 +204,23 @@ def test_a_force_of_another_shape_is_refused_by_name(engine, kind):
     cloth = cloth_with(engine, kind)
     with pytest.raises(tc.errors.InvalidInput, match=r"force of effect 'own'.*a row for each of the"):
         cloth(start(cloth), opening(END), TIMES)
+
+
+def test_batched_poses_without_gradient_and_their_divergence():
+    """Rows of some substeps of a batch are not contiguous."""
+    mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(4, 4))
+    t = torch.linspace(0, 0.02, 4)
+    pose = torch.eye(4).repeat(3, 4, 1, 1)
+    pose[..., 2, 3] = 0.1 * t * torch.arange(1, 4)[:, None]
+    motion = {"hand": tc.Trajectory(t, pose, torch.ones(4, dtype=torch.bool))}
+
+    def run(engine, motion):
+        effects, hand = {"pull": Pull()}, {"hand": tc.boundaries.Grasp([0, 1])}
+        cloth = tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), 0.2, effects, hand, contact=None, engine=engine)
+        with torch.no_grad():
+            return cloth(cloth.rest_state(), motion, [0, 0.01, 0.02]).x
+
+    torch.testing.assert_close(run("auto", motion), run("reference", motion))
+    pose[1, 2, 2, 3] = 1e200
+    with pytest.raises(tc.errors.SimulationDiverged):
+        run("auto", motion)

@@ -187,7 +187,7 @@ def test_a_collider_becomes_a_plane(recording):
 def test_unknowns_by_public_name(model):
     names = set(available(model))
     assert names >= {"youngs_modulus", "poisson_ratio", "air.normal", "bending.stiffness", "areal_density"}
-    one = collect(model, ["air.normal", "youngs_modulus", "air.normal"], 0.005)
+    one = collect(model, ["air.normal", "youngs_modulus", "air.normal"], (0.3, 0.005))
     assert [u.name for u in one] == ["air.normal", "youngs_modulus", "areal_density"]
     assert [u.measured for u in one] == [False, False, True]
     assert one[2].prior_std == pytest.approx(0.005 / 0.3)  # of the logarithm

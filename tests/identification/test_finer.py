@@ -1,5 +1,7 @@
 """A fit on a coarse mesh, corrected by one simulation on a finer one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -83,3 +85,34 @@ def test_a_mesh_that_is_fine_already_is_hardly_corrected(recording):
         for c, r in ((twins.at(recording), recording), (fine, episode))
     )
     assert finer < 0.6 * coarse
+
+
+def test_a_sewn_mesh_keeps_its_pattern():
+    """Warp and weft of the shirt's panels are those of the coarse mesh: so is the energy of a stretched one."""
+    mesh = tc.meshes.shirt(triangles=300)
+    law = tc.materials.OrthotropicAEP(2e6, 2e5, 1e4, thickness=1e-3)
+    grip = {"left": tc.boundaries.Grasp.at("left shoulder")}
+    coarse = tc.Cloth(mesh, law, 0.15, boundaries=grip, contact=None)
+    fine = finer_cloth(coarse)
+    for stretch in ([1.05, 1.0, 1.0], [1.0, 1.05, 1.0]):
+        own, other = (
+            sum(c.energy(c.state(torch.as_tensor(c.mesh.vertices * stretch))).values()).item() for c in (coarse, fine)
+        )
+        assert other == pytest.approx(own, rel=1e-6)
+
+
+def test_a_late_clock_is_no_difference_between_meshes():
+    late = twins.twin()
+    moved = {n: _later(g, 0.03) for n, g in late.grippers.items()}  # frames were taken 30 ms after they say
+    late = replace(late, grippers=moved)
+    names, clock = ["youngs_modulus", "air.normal"], {"clock": 0.03}
+    found = identify(twins.at(late), late, names, nuisances=clock, refine=True).parameters["air.normal"]
+    assert found.value == pytest.approx(twins.TRUE.drag, abs=3 * found.std)
+    assert found.std < 0.05
+
+
+def _later(g, by):
+    """A gripper's motion, begun so much later."""
+    parts = "position", "quat_wxyz", "closed"
+    ahead = {name: np.concatenate([getattr(g, name)[:1], getattr(g, name)]) for name in parts}
+    return replace(g, t=np.concatenate([g.t[:1], g.t + by]), **ahead)

@@ -256,3 +256,11 @@ def test_an_effect_that_the_episode_does_not_bring_says_how(recording, name, rem
     bare = replace(recording, air_density=None, cloth=replace(recording.cloth, nominal={}))
     with pytest.raises(InvalidInput, match=remedy):
         identify(cloth_from(bare), bare, [name])
+
+
+def test_the_density_was_weighed_wherever_the_fit_starts():
+    made = twin()
+    cloth = at(made)
+    cloth.areal_density.set(1.3 * made.cloth.areal_density)
+    found = identify(cloth, made, ["youngs_modulus", "air.normal"]).parameters["areal_density"]
+    assert found.value == pytest.approx(made.cloth.areal_density, abs=3 * made.cloth.areal_density_std)

@@ -1,12 +1,18 @@
 """Answers that are kept: found again, written whole, and never taken for those of another question or problem."""
 
 import os
+from dataclasses import replace
 
 import pytest
 import torch
+import twins
 
 from torchcloth.errors import InvalidInput
+from torchcloth.identification import identify
+from torchcloth.identification.episodes import episode
 from torchcloth.identification.journal import Journal, digest
+from torchcloth.identification.objective import Objective
+from torchcloth.identification.unknowns import collect
 
 POINT = torch.tensor([1.0, 2.0], dtype=torch.float64)
 
@@ -71,3 +77,31 @@ def test_an_interrupt_while_writing_leaves_no_answer(tmp_path, monkeypatch):
 def test_fingerprints_tell_apart_what_is_joined():
     assert digest(["ab", "c"]) != digest(["a", "bc"])
     assert digest([torch.zeros(2)]) == digest([torch.zeros(4)[:2]])
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda r: replace(r, air_density=0.3),
+        lambda r: replace(r, grasps={n: replace(g, radius=1.5 * g.radius) for n, g in r.grasps.items()}),
+        lambda r: replace(r, grippers={n: replace(g, t=1.5 * g.t) for n, g in r.grippers.items()}),
+    ],
+    ids=["air", "radius", "times"],
+)
+def test_what_is_no_tensor_tells_problems_apart(other):
+    made = twins.twin()
+    ids = []
+    for recording in (made, other(made)):
+        cloth = twins.at(recording)
+        objective = Objective(cloth, collect(cloth, ["youngs_modulus"], None), [episode(cloth, recording)])
+        ids.append(digest(objective.identity()))
+    assert ids[0] != ids[1]
+
+
+def test_beginnings_of_several_episodes_are_told_apart(tmp_path):
+    """The first is so short that its beginning is all of it."""
+    both = [twins.first(twins.twin(seed=3), 4), twins.twin()]
+    names = ["youngs_modulus", "air.normal"]
+    plain = identify(twins.at(both[0]), both, names)
+    kept = identify(twins.at(both[0]), both, names, journal=tmp_path / "journal")
+    assert kept.parameters["youngs_modulus"].value == plain.parameters["youngs_modulus"].value

@@ -157,7 +157,9 @@ def test_an_amplitude_of_zero_can_be_known(recording):
 
 def test_what_is_withdrawn_is_not_identified_by_its_prior_either(model):
     """The fit took it to elsewhere, with the error of slopes that mean nothing: its prior's is what is known."""
-    unknowns = with_priors(collect(model, ["youngs_modulus", "poisson_ratio"], 0.005), {"youngs_modulus": (1e6, 1.01)})
+    unknowns = with_priors(
+        collect(model, ["youngs_modulus", "poisson_ratio"], (0.3, 0.005)), {"youngs_modulus": (1e6, 1.01)}
+    )
     raw = torch.tensor([u.start for u in unknowns])
     fitted = estimates(model, unknowns, raw, torch.diag(torch.full((3,), 1e-12)))
     assert fitted.parameters["youngs_modulus"].source == fitted.parameters["areal_density"].source == "prior"

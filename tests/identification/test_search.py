@@ -105,7 +105,7 @@ def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_
 
 
 def test_starts_are_spread_over_two_decades(model):
-    unknowns = collect(model, ["youngs_modulus", "poisson_ratio", "air.normal"], 0.005)
+    unknowns = collect(model, ["youngs_modulus", "poisson_ratio", "air.normal"], (0.3, 0.005))
     begin = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
     found = torch.stack(starts.spread(unknowns, begin, 33))
     assert torch.equal(found[0], begin)

@@ -19,7 +19,7 @@ EARLY = 0.35  # five frames: 200 ms of the motion, 0.3 s of settling before it
 @pytest.fixture
 def short(recording, model):
     """(cloth, unknowns with density, five frames)."""
-    unknowns = collect(model, NAMES, recording.cloth.areal_density_std)
+    unknowns = collect(model, NAMES, recording.cloth.weighed)
     return model, unknowns, episode(model, recording).until(EARLY)
 
 

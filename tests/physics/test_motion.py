@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import torchcloth as tc
+from torchcloth.boundaries.motion import interpolate
 
 
 def sheet(size=0.3, n=8, *, effects=None, boundaries=None, contact=tc.Contact(), Y=300.0, density=0.15):  # noqa: B008
@@ -126,3 +127,26 @@ def test_sticks_and_slides_on_an_incline():
         expected = 0.5 * 9.81 * (math.sin(angle) - mu * math.cos(angle)) * 0.09 if slides else 0.0
         assert moved == pytest.approx(expected, rel=0.03, abs=1e-9)
         assert float(out.x[..., 2].min()) > -1e-9
+
+
+@pytest.mark.parametrize("origin", [1000.0, 1.7e9])
+def test_float32_has_room_for_substeps_whatever_the_clock_says(origin):
+    mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(4, 4))
+    t = torch.linspace(0, 0.2, 9, dtype=torch.float64)
+    pose = torch.eye(4).repeat(9, 1, 1)
+    pose[:, 2, 3] = 0.05 * (1 - torch.cos(20 * t)).float()
+    found = []
+    for start in (0.0, origin):
+        hand = {"hand": tc.boundaries.Grasp([0, 1])}
+        cloth = tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), 0.2, boundaries=hand, contact=None).float()
+        motion = {"hand": tc.Trajectory(start + t, pose, torch.ones(9, dtype=torch.bool))}
+        still = cloth.settle(cloth.rest_state(), motion, start=start, duration=0.01)
+        found.append(cloth(still, motion, [start, start + 0.2]))
+    assert found[0].x.dtype == torch.float32
+    torch.testing.assert_close(found[1].v, found[0].v, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(found[1].wrench["hand"], found[0].wrench["hand"], rtol=1e-2, atol=1e-4)
+
+
+def test_a_path_of_one_knot_stands_still():
+    still = tc.Trajectory(torch.zeros(1), torch.eye(4)[None], torch.ones(1, dtype=torch.bool))
+    torch.testing.assert_close(interpolate(still, torch.tensor([-1.0, 0.0, 2.0])), torch.eye(4).expand(3, 4, 4))

@@ -137,3 +137,19 @@ def test_the_usual_material_point_method_knows_no_stages():
     mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(4, 4))
     cloth = tc.Cloth(mesh, tc.materials.AEP(3e5, 0.3), 0.2, {"viscous": E.KelvinVoigt(3.0)}, transfer="apic")
     assert cloth.stable_step() == limits(cloth).longest(0)
+
+
+@pytest.mark.parametrize("engine", ["reference", "auto"])
+@pytest.mark.parametrize("effect", [E.KelvinVoigt(3.0), E.Bending(1e-3, 0.3)])
+def test_a_hand_feels_what_the_cloth_is_given(effect, engine):
+    """In vacuum: the hand's impulse is the cloth's momentum, also of forces that act in stages."""
+    mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(6, 6))
+    hand = {"hand": tc.boundaries.Grasp(range(6))}
+    cloth = tc.Cloth(mesh, tc.materials.AEP(3e5, 0.3), 0.2, {"viscous": effect}, hand, contact=None, engine=engine)
+    assert limits(cloth).stages(limits(cloth).step) > 1
+    t = torch.linspace(0, 0.03, 6)
+    pose = torch.eye(4).repeat(6, 1, 1)
+    pose[:, 1, 3], pose[:, 2, 3] = -20 * t**2, 10 * t**2
+    out = cloth(cloth.rest_state(), {"hand": tc.Trajectory(t, pose, torch.ones(6, dtype=torch.bool))}, t)
+    impulse = -(out.wrench["hand"][1:, :3] * t.diff()[:, None]).sum(0)
+    torch.testing.assert_close(impulse, (cloth.model().mass * out.state.v).sum(0), rtol=1e-9, atol=1e-12)

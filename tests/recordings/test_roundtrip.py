@@ -168,6 +168,8 @@ def test_frames_and_images(episode, recording):
     camera.depth.paths[0].write_bytes(b"no image")
     with pytest.raises(RecordingError, match="cannot be decoded"):
         camera.depth.load(0)
+    with pytest.raises(RecordingError, match="cannot be decoded"):
+        list(camera.depth.files())  # nor handed on
     with pytest.raises(RecordingError, match="wrong size"):
         replace(camera.depth, size=(6, 8)).load(1)
 

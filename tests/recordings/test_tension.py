@@ -90,6 +90,7 @@ def test_a_wrong_specimen_is_refused(folder, key, value, message):
         ("displacement,force\n0,1\n0.001,nan\n", "force is not finite"),
         ("displacement,force\n0,1\n0.001,inf\n", "force is not finite"),
         ("displacement,force\n0,1\n1.9,2\n", "looks like millimetres"),
+        ("displacement,force\n0,0\n0.001,0\n", "0 in every row; .*load cell"),
         ("repeat,displacement,force\n0,0,1\n0.5,0,1\n", "repeat is not whole"),
         ('displacement,force\n0,"1\n', "is not CSV|cells"),
     ],

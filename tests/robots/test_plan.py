@@ -231,3 +231,31 @@ def test_a_plan_is_plain_numpy_for_a_recording(made):
     for joints in made["swing"][1].joints().values():
         assert isinstance(joints.q, np.ndarray)
         assert joints.closed.dtype == bool
+
+
+@pytest.mark.parametrize("order", [("left", "right"), ("right", "left")])
+def test_each_gripper_opens_by_its_own_path(order):
+    """One arm stands still: its path needs fewer points than the other's."""
+    rig, t = robots.bimanual_rig(), torch.arange(61, dtype=torch.float64) * 0.03
+    moving = P.minimum_jerk((t / 1.2).clamp(max=1))
+
+    def path(y, rise, closed):
+        pose = torch.eye(4, dtype=torch.float64).repeat(len(t), 1, 1)
+        pose[:, 0, 3], pose[:, 1, 3], pose[:, 2, 3] = 0.5, y, 0.3 + rise * moving
+        return Trajectory(t, pose, closed)
+
+    own = {"left": path(0.2, 0.0, t >= 0), "right": path(-0.2, 0.1, t < 1.5 - 1e-9)}
+    holds = {"left": Hold(0.9, 0, True, 0.7), "right": Hold(0.9, 0, False, 0.7)}
+    found = plan(rig, P.Action({name: own[name] for name in order}, float(t[-1]), 1.5), holds=holds)
+    opened = found.t[~found.closed["right"]]
+    assert float(opened[0]) == pytest.approx(1.5 * found.slower, abs=0.02)
+    assert bool(found.closed["left"].all())
+
+
+def test_paths_that_do_not_end_together_are_refused():
+    t = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    still = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    closed = torch.ones(2, dtype=torch.bool)
+    motion = {"left": Trajectory(t, still, closed), "right": Trajectory(1.5 * t, still, closed)}
+    with pytest.raises(InvalidInput, match="one end"):
+        plan(robots.bimanual_rig(), P.Action(motion, 1.5, 1.0))

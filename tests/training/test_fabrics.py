@@ -181,3 +181,15 @@ def test_distance_is_mahalanobis_with_the_trials_own_error_and_the_spread_beyond
     noisy = [other._replace(error=np.array([5.0, 5.0])) for other in others]
     assert classify._squared(trial, noisy) == pytest.approx(9.0 / (0.25 * 1.25))
     assert classify._squared(trial, others[:1]) is None
+
+
+def test_a_fabric_with_too_few_others_is_not_counted_as_wrong():
+    """Of two trials of wool one has one other, which is no spread: it cannot be called wool, nor anything else."""
+    rng = np.random.default_rng(0)
+
+    def trials(fabric, centre, count):
+        return [classify.Trial(fabric, centre + 0.01 * rng.standard_normal(1), np.array([0.01])) for _ in range(count)]
+
+    found = classify.confusion(trials("cotton", 0.0, 10) + trials("wool", 5.0, 2), ["cotton", "wool"])
+    assert (found["right"], found["trials"]) == (10, 10)
+    assert classify.confusion(trials("cotton", 0.0, 2), ["cotton"])["trials"] == 0

@@ -11,9 +11,11 @@ pytest.importorskip("lightning")
 
 from lightning.pytorch.callbacks import Callback
 
+import torchcloth as tc
 import torchcloth.training.fit.run as run
 from torchcloth.training.fit.command import main
-from torchcloth.training.fit.config import load
+from torchcloth.training.fit.config import Learn, Network, load
+from torchcloth.training.fit.learned import Learned
 from torchcloth.training.fit.module import FitModule
 
 sys.path.insert(0, str(Path(__file__).parent))  # the network in nets.py
@@ -135,3 +137,14 @@ def test_validation_is_held_out(config, episodes, tmp_path):
 def test_every_loss_has_a_gradient(config, loss):
     module = run.fit(load(config(loss={loss: 1e-3}, optimizer={"steps": 1})))
     assert float(module.learned.values()["youngs_modulus"]) != pytest.approx(8e4, rel=1e-3)
+
+
+def test_a_network_cannot_make_a_cone_negative():
+    mesh = tc.meshes.rectangle(0.2, 0.2, triangles=18)
+    cloth = tc.Cloth(mesh, tc.materials.AEP.preset("cotton"), 0.15, contact=tc.Contact(0.05))
+    network = Network("torch.nn.Linear", ["cone"], {"in_features": 2, "out_features": 1})
+    learned = Learned(cloth, Learn(network=network))
+    with torch.no_grad():
+        learned.network.weight.zero_()
+        learned.network.bias.fill_(-1.0)
+    assert float(learned.values()["cone"].max()) == 0.0

@@ -20,6 +20,8 @@ from torchcloth.training.fit.data import Deal
         (["optimizer.steps=0"], "config: optimizer.steps; got 0; expected at least 1"),
         (["optimizer.rate=-1"], "config: optimizer.rate; got -1.0"),
         (["steps"], "override; got 'steps'; expected KEY=VALUE"),
+        (["data.train.0=mine"], "override; got data.train.0; expected nothing inside of 'train'"),
+        (["out.x=1"], "override; got out.x"),
         (["data.train=[]"], "config: data.train; got no episodes"),
         (["data.train=nowhere"], "nowhere does not exist"),
         (["data.train=nowhere/*"], "got no folder that matches nowhere/*"),

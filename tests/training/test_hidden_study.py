@@ -99,6 +99,24 @@ def test_an_answer_that_is_none_says_how_it_ended(monkeypatch, tmp_path):
         assert json.loads((tmp_path / word / "diagnosis.json").read_text()) == found
 
 
+def test_a_diagnosis_that_was_stopped_is_no_answer_and_goes_on(monkeypatch, tmp_path):
+    commands = []
+
+    def run(command):
+        commands.append(command)
+        (tmp_path / "a" / "progress").mkdir(parents=True, exist_ok=True)
+        if len(commands) == 1:
+            return Namespace(returncode=130, stdout="", stderr="torchcloth: stopped; `--resume` goes on from there")
+        (tmp_path / "a" / "diagnosis.json").write_text(json.dumps(ANSWER))
+        return Namespace(returncode=0, stdout="", stderr="")
+
+    monkeypatch.setattr(hidden, "_run", run)
+    with pytest.raises(KeyboardInterrupt):
+        hidden.answered([tmp_path / "e1"], tmp_path / "a")
+    assert hidden.answered([tmp_path / "e1"], tmp_path / "a") == ANSWER
+    assert ["--resume" in command for command in commands] == [False, True]
+
+
 def test_experiments_are_made_of_the_same_case_and_answered_with_all_episodes(called, tmp_path):
     made = []
     make = lambda *arguments: (made.append(arguments), (Path(arguments[-1]) / "e9").mkdir(parents=True))  # noqa: E731

@@ -70,9 +70,14 @@ def check_cover(trajectory: Trajectory, name: str, start: float, end: float) -> 
 def interpolate(trajectory: Trajectory, times: Tensor) -> Tensor:
     """Poses [..., N, 4, 4] at ``times`` [N] s: cubic Hermite on positions and rotation columns, orthonormalised.
 
-    C1, so that the held cloth sees no velocity jumps at the knots; differentiable in the knots' poses.
+    C1, so that the held cloth sees no velocity jumps at the knots; differentiable in the knots' poses. Times are
+    counted from the first of ``times`` before they get the poses' precision: float32 has no room for substeps far
+    from 0.
     """
-    t, pose = trajectory.t.to(times), trajectory.pose
+    pose, origin = trajectory.pose, times[:1]
+    t, times = ((some - origin).to(pose) for some in (trajectory.t.to(times), times))
+    if len(t) == 1:
+        return pose.expand(*pose.shape[:-3], len(times), 4, 4)
     mixed = hermite(t, pose, _slopes(t, pose), times)
     first = mixed[..., :3, 0]
     first = first * dot(first, first).rsqrt()

@@ -9,8 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from .._files import PROGRESS
 from .folders import check_folder
-from .identify import PROGRESS, STOPPED
+from .identify import STOPPED
 
 
 def add(verbs: Any) -> None:

@@ -10,6 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .._files import PROGRESS
 from ..errors import InvalidInput
 from . import fields
 from .folders import check_folder
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
 DEMO = "bimanual_swing"
 STOPPED = "; `--resume` goes on from there"
-PROGRESS = "progress"  # folder in DIR, while a fit is not done
 
 
 def add(verbs: Any) -> None:

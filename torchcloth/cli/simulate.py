@@ -96,7 +96,9 @@ def _finished(folder: Path, order: Order) -> bool:
     try:
         found = json.loads((folder / "episode.json").read_text(encoding="utf-8")).get("order")
     except FileNotFoundError:
-        return False
+        if not folder.exists():
+            return False
+        found = None
     except (OSError, ValueError, AttributeError):
         found = None
     if found != order.facts():
@@ -125,6 +127,7 @@ def _make(out: Path, order: Order) -> None:
             error.args = (f"{order.name}: {error}",)
             raise
         advance("writing", 0, 1)
+        (out / f"{order.name}.gif").unlink(missing_ok=True)  # of an episode that is gone
         recordings.write(recording, out / order.name)
 
 

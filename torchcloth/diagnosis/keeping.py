@@ -12,8 +12,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ..identification.episodes import Episode
-from ..identification.journal import Journal, digest
+from ..identification.journal import Journal, digest, facts_of
 from .cells import Cells, Piece
 from .own_causes import digests
 from .setting import Kept, Setting
@@ -44,13 +43,6 @@ def kept_in(folder: Path, model: Model, setting: Setting, resume: bool | None) -
 def _problem(model: Model, setting: Setting) -> list[object]:
     """All that an answer depends on beside the question."""
     cloth = model.base.cloth
-    data = [part for e in setting.episodes for part in _parts(e)]
+    data = [part for e in setting.episodes for part in e.identity()]
     parts = [(p.name, p.step, p.std) for p in model.parameters]
-    fabric = [*cloth.state_dict().values(), cloth.mesh.rest.tobytes(), cloth.mesh.faces.tobytes(), setting.rest]
-    return [metadata.version("torchcloth"), setting.dt, parts, *digests(), *fabric, *data]
-
-
-def _parts(e: Episode) -> list[object]:
-    seen = [e.times, e.initial, e.settles, *e.clouds, e.markers, *(e.places or ()), e.noise, e.eye]
-    moved = [part for name, m in e.motion.items() for part in (name, m.t, m.pose, m.closed)]
-    return [*seen, *moved, *e.wrenches.values()]
+    return [metadata.version("torchcloth"), setting.dt, parts, *digests(), *facts_of(cloth), setting.rest, *data]

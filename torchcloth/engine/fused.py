@@ -143,7 +143,7 @@ def rollout(model: Model, state: ClothState, dt: float, drives: Mapping[str, Dri
 
 def _cut(moves: Mapping[Field, Tensor], first: int, last: int) -> dict[Field, Tensor]:
     """The rows of some substeps."""
-    return {field: rows[:, first:last] for field, rows in moves.items()}
+    return {field: rows[:, first:last].contiguous() for field, rows in moves.items()}
 
 
 def _are_numbers(inputs: list[Tensor]) -> bool:

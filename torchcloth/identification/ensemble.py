@@ -100,7 +100,7 @@ def later(objective: Objective, part: Objective) -> Callable[[Linearised], Tenso
     def mask(linear: Linearised) -> Tensor:
         episode = objective.episode_of(linear)
         length = torch.tensor([len(e.times) + gauss_newton.WINDOW for e in objective.episodes])
-        seen = torch.tensor([len(e.times) for e in part.episodes])
+        seen = torch.tensor([e.observed for e in part.episodes])
         return linear.frame - (length.cumsum(0) - length)[episode] >= seen[episode]
 
     return mask

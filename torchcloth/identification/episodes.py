@@ -65,10 +65,21 @@ class Episode:
     unseen: int = 0
     eye: Tensor | None = None
 
+    def identity(self) -> list[object]:
+        """What simulations of it, and what is seen of them, depend on."""
+        seen = [self.times, self.initial, self.settles, *self.clouds, self.markers, *(self.places or ()), self.noise]
+        moved = [part for name, m in self.motion.items() for part in (name, m.t, m.pose, m.closed)]
+        return [*seen, self.eye, *moved, *(part for pair in self.wrenches.items() for part in pair)]
+
     @property
     def observed(self) -> int:
         """Frames of which there may be data."""
         return len(self.times) - self.unseen
+
+    @property
+    def lookahead(self) -> float:
+        """s, of frames that are simulated after the last observed one."""
+        return float(self.times[-1] - self.times[self.observed - 1])
 
     def beyond(self, reach: float) -> Episode:
         """With frames after the last, for ``reach`` [s] or as long as the motion goes on: a late clock sees them."""

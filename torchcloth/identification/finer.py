@@ -9,7 +9,7 @@ third of d is added to the standard errors for what the extrapolation leaves ope
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -76,7 +76,10 @@ def mesh_step(objective: Objective, final: gauss_newton.Iterate, recordings: Seq
     """[K], the step that a mesh twice as fine asks for at the solution; unconstrained coordinates."""
     coarse = objective.cloth
     cloth = finer_cloth(coarse)
-    episodes = [episode(cloth, finer_recording(r, coarse.mesh, cloth.mesh)) for r in recordings]
+    episodes = [
+        episode(cloth, finer_recording(r, coarse.mesh, cloth.mesh)).beyond(e.lookahead)
+        for r, e in zip(recordings, objective.episodes, strict=True)
+    ]
     fine = Objective(
         cloth, objective.unknowns, episodes, objective.dt, objective.nuisances, objective.blocks, objective.floors
     )
@@ -92,7 +95,8 @@ def mesh_step(objective: Objective, final: gauss_newton.Iterate, recordings: Seq
 
 def _divided_mesh(mesh: Mesh) -> Mesh:
     ends, faces = _divided(mesh.faces)
-    return Mesh.build(_between(mesh.vertices, ends), faces, None if mesh.uv is None else _between(mesh.uv, ends))
+    pattern = None if mesh.pattern is None else _quartered(mesh.pattern)
+    return Mesh.build(_between(mesh.vertices, ends), faces, pattern, mesh.places)
 
 
 def _regripped(part: AbstractBoundary, ends: np.ndarray, before: int) -> AbstractBoundary:
@@ -107,11 +111,20 @@ def _between(field: np.ndarray, ends: np.ndarray) -> np.ndarray:
     return np.concatenate([field, 0.5 * (field[ends[:, 0]] + field[ends[:, 1]])])
 
 
+def _quartered(corners: np.ndarray) -> np.ndarray:
+    """[4 F, 3, 2] of the triangles of ``_divided`` from [F, 3, 2]; along a seam each panel has its own."""
+    i, j, k = corners.transpose(1, 0, 2)
+    return _four((i, j, k), ((j + k) / 2, (k + i) / 2, (i + j) / 2))
+
+
 def _divided(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(vertex pairs [N, 2] with a new vertex between, faces [4 F, 3])."""
     sides = np.sort(faces[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2), axis=1)
     ends, index = np.unique(sides, axis=0, return_inverse=True)
-    a, b, c = (index.reshape(-1, 3) + faces.max() + 1).T  # opposite to the corners
-    i, j, k = faces.T
-    parts = [np.stack(t, 1) for t in ((i, c, b), (c, j, a), (b, a, k), (a, b, c))]
-    return ends, np.concatenate(parts)
+    return ends, _four(faces.T, (index.reshape(-1, 3) + faces.max() + 1).T)
+
+
+def _four(corners: Iterable[np.ndarray], middles: Iterable[np.ndarray]) -> np.ndarray:
+    """[4 F, 3, ...], the parts of every triangle, from its corners and what is halfway opposite to each, [F, ...]."""
+    (i, j, k), (a, b, c) = corners, middles
+    return np.concatenate([np.stack(t, 1) for t in ((i, c, b), (c, j, a), (b, a, k), (a, b, c))])

@@ -121,7 +121,7 @@ def identify(
     if refine:
         finer_cloth(cloth)  # refuses now what it would refuse at the end
     names = default_parameters(cloth) if parameters is None else list(parameters)
-    measured = None if method in CHAMFER else episodes_in[0].cloth.areal_density_std  # joins as a prior only
+    measured = None if method in CHAMFER else episodes_in[0].cloth.weighed  # joins as a prior only
     unknowns = with_priors(collect(cloth, names, measured), priors or {})
     if not unknowns:
         raise InvalidInput("parameters", got="none", expected="at least one name")

@@ -81,7 +81,7 @@ def _solved(
 
 def _told(objective: Objective, failed: Checked, part: Objective, checked: Checked) -> Within:
     frames, count = (max(e.observed for e in o.episodes) for o in (part, objective))
-    until = max(float(e.times[-1] - e.times[0]) for e in part.episodes)
+    until = max(float(e.times[e.observed - 1] - e.times[0]) for e in part.episodes)
     warning = (
         f"{failed.reason}: derivatives hold for the first {until:.2f} s only, and only those frames, "
         f"{frames} of {count}, were used"

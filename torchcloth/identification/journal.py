@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from .._files import atomically
+from ..cloth import Cloth
 from ..errors import InvalidInput
 
 FORMAT = 1
@@ -105,3 +106,15 @@ def digest(parts: Sequence[object]) -> str:
         data = part.detach().contiguous().numpy().tobytes() if isinstance(part, Tensor) else repr(part).encode()
         found.update(len(data).to_bytes(8, "little") + data)
     return found.hexdigest()[:24]
+
+
+def facts_of(cloth: Cloth) -> list[object]:
+    """All that its simulations depend on: tensors by name, and what its parts keep as plain numbers and words."""
+    tensors = [part for pair in (*cloth.named_parameters(), *cloth.named_buffers()) for part in pair]
+    plain = [
+        (path, name, value)
+        for path, part in cloth.named_modules()
+        for name, value in vars(part).items()
+        if name != "training" and not name.startswith("_") and isinstance(value, (bool, int, float, str, tuple))
+    ]
+    return [*tensors, *plain, cloth.mesh.rest.tobytes(), cloth.mesh.faces.tobytes(), cloth.contact]

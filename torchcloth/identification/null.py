@@ -14,7 +14,7 @@ ARM = 0.05  # m, length of the axes that carry a gripper's orientation into the 
 def rigid_carry(episode: Episode) -> Tensor:
     """Frames [T, V, 3] m of the initial shape under the rigid motion that best follows all grippers."""
     times = episode.times
-    marks = [_marks(interpolate(trajectory, times.to(trajectory.pose))) for trajectory in episode.motion.values()]
+    marks = [_marks(interpolate(trajectory, times)) for trajectory in episode.motion.values()]
     if not marks:
         return episode.initial.expand(len(times), -1, -1)
     rotation, shift = _align(torch.cat(marks, dim=1))

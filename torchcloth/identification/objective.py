@@ -16,7 +16,7 @@ from . import gauss_newton
 from .blocks import BLOCKS, Block
 from .episodes import Episode
 from .identifiability import Reach
-from .journal import Journal
+from .journal import Journal, digest, facts_of
 from .misfit import Figures, figures, huber
 from .nuisances import AbstractNuisance, Placed, place
 from .replays import Frames, each, simulate, tangents
@@ -60,7 +60,7 @@ class Objective:
 
     def part(self, share: float) -> Objective:
         """The same for the first ``share`` of the frames."""
-        return self._like([e.until(share) for e in self.episodes], self.nuisances)
+        return self._like([e.until(share).beyond(e.lookahead) for e in self.episodes], self.nuisances)
 
     def beside(self, nuisances: Sequence[AbstractNuisance]) -> Objective:
         """The same with other nuisances."""
@@ -124,21 +124,10 @@ class Objective:
 
     def identity(self) -> list[object]:
         """What the answers to the solvers' questions depend on."""
-        data = [
-            part
-            for e in self.episodes
-            for part in (
-                e.times,
-                e.initial,
-                *e.clouds,
-                e.markers,
-                *e.wrenches.values(),
-                *(m.pose for m in e.motion.values()),
-            )
-        ]
-        model = [*self.cloth.state_dict().values(), self.cloth.mesh.rest.tobytes(), self.dt, self.cloth.engine]
-        names = [u.name for u in self.unknowns], [b.name for b in self.blocks], self.floors
-        return [*data, *model, *names, self.middle, self.prior_std]
+        data = [part for e in self.episodes for part in e.identity()]
+        model = [*facts_of(self.cloth), self.dt]
+        names = [u.name for u in self.unknowns], [b.name for b in self.blocks], [n.name for n in self.nuisances]
+        return [*data, *model, *names, self.floors, self.middle, self.prior_std]
 
     def episode_of(self, linear: gauss_newton.Linearised) -> Tensor:
         """[R] which episode a row belongs to."""
@@ -266,7 +255,7 @@ class Objective:
     def _ask(self, question: str, raw: Tensor, work: Callable[[], Any]) -> Any:
         if self.journal is None:
             return work()
-        return self.journal.ask(f"{question}-{len(self.episodes[0].times)}", raw, work)
+        return self.journal.ask(f"{question}-{digest([len(e.times) for e in self.episodes])}", raw, work)
 
     def secants(self, raw: Tensor, steps: Tensor) -> tuple[gauss_newton.Linearised, Reach]:
         """The same with one-sided differences over finite ``steps`` of the fabric's unknowns, and how far these reach.

@@ -92,8 +92,11 @@ def needs_contact(cloth: Cloth, path: str) -> bool:
     return cloth.contact is None and path in ("material.contact_stiffness", "material.shear_stiffness", "material.cone")
 
 
-def collect(cloth: Cloth, names: Sequence[str], density_std: float | None, absent: bool = False) -> list[Unknown]:
-    """The unknowns of a fit, by public name; areal density joins with its measured prior when that is known.
+def collect(
+    cloth: Cloth, names: Sequence[str], weighed: tuple[float, float] | None, absent: bool = False
+) -> list[Unknown]:
+    """The unknowns of a fit, by public name; areal density joins as it was ``weighed`` (value, standard deviation),
+    wherever the cloth's own starts.
 
     ``absent`` admits parameters that the model does not contain, for reports.
 
@@ -119,11 +122,10 @@ def collect(cloth: Cloth, names: Sequence[str], density_std: float | None, absen
                 remedy="it needs contact (--contact)",
             )
         out.append(_unknown(cloth, name, known[name]))
-    density = float(cloth.areal_density.value.detach().mean())
-    if density_std and "areal_density" in known and "areal_density" not in names:
-        raw = math.log(density)
-        key = known["areal_density"] + ".raw"
-        out.append(Unknown("areal_density", key, cloth.areal_density, raw, density_std / density, measured=True))
+    if weighed and "areal_density" in known and "areal_density" not in names:
+        start, (value, std), key = float(cloth.areal_density.raw.detach()), weighed, known["areal_density"] + ".raw"
+        mean = math.log(value)
+        out.append(Unknown("areal_density", key, cloth.areal_density, start, std / value, measured=True, mean=mean))
     return out
 
 

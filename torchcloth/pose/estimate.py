@@ -85,7 +85,7 @@ def estimate_pose(
     check_size(recording)
     data, fields = episode(cloth, recording), modes_of(cloth.mesh)
     coarse = modes_of(cloth.mesh, modes).fields.to(data.initial)
-    density = recording.cloth.areal_density_std if uncertain else None
+    density = recording.cloth.weighed if uncertain else None
     unknowns = with_priors(collect(cloth, list(uncertain or {}), density), uncertain or {})
     blocks = blocks_for(use)
     own = chosen(nuisances, implied([block.name for block in blocks], [data]))

@@ -82,7 +82,7 @@ class PoseEstimate:
         names = ("times", "x", "v", "std", "seen", "faces", "windows", "acceleration", "alone")
         arrays = {name: getattr(self, name).cpu().numpy() for name in names}
         small = {name: a.astype(np.float32) if a.ndim == 3 else a for name, a in arrays.items()}
+        text = json.dumps(self.as_dict(), indent=1, allow_nan=False) + "\n"
         with atomically(folder / "pose.npz") as part:
             np.savez_compressed(part, **small)
-        text = json.dumps(self.as_dict(), indent=1, allow_nan=False) + "\n"
         return folder / "pose.npz", write_text(folder / "pose.json", text)

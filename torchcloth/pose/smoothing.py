@@ -8,12 +8,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..errors import SimulationDiverged
 from ..identification import gauss_newton
 from .objective import Corrected
 
 PARTS = (0.25, 0.5)  # of the frames: far from the truth a long motion is too nonlinear to start with
 ROUNDS = 8  # of all frames, at most
 LEAST = 0.01  # m/s^2, a thousandth of gravity
+FASTEST = 1e4  # m/s^2, a thousand times gravity: no cloth needs that to be where it was seen
 TRIES = 40  # of expectation and maximisation, on one linearisation
 SMALL = 0.2  # standard errors per unknown, rms, of a step that ends the search
 
@@ -73,6 +75,12 @@ def _learn(objective: Corrected, at: gauss_newton.Iterate) -> tuple[Tensor, Tens
         root = root_of(information, objective.prior_std)
         mean = root @ (root.mT @ (pull + objective.middle / objective.prior_std**2))
         squared = (mean.square() + root.square().sum(1))[objective.pushes].reshape(shape).mean((0, 2))
+        if not bool((squared < FASTEST**2).all()):
+            raise SimulationDiverged(
+                "pose: the force that corrects the simulation grows without end",
+                got=f"more than {FASTEST:g} m/s^2",
+                remedy="the motion amplifies small pushes too much: a longer window, fewer frames, or a better fabric",
+            )
         objective.expecting(squared.sqrt().clamp(min=LEAST))
     return root_of(information, objective.prior_std), information
 

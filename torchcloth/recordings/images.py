@@ -78,7 +78,9 @@ class ImageStream:
             if i == len(frames):
                 raise RecordingError(f"{self.kind} images are too many", expected=f"{len(self)}, one for each time")
             if isinstance(image, Path):
-                yield frames[i], image.suffix, image.read_bytes()
+                data = image.read_bytes()
+                self._decoded(data, str(image))  # what is damaged is not handed on
+                yield frames[i], image.suffix, data
             else:
                 yield frames[i], *self._file(image, self._place(i, frames[i]))
         if i + 1 < len(frames):

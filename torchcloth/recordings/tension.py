@@ -118,6 +118,13 @@ def _read(folder: Folder) -> ForceDisplacement:
         extra=meta.rest,
         **columns,
     )
+    if not np.any(table.force):
+        raise RecordingError(
+            f"{folder.place(ROWS)}: force",
+            got="0 in every row",
+            expected="forces",
+            remedy="was the load cell connected?",
+        )
     worst = float(np.abs(table.strain).max())
     if worst > LARGEST_STRAIN:
         raise RecordingError(

@@ -33,6 +33,11 @@ class ClothInfo:
     nominal: dict[str, Any] = field(default_factory=dict)  # data-sheet values: a start for fits, possibly wrong
     extra: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def weighed(self) -> tuple[float, float] | None:
+        """kg/m^2, areal density and its standard deviation; None where that is not known."""
+        return (self.areal_density, self.areal_density_std) if self.areal_density_std else None
+
     def pattern_box(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Lower and upper corner, each [2] m, of the pattern; None for a mesh without pattern coordinates."""
         if self.uv is not None:

@@ -158,7 +158,11 @@ def _put(content: dict[str, Any], key: str, value: Any) -> None:
     while "." in rest and is_dataclass(kind):
         section, rest = rest.split(".", 1)
         kind = _section(get_type_hints(kind).get(section))
-        content[section] = inner = dict(content.get(section) or {})
+        inner = content.get(section) or {}
+        plain = kind is not None and not is_dataclass(kind) and get_origin(kind) is not dict
+        if plain or not isinstance(inner, dict):
+            raise InvalidInput("override", got=key, expected=f"nothing inside of {section!r}, which has no keys")
+        content[section] = inner = dict(inner)
         content = inner
     content[rest] = value
 

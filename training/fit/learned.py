@@ -74,7 +74,11 @@ class Learned(nn.Module):
         if out.shape != (len(self._places), len(names)):
             expected = f"[{len(self._places)}, {len(names)}], a column for each of {', '.join(names)}"
             raise InvalidInput(f"{self.what.network.module}: output", got=list(out.shape), expected=expected)
-        return own | {name: self.parameter(name).raw + self.units[name] * out[:, i] for i, name in enumerate(names)}
+        given = {name: self.parameter(name).raw + self.units[name] * out[:, i] for i, name in enumerate(names)}
+        amplitudes = {
+            name: raw.clamp(min=0.0) for name, raw in given.items() if self.parameter(name).domain == "nonnegative"
+        }
+        return own | given | amplitudes
 
     def entries(self) -> dict[str, Tensor]:
         """What the network gives, by the names of the cloth's stored tensors."""

@@ -72,24 +72,27 @@ def confusion(trials: Sequence[Trial], fabrics: Sequence[str]) -> dict[str, Any]
     """Each trial left out and assigned.
 
     Returns:
-        ``matrix`` true fabric -> assigned fabric -> count; ``right`` of ``trials``; ``within``: how many are so near
-        their own fabric as 95 % should be; ``margin``: least distance from a wrong fabric, in standard deviations,
-        over all trials; ``distance`` true fabric -> fabric -> mean distance.
+        ``matrix`` true fabric -> assigned fabric -> count; ``right`` of the ``trials`` of fabrics with enough others;
+        ``within``: how many are so near their own fabric as 95 % should be; ``margin``: least distance from a wrong
+        fabric, in standard deviations, over all trials; ``distance`` true fabric -> fabric -> mean distance.
     """
     matrix = {a: dict.fromkeys(fabrics, 0) for a in fabrics}
     distances: dict[str, dict[str, list[float]]] = {a: {b: [] for b in fabrics} for a in fabrics}
-    within = 0
+    within = judged = 0
     for i, trial in enumerate(trials):
         others = [t for j, t in enumerate(trials) if j != i]
         squared = {name: _squared(trial, [t for t in others if t.fabric == name]) for name in fabrics}
         known = {name: d for name, d in squared.items() if d is not None}
+        if trial.fabric not in known:  # the others of its own fabric are too few: it could only be wrong
+            continue
+        judged += 1
         matrix[trial.fabric][min(known, key=lambda name: known[name])] += 1
-        within += known.get(trial.fabric, np.inf) <= UNLIKELY[len(trial.place)]
+        within += known[trial.fabric] <= UNLIKELY[len(trial.place)]
         for name, d in known.items():
             distances[trial.fabric][name].append(d**0.5)
     wrong = [d for a, row in distances.items() for b, own in row.items() if a != b for d in own]
     return {
-        "trials": len(trials),
+        "trials": judged,
         "right": sum(matrix[name][name] for name in fabrics),
         "within": int(within),
         "margin": min(wrong) if wrong else None,

@@ -10,6 +10,7 @@ import argparse
 import json
 import os
 import secrets
+import signal
 import subprocess
 import sys
 import time
@@ -20,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchcloth._files import write_text
+from torchcloth._files import PROGRESS, write_text
 from torchcloth.errors import InvalidInput
 
 from ..kept import Kept
@@ -33,6 +34,7 @@ CASES = 60
 # sealed, for the tests: a fault, air.drag_n at 1.5, a null and two hard ones
 FAST = (10_089_647_178, 10_089_647_168, 10_089_647_160, 10_089_647_165, 10_089_647_164)
 REFUSED = 2  # exit code
+STOPPED = (130, -signal.SIGINT)
 LINES = 20  # of an error that are kept
 HEADINGS = (0.0, 90.0, 180.0, 270.0)  # degrees, of random experiments
 
@@ -157,7 +159,9 @@ def _gain(
 def answered(episodes: list[Path], out: Path) -> dict[str, Any]:
     """What ``torchcloth diagnose`` writes, or how it ended instead."""
     command = [sys.executable, "-m", "torchcloth.cli", "diagnose", *map(str, episodes), "--out", str(out)]
-    done = _run(command)
+    done = _run([*command, "--resume"] if (out / PROGRESS).exists() else command)
+    if done.returncode in STOPPED:  # by who stops the study: that is no answer
+        raise KeyboardInterrupt
     if done.returncode == 0:
         return json.loads((out / "diagnosis.json").read_text())
     said = done.stderr.strip().splitlines() or ["nothing"]

@@ -15,28 +15,39 @@ def relaxed(low: Lowering) -> tuple[Loop, list[int]]:
         loop = low.loop(low.vertices)
         return loop, loop.load(low.v.now)
     first, slope = Polynomial.of(low.model.stages)
-    before, now, held = low.program.constant([[0.0, 0.0, 0.0]]), low.v.now, _held(low)
-    loop, after = _stage(low, before, now, (first, slope), held)
+    none, held = low.program.constant([[0.0, 0.0, 0.0]]), _held(low)
+    seen, given = (none, low.v.now), (none, low.v.now)  # before and now: to neighbours, and what all are given
+    loop, force = _forced(low, low.v.now)
+    factors = first, slope
     for _ in range(low.model.stages - 1):
-        before, now = now, low.program.temporary(low.vertices, 3)
-        loop.put(after, now)
-        loop, after = _stage(low, before, now, (2 * first, 2 * slope), held)
-    both = loop.call("plus3", loop.load(low.v.now), after)
+        new = tuple(low.program.temporary(low.vertices, 3) for _ in range(2))
+        after = _stage(low, loop, seen, factors, held, force), _stage(low, loop, given, factors, low.number(0.0), force)
+        for value, field in zip(after, new, strict=True):
+            loop.put(value, field)
+        seen, given, factors = (seen[1], new[0]), (given[1], new[1]), (2 * first, 2 * slope)
+        loop, force = _forced(low, seen[1])
+    both = loop.call("plus3", loop.load(low.v.now), _stage(low, loop, given, factors, low.number(0.0), force))
     return loop, loop.call("scaled3", loop.load(low.number(1 / (1 + PEAK))), both)
 
 
-def _stage(
-    low: Lowering, before: Field, now: Field, factors: tuple[float, float], held: Field
-) -> tuple[Loop, list[int]]:
+def _forced(low: Lowering, velocity: Field) -> tuple[Loop, Field]:
+    """(a loop over the vertices, viscous forces at these velocities)."""
     force = low.program.temporary(low.vertices, 3)
     for add in low.viscous:
-        add(now, force)
-    loop = low.loop(low.vertices)
+        add(velocity, force)
+    return low.loop(low.vertices), force
+
+
+def _stage(
+    low: Lowering, loop: Loop, velocities: tuple[Field, Field], factors: tuple[float, float], held: Field, force: Field
+) -> list[int]:
+    """The next velocities after those (before, now)."""
+    before, now = velocities
     fields = low.dt, *map(low.number, factors), held, now, before, force, low.mass
     inputs = [loop.load(field) for field in fields]
     if low.resistance is None:
-        return loop, loop.call("stage", *inputs)
-    return loop, loop.call("stage_in_air", *inputs, loop.load(low.resistance))
+        return loop.call("stage", *inputs)
+    return loop.call("stage_in_air", *inputs, loop.load(low.resistance))
 
 
 def _held(low: Lowering) -> Field:
