@@ -7,11 +7,14 @@ import pytest
 import torch
 
 from torchcloth.diagnosis.cells import NAMES as KINDS
+from torchcloth.diagnosis.cells import Cells
 from torchcloth.diagnosis.classes import alike, correlations
 from torchcloth.diagnosis.comparison import compare, predict, spread
-from torchcloth.diagnosis.fitting import step_of
+from torchcloth.diagnosis.evidence import as_rough
+from torchcloth.diagnosis.fitting import renoised, step_of
 from torchcloth.diagnosis.noise import ROUGH, Noise, fit_noise, floor_of, whitened
 from torchcloth.diagnosis.screening import Row, _decided, screen
+from torchcloth.diagnosis.trials import CLEAR
 from torchcloth.diagnosis.wording import _is_too_large, _too_large
 
 NAMES = ["a", "b", "c"]
@@ -204,7 +207,47 @@ def test_twins_form_a_class_and_strangers_do_not():
     found = asked([0.0, 0.0, 1.0, 0.0, 0.0], slopes=same)
     rows = {r.hypothesis.name: r for r in screen(found)}
     assert float(correlations(found)[0, 1]) > 0.99
-    assert [r.hypothesis.name for r in alike(found, rows["a"], [rows["b"], rows["c"]])] == ["b"]
+    assert [r.hypothesis.name for r in alike(found, rows["a"], 1.0, [rows["b"], rows["c"]])] == ["b"]
+
+
+def test_what_a_fit_finds_tells_it_from_strangers_though_a_score_found_little():
+    """A cause that slopes where it was asked about hardly showed is not alike everything."""
+    found = asked([0.0, 0.0, 1.0, 0.0, 0.0])
+    rows = {r.hypothesis.name: r for r in screen(found)}
+    little, others = rows["a"]._replace(gain=1.0), [rows["b"], rows["c"]]
+    assert len(alike(found, little, 0.0, others)) == 2
+    assert alike(found, little, 1.0, others) == []
+
+
+def test_more_scatter_within_cells_is_no_gain():
+    """Of two models that leave the same residuals neither is the likelier, however their points scatter."""
+    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
+    cells = [c._replace(spread=1.1 * c.spread, count=c.count - 1, rough=c.rough + 1e-4) for c in ev.cells]
+    groups, one, other = ["x", "y", "x", "y"], toys.fitted(ev), toys.fitted(replace(ev, cells=cells))
+    like = [renoised(found, one.noise, one.evidence) for found in (one, other)]
+    first, same, more = (predict(found, groups) for found in (*like, renoised(other, one.noise, other.evidence)))
+    assert compare(first, same, 1e-3).density == pytest.approx(0.0, abs=1e-9)
+    assert abs(compare(first, more, 1e-3).density) > CLEAR
+
+
+def test_cells_that_another_lacks_keep_their_scatter():
+    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
+    less = [Cells(*(column[5:] for column in c)) for c in ev.cells]
+    like = replace(ev, cells=[c._replace(spread=2 * c.spread) for c in less], numerics=[n[5:] for n in ev.numerics])
+    for own, taken in zip(ev.cells, as_rough(ev, like).cells, strict=True):
+        assert torch.equal(taken.spread[:5], own.spread[:5])
+        assert torch.equal(taken.spread[5:], 2 * own.spread[5:])
+
+
+def test_an_episode_without_a_cell_says_nothing():
+    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
+    none = Cells(*(column[:0] for column in ev.cells[0]))
+    empty = replace(ev, cells=[none, *ev.cells[1:]], numerics=[ev.numerics[0][:0], *ev.numerics[1:]])
+    rest = replace(ev, cells=ev.cells[1:], numerics=ev.numerics[1:], stds=ev.stds[1:])
+    noise = fit_noise(empty)
+    assert torch.equal(noise.level, fit_noise(rest).level)
+    assert torch.equal(whitened(empty, noise).value, whitened(rest, noise).value)
+    assert len(as_rough(ev, empty).cells[0].value) == len(ev.cells[0].value)
 
 
 def test_a_true_cause_predicts_motions_that_were_held_out():

@@ -27,6 +27,7 @@ def truth(found: Case) -> dict[str, object]:
     effects = [
         {
             **asdict(h),
+            "amplitude": _by_sheet(h, found),
             "names": list(_partner(h.name).names),
             "hypothesis": _hypothesis(h),
             "sign": _forward(h.options.get("heading")) * _partner(h.name).sign,
@@ -47,6 +48,13 @@ def truth(found: Case) -> dict[str, object]:
         "said": found.said,
         "fabric": found.fabric,
     }
+
+
+def _by_sheet(hidden: Hidden, found: Case) -> float:
+    """The amplitude as the library means it: a share of mass is one of what the data sheet says."""
+    if hidden.name != "mass.density":
+        return hidden.amplitude
+    return (1 + hidden.amplitude) / found.said["areal_density"] - 1
 
 
 def _partner(name: str):

@@ -152,6 +152,13 @@ def test_truths_name_what_is_right():
     assert json.loads(json.dumps(wind)) == wind
 
 
+def test_a_share_of_mass_is_one_of_what_the_data_sheet_says():
+    found = next(c for c in map(case, range(DEVELOPMENT)) if c.kind == "mass without forces")
+    (hidden,), sheet = found.effects, found.said["areal_density"]
+    assert sheet != 1.0
+    assert (1 + truth(found)["effects"][0]["amplitude"]) * sheet == pytest.approx(1 + hidden.amplitude)
+
+
 def test_hypotheses_are_the_librarys_with_their_axes():
     names = {h.name for h in known()}
     for seed in range(DEVELOPMENT):

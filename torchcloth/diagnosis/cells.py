@@ -62,6 +62,8 @@ def stretches(cells: Sequence[Cells]) -> Tensor:
 
 def aligned(key: Tensor, other: Tensor, columns: Tensor) -> Tensor:
     """Rows of ``columns`` [O, ...] of the cells ``other`` in the order of the cells ``key`` [C]; zero where missing."""
+    if not len(other):
+        return columns.new_zeros(len(key), *columns.shape[1:])
     order = torch.argsort(other)
     place = order[torch.searchsorted(other[order], key).clamp(max=len(other) - 1)]
     found = columns[place].clone()
@@ -71,8 +73,8 @@ def aligned(key: Tensor, other: Tensor, columns: Tensor) -> Tensor:
 
 def mean_over(stretch: Tensor, values: Tensor) -> Tensor:
     """[C] of values [C], over each cell's stretch."""
-    total = values.new_zeros(int(stretch.max()) + 1).index_add(0, stretch, values)
-    return (total / torch.bincount(stretch))[stretch]
+    count = torch.bincount(stretch)
+    return (values.new_zeros(len(count)).index_add(0, stretch, values) / count)[stretch]
 
 
 def cells_of(frames: Frames, moved: Frames | None, episode: Episode, sheet: Sheet, rest: Tensor) -> Cells:

@@ -23,16 +23,20 @@ def correlations(found: Fitted) -> Tensor:
     return (asked.mT @ asked) / (norm[:, None] * norm)
 
 
-def alike(found: Fitted, row: Row, others: Sequence[Row]) -> list[Row]:
-    """Those of ``others`` that cannot be told from ``row`` at its amplitude, of other effects."""
+def alike(found: Fitted, row: Row, amplitude: float, others: Sequence[Row]) -> list[Row]:
+    """Those of ``others`` that cannot be told from ``row`` at this amplitude or the one that was asked for.
+
+    Directions of the same effect are none.
+    """
     index = {h.name: k for k, h in enumerate(found.evidence.hypotheses)}
     if row.hypothesis.name not in index:  # no world could have it there
         return []
     rho = correlations(found)[index[row.hypothesis.name]]
+    square = max(row.gain, (amplitude / row.std) ** 2)
     out = []
     for other in others:
         r = float(rho[index[other.hypothesis.name]])
-        told = row.gain * (1 - r * r)
+        told = square * (1 - r * r)
         if other.hypothesis.effect != row.hypothesis.effect and (abs(r) > ALIKE or told < TOLD):
             out.append(other)
     return out

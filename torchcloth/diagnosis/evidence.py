@@ -169,11 +169,25 @@ def as_held(evidence: Evidence, like: Evidence) -> Evidence:
 
 
 def as_rough(evidence: Evidence, like: Evidence) -> Evidence:
-    """With another's roughness and numerics: densities of models are compared by the same covariance only."""
+    """With another's scatter, roughness and numerics: densities of models are compared by the same covariance only."""
     both = list(zip(evidence.cells, like.cells, strict=True))
-    cells = [own._replace(rough=aligned(own.key, other.key, other.rough)) for own, other in both]
+    cells = [_as_certain(own, other) for own, other in both]
     numerics = [aligned(own.key, other.key, n) for (own, other), n in zip(both, like.numerics, strict=True)]
     return replace(evidence, cells=cells, numerics=numerics)
+
+
+def _as_certain(own: Cells, other: Cells) -> Cells:
+    """With another's counts, scatter and roughness; cells that only ``own`` has keep theirs, and no roughness."""
+    kept = torch.isin(own.key, other.key)
+
+    def taken(mine: Tensor, theirs: Tensor) -> Tensor:
+        return torch.where(kept, aligned(own.key, other.key, theirs), mine)
+
+    return own._replace(
+        count=taken(own.count, other.count),
+        spread=taken(own.spread, other.spread),
+        rough=aligned(own.key, other.key, other.rough),
+    )
 
 
 def central(cells: Cells, shifts: Sequence[tuple[int, float]], parameters: int) -> Cells:

@@ -35,7 +35,7 @@ class Missing(NamedTuple):
     """The missing force in one motion."""
 
     motion: str
-    windows: Tensor  # [W, 2] s
+    windows: Tensor  # [W, 2] s, from the first frame
     force: Tensor  # [W, V, 3] Pa, world axes
     std: Tensor  # [W, V, 3] Pa
     x: Tensor  # [W, V, 3] m, where the cloth is in the middle of each
@@ -125,7 +125,7 @@ def missing_force(
     for name, p, e in zip(setting.names, parts, setting.episodes, strict=True):
         here = slice(first, first := first + 3 * modes * len(p.windows))
         force, std = (density[:, None] * f for f in _spread(answer.mean[here], answer.covariance[here, here], fields))
-        told.append(Missing(name, torch.stack([e.times[list(w)] for w in p.windows]), force, std, p.x))
+        told.append(Missing(name, torch.stack([e.times[list(w)] - e.times[0] for w in p.windows]), force, std, p.x))
     weight = GRAVITY * float((density * area).sum() / area.sum())
     return MissingForce(told, gain, weight, setting.rest[:, :2], torch.as_tensor(world.cloth.mesh.faces), area)
 

@@ -47,7 +47,7 @@ def diagnose(
     Args:
         recordings: episodes of one cloth, at least two, of different motions (``split["motion"]``).
         model: where to start; None: the base model of the first episode, in vacuum.
-        hypotheses: what to look for; None: the catalogue.
+        hypotheses: what to look for; None: the catalogue. With ``resume`` a name must mean what it did.
         progress: called with one line for each episode that is simulated.
         journal: folder for finished episodes, a few hundred kilobytes each; None: nothing is kept.
         resume: go on with what a diagnosis that was stopped left there; the answer is the same, bit by bit. None: start

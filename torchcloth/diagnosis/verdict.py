@@ -148,7 +148,7 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     std = (float(_errors(found, names, best.alone)[count + place]) ** 2 + best.row.bias**2) ** 0.5
     beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
     others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in beaten]
-    kin = [r.hypothesis.name for r in alike(step.before, best.row, others)]
+    kin = [r.hypothesis.name for r in alike(step.before, best.row, amplitude, others)]
     return {
         **_told(h, amplitude),
         "ci95": [amplitude - NORMAL * std, amplitude + NORMAL * std],
