@@ -30,6 +30,19 @@ def last_knot(t: Tensor, times: Tensor) -> Tensor:
     return torch.cat([torch.searchsorted(t, some, right=True) for some in times.detach().split(AT_ONCE)]) - 1
 
 
+def hermite_slope(t: Tensor, value: Tensor, slope: Tensor, times: Tensor) -> Tensor:
+    """Derivative of ``hermite`` by ``times``; the first and last slope beyond."""
+    k = last_knot(t, times).clamp(0, len(t) - 2)
+    step = (t[k + 1] - t[k])[:, None, None]
+    s = ((times - t[k])[:, None, None] / step).clamp(0.0, 1.0)
+    chord = (value.index_select(-3, k + 1) - value.index_select(-3, k)) / step
+    return (
+        6 * (s - s**2) * chord
+        + (3 * s**2 - 4 * s + 1) * slope.index_select(-3, k)
+        + (3 * s**2 - 2 * s) * slope.index_select(-3, k + 1)
+    )
+
+
 def hermite(t: Tensor, value: Tensor, slope: Tensor, times: Tensor) -> Tensor:
     """[..., N, A, B] at ``times`` [N] of cubics between knots ``t`` [K], constant beyond.
 

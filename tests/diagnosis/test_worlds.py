@@ -8,7 +8,7 @@ import sheets
 import torch
 
 from torchcloth.diagnosis import air, fabric, grip, observer
-from torchcloth.diagnosis.base_model import base_model, together
+from torchcloth.diagnosis.base_model import base_model
 from torchcloth.diagnosis.cells import _places
 from torchcloth.diagnosis.evidence import asked_about, gather
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
@@ -21,6 +21,7 @@ from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification.sheet import sheet_of
 from torchcloth.meshes import rectangle
 from torchcloth.recordings import Collider
+from torchcloth.recordings.together import together
 
 RECORDING = sheets.episode()
 

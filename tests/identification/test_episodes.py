@@ -138,6 +138,15 @@ def test_frames_after_the_motion_are_left_out(recording, model):
     seen = episode(model, late)
     assert len(seen.times) == len(seen.clouds) == twins.FRAMES - 2
     assert float(seen.times[-1]) <= 0.72
+    (doubt,) = seen.doubts()
+    assert f"2 of {twins.FRAMES} frames come after the motion's end" in doubt
+    assert episode(model, recording).doubts() == []
+
+
+def test_an_episode_in_which_nothing_is_held_says_so(recording, model):
+    open_ = {name: replace(g, closed=np.zeros_like(g.closed)) for name, g in recording.grippers.items()}
+    (doubt,) = episode(model, replace(recording, grippers=open_)).doubts()
+    assert "no gripper is ever closed" in doubt
 
 
 def test_until_keeps_the_early_frames(recording, model):
@@ -230,6 +239,26 @@ def test_wrong_arguments_are_named(model, recording, arguments, said):
     with pytest.raises(ValueError, match=said) as caught:
         identify(model, recording, **{"parameters": ["youngs_modulus"], **arguments})
     assert "\n" not in str(caught.value)
+
+
+def test_episodes_of_another_cloth_or_grasp_are_refused(model, recording):
+    other = with_cloth(shifted(recording, 1.0), areal_density=2 * recording.cloth.areal_density)
+    with pytest.raises(InvalidInput, match=r"another areal density \(kg/m\^2\) than in"):
+        identify(model, [recording, other])
+    one = replace(shifted(recording, 1.0), grasps=dict(list(recording.grasps.items())[:1]))
+    with pytest.raises(InvalidInput, match="another set of grasps than in"):
+        identify(model, [recording, one])
+    numbered = with_cloth(shifted(recording, 1.0), faces=recording.cloth.faces[::-1])
+    with pytest.raises(InvalidInput, match="another numbering of the mesh"):
+        identify(model, [recording, numbered])
+
+
+def test_a_first_shape_of_another_mesh_is_refused(recording, model):
+    elsewhere = with_cloth(recording, uv=0.001 + recording.cloth.uv, faces=recording.cloth.faces[:, ::-1][5:])
+    with pytest.raises(InvalidInput, match="those of a mesh with other triangles"):
+        episode(model, elsewhere)
+    turned = with_cloth(recording, faces=recording.cloth.faces[:, ::-1])  # the same triangles
+    assert torch.equal(episode(model, turned).initial, episode(model, recording).initial)
 
 
 def test_no_recordings_are_refused(model):

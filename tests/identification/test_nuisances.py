@@ -54,6 +54,23 @@ def test_every_unknown_has_its_slope(objective):
         assert float(error) < 1e-3 * float(size) + 1e-9, k
 
 
+def test_a_first_shape_that_was_not_measured_does_not_settle(pulled):
+    """Slopes along where the grippers hold, of cloth that moves from the first frame on."""
+    model = stretches.model(pulled)
+    seen = replace(episode(model, pulled).until(0.3), settles=False)
+    found = Objective(model, collect(model, ["youngs_modulus"], None), [seen], 4e-4, chosen(["grasp"]))
+    still = simulate(model, found.unknowns, found.start[:1], seen, 4e-4)
+    torch.testing.assert_close(found.seen(found.start)[0].x, still.x)
+
+
+def test_what_a_late_clock_sees_moves_as_fast_as_it_is_seen_to(pulled):
+    model = stretches.model(pulled)
+    seen, own = episode(model, pulled).until(0.3), collect(model, ["youngs_modulus"], None)
+    frames, clock, h = simulate(model, own, torch.tensor([own[0].start]), seen), KINDS["clock"](), 1e-6
+    one, two = (clock.see(frames, torch.tensor([0.004 + d]), seen) for d in (-h, h))
+    torch.testing.assert_close((two.x - one.x)[:-1] / (2 * h), 0.5 * (one.v + two.v)[:-1], rtol=1e-5, atol=1e-6)
+
+
 def test_an_episodes_nuisances_do_not_touch_the_other(objective):
     linear = objective.linearise(objective.start)
     first = linear.frame < len(objective.episodes[0].times)

@@ -1,6 +1,7 @@
 """The whole: against truth, with right and wrong models, as one continuous motion."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from occluded import WRONG, model
 from torchcloth import recordings as rec
 from torchcloth.effects import BodyForce
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import episode
+from torchcloth.identification import episode, nuisances
 from torchcloth.identification.misfit import figures
 from torchcloth.pose import estimate_pose
 from torchcloth.types import ClothState
@@ -137,3 +138,23 @@ def test_markers_alone(scene):
 def test_bad_options(scene, options, match):
     with pytest.raises(InvalidInput, match=match):
         estimate_pose(model(scene, twins.TRUE), scene.recording, **options)
+
+
+def test_a_late_clock_sees_beyond_the_last_stamp(scene, monkeypatch):
+    """Frames taken later than they say: the last is where the cloth was then, which takes simulating on."""
+    late, kept = 0.6 / twins.RATE, slice(0, -4)
+    points = scene.recording.points
+    counts = points.counts[kept]
+    stamps = np.concatenate([points.t[:1], points.t[kept][1:] - late])
+    seen = replace(scene.recording, points=replace(points, t=stamps, counts=counts, xyz=points.xyz[: counts.sum()]))
+
+    def last(found):
+        assert len(found.times) == len(found.x) == len(found.v) == len(found.seen) == len(found.null) == len(counts)
+        assert float(found.windows[-1, 1]) == pytest.approx(float(found.times[-1]))
+        return float((found.x[-1] - scene.truth[len(counts) - 1]).norm(dim=-1).square().mean().sqrt())
+
+    ask = partial(estimate_pose, model(scene, twins.TRUE), seen, nuisances={"clock": 0.03}, modes=4, window=0.18)
+    found = ask()
+    assert found.nuisances["clock"].value == pytest.approx(late, rel=0.1)
+    monkeypatch.setattr(nuisances, "LATEST", 0.0)
+    assert last(found) < 0.5 * last(ask())

@@ -118,13 +118,14 @@ def _identify(options: argparse.Namespace) -> int:
     from .. import recordings
     from ..identification import Identification
     from ..identification.journal import clear
+    from ..recordings.together import together
 
     torch.set_default_dtype(torch.float64)  # sensitivities lose digits over thousands of substeps in float32
     torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
     check_folder(options.out)
     fields.check(options, _defaults())
     episodes = [recordings.read(path) for path in options.episodes]
-    cloth = _cloth(options, episodes[0])
+    cloth = _cloth(options, together(episodes))
     size = f"{len(episodes)} episode(s), {len(cloth.mesh.faces)} triangles"
     print(f"{size}, stable substep {cloth.stable_step():.3g} s with the start values")
     if options.fields:

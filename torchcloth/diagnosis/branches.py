@@ -68,7 +68,7 @@ def _begun(e: Episode, world: World, rng: torch.Generator) -> list[Episode]:
         wave = drawn * (2 * torch.pi * share / (SHORTEST * size * drawn.norm(dim=1)))[:, None]
         field = (e.initial @ wave.mT + 2 * torch.pi * phase).cos().sum(1, keepdim=True)
         off = FIRST * field / field.square().mean().sqrt() * normal
-        out += [replace(e, initial=e.initial + sign * off, settles=True) for sign in (1, -1)]
+        out += [replace(e, initial=e.initial + sign * off) for sign in (1, -1)]
     return out
 
 

@@ -12,7 +12,7 @@ import torch
 from ..errors import InvalidInput, RecordingError
 from ..recordings import Recording
 from ..recordings.marks import alike, each_once, mark
-from .base_model import together
+from ..recordings.together import together
 from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
 from .evidence import Evidence, as_held, as_rough, gather
 from .fitting import Fitted

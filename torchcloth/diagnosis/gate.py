@@ -17,6 +17,7 @@ from ..errors import InvalidInput, RecordingError
 from ..recordings import Recording, checks, read
 from ..recordings.reading import EPISODE
 from ..recordings.ticks import times
+from ..recordings.together import name_of, same_cloth
 from .gate_clouds import Seen, handed, places, units
 
 JUMP, LEAST_JUMP = 8.0, 0.2  # usual intervals and s: a longer one is no dropped frame any more
@@ -85,55 +86,6 @@ def read_episodes(folders: Sequence[str | Path]) -> tuple[list[Recording], list[
             what = f"{error.what}, got {error.got}" if error.got is not None else error.what
             faults.append(Fault(Path(folder).name, what, error.remedy or "record again"))
     return found, faults
-
-
-def name_of(recording: Recording, k: int) -> str:
-    """Of the k-th episode, in messages."""
-    return recording.path.name if recording.path is not None else f"episode {k}"
-
-
-def same_cloth(recordings: Sequence[Recording]) -> None:
-    """Raises InvalidInput where the episodes do not describe one cloth, held at the same places."""
-    first = recordings[0]
-    for k, other in enumerate(recordings[1:], 1):
-        for what, of in _DESCRIBED.items():
-            a, b = of(first), of(other)
-            if not _equal(a, b):
-                raise InvalidInput(
-                    f"{name_of(other, k)}: another {what} than in {name_of(first, 0)}",
-                    got=_shown(b),
-                    expected=_shown(a),
-                    remedy="diagnose the episodes of each cloth apart, or correct the description of one",
-                )
-
-
-_DESCRIBED = {
-    "cloth (width and height of the pattern, m)": lambda r: (
-        None if (b := r.cloth.pattern_box()) is None else b[1] - b[0]
-    ),
-    "mesh (vertices, triangles)": lambda r: (
-        None if r.cloth.faces is None else [r.cloth.faces.max() + 1, len(r.cloth.faces)]
-    ),
-    "areal density (kg/m^2)": lambda r: r.cloth.areal_density,
-    "thickness (m)": lambda r: r.cloth.thickness,
-    "data sheet": lambda r: {name: value for name, value in sorted(r.cloth.nominal.items()) if name != "units"},
-    "gravity (m/s^2)": lambda r: r.gravity,
-    "set of grasps": lambda r: sorted(r.grasps),
-    "place of a grasp (m)": lambda r: [g.uv.tolist() for _, g in sorted(r.grasps.items()) if g.uv is not None],
-}
-
-
-def _equal(a: object, b: object) -> bool:
-    if a is None or b is None:
-        return a is b
-    try:
-        return bool(np.allclose(a, b, rtol=1e-3, atol=1e-6))  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        return a == b
-
-
-def _shown(value: object) -> str:
-    return " x ".join(f"{x:.4g}" for x in value) if isinstance(value, np.ndarray) else str(value)
 
 
 def _faults(recording: Recording) -> Iterator[tuple[str, str]]:

@@ -13,7 +13,7 @@ from ..identification.episode_prediction import EpisodePrediction, with_errors
 from ..identification.episodes import episode
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
-from .base_model import together
+from ..recordings.together import together
 from .cells import directions
 from .model_file import ModelFile, load_model, of_fabric, read_model
 from .pieces import side_by_side

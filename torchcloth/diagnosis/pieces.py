@@ -91,7 +91,7 @@ def runs(
     """An episode in a world, in those ``near``, with every hypothesis and with held places off, side by side."""
     beside = [partial(w.frames, e, dt) for w in near]
     modes = Held().modes(world.cloth, e) if with_held else ()
-    held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m, settles=True), dt) for m in modes]
+    held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m), dt) for m in modes]
     changed = [_if_possible(partial(h.apply, world, h.typical)) for h in hypotheses]
     moves = [c is not None and (c.cloth is not world.cloth or c.motions is not world.motions) for c in changed]
     first = [] if finer is None else [finer]  # it takes longest

@@ -15,7 +15,8 @@ from .._files import write_text
 from ..errors import InvalidInput
 from ..recordings import Recording
 from ..recordings.marks import each_once, mark
-from .base_model import base_model, together
+from ..recordings.together import together
+from .base_model import base_model
 from .gate import check, somewhere_seen
 from .hypotheses import catalogue
 from .keeping import kept_in

@@ -29,6 +29,7 @@ from .carried import between, carried, with_patches
 DEFAULT_STIFFNESS = 300.0  # N/m, a start in the middle of the published fabrics, where an episode names none
 DEFAULT_POISSON = 0.2
 SHEET_TRIANGLES = 288
+SAME = 1e-6  # m, on the pattern: one place
 FARTHEST = 0.2  # m, of a held patch from its gripper's origin at the first frame
 
 
@@ -50,6 +51,7 @@ class Episode:
             ends at the frame, NaN where not measured.
         unseen: frames at the end that are simulated and not observed.
         eye: [3] m, where the camera stands; None where there is none, or more than one.
+        dropped: frames after the motion's end, which are not simulated.
     """
 
     name: str
@@ -64,6 +66,7 @@ class Episode:
     wrenches: Mapping[str, Tensor] = field(default_factory=dict)
     unseen: int = 0
     eye: Tensor | None = None
+    dropped: int = 0
 
     def identity(self) -> list[object]:
         """What simulations of it, and what is seen of them, depend on."""
@@ -80,6 +83,18 @@ class Episode:
     def lookahead(self) -> float:
         """s, of frames that are simulated after the last observed one."""
         return float(self.times[-1] - self.times[self.observed - 1])
+
+    def doubts(self) -> list[str]:
+        """What a reader should know of it, in sentences."""
+        out = []
+        if self.dropped:
+            out.append(
+                f"{self.name}: {self.dropped} of {self.observed + self.dropped} frames come after the motion's end and "
+                "were left out: record the motion as long, or check clock_offset"
+            )
+        if self.motion and not any(bool(m.closed.any()) for m in self.motion.values()):
+            out.append(f"{self.name}: no gripper is ever closed: the cloth was simulated as let go")
+        return out
 
     def beyond(self, reach: float) -> Episode:
         """With frames after the last, for ``reach`` [s] or as long as the motion goes on: a late clock sees them."""
@@ -106,7 +121,7 @@ class Episode:
 
     def until(self, share: float) -> Episode:
         """The first ``share`` of the frames, at least four."""
-        count = max(4, round(share * self.observed))
+        count = min(self.observed, max(4, round(share * self.observed)))
         return replace(
             self,
             times=self.times[:count],
@@ -193,7 +208,7 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
     missing = [key for key in needed if key not in motion]
     if missing:
         raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=f"motion of {sorted(motion)}")
-    times = _frame_times(name, recording, motion, needed)
+    times, dropped = _frame_times(name, recording, motion, needed)
     initial = first_shape(name, cloth, recording).to(dtype)
     _check_place(name, cloth, motion, initial, times[0])
     markers = streams.markers(recording, times, dtype)
@@ -209,6 +224,7 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
         places=None if markers is None else streams.on_pattern(cloth.mesh, recording.markers.uv),  # type: ignore
         wrenches=streams.wrenches(recording, needed, times, dtype),
         eye=_eye(recording, dtype),
+        dropped=dropped,
     )
 
 
@@ -219,10 +235,12 @@ def _eye(recording: Recording, dtype: torch.dtype) -> Tensor | None:
     return torch.as_tensor(camera.T_world_camera[:3, 3], dtype=dtype)
 
 
-def _frame_times(name: str, recording: Recording, motion: Mapping[str, Trajectory], needed: list[str]) -> np.ndarray:
-    """Of the points and markers from the first frame on, which is the points' first where there are points.
+def _frame_times(
+    name: str, recording: Recording, motion: Mapping[str, Trajectory], needed: list[str]
+) -> tuple[np.ndarray, int]:
+    """(times, number of frames after the motion's end, left out) of points and markers, else of force readings.
 
-    Where nothing was seen, of the force readings.
+    The first frame is the points' where there are points.
     """
     seen = [s.t + recording.clock_offset for s in (recording.points, recording.markers) if s is not None]
     if not seen:
@@ -262,12 +280,24 @@ def first_shape(name: str, cloth: Cloth, recording: Recording) -> Tensor:
 
 
 def on_mesh(mesh: Mesh, recording: Recording, initial: Tensor) -> Tensor:
-    """[V, 3] m, positions of the vertices of an episode's mesh, carried to a mesh with the same triangles elsewhere."""
+    """[V, 3] m, positions of the vertices of an episode's mesh, carried to a mesh with the same triangles elsewhere.
+
+    Raises:
+        InvalidInput: its vertices are at other places of the pattern and its triangles are others.
+    """
     info = recording.cloth
     if info.vertices is None or info.faces is None or info.uv is None or mesh.uv is None:
         return initial
-    if np.array_equal(info.uv, mesh.uv) or not np.array_equal(info.faces, mesh.faces):
+    if np.allclose(info.uv, mesh.uv, rtol=0, atol=SAME):
         return initial
+    own, theirs = (np.unique(np.sort(faces, axis=1), axis=0) for faces in (mesh.faces, info.faces))
+    if not np.array_equal(own, theirs):
+        raise InvalidInput(
+            "initial_vertices",
+            got="those of a mesh with other triangles",
+            expected="positions of the cloth's vertices, in its order",
+            remedy="build the cloth from the episode (cloth_from), or give it the cloth's mesh",
+        )
     return carried(between(Mesh.build(info.vertices, info.faces, info.uv), mesh.uv), initial.double())
 
 
@@ -294,8 +324,8 @@ def _number(nominal: Mapping[str, Any], key: str, default: float) -> float:
         raise RecordingError(f"cloth.nominal.{key}", got=repr(nominal[key]), expected="a number in SI units") from None
 
 
-def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[str]) -> np.ndarray:
-    """Frames that the motion covers; the first frame must be one of them, it is where the cloth is known."""
+def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[str]) -> tuple[np.ndarray, int]:
+    """(those that the motion covers, number of others); it must cover the first, where the cloth is known."""
     start = max((float(motion[key].t[0]) for key in needed), default=-np.inf)
     end = min((float(motion[key].t[-1]) for key in needed), default=np.inf)
     inside = np.flatnonzero((times >= start - 1e-6) & (times <= end + 1e-6))
@@ -306,7 +336,7 @@ def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[s
             expected="motion that covers the first frame",
             remedy="check clock_offset",
         )
-    return times[inside]
+    return times[inside], len(times) - len(inside)
 
 
 def effects_of(recording: Recording) -> dict[str, AbstractEffect]:

@@ -25,7 +25,7 @@ from .given import given
 from .identifiability import combinations, influences
 from .journal import Journal
 from .misfit import figures, forces_rms
-from .nuisances import Clock, chosen, implied
+from .nuisances import chosen, foreseen, implied
 from .null import constant_force, no_force, rigid_carry
 from .objective import Objective
 from .profile import profiles
@@ -37,7 +37,6 @@ from .saved import model_of
 from .search import CHAMFER, METHODS, Method, Outcome, Progress, Search
 from .unknowns import collect, with_priors
 
-LATEST = 2.0  # standard deviations of a clock's prior, for which the simulation goes on after the last frame
 PAPER_ITERATIONS = 35  # of the DiffCP paper's stop rule
 MOST_STARTS = 1000
 ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
@@ -130,9 +129,7 @@ def identify(
     episodes = [episode(cloth, r) for r in episodes_in]
     _check_seen(method, stop, episodes)
     own = chosen(nuisances, implied([block.name for block in blocks], episodes))
-    late = LATEST * max((n.std for n in own if isinstance(n, Clock)), default=0.0)
-    episodes = [e.beyond(late) for e in episodes] if late else episodes
-    objective = Objective(cloth, unknowns, episodes, dt, own, blocks, noise)
+    objective = Objective(cloth, unknowns, foreseen(episodes, own), dt, own, blocks, noise)
     start = objective.raw(guess or {})
     if journal is not None:
         objective.journal = Journal(journal, [method, stop, rate, starts, *objective.identity(), start], resume)

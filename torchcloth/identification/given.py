@@ -8,18 +8,20 @@ from ..errors import InvalidInput
 from ..recordings import Recording
 from ..recordings.extents import check_size
 from ..recordings.marks import each_once
+from ..recordings.together import same_cloth
 
 
 def given(recordings: Recording | Sequence[Recording]) -> list[Recording]:
     """The episodes of a fit.
 
     Raises:
-        InvalidInput: none, or one twice.
+        InvalidInput: none, one twice, or different cloths.
         RecordingError: one was seen in another unit than metres.
     """
     found = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not found:
         raise InvalidInput("recordings", got="none", expected="at least one episode")
+    same_cloth(found)
     each_once(found)
     for recording in found:
         check_size(recording)

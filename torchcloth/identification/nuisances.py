@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._math import hermite
+from .._math import hermite, hermite_slope
 from ..boundaries import Grasp
 from ..cloth import Cloth
 from ..errors import InvalidInput
@@ -22,6 +22,7 @@ from .replays import Frames
 
 LEVER = 0.1  # m, at which a turned camera is off by as much as a shifted one
 AXES = "xyz"
+LATEST = 2.0  # standard deviations of a clock, for which a simulation goes on after the last frame
 
 
 class AbstractNuisance(ABC):
@@ -67,8 +68,8 @@ class Clock(AbstractNuisance):
     def see(self, frames: Frames, values: Tensor, episode: Episode) -> Frames:
         """Cubic between frames, by their velocities; at rest before the first and after the last."""
         t = episode.times.to(frames.x)
-        x = hermite(t, frames.x, frames.v, t + values[0])
-        return frames._replace(x=x)
+        x, v = (path(t, frames.x, frames.v, t + values[0]) for path in (hermite, hermite_slope))
+        return frames._replace(x=x, v=v)
 
 
 class Camera(AbstractNuisance):
@@ -195,6 +196,12 @@ def chosen(wanted: Mapping[str, float | None] | Sequence[str], implied: Sequence
             raise InvalidInput(f"nuisance {name}", got=std, expected=f"a standard deviation >= 0 in {KINDS[name].unit}")
     every = {**dict.fromkeys(implied), **given}
     return [kind(every[name]) for name, kind in KINDS.items() if name in every and every[name] != 0]
+
+
+def foreseen(episodes: Sequence[Episode], nuisances: Sequence[AbstractNuisance]) -> list[Episode]:
+    """With frames after the last, as far as a late clock may see."""
+    late = LATEST * max((n.std for n in nuisances if isinstance(n, Clock)), default=0.0)
+    return [e.beyond(late) for e in episodes] if late else list(episodes)
 
 
 class Placed(NamedTuple):

@@ -175,7 +175,7 @@ class Objective:
         episode = self.episodes[i]
         for where, modes in self._modes(i):
             shift = torch.einsum("k,kvc->vc", raw[where].to(modes), modes)
-            episode = replace(episode, initial=episode.initial + shift, settles=True)
+            episode = replace(episode, initial=episode.initial + shift)
         return episode
 
     def _tangents(self, raw: Tensor, i: int) -> tuple[Frames, Frames]:

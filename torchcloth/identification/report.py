@@ -174,6 +174,7 @@ def warnings_of(
         out.append(
             "an episode has no initial_vertices: the rest mesh, as placed in the file, was taken as the first frame"
         )
+    out += [doubt for e in episodes for doubt in e.doubts()]
     if cloth.contact is None and _layers_meet(cloth, frames, faces):
         out.append("layers of the cloth come near each other, and contact was left out: fit with contact")
     return out

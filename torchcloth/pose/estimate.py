@@ -14,9 +14,9 @@ from ..boundaries import Grasp
 from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..identification.blocks import blocks_for
-from ..identification.episodes import episode
+from ..identification.episodes import Episode, episode
 from ..identification.misfit import figures
-from ..identification.nuisances import chosen, implied
+from ..identification.nuisances import chosen, foreseen, implied
 from ..identification.null import rigid_carry
 from ..identification.report import estimates, nuisance_estimates
 from ..identification.unknowns import collect, with_priors
@@ -89,7 +89,9 @@ def estimate_pose(
     unknowns = with_priors(collect(cloth, list(uncertain or {}), density), uncertain or {})
     blocks = blocks_for(use)
     own = chosen(nuisances, implied([block.name for block in blocks], [data]))
-    correction = Correction(windows_of(data.times, window), coarse, torch.full((modes,), FIRST_GUESS))
+    windows, (data,) = windows_of(data.times, window), foreseen([data], own)
+    windows[-1] = (windows[-1][0], len(data.times) - 1)  # what a late clock sees is pushed as the last frame is
+    correction = Correction(windows, coarse, torch.full((modes,), FIRST_GUESS))
     objective = Corrected(pushable(cloth), unknowns, data, correction, dt, own, blocks, noise)
     gravity = float(torch.as_tensor(recording.gravity).norm()) or 9.81
 
@@ -102,14 +104,16 @@ def estimate_pose(
 
 
 def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: float, began: float) -> PoseEstimate:
-    data, cloth, raw = objective.episodes[0], objective.cloth, found.raw
+    data, cloth, raw = objective.episodes[0].until(1.0), objective.cloth, found.raw
+    ends = [data.times[[first, min(last, data.observed - 1)]] for first, last in objective.correction.windows]
     with torch.no_grad():
         frames, moved = objective.tangents(raw)
-        alone, null = objective.frames(objective.start)[0], rigid_carry(data)
-        std = _errors(objective, found, frames.x, moved.x, fields)
+        x, v, along = frames.x[: data.observed], frames.v[: data.observed], moved.x[:, : data.observed]
+        alone, null = objective.frames(objective.start)[0][: data.observed], rigid_carry(data)
+        std = _errors(objective, data, found, x, along, fields)
         last = objective.last_state(raw)
-    seen, shares = seen_vertices(frames.x, data, cloth.mesh), _shares(objective, raw, gravity)
-    fit = _distances(objective, {"after": frames.x, "alone": alone, "null": null})
+    seen, shares = seen_vertices(x, data, cloth.mesh), _shares(objective, raw, gravity)
+    fit = _distances(data, objective.faces, {"after": x, "alone": alone, "null": null})
     fit |= {
         "force_share": float(shares.square().mean().sqrt()),
         "force_share_max": float(shares.max()),
@@ -123,12 +127,12 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
     fabric = estimates(cloth, objective.unknowns, raw, found.covariance).parameters
     return PoseEstimate(
         times=data.times,
-        x=frames.x,
-        v=frames.v,
+        x=x,
+        v=v,
         std=std,
         seen=seen,
         faces=objective.faces,
-        windows=torch.stack([data.times[list(w)] for w in objective.correction.windows]),
+        windows=torch.stack(ends),
         acceleration=objective.correction.field(raw[objective.pushes]),
         shares=shares,
         alone=alone,
@@ -137,23 +141,23 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         parameters={u.name: fabric[u.name] for u in objective.unknowns},
         nuisances=next(iter(nuisance_estimates([data], objective.placed, raw, found.covariance).values())),
         fit=fit,
-        warnings=warnings_of(fit, shares, seen, data, objective.correction),
+        warnings=warnings_of(fit, shares, seen, data, ends),
     )
 
 
-def _distances(objective: Corrected, frames: Mapping[str, Tensor]) -> dict[str, Any]:
-    found = {key: figures([x], objective.episodes, objective.faces) for key, x in frames.items()}
+def _distances(data: Episode, faces: Tensor, frames: Mapping[str, Tensor]) -> dict[str, Any]:
+    found = {key: figures([x], [data], faces) for key, x in frames.items()}
     return {f"{what}_{key}": getattr(f, what) for what in ("chamfer", "rms") for key, f in found.items()}
 
 
-def _errors(objective: Corrected, found: Smoothed, x: Tensor, moved: Tensor, fields: Modes) -> Tensor:
+def _errors(objective: Corrected, data: Episode, found: Smoothed, x: Tensor, moved: Tensor, fields: Modes) -> Tensor:
     """[T, V, 3] m, of what was estimated, and of what is finer than it."""
     root = found.root.to(moved)
     variance = torch.stack([(root.mT @ frame.flatten(1)).square().sum(0) for frame in moved.unbind(1)])
     held = _held(objective.cloth)
-    noise = objective.episodes[0].noise or objective.blocks[0].floor
+    noise = data.noise or objective.blocks[0].floor
     coarse = len(objective.correction.modes)
-    finer = unexplained(x, objective.episodes[0], objective.faces, fields, coarse, held, noise)
+    finer = unexplained(x, data, objective.faces, fields, coarse, held, noise)
     return (variance.reshape(x.shape) + finer.square().unsqueeze(-1)).sqrt()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -127,9 +128,10 @@ class Corrected(Objective):
             if first < len(episode.times) - 1:
                 yield first, episode.times[first : last + 1]
 
-    def rollouts(self, raw: Tensor) -> Iterator[Rollout]:
-        """Window after window; differentiable in reverse mode when ``raw`` requires grad."""
+    def rollouts(self, raw: Tensor, frames: int | None = None) -> Iterator[Rollout]:
+        """Window after window, of all frames or the first; differentiable when ``raw`` requires grad."""
         episode = self._begun(raw, 0)
+        episode = replace(episode, times=episode.times[:frames])
         entries = overrides(self.unknowns, raw[: len(self.unknowns)].to(episode.initial))
         fields = self.correction.field(raw[self.pushes].to(episode.initial))
         state = self.cloth.state(episode.initial)
@@ -148,8 +150,8 @@ class Corrected(Objective):
         return frames
 
     def last_state(self, raw: Tensor) -> ClothState:
-        """At the last frame."""
-        *_, last = self.rollouts(raw)
+        """At the last observed frame."""
+        *_, last = self.rollouts(raw, self.episodes[0].observed)
         return last.state
 
     def tangents(self, raw: Tensor) -> tuple[Frames, Frames]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..identification.episodes import Episode
-from .objective import Correction
 
 LARGE = 0.1  # of the weight, from which a corrective force says that the model is wrong
 MISSED = 1.3  # rms over the stated noise
@@ -17,12 +16,12 @@ BLIND = 0.3  # s without anything seen
 
 
 def warnings_of(
-    fit: Mapping[str, Any], shares: Tensor, seen: Tensor, data: Episode, correction: Correction
+    fit: Mapping[str, Any], shares: Tensor, seen: Tensor, data: Episode, windows: Sequence[Tensor]
 ) -> list[str]:
     """Sentences."""
     out = []
     if fit["force_share"] > LARGE:
-        first, last = (float(data.times[k]) for k in correction.windows[int(shares.argmax())])
+        first, last = windows[int(shares.argmax())].tolist()
         out.append(
             f"the model is wrong: it takes a corrective force of {100 * fit['force_share']:.0f} % of the weight (rms; "
             f"{100 * fit['force_share_max']:.0f} % in {first:.2f}-{last:.2f} s) to follow what was seen: identify the "
@@ -42,7 +41,7 @@ def warnings_of(
     blind = _longest_gap(data.times, seen.any(1))
     if blind > BLIND:
         out.append(f"nothing was seen for {blind:.2f} s: there the estimate is simulation alone")
-    return out
+    return out + data.doubts()
 
 
 def _longest_gap(times: Tensor, any_seen: Tensor) -> float:

@@ -19,8 +19,8 @@ import numpy as np
 
 from torchcloth._files import write_text
 from torchcloth.diagnosis import base_model, catalogue, judge, load_model, save_model, search, setting_of
-from torchcloth.diagnosis.base_model import together
 from torchcloth.recordings import Recording
+from torchcloth.recordings.together import together
 
 from ..kept import Kept
 from . import air_tables

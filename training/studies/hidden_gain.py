@@ -15,11 +15,11 @@ from typing import Any
 
 from torchcloth.diagnosis import Hypothesis, Model, World, base_model, fit, load_model, setting_of
 from torchcloth.diagnosis.approach import approach
-from torchcloth.diagnosis.base_model import together
 from torchcloth.diagnosis.cells import SEEN, cells_of
 from torchcloth.diagnosis.hypotheses import known
 from torchcloth.diagnosis.setting import Setting
 from torchcloth.recordings import read
+from torchcloth.recordings.together import together
 
 LEAST = 2e-4  # m: where an oracle gains less, there is nothing to be gained
 

@@ -21,11 +21,11 @@ import torch
 from torchcloth._files import write_text
 from torchcloth.diagnosis import Hypothesis, base_model, catalogue, fit, screen, setting_of
 from torchcloth.diagnosis.approach import approach
-from torchcloth.diagnosis.base_model import together
 from torchcloth.diagnosis.cells import Cells, aligned
 from torchcloth.diagnosis.evidence import Evidence
 from torchcloth.diagnosis.fitting import Fitted, weighed
 from torchcloth.recordings import Camera, PointClouds, Recording
+from torchcloth.recordings.together import together
 
 from ..kept import Kept
 from .fabric_tables import table
