@@ -215,6 +215,20 @@ def test_velocities_alone_may_be_batched():
         assert torch.equal(both[k], cloth(state._replace(v=v[k]), times=(0.0, 0.01)).x)
 
 
+@pytest.mark.parametrize("engine", ["reference", "fused"])
+def test_the_friction_of_a_table_alone_may_be_batched(engine):
+    """Sliding down it from one state."""
+    table = lambda mu: {"table": tc.boundaries.Plane(friction=mu)}  # noqa: E731
+    effects = {"gravity": tc.effects.Gravity((3.0, 0.0, -9.0))}
+    coefficients, found = torch.tensor([[0.1], [0.5]]), []
+    for mu in (coefficients, *coefficients.flatten().tolist()):
+        cloth = sheet(effects=effects, boundaries=table(mu))
+        cloth.engine = engine
+        found.append(cloth(cloth.rest_state(), times=(0.0, 0.05)).x)
+    assert float((found[1] - found[2]).detach().norm()) > 1e-3
+    torch.testing.assert_close(found[0], torch.stack(found[1:]), rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_refused(dtype):
     cloth = sheet().to(dtype)

@@ -14,6 +14,7 @@ from .boundaries.motion import check_cover
 from .effects import AbstractEffect
 from .errors import InvalidInput, SimulationDiverged, UnstableStep
 from .model import Model
+from .parameters import PhysicalParameter
 from .transfer import Contact
 from .types import ClothState, Trajectory
 
@@ -165,6 +166,8 @@ def expand_state(state: ClothState, model: Model, motion: Mapping[str, Trajector
         **{f"motion[{name!r}].pose": trajectory.pose.shape[:-3] for name, trajectory in motion.items()},
     }
     parameters = [t.shape[:-2] for t in tensors if t.ndim > 2]
+    own = (p for b in model.boundaries.values() for p in b.modules() if isinstance(p, PhysicalParameter))
+    parameters += [p.raw.shape[:-1] for p in own if p.raw.ndim]
     try:
         batch = torch.broadcast_shapes(*found.values(), *parameters)
     except RuntimeError:

@@ -85,6 +85,14 @@ def test_means_of_a_signal_between_frames():
     np.testing.assert_allclose(mean[1:, 2], [0.75, 0.75])
 
 
+def test_a_lost_reading_takes_its_interval_and_no_other():
+    t = np.arange(6) / 10
+    value = np.stack([t, np.where(t == 0.2, np.nan, t)], axis=1)
+    mean = streams._means(t, value, np.array([0.0, 0.1, 0.25, 0.4, 0.45]))
+    np.testing.assert_allclose(mean[1:, 0], [0.05, 0.175, 0.325, 0.425])
+    np.testing.assert_allclose(mean[1:, 1], [0.05, np.nan, np.nan, 0.425])
+
+
 def test_forces_are_those_of_the_rollout(pulled, model):
     """At the truth, on the truth's mesh: what is left is the sensor's noise, averaged over some three knots."""
     exact = stretches.cloth(stretches.Fabric(), stretches.TRUTH)

@@ -75,8 +75,10 @@ def test_what_was_not_seen_is_null_on_disk_and_a_dash_in_the_table(fit, felt, tm
 
 
 def test_its_pictures_show_forces(fit, felt, tmp_path):
+    (tmp_path / "fit.png").write_text("of an earlier fit, to points")
     drawn = draw(fit, [episode(cloth_from(felt), felt)], cloth_from(felt).mesh.faces, tmp_path)
     assert [p.name for p in drawn] == ["forces.png", "parameters.png"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["forces.png", "parameters.png"]
 
 
 def test_a_fit_of_forces_that_is_worthless_is_called_so(fit):

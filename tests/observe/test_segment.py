@@ -29,6 +29,13 @@ def pose(x, y, z):
     return out
 
 
+def test_images_of_another_size_are_refused():
+    depth = np.zeros((CAMERA.height, CAMERA.width))
+    for wrong in ({"depth": depth[:-1]}, {"mask": depth[:, 1:] > 0}, {"colors": depth}):
+        with pytest.raises(InvalidInput, match=f"{next(iter(wrong))}; got shape .* the camera's pixels"):
+            segment_depth(CAMERA, how=Segmentation(), **{"depth": depth, **wrong})
+
+
 @pytest.fixture(scope="module")
 def scene():
     """A 0.4 m cloth on a table, lifted in the middle by an arm; a box stands beside it."""

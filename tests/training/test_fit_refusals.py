@@ -1,14 +1,21 @@
 """Wrong input: one line, exit code 2, nothing written; episodes dealt without padding."""
 
 import json
+import sys
+from pathlib import Path
 
 import pytest
+from torch import nn
 
 pytest.importorskip("lightning")
 
 from torchcloth.training.fit.command import main
 from torchcloth.training.fit.config import load
 from torchcloth.training.fit.data import Deal
+
+sys.path.insert(0, str(Path(__file__).parent))  # nets.py
+
+SEVEN = "{in_features: 7, out_features: 1}"
 
 
 @pytest.mark.parametrize(
@@ -38,6 +45,11 @@ from torchcloth.training.fit.data import Deal
         (["loss.points=0"], "config: loss.points; got 0.0; expected a scale > 0"),
         (["loss={markers: 0.001}"], "nothing to compare with"),
         (["learn.network={module: no.Net, gives: [poisson_ratio]}"], "config: learn.network; got no.Net (No module"),
+        (["learn.network={module: torch.nn.Softmax, gives: [poisson_ratio]}"], "torch.nn.Softmax: output; got ["),
+        (
+            [f"learn.network={{module: torch.nn.Linear, arguments: {SEVEN}, gives: [poisson_ratio]}}"],
+            "torch.nn.Linear: input; got mat1 and mat2 shapes cannot be multiplied",
+        ),
         (["run.loggers=[wandb]"], "config: run.loggers; got 'wandb'; expected csv or tensorboard"),
         (["run.processes=4"], "config: run.processes; got 4; expected at most 3, the episodes at a step"),
         (["--resume"], "--resume; got no "),
@@ -69,6 +81,29 @@ def test_another_problem_is_not_resumed(config, episodes, capsys):
     for other in (["optimizer.rate=0.2"], ["model.start.youngs_modulus=5e4"], [f"data.train={episodes}/ep_0"]):
         assert main(["--config", path, "--resume", *other]) == 2
         assert "a checkpoint of another run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("damage", [lambda whole: whole[: len(whole) // 2], lambda _: b"", lambda _: b"no checkpoint"])
+def test_a_damaged_checkpoint_is_not_resumed(config, tmp_path, capsys, damage):
+    path = config(optimizer={"steps": 1})
+    assert main(["--config", path]) == 0
+    (kept,) = tmp_path.rglob("last.ckpt")
+    kept.write_bytes(damage(kept.read_bytes()))
+    capsys.readouterr()
+    assert main(["--config", path, "--resume"]) == 2
+    said = capsys.readouterr().err
+    assert "which is damaged" in said
+    assert said.count("\n") == 1
+
+
+def test_a_network_that_has_changed_is_not_resumed(config, capsys, monkeypatch):
+    network = {"module": "nets.Wavy", "gives": ["poisson_ratio"]}
+    monkeypatch.setattr("nets.Wavy", lambda: nn.Linear(2, 1), raising=False)
+    path = config(optimizer={"steps": 1}, learn={"network": network})
+    assert main(["--config", path]) == 0
+    monkeypatch.setattr("nets.Wavy", lambda: nn.Sequential(nn.Linear(2, 3), nn.Linear(3, 1)))
+    assert main(["--config", path, "--resume"]) == 2
+    assert "got learned.network.0.bias of shape none; expected (3,): the model" in capsys.readouterr().err
 
 
 def test_the_shipped_config_is_read():

@@ -21,7 +21,7 @@ from ..cloth import Cloth
 from ..errors import InvalidInput
 
 FORMAT = 1
-DAMAGED = (RuntimeError, KeyError, ValueError, EOFError, pickle.UnpicklingError)  # torch's, of a file that is none
+DAMAGED = (RuntimeError, KeyError, ValueError, EOFError, OSError, pickle.UnpicklingError)  # torch's, of half a file
 T = TypeVar("T", bound=Sequence)
 
 
@@ -74,7 +74,7 @@ class Journal:
             answer = torch.load(path, weights_only=True)
             self.recalled += 1
             return answer
-        except (FileNotFoundError, *DAMAGED):
+        except DAMAGED:
             answer = work()
         self._write(path, tuple(answer))
         return answer

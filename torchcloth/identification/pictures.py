@@ -23,6 +23,8 @@ BEFORE, AFTER, NULL = "#b0653a", "#1f6f8b", "#888888"
 def draw(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray, folder: Path) -> list[Path]:
     """Write fit.png and distances.png, forces.png, parameters.png into ``folder``, each where it has something to show.
 
+    Those of an earlier fit that now have nothing to show are removed.
+
     Returns:
         their paths.
     """
@@ -33,6 +35,8 @@ def draw(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray, fo
     if any(e.wrenches for e in episodes):
         figures["forces"] = forces(fit, episodes)
     figures["parameters"] = parameters(fit)
+    for name in {"fit", "distances", "forces"} - figures.keys():
+        (folder / f"{name}.png").unlink(missing_ok=True)
     return [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items()]
 
 

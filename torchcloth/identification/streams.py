@@ -115,7 +115,12 @@ def _measuring(recording: Recording, names: Sequence[str]) -> dict[str, GripperM
 
 
 def _means(t: np.ndarray, value: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Means [T, C] of a piecewise linear signal [K, C] between frames; the first frame ends no interval."""
+    """Means [T, C] of a piecewise linear signal [K, C] between frames; the first frame ends no interval.
+
+    NaN over intervals that a NaN reaches into.
+    """
+    lost = np.concatenate([np.zeros_like(value[:1]), np.cumsum(np.isnan(value), axis=0)])
+    value = np.where(np.isnan(value), 0.0, value)
     area = 0.5 * np.diff(t)[:, None] * (value[1:] + value[:-1])
     total = np.concatenate([np.zeros_like(value[:1]), np.cumsum(area, axis=0)])
     at = np.clip(frames, t[0], t[-1])
@@ -124,4 +129,6 @@ def _means(t: np.ndarray, value: np.ndarray, frames: np.ndarray) -> np.ndarray:
     integral = total[k] + 0.5 * (at - t[k])[:, None] * (value[k] + here)
     out = np.full((len(frames), value.shape[1]), np.nan)
     out[1:] = np.diff(integral, axis=0) / np.diff(frames)[:, None]
+    last = np.searchsorted(t, at).clip(max=len(t) - 1)  # knot at or after each frame; k is the one at or before
+    out[1:][lost[last[1:] + 1] > lost[k[:-1]]] = np.nan
     return out

@@ -120,8 +120,12 @@ def segment_depth(
         colors: [H, W, 3] uint8, of the same pixels (`colors_at` gives those of another camera).
         robot: meshes of the robot's solids (`solid_meshes`).
         grasps: [G, 3] m, where grippers hold the cloth.
+
+    Raises:
+        InvalidInput: an image of another size than the camera's, or a mask or colors of another than the image's.
     """
     depth = np.asarray(depth)
+    _check_sizes(camera, depth, mask, colors)
     wanted = (depth > 0) & np.isfinite(camera.grid[..., 0])
     if mask is not None:
         wanted &= mask
@@ -134,6 +138,15 @@ def segment_depth(
     removed = {"edge": int(taken.sum()), **found.removed} if how.edge else found.removed
     kept = np.flatnonzero(left[wanted])[found.kept]
     return Segmented(found.points, kept, removed, int(wanted.sum()), found.table, found.normals)
+
+
+def _check_sizes(camera: DepthCamera, depth: Array, mask: Array | None, colors: Array | None) -> None:
+    size = (camera.height, camera.width)
+    images = {"depth": (depth, size), "mask": (mask, size), "colors": (colors, (*size, 3))}
+    for name, (image, shape) in images.items():
+        if image is not None and np.shape(image) != shape:
+            expected = f"{list(shape)}, the camera's pixels"
+            raise InvalidInput(name, got=f"shape {list(np.shape(image))}", expected=expected)
 
 
 def segment(

@@ -70,7 +70,7 @@ class Learned(nn.Module):
         own: dict[str, Tensor] = {name: self.parameter(name).raw for name in (*self.what.parameters, *self.what.fields)}
         if self.network is None or self.what.network is None:
             return own
-        out, names = self.network(self._places), self.what.network.gives
+        out, names = self._given(self.network, self.what.network.module), self.what.network.gives
         if out.shape != (len(self._places), len(names)):
             expected = f"[{len(self._places)}, {len(names)}], a column for each of {', '.join(names)}"
             raise InvalidInput(f"{self.what.network.module}: output", got=list(out.shape), expected=expected)
@@ -79,6 +79,13 @@ class Learned(nn.Module):
             name: raw.clamp(min=0.0) for name, raw in given.items() if self.parameter(name).domain == "nonnegative"
         }
         return own | given | amplitudes
+
+    def _given(self, network: nn.Module, name: str) -> Tensor:
+        try:
+            return network(self._places)
+        except RuntimeError as error:  # torch's, of shapes that do not fit
+            expected = f"a network of places {list(self._places.shape)}"
+            raise InvalidInput(f"{name}: input", got=str(error).splitlines()[0], expected=expected) from None
 
     def entries(self) -> dict[str, Tensor]:
         """What the network gives, by the names of the cloth's stored tensors."""

@@ -168,3 +168,12 @@ class FitModule(pl.LightningModule):
                 expected="the same episodes and config, but for steps, processes and loggers",
                 remedy="start again without --resume",
             )
+        own = {key: tuple(value.shape) for key, value in self.state_dict().items()}
+        kept = {key: tuple(value.shape) for key, value in checkpoint["state_dict"].items()}
+        if own != kept:
+            key = min(key for key in own.keys() | kept.keys() if own.get(key) != kept.get(key))
+            raise InvalidInput(
+                "checkpoint",
+                got=f"{key} of shape {kept.get(key, 'none')}",
+                expected=f"{own.get(key, 'none')}: the model and the network's class as they were",
+            )

@@ -55,6 +55,8 @@ def save(
     if fields:
         with atomically(folder / "fields.npz") as part:
             np.savez(part, **fields)
+    else:
+        (folder / "fields.npz").unlink(missing_ok=True)  # of an earlier run
     write_text(folder / "fit.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     return content
 

@@ -16,7 +16,7 @@ from lightning.pytorch.strategies import DDPStrategy
 
 from torchcloth import Cloth
 from torchcloth.errors import InvalidInput, MissingDependency
-from torchcloth.identification.journal import digest
+from torchcloth.identification.journal import DAMAGED, digest
 from torchcloth.identification.objective import Objective
 
 from . import result
@@ -55,8 +55,24 @@ def fit(config: Config, resume: bool = False) -> FitModule:
         raise InvalidInput("out", got=f"{folder}, a file", expected="a folder, new or existing")
     if resume and not checkpoint.is_file():
         raise InvalidInput("--resume", got=f"no {checkpoint}", expected="what an interrupted run left")
+    if resume:
+        _check_readable(checkpoint)
     with precision(config.model.precision):
         return _run(config, folder, checkpoint if resume else None)
+
+
+def _check_readable(checkpoint: Path) -> None:
+    try:
+        whole = {"state_dict", "hyper_parameters", "history"} <= torch.load(checkpoint, weights_only=True).keys()
+    except (*DAMAGED, AttributeError):
+        whole = False
+    if not whole:
+        raise InvalidInput(
+            "--resume",
+            got=f"{checkpoint}, which is damaged",
+            expected="what an interrupted run left",
+            remedy="start again without --resume",
+        )
 
 
 def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:

@@ -45,6 +45,7 @@ def test_an_imported_bag_keeps_its_absolute_times(tmp_path):
     file = formats.write_mcap(imported, tmp_path / "again.mcap")
     back = formats.read(file)
     assert back.extra["source"]["start_ns"] == foreign.EPOCH
+    assert back.extra["source"]["origin"] == imported.extra["source"]
     np.testing.assert_array_equal(back.points.xyz, imported.points.xyz)
     np.testing.assert_array_equal(back.grippers["left"].t, imported.grippers["left"].t)
     for kind in ("depth", "color"):

@@ -96,6 +96,8 @@ class _Bag:
         self.epoch = _epoch(recording)
         self.events: list[Event] = []
         self.mapping: dict[str, Any] = {"epoch": self.epoch, "motion": {}, "cameras": {}}
+        if isinstance(own := recording.extra.get("source"), dict):
+            self.mapping["origin"] = own  # where the recording is from
 
     def write(self) -> None:
         """Write every message in the order of time."""

@@ -57,6 +57,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     epoch = source.maybe(source.take, "epoch")
     if epoch is not None and (isinstance(epoch, bool) or not isinstance(epoch, int) or abs(epoch) > 2**62):
         raise RecordingError(f"{source.at('epoch')} is no time", got=epoch, expected="whole nanoseconds")
+    origin = source.maybe(source.inside, "origin")
     motion = {name: MotionTopics(fields, bag, scene) for name, fields in source.each("motion").items()}
     each = source.each("cameras")
     cameras = {name: CameraTopics(fields, bag, scene.depth_scale(name)) for name, fields in each.items()}
@@ -70,7 +71,13 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
         motion={name: part.arrays(start) for name, part in motion.items()},
         points=clouds.arrays(start) if clouds else None,
         cameras={name: part.camera(start) for name, part in cameras.items()},
-        notes={"format": NAME, "start_ns": start, "checksums": bag.checksums, "unchecked": UNCHECKED[bag.checksums]},
+        notes={
+            "format": NAME,
+            "start_ns": start,
+            "checksums": bag.checksums,
+            "unchecked": UNCHECKED[bag.checksums],
+            **({} if origin is None else {"origin": origin.rest}),
+        },
     )
     return embedded.restore(found, scene)
 

@@ -41,7 +41,7 @@ struct Assemble {
     }
 };
 
-// What an in-plane law sees of F: g = F^T F, and J = sqrt(det g). Frame-indifferent by construction.
+// What an in-plane law sees of F: g = F^T F, and J = sqrt(det g) = |f1 x f2|. Frame-indifferent by construction.
 template <class T>
 struct Metric {
     T warp, weft, shear, J;  // f1 . f1, f2 . f2, f1 . f2
@@ -49,8 +49,8 @@ struct Metric {
 
 template <class T>
 constexpr Metric<T> metric(Vec<T> f1, Vec<T> f2) {
-    const T warp = dot(f1, f1), weft = dot(f2, f2), shear = dot(f1, f2);
-    return {warp, weft, shear, sqrt(warp * weft - shear * shear)};
+    const Vec<T> normal = cross(f1, f2);  // det g of slivers has no digits left in float32
+    return {dot(f1, f1), dot(f2, f2), dot(f1, f2), sqrt(dot(normal, normal))};
 }
 
 // Second Piola-Kirchhoff stress: P = F S.
