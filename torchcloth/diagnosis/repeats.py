@@ -47,7 +47,7 @@ def _alike(a: Episode, b: Episode) -> bool:
     since = torch.linspace(0.0, span, 50, dtype=a.times.dtype)
 
     def path(e: Episode, name: str) -> Tensor:
-        pose = interpolate(e.motion[name], (float(e.times[0]) + since).to(e.motion[name].pose))
+        pose = interpolate(e.motion[name], float(e.times[0]) + since)
         return pose[:, :3, 3] - pose[0, :3, 3]
 
     return all(float((path(a, name) - path(b, name)).norm(dim=-1).max()) < SAME for name in a.motion)

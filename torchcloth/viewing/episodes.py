@@ -184,7 +184,7 @@ def _poses(pose: torch.Tensor, count: int) -> Array:
 
 def _trace(path: Trajectory, times: Array) -> Trace:
     inside = np.clip(times, float(path.t[0]), float(path.t[-1]))
-    poses = interpolate(path, torch.as_tensor(inside, dtype=path.pose.dtype))
+    poses = interpolate(path, torch.as_tensor(inside))
     return Trace(path.pose[:, :3, 3].numpy(), poses.numpy())
 
 
