@@ -33,7 +33,9 @@ class BuildWithEngine(build_py):
             if not self.editable_mode:
                 folder = Path(self.build_lib, "torchcloth", "engine", "built")
                 folder.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(library, folder / library.name)
+                part = folder / f".{library.name}"  # a process that loads half a library dies
+                shutil.copyfile(library, part)
+                os.replace(part, folder / library.name)
         except (building.Unbuilt, OSError) as miss:
             print(f"torchcloth: the engine is not built now: {miss}", file=sys.stderr)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Literal, cast
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from . import functional
 from .boundaries import AbstractBoundary
 from .effects import AbstractEffect
 from .engine.choice import Choice, Setting, check_setting, choose, still_drives
+from .errors import InvalidInput
 from .initial import damped, first_state, held, likeness
 from .intervals import Plan, run
 from .materials import AbstractMaterial
@@ -27,6 +29,7 @@ from .transfer import Contact, Grid
 from .types import ClothState, Rollout, Trajectory
 from .validation import (
     check_field,
+    check_fields,
     check_grasps,
     check_motions,
     check_state,
@@ -36,6 +39,8 @@ from .validation import (
     check_transfer,
     expand_state,
 )
+
+_OWNERS: WeakKeyDictionary[nn.Module, ref[Cloth]] = WeakKeyDictionary()  # of effects and boundaries
 
 
 class Cloth(nn.Module):
@@ -90,11 +95,31 @@ class Cloth(nn.Module):
                 check_field(path, part.raw, len(mesh.faces))
         self.areal_density = PhysicalParameter(areal_density, "kg/m^2", name="areal_density")
         check_field("areal_density", self.areal_density.raw, len(mesh.faces))
+        check_fields(effects or {}, len(mesh.faces))
+        self._own(effects or {}, boundaries or {})
         self.effects = nn.ModuleDict({name: part.bind(mesh) for name, part in (effects or {}).items()})
         self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in (boundaries or {}).items()})
         check_grasps(dict(self._parts()), self.boundaries)
         self.contact, self._grid = contact, None if contact is None else contact.grid(mesh)
         self._store_geometry()
+        for parameter in self.parameters():  # tensors keep their precision until a cloth has one
+            parameter.data = parameter.data.to(self._area.dtype)
+
+    def _own(self, *parts: Mapping[str, nn.Module]) -> None:
+        """Refuse what is bound to another cloth's mesh: it would be bound anew under that one's feet."""
+        for name, part in ((name, part) for group in parts for name, part in group.items()):
+            if not name.isprintable() or not name or "." in name or hasattr(nn.ModuleDict, name):
+                expected = "a name without dots that is no method of torch's ModuleDict"
+                raise InvalidInput("name of an effect or boundary", got=repr(name), expected=expected)
+            owner = None if (known := _OWNERS.get(part)) is None else known()
+            if owner is not None and not owner.mesh.same(self.mesh):
+                raise InvalidInput(
+                    name,
+                    got="an effect or boundary of another cloth, bound to its mesh",
+                    expected="one of its own",
+                    remedy="make it anew, or copy.deepcopy it",
+                )
+            _OWNERS[part] = ref(self)
 
     def _store_geometry(self) -> None:
         gradient, area = self.mesh.shape_gradient, self.mesh.area

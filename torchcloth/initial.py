@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .boundaries import drive
-from .boundaries.motion import check, interpolate
+from .boundaries.motion import check, check_cover, interpolate
 from .effects import MassDamping
 from .model import Model
 from .self_contact import first_directors
@@ -51,6 +51,7 @@ def held(motion: Mapping[str, Trajectory], start: float, end: float) -> dict[str
     found, span = {}, torch.tensor([start, end], dtype=torch.float64)
     for name, trajectory in motion.items():
         check(trajectory, name)
+        check_cover(trajectory, name, start, start)
         pose = interpolate(trajectory, span[:1])
         closed = drive(trajectory, span[:1].repeat(2)).closed[0]
         found[name] = Trajectory(span, pose.expand(*pose.shape[:-3], 2, 4, 4), torch.tensor([closed, closed]))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as recompute
 
 from . import functional
@@ -20,6 +21,8 @@ from .errors import SimulationDiverged
 from .self_contact import CHUNK
 from .types import ClothState, Rollout, Trajectory
 from .validation import check_extent
+
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
 class Interval(NamedTuple):
@@ -134,13 +137,25 @@ def _by_reference(
     interval: Interval, state: ClothState, drives: Mapping[str, Drive], checkpoint: bool
 ) -> tuple[ClothState, Impulses]:
     total: Impulses = {}
+    store = checkpoint and torch.is_grad_enabled()
+    model = interval.model
+    if store:
+        model = model._replace(boundaries={name: _as_it_is(part) for name, part in model.boundaries.items()})
     for first in range(0, interval.count, CHUNK):
         substeps = min(CHUNK, interval.count - first)
-        run = partial(functional.rollout, interval.model, dt=interval.dt, drives=drives, substeps=substeps, first=first)
-        store = checkpoint and torch.is_grad_enabled()
+        run = partial(functional.rollout, model, dt=interval.dt, drives=drives, substeps=substeps, first=first)
         state, impulses = recompute(run, state, use_reentrant=False, preserve_rng_state=False) if store else run(state)
         total = added(total, impulses)
     return state, total
+
+
+def _as_it_is(part: ModuleT) -> ModuleT:
+    """A shallow copy that keeps the parameters of the moment: those of ``functional_call`` go before the backward."""
+    own = copy(part)
+    own.__dict__ = part.__dict__.copy()
+    own._parameters = part._parameters.copy()
+    own._modules = {name: None if inner is None else _as_it_is(inner) for name, inner in part._modules.items()}
+    return own
 
 
 def check_finite(interval: Interval, before: ClothState, after: ClothState) -> None:

@@ -93,7 +93,7 @@ class _Walk:
         values, batch = dict(self.cloth.named_parameters()), self.plan.state.x.ndim - 2
         with forward_ad.dual_level(), real_tangents():
             entries = _dual_copies(values, {name: tangent[changes] for name, tangent in given.items()}, batch)
-            found = functional_call(_Built(self.cloth, self.build, work), entries, ())
+            found = functional_call(_Built(self.cloth, self.build, work), entries, (), tie_weights=False)
             tangents = ((key, forward_ad.unpack_dual(dual).tangent) for key, dual in found.items())
             moved = {key: tangent for key, tangent in tangents if tangent is not None}
         every = {key: t.new_zeros(self.count, *t.shape[1:]) for key, t in moved.items()}
@@ -156,7 +156,7 @@ def _by_copies(
         if along.state is not None:
             many = _both(many, _tangent_of(state, along, count), forward_ad.make_dual)
         moved = _dual_motion(motion, along, count, batch)
-        out = functional_call(_Replay(cloth), entries, (many, moved, plan.frames, dt, settle))
+        out = functional_call(_Replay(cloth), entries, (many, moved, plan.frames, dt, settle), tie_weights=False)
         primal = _each(out, lambda t: forward_ad.unpack_dual(t).primal[0].clone())
         return primal, _each(out, _tangent)
 

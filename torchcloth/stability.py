@@ -15,6 +15,7 @@ from .relaxation import MOST, Polynomial
 from .strain import grown_gradient
 
 SAFETY = 0.7  # of the linear limit: leaves room for tangents that double beyond what the material states
+LOOSE = 4.0  # speed that a grip yields for a viscous force over the one that causes it: stages hold what is held
 STAGE = 0.4  # of a substep's cost, for a stage: 0.3 of bending, 0.45 of the membrane
 
 
@@ -67,6 +68,10 @@ def limits_of(model: Model, gradient: Tensor) -> Limits:
     elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
     staged = model.effects.values() if model.transfer == "mesh" else ()
     viscous = sum(float(effect.viscous_rate(c, model.mass)) for effect, c in staged)
+    yielding = max((effect.yielding(c) for effect, c in model.effects.values()), default=0.0)
+    if viscous > 0 and yielding * viscous * float(model.mass.detach().max()) > LOOSE:
+        viscous = 0.0
+    lighter = _lighter(model)
     stiffness = model.material.stiffness(model.coefficients)
     numbers = (*stiffness, model.areal_density, *([] if model.rest is None else [model.rest]))
     hangs_on = (gradient._version, spacing, *((t.dtype, t.detach().tolist()) for t in numbers))
@@ -75,11 +80,22 @@ def limits_of(model: Model, gradient: Tensor) -> Limits:
         shape = gradient if model.rest is None else grown_gradient(gradient, model.rest)
         try:
             squared = squared_frequency(shape, model.areal_density, stiffness, spacing)
-        except RuntimeError as error:  # no eigenvalues of what is not finite, or whose square is not
+        except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage] - not finite, or its square
             largest = max(float(t.max()) for t in stiffness)
             raise UnstableStep("stiffness", got=f"{largest:.3g} N/m", expected="a fabric's: the step is 0 s") from error
         _KNOWN[gradient] = hangs_on, squared
-    return Limits(squared + elastic, max(0.0, damping - viscous), viscous)
+    return Limits(lighter * squared + elastic, max(0.0, damping - viscous), viscous)
+
+
+def _lighter(model: Model) -> float:
+    """Largest ratio of the fabric's own mass at a vertex to the one that it has; 1 where nothing takes mass away."""
+    mass = model.mass.detach()
+    if not bool((mass > 0).all()):
+        raise InvalidInput(
+            "mass", got=f"{float(mass.min()):.3g} kg at a vertex", expected="more than 0 with all effects"
+        )
+    added = [own for effect, c in model.effects.values() if (own := effect.mass(c)) is not None]
+    return float((1 - sum(added) / mass).clamp(min=1.0).max()) if added else 1.0
 
 
 _KNOWN: WeakTensorKeyDictionary = WeakTensorKeyDictionary()  # by the gradient, which belongs to one mesh

@@ -21,11 +21,21 @@ from .types import ClothState, Trajectory
 MOST_SUBSTEPS = 10_000_000  # of one simulation: a minute of the stiffest cloth; poses of more fill the memory
 
 
-def check_field(name: str, raw: Tensor, triangles: int) -> None:
-    """Fields have one value per triangle; batches of scalars are [B, 1]."""
+def check_field(name: str, raw: Tensor, triangles: int | None) -> None:
+    """Fields have one value per triangle, where there may be some; batches of scalars are [B, 1]."""
     if raw.ndim and raw.shape[-1] not in (1, triangles):
-        expected = f"a scalar, [{triangles}] (one per triangle) or [B, 1]"
+        expected = (
+            "a scalar or [B, 1]" if triangles is None else f"a scalar, [{triangles}] (one per triangle) or [B, 1]"
+        )
         raise InvalidInput(name, got=f"shape {tuple(raw.shape)}", expected=expected)
+
+
+def check_fields(effects: Mapping[str, AbstractEffect], triangles: int) -> None:
+    """What the parameters of effects may be, where these say so."""
+    for name, effect in effects.items():
+        for path, part in effect.named_modules():
+            if isinstance(part, PhysicalParameter) and effect.per_triangle is not None:
+                check_field(f"effects.{name}.{path}", part.raw, triangles if path in effect.per_triangle else None)
 
 
 def check_numbers(what: str, values: object) -> None:

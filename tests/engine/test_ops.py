@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
 from clothes import close, opening, sheet, start
-from torch.func import functional_call, jacfwd, jvp, vjp, vmap
+from torch.func import functional_call, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 import torchcloth as tc
 from torchcloth.engine.choice import still_drives
@@ -89,6 +89,30 @@ def test_second_derivatives_are_refused():
     (gradient,) = torch.autograd.grad(Rollout.apply(known.number, STEPS, 1, *inputs)[0].sum(), x, create_graph=True)
     with pytest.raises(InvalidInput, match=r'second derivatives; .*engine="reference"'):
         gradient.sum().backward()
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        lambda f, r: hessian(f)(r),
+        lambda f, r: jacfwd(jacfwd(f))(r),
+        lambda f, r: jacrev(jacrev(f))(r),
+        lambda f, r: jvp(jacrev(f), (r,), (torch.ones_like(r),)),
+    ],
+    ids=["hessian", "forward over forward", "reverse over reverse", "forward over reverse"],
+)
+def test_no_order_of_modes_drops_the_curvature(second):
+    """First derivatives work under the same transforms; second ones are refused, not zero."""
+    cloth = tc.Cloth(tc.meshes.rectangle(0.1, 0.1, resolution=(3, 3)), tc.materials.AEP(1e5, 0.3), 0.15, contact=None)
+    state = cloth.state(cloth.rest_state().x, 0.1 * torch.randn(9, 3))
+    name, raw = "material.youngs_modulus.raw", cloth.material.youngs_modulus.raw.detach()
+
+    def loss(raw):
+        return functional_call(cloth, {name: raw}, (state, {}, [0, 0.01]), {"checkpoint": False}).x[-1].square().sum()
+
+    close(jacfwd(loss)(raw), jacrev(loss)(raw), 1e-8, "slope")
+    with pytest.raises(InvalidInput, match="second derivatives"):
+        second(loss, raw)
 
 
 def test_a_jacobian_is_one_call_with_many_directions():

@@ -274,3 +274,15 @@ def test_load_reads_a_ply(tmp_path):
     np.testing.assert_allclose(mesh.vertices, flat.vertices, atol=1e-7)
     np.testing.assert_array_equal(mesh.faces, flat.faces)
     assert mesh.pattern is None
+
+
+def test_triangles_that_turn_unlike_are_refused():
+    """Without a pattern nothing else tells them from the others, and bending of their edges would be lost."""
+    mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(5, 5))
+    faces = mesh.faces.copy()
+    faces[::5] = faces[::5][:, ::-1]
+    with pytest.raises(InvalidInput, match="along which two triangles go the same way"):
+        Mesh.build(mesh.vertices, faces)
+    fin = np.concatenate([mesh.vertices, [[0.1, 0.1, 0.1]]])
+    with pytest.raises(InvalidInput, match="at most two at an edge"):
+        Mesh.build(fin, np.concatenate([mesh.faces, [[*mesh.faces[8][:2], 25]]]))

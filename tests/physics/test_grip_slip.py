@@ -113,3 +113,21 @@ def test_a_cloth_without_that_grasp_is_refused():
     for options in ({"mobility": -1.0}, {"hold": -1.0}):
         with pytest.raises(tc.errors.InvalidInput):
             tc.effects.GripSlip("left", **options)
+
+
+@pytest.mark.parametrize("engine", ["reference", "fused"])
+@pytest.mark.parametrize(("viscosity", "mobility"), [(3.0, 0.5), (1.0, 1e3)])
+def test_a_grip_that_yields_beside_viscosity_is_stable(engine, viscosity, mobility):
+    """Stages hold what is held: where a grip yields much, viscous forces act in one piece."""
+    cloth = tc.Cloth(
+        tc.meshes.rectangle(0.2, 0.2, resolution=(6, 6)), tc.materials.AEP(1e5, 0.3), 0.15,
+        {"viscous": tc.effects.KelvinVoigt(viscosity), "slip": tc.effects.GripSlip("hand", mobility, 0.1)},
+        {"hand": tc.boundaries.Grasp(uv=[[0.0, 0.2]], radius=0.045)}, contact=None, engine=engine,
+    )  # fmt: skip
+    pose = torch.eye(4).repeat(2, 1, 1)
+    pose[1, 1, 3] = 0.05
+    motion = {"hand": tc.Trajectory(torch.tensor([0.0, 0.05]), pose, torch.ones(2, dtype=torch.bool))}
+    with torch.no_grad():
+        usual, fine = (cloth(cloth.rest_state(), motion, (0.0, 0.02, 0.03), dt=dt) for dt in (None, 1e-5))
+    torch.testing.assert_close(usual.x, fine.x, rtol=0, atol=1e-4)
+    assert float(usual.v.abs().max()) < 1.3 * float(fine.v.abs().max())

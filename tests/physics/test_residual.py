@@ -102,3 +102,17 @@ def test_it_says_what_it_does_and_refuses_what_it_does_not_know():
     for terms in ({}, {"magnetism": 1.0}, {"across@hem": 1.0}):
         with pytest.raises(InvalidInput, match="terms"):
             ResidualForce(terms)
+
+
+def test_mass_that_is_taken_away_shortens_the_step():
+    """Stable with a quarter of the mass, refused with less than none."""
+    made = lambda mass: tc.Cloth(  # noqa: E731
+        tc.meshes.rectangle(0.2, 0.2, resolution=(6, 6)), tc.materials.AEP(1e4, 0.3), 0.2,
+        {"residual": ResidualForce({"mass": mass})}, contact=None,
+    )  # fmt: skip
+    cloth, plain = made(-0.15), made(0.0)
+    assert cloth.stable_step() == pytest.approx(0.5 * plain.stable_step(), rel=1e-6)
+    state = cloth.state(cloth.rest_state().x + 1e-4 * torch.randn(36, 3))
+    assert float(cloth(state, times=(0.0, 0.2)).v.detach().abs().max()) < 1.0
+    with pytest.raises(InvalidInput, match="mass; got -"):
+        made(-0.25).stable_step()

@@ -17,14 +17,16 @@ class Coulomb(PhysicalParameter):
     """Coulomb's law, stick and slip: the tangential impulse is at most mu times the normal one.
 
     Args:
-        friction: mu [-], >= 0.
+        friction: mu [-], >= 0; a batch is [B, 1].
 
     Raises:
-        InvalidInput: a negative coefficient.
+        InvalidInput: a negative coefficient, or another shape.
     """
 
     def __init__(self, friction: float | Tensor) -> None:
         super().__init__(friction, "-", "nonnegative", name="friction")
+        if self.raw.ndim and self.raw.shape[-1] != 1:
+            raise InvalidInput("friction", got=f"shape {tuple(self.raw.shape)}", expected="a scalar or [B, 1]")
 
     def taken(self, slip: Tensor, push: Tensor) -> Tensor:
         """Share of the slip that is lost [..., N, 1]; 1 where the surfaces stick.

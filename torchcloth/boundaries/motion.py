@@ -58,7 +58,8 @@ def check_cover(trajectory: Trajectory, name: str, start: float, end: float) -> 
     Raises:
         InvalidInput: it begins later or ends earlier.
     """
-    t, slack = trajectory.t, 1e-6 * max(1.0, abs(end))
+    t = trajectory.t
+    slack = 1e-6 + 4 * torch.finfo(t.dtype).eps * abs(end)
     if float(t[0]) > start + slack or float(t[-1]) < end - slack:
         raise InvalidInput(
             f"motion[{name!r}].t",

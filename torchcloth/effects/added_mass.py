@@ -28,6 +28,7 @@ class AddedMass(AbstractEffect):
     """
 
     amplitudes = {"length": Amplitude("m", 0.15, 0.015, ("gravity.acceleration", "plane.friction"))}
+    per_triangle = ("length",)
 
     def __init__(self, length: float | Tensor = 0.15, density: float = 1.204) -> None:
         super().__init__()

@@ -39,6 +39,7 @@ class Adhesion(AbstractEffect):
     """
 
     amplitudes = {"stress": Amplitude("Pa", 1.5, 0.3, ("contact.mu",))}
+    per_triangle = ()
 
     def __init__(
         self,

@@ -47,6 +47,7 @@ class AirDrag(AbstractEffect):
         "tangential": Amplitude("-", 0.016, 0.005, ("mass_damping",)),
         "wind": Amplitude("m/s", 0.3, 0.05, ("gravity.tilt",)),
     }
+    per_triangle = ("normal", "tangential")
     acts_on = "triangles"
 
     def __init__(

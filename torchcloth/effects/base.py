@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, ClassVar, Literal, NamedTuple
 
 from torch import Tensor, nn
@@ -47,11 +48,14 @@ class AbstractEffect(nn.Module, ABC):
 
     Class attributes:
         amplitudes: by parameter name, the main one first.
+        per_triangle: names of parameters that may have a value for each triangle, all others being scalars or batches
+            of them; None: not said, so not checked.
         acts_on: whether ``force`` returns one row per vertex, or one per triangle (shared equally by its corners).
         grasp: name of the boundary that ``loosen`` belongs to.
     """
 
     amplitudes: ClassVar[Mapping[str, Amplitude]]
+    per_triangle: ClassVar[Collection[str] | None] = None
     acts_on: ClassVar[Literal["vertices", "triangles"]] = "vertices"
     grasp: str | None = None
 
@@ -85,6 +89,10 @@ class AbstractEffect(nn.Module, ABC):
     def growth(self, c: Any) -> Tensor | None:
         """[..., E or 1, 2, 2], columns: where the warp and weft of the pattern lie in the true rest shape."""
         return None
+
+    def yielding(self, c: Any) -> float:
+        """m/(N s): most speed that ``loosen`` gives for a force; viscous forces on what yields much take no stages."""
+        return 0.0 if self.grasp is None else math.inf
 
     def loosen(self, c: Any, index: Tensor, free: Tensor, held: Tensor, mass: Tensor, dt: float) -> Tensor:
         """Velocities of the held vertices ``index`` in an imperfect grip, from those ``free`` of it and ``held`` by it.

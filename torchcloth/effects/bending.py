@@ -68,6 +68,7 @@ class Bending(AbstractEffect):
         "curl_warp": Amplitude("1/m", 3.0, 0.3, ("crease",)),
         "curl_weft": Amplitude("1/m", 3.0, 0.3, ("crease",)),
     }
+    per_triangle = ("stiffness",)
 
     def __init__(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from ..errors import InvalidInput
+from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from ..types import Moment
 from .base import AbstractEffect, Amplitude
@@ -29,6 +30,13 @@ class BodyForce(AbstractEffect):
         if acceleration.ndim < 2 or acceleration.shape[-1] != 3:
             raise InvalidInput("acceleration", got=f"shape {tuple(acceleration.shape)}", expected="[V or 1, 3] m/s^2")
         self.acceleration = PhysicalParameter(acceleration, "m/s^2", "real", name="acceleration of a body force")
+
+    def bind(self, mesh: Mesh) -> BodyForce:
+        """Check that there is one for each vertex, or one for all."""
+        rows, vertices = self.acceleration.raw.shape[-2], len(mesh.vertices)
+        if rows not in (1, vertices):
+            raise InvalidInput("acceleration", got=f"{rows} rows", expected=f"{vertices}, one per vertex, or 1")
+        return self
 
     def coefficients(self) -> Tensor:
         """[..., V or 1, 3] m/s^2."""

@@ -22,6 +22,7 @@ class MassDamping(AbstractEffect):
     """
 
     amplitudes = {"rate": Amplitude("1/s", 1.0, 0.05, ("air",))}
+    per_triangle = ()
 
     def __init__(self, rate: float | Tensor = 1.0) -> None:
         super().__init__()

@@ -32,6 +32,7 @@ class BendingFriction(AbstractEffect):
     """
 
     amplitudes = {"moment": Amplitude("N", 2e-4, 2e-5, ("bending_damping", "crease"))}
+    per_triangle = ()
 
     def __init__(self, moment: float | Tensor = 2e-4, threshold: float = 5.0) -> None:
         super().__init__()
@@ -88,6 +89,7 @@ class ShearFriction(AbstractEffect):
     """
 
     amplitudes = {"hysteresis": Amplitude("N/m", 1.0, 0.1, ("membrane_viscosity",))}
+    per_triangle = ("hysteresis",)
 
     def __init__(self, hysteresis: float | Tensor = 1.0, threshold: float = 0.01) -> None:
         super().__init__()

@@ -43,6 +43,7 @@ class GripSlip(AbstractEffect):
         ),
         "hold": Amplitude("N", 1.0, 0.1),
     }
+    per_triangle = ()
 
     def __init__(self, grasp: str, mobility: float | Tensor = 0.01, hold: float | Tensor = 1.0) -> None:
         super().__init__()
@@ -53,6 +54,10 @@ class GripSlip(AbstractEffect):
     def coefficients(self) -> Coefficients:
         """The parameters as fields."""
         return Coefficients(self.mobility.field, self.hold.field)
+
+    def yielding(self, c: Coefficients) -> float:
+        """The mobility."""
+        return float(c.mobility.detach().max())
 
     def loosen(self, c: Coefficients, index: Tensor, free: Tensor, held: Tensor, mass: Tensor, dt: float) -> Tensor:
         """The patch moves on with the same velocity all over, so that its pull falls to what the law says."""

@@ -30,6 +30,7 @@ class LineMass(AbstractEffect):
     """
 
     amplitudes = {"mass_per_length": Amplitude("kg/m", 4.5e-3, 1e-3, ("areal_density", "gravity.tilt"))}
+    per_triangle = ()
 
     def __init__(
         self, mass_per_length: float | Tensor = 4.5e-3, edges: Literal["boundary", "seams"] | ArrayLike = "boundary"

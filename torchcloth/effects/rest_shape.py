@@ -41,6 +41,7 @@ class RestShape(AbstractEffect):
         "shrink_weft": Amplitude("-", 0.02, 0.005, ("areal_density", "grip_slip.mobility", "material.orthotropy")),
         "skew": Amplitude("rad", 0.02, 0.005, ("material.orthotropy",)),
     }
+    per_triangle = ("shrink_warp", "shrink_weft", "skew")
 
     def __init__(
         self, shrink_warp: float | Tensor = 0.0, shrink_weft: float | Tensor = 0.0, skew: float | Tensor = 0.0

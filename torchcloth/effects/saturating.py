@@ -36,6 +36,7 @@ class SaturatingBending(AbstractEffect):
     """
 
     amplitudes = {"moment": Amplitude("N", 1e-3, 1e-4, ("bending", "internal_friction"))}
+    per_triangle = ()
 
     def __init__(self, moment: float | Tensor = 1e-3, curvature: float | Tensor = 2.0) -> None:
         super().__init__()

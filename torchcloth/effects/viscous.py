@@ -33,6 +33,7 @@ class KelvinVoigt(AbstractEffect):
     """
 
     amplitudes = {"viscosity": Amplitude("N s/m", 1.0, 0.1, ("numerics", "internal_friction"))}
+    per_triangle = ("viscosity",)
 
     def __init__(self, viscosity: float | Tensor = 1.0) -> None:
         super().__init__()

@@ -51,7 +51,10 @@ def compiler() -> list[str]:
         Unbuilt: there is none.
     """
     for command in (os.environ.get("CXX", ""), "g++", "clang++", "c++"):
-        parts = shlex.split(command)
+        try:
+            parts = shlex.split(command)
+        except ValueError as error:
+            raise Unbuilt(f"CXX is no command ({error})", "correct it, or leave it out") from None
         if parts and shutil.which(parts[0]):
             return parts
     raise Unbuilt("no C++ compiler", "install one (Debian, Ubuntu: apt-get install g++) or name it in CXX")
@@ -68,7 +71,7 @@ def version(command: list[str]) -> str:
 def folders() -> list[Path]:
     """Where a library may be kept, best first."""
     own = os.environ.get("TORCHCLOTH_CACHE")
-    found = [Path(own)] if own else []
+    found = [Path(own).expanduser().resolve()] if own else []  # a bare name would be looked for by the loader
     with suppress(RuntimeError):  # nobody's home
         found.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchcloth")
     return [*found, Path(tempfile.gettempdir()) / f"torchcloth-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"]

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import IntEnum
 
+from ..errors import InvalidInput
 from .fields import Field
 from .library import kernels
 
@@ -31,9 +32,16 @@ class Loop:
     """Instructions on every item."""
 
     def __init__(
-        self, items: int, own: int = OWN, among: int = -1, counted: int = -1, flat: bool = False, again: bool = False
+        self,
+        items: int,
+        reach: Sequence[int],
+        own: int = OWN,
+        among: int = -1,
+        counted: int = -1,
+        flat: bool = False,
+        again: bool = False,
     ) -> None:
-        self.items, self._own, self._among, self._counted = items, own, among, counted
+        self.items, self._reach, self._own, self._among, self._counted = items, reach, own, among, counted
         self.flat, self.again = flat, again
         self._used = 0
         self._code: list[tuple] = []
@@ -90,7 +98,13 @@ class Loop:
         self._code.append(("move", code, field.id, self._place(field, at), regs[0]))
 
     def _place(self, field: Field, at: int | None) -> int:
-        return SHARED if field.rows == 1 else self._own if at is None else at
+        if field.rows == 1:
+            return SHARED
+        at = self._own if at is None else at
+        wanted = self.items if at == OWN else self._reach[at] if at >= 0 else 0  # beyond the rows lies other memory
+        if field.rows and wanted and (field.rows < wanted or (at == OWN and field.rows > wanted)):
+            raise InvalidInput("coefficients", got=f"{field.rows} values", expected=f"1 or {wanted}")
+        return at
 
     def _new(self, count: int) -> list[int]:
         self._used += count

@@ -199,7 +199,9 @@ def _adjoint(ctx: Any, seeds: Sequence[Tensor | None], needs: Sequence[bool]) ->
     given = [
         like.new_zeros(scenes, f.rows, f.comps) if s is None else s for f, s in zip(fields, seeds[:-1], strict=True)
     ]
-    found = ops.rollout_backward(ctx.number, ctx.substeps, ctx.every, inputs, records, given, wanted)
+    count, known = len(inputs), (ctx.number, ctx.substeps, ctx.every)
+    work = lambda *t: ops.rollout_backward(*known, t[:count], t[count], t[count + 1 :], wanted)  # noqa: E731
+    found = _Once.apply(work, *inputs, records, *given)
     grads: list[Tensor | None] = [None] * len(inputs)
     for i, grad in zip(wanted, found, strict=True):
         grads[i] = grad
@@ -222,6 +224,23 @@ def _refuse(ctx: Any, *seeds: Any) -> NoReturn:
 torch.library.register_autograd("torchcloth::rollout", _op_backward, setup_context=_remember)
 torch.library.register_autograd("torchcloth::rollout_backward", _refuse)
 torch.library.register_autograd("torchcloth::rollout_tangent", _refuse)
+
+
+class _Once(torch.autograd.Function):
+    """Work on tensors that has no derivative of its own in either mode, under any transform."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(work: Callable[..., list[Tensor]], *tensors: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore
+        """The work."""
+        return tuple(work(*tensors))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        """Nothing is kept."""
+
+    backward = jvp = staticmethod(_refuse)  # type: ignore[assignment]
 
 
 class Rollout(torch.autograd.Function):
@@ -254,5 +273,7 @@ class Rollout(torch.autograd.Function):
         *inputs, _ = ctx.saved_tensors
         moved = [i for i, t in enumerate(tangents[3:]) if t is not None]
         dots = [t.unsqueeze(1) for t in tangents[3:] if t is not None]
-        results = ops.rollout_tangent(ctx.number, ctx.substeps, inputs, dots, moved)
+        number, substeps, count = ctx.number, ctx.substeps, len(inputs)
+        work = lambda *t: ops.rollout_tangent(number, substeps, t[:count], t[count:], moved)  # noqa: E731
+        results = _Once.apply(work, *inputs, *dots)
         return *(t.squeeze(1) for t in results[len(results) // 2 :]), None

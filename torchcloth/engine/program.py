@@ -41,6 +41,7 @@ class Program:
         self.fields: list[Field] = []
         self._constants: dict[bytes, Field] = {}
         self._tables: dict[bytes, int] = {}
+        self._reach: list[int] = []  # of each table: rows that it needs
         self._stages: list[Loop | Stencil | Sieve | Layers | PerMass] = []
         self._lists = 0
         self._written: list[tuple[str, tuple]] = []
@@ -95,6 +96,7 @@ class Program:
         key = data.tobytes()
         if key not in self._tables:
             self._tables[key] = len(self._tables)
+            self._reach.append(int(data.max(initial=-1)) + 1)
             self._api("table")(self._handle, data, len(data))
         return self._tables[key]
 
@@ -114,22 +116,22 @@ class Program:
             order: in which they are gone through.
             flat: what it gives has no derivative.
         """
-        self._stages.append(Loop(items, OWN if order is None else self.table(order), flat=flat))
+        self._stages.append(Loop(items, self._reach, OWN if order is None else self.table(order), flat=flat))
         return self._stages[-1]  # type: ignore[return-value]
 
     def first(self) -> Loop:
         """Runs before all stages that are there already, once."""
-        self._stages.insert(0, Loop(1))
+        self._stages.insert(0, Loop(1, self._reach))
         return self._stages[0]  # type: ignore[return-value]
 
     def among(self, near: int, flat: bool = False) -> Loop:
         """On those points alone that a sieve has found; ``flat`` as for ``loop``."""
-        self._stages.append(Loop(0, among=near, flat=flat))
+        self._stages.append(Loop(0, self._reach, among=near, flat=flat))
         return self._stages[-1]  # type: ignore[return-value]
 
     def varying(self, count: int, again: bool = False) -> Loop:
         """A loop over what contact finds, number ``count``; ``again``: it writes what is not recorded, and is read."""
-        self._stages.append(Loop(0, counted=count, again=again))
+        self._stages.append(Loop(0, self._reach, counted=count, again=again))
         return self._stages[-1]  # type: ignore[return-value]
 
     def contact(self, layers: Layers) -> None:

@@ -192,7 +192,7 @@ class _Fields(Objective):
         """One episode with these fields."""
         data = self.episodes[i]
         entries = {f"cloth.material.{n}.raw": part.to(data.initial) for n, part in self._parts(raw).items()}
-        return frames_of(functional_call(Replay(self.cloth), entries, (data, self.dt)))
+        return frames_of(functional_call(Replay(self.cloth), entries, (data, self.dt), tie_weights=False))
 
 
 def laplacian(mesh: Mesh) -> Tensor:

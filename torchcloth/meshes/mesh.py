@@ -48,7 +48,8 @@ class Mesh:
             places: vertex indices by name.
 
         Raises:
-            InvalidInput: wrong shapes, indices out of range, unused vertices, degenerate or flipped triangles.
+            InvalidInput: wrong shapes, indices out of range, unused vertices, degenerate or flipped triangles, more
+                than two at an edge.
         """
         x = np.array(vertices, dtype=np.float64)
         f = np.array(faces, dtype=np.int64)
@@ -63,8 +64,14 @@ class Mesh:
                 got=f"{len(bad)} degenerate or flipped triangles (first: {bad[0]}, area {area[bad[0]]:.3g} m^2)",
                 expected="positive area in the rest shape",
             )
+        _check_winding(f)
         named = {name: _check_place(name, np.array(index), len(x)) for name, index in (places or {}).items()}
         return Mesh(x, f, rest, pattern, named)
+
+    def same(self, other: Mesh) -> bool:
+        """Whether vertices, triangles and rest shapes are the same."""
+        pairs = ((self.vertices, other.vertices), (self.faces, other.faces), (self.rest, other.rest))
+        return self is other or all(np.array_equal(a, b) for a, b in pairs)
 
     @property
     def uv(self) -> np.ndarray | None:
@@ -211,6 +218,19 @@ def _check_triangles(x: np.ndarray, f: np.ndarray) -> None:
             got=f"{len(unused)} in no triangle (first: {unused[0]})",
             expected="every vertex in a triangle",
             remedy="a vertex without area has no mass; remove it",
+        )
+
+
+def _check_winding(f: np.ndarray) -> None:
+    along = np.stack([f, np.roll(f, -1, axis=1)], -1).reshape(-1, 2)
+    edges, times = np.unique(along, axis=0, return_counts=True)
+    if (times > 1).any():
+        first = edges[times > 1][0].tolist()
+        raise InvalidInput(
+            "faces",
+            got=f"{int((times > 1).sum())} edges along which two triangles go the same way (first: {first})",
+            expected="neighbours that turn alike, at most two at an edge",
+            remedy="orient the faces alike; fins and pockets are cloths of their own",
         )
 
 

@@ -138,7 +138,9 @@ class Corrected(Objective):
         for w, (_, times) in enumerate(self._windows(episode)):
             own = {f"cloth.{key}": value for key, value in {**entries, KEY: fields[w]}.items()}
             settles = episode.settles and w == 0
-            out = functional_call(_Window(self.cloth), own, (state, episode, times, self.dt, settles))
+            out = functional_call(
+                _Window(self.cloth), own, (state, episode, times, self.dt, settles), tie_weights=False
+            )
             state = out.state
             yield out
 
@@ -188,7 +190,7 @@ class Corrected(Objective):
             entries = {f"cloth.{key}": value for key, value in {**fabric, KEY: fields[w]}.items()}
             settles = episode.settles and w == 0
             call = (state, episode, times, self.dt, settles, along)
-            out, way = functional_call(_Window(self.cloth), entries, call)
+            out, way = functional_call(_Window(self.cloth), entries, call, tie_weights=False)
             state, moved = out.state, way.state
             parts.append(frames_of(out))
             spread = torch.tensor(index)

@@ -63,7 +63,7 @@ class FitModule(pl.LightningModule):
             raise InvalidInput("forward", got="a module without data", expected="a module in a run, or use cloth()")
         entries = {f"cloth.{key}": value for key, value in self.learned.entries().items()}
         model = Replay(self.learned.cloth)
-        rollout = functional_call(model, entries, (episode, self.config.model.dt or None))
+        rollout = functional_call(model, entries, (episode, self.config.model.dt or None), tie_weights=False)
         return scene_of(frames_of(rollout), None, episode, self.sheet)
 
     def setup(self, stage: str) -> None:
