@@ -269,6 +269,7 @@ class Arm(nn.Module):
         ]
 
     def _posture(self, name: str, q: Tensor) -> Tensor:
+        q = torch.as_tensor(q)
         if q.ndim != 1:
             raise InvalidInput(
                 f"{name} has the wrong shape", got=tuple(q.shape), expected=f"({len(self.joint_names)},)"
@@ -276,6 +277,7 @@ class Arm(nn.Module):
         return self._checked(q.detach(), name)
 
     def _checked(self, q: Tensor, name: str = "q") -> Tensor:
+        q = torch.as_tensor(q)  # recordings hold arrays
         joints = len(self.joint_names)
         if q.ndim == 0 or q.shape[-1] != joints or not q.is_floating_point():
             names = ", ".join(self.joint_names)
@@ -286,6 +288,7 @@ class Arm(nn.Module):
 
 
 def _checked_base(base: Tensor) -> Tensor:
+    base = torch.as_tensor(base)
     if base.shape != (4, 4) or not base.is_floating_point():
         got = f"{base.dtype} {tuple(base.shape)}"
         raise InvalidInput("base has the wrong shape or type", got=got, expected="floating (4, 4)")

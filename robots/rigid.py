@@ -67,6 +67,6 @@ def check_rigid(name: str, pose: Tensor) -> None:
     rotation = pose[..., :3, :3]
     eye = torch.eye(4, dtype=pose.dtype, device=pose.device)
     rigid = (rotation @ rotation.mT - eye[:3, :3]).abs().amax() < 1e-5
-    if not bool(rigid & (rotation.det() > 0).all() & (pose[..., 3, :] == eye[3]).all()):
+    if not bool(pose.isfinite().all() & rigid & (rotation.det() > 0).all() & (pose[..., 3, :] == eye[3]).all()):
         expected = "a rotation, a position and a last row (0, 0, 0, 1)"
         raise InvalidInput(f"{name} is not a rigid pose", expected=expected, remedy="orthonormalise its rotation")

@@ -483,3 +483,21 @@ def test_trajectories_cover_the_times_also_far_from_zero(held):
         held(held.rest_state(), motion, (begin + 999.0, begin + 999.1))
     with pytest.raises(InvalidInput, match="to cover"):
         held.settle(held.rest_state(), motion, start=begin + 50.0, duration=0.1)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        lambda: (tc.materials.OrthotropicAEP(1e6, 1e4, 4e3, 0.01), {}),
+        lambda: (tc.materials.AEP(1e5, 0.3), {"shrunk": tc.effects.RestShape(0.03)}),
+        lambda: (tc.materials.AEP(1e5, 0.3), {"bending": tc.effects.Bending(1e-3, weft_ratio=0.5)}),
+        lambda: (tc.materials.AEP(1e5, 0.3), {"friction": tc.effects.ShearFriction(1.0)}),
+    ],
+)
+def test_axes_need_a_pattern(part):
+    """Without one each triangle has its own."""
+    mesh = tc.meshes.rectangle(0.2, 0.1, resolution=(5, 3))
+    material, effects = part()
+    with pytest.raises(InvalidInput, match="no pattern coordinates; expected uv"):
+        tc.Cloth(tc.meshes.Mesh.build(mesh.vertices, mesh.faces), material, 0.2, effects)
+    tc.Cloth(mesh, material, 0.2, effects)

@@ -6,6 +6,7 @@ import torch
 import torchcloth as tc
 from torchcloth.engine.building import Unbuilt
 from torchcloth.engine.library import library
+from torchcloth.errors import InvalidInput
 from torchcloth.losses import chamfer_to_surface, chamfer_to_vertices, closest, residuals
 from torchcloth.losses import nearest as search
 from torchcloth.testing import check_gradients
@@ -95,8 +96,33 @@ def test_both_searches_find_the_same_places(vertices, points, dtype):
 def test_no_place_is_near_to_what_is_not_finite(vertices, points):
     for where in (points, vertices):
         where[0] = torch.nan
-        with pytest.raises(IndexError):
+        with pytest.raises(InvalidInput, match="points or vertices; got NaN"):
             closest(points, vertices, FACES)
+
+
+def test_two_precisions_are_refused(vertices, points):
+    with pytest.raises(InvalidInput, match="expected one precision"):
+        closest(points.float(), vertices, FACES)
+
+
+def test_a_triangle_without_an_edge_is_as_near_as_its_place(vertices, points):
+    bare = vertices[FACES].clone()
+    bare[0, 1] = bare[0, 0]
+    face, weights = search.nearest(points, bare, 10**6)
+    assert bool(weights.isfinite().all())
+    place = (weights[..., None] * bare[face]).sum(1)
+    assert float((points - place).norm(dim=1).max()) < 0.2
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4, 5], [1, 0, 2, 3, 4, 5], [3, 2, 1, 5, 4, 0]])
+def test_beyond_a_vertex_of_the_rim_is_beyond(order):
+    """Whichever of its triangles is hit: some touch the rim with this vertex only."""
+    corners = [[-0.1, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, -0.1, 0], [-0.02, 0.04, 0], [-0.02, -0.04, 0]]
+    faces = torch.tensor([[1, 4, 5], [1, 2, 4], [1, 5, 3], [2, 0, 4], [0, 3, 5], [0, 5, 4]])[order]
+    x, point = torch.tensor(corners, dtype=torch.float64), torch.tensor([[0.12, 0.0, 0.0]], dtype=torch.float64)
+    hits = closest(point, x, faces)
+    assert bool(hits.beyond)
+    assert float(residuals(point, x, hits)[1]) == pytest.approx(0.02)
 
 
 def test_residuals_of_a_flat_sheet():

@@ -28,6 +28,7 @@ from .strain import inverse_growth
 from .transfer import Contact, Grid
 from .types import ClothState, Rollout, Trajectory
 from .validation import (
+    check_axes,
     check_field,
     check_fields,
     check_grasps,
@@ -96,6 +97,7 @@ class Cloth(nn.Module):
         self.areal_density = PhysicalParameter(areal_density, "kg/m^2", name="areal_density")
         check_field("areal_density", self.areal_density.raw, len(mesh.faces))
         check_fields(effects or {}, len(mesh.faces))
+        check_axes(mesh, {"material": material, **(effects or {})})
         self._own(effects or {}, boundaries or {})
         self.effects = nn.ModuleDict({name: part.bind(mesh) for name, part in (effects or {}).items()})
         self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in (boundaries or {}).items()})

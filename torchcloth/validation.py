@@ -13,6 +13,8 @@ from .boundaries.motion import check as check_motion
 from .boundaries.motion import check_cover
 from .effects import AbstractEffect
 from .errors import InvalidInput, SimulationDiverged, UnstableStep
+from .materials import AbstractMaterial
+from .meshes import Mesh
 from .model import Model
 from .parameters import PhysicalParameter
 from .transfer import Contact
@@ -28,6 +30,18 @@ def check_field(name: str, raw: Tensor, triangles: int | None) -> None:
             "a scalar or [B, 1]" if triangles is None else f"a scalar, [{triangles}] (one per triangle) or [B, 1]"
         )
         raise InvalidInput(name, got=f"shape {tuple(raw.shape)}", expected=expected)
+
+
+def check_axes(mesh: Mesh, parts: Mapping[str, AbstractMaterial | AbstractEffect]) -> None:
+    """Without a pattern each triangle has axes of its own."""
+    name = next((name for name, part in parts.items() if part.has_axes), None)
+    if mesh.pattern is None and name is not None:
+        raise InvalidInput(
+            "mesh",
+            got="no pattern coordinates",
+            expected=f"uv, so that warp and weft have directions for {name!r}",
+            remedy="Mesh.build(vertices, faces, uv), or texture coordinates in the file",
+        )
 
 
 def check_fields(effects: Mapping[str, AbstractEffect], triangles: int) -> None:

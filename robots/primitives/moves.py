@@ -69,6 +69,8 @@ def action(
         InvalidInput: a value that gives no motion, or none that ends, or a path through the table.
     """
     check(speed=limits.speed, acceleration=limits.acceleration, rest=rest)
+    for move in moves:
+        finite(roll=move.roll)
     start = points(grips)
     moves = [move for move in moves if move.moves]
     aside = _aside(start, any(move.apart for move in moves))
@@ -145,6 +147,13 @@ def finite(**values: float) -> None:
     for name, value in values.items():
         if not math.isfinite(value):
             raise InvalidInput(name, got=value, expected="a finite number")
+
+
+def whole(**values: float) -> None:
+    """Refuses what is no number of times."""
+    for name, value in values.items():
+        if not (value >= 1 and value == int(value)):
+            raise InvalidInput(name, got=value, expected="a whole number >= 1")
 
 
 def _sample(moves: Sequence[Move], limits: Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:

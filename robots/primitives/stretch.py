@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .moves import Action, Grips, Limits, Move, action, check
+from .moves import Action, Grips, Limits, Move, action, check, whole
 
 
 def stretch(
@@ -27,6 +27,7 @@ def stretch(
     Raises:
         InvalidInput: a value that gives no motion, or another number of grippers than two.
     """
-    check(by=by, cycles=cycles, hold=hold)
+    check(by=by, hold=hold)
+    whole(cycles=cycles)
     moves = [Move(apart=by, least=hold), Move(apart=-by, least=hold)] * int(cycles)
     return action(grips, moves, 0.0, rest, limits, release=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .moves import Action, Grips, Limits, Move, action, along, check
+from .moves import Action, Grips, Limits, Move, action, along, check, whole
 
 
 def swing(
@@ -43,7 +43,8 @@ def to_and_fro(
     limits: Limits,
 ) -> Action:
     """Half a way out, whole ways between both ends, half a way home, along a unit vector."""
-    check(amplitude=amplitude, cycles=cycles, period=period)
+    check(amplitude=amplitude, period=period)
+    whole(cycles=cycles)
     half = period / 2
     ways = [(1, 0.5 * half), *((2 * (-1) ** k, half) for k in range(1, 2 * int(cycles))), (1, 0.5 * half)]
     x, y, z = direction

@@ -224,3 +224,22 @@ def test_batched_poses_without_gradient_and_their_divergence():
     pose[1, 2, 2, 3] = 1e200
     with pytest.raises(tc.errors.SimulationDiverged):
         run("auto", motion)
+
+
+class Even(Pull):
+    """On triangles, the same in every scene."""
+
+    acts_on = "triangles"
+
+    def force(self, c, now):
+        return c * now.surface.area / now.surface.area.mean() * torch.tensor([1.0, 0.0, 0.0]).to(now.x)
+
+
+def test_a_force_on_triangles_may_be_that_of_all_scenes():
+    found = []
+    for engine in ("reference", "fused"):
+        cloth = sheet(effects={"even": Even()}, boundaries={})
+        cloth.engine = engine
+        state = cloth.state(start(cloth).x.expand(2, -1, -1).clone())
+        found.append(cloth(state, times=(0.0, 0.01)).x)
+    close(found[1], found[0], 1e-10, "positions")

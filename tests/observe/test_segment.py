@@ -29,6 +29,44 @@ def pose(x, y, z):
     return out
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"neighbours": -1},
+        {"radius": 0.01, "company": 0},
+        {"above": np.nan},
+        {"low": (-1.0, -1.0)},
+        {"low": (np.nan, 0.0, 0.0)},
+        {"low": (0.0, 0.0, 1.0), "high": (1.0, 1.0, 0.0)},
+        {"hsv": (0.1, 0.2)},
+        {"hsv": ((100, 0, 0), (140, 255, 255))},
+        {"table": (0.0, 0.0, -1.0, 0.0)},
+    ],
+    ids=str,
+)
+def test_stages_that_would_take_all_or_fail_are_refused(options):
+    with pytest.raises(InvalidInput, match="|".join(options)):
+        Segmentation(**options)
+
+
+def test_corners_may_be_arrays_and_masks_bytes():
+    points = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    how = Segmentation(low=np.array([-1.0, -1.0, -1.0]), high=np.ones(3), neighbours=None, gap=None)
+    assert segment(points, how).kept.tolist() == [0]
+    depth = np.full((CAMERA.height, CAMERA.width), 0.5)
+    mask = np.zeros_like(depth, dtype=np.uint8)
+    mask[100:102, 100:102] = 255
+    assert segment_depth(CAMERA, depth, Segmentation(edge=None, neighbours=None, gap=None), mask=mask).came == 4
+
+
+def test_what_lies_inside_the_robot_is_the_robots():
+    """Arms are thicker than what counts as near; their solids overlap."""
+    solids = [solid_mesh("cylinder", (0.07, 0.4), pose(x, 0.0, 0.0)) for x in (0.0, 0.05)]
+    points = np.array([[x, 0.0, 0.0] for x in (0.0, 0.025, 0.1, 0.125, 0.14, 0.2)])
+    how = Segmentation(neighbours=None, gap=None, robot=0.012)
+    assert segment(points, how, robot=solids).kept.tolist() == [4, 5]
+
+
 def test_images_of_another_size_are_refused():
     depth = np.zeros((CAMERA.height, CAMERA.width))
     for wrong in ({"depth": depth[:-1]}, {"mask": depth[:, 1:] > 0}, {"colors": depth}):

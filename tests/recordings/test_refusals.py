@@ -168,6 +168,16 @@ def test_episode_json(episode, keys, value, message):
     refused(episode, message)
 
 
+def test_a_pose_with_few_digits_is_the_nearest_rotation(episode):
+    """Cameras and arms ask for exact ones."""
+    c, s = np.round([np.cos(0.3), np.sin(0.3)], 4)
+    typed = [[c, -s, 0.0, 0.1], [s, c, 0.0, 0.2], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    edit_json(episode, ("robots", "right", "T_world_base"), typed)
+    pose = rec.read(episode).robots["right"].T_world_base
+    assert np.abs(pose - typed).max() < 1e-4
+    assert np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < 1e-14
+
+
 M, P, K, T = "motion.npz", "points.npz", "markers.npz", "truth.npz"
 NPZ = [
     (M, "left/t", DROP, "motion.npz: left/t is missing"),

@@ -94,12 +94,14 @@ def _with_progress(recording: Recording, write: Any) -> None:
 
 def _report(recording: Recording, target: Path) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table("stream", "holds", "samples", "from, s", "to, s", "rate, Hz")
     for name, holds, t in _streams(recording):
         rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else float("nan")
-        table.add_row(name, holds, str(len(t)), f"{t[0]:.3f}", f"{t[-1]:.3f}", "" if rate != rate else f"{rate:.1f}")
+        usual = "" if rate != rate else f"{rate:.1f}"
+        table.add_row(escape(name), holds, str(len(t)), f"{t[0]:.3f}", f"{t[-1]:.3f}", usual)
     Console(soft_wrap=True).print(table)
     source = recording.extra.get("source")
     if isinstance(source, dict) and source.get("unchecked"):

@@ -59,6 +59,11 @@ class AbstractEffect(nn.Module, ABC):
     acts_on: ClassVar[Literal["vertices", "triangles"]] = "vertices"
     grasp: str | None = None
 
+    @property
+    def has_axes(self) -> bool:
+        """Whether warp and weft differ: then the mesh must have a pattern."""
+        return False
+
     def bind(self, mesh: Mesh) -> AbstractEffect:
         """Resolve what depends on the mesh; returns self."""
         return self

@@ -123,6 +123,11 @@ class Bending(AbstractEffect):
     def _uneven(self, size: int) -> bool:
         return size > 1 or self.weft_ratio is not None or self.twist_ratio is not None
 
+    @property
+    def has_axes(self) -> bool:
+        """Of woven cloth and curls."""
+        return any(p is not None for p in (self.weft_ratio, self.twist_ratio, self.curl_warp, self.curl_weft))
+
     def coefficients(self) -> Coefficients:
         """Resolved once per rollout."""
         field = self.stiffness.field

@@ -102,6 +102,11 @@ class ShearFriction(AbstractEffect):
         self.triangles.bind(mesh, self.hysteresis.raw.device)
         return self
 
+    @property
+    def has_axes(self) -> bool:
+        """Yarns turn against each other."""
+        return True
+
     def coefficients(self) -> Tensor:
         """HG [..., 1, 1] N/m."""
         return 0.5 * self.hysteresis.field

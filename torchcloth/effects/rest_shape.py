@@ -56,6 +56,11 @@ class RestShape(AbstractEffect):
         self.shrink_weft = PhysicalParameter(shrink_weft, "-", "real", name="shrinkage along the weft")
         self.skew = PhysicalParameter(skew, "rad", "real", name="skew")
 
+    @property
+    def has_axes(self) -> bool:
+        """Shrinkage has a direction."""
+        return True
+
     def coefficients(self) -> Coefficients:
         """The parameters as fields."""
         return Coefficients(self.shrink_warp.field, self.shrink_weft.field, self.skew.field)

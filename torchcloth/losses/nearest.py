@@ -7,6 +7,7 @@ from torch import Tensor
 
 from .._math import cross
 from ..engine.library import at_hand
+from ..errors import InvalidInput
 
 LETTERS = {torch.float32: "f", torch.float64: "d"}
 
@@ -16,6 +17,8 @@ def nearest(points: Tensor, corners: Tensor, chunk: int) -> tuple[Tensor, Tensor
 
     By the engine's library, where that is at hand; ``chunk``: pairs per pass, where torch searches.
     """
+    if points.dtype != corners.dtype:
+        raise InvalidInput("points and vertices", got=f"{points.dtype} and {corners.dtype}", expected="one precision")
     found = _compiled(points, corners)
     if found is None:
         parts = [_closest(part, corners) for part in points.split(max(1, chunk // len(corners)))]
@@ -39,6 +42,8 @@ def _compiled(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor] | None:
 
 def _closest(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
     """``nearest`` in torch."""
+    if not bool(points.isfinite().all() & corners.isfinite().all()):
+        raise InvalidInput("points or vertices", got="NaN or infinite entries", expected="finite metres")
     point, triangle = _near(points, corners)
     offset, x = points[point], corners[triangle]
     weights, squared = _on_triangles(offset, x)
@@ -77,7 +82,7 @@ def _project_inside(points: Tensor, corners: Tensor) -> Tensor:
     scale = normal / _inner(normal, normal)[:, None]
     v, w = _inner(cross(offset, e2), scale), _inner(cross(e1, offset), scale)
     weights = torch.stack([1 - v - w, v, w], dim=-1)
-    outside = (weights < 0).any(-1, keepdim=True)
+    outside = ~(weights >= 0).all(-1, keepdim=True)  # of a triangle without area they are no numbers
     return torch.where(outside, torch.eye(3, dtype=a.dtype, device=a.device)[0], weights)
 
 
@@ -85,7 +90,8 @@ def _project_edge(points: Tensor, corners: Tensor, start: int) -> Tensor:
     """Barycentric coordinates [M, 3] of the closest point on the edge from corner ``start`` to the next."""
     end = (start + 1) % 3
     a, edge = corners[:, start], corners[:, end] - corners[:, start]
-    t = (_inner(points - a, edge) / _inner(edge, edge)).clamp(0.0, 1.0)
+    length = _inner(edge, edge).clamp(min=torch.finfo(edge.dtype).tiny)  # a corner twice is a point
+    t = (_inner(points - a, edge) / length).clamp(0.0, 1.0)
     weights = t.new_zeros(*t.shape, 3)
     weights[..., start], weights[..., end] = 1 - t, t
     return weights

@@ -32,6 +32,9 @@ def closest(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 4_000_
         vertices: [V, 3] m.
         faces: [F, 3] int64.
         chunk: point-triangle pairs per pass, where torch searches.
+
+    Raises:
+        InvalidInput: two precisions, or numbers that are not finite.
     """
     with torch.no_grad():
         points, vertices = points.detach(), vertices.detach()
@@ -71,9 +74,12 @@ def distances(points: Tensor, vertices: Tensor, hits: Hits) -> Tensor:
 
 
 def _on_boundary(faces: Tensor, face: Tensor, weights: Tensor) -> Tensor:
-    """[N] bool, whether the closest point lies on an edge that only one triangle has."""
+    """[N] bool, whether the closest point lies on an edge that only one triangle has, or is an end of one."""
     edges = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], dim=1).sort(-1).values
     number = edges[..., 0] * (faces.max() + 1) + edges[..., 1]  # one number for each edge: sorts far faster than rows
     _, inverse, count = number.flatten().unique(return_inverse=True, return_counts=True)
     open_edge = (count[inverse] == 1).reshape(-1, 3)  # the edge opposite to each corner
-    return ((weights <= 0) & open_edge[face]).any(-1)
+    rim = torch.zeros(int(faces.max()) + 1, dtype=torch.bool, device=faces.device)
+    rim[edges[open_edge].flatten()] = True
+    corner = rim[faces[face].gather(-1, weights.argmax(-1, keepdim=True)).squeeze(-1)] & (weights >= 1).any(-1)
+    return ((weights <= 0) & open_edge[face]).any(-1) | corner

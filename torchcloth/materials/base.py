@@ -40,6 +40,11 @@ class AbstractMaterial(nn.Module, ABC):
     n [..., E, 1, 3] and d3 [..., E, S, 3] (S contact points per triangle).
     """
 
+    @property
+    def has_axes(self) -> bool:
+        """Whether warp and weft differ: then the mesh must have a pattern."""
+        return False
+
     @abstractmethod
     def coefficients(self) -> Any:
         """NamedTuple of tensors [..., E or 1, 1] derived from the learnable parameters."""

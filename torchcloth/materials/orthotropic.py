@@ -108,6 +108,11 @@ class OrthotropicAEP(DirectorMaterial):
 
         return cls(**find(name).orthotropic(**changes))
 
+    @property
+    def has_axes(self) -> bool:
+        """Also where both are alike: they are learnable."""
+        return True
+
     def coefficients(self) -> Coefficients:
         """Stiffnesses times thickness."""
         warp, weft = self.youngs_modulus.field * self.thickness, self.weft_modulus.field * self.thickness

@@ -77,6 +77,7 @@ class DepthCamera:
         K = self.K
         if (
             K.shape != (3, 3)
+            or not np.isfinite(K).all()
             or not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1])
             or min(K[0, 0], K[1, 1]) <= 0
         ):

@@ -71,12 +71,27 @@ class Segmentation:
             value = getattr(self, name)
             if value is not None and not 0 <= value < np.inf:
                 raise InvalidInput(name, got=value, expected="None or a finite number that is not negative")
+        for name, least in (("neighbours", 1), ("company", 1), ("crowd", 1)):
+            value = getattr(self, name)
+            if value is not None and not (value >= least and value == int(value)):
+                raise InvalidInput(name, got=value, expected=f"None or a whole number >= {least}")
+        if not np.isfinite(self.above):
+            raise InvalidInput("above", got=self.above, expected="a finite height in m")
+        for name, shape in (("low", (3,)), ("high", (3,)), ("hsv", (2, 3))):
+            value = getattr(self, name)
+            if value is not None and (np.shape(value) != shape or np.isnan(np.asarray(value, float)).any()):
+                raise InvalidInput(name, got=value, expected=f"numbers of shape {list(shape)}")
+        if self.low is not None and self.high is not None and not bool(np.all(np.less(self.low, self.high))):
+            raise InvalidInput("low", got=self.low, expected=f"below high, {self.high}")
+        if self.hsv is not None and not (np.min(self.hsv) >= 0 and np.max(self.hsv) <= 1):
+            raise InvalidInput("hsv", got=self.hsv, expected="hue, saturation and value from 0 to 1")
         if isinstance(self.table, str) and self.table != "find":
             raise InvalidInput("table", got=repr(self.table), expected='"find", a plane (a, b, c, d), or None')
         if self.table is not None and not isinstance(self.table, str):
             plane = np.asarray(self.table, dtype=float)
-            if plane.shape != (4,) or not abs(np.linalg.norm(plane[:3]) - 1) < 1e-6:
-                raise InvalidInput("table", got=self.table, expected="(a, b, c, d) with a unit normal (a, b, c)")
+            if plane.shape != (4,) or not abs(np.linalg.norm(plane[:3]) - 1) < 1e-6 or not plane[2] > 0:
+                expected = "(a, b, c, d) with a unit normal (a, b, c) that points up"
+                raise InvalidInput("table", got=self.table, expected=expected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +143,7 @@ def segment_depth(
     _check_sizes(camera, depth, mask, colors)
     wanted = (depth > 0) & np.isfinite(camera.grid[..., 0])
     if mask is not None:
-        wanted &= mask
+        wanted &= np.asarray(mask, dtype=bool)
     taken = steep(depth, how.edge) & wanted if how.edge else np.zeros_like(wanted)
     left = wanted & ~taken
     points = to_points(camera, depth, left)
@@ -176,12 +191,12 @@ def segment(
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InvalidInput("points", got=f"shape {points.shape}", expected="[N, 3], finite, in m")
     shape = None if colors is None else np.shape(colors)
-    if how.hsv and shape != points.shape:
+    if how.hsv is not None and shape != points.shape:
         raise InvalidInput("colors", got=f"shape {shape}", expected=f"{points.shape}, since hsv is given")
     cloud = _Cloud(points)
-    if how.low or how.high:
+    if how.low is not None or how.high is not None:
         cloud.keep("crop", lambda p, _: _inside(p, how))
-    if how.hsv:
+    if how.hsv is not None:
         cloud.keep("color", lambda _, index: _of_color(np.asarray(colors)[index], how))
     if how.robot and len(robot):
         cloud.keep("robot", lambda p, _: _distance(p, robot) > (how.robot or 0))
@@ -213,15 +228,14 @@ class _Cloud:
 
 
 def _inside(points: Array, how: Segmentation) -> Array:
-    low, high = how.low or (-np.inf,) * 3, how.high or (np.inf,) * 3
-    inside = (points >= np.asarray(low)) & (points <= np.asarray(high))
-    return np.all(inside, axis=1)
+    low, high = -np.inf if how.low is None else how.low, np.inf if how.high is None else how.high
+    return np.all((points >= np.asarray(low)) & (points <= np.asarray(high)), axis=1)
 
 
 def _of_color(colors: Array, how: Segmentation) -> Array:
     from matplotlib.colors import rgb_to_hsv
 
-    low, high = how.hsv or ((0, 0, 0), (1, 1, 1))
+    low, high = ((0, 0, 0), (1, 1, 1)) if how.hsv is None else how.hsv
     hue, *rest = rgb_to_hsv(colors / 255).T
     good = (hue >= low[0]) & (hue <= high[0]) if low[0] <= high[0] else (hue >= low[0]) | (hue <= high[0])
     for value, least, most in zip(rest, low[1:], high[1:], strict=True):
@@ -230,14 +244,17 @@ def _of_color(colors: Array, how: Segmentation) -> Array:
 
 
 def _distance(points: Array, meshes: Sequence[Mesh]) -> Array:
-    o3d = open3d_or_refuse()
-    scene = o3d.t.geometry.RaycastingScene()
+    """[N] m from the nearest of the solids, negative inside; each is a scene of its own, for they overlap."""
+    o3d, found = open3d_or_refuse(), np.full(len(points), np.inf, np.float32)
+    asked = o3d.core.Tensor(points.astype(np.float32))
     for vertices, faces in meshes:
+        scene = o3d.t.geometry.RaycastingScene()
         scene.add_triangles(
             o3d.core.Tensor(np.ascontiguousarray(vertices, np.float32)),
             o3d.core.Tensor(np.ascontiguousarray(faces, np.uint32)),
         )
-    return scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
+        found = np.minimum(found, scene.compute_signed_distance(asked).numpy())
+    return found
 
 
 def _table(points: Array, how: Segmentation) -> Array | None:

@@ -17,6 +17,7 @@ FARTHEST_BASE = 100.0  # m; a base or camera may stand far from a map's origin, 
 LONGEST_EPISODE = 86_400.0  # s
 HUGE = 1e100  # stands for infinity: nothing physical comes near, and squares of smaller numbers stay finite
 UNIT_TOLERANCE = 1e-3  # quaternions and rotations are often stored as float32 or with four digits
+EXACT = 1e-9  # of R R^T: nothing was rounded
 
 _KINDS = {"float": ("iuf", np.float64), "int": ("iu", np.int64), "bool": ("b", np.bool_)}
 _NAME = re.compile(r"[^./\\\x00][^/\\\x00]*")
@@ -105,8 +106,12 @@ def unit(vectors: np.ndarray, place: str) -> None:
         raise RecordingError(f"{place} is not unit", got=got, expected="length 1", remedy="normalise it")
 
 
-def transform(matrix: np.ndarray, place: str) -> None:
-    """Refuse a [4, 4] matrix that is not a rigid motion in metres."""
+def transform(matrix: np.ndarray, place: str) -> np.ndarray:
+    """A rigid motion in metres [4, 4]; one that was stored with few digits is rounded to the nearest rotation.
+
+    Raises:
+        RecordingError: it is none.
+    """
     rotation = matrix[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if error > UNIT_TOLERANCE or np.linalg.det(rotation) < 0:
@@ -122,6 +127,12 @@ def transform(matrix: np.ndarray, place: str) -> None:
     if np.abs(matrix[:3, 3]).max() > FARTHEST_BASE:
         got = matrix[:3, 3].tolist()
         raise RecordingError(f"{place} looks like millimetres", got=got, expected="metres", remedy="multiply by 0.001")
+    if error < EXACT:
+        return matrix
+    left, _, right = np.linalg.svd(rotation)
+    rigid = matrix.copy()
+    rigid[:3, :3] = left @ right
+    return rigid
 
 
 def name(value: str, place: str) -> str:

@@ -179,6 +179,4 @@ def _nominal(fields: Fields) -> dict[str, Any]:
 
 
 def _transform(fields: Fields, key: str) -> np.ndarray:
-    matrix = fields.array(key, 4, 4)
-    checks.transform(matrix, fields.at(key))
-    return matrix
+    return checks.transform(fields.array(key, 4, 4), fields.at(key))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import RecordingError
+from ..errors import InvalidInput, RecordingError
 from ..meshes import obj
 from . import checks, images, streams
 from .files import Folder, save_npz
@@ -58,6 +58,8 @@ def write(
 
 
 def _fill(part: Path, recording: Recording, compact: bool, on_image: Callable[[], None]) -> None:
+    if recording.cloth is None:
+        raise InvalidInput("recording.cloth", got="None", expected="a ClothInfo: what the cloth is")
     text = json.dumps(episode(recording), indent=1, allow_nan=False, default=plain)
     (part / EPISODE).write_text(text + "\n", encoding="utf-8")
     _write_cloth(part, recording.cloth)

@@ -116,8 +116,7 @@ def fixed_pose(
     poses: np.ndarray, place: str, *, metres: float = 2e-3, radians: float = 4e-3, remedy: str = ""
 ) -> np.ndarray:
     """The one pose [4, 4] of a camera that stood still for all of ``poses`` [N, 4, 4]; a moving one is refused."""
-    for pose in poses:
-        checks.transform(pose, place)
+    poses = np.stack([checks.transform(pose, place) for pose in poses])
     first = poses[0]
     moved = np.linalg.norm(poses[:, :3, 3] - first[:3, 3], axis=1).max()
     traces = np.einsum("ij,nij->n", first[:3, :3], poses[:, :3, :3])

@@ -218,6 +218,5 @@ def depth_to_color(calibration: dict[str, Any], path: Path) -> np.ndarray:
         matrix = np.eye(4)
         matrix[:3, :3] = fields.array("Rotation", 9).reshape(3, 3)
         matrix[:3, 3] = fields.array("Translation", 3)
-        checks.transform(matrix, place)
-        matrices[kind] = matrix
+        matrices[kind] = checks.transform(matrix, place)
     return matrices["color"] @ np.linalg.inv(matrices["depth"])

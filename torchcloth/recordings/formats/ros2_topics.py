@@ -98,6 +98,10 @@ class MotionTopics:
         closed = self.closed.at(logged, self.place)
         if closed is not None:
             out["closed"] = closed
+        if self.wrench and not self._wrenches:
+            raise RecordingError(
+                f"{self.place}: {self.wrench} is empty", expected="wrenches", remedy="leave it out of source"
+            )
         return out | self._wrench_arrays(out, start) if self._wrenches else out
 
     def _pose_arrays(self, start: int) -> dict[str, np.ndarray]:

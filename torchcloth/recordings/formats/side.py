@@ -68,8 +68,7 @@ class Scene:
             if key in item:
                 place = f"{self.name}: {group}.{frame}.{key}"
                 matrix = checks.array(item[key], place, (4, 4))
-                checks.transform(matrix, place)
-                return matrix
+                return checks.transform(matrix, place)
         expected = '"world", or a camera or robot that the scene places'
         raise RecordingError(f"{self.name}: frame {frame!r} is unknown", expected=expected)
 
