@@ -501,3 +501,9 @@ def test_axes_need_a_pattern(part):
     with pytest.raises(InvalidInput, match="no pattern coordinates; expected uv"):
         tc.Cloth(tc.meshes.Mesh.build(mesh.vertices, mesh.faces), material, 0.2, effects)
     tc.Cloth(mesh, material, 0.2, effects)
+
+
+@pytest.mark.parametrize("rate", [math.nan, math.inf, -1.0])
+def test_settling_needs_a_finite_rate(held, rate):
+    with pytest.raises(InvalidInput, match="rate"):
+        held.settle(held.rest_state(), {"hand": trajectory()}, rate=rate)

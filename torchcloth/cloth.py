@@ -33,6 +33,7 @@ from .validation import (
     check_fields,
     check_grasps,
     check_motions,
+    check_rate,
     check_state,
     check_step,
     check_substeps,
@@ -294,6 +295,7 @@ class Cloth(nn.Module):
         motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
         model, step = self._stepping()
         check_substeps(duration, step)
+        check_rate(rate)
         count = int(np.ceil(duration * (1 / step + rate)))
         return self._ready(model, state, motion, frames, [count], rate)
 

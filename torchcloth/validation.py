@@ -67,6 +67,12 @@ def check_duration(seconds: float) -> None:
         raise InvalidInput("duration of settling", got=f"{seconds:g} s", expected="a time > 0")
 
 
+def check_rate(rate: float) -> None:
+    """Damping while a cloth settles."""
+    if not 0 <= rate < float("inf"):
+        raise InvalidInput("rate of settling", got=f"{rate:g} 1/s", expected="a finite rate >= 0")
+
+
 def check_times(times: Tensor | Sequence[float]) -> list[float]:
     """Frame times as a list of increasing seconds."""
     flat = torch.as_tensor(times, dtype=torch.float64)

@@ -286,3 +286,19 @@ def test_triangles_that_turn_unlike_are_refused():
     fin = np.concatenate([mesh.vertices, [[0.1, 0.1, 0.1]]])
     with pytest.raises(InvalidInput, match="at most two at an edge"):
         Mesh.build(fin, np.concatenate([mesh.faces, [[*mesh.faces[8][:2], 25]]]))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda folder: tc.meshes.rectangle(0.2, 0.2, triangles=0), "triangles; got 0"),
+        (lambda folder: tc.meshes.rectangle(np.inf, 0.2), "rectangle size"),
+        (lambda folder: tc.meshes.load(folder / "cloth.stl"), "expected an OBJ or PLY file"),
+        (lambda folder: tc.meshes.load(folder / "cloth.txt"), "expected an OBJ or PLY file"),
+    ],
+)
+def test_what_makes_no_sheet_is_refused(make, message, tmp_path):
+    for name in ("cloth.stl", "cloth.txt"):
+        (tmp_path / name).write_text("solid")
+    with pytest.raises(InvalidInput, match=message):
+        make(tmp_path)

@@ -27,10 +27,13 @@ def rectangle(
     Raises:
         InvalidInput: non-positive sizes or fewer than 2 vertices on a side.
     """
-    if not (width > 0 and height > 0):
+    if not (0 < width < np.inf and 0 < height < np.inf):
         raise InvalidInput("rectangle size", got=f"{width:g} x {height:g} m", expected="positive lengths")
     if resolution is None:
-        cells = max(1.0, (triangles or 800) / 2.0)
+        triangles = 800 if triangles is None else triangles
+        if triangles < 1:
+            raise InvalidInput("triangles", got=triangles, expected="at least 1")
+        cells = max(1.0, triangles / 2.0)
         columns = max(1, round((cells * width / height) ** 0.5))
         resolution = (columns + 1, max(1, round(cells / columns)) + 1)
     nx, ny = resolution
@@ -60,6 +63,8 @@ def load(path: str | Path) -> Mesh:
     path = Path(path)
     if not path.is_file():
         raise InvalidInput("mesh file", got=str(path), expected="an existing OBJ or PLY file")
+    if path.suffix.lower() not in (".obj", ".ply"):  # others know no vertices that triangles share
+        raise InvalidInput("mesh file", got=str(path), expected="an OBJ or PLY file")
     if path.suffix.lower() == ".obj":
         return Mesh.build(*_read_obj(path))
     try:
