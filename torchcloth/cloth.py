@@ -33,6 +33,7 @@ from .validation import (
     check_fields,
     check_grasps,
     check_motions,
+    check_names,
     check_rate,
     check_state,
     check_step,
@@ -97,23 +98,24 @@ class Cloth(nn.Module):
                 check_field(path, part.raw, len(mesh.faces))
         self.areal_density = PhysicalParameter(areal_density, "kg/m^2", name="areal_density")
         check_field("areal_density", self.areal_density.raw, len(mesh.faces))
-        check_fields(effects or {}, len(mesh.faces))
-        check_axes(mesh, {"material": material, **(effects or {})})
-        self._own(effects or {}, boundaries or {})
-        self.effects = nn.ModuleDict({name: part.bind(mesh) for name, part in (effects or {}).items()})
-        self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in (boundaries or {}).items()})
+        effects, boundaries = effects or {}, boundaries or {}
+        check_fields(effects, len(mesh.faces))
+        check_axes(mesh, {"material": material, **effects})
+        check_names([*effects, *boundaries])
+        self._check_free([*effects.items(), *boundaries.items()])
+        self.effects = nn.ModuleDict({name: part.bind(mesh) for name, part in effects.items()})
+        self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in boundaries.items()})
         check_grasps(dict(self._parts()), self.boundaries)
         self.contact, self._grid = contact, None if contact is None else contact.grid(mesh)
         self._store_geometry()
         for parameter in self.parameters():  # tensors keep their precision until a cloth has one
             parameter.data = parameter.data.to(self._area.dtype)
+        for part in (*self.effects.values(), *self.boundaries.values()):
+            _OWNERS[part] = ref(self)
 
-    def _own(self, *parts: Mapping[str, nn.Module]) -> None:
+    def _check_free(self, parts: Iterable[tuple[str, nn.Module]]) -> None:
         """Refuse what is bound to another cloth's mesh: it would be bound anew under that one's feet."""
-        for name, part in ((name, part) for group in parts for name, part in group.items()):
-            if not name.isprintable() or not name or "." in name or hasattr(nn.ModuleDict, name):
-                expected = "a name without dots that is no method of torch's ModuleDict"
-                raise InvalidInput("name of an effect or boundary", got=repr(name), expected=expected)
+        for name, part in parts:
             owner = None if (known := _OWNERS.get(part)) is None else known()
             if owner is not None and not owner.mesh.same(self.mesh):
                 raise InvalidInput(
@@ -122,7 +124,6 @@ class Cloth(nn.Module):
                     expected="one of its own",
                     remedy="make it anew, or copy.deepcopy it",
                 )
-            _OWNERS[part] = ref(self)
 
     def _store_geometry(self) -> None:
         gradient, area = self.mesh.shape_gradient, self.mesh.area

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -50,6 +50,14 @@ def check_fields(effects: Mapping[str, AbstractEffect], triangles: int) -> None:
         for path, part in effect.named_modules():
             if isinstance(part, PhysicalParameter) and effect.per_triangle is not None:
                 check_field(f"effects.{name}.{path}", part.raw, triangles if path in effect.per_triangle else None)
+
+
+def check_names(names: Iterable[str]) -> None:
+    """Of effects and boundaries, as torch's ModuleDict takes them."""
+    for name in names:
+        if not isinstance(name, str) or not name or "." in name or hasattr(nn.ModuleDict, name):
+            expected = "a name without dots that is no method of torch's ModuleDict"
+            raise InvalidInput("name of an effect or boundary", got=repr(name), expected=expected)
 
 
 def check_numbers(what: str, values: object) -> None:

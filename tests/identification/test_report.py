@@ -1,6 +1,7 @@
 """Statements: every warning can be reached, none comes without its reason, and numbers are never bare."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +10,7 @@ from twins import at
 
 import torchcloth as tc
 from torchcloth.identification import gauss_newton, linearity
+from torchcloth.identification.episodes import Episode
 from torchcloth.identification.misfit import Figures
 from torchcloth.identification.report import Found, estimates, warnings_of, withdraw
 from torchcloth.identification.result import Identification
@@ -18,7 +20,7 @@ from torchcloth.identification.unknowns import collect, with_priors
 GOOD = Estimate(2.0, 0.1, (1.8, 2.2), "-", 1.0, True)
 LOST = Estimate(2.0, 1.9, (0.1, 9.0), "-", 1.0, False)
 FIT = {"chamfer_before": 5e-3, "chamfer_after": 0.8e-3, "chamfer_null": 10e-3, "rms_after": 1e-3}
-EPISODE = SimpleNamespace(noise=1e-3, settles=True)
+EPISODE = Episode("shake", {}, torch.zeros(9), [], torch.zeros(0, 3), settles=True, noise=1e-3)
 
 
 def found(a=GOOD, b=GOOD, correlation=0.0, density=True):
@@ -59,7 +61,8 @@ def test_a_good_fit_has_no_warnings(model):
         ({"what": found(correlation=-0.97)}, "b and a can hardly be told apart (correlation -0.97)"),
         ({"what": found(density=False)}, "areal density was taken as exact"),
         ({"fit": {"rms_after": 2.1e-3}}, "the residual (2.1 mm rms) exceeds 1.3 times the sensor noise (1.0 mm)"),
-        ({"episodes": (EPISODE, SimpleNamespace(noise=1e-3, settles=False))}, "an episode has no initial_vertices"),
+        ({"episodes": (EPISODE, replace(EPISODE, settles=False))}, "an episode has no initial_vertices"),
+        ({"episodes": (replace(EPISODE, dropped=3),)}, "shake: 3 of 12 frames come after the motion's end"),
     ],
 )
 def test_every_warning_comes_alone_with_its_reason(model, change, said):
@@ -75,7 +78,7 @@ def test_layers_that_meet_are_noticed_where_contact_was_left_out(model, recordin
 
 
 def test_unknown_noise_is_not_compared(model):
-    assert warn(model, fit={"rms_after": 1.0}, episodes=(SimpleNamespace(noise=None, settles=True),)) == []
+    assert warn(model, fit={"rms_after": 1.0}, episodes=(replace(EPISODE, noise=None),)) == []
 
 
 def test_what_was_measured_or_absent_is_not_called_unidentifiable(model):
