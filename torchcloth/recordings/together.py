@@ -64,6 +64,8 @@ def _equal(a: object, b: object) -> bool:
 
 
 def _shown(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
     return " x ".join(f"{x:.4g}" for x in value) if isinstance(value, np.ndarray) else str(value)
 
 
