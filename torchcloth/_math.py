@@ -30,11 +30,23 @@ def last_knot(t: Tensor, times: Tensor) -> Tensor:
     return torch.cat([torch.searchsorted(t, some, right=True) for some in times.detach().split(AT_ONCE)]) - 1
 
 
+def hermite(t: Tensor, value: Tensor, slope: Tensor, times: Tensor) -> Tensor:
+    """[..., N, A, B] at ``times`` [N] of cubics between knots ``t`` [K], constant beyond.
+
+    ``value`` and ``slope``, its derivative, are [..., K, A, B].
+    """
+    k, step, s = _between_knots(t, times)
+    return (
+        (2 * s**3 - 3 * s**2 + 1) * value.index_select(-3, k)
+        + (s**3 - 2 * s**2 + s) * step * slope.index_select(-3, k)
+        + (3 * s**2 - 2 * s**3) * value.index_select(-3, k + 1)
+        + (s**3 - s**2) * step * slope.index_select(-3, k + 1)
+    )
+
+
 def hermite_slope(t: Tensor, value: Tensor, slope: Tensor, times: Tensor) -> Tensor:
     """Derivative of ``hermite`` by ``times``; the first and last slope beyond."""
-    k = last_knot(t, times).clamp(0, len(t) - 2)
-    step = (t[k + 1] - t[k])[:, None, None]
-    s = ((times - t[k])[:, None, None] / step).clamp(0.0, 1.0)
+    k, step, s = _between_knots(t, times)
     chord = (value.index_select(-3, k + 1) - value.index_select(-3, k)) / step
     return (
         6 * (s - s**2) * chord
@@ -43,17 +55,8 @@ def hermite_slope(t: Tensor, value: Tensor, slope: Tensor, times: Tensor) -> Ten
     )
 
 
-def hermite(t: Tensor, value: Tensor, slope: Tensor, times: Tensor) -> Tensor:
-    """[..., N, A, B] at ``times`` [N] of cubics between knots ``t`` [K], constant beyond.
-
-    ``value`` and ``slope``, its derivative, are [..., K, A, B].
-    """
+def _between_knots(t: Tensor, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(knot before [N], to the next one [N, 1, 1], share of that way [N, 1, 1]) of ``times`` [N]; 0 and 1 beyond."""
     k = last_knot(t, times).clamp(0, len(t) - 2)
     step = (t[k + 1] - t[k])[:, None, None]
-    s = ((times - t[k])[:, None, None] / step).clamp(0.0, 1.0)
-    return (
-        (2 * s**3 - 3 * s**2 + 1) * value.index_select(-3, k)
-        + (s**3 - 2 * s**2 + s) * step * slope.index_select(-3, k)
-        + (3 * s**2 - 2 * s**3) * value.index_select(-3, k + 1)
-        + (s**3 - s**2) * step * slope.index_select(-3, k + 1)
-    )
+    return k, step, ((times - t[k])[:, None, None] / step).clamp(0.0, 1.0)

@@ -80,7 +80,11 @@ def centroids(geometry: Geometry, field: Tensor) -> Tensor:
 
 
 def assemble(geometry: Geometry, shares: tuple[Tensor, Tensor, Tensor], like: Tensor) -> Tensor:
-    """Sum the corners' shares [..., E, K] on the vertices [..., V, K]; ``like`` has the result's shape."""
+    """Sum the corners' shares [..., E, K] on the vertices [..., V, K]; ``like`` has the result's shape.
+
+    Either may lack batch dimensions that the other has.
+    """
     stacked = torch.cat(shares, dim=-2)
+    stacked = stacked.expand(*torch.broadcast_shapes(stacked.shape[:-2], like.shape[:-2]), *stacked.shape[-2:])
     index = geometry.corners.unsqueeze(-1).expand(stacked.shape)  # scatter_add: 7 times faster than index_add here
     return torch.zeros_like(like).expand(*stacked.shape[:-2], -1, -1).scatter_add(-2, index, stacked)

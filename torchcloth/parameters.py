@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from .errors import InvalidInput
 
@@ -97,6 +99,14 @@ class PhysicalParameter(nn.Module):
         value = self.value.detach()
         shown = f"{value.item():.6g}" if value.numel() == 1 else f"field {tuple(value.shape)}, mean {value.mean():.6g}"
         return f"{shown} {self.unit}"
+
+
+def called(module: nn.Module, values: Mapping[str, Tensor], arguments: tuple) -> Any:
+    """``module(*arguments)`` with these in the place of its parameters.
+
+    Ties are left alone: torch would replace the parameters of a part that a cloth has twice, and not put them back.
+    """
+    return functional_call(module, dict(values), arguments, tie_weights=False)
 
 
 def to_value(raw: Tensor, domain: Domain) -> Tensor:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
-from torch.func import functional_call
 
 from .boundaries import Drive
 from .engine.tangents import FusedTangents
@@ -17,6 +16,7 @@ from .forward_mode import real_tangents
 from .initial import damped, held
 from .intervals import Interval, Plan, check_finite, collect
 from .model import Model
+from .parameters import called
 from .types import ClothState, Rollout, Trajectory
 from .validation import check_numbers
 
@@ -93,7 +93,7 @@ class _Walk:
         values, batch = dict(self.cloth.named_parameters()), self.plan.state.x.ndim - 2
         with forward_ad.dual_level(), real_tangents():
             entries = _dual_copies(values, {name: tangent[changes] for name, tangent in given.items()}, batch)
-            found = functional_call(_Built(self.cloth, self.build, work), entries, (), tie_weights=False)
+            found = called(_Built(self.cloth, self.build, work), entries, ())
             tangents = ((key, forward_ad.unpack_dual(dual).tangent) for key, dual in found.items())
             moved = {key: tangent for key, tangent in tangents if tangent is not None}
         every = {key: t.new_zeros(self.count, *t.shape[1:]) for key, t in moved.items()}
@@ -103,7 +103,7 @@ class _Walk:
 
 
 class _Built(nn.Module):
-    """Work on a model within ``functional_call``, so that parts read the dual parameters wherever they do."""
+    """Work on a model within ``called``, so that parts read the dual parameters wherever they do."""
 
     def __init__(self, cloth: nn.Module, build: Callable[[], Model], work: Callable[[Model], Any]) -> None:
         super().__init__()
@@ -156,7 +156,7 @@ def _by_copies(
         if along.state is not None:
             many = _both(many, _tangent_of(state, along, count), forward_ad.make_dual)
         moved = _dual_motion(motion, along, count, batch)
-        out = functional_call(_Replay(cloth), entries, (many, moved, plan.frames, dt, settle), tie_weights=False)
+        out = called(_Replay(cloth), entries, (many, moved, plan.frames, dt, settle))
         primal = _each(out, lambda t: forward_ad.unpack_dual(t).primal[0].clone())
         return primal, _each(out, _tangent)
 

@@ -98,6 +98,16 @@ def test_what_is_no_tensor_tells_problems_apart(other):
     assert ids[0] != ids[1]
 
 
+def test_another_engine_is_another_problem():
+    """Its last digits differ, and a fit goes on bit by bit."""
+    made = twins.twin()
+    cloth, ids = twins.at(made), []
+    for cloth.engine in ("fused", "reference"):
+        objective = Objective(cloth, collect(cloth, ["youngs_modulus"], None), [episode(cloth, made)])
+        ids.append(digest(objective.identity()))
+    assert ids[0] != ids[1]
+
+
 def test_beginnings_of_several_episodes_are_told_apart(tmp_path):
     """The first is so short that its beginning is all of it."""
     both = [twins.first(twins.twin(seed=3), 4), twins.twin()]

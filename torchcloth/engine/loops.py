@@ -101,8 +101,13 @@ class Loop:
         if field.rows == 1:
             return SHARED
         at = self._own if at is None else at
-        wanted = self.items if at == OWN else self._reach[at] if at >= 0 else 0  # beyond the rows lies other memory
-        if field.rows and wanted and (field.rows < wanted or (at == OWN and field.rows > wanted)):
+        if at == OWN:
+            wanted, fits = self.items, field.rows == self.items
+        elif at >= 0:
+            wanted, fits = self._reach[at], field.rows >= self._reach[at]
+        else:  # what contact finds
+            return at
+        if field.rows and wanted and not fits:  # beyond the rows lies other memory
             raise InvalidInput("coefficients", got=f"{field.rows} values", expected=f"1 or {wanted}")
         return at
 

@@ -61,7 +61,6 @@ class TorchParts:
             elif force is not None:
                 total = total + force
         if shares is not None:
-            shares = shares.expand(*state.x.shape[:-2], *shares.shape[-2:])
             total = total + assemble(self.model.geometry, (shares, shares, shares), state.x)
         return total, memory
 

@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.func import functional_call
 
 from .._files import write_text
 from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..meshes import Mesh
-from ..parameters import PhysicalParameter, to_value
+from ..parameters import PhysicalParameter, called, to_value
 from ..recordings import Recording
 from .blocks import blocks_for
 from .descent import quasi_newton
@@ -192,7 +191,7 @@ class _Fields(Objective):
         """One episode with these fields."""
         data = self.episodes[i]
         entries = {f"cloth.material.{n}.raw": part.to(data.initial) for n, part in self._parts(raw).items()}
-        return frames_of(functional_call(Replay(self.cloth), entries, (data, self.dt), tie_weights=False))
+        return frames_of(called(Replay(self.cloth), entries, (data, self.dt)))
 
 
 def laplacian(mesh: Mesh) -> Tensor:

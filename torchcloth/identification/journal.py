@@ -117,4 +117,4 @@ def facts_of(cloth: Cloth) -> list[object]:
         for name, value in vars(part).items()
         if name != "training" and not name.startswith("_") and isinstance(value, (bool, int, float, str, tuple))
     ]
-    return [*tensors, *plain, cloth.mesh.rest.tobytes(), cloth.mesh.faces.tobytes(), cloth.contact]
+    return [*tensors, *plain, cloth.mesh.rest.tobytes(), cloth.mesh.faces.tobytes(), cloth.contact, cloth.engine]

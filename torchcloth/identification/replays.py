@@ -8,9 +8,9 @@ from typing import NamedTuple
 import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
-from torch.func import functional_call
 
 from ..cloth import Cloth
+from ..parameters import called
 from ..sensitivities import Directions
 from ..types import ClothState, Rollout
 from .episodes import Episode
@@ -48,7 +48,7 @@ def simulate(
 ) -> Frames:
     """The episode at the unknowns ``raw`` [K]; differentiable in reverse mode when ``raw`` requires grad."""
     entries = {f"cloth.{key}": value.to(episode.initial) for key, value in overrides(unknowns, raw).items()}
-    return frames_of(functional_call(Replay(cloth), entries, (episode, dt), tie_weights=False))
+    return frames_of(called(Replay(cloth), entries, (episode, dt)))
 
 
 def tangents(
@@ -70,7 +70,7 @@ def tangents(
     along = Directions(overrides(unknowns, eye))
     if modes is not None and extra:
         along = along._replace(state=state_along(cloth, episode, modes, len(unknowns)))
-    out, moved = functional_call(_Tangents(cloth), entries, (episode, along, dt), tie_weights=False)
+    out, moved = called(_Tangents(cloth), entries, (episode, along, dt))
     return frames_of(out), frames_of(moved)
 
 

@@ -222,13 +222,11 @@ def _check_triangles(x: np.ndarray, f: np.ndarray) -> None:
 
 
 def _check_winding(f: np.ndarray) -> None:
-    along = np.stack([f, np.roll(f, -1, axis=1)], -1).reshape(-1, 2)
-    edges, times = np.unique(along, axis=0, return_counts=True)
-    if (times > 1).any():
-        first = edges[times > 1][0].tolist()
+    bad = topology.unlike(f)
+    if len(bad):
         raise InvalidInput(
             "faces",
-            got=f"{int((times > 1).sum())} edges along which two triangles go the same way (first: {first})",
+            got=f"{len(bad)} edges along which two triangles go the same way (first: {bad[0].tolist()})",
             expected="neighbours that turn alike, at most two at an edge",
             remedy="orient the faces alike; fins and pockets are cloths of their own",
         )

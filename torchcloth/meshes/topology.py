@@ -10,6 +10,12 @@ def edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.unique(np.sort(_sides(faces), axis=1), axis=0, return_counts=True)
 
 
+def unlike(faces: np.ndarray) -> np.ndarray:
+    """Sides [N, 2] that several triangles run along in one direction: they turn unlike, or are more than two."""
+    sides, times = np.unique(_sides(faces), axis=0, return_counts=True)
+    return sides[times > 1]
+
+
 def seams(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     """Edges [N, 2] whose triangles lie apart on the pattern [F, 3, 2] m: there, two panels are sewn."""
     pairs = np.unique(_laid_sides(faces, pattern), axis=0)[:, :2]

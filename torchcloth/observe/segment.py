@@ -71,10 +71,10 @@ class Segmentation:
             value = getattr(self, name)
             if value is not None and not 0 <= value < np.inf:
                 raise InvalidInput(name, got=value, expected="None or a finite number that is not negative")
-        for name, least in (("neighbours", 1), ("company", 1), ("crowd", 1)):
+        for name in ("neighbours", "company", "crowd"):
             value = getattr(self, name)
-            if value is not None and not (value >= least and value == int(value)):
-                raise InvalidInput(name, got=value, expected=f"None or a whole number >= {least}")
+            if value is not None and not (value >= 1 and value == int(value)):
+                raise InvalidInput(name, got=value, expected="None or a whole number >= 1")
         if not np.isfinite(self.above):
             raise InvalidInput("above", got=self.above, expected="a finite height in m")
         for name, shape in (("low", (3,)), ("high", (3,)), ("hsv", (2, 3))):

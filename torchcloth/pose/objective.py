@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call
 
 from ..cloth import Cloth
 from ..effects import BodyForce
@@ -22,6 +21,7 @@ from ..identification.nuisances import AbstractNuisance
 from ..identification.objective import Objective, pushed
 from ..identification.replays import SETTLING, Frames, each, frames_of, state_along
 from ..identification.unknowns import Unknown, overrides
+from ..parameters import called
 from ..sensitivities import Directions
 from ..types import ClothState, Rollout
 
@@ -138,9 +138,7 @@ class Corrected(Objective):
         for w, (_, times) in enumerate(self._windows(episode)):
             own = {f"cloth.{key}": value for key, value in {**entries, KEY: fields[w]}.items()}
             settles = episode.settles and w == 0
-            out = functional_call(
-                _Window(self.cloth), own, (state, episode, times, self.dt, settles), tie_weights=False
-            )
+            out = called(_Window(self.cloth), own, (state, episode, times, self.dt, settles))
             state = out.state
             yield out
 
@@ -190,7 +188,7 @@ class Corrected(Objective):
             entries = {f"cloth.{key}": value for key, value in {**fabric, KEY: fields[w]}.items()}
             settles = episode.settles and w == 0
             call = (state, episode, times, self.dt, settles, along)
-            out, way = functional_call(_Window(self.cloth), entries, call, tie_weights=False)
+            out, way = called(_Window(self.cloth), entries, call)
             state, moved = out.state, way.state
             parts.append(frames_of(out))
             spread = torch.tensor(index)

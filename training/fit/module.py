@@ -7,7 +7,6 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 from torch import Tensor
-from torch.func import functional_call
 
 from torchcloth import Cloth
 from torchcloth.errors import InvalidInput
@@ -16,6 +15,7 @@ from torchcloth.identification.objective import Objective
 from torchcloth.identification.replays import Replay, frames_of
 from torchcloth.identification.rows import Scene, scene_of
 from torchcloth.identification.sheet import Sheet
+from torchcloth.parameters import called
 
 from .config import from_dict
 from .data import Episodes
@@ -63,7 +63,7 @@ class FitModule(pl.LightningModule):
             raise InvalidInput("forward", got="a module without data", expected="a module in a run, or use cloth()")
         entries = {f"cloth.{key}": value for key, value in self.learned.entries().items()}
         model = Replay(self.learned.cloth)
-        rollout = functional_call(model, entries, (episode, self.config.model.dt or None), tie_weights=False)
+        rollout = called(model, entries, (episode, self.config.model.dt or None))
         return scene_of(frames_of(rollout), None, episode, self.sheet)
 
     def setup(self, stage: str) -> None:

@@ -1,0 +1,114 @@
+"""Effects, boundaries and laws of a cloth: what of them is refused, and that a cloth leaves them as they are."""
+
+import copy
+import gc
+
+import pytest
+import torch
+from small import sheet
+from torch.func import functional_call
+
+import torchcloth as tc
+from torchcloth.errors import InvalidInput
+
+
+@pytest.mark.parametrize("engine", ["reference", "fused"])
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (lambda e, v: {"effects": {"part": tc.effects.MassDamping(torch.ones(e))}}, r"rate; got .*scalar or \[B, 1\]"),
+        (
+            lambda e, v: {"effects": {"part": tc.effects.AirDrag(torch.ones(v))}},
+            "normal; got shape .*one per triangle",
+        ),
+        (
+            lambda e, v: {"effects": {"part": tc.effects.BodyForce(torch.ones(7, 3))}},
+            "7 rows; expected 16, one per vertex",
+        ),
+        (lambda e, v: {"boundaries": {"part": tc.boundaries.Plane(friction=torch.ones(2))}}, "friction; got shape"),
+        (lambda e, v: {"effects": {"a.b": tc.effects.Gravity()}}, "name of an effect or boundary; got 'a.b'"),
+        (lambda e, v: {"boundaries": {"keys": tc.boundaries.Plane()}}, "name of an effect or boundary; got 'keys'"),
+    ],
+)
+def test_parts_whose_numbers_do_not_fit_the_mesh_are_refused(engine, parts, message):
+    with pytest.raises(InvalidInput, match=message):
+        sheet(**parts(18, 16)).engine = engine
+
+
+def test_coefficients_never_reach_beyond_their_rows():
+    """Wrong numbers that come later, in the engine: it would read other memory."""
+    cloth = sheet(effects={"damping": tc.effects.MassDamping(1.0)})
+    cloth.engine = "fused"
+    for count in (7, 15, 17, 18):
+        with pytest.raises(InvalidInput, match=f"coefficients; got {count} values; expected 1 or 16"):
+            functional_call(
+                cloth, {"effects.damping.rate.raw": torch.ones(count)}, (cloth.rest_state(), {}, (0.0, 0.01))
+            )
+
+
+def test_a_part_of_another_cloth_is_not_bound_anew():
+    bending, hand = tc.effects.Bending(1e-3), tc.boundaries.Grasp.corner("upper-right", radius=1e-3)
+    first = sheet(effects={"bending": bending}, boundaries={"hand": hand})
+    held = hand.index.clone()
+    for parts in ({"effects": {"bending": bending}}, {"boundaries": {"hand": hand}}):
+        with pytest.raises(InvalidInput, match=r"an effect or boundary of another cloth.*copy.deepcopy"):
+            sheet(7, **parts)
+    assert torch.equal(first.boundaries["hand"].index, held)
+    sheet(4, effects={"bending": bending})  # the same mesh
+    sheet(7, effects={"bending": copy.deepcopy(bending)})
+    del first
+    gc.collect()
+    sheet(7, boundaries={"hand": hand})  # nobody's any more
+
+
+def test_a_cloth_has_one_precision():
+    torch.set_default_dtype(torch.float32)
+    wide = torch.full((18,), 1e5, dtype=torch.float64)
+    cloth = tc.Cloth(
+        sheet().mesh, tc.materials.AEP(wide, 0.3), 0.2, {"air": tc.effects.AirDrag(wide / 1e5)}, contact=None
+    )
+    for cloth.engine in ("reference", "fused"):
+        assert cloth(cloth.rest_state(), times=(0.0, 1e-3)).x.dtype == torch.float32
+
+
+def test_a_law_on_two_solids_survives_sensitivities():
+    rubber = tc.boundaries.Coulomb(0.3)
+    solids = {"table": tc.boundaries.Plane(friction=rubber), "ball": tc.boundaries.Sphere(0.1, friction=rubber)}
+    cloth = sheet(effects={"gravity": tc.effects.Gravity()}, boundaries=solids)
+    along = tc.Directions({"boundaries.table.friction.raw": torch.tensor([1.0, 2.0])})
+    cloth.sensitivities(cloth.rest_state(), {}, (0.0, 0.01), along=along)
+    assert isinstance(rubber.raw, torch.nn.Parameter)
+    assert rubber.raw.shape == ()
+
+
+def test_gradients_of_a_bodys_numbers_under_functional_call():
+    """By recomputation, after ``functional_call`` has put the module's own back."""
+    ball = tc.boundaries.Sphere(0.5, (0.1, 0.1, -0.5005), friction=0.3)
+    cloth = sheet(7, effects={"gravity": tc.effects.Gravity()}, boundaries={"ball": ball}, Y=1.0)
+    cloth.engine = "reference"
+    state = cloth.state(cloth.rest_state().x, torch.tensor([0.3, 0.1, -0.1]).expand(49, 3))
+    raw, slopes = torch.tensor(0.02, requires_grad=True), []
+    for checkpoint in (True, False):
+        entries, options = {"boundaries.ball.friction.raw": raw}, {"checkpoint": checkpoint}
+        x = functional_call(cloth, entries, (state, {}, (0.0, 0.05)), options).x[-1]
+        slopes.append(torch.autograd.grad(x.square().sum(), raw)[0])
+    assert float(slopes[1]) != 0.0
+    torch.testing.assert_close(slopes[0], slopes[1])
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        lambda: (tc.materials.OrthotropicAEP(1e6, 1e4, 4e3, 0.01), {}),
+        lambda: (tc.materials.AEP(1e5, 0.3), {"shrunk": tc.effects.RestShape(0.03)}),
+        lambda: (tc.materials.AEP(1e5, 0.3), {"bending": tc.effects.Bending(1e-3, weft_ratio=0.5)}),
+        lambda: (tc.materials.AEP(1e5, 0.3), {"friction": tc.effects.ShearFriction(1.0)}),
+    ],
+)
+def test_axes_need_a_pattern(part):
+    """Without one each triangle has its own."""
+    mesh = tc.meshes.rectangle(0.2, 0.1, resolution=(5, 3))
+    material, effects = part()
+    with pytest.raises(InvalidInput, match="no pattern coordinates; expected uv"):
+        tc.Cloth(tc.meshes.Mesh.build(mesh.vertices, mesh.faces), material, 0.2, effects)
+    tc.Cloth(mesh, material, 0.2, effects)
