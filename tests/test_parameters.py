@@ -34,6 +34,12 @@ def test_refuses_values_outside_its_domain(domain, value):
         tc.PhysicalParameter(value, "Pa", domain, name="stiffness")
 
 
+@pytest.mark.parametrize("value", [[1.0, [2.0]], "soft", None])
+def test_refuses_what_is_no_number(value):
+    with pytest.raises(InvalidInput, match=r"stiffness; got .*; expected a number or a tensor"):
+        tc.PhysicalParameter(value, "Pa", name="stiffness")
+
+
 def test_refuses_an_unknown_domain():
     with pytest.raises(InvalidInput, match="nonnegative"):
         tc.PhysicalParameter(1.0, "Pa", "any")

@@ -48,7 +48,7 @@ class PhysicalParameter(nn.Module):
         name: how messages call it.
 
     Raises:
-        InvalidInput: value outside the domain or not finite.
+        InvalidInput: no number or tensor, outside the domain or not finite.
     """
 
     def __init__(self, value: float | Tensor, unit: str, domain: Domain = "positive", *, name: str = "parameter"):
@@ -81,7 +81,10 @@ class PhysicalParameter(nn.Module):
             self.raw.copy_(new)
 
     def _to_raw(self, value: float | Tensor) -> Tensor:
-        tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).detach().clone()
+        try:
+            tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).detach().clone()
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise InvalidInput(self.label, got=f"{value!r:.40}", expected="a number or a tensor") from error
         if not tensor.is_floating_point():
             tensor = tensor.to(torch.get_default_dtype())
         interval = _DOMAINS[self.domain]

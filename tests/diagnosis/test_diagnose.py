@@ -100,6 +100,9 @@ def test_where_nothing_is_hidden_nothing_is_named():
     assert answer.content["gain"] is None
     withdrawn = replace(answer.found, withdrawn=("air.drag_n",))  # a law did more, and then did not hold
     assert judge(withdrawn, withdrawn.setting.names).verdict == "unexplained"
+    setting, (first, *others) = answer.found.setting, answer.found.setting.episodes
+    late = replace(answer.found, setting=replace(setting, episodes=(replace(first, dropped=3), *others)))
+    assert any("come after the motion's end" in text for text in judge(late, setting.names).content["warnings"])
 
 
 def test_one_motion_is_refused(tmp_path, capsys):

@@ -52,6 +52,7 @@ def held():
         ({"hand": turning(1.0, math.radians(95), 2)}, "over 90 degrees between knots; .*more knots"),
         ([trajectory()], "motion; got list; expected a dict"),
         ({"hand": torch.eye(4)}, r"motion\['hand'\]; got Tensor; expected a Trajectory"),
+        ({"hand": trajectory()._replace(closed=torch.ones(2))}, "closed; got float32; expected bool; for example"),
         ({"hand": trajectory()._replace(closed=[True, True])}, r"motion\['hand'\]; got Tensor, Tensor, list"),
         ({"hand": trajectory(pose=torch.eye(4).long().repeat(2, 1, 1))}, r"pose; got torch\.int64"),
     ],

@@ -20,6 +20,16 @@ from torchcloth.boundaries import (
 from torchcloth.errors import InvalidInput, MissingDependency
 
 
+def test_state_brings_the_cell_along():
+    """Two grids of one shape: a solid and another of twice its size."""
+    small = MeshSolid(*block((0.1, 0.08, 0.06), (0, 0, 0)), cell=0.01)
+    large = MeshSolid(*block((0.2, 0.16, 0.12), (0, 0, 0)), cell=0.02)
+    p = torch.tensor([[0.07, 0.01, 0.0], [0.0, 0.0, 0.02]])
+    assert not torch.equal(small.distance(p)[0], large.distance(p)[0])
+    small.load_state_dict(large.state_dict())
+    assert torch.equal(small.distance(p)[0], large.distance(p)[0])
+
+
 @pytest.mark.parametrize("cell", [0.012, 0.006])
 def test_a_mesh_solid_is_the_solid_that_its_mesh_draws(cell):
     """Against closed forms: a ball's surface to cell^2 / (4 r), a box's faces exactly and its edges to half a cell."""

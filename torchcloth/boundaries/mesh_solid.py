@@ -51,27 +51,29 @@ class MeshSolid(AbstractCollider):
         super().__init__(friction, pose=pose, **options)
         x, f = _closed(np.array(vertices, np.float64), np.array(faces, np.int64))
         low, extent = x.min(0), np.ptp(x, axis=0)
-        self.cell = float(extent.max() / 48 if cell is None else cell)
-        if not 0 < self.cell < np.inf:
-            raise InvalidInput("cell", got=f"{self.cell:g} m", expected="a length > 0")
-        count = np.ceil(extent / self.cell - 1e-9) + 1 + 2 * MARGIN
+        cell = float(extent.max() / 48 if cell is None else cell)
+        if not 0 < cell < np.inf:
+            raise InvalidInput("cell", got=f"{cell:g} m", expected="a length > 0")
+        count = np.ceil(extent / cell - 1e-9) + 1 + 2 * MARGIN
         if count.prod() > MOST:
             raise InvalidInput(
                 "cell",
-                got=f"{self.cell:g} m, which asks for {count.prod():.3g} grid nodes",
+                got=f"{cell:g} m, which asks for {count.prod():.3g} grid nodes",
                 expected=f"at most {MOST:.3g} nodes",
-                remedy=f"take a cell of {self.cell * (count.prod() / MOST) ** (1 / 3):.2g} m or more",
+                remedy=f"take a cell of {cell * (count.prod() / MOST) ** (1 / 3):.2g} m or more",
             )
-        origin = low + extent / 2 - (count - 1) / 2 * self.cell
-        axes = [origin[k] + self.cell * np.arange(int(count[k])) for k in range(3)]
+        origin = low + extent / 2 - (count - 1) / 2 * cell
+        axes = [origin[k] + cell * np.arange(int(count[k])) for k in range(3)]
         values = _signed_distances(x, f, np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3))
         dtype = torch.get_default_dtype()
         self.register_buffer("values", torch.as_tensor(values, dtype=dtype))
+        self.register_buffer("cell", torch.tensor(cell, dtype=dtype))
         self.register_buffer("origin", torch.as_tensor(origin, dtype=dtype))
         self.register_buffer("count", torch.as_tensor(count.astype(np.int64)))
         self.register_buffer("up", torch.tensor([0.0, 0.0, 1.0], dtype=dtype), persistent=False)
         self.up: Tensor
         self.values: Tensor
+        self.cell: Tensor
         self.origin: Tensor
         self.count: Tensor
 

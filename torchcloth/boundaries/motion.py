@@ -19,7 +19,8 @@ def check(trajectory: Trajectory, name: str) -> None:
     """Refuse a trajectory that cannot be followed.
 
     Raises:
-        InvalidInput: shapes, time order, non-finite poses, or turns over 90 degrees between knots.
+        InvalidInput: shapes, time order, ``closed`` that is not bool, non-finite poses, or turns over 90 degrees
+            between knots.
     """
     where = f"motion[{name!r}]"
     if not isinstance(trajectory, Trajectory) or not all(isinstance(part, Tensor) for part in trajectory):
@@ -33,6 +34,9 @@ def check(trajectory: Trajectory, name: str) -> None:
             got=f"t {tuple(t.shape)}, pose {tuple(pose.shape)}, closed {tuple(closed.shape)}",
             expected="t [K], pose [..., K, 4, 4], closed [K] with K >= 2",
         )
+    if closed.dtype != torch.bool:
+        got, remedy = str(closed.dtype).removeprefix("torch."), "for example closed > 0.5"
+        raise InvalidInput(f"{where}.closed", got=got, expected="bool", remedy=remedy)
     if not bool((t[1:] > t[:-1]).all()):
         raise InvalidInput(f"{where}.t", got="times that do not increase", expected="strictly increasing seconds")
     if not pose.is_floating_point() or not bool(torch.isfinite(pose).all()):

@@ -66,7 +66,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=35,
         metavar="N",
-        help="at most N on all frames, after up to 10 on early ones (35)",
+        help="at most N on all frames, after up to 10 on early ones (35); what is sought where derivatives "
+        "fail takes up to 20 a stage",
     )
     parser.add_argument(
         "--use", nargs="+", choices=["points", "markers", "force"], help="kinds of data (default: all of an episode)"

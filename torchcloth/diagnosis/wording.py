@@ -110,7 +110,8 @@ def _residual(found: dict[str, Any] | None) -> list[str]:
 
 def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> list[str]:
     """What a reader of a search over episodes with these motions should mind; ``left`` is its lack of fit."""
-    out = [
+    out = [doubt for e in found.setting.episodes for doubt in e.doubts()]
+    out += [
         f"{p.name} is {far:.1f} standard deviations from its data sheet: it does another's job"
         for p, far in found.end.model.strained
     ]

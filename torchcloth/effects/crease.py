@@ -76,6 +76,10 @@ class CreasingBending(Bending):
         """Curl and creases."""
         return curl + remembered(now)
 
+    def energy(self, c: Coefficients, x: Tensor, memory: Tensor | None = None) -> Tensor:
+        """Bending energy [...] J of a sheet with the creases ``memory`` [..., V, 3] 1/m; None: of a virgin one."""
+        return super().energy(c if memory is None else c._replace(curl=cast("Tensor", c.curl) + memory), x)
+
     def extra_repr(self) -> str:
         """One line of the data sheet."""
         return f"{super().extra_repr()}, yield_curvature={self.yield_curvature:g} 1/m"

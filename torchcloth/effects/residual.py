@@ -105,8 +105,15 @@ class ResidualForce(AbstractEffect):
         self.bound: Tensor  # [V, 1] -: over mass, bounds the damping rate per unit viscosity
 
     def bind(self, mesh: Mesh) -> ResidualForce:
-        """Resolve places and stencils."""
+        """Resolve places and stencils.
+
+        Raises:
+            InvalidInput: a held vertex that the mesh does not have.
+        """
         like = {"dtype": torch.get_default_dtype(), "device": self.strength.raw.device}
+        wrong = [k for k in self.held if not 0 <= k < len(mesh.vertices)]
+        if wrong:
+            raise InvalidInput("held", got=f"vertex {wrong[0]}", expected=f"0 to {len(mesh.vertices) - 1}")
         self.triangles.bind(mesh, self.strength.raw.device)
         self.sheet.bind(mesh, device=self.strength.raw.device)
         weights = torch.as_tensor(_places(mesh, self.held), **like)

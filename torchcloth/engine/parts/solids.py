@@ -51,7 +51,7 @@ def _cylinder(low: Lowering, bar: Cylinder) -> Distance:
 
 def _mesh_solid(low: Lowering, solid: MeshSolid) -> Distance:
     values = low.program.constant(solid.values.reshape(-1, 1))
-    cell = solid.origin.new_tensor([solid.cell])
+    cell = solid.cell.reshape(1)
     grid = _row(low, solid.origin, solid.count - 1, cell)
     rest = _row(low, cell, solid.up)
 
