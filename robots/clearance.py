@@ -68,16 +68,20 @@ class Solids(NamedTuple):
         return Solids(self.kind[solid], self.half[solid], self.pose[time, solid])
 
 
-def nearest(solids: Sequence[Named], pairs: Sequence[tuple[int, int]], times: Tensor) -> Gap:
-    """The smallest distance among ``pairs`` of solids at ``times`` [T] s; ``FAR`` at most, nothing finer is asked."""
-    best = Gap(FAR, "", "", 0.0)
+def nearest(solids: Sequence[Named], pairs: Sequence[tuple[int, int]], times: Tensor, least: float = 0.0) -> Gap:
+    """The smallest distance among ``pairs`` of solids at ``times`` [T] s.
+
+    ``FAR`` at most, or ``least`` [m] where more is asked for: nothing finer is.
+    """
+    far = max(FAR, least)
+    best = Gap(far, "", "", 0.0)
     if not pairs:
         return best
     every = Solids.of([solid.primitive for solid in solids], len(times))
     a, b = torch.tensor(pairs).T
     ball = every.half.norm(dim=-1)
     apart = (every.pose[:, a, :3, 3] - every.pose[:, b, :3, 3]).norm(dim=-1) - ball[a] - ball[b]
-    time, pair = torch.nonzero(apart < FAR, as_tuple=True)
+    time, pair = torch.nonzero(apart < far, as_tuple=True)
     if not len(time):
         return best
     bound = distances(every.pick(time, a[pair]), every.pick(time, b[pair]))

@@ -39,21 +39,21 @@ def within_arm(scene: Scene, name: str, q: Tensor, times: Tensor, clearance: flo
         fingers = [i for i in range(top) if solids[i].primitive.link == arm.frame]
         others = [i for i in range(top) if i not in fingers and bodies[i] > 0]  # the root may stand on it
         solids = [*solids, Named("the table", scene.table.primitive())]
-        gaps.append((clearance, nearest(solids, [(i, top) for i in others], times)))
+        gaps.append((clearance, nearest(solids, [(i, top) for i in others], times, clearance)))
         gaps.append((0.0, nearest(solids, [(i, top) for i in fingers], times)))
     refusals = [gap.refusal(least) for least, gap in gaps if gap.distance < least]
     closest = min((gap for least, gap in gaps if least > 0), key=lambda gap: gap.distance)
     return closest, refusals[0] if refusals else None
 
 
-def between_arms(scene: Scene, splines: Mapping[str, Spline]) -> Gap:
-    """The smallest distance of any arm to any other."""
+def between_arms(scene: Scene, splines: Mapping[str, Spline], clearance: float = 0.0) -> Gap:
+    """The smallest distance of any arm to any other; ``FAR`` or ``clearance`` [m] where all are farther apart."""
     times = next(iter(splines.values())).finer(STEP)
     groups = [_solids(scene[name], name, spline.at(times)[0]) for name, spline in splines.items()]
     solids = [solid for group in groups for solid in group]
     owner = [number for number, group in enumerate(groups) for _ in group]
     pairs = [(i, j) for i, j in combinations(range(len(solids)), 2) if owner[i] != owner[j]]
-    return nearest(solids, pairs, times)
+    return nearest(solids, pairs, times, clearance)
 
 
 def _solids(arm: Arm, name: str, q: Tensor) -> list[Named]:

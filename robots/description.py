@@ -150,12 +150,14 @@ def _axis(joint: Any) -> Tensor:
 
 
 def _limits(joint: Any) -> tuple[float, ...]:
-    """Lower, upper, soft lower, soft upper, velocity, effort; infinite where the file is silent."""
+    """Lower, upper, soft lower, soft upper, velocity, effort; infinite where the file is silent, or a velocity is 0."""
     lower, upper, velocity, effort = -math.inf, math.inf, math.inf, math.inf
     if joint.limit is not None:
-        velocity, effort = joint.limit.velocity, joint.limit.effort
+        velocity, effort = joint.limit.velocity or math.inf, joint.limit.effort  # 0 is "not stated", as in ROS
         if joint.type != "continuous":  # URDF gives a continuous joint's missing bounds as 0
             lower, upper = joint.limit.lower, joint.limit.upper
+    if not velocity > 0:
+        raise InvalidInput(f"velocity limit of joint {joint.name!r}", got=velocity, expected="a value > 0")
     if lower > upper:
         raise InvalidInput(f"limits of joint {joint.name!r}", got=f"{lower} to {upper}", expected="lower <= upper")
     soft = joint.safety_controller

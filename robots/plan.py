@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from copy import deepcopy
 from itertools import product
 from typing import NamedTuple
 
@@ -94,6 +95,7 @@ def plan(
     for name, value in {"acceleration": acceleration, "clearance": clearance, "period": period}.items():
         if not (math.isfinite(value) and value > 0):
             raise InvalidInput(name, got=value, expected="a finite value > 0")
+    scene = deepcopy(scene).double()  # float32 has no digits for solutions as exact as these
     spans = {name: path.t[[0, -1]].tolist() for name, path in action.motion.items()}
     if any(max(ends) - min(ends) > SAME for ends in zip(*spans.values(), strict=True)):
         told = ", ".join(f"{name} {first:g} to {last:g} s" for name, (first, last) in spans.items())
@@ -106,7 +108,7 @@ def plan(
     refusals = []
     for combination in sorted(product(*options.values()), key=lambda some: max(way.load.factor for way, _ in some)):
         chosen = {name: way for name, (way, _) in zip(options, combination, strict=True)}
-        gap = between_arms(scene, {name: way.spline for name, way in chosen.items()})
+        gap = between_arms(scene, {name: way.spline for name, way in chosen.items()}, clearance)
         if gap.distance >= clearance:
             nearest = min([gap, *(own for _, own in combination)], key=lambda gap: gap.distance)
             return _timed(scene, action, chosen, nearest, slow_down, period)

@@ -19,7 +19,7 @@ Case = Callable[[], dict[str, Any]]
 
 
 class Kept:
-    """A folder of finished cases, one JSON file each; nothing is written before the first is finished.
+    """A folder of finished cases, one JSON file each; nothing is written before ``begin``, or the first is finished.
 
     Args:
         folder: new, or one that holds a study of the same settings.
@@ -32,6 +32,11 @@ class Kept:
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         self.folder, self.settings = folder, dict(settings)
         check_settings(folder, self.settings)
+
+    def begin(self) -> None:
+        """Note the settings at once: where cases leave more than a result, also of a study stopped in its first one."""
+        if not (self.folder / "study.json").exists():
+            write_settings(self.folder, self.settings)
 
     def find(self, name: str) -> dict[str, Any] | None:
         """A finished case, or None.
@@ -49,8 +54,7 @@ class Kept:
 
     def keep(self, name: str, content: Mapping[str, Any]) -> None:
         """Write a finished case; a crash leaves no half file."""
-        if not self.folder.exists() or not (self.folder / "study.json").exists():
-            write_settings(self.folder, self.settings)
+        self.begin()
         self._path(name).parent.mkdir(exist_ok=True)
         write_text(self._path(name), json.dumps(content, indent=1, allow_nan=False) + "\n")
 

@@ -85,6 +85,15 @@ def test_a_wrong_law_widens_the_interval_until_it_covers(tables):
     assert missed == pytest.approx(share, rel=0.2), "the 45 degrees are missed by what was put in"
 
 
+def test_a_table_whose_miss_the_numbers_errors_explain_says_nothing_of_the_law():
+    """Of three angles, the two at the ends leave the shear modulus open, whatever the third one reads."""
+    draw = np.random.default_rng(2)
+    three = [readings(angle, 0.03, draw, count=20) for angle in (0, 45, 90)]
+    *_, whole = cross_validated(fit_tension(cloth(), three, NAMES), cloth(), three)
+    assert whole.model.tables[1].left_out == {"force": None, "lateral": None}
+    assert "45" not in predict_tension(whole.model, strip(30)).law_from
+
+
 def test_where_the_laws_part_comes_from_is_said(fit, tables):
     note = predict_tension(fit.model, strip(30)).warnings
     assert note == ["the law's part is of fitted tables: a direction that was not fitted may be missed by more"]

@@ -186,6 +186,7 @@ def test_load_refuses(crane, tmp_path):
         ('effort="5"', "", "effort"),
         ('xyz="1 1 0"', 'xyz="0 0 0"', "axis of joint 'luff'"),
         ('lower="-1"', 'lower="3"', "limits of joint 'luff'"),
+        ('velocity="2"', 'velocity="-1"', "velocity limit of joint 'luff'; got -1.0; expected a value > 0"),
         ('<parent link="ground"/>', '<parent link="hook"/>', "closes a loop"),
         ('<parent link="ground"/>', '<parent link="gone"/>', "no parent link"),
     ],
@@ -194,6 +195,13 @@ def test_load_refuses_a_broken_file(crane, old, new, match):
     assert old in crane.read_text()
     crane.write_text(crane.read_text().replace(old, new))
     refused(match, crane, frame="hook")
+
+
+def test_a_velocity_of_zero_is_no_limit(crane):
+    """As ROS reads it: 0 stands where nobody knew better, and a joint that cannot move is fixed."""
+    assert robots.load(crane, frame="hook").limits.velocity[-1] == 2.0
+    crane.write_text(crane.read_text().replace('velocity="2"', 'velocity="0"'))
+    assert robots.load(crane, frame="hook").limits.velocity[-1] == torch.inf
 
 
 def test_loading_is_silent(crane, capfd):

@@ -105,6 +105,9 @@ def test_nearest_finds_pair_and_time():
     assert gap.distance == pytest.approx(0.06, abs=EXACT)
     assert nearest(solids, [(0, 2)], torch.arange(5)).distance == FAR
     assert nearest(solids, [], torch.arange(5)).distance == FAR
+    apart = [Named(str(x), sphere(0.1, x=x)) for x in (0.0, 0.5)]
+    assert nearest(apart, [(0, 1)], torch.arange(1)).distance == FAR
+    assert nearest(apart, [(0, 1)], torch.arange(1), least=0.4).distance == pytest.approx(0.3, abs=EXACT)
 
 
 def test_links_that_the_makers_never_check_cannot_meet(random_q):

@@ -61,6 +61,16 @@ def finely(found, name, count=8000):
     return times, Spline.through(found.t, found.q[name]).at(times)[0]
 
 
+def test_single_precision_arms_are_planned_in_double(made):
+    action, left, right = CASES["hang"]
+    holds = {"left": Hold(*left), "right": Hold(*right)}
+    rig = robots.bimanual_rig(dtype=torch.float32)
+    found = plan(rig, action, holds=holds)
+    assert next(rig.buffers()).dtype == torch.float32
+    for name, q in made["hang"][1].q.items():
+        torch.testing.assert_close(found.q[name], q, rtol=0, atol=1e-5)
+
+
 @pytest.mark.parametrize("family", CASES)
 @pytest.mark.parametrize("arm", ["left", "right"])
 def test_within_position_velocity_and_acceleration_limits(rig, made, family, arm):

@@ -33,6 +33,10 @@ SEVEN = "{in_features: 7, out_features: 1}"
         (["data.train=nowhere"], "nowhere does not exist"),
         (["data.train=nowhere/*"], "got no folder that matches nowhere/*"),
         (["data.train=example:bimanual_swing", "data.val={held}"], "held: another cloth"),
+        (
+            ["data.val={trained}"],
+            "config: data.val; got {trained}, which is in data.train, too; expected episodes that",
+        ),
         (["data.val_motion=fling"], "config: data.val_motion; got 'fling'; expected one of data.train: shake"),
         (["data.per_step=4"], "config: data.per_step; got 4; expected at most 3"),
         (["learn.parameters=[stiffness]"], "parameter to fit; got 'stiffness'; expected one of"),
@@ -57,7 +61,9 @@ SEVEN = "{in_features: 7, out_features: 1}"
 )
 def test_one_line(config, episodes, capsys, options, words):
     path = config()
-    options = [option.replace("{held}", str(episodes / "held")) for option in options]
+    places = {"{held}": str(episodes / "held"), "{trained}": str(episodes / "ep_1")}
+    for name, place in places.items():
+        options, words = [option.replace(name, place) for option in options], words.replace(name, place)
     assert main(["--config", path, *options]) == 2
     said = capsys.readouterr().err
     assert said.startswith("fit: ")
@@ -78,9 +84,19 @@ def test_a_file_that_is_no_config(tmp_path, capsys, content):
 def test_another_problem_is_not_resumed(config, episodes, capsys):
     path = config(optimizer={"steps": 1})
     assert main(["--config", path]) == 0
-    for other in (["optimizer.rate=0.2"], ["model.start.youngs_modulus=5e4"], [f"data.train={episodes}/ep_0"]):
+    moved = [f"data.train=[{episodes}/ep_0,{episodes}/ep_1]", f"data.val={episodes}/ep_2"]
+    changed = ["optimizer.rate=0.2"], ["model.start.youngs_modulus=5e4"], [f"data.train={episodes}/ep_0"], moved
+    for other in changed:
         assert main(["--config", path, "--resume", *other]) == 2
         assert "a checkpoint of another run" in capsys.readouterr().err
+
+
+def test_fewer_steps_than_were_done_are_refused(config, capsys):
+    path = config(optimizer={"steps": 2})
+    assert main(["--config", path]) == 0
+    capsys.readouterr()
+    assert main(["--config", path, "--resume", "optimizer.steps=1"]) == 2
+    assert "config: optimizer.steps; got 1; expected at least 2, the steps already done" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("damage", [lambda whole: whole[: len(whole) // 2], lambda _: b"", lambda _: b"no checkpoint"])

@@ -74,6 +74,32 @@ def test_finished_cases_are_not_repeated_and_more_may_be_added(called, tmp_path,
     assert (tmp_path / "s" / "hidden.md").read_text().count("| 00") == 4
 
 
+def test_a_round_that_is_stopped_in_its_first_case_keeps_its_secret(called, tmp_path, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hidden, "answered", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            hidden.run(options(tmp_path, cases=1))
+    secret = json.loads((tmp_path / "s" / "study.json").read_text())["secret"]
+    assert hidden.drawn(options(tmp_path)).settings["secret"] == secret
+
+
+def test_what_another_version_has_begun_is_begun_anew(called, tmp_path, monkeypatch):
+    (tmp_path / "a" / "progress").mkdir(parents=True)
+    usual = hidden._run
+
+    def run(command):
+        if "--resume" in command:
+            return Namespace(returncode=2, stdout="", stderr="resume; got progress of another fit")
+        (tmp_path / "a").rmdir()  # empty by now
+        return usual(command)
+
+    monkeypatch.setattr(hidden, "_run", run)
+    assert hidden.answered([tmp_path / "e1"], tmp_path / "a") == ANSWER
+
+
 def test_secrets_are_kept_fresh_ones_differ_and_development_is_no_secret(tmp_path):
     one, two = (hidden.drawn(options(tmp_path / name)) for name in "ab")
     assert one.settings["secret"] != two.settings["secret"]

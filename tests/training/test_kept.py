@@ -53,6 +53,13 @@ def test_an_error_ends_a_study_of_several_jobs(tmp_path):
         Kept(tmp_path / "s", {}).run({"bad": work} | never, jobs=2)
 
 
+def test_settings_are_known_from_where_a_study_begins(tmp_path):
+    """Cases that leave more than a result would else be taken for those of other settings."""
+    Kept(tmp_path / "s", {"secret": 3}).begin()
+    with pytest.raises(InvalidInput, match="which holds a study with secret 3; expected secret 4"):
+        Kept(tmp_path / "s", {"secret": 4})
+
+
 def test_nothing_is_written_before_a_case_is_finished(tmp_path):
     assert Kept(tmp_path / "s", {}).find("a") is None
     with pytest.raises(ValueError, match=r"NaN|nan|JSON"):

@@ -31,7 +31,8 @@ class Pulled:
 
     ``missed``: root mean square error of the force, over the root of mean times largest rise above the preload; and of
     the lateral strain, over the root of its mean times largest size; None where not measured. ``left_out``: of the law
-    fitted to the other tables, without what the errors of its numbers explain; None where that was not tried.
+    fitted to the other tables, without what the errors of its numbers explain; None where that was not tried, or they
+    explain it all, which tells nothing of the law.
     """
 
     angle: float  # rad
@@ -117,8 +118,10 @@ def missed(table: ForceDisplacement, curve: Response, known: tuple[Tensor, Tenso
         square = (curve[k].detach().numpy()[rows] - seen[rows]) ** 2
         if known is not None:
             square = square - known[k].numpy()[rows] ** 2
+            if square.mean() <= 0:
+                continue
         rise = np.abs(seen[rows] - base)
-        out[kind] = math.sqrt(max(0.0, square.mean()) / (rise.mean() * rise.max()))
+        out[kind] = math.sqrt(square.mean() / (rise.mean() * rise.max()))
     return out
 
 

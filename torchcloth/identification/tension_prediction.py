@@ -236,7 +236,7 @@ def _law_from(tables: list[Pulled], angle: float) -> tuple[list[dict[str, float 
     """The shares to take the law's misfit from, where from in words, warnings."""
     if any(abs(_folded(t.angle) - _folded(angle)) < SAME for t in tables):
         return [t.missed for t in tables], "fitted tables, of which one has this angle", []
-    tried = [t for t in tables if t.left_out is not None]
+    tried = [t for t in tables if t.left_out is not None and any(x is not None for x in t.left_out.values())]
     if not tried:
         note = "the law's part is of fitted tables: a direction that was not fitted may be missed by more"
         return [t.missed for t in tables], "fitted tables", [note]

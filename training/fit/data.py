@@ -26,10 +26,15 @@ def found(data: Data) -> tuple[list[Recording], list[Recording]]:
     """The episodes to train with and to validate with.
 
     Raises:
-        InvalidInput: a pattern without episodes, nothing to train with, or episodes of different cloths.
+        InvalidInput: a pattern without episodes, nothing to train with, an episode to do both with, or episodes of
+            different cloths.
         RecordingError: an episode that cannot be trusted.
     """
     train, val = _read(data.train, "data.train"), _read(data.val, "data.val")
+    both = {_place(r) for r in train} & {_place(r) for r in val}
+    if both:
+        got = f"{min(both)}, which is in data.train, too"
+        raise InvalidInput("config: data.val", got=got, expected="episodes that are not trained with")
     motions = {r.split.get("motion") for r in train}
     for motion in data.val_motion:
         if motion not in motions:
@@ -48,7 +53,7 @@ def found(data: Data) -> tuple[list[Recording], list[Recording]]:
 
 
 def _read(patterns: Sequence[str], key: str) -> list[Recording]:
-    folders: dict[Path, None] = {}
+    folders: dict[Path, Path] = {}
     for pattern in patterns:
         if pattern.startswith(EXAMPLE):
             shipped = resources.files("torchcloth") / "examples" / pattern.removeprefix(EXAMPLE)
@@ -57,8 +62,13 @@ def _read(patterns: Sequence[str], key: str) -> list[Recording]:
             matches = sorted(glob(pattern)) if any(c in pattern for c in "*?[") else [pattern]
         if not matches:
             raise InvalidInput(f"config: {key}", got=f"no folder that matches {pattern}", expected="episodes")
-        folders |= dict.fromkeys(map(Path, matches))
-    return [recordings.read(folder) for folder in folders]
+        for folder in map(Path, matches):
+            folders.setdefault(folder.resolve(), folder)
+    return [recordings.read(folder) for folder in folders.values()]
+
+
+def _place(r: Recording) -> Path:
+    return Path(str(r.path)).resolve()
 
 
 class Deal(Sampler[list[int]]):

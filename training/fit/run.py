@@ -44,9 +44,9 @@ def fit(config: Config, resume: bool = False) -> FitModule:
         resume: go on from ``out/last.ckpt``; the result is what it would have been, bit by bit.
 
     Raises:
-        InvalidInput: a config or data that make no run; nothing to resume.
+        InvalidInput: a config or data that make no run; nothing to resume, or more steps done than asked for.
         RecordingError: an episode that cannot be trusted.
-        SimulationDiverged: a step led where nothing can be simulated; the checkpoint before it is kept.
+        SimulationDiverged: a step led where nothing can be simulated, and the checkpoint is from there.
     """
     torch.set_num_threads(1)  # meshes of a thousand triangles: processes pay, threads do not
     folder = Path(config.out)
@@ -56,16 +56,17 @@ def fit(config: Config, resume: bool = False) -> FitModule:
     if resume and not checkpoint.is_file():
         raise InvalidInput("--resume", got=f"no {checkpoint}", expected="what an interrupted run left")
     if resume:
-        _check_readable(checkpoint)
+        _check_checkpoint(checkpoint, config.optimizer.steps)
     with precision(config.model.precision):
         return _run(config, folder, checkpoint if resume else None)
 
 
-def _check_readable(checkpoint: Path) -> None:
+def _check_checkpoint(checkpoint: Path, steps: int) -> None:
     try:
-        whole = {"state_dict", "hyper_parameters", "history"} <= torch.load(checkpoint, weights_only=True).keys()
+        found = torch.load(checkpoint, weights_only=True)
+        whole = {"state_dict", "hyper_parameters", "history"} <= found.keys()
     except (*DAMAGED, AttributeError):
-        whole = False
+        found, whole = {}, False
     if not whole:
         raise InvalidInput(
             "--resume",
@@ -73,6 +74,9 @@ def _check_readable(checkpoint: Path) -> None:
             expected="what an interrupted run left",
             remedy="start again without --resume",
         )
+    done = len(found["history"])
+    if done > steps:
+        raise InvalidInput("config: optimizer.steps", got=steps, expected=f"at least {done}, the steps already done")
 
 
 def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
@@ -149,4 +153,4 @@ def _problem(config: Config, cloth: Cloth, data: Episodes) -> str:
     """Fingerprint of data, model and options; of what may change while a run rests, nothing."""
     fixed = replace(config, out="", run=Run(seed=config.run.seed), data=replace(config.data, train=[], val=[]))
     fixed = replace(fixed, optimizer=replace(config.optimizer, steps=Optimizer.steps))
-    return digest([fixed, *Objective(cloth, [], [*data.train, *data.val]).identity()])
+    return digest([fixed, len(data.train), *Objective(cloth, [], [*data.train, *data.val]).identity()])

@@ -76,7 +76,7 @@ FAST = Scale(
 
 
 class Problem(NamedTuple):
-    """What all methods are given."""
+    """What all methods are given; descent and Adam look at its clouds alone."""
 
     cloth: Cloth  # at the start values
     recording: Recording
@@ -193,8 +193,8 @@ def _table(found: dict[str, dict[str, Any]]):
 
 NOTE = (
     "descent: plain gradient descent; paper: Adam with the paper's stop, a Chamfer distance below 15 mm. Both follow "
-    "the paper's loss (cloud to nearest vertex), in logarithms, and have no test of convergence. *: stopped there, not "
-    "converged. ?: called not identifiable. Iterations: of all stages. CPU: of the fit alone; clock: with what "
+    "the paper's loss (cloud to nearest vertex), in logarithms, without markers and forces, which Gauss-Newton uses, "
+    "and have no test of convergence. *: stopped there, not converged. ?: called not identifiable. Iterations: of all stages. CPU: of the fit alone; clock: with what "
     "else ran; load: processes that wanted to run, mean of 5 minutes. Chamfer: one-sided, cloud to surface, at start "
     "and end. Gauss-Newton counts each of its tangents as a simulation, and ends with error bars."
 )

@@ -121,8 +121,8 @@ def _marks(result: Mapping[str, Any]) -> list[str]:
         lines.append(f"{promise}: {sum(judged.values())} of {len(judged)}" + (f"; not {missed}" if missed else ""))
     counts = []
     for symbol in ("E", "ν"):
-        own = [fabric[symbol]["stretched"] for fabric in result["fabrics"].values()]
-        counts.append(f"{sum(s.get('covered') or 0 for s in own)} of {sum(s['identifiable'] for s in own)} of {symbol}")
+        own = [s for f in result["fabrics"].values() if (s := f[symbol]["stretched"])["covered"] is not None]
+        counts.append(f"{sum(s['covered'] for s in own)} of {sum(s['identifiable'] for s in own)} of {symbol}")
     lines.append(f"95 % intervals hold the truth in {', '.join(counts)}: fits corrected for their mesh")
     return [*lines, f"{result['seconds']:.0f} s a fit (median)"]
 

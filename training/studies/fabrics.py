@@ -84,7 +84,7 @@ def _fabric(name: str, cases: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]
 
 
 def statistics(estimates: Sequence[Mapping[str, Any]], truth: float) -> dict[str, Any]:
-    """Of the trials that know the parameter: grand mean, CoV, relative errors. None where fewer than half know it."""
+    """Of the trials that know the parameter: grand mean, CoV, relative errors. None unless more than half know it."""
     known = [e for e in estimates if e["identifiable"]]
     out: dict[str, Any] = {"trials": len(estimates), "identifiable": len(known)}
     if 2 * len(known) <= len(estimates):

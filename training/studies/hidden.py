@@ -10,6 +10,7 @@ import argparse
 import json
 import os
 import secrets
+import shutil
 import signal
 import subprocess
 import sys
@@ -62,6 +63,7 @@ def run(options: argparse.Namespace) -> None:
     """Make, diagnose and reveal what is missing, then print and write hidden.json and hidden.md."""
     chosen = drawn(options)
     kept = Kept(options.out, chosen.settings)
+    kept.begin()
     work: dict[str, Callable[[], dict[str, Any]]] = {
         name: partial(one, options.out, name, seed, chosen.fast) for name, seed in chosen.seeds.items()
     }
@@ -159,7 +161,11 @@ def _gain(
 def answered(episodes: list[Path], out: Path) -> dict[str, Any]:
     """What ``torchcloth diagnose`` writes, or how it ended instead."""
     command = [sys.executable, "-m", "torchcloth.cli", "diagnose", *map(str, episodes), "--out", str(out)]
-    done = _run([*command, "--resume"] if (out / PROGRESS).exists() else command)
+    begun = (out / PROGRESS).exists()
+    done = _run([*command, "--resume"] if begun else command)
+    if begun and done.returncode == REFUSED:  # another version of the program left it
+        shutil.rmtree(out / PROGRESS)
+        done = _run(command)
     if done.returncode in STOPPED:  # by who stops the study: that is no answer
         raise KeyboardInterrupt
     if done.returncode == 0:

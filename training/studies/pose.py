@@ -59,6 +59,7 @@ def run(options: argparse.Namespace) -> None:
     """Every motion with every model; a table, and a picture."""
     setting = FAST if options.fast else Setting()
     kept = Kept(options.out, {"study": "pose", **{key: _plain(value) for key, value in setting._asdict().items()}})
+    kept.begin()
     cases: dict[str, Callable[[], dict[str, Any]]] = {}
     for motion in setting.motions:
         cases[f"{motion}, geometry"] = lambda motion=motion: _geometry(_scene(options.out, setting, motion))

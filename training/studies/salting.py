@@ -110,7 +110,7 @@ def salted(source: Path, fast: bool) -> dict[str, Any]:
             "truth": {"effect": salt.cause, "amplitude": salt.amplitude, "unit": salt.unit},
             "told": [{"effect": r.hypothesis.name, "amplitude": r.amplitude, "gain": r.gain} for r in rows[:3]],
             "fitted": sizes[1][0] - sizes[0][0],
-            "std": sizes[1][1],
+            "std": sizes[1][1],  # of either fit; of their difference it is less, they have their noise in common
         }
     return out
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchcloth.identification import cross_validated, fit_tension, predict_tension, specimen_like
-from torchcloth.identification.tension_model import TensionModel, with_left_out
+from torchcloth.identification.tension_model import TensionModel
 from torchcloth.recordings import ForceDisplacement
 
 from ..checkout import module
@@ -25,7 +25,7 @@ EVERY = {True: 8, False: 2}  # rows of nylon; fast, whole
 def nylon(source: Path, out: Path, fast: bool) -> dict[str, Any]:
     """The four angles together, each from the other three, and angles between; saves the fit for `torchcloth predict`.
 
-    The interval of an angle that was left out takes the law's part from the other angles left out, not from its own.
+    The interval of an angle that was left out takes the law's part from the others, each left out of those three.
     """
     adapter = module("realdata", "nylon")
     tables = {angle: t.rows(slice(None, None, EVERY[fast])) for angle, t in adapter.tables(source).items()}
@@ -33,10 +33,10 @@ def nylon(source: Path, out: Path, fast: bool) -> dict[str, Any]:
     fit = fit_tension(adapter.start(), pulls, names)
     *parts, whole = cross_validated(fit, adapter.start(), pulls)
     whole.save(out)
-    shares = [t.left_out or {} for t in whole.model.tables]
     left_out = {}
-    for k, (angle, part) in enumerate(zip(tables, parts, strict=True)):
-        model = with_left_out(part.model, [shares[i] for i in range(len(shares)) if i != k])
+    for angle, part in zip(tables, parts, strict=True):
+        *_, nested = cross_validated(part, adapter.start(), [t for a, t in tables.items() if a != angle])
+        model = nested.model
         unknown = [name for name in names if not part.parameters[name].identifiable]
         left_out[str(angle)] = predict_tension(model, tables[angle]).as_dict() | {"not_identifiable": unknown}
     return {
