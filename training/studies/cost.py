@@ -194,7 +194,8 @@ def _table(found: dict[str, dict[str, Any]]):
 NOTE = (
     "descent: plain gradient descent; paper: Adam with the paper's stop, a Chamfer distance below 15 mm. Both follow "
     "the paper's loss (cloud to nearest vertex), in logarithms, without markers and forces, which Gauss-Newton uses, "
-    "and have no test of convergence. *: stopped there, not converged. ?: called not identifiable. Iterations: of all stages. CPU: of the fit alone; clock: with what "
+    "and have no test of convergence. *: stopped there, not converged. "
+    "?: called not identifiable. Iterations: of all stages. CPU: of the fit alone; clock: with what "
     "else ran; load: processes that wanted to run, mean of 5 minutes. Chamfer: one-sided, cloud to surface, at start "
     "and end. Gauss-Newton counts each of its tangents as a simulation, and ends with error bars."
 )
