@@ -96,6 +96,16 @@ def test_what_is_explained_is_counted_beyond_what_a_right_model_leaves():
     assert explained(calm, calm + rows(5e-3)) == 0.0
 
 
+def test_what_only_forces_tell_is_counted_where_positions_lack_nothing():
+    def rows(points, force, torque=3.0):
+        felt = [row("swing", force, 1.0, "force", "N"), row("swing", torque, 1.0, "torque", "N m")]
+        return [row("swing", 1e-3 * points), *felt]
+
+    assert explained(rows(1.05, 5.0), rows(1.06, 1.0)) == pytest.approx(24 / 32)
+    assert explained(rows(1.5, 5.0), rows(1.0, 5.0)) == 1.0  # or positions alone
+    assert explained(rows(5.0, 5.0), rows(5.0, 1.0)) == 0.0
+
+
 def snapped(found, at, stretches=8):
     """A row of which one stretch is 20 mm off."""
     (left, expected), off = found.stretches[at], 4e-4 / stretches
@@ -131,7 +141,7 @@ def test_motions_that_fit_are_asked_about_causes_where_others_do_not(monkeypatch
     end = SimpleNamespace(noise=None, evidence=None)
     rows = [row(name, 10.0 if name in lacking else 1.0, 1.0) for name in ("a", "b", "a")]
     monkeypatch.setattr(doubts, "lack_of_fit", lambda *_: rows)
-    monkeypatch.setattr(doubts, "renoised", lambda found, *_: found)
+    monkeypatch.setattr(doubts, "weighed_alike", lambda *both: both)
     monkeypatch.setattr(doubts, "predict", lambda found, names, alone: (found, sorted(alone)))
     monkeypatch.setattr(doubts, "of_episodes", lambda p, which: asked.append((p[1], which)))
     monkeypatch.setattr(doubts, "compare", lambda *_: None)

@@ -11,7 +11,7 @@ from torchcloth.diagnosis.cells import Cells
 from torchcloth.diagnosis.classes import alike, correlations
 from torchcloth.diagnosis.comparison import compare, predict, spread
 from torchcloth.diagnosis.evidence import as_rough
-from torchcloth.diagnosis.fitting import renoised, step_of
+from torchcloth.diagnosis.fitting import renoised, step_of, weighed_alike
 from torchcloth.diagnosis.noise import ROUGH, Noise, fit_noise, floor_of, whitened
 from torchcloth.diagnosis.screening import Row, _decided, screen
 from torchcloth.diagnosis.trials import CLEAR
@@ -230,13 +230,19 @@ def test_more_scatter_within_cells_is_no_gain():
     assert abs(compare(first, more, 1e-3).density) > CLEAR
 
 
-def test_cells_that_another_lacks_keep_their_scatter():
+def test_models_that_meet_other_cells_are_compared_on_those_that_both_meet():
+    """The same residuals are no gain, whichever of the two has met fewer of them."""
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
-    less = [Cells(*(column[5:] for column in c)) for c in ev.cells]
-    like = replace(ev, cells=[c._replace(spread=2 * c.spread) for c in less], numerics=[n[5:] for n in ev.numerics])
-    for own, taken in zip(ev.cells, as_rough(ev, like).cells, strict=True):
-        assert torch.equal(taken.spread[:5], own.spread[:5])
-        assert torch.equal(taken.spread[5:], 2 * own.spread[5:])
+    rough = replace(ev, cells=[c._replace(rough=1e-3 * torch.rand(len(c.value))) for c in ev.cells])
+    fewer = [Cells(*(column[5:] for column in c)) for c in rough.cells]
+    less = replace(ev, cells=[c._replace(spread=2 * c.spread) for c in fewer], numerics=[n[5:] for n in ev.numerics])
+    for own, taken in zip(ev.cells, as_rough(ev, less).cells, strict=True):
+        assert torch.equal(taken.key, own.key[5:])
+        assert torch.equal(taken.spread, 2 * own.spread[5:])
+    groups, one, other = ["x", "y", "x", "y"], toys.fitted(rough), toys.fitted(replace(less, cells=fewer))
+    for both in ((one, other), (other, one)):
+        first, second = (predict(found, groups) for found in weighed_alike(*both))
+        assert compare(first, second, 1e-3).density == pytest.approx(0.0, abs=1e-9)
 
 
 def test_an_episode_without_a_cell_says_nothing():
@@ -247,7 +253,9 @@ def test_an_episode_without_a_cell_says_nothing():
     noise = fit_noise(empty)
     assert torch.equal(noise.level, fit_noise(rest).level)
     assert torch.equal(whitened(empty, noise).value, whitened(rest, noise).value)
-    assert len(as_rough(ev, empty).cells[0].value) == len(ev.cells[0].value)
+    alike = as_rough(ev, empty)
+    assert [len(c.value) for c in alike.cells] == [0, *(len(c.value) for c in ev.cells[1:])]
+    assert torch.isfinite(whitened(alike, noise).value).all()
 
 
 def test_a_true_cause_predicts_motions_that_were_held_out():

@@ -55,6 +55,7 @@ class SensorSpec:
 def see(spec: SensorSpec, sheet: SheetSpec, t: Array, x: Array, rng: np.random.Generator) -> PointClouds:
     """Points of the true motion x [K, V, 3] m at t [K] s, at the sensor's own frame times."""
     stamps = np.arange(int((t[-1] - t[0]) * spec.rate + 1e-9) + 1) / spec.rate + t[0]
+    stamps = stamps[stamps - spec.delay <= t[-1] + 1e-9]  # of later light nothing is known
     frames = CubicSpline(t, x)(np.maximum(stamps - spec.delay, t[0]))
     walk = np.zeros(6)
     clouds = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,4 +78,6 @@ def _cells(gain: Gain) -> list[str]:
     low, high = gain.explained_ci95
     share = f"{100 * gain.explained:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
     density = f"{gain.density:+.0f} ({gain.ci95[0]:+.0f} to {gain.ci95[1]:+.0f})"
+    if math.isnan(gain.before):  # forces only
+        return ["–", "–", "–", density]
     return [f"{1e3 * gain.before:.2f}", f"{1e3 * gain.after:.2f}", share, density]

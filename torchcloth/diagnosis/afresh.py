@@ -30,7 +30,7 @@ def afresh(
 
     Without those that promise little beside the best.
     """
-    sheet = start.model.at(torch.zeros_like(start.model.point))
+    sheet = replace(start.model, values=torch.zeros_like(start.model.values))
     away = [replace(h, typical=-h.typical) for h in hypotheses if h.signed]
     about = staged(progress, "from the data sheet, causes")
     there = fit(sheet, setting, hypotheses, 0, about, before=start.evidence)

@@ -18,16 +18,19 @@ from .evidence import Evidence, gather
 from .fitting import prior_precision
 from .noise import unfitted, whitened
 from .setting import Progress, Setting
+from .steps import shifted
 from .world import Model
 
 SWEEPS = 2
 FARTHEST = 1.2  # widths, of one sweep
+HALVINGS = 4  # of a width without a world
 THERE = 0.25  # widths, from which on slopes do
 
 
 def approach(model: Model, setting: Setting, progress: Progress = lambda _: None) -> tuple[Model, Evidence]:
     """(a model near the optimum, evidence whose nuisances' slopes may be used from there on)."""
     wide = [*(p.std for p in model.parameters), *(0.5 * abs(h.typical) for h in model.accepted)]
+    wide = [_possible(model, k, width) for k, width in enumerate(wide)]
     width, before = torch.tensor(wide, dtype=torch.float64), None
     prior = prior_precision(model).sqrt()
     for _ in range(SWEEPS):
@@ -43,6 +46,15 @@ def approach(model: Model, setting: Setting, progress: Progress = lambda _: None
             break
         width = torch.where(u.abs() > 0.8, width, 0.5 * width)
     return model, before  # type: ignore[return-value]
+
+
+def _possible(model: Model, coordinate: int, width: float) -> float:
+    """The width, or as much of it as has a world on either side."""
+    for _ in range(HALVINGS):
+        if all(shifted(model, coordinate, sign * width).possible for sign in (1.0, -1.0)):
+            break
+        width *= 0.5
+    return width
 
 
 def _lowest(value: Tensor, slope: Tensor, bend: Tensor, start: Tensor, pull: Tensor, iterations: int = 50) -> Tensor:

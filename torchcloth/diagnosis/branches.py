@@ -45,8 +45,8 @@ def unstable(found: Fitted, setting: Setting, progress: Progress = lambda _: Non
     drawn = torch.randn(DIRECTIONS, len(point), generator=rng, dtype=point.dtype)
     steps = drawn / drawn.norm(dim=1, keepdim=True) * sizes
     steps = torch.cat([steps, -steps])
-    worlds = [found.model.at(point + step).world() for step in steps]
-    moved = [found.model.at(point + step).point - point for step in steps]
+    beside = [near for step in steps if (near := found.model.at(point + step)).possible]
+    worlds, moved = [near.world() for near in beside], [near.point - point for near in beside]
     moved += [torch.zeros_like(point)] * (2 * DIRECTIONS)
     plain, keys = found.model.world(), []
     for k, e in enumerate(setting.episodes):

@@ -40,6 +40,11 @@ class Predicted(NamedTuple):
     smooth: Tensor  # [C] share of the noise's variance that is no roughness
 
     @property
+    def place(self) -> Tensor:
+        """[C] the same for the same cell of the same episode by another model."""
+        return self.episode * 10**9 + self.key
+
+    @property
     def seen(self) -> Tensor:
         """[C] bool, a position and not a force."""
         return self.kind < SEEN
@@ -48,7 +53,7 @@ class Predicted(NamedTuple):
 class Gain(NamedTuple):
     """Of one model over another, on motions held out."""
 
-    before: float  # m RMS, whole residual of positions
+    before: float  # m RMS, whole residual of positions; NaN where nothing was seen
     after: float
     density: float  # log predictive density, second minus first
     ci95: tuple[float, float]  # of the density's difference
@@ -189,7 +194,8 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     seen, felt = counts * one.seen, counts * (one.kind == SEEN)
     calm = _calm(one, two, seen)
     mended = (_mended(one, two, seen), 3**0.5 * _mended(one, two, felt))  # a force has three cells
-    return Gain((before / n) ** 0.5, (after / n) ** 0.5, total, (low, high), share, (left, right), calm, mended)
+    rms = [(square / n) ** 0.5 if n else np.nan for square in (before, after)]  # nothing was seen, only felt
+    return Gain(rms[0], rms[1], total, (low, high), share, (left, right), calm, mended)
 
 
 def _share(squares: np.ndarray, floor: float) -> float:
@@ -200,11 +206,10 @@ def _share(squares: np.ndarray, floor: float) -> float:
 
 def _both(first: Predicted, second: Predicted) -> tuple[Predicted, Predicted]:
     """Cells that both have, in one order, their stretches numbered alike."""
-    key = lambda p: p.episode * 10**9 + p.key  # noqa: E731
-    shared = torch.isin(key(first), key(second))
+    shared = torch.isin(first.place, second.place)
     one = Predicted(*(column[shared] for column in first))
     one = one._replace(stretch=one.stretch.unique(return_inverse=True)[1])
-    other = aligned(key(one), key(second), torch.stack([second.value, second.white, second.scale], 1)).unbind(1)
+    other = aligned(one.place, second.place, torch.stack([second.value, second.white, second.scale], 1)).unbind(1)
     return one, one._replace(value=other[0], white=other[1], scale=other[2])
 
 

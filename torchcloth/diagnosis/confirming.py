@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -13,8 +14,9 @@ from ..errors import InvalidInput, RecordingError
 from ..recordings import Recording
 from ..recordings.marks import alike, each_once, mark
 from ..recordings.together import together
+from .cells import aligned
 from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
-from .evidence import Evidence, as_held, as_rough, gather
+from .evidence import Evidence, as_held, as_rough, gather, shared
 from .fitting import Fitted
 from .gate import check, somewhere_seen
 from .model_file import ModelFile, read_model
@@ -64,8 +66,8 @@ class Confirmation:
 
 def _told(gain: Gain) -> dict[str, Any]:
     return {
-        "rms_before": gain.before,
-        "rms_after": gain.after,
+        "rms_before": None if math.isnan(gain.before) else gain.before,
+        "rms_after": None if math.isnan(gain.after) else gain.after,
         "unit": "m",
         "explained_fraction": gain.explained,
         "explained_ci95": list(gain.explained_ci95),
@@ -103,27 +105,35 @@ def confirm(
         gather(file.model, setting, (), staged(progress, stage))
         for file, setting, stage in zip(files, settings, ("base", "extended"), strict=True)
     ]
-    noise = fit_noise(found[1])
-    before, after = (_judged(f.model, e, noise, found[1]) for f, e in zip(files, found, strict=True))
+    noise, like = fit_noise(found[1]), shared(found[1], found[:1])
+    before, after = (_judged(f.model, e, noise, like) for f, e in zip(files, found, strict=True))
     floor, source = min(floor_of(e, least()) for e in found), "sensor only"  # slow errors may be the models' own
-    if (repeated := repeats(after, pairs_of(recordings, settings[1].episodes))) is not None:
+    if (repeated := repeats(after.whole, pairs_of(recordings, settings[1].episodes))) is not None:
         floor, source = repeated.rms, "repetitions"
     names = settings[0].names
-    motions = {name: _of_motion(before, after, names, name, floor) for name in dict.fromkeys(names)}
-    return Confirmation(_gain(before, after, floor), motions, floor, source)
+    motions = {name: [k for k, own in enumerate(names) if own == name] for name in dict.fromkeys(names)}
+    of = {name: _gain(before.of(own), after.of(own), floor) for name, own in motions.items()}
+    return Confirmation(_gain(before, after, floor), of, floor, source)
 
 
-def _of_motion(before: Predicted, after: Predicted, names: Sequence[str], motion: str, floor: float) -> Gain:
-    own = [k for k, name in enumerate(names) if name == motion]
-    return _gain(of_episodes(before, own), of_episodes(after, own), floor)
+class _Judged(NamedTuple):
+    """One model on episodes that it was not fitted to."""
+
+    whole: Predicted  # all that it meets, in metres by nobody's noise
+    alike: Predicted  # the same where the other model meets it, too, with densities by the extended one's noise
+
+    def of(self, episodes: Sequence[int]) -> _Judged:
+        return _Judged(*(of_episodes(p, episodes) for p in self))
 
 
-def _gain(before: Predicted, after: Predicted, floor: float) -> Gain:
+def _gain(before: _Judged, after: _Judged, floor: float) -> Gain:
     """Each model's rms over all that it meets; what is compared, over what both do."""
-    return compare(before, after, floor)._replace(before=_rms(before), after=_rms(after))
+    gain = compare(before.alike, after.alike, floor)
+    return gain._replace(before=_rms(before.whole), after=_rms(after.whole))
 
 
 def _rms(p: Predicted) -> float:
+    """NaN where nothing was seen."""
     return float(p.value[p.seen].square().mean().sqrt())
 
 
@@ -156,13 +166,14 @@ def _refuse_seen(recording: Recording, files: Sequence[ModelFile]) -> None:
         )
 
 
-def _judged(model: Model, evidence: Evidence, noise: Noise, like: Evidence) -> Predicted:
-    """Density by ``noise``, as rough and with the nuisances of the extended model ``like``; metres by nobody's noise.
+def _judged(model: Model, evidence: Evidence, noise: Noise, like: Evidence) -> _Judged:
+    """Density by ``noise``, on the cells, as rough and with the nuisances of ``like``; metres by nobody's noise.
 
     So the base's figures are the same whatever it is compared with.
     """
-    left = as_it_is(_as_fitted(model, evidence, unfitted()))
-    return left._replace(white=as_it_is(_as_fitted(model, as_rough(as_held(evidence, like), like), noise)).white)
+    whole = as_it_is(_as_fitted(model, evidence, unfitted()))
+    alike = as_it_is(_as_fitted(model, as_rough(as_held(evidence, like), like), noise))
+    return _Judged(whole, alike._replace(value=aligned(alike.place, whole.place, whole.value)))
 
 
 def _as_fitted(model: Model, evidence: Evidence, noise: Noise) -> Fitted:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from .comparison import compare, of_episodes, predict
-from .fitting import Fitted, fit, renoised, without_cause
+from .fitting import Fitted, fit, renoised, weighed_alike, without_cause
 from .lacking import explained, lack_of_fit
 from .placebo import placebo
 from .setting import Progress, Setting, staged
@@ -25,8 +25,8 @@ def pruned(
             continue
         less = without_cause(current, name)
         less = fit(less, setting, (), 0, staged(progress, f"without {name}"), current.noise, current.evidence)
-        plain, alone = renoised(less, current.noise, current.evidence), step.best.alone
-        gain = compare(predict(plain, setting.names, alone), predict(current, setting.names, alone), 0.0)
+        without, there = (predict(f, setting.names, step.best.alone) for f in weighed_alike(less, current))
+        gain = compare(without, there, 0.0)
         if sure and worthwhile(gain):
             continue
         steps = [s for s in steps if s is not step]
@@ -77,11 +77,11 @@ def unheard(start: Fitted, end: Fitted, steps: Sequence[Step], names: Sequence[s
     alone = alone_in(steps)
     if not sound:
         return False
-    first, last = (predict(f, names, alone) for f in (renoised(start, end.noise, end.evidence), end))
+    first, last = (predict(f, names, alone) for f in weighed_alike(start, end))
     return not worthwhile(compare(of_episodes(first, sound), of_episodes(last, sound), 0.0))
 
 
 def predicts_better(one: Fitted, other: Fitted, names: Sequence[str]) -> float:
     """Log density by which one fit of a model predicts motions held out better than another."""
-    first, second = (predict(renoised(f, other.noise, other.evidence), names) for f in (other, one))
+    second, first = (predict(f, names) for f in weighed_alike(one, other))
     return compare(first, second, 0.0).density

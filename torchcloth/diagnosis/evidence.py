@@ -168,26 +168,27 @@ def as_held(evidence: Evidence, like: Evidence) -> Evidence:
     return replace(evidence, cells=cells, stds=like.stds)
 
 
+def shared(like: Evidence, others: Sequence[Evidence]) -> Evidence:
+    """The same on the cells that all the others have, too."""
+    cells, numerics = [], []
+    for k, (own, difference) in enumerate(zip(like.cells, like.numerics, strict=True)):
+        kept = torch.ones_like(own.key, dtype=torch.bool)
+        for other in others:
+            kept &= torch.isin(own.key, other.cells[k].key)
+        cells.append(Cells(*(column[kept] for column in own)))
+        numerics.append(difference[kept])
+    return replace(like, cells=cells, numerics=numerics)
+
+
 def as_rough(evidence: Evidence, like: Evidence) -> Evidence:
-    """With another's scatter, roughness and numerics: densities of models are compared by the same covariance only."""
-    both = list(zip(evidence.cells, like.cells, strict=True))
-    cells = [_as_certain(own, other) for own, other in both]
-    numerics = [aligned(own.key, other.key, n) for (own, other), n in zip(both, like.numerics, strict=True)]
+    """With another's scatter, roughness and numerics, on its cells: by the same covariance alone densities compare."""
+    cells, numerics = [], []
+    for own, other, difference in zip(shared(evidence, [like]).cells, like.cells, like.numerics, strict=True):
+        columns = torch.stack([other.count, other.spread, other.rough, difference], 1)
+        count, spread, rough, difference = aligned(own.key, other.key, columns).unbind(1)
+        cells.append(own._replace(count=count, spread=spread, rough=rough))
+        numerics.append(difference)
     return replace(evidence, cells=cells, numerics=numerics)
-
-
-def _as_certain(own: Cells, other: Cells) -> Cells:
-    """With another's counts, scatter and roughness; cells that only ``own`` has keep theirs, and no roughness."""
-    kept = torch.isin(own.key, other.key)
-
-    def taken(mine: Tensor, theirs: Tensor) -> Tensor:
-        return torch.where(kept, aligned(own.key, other.key, theirs), mine)
-
-    return own._replace(
-        count=taken(own.count, other.count),
-        spread=taken(own.spread, other.spread),
-        rough=aligned(own.key, other.key, other.rough),
-    )
 
 
 def central(cells: Cells, shifts: Sequence[tuple[int, float]], parameters: int) -> Cells:

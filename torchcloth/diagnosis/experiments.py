@@ -14,7 +14,7 @@ import torch
 
 from ..recordings import GripperMotion, PointClouds, Recording
 from ..robots import gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ..robots.paths import paths  # pyright: ignore[reportMissingImports]
+from ..robots.paths import Path, paths  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
 
 STILL, KNOT = 0.2, 0.01  # s, all stand still before and after; between knots
@@ -94,12 +94,17 @@ def possible(recordings: Sequence[Recording]) -> list[tuple[Experiment, Recordin
     found = []
     for experiment in LIBRARY:
         template = begins[PLANS[experiment.motion].lying]
-        if template is None or not paths(template):
+        if template is None or not _holding(template):
             continue
-        if experiment.motion == "stretch" and len(paths(template)) < 2:
+        if experiment.motion == "stretch" and len(_holding(template)) < 2:
             continue
         found.append((experiment, template))
     return found
+
+
+def _holding(recording: Recording) -> dict[str, Path]:
+    """Paths of grippers that hold the cloth: others stand by."""
+    return {name: path for name, path in paths(recording).items() if not recording.grasps or name in recording.grasps}
 
 
 def _lies(recording: Recording) -> bool:
@@ -114,7 +119,7 @@ def _lies(recording: Recording) -> bool:
 
 def planned(experiment: Experiment, template: Recording) -> Recording:
     """The experiment as an episode: what the grippers do, where the cloth begins; nothing is seen of it yet."""
-    plan, own = PLANS[experiment.motion], paths(template)
+    plan, own = PLANS[experiment.motion], _holding(template)
     start = max(p.t[0] for p in own.values())
     if template.points is not None:
         start = max(start, float(template.points.t[0] + template.clock_offset))

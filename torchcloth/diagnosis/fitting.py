@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..identification.bounds import bounded
 from .bursts import calmed, densities, unweighted
-from .evidence import Evidence, as_held, as_rough, asked_about, gather
+from .evidence import Evidence, as_held, as_rough, asked_about, gather, shared
 from .noise import Noise, Whitened, fit_noise, unfitted, whitened
 from .pieces import IMPOSSIBLE
 from .setting import Progress, Setting, staged
@@ -162,8 +162,14 @@ def _columns(white: Whitened, columns: Sequence[int]) -> Whitened:
     return white._replace(jacobian=white.jacobian[:, columns])
 
 
+def weighed_alike(first: Fitted, second: Fitted) -> tuple[Fitted, Fitted]:
+    """Both by the second's noise, on the cells that both have."""
+    like = shared(second.evidence, [first.evidence])
+    return renoised(first, second.noise, like), renoised(second, second.noise, like)
+
+
 def renoised(found: Fitted, noise: Noise, like: Evidence) -> Fitted:
-    """The same with residuals weighed by another noise, in which stretches are as rough as ``like`` has them."""
+    """The same weighed by another noise, on the cells of ``like`` and with stretches as rough as those."""
     evidence = as_rough(found.evidence, like)
     return replace(found, evidence=evidence, noise=noise, white=calmed(whitened(evidence, noise)))
 

@@ -34,7 +34,8 @@ class Seen:
         stream = recording.points if recording.points is not None else recording.markers
         self.t = np.zeros(0) if stream is None else stream.t + recording.clock_offset
         self.clouds = extents.seen(recording)
-        self.paths: dict[str, Path] = paths(recording)
+        held = recording.grasps or paths(recording)
+        self.paths: dict[str, Path] = {name: path for name, path in paths(recording).items() if name in held}
 
     @cached_property
     def cloth(self) -> Cloth:
@@ -83,7 +84,7 @@ def _nearest(cloud: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def units(seen: Seen) -> Iterator[tuple[str, str]]:
     """A cloud that no cloth of this size could show."""
-    if (found := extents.other_unit(seen.clouds, seen.length)) is not None:
+    if (found := extents.other_unit(extents.full(seen.clouds), seen.length)) is not None:
         yield found
 
 

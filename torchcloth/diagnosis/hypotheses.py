@@ -20,8 +20,11 @@ def register(hypothesis: Hypothesis) -> Hypothesis:
     """Let a hypothesis of one's own join every search; one of the same name that was registered before is replaced.
 
     Raises:
-        InvalidInput: a name of the catalogue.
+        InvalidInput: a name of the catalogue, or a typical amplitude that it cannot have.
     """
+    if hypothesis.typical == 0 or (hypothesis.typical < 0 and not hypothesis.signed):
+        expected = "another than 0" if hypothesis.signed else "a value > 0, or signed=True"
+        raise InvalidInput(f"typical of {hypothesis.name!r}", got=hypothesis.typical, expected=expected)
     forget(hypothesis.name)
     if hypothesis.name in {h.name for h in known()}:
         raise InvalidInput(

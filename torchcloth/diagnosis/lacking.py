@@ -48,6 +48,11 @@ class Left(NamedTuple):
     stretches: Mapping[int, tuple[float, float]]  # of time: shares of left^2 and expected^2, by window
 
     @property
+    def seen(self) -> bool:
+        """A position and not a force."""
+        return self.unit == "m"
+
+    @property
     def ratio(self) -> float:
         """Of what is left to what was to be expected."""
         return self.left / self.expected
@@ -98,6 +103,17 @@ def is_lacking(found: Fitted, names: Sequence[str]) -> bool:
 def explained(before: Sequence[Left], after: Sequence[Left]) -> float:
     """Share of what a right model would not leave of points, edges and markers that is gone; 1 of nothing.
 
+    Of forces and torques, where that is more and positions lack nothing, before or after.
+    """
+    share = _gone(before, after, seen=True)
+    if any(row.seen and row.lacking for row in (*before, *after)):
+        return share
+    return max(share, _gone(before, after, seen=False))
+
+
+def _gone(before: Sequence[Left], after: Sequence[Left], seen: bool) -> float:
+    """That share of positions in m^2, or of what is felt in units of what a right model leaves.
+
     Motions in which less is left than that make up for none in which it is more. Where both meshes do not agree, before
     or after, nothing is counted on either side: what vacuum folds away would come back as if a cause had brought it.
     Nor is the stretch of each motion that is the worst after.
@@ -106,9 +122,9 @@ def explained(before: Sequence[Left], after: Sequence[Left]) -> float:
     worst = {(row.episode, row.kind): row.worst for row in after}
 
     def over(rows: Sequence[Left]) -> float:
-        judged = [r for r in rows if r.unit == "m" and (r.motion, r.kind) not in folded]
-        rests = [r.rest(worst.get((r.episode, r.kind))) for r in judged]
-        return sum(max(0.0, left - expected) for left, expected in rests)
+        judged = [r for r in rows if r.seen is seen and (r.motion, r.kind) not in folded]
+        rests = [(r.rest(worst.get((r.episode, r.kind))), 1.0 if seen else r.expected**2) for r in judged]
+        return sum(max(0.0, left - expected) / unit for (left, expected), unit in rests)
 
     first, last = over(before), over(after)
     return 1.0 - last / first if first > 0 else float(last == 0)

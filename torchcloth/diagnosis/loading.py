@@ -11,12 +11,14 @@ import torch
 from ..cloth import Cloth
 from ..identification.episode_prediction import EpisodePrediction, with_errors
 from ..identification.episodes import episode
+from ..identification.replays import each
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from ..recordings.together import together
 from .cells import directions
 from .model_file import ModelFile, load_model, of_fabric, read_model
 from .pieces import side_by_side
+from .setting import LATE
 from .steps import one_way, shifted
 from .world import Model, World
 
@@ -103,6 +105,8 @@ def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
     covariance = torch.zeros(len(every), len(every)) if file.covariance is None else file.covariance
     shifts = every[: len(covariance)]  # a residual force, which comes last, has no errors
     worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]
-    frames, *beside = side_by_side(lambda w: w.frames(data), worlds)
+    further, count = data.beyond(LATE), len(data.times)
+    done = side_by_side(lambda w: w.frames(further), worlds)
+    frames, *beside = (each(f, lambda field: field[:count]) for f in done)
     slopes = directions(frames, beside, [step for _, step in shifts])
     return with_errors(world.cloth, data, frames, slopes, covariance, math.nan)

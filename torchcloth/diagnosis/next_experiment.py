@@ -31,7 +31,7 @@ from .fitting import Fitted, prior_precision
 from .lacking import reference
 from .noise import Noise
 from .pieces import joined, nuisances, runs, side_by_side
-from .setting import Progress, Setting
+from .setting import LATE, Progress, Setting, foreseen
 from .steps import both_ways, shifted
 from .stepwise import Found
 from .trials import HARDLY
@@ -153,7 +153,7 @@ def whitened_slopes(question: Question, recording: Recording, setting: Setting) 
     """[C, own + causes] of an experiment that has not been done, by the present model on the coarser mesh."""
     found, model = question.fitted, question.fitted.model
     hypotheses = [found.evidence.hypotheses[k] for k in _columns(question)]
-    world, blank = model.world(), episode(model.base.cloth, recording)
+    world, blank = model.world(), foreseen(episode(model.base.cloth, recording))
     shifts = both_ways(model)
     near = [shifted(model, k, step).world() for k, step in shifts]
     done = runs(world, blank, setting.dt, hypotheses, near, with_held=True)
@@ -188,7 +188,8 @@ def as_seen(frames: Frames, blank: Episode, setting: Setting, seed: int = 0) -> 
         weight = (weight / weight.sum(1, keepdim=True)).to(x)
         on = (weight[..., None] * x[face]).sum(1)
         clouds.append(on + noise * torch.randn(many, 3, generator=rng).to(x))
-    return replace(blank, clouds=clouds, wrenches={name: frames.wrench[name] for name in blank.wrenches})
+    seen = replace(blank, clouds=clouds, wrenches={name: frames.wrench[name] for name in blank.wrenches})
+    return seen.unseen_after(float(blank.times[-1]) - LATE)
 
 
 def _columns(question: Question) -> list[int]:

@@ -20,7 +20,7 @@ from ..recordings import Recording
 from .cells import aligned
 from .comparison import Predicted
 
-SAME = 0.01  # m, within which two grippers follow one command
+SAME, TURNED = 0.01, 0.1  # m and rad, within which two grippers follow one command
 
 
 class Repeats(NamedTuple):
@@ -40,17 +40,19 @@ def pairs_of(recordings: Sequence[Recording], episodes: Sequence[Episode]) -> li
 
 
 def _alike(a: Episode, b: Episode) -> bool:
-    """Whether the grippers go the same way from the first frame on, wherever that is."""
+    """Whether the grippers go the same way from the first frame on, wherever that is, and face the same way."""
     if a.motion.keys() != b.motion.keys():
         return False
     span = min(float(e.times[-1] - e.times[0]) for e in (a, b))
     since = torch.linspace(0.0, span, 50, dtype=a.times.dtype)
 
-    def path(e: Episode, name: str) -> Tensor:
-        pose = interpolate(e.motion[name], float(e.times[0]) + since)
-        return pose[:, :3, 3] - pose[0, :3, 3]
+    def poses(e: Episode) -> Tensor:
+        return torch.stack([interpolate(e.motion[name], float(e.times[0]) + since) for name in a.motion])
 
-    return all(float((path(a, name) - path(b, name)).norm(dim=-1).max()) < SAME for name in a.motion)
+    one, two = poses(a), poses(b)
+    apart = (one[..., :3, 3] - one[:1, :1, :3, 3]) - (two[..., :3, 3] - two[:1, :1, :3, 3])
+    turned = (one[..., :3, :3] - two[..., :3, :3]).flatten(-2).norm(dim=-1) / 2**0.5  # rad, while it is small
+    return float(apart.norm(dim=-1).max()) < SAME and float(turned.max()) < TURNED
 
 
 def repeats(predicted: Predicted, pairs: Sequence[tuple[int, int]]) -> Repeats | None:

@@ -16,6 +16,7 @@ from .cells import Piece
 from .refined import refined
 from .world import Model, World
 
+LATE = 0.05  # s, by which a clock may be late and its last frames still be simulated
 Progress = Callable[[str], None]
 Kept = Callable[[Sequence[object], Tensor, Callable[[], Piece]], Piece]  # (question, point, work) -> answer
 
@@ -63,7 +64,7 @@ def setting_of(model: Model, recordings: Sequence[Recording]) -> Setting:
 
 def _setting(model: Model, recordings: Sequence[Recording]) -> Setting:
     cloth = model.base.cloth
-    episodes = tuple(episode(cloth, r) for r in recordings)
+    episodes = tuple(foreseen(episode(cloth, r)) for r in recordings)
     mesh = cloth.mesh
     pattern = torch.as_tensor(mesh.vertices).double()
     if mesh.uv is not None:
@@ -72,6 +73,15 @@ def _setting(model: Model, recordings: Sequence[Recording]) -> Setting:
         thin = int((pattern.amax(0) - pattern.amin(0)).argmin())
         pattern = pattern[:, [*(k for k in range(3) if k != thin), thin]]
     return Setting(model.base, tuple(recordings), episodes, sheet_for(cloth, episodes), pattern)
+
+
+def foreseen(e: Episode) -> Episode:
+    """With frames after the last as far as a late clock sees; without what it would see of none that is simulated.
+
+    A cloth that stands still in its last frames instead is millimetres off, for no cause.
+    """
+    further = e.beyond(LATE)
+    return further.unseen_after(float(further.times[-1]) - LATE)
 
 
 def staged(progress: Progress, stage: str) -> Progress:

@@ -10,7 +10,7 @@ from .approach import approach
 from .branches import unstable, without
 from .comparison import Gain, compare, predict
 from .doubts import mended, plainer, predicts_better, pruned, unheard
-from .fitting import Fitted, fit, renoised
+from .fitting import Fitted, fit, weighed_alike
 from .lacking import is_lacking
 from .noise import floor_of
 from .repeats import Repeats, pairs_of, repeats
@@ -123,8 +123,8 @@ def instead(found: Found, laws: Fitted, tried: int, progress: Progress = lambda 
     if step is None:
         return found
     alone = alone_in(found.steps)
-    law = renoised(step.best.fitted, found.end.noise, found.end.evidence)
-    over = compare(predict(found.end, names, alone), predict(law, names, alone), 0.0)
+    law, end = (predict(f, names, alone) for f in weighed_alike(step.best.fitted, found.end))
+    over = compare(end, law, 0.0)
     if over.ci95[0] < 0 or over.density < HALF * gained:
         return found
     withdrawn = tuple(s.best.hypothesis.name for s in found.causes)
@@ -188,6 +188,6 @@ def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) 
     last, sensor = predict(current, setting.names, alone), floor_of(current.evidence, current.noise)
     repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
     floor = sensor if repeated is None else repeated.rms
-    first = predict(renoised(start, current.noise, current.evidence), setting.names, alone)
-    whole = compare(first, last, floor) if steps else None
+    before, after = (predict(f, setting.names, alone) for f in weighed_alike(start, current))
+    whole = compare(before, after, floor) if steps else None
     return Found(start, current, steps, screened, whole, floor, sensor, repeated, setting)

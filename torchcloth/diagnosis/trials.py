@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from .comparison import Gain, Predicted, compare, predict, spread, telling
-from .evidence import Evidence
+from .evidence import Evidence, shared
 from .fitting import Fitted, fit, renoised, with_cause
 from .noise import Noise, fit_noise, unfitted
 from .pieces import IMPOSSIBLE
@@ -126,18 +126,18 @@ def one_step(
         likely[k] = _better(likely[k], after)
     likeliest = max(likely, key=lambda c: c.gain.density).fitted.evidence
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
-    noise = fit_noise(likeliest)
-    tried = _compared(current, [(c.row, c.fitted) for c in likely], setting.names, noise, likeliest)
+    noise, like = fit_noise(likeliest), shared(likeliest, [current.evidence, *(c.fitted.evidence for c in likely)])
+    tried = _compared(current, [(c.row, c.fitted) for c in likely], setting.names, noise, like)
     useful = _ranked(_themselves([c for c in tried if _useful(c, setting.names)]))
     others = [c for c in tried if c not in useful]
-    beside = lambda c: placebo(renoised(c.fitted, noise, likeliest), setting.names, c.alone)  # noqa: E731
+    beside = lambda c: placebo(renoised(c.fitted, noise, like), setting.names, c.alone)  # noqa: E731
     chance = None
     while useful and not (chance := beside(useful[0])).passed:
         useful = useful[1:]
     if not useful or chance is None:
         return None
     best = useful[0]
-    alike = lambda c: predict(renoised(c.fitted, noise, likeliest), setting.names, best.alone)  # noqa: E731
+    alike = lambda c: predict(renoised(c.fitted, noise, like), setting.names, best.alone)  # noqa: E731
     possible = [*useful, *(c for c in others if worthwhile(c.gain) and _agreed(c, setting.names))]
     rivals = {c.hypothesis.name: c for c in reversed(possible) if c is not best and _rival(c, alike(c), best)}
     rivals |= {c.hypothesis.name: c for c in others if _open(c, alike(c), best)}
@@ -168,7 +168,8 @@ def _better(before: Candidate, after: Candidate) -> Candidate:
 def _compared(
     current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise, like: Evidence
 ) -> list[Candidate]:
-    """Each fit beside the model without it, on motions held out; all by one noise, as rough as ``like``."""
+    """Each fit beside the model without it, on motions held out; all by one noise, on what they share of ``like``."""
+    like = shared(like, [current.evidence, *(found.evidence for _, found in fits)])
     before, out = renoised(current, noise, like), []
     for row, found in fits:
         after = renoised(found, noise, like)

@@ -13,6 +13,7 @@ from torch import Tensor
 from ..boundaries import AbstractBoundary
 from ..cloth import Cloth
 from ..effects import AbstractEffect
+from ..errors import InvalidInput
 from ..identification.episodes import Episode
 from ..identification.replays import Frames, Replay, frames_of
 from ..materials import AbstractMaterial
@@ -34,7 +35,10 @@ class World:
     views: tuple[View, ...] = ()
 
     def frames(self, episode: Episode, dt: float | None = None) -> Frames:
-        """What an observer has of the episode, simulated without derivatives."""
+        """What an observer has of the episode, simulated without derivatives.
+
+        One with a late clock sees beyond the last frame (``Episode.beyond``): give the episode more than are wanted.
+        """
         return self.seen(self.simulated(episode, dt), episode)
 
     def simulated(self, episode: Episode, dt: float | None = None) -> Frames:
@@ -194,6 +198,15 @@ class Model:
             if amplitude:
                 world = hypothesis.apply(world, amplitude)
         return world
+
+    @property
+    def possible(self) -> bool:
+        """Whether there is such a world."""
+        try:
+            self.world()
+        except InvalidInput:
+            return False
+        return True
 
     @property
     def point(self) -> Tensor:

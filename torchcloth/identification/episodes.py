@@ -119,6 +119,15 @@ class Episode:
             unseen=self.unseen + extra,
         )
 
+    def unseen_after(self, end: float) -> Episode:
+        """Without what was seen later than ``end`` [s]; what was felt stays."""
+        late = self.times > end + streams.SAME
+        markers = self.markers
+        if markers is not None:
+            markers = markers.where(~late[:, None, None], torch.nan)
+        clouds = [c[:0] if gone else c for c, gone in zip(self.clouds, late.tolist(), strict=True)]
+        return replace(self, clouds=clouds, markers=markers)
+
     def until(self, share: float) -> Episode:
         """The first ``share`` of the frames, at least four."""
         count = min(self.observed, max(4, round(share * self.observed)))

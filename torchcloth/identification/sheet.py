@@ -129,7 +129,7 @@ def _runs(edges: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
     following = {int(a): i for i, (a, _) in enumerate(edges)}
     direction = x[edges[:, 1]] - x[edges[:, 0]]
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    after = np.array([following.get(int(b), -1) for b in edges[:, 1]])
+    after = np.array([following.get(int(b), -1) for b in edges[:, 1]], dtype=int)  # of a closed surface, none
     bends = (after < 0) | ((direction * direction[after]).sum(1) < np.cos(np.radians(CORNER)))
     begins = np.zeros(len(edges), bool)
     begins[after[bends & (after >= 0)]] = True

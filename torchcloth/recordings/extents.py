@@ -61,10 +61,15 @@ def other_unit(clouds: Sequence[np.ndarray], length: float) -> tuple[str, str] |
     )
 
 
+def full(clouds: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Those that show a size."""
+    return [c for c in clouds if len(c) >= ENOUGH]
+
+
 def of_another_size(recording: Recording) -> tuple[str, str] | None:
     """The same for an episode, where its frames show enough to tell."""
     length = size(recording.cloth)[0]
-    return None if length is None else other_unit([c for c in seen(recording) if len(c) >= ENOUGH], length)
+    return None if length is None else other_unit(full(seen(recording)), length)
 
 
 def check_size(recording: Recording) -> None:

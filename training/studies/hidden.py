@@ -150,9 +150,9 @@ def experiments(
 def _gain(
     out: Path, name: str, make: Callable[..., str], given: list[Path], answer: Mapping[str, Any], truth: Mapping
 ) -> float | None:
-    """Of the answer, over the oracle's."""
+    """Of the answer, over the oracle's; 0 of one that is none."""
     if not answer.get("model"):
-        return None
+        return 0.0
     folder = out / "episodes" / f"{name}-unseen"
     make("--unseen", "--out", str(folder))
     return gain(given, out / "answers" / name / str(answer["model"]), next(folder.iterdir()), truth)
