@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import linear_toys as toys
+import numpy as np
 import pytest
 import sheets
 import torch
@@ -38,9 +39,13 @@ def test_the_floor_is_what_repetitions_differ_by_whatever_the_model_gets_wrong()
 
 
 def test_repetitions_are_of_one_command(tmp_path):
-    def kept(name, motion, split, shift=0.0):
+    def kept(name, motion, split, shift=0.0, turn=1.0):
         own = replace(sheets.episode(motion), split=split)
-        moved = {n: replace(g, position=g.position + shift * g.t[:, None]) for n, g in own.grippers.items()}
+        facing = np.array([turn, 0.0, 0.0, (1 - turn**2) ** 0.5])
+        moved = {
+            n: replace(g, position=g.position + shift * g.t[:, None], quat_wxyz=np.tile(facing, (len(g.t), 1)))
+            for n, g in own.grippers.items()
+        }
         return rec.read(rec.write(replace(own, grippers=moved), tmp_path / name))
 
     recordings = [
@@ -50,6 +55,7 @@ def test_repetitions_are_of_one_command(tmp_path):
         kept("d", "slow", {"motion": "other", "replicate_of": "a"}),
         kept("e", "slow", {"motion": "swing"}, shift=0.1),  # 3 cm farther on
         kept("f", "lift", {"motion": "lift"}),
+        kept("g", "slow", {"motion": "swing"}, turn=0.9),  # another heading
     ]
     setting = setting_of(base_model(recordings[0]), recordings)
     assert pairs_of(setting.recordings, setting.episodes) == [(0, 1), (0, 3), (1, 3)]

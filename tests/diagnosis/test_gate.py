@@ -106,6 +106,29 @@ def seen_where(recording, keep):
     return replace(recording, points=rec.PointClouds(points.t, np.concatenate(frames), counts))
 
 
+def with_markers(recording, count):
+    """Instead of the cloud: single places, near each other."""
+    points = recording.points
+    middle = np.array([np.median(points.frame(i), axis=0) for i in range(len(points))])
+    xyz = middle[:, None] + 0.01 * np.arange(count)[:, None] * [1.0, 0.0, 0.0]
+    uv = np.full((count, 2), 0.15)
+    return replace(recording, points=None, markers=rec.Markers(points.t, xyz, uv))
+
+
+def with_bystander(recording):
+    """A gripper that holds nothing, where it is not in the way."""
+    own = recording.grippers["left"]
+    idle = replace(own, position=own.position + np.array([0.0, 1.5, 0.0]), closed=np.zeros_like(own.closed))
+    return replace(recording, grippers={**recording.grippers, "idle": idle})
+
+
+GOOD |= {
+    "one marker": lambda r: with_markers(r, 1),
+    "three markers": lambda r: with_markers(r, 3),
+    "a gripper that stands by": with_bystander,
+}
+
+
 @pytest.mark.parametrize("what", GOOD)
 def test_what_a_diagnosis_looks_for_passes(turned, what):
     assert check([GOOD[what](turned)]) == []

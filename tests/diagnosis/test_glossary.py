@@ -24,3 +24,8 @@ def test_the_docs_have_the_table():
 def test_a_name_of_the_catalogue_is_not_for_users():
     with pytest.raises(InvalidInput, match=r"'air\.drag_n', which the catalogue has.*'my\.drag_n'"):
         register(Hypothesis("air.drag_n", "-", 1.0, lambda world, _: world))
+    for typical in (0.0, -0.1):
+        with pytest.raises(
+            InvalidInput, match=rf"typical of 'my\.less'; got {typical}; expected a value > 0, or signed"
+        ):
+            register(Hypothesis("my.less", "-", typical, lambda world, _: world))

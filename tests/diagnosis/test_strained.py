@@ -40,6 +40,19 @@ def test_it_begins_at_the_data_sheet_and_is_nothing_where_that_ends_as_far(monke
     assert (again is None) == (ends > OFTEN)
 
 
+def test_causes_that_are_known_stay_where_others_are_tried_from_the_data_sheet(monkeypatch):
+    asked = []
+
+    def fit(model, *_, **__):
+        asked.append(model)
+        raise SimulationDiverged("x", got="nan", expected="numbers")
+
+    monkeypatch.setattr(afresh, "fit", fit)
+    with pytest.raises(SimulationDiverged):
+        afresh.afresh(found(OFTEN + 1), None, [], 4)  # type: ignore[arg-type]
+    assert asked[0].point.tolist() == [0.0, 1.5]
+
+
 def test_where_the_data_sheet_is_no_world_nothing_begins_there(monkeypatch):
     def diverges(*_):
         raise SimulationDiverged("x", got="nan", expected="numbers")

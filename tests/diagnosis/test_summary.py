@@ -2,7 +2,7 @@
 
 from torchcloth.diagnosis.wording import sentences
 
-LISTS = ("causes", "minor", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "drifts", "warnings")
+LISTS = ("causes", "given", "minor", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "drifts", "warnings")
 NONE = ("gain", "missing_force", "residual", "next_experiment")
 
 

@@ -14,7 +14,7 @@ from torchcloth.diagnosis.evidence import asked_about, gather
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
-from torchcloth.diagnosis.setting import motions_of, setting_of
+from torchcloth.diagnosis.setting import LATE, motions_of, setting_of
 from torchcloth.diagnosis.steps import one_way, step_sizes
 from torchcloth.diagnosis.world import Hypothesis
 from torchcloth.errors import InvalidInput, RecordingError
@@ -334,3 +334,21 @@ def test_a_table_that_leans_or_stands_rubs_otherwise_along_an_axis_of_its_own(no
     assert law.ratio.value.item() == pytest.approx(2.0)
     again = grip._friction(grip._friction(model.world(), along=-0.5), more=0.1).cloth.boundaries["table"].friction
     assert torch.allclose(again.axis, law.axis)
+
+
+def test_a_late_clock_sees_only_frames_that_were_simulated():
+    """Of the last ones, which it would see beyond the motion's end, no points are used."""
+    recording = sheets.recorded("fast", lambda world: world, 4)
+    model = base_model(recording)
+    (e,) = setting_of(model, [recording]).episodes
+    used = torch.tensor([len(c) > 0 for c in e.clouds])
+    assert used.sum() == len(recording.points) - 1
+    assert float(e.times[used][-1]) <= float(e.motion["left"].t[-1]) - LATE
+    clock = next(h for h in catalogue(model, [recording]) if h.name == "obs.clock")
+    late = clock.apply(model.world(), 0.03).frames(e).x
+    then = torch.cat([e.times[:1], e.times[used][1:] + 0.03])
+    truth = model.world().frames(replace(e, times=then)).x
+    off = lambda x: (x - truth).square().mean((-2, -1)).sqrt()[1:]  # noqa: E731
+    assert float(off(late[used]).max()) < 6e-4  # of cubics through frames 50 ms apart
+    assert float(off(model.world().frames(e).x[used]).max()) > 4e-3
+    assert float((late[-1] - model.world().frames(e).x[-1]).norm(dim=-1).max()) < 1e-9  # stands still there

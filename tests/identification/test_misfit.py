@@ -107,6 +107,12 @@ def test_parts_and_rim_are_the_same_on_a_finer_mesh(side, resolution, patterned)
     assert all(float((one[k] - other[k]).norm()) < side / (resolution - 1) for k in one)
 
 
+def test_a_closed_surface_has_no_rim():
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    mesh = tc.meshes.Mesh.build(0.1 * corners, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))
+    assert rim_of(mesh, None, 0.01).count == 0
+
+
 def turned(angle: float, axis=(0.3, -0.5, 0.8)) -> Tensor:
     axis = torch.tensor(axis) / torch.tensor(axis).norm()
     skew = torch.linalg.cross(axis.expand(3, 3), torch.eye(3)).mT

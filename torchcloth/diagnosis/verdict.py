@@ -85,6 +85,7 @@ def judge(
     content = {
         "verdict": verdict,
         "causes": causes,
+        "given": _given(found, names),
         "minor": minor,
         "ruled_out": [r.hypothesis.name for r in rows if r.decision == "absent"],
         "undecided": [*doubtful, *(r.hypothesis.name for r in rows if r.decision in ("inconclusive", "present"))],
@@ -110,10 +111,8 @@ def judge(
 
 def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
     """The answer where episodes cannot be believed: what is wrong with them."""
-    lists: dict[str, Any] = {
-        key: []
-        for key in ("causes", "minor", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "drifts", "warnings")
-    }
+    keys = "causes given minor ruled_out undecided unresolvable lack_of_fit drifts warnings"
+    lists: dict[str, Any] = {key: [] for key in keys.split()}
     none = dict.fromkeys(("gain", "missing_force", "residual", "next_experiment", "model"))
     said = [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults]
     content = {**lists, **none, "verdict": "invalid_data", "also_unexplained": False, "parameters": {}}
@@ -140,6 +139,19 @@ def _minor(found: Found, step: Step) -> dict[str, Any]:
 
 def _told(hypothesis: Hypothesis, amplitude: float) -> dict[str, Any]:
     return {"effect": hypothesis.name, "amplitude": amplitude, "unit": hypothesis.unit}
+
+
+def _given(found: Found, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Causes that the model came with, fitted anew."""
+    model, first = found.end.model, len(found.end.model.parameters)
+    given = found.start.model.accepted
+    std = _errors(found, names).tolist() if given else []
+    out = []
+    for h in given:
+        place = model.place(h.name)
+        amplitude, error = model.amplitudes[place], NORMAL * std[first + place]
+        out.append({**_told(h, amplitude), "ci95": [amplitude - error, amplitude + error]})
+    return out
 
 
 def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:

@@ -23,9 +23,9 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
             f"{1e3 * gain['rms_after']:.2f} mm with the causes below; {1e3 * gain['floor']:.2f} mm would be expected "
             f"({content['floor']['source']})."
         )
+    out += [f"Came with the model, fitted anew: {_sized(c)}." for c in content["given"]]
     for c in content["causes"]:
-        low, high = c["ci95"]
-        out.append(f"Cause: {c['effect']} = {c['amplitude']:.4g} {c['unit']} (95 %: {low:.4g} to {high:.4g}).")
+        out.append(f"Cause: {_sized(c)}.")
         others = [name for name in c["class"] if name != c["effect"]] + [r["effect"] for r in c["rivals"]]
         out += [f"  {said}" for said in (GLOSSARY.get(c["effect"].partition("[")[0]),) if said]
         if others:
@@ -63,6 +63,11 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
     if content["next_experiment"]:
         out.append(f"Next experiment: {content['next_experiment']['why']}")
     return [*out, *(f"Warning: {text}." for text in content["warnings"])]
+
+
+def _sized(row: dict[str, Any]) -> str:
+    low, high = row["ci95"]
+    return f"{_size(row)} (95 %: {low:.4g} to {high:.4g})"
 
 
 def _size(row: dict[str, Any]) -> str:
