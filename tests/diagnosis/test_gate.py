@@ -147,6 +147,16 @@ def test_episodes_of_two_cloths_are_refused(turned):
     ):
         with pytest.raises(InvalidInput, match=r"another (gravity|data sheet)"):
             check([turned, other])
+    held = {name: rec.GraspInfo(vertices=np.array([0, 1]), uv=None) for name in turned.grasps}
+    others = {name: replace(g, vertices=np.array([40, 41])) for name, g in held.items()}
+    wider = {name: replace(g, radius=2 * g.radius) for name, g in turned.grasps.items()}
+    for one, two, what in (
+        (replace(turned, grasps=held), replace(turned, grasps=others), "vertices of a grasp"),
+        (turned, replace(turned, grasps=wider), "radius of a grasp"),
+        (replace(turned, air_density=None), replace(turned, air_density=1.2), "air"),
+    ):
+        with pytest.raises(InvalidInput, match=f"another {what}"):
+            check([one, two])
     elsewhere = {name: rec.GraspInfo(g.uv * 0.5, g.radius) for name, g in turned.grasps.items()}
     with pytest.raises(InvalidInput, match="another place of a grasp"):
         check([turned, replace(turned, grasps=elsewhere)])

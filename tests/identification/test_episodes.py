@@ -8,6 +8,7 @@ import torch
 import twins
 from twins import at, shifted
 
+import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import cloth_from, episode, identify
@@ -191,6 +192,15 @@ def test_a_collider_becomes_a_plane(recording):
 
 
 # -- unknowns --------------------------------------------------------------------------------------------------------
+
+
+def test_a_step_is_half_of_what_is_typical_with_a_sign_and_without():
+    mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(3, 3))
+    effects = {"rest": tc.effects.RestShape(shrink_warp=0.0), "air": tc.effects.AirDrag(1.0)}
+    cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, effects, contact=None)
+    found = collect(cloth, ["rest.shrink_warp", "air.normal", "youngs_modulus"], None)
+    assert [u.longest_step / u.size for u in found] == [0.5, 0.5, 1.0]
+    assert found[0].longest_step == pytest.approx(0.01)
 
 
 def test_unknowns_by_public_name(model):

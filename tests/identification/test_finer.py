@@ -36,6 +36,16 @@ def test_a_grip_holds_the_new_vertices_between_those_it_held():
     assert (held[:, 0] == 0).all()
 
 
+def test_a_residual_force_is_no_parameter_and_no_obstacle(model):
+    """As in the extended model of a diagnosis: its strengths are not fitted, and it stays on the finer mesh."""
+    law = tc.effects.ResidualForce({"across": 0.1, "mass@edge": 0.01}, held=[0, 1])
+    cloth = tc.Cloth(model.mesh, tc.materials.AEP(1e5), 0.2, {"residual": law}, contact=None)
+    assert "residual.strength" not in fit.default_parameters(cloth)
+    fine = finer_cloth(cloth)
+    assert fine.effects["residual"].held == (0, 1)
+    assert len(fine.effects["residual"].share) == len(fine.mesh.vertices)
+
+
 def test_fields_are_refused_before_anything_is_computed(model, recording):
     model.material.youngs_modulus.raw.data = model.material.youngs_modulus.raw.data.expand(
         len(model.mesh.faces)

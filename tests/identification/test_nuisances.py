@@ -12,7 +12,7 @@ from torchcloth.errors import InvalidInput
 from torchcloth.identification import episode, identify
 from torchcloth.identification.nuisances import KINDS, chosen
 from torchcloth.identification.objective import Objective
-from torchcloth.identification.replays import simulate
+from torchcloth.identification.replays import Frames, simulate
 from torchcloth.identification.unknowns import collect
 
 EVERY = ("clock", "camera", "tare", "grasp", "shape")
@@ -86,6 +86,17 @@ def test_a_late_clock_is_found(pulled):
     assert own["clock"].value == pytest.approx(0.02, abs=3e-3)
     assert own["clock"].unit == "s"
     assert "clock" not in fit.parameters
+
+
+def test_a_late_clock_far_from_zero_and_in_single_precision(pulled):
+    seen = episode(stretches.model(pulled), pulled)
+    wave = lambda t: (torch.sin(9.0 * t), 9.0 * torch.cos(9.0 * t))  # noqa: E731
+    since = seen.times - seen.times[0]
+    x, v = (f.float()[:, None, None] for f in wave(since))
+    frames = Frames(x, v, {}, x.new_zeros(len(since)))
+    far = replace(seen, times=seen.times + 1.7e9)
+    late = KINDS["clock"]().see(frames, torch.tensor([5e-3]), far).x[:-1, 0, 0]
+    torch.testing.assert_close(late, wave(since[:-1] + 5e-3)[0].float(), rtol=0, atol=1e-3)
 
 
 def test_a_late_clock_sees_what_comes_after_the_last_frame(pulled):

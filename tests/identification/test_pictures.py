@@ -3,7 +3,9 @@
 from types import SimpleNamespace
 from typing import Any
 
-from torchcloth.identification.pictures import parameters, save_figure
+import torch
+
+from torchcloth.identification.pictures import _felt, parameters, save_figure
 
 
 def estimate(value, initial, *ci95) -> Any:
@@ -26,3 +28,12 @@ def test_a_wide_interval_of_a_positive_parameter_is_logarithmic(tmp_path):
     left, right = figure.axes[0].transData.transform([(low, 0), (high, 0)])[:, 0]
     assert 0.3 < (place - left) / (right - left) < 0.7  # the value stands in the middle, not at the left end
     assert save_figure(figure, tmp_path / "a.png").is_file()
+
+
+def test_grippers_that_felt_no_force_are_not_drawn():
+    """A torque alone has no main direction of a force."""
+    both, torque = torch.rand(5, 6), torch.full((5, 6), torch.nan)
+    torque[:, 3:] = 1.0
+    e: Any = SimpleNamespace(wrenches={"left": both, "right": torque})
+    assert list(_felt(e)) == ["left"]
+    assert torch.equal(_felt(e)["left"], both[1:, :3])

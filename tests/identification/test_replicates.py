@@ -80,6 +80,14 @@ def test_leaving_out_an_episode_moves_the_estimate_as_a_fit_without_it_does():
         assert float((moved - wanted).norm()) < 0.1 * float(wanted.norm())
 
 
+def test_episodes_without_data_of_a_kind_do_not_scatter():
+    """One of three alone has readings: without it there is no fit, and the others move nothing."""
+    toy, episode = repeats(1, 3)
+    at = minimise(toy.problem(), toys.TRUE.clone(), 20, lambda _: False)
+    alone = torch.zeros_like(episode)
+    assert torch.equal(replicates.scatter(toy.problem(), at, alone, torch.zeros(3).long()), torch.zeros_like(at.raw))
+
+
 def test_only_replicates_scatter():
     """Two motions whose values differ by far more than replicates of one: that difference is not scatter."""
     strata, options = torch.tensor([1, 1, 1, 2, 2, 2]), {"motions": 2, "offset": 0.5}

@@ -31,6 +31,18 @@ def test_start_values_that_were_not_fitted_are_kept(pair, tmp_path):
     assert values["youngs_modulus"] == pair.parameters["youngs_modulus"].value != pytest.approx(2e4)
 
 
+def test_what_the_data_left_open_is_uncertain_and_not_exact(pair, recording, tmp_path):
+    path = pair.save(tmp_path)
+    _, known = fitted(path, recording)
+    assert known.keys() == pair.keys.keys()
+    content = json.loads(path.read_text())
+    content["parameters"]["youngs_modulus"] |= {"identifiable": False, "std": 2.3 * known["youngs_modulus"][0]}
+    path.write_text(json.dumps(content))
+    _, unknown = fitted(path, recording)
+    assert unknown["youngs_modulus"] == pytest.approx((known["youngs_modulus"][0], 10.0), rel=0.01)
+    assert unknown["air.normal"] == known["air.normal"]
+
+
 def test_points_may_have_been_rounded_on_disk(pair, recording, tmp_path):
     """Fitted in memory, viewed from a folder whose points are in tenths of a millimetre."""
     path = recordings.write(recording, tmp_path / "episode")

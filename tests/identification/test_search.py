@@ -144,6 +144,7 @@ def test_a_prior_of_ones_own(model, brief):
     assert given[0].value(given[0].middle) == pytest.approx(5e4)
     assert given[0].prior_std == pytest.approx(0.405, abs=1e-3)  # ln 1.5
     assert given[1].slope(given[1].middle) * given[1].prior_std == pytest.approx(0.02)
+    assert [u.measured for u in given] == [False, True]  # 1.5 times is no measurement, a fifteenth is
     fit = identify(model, brief, ["poisson_ratio"], priors={"poisson_ratio": (0.3, 0.01)}, iterations=2)
     assert fit.parameters["poisson_ratio"].value == pytest.approx(0.3, abs=0.02)
     assert fit.parameters["poisson_ratio"].source == "prior"

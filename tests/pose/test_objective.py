@@ -79,6 +79,12 @@ def test_no_window_is_shorter_than_a_frame_however_short_is_asked_for():
     assert windows_of(torch.arange(4) / 10, 1e-9) == [(0, 1), (1, 2), (2, 3)]
 
 
+def test_windows_far_from_zero():
+    torch.set_default_dtype(torch.float32)
+    times = torch.arange(11, dtype=torch.float64) / 30
+    assert windows_of(times + 1.7e9, 0.1) == windows_of(times, 0.1) == [(0, 3), (3, 7), (7, 10)]
+
+
 def test_a_part_is_the_beginning_of_the_same_motion(objective):
     part, raw = objective.part(0.5), objective.start + 0.3 * objective.prior_std
     torch.testing.assert_close(part.frames(raw)[0][:3], objective.frames(raw)[0][:3])  # the last has no end to lean on

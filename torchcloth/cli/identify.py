@@ -134,8 +134,9 @@ def _identify(options: argparse.Namespace) -> int:
     fit = _fit(options, cloth, episodes)
     if isinstance(fit, Identification):
         return _report(options.out, fit, cloth, episodes)
+    code = fields.report(options.out, fit, cloth)
     clear(options.out / PROGRESS)
-    return fields.report(options.out, fit, cloth)
+    return code
 
 
 def _defaults() -> argparse.Namespace:

@@ -36,10 +36,11 @@ def finer_cloth(cloth: Cloth) -> Cloth:
     """With every triangle divided into four.
 
     Raises:
-        InvalidInput: a parameter with one value per triangle.
+        InvalidInput: a parameter with one value per triangle or vertex.
     """
+    places = len(cloth.mesh.faces), len(cloth.mesh.vertices)
     for name, part in cloth.named_modules():
-        if isinstance(part, PhysicalParameter) and part.raw.ndim > 0:
+        if isinstance(part, PhysicalParameter) and any(size in places for size in part.raw.shape[-2:]):
             expected = "one number for all triangles"
             raise InvalidInput(f"a finer mesh: {name}", got=f"shape {tuple(part.raw.shape)}", expected=expected)
     mesh, kept = cloth.mesh, copy.deepcopy(cloth, {id(cloth.mesh): cloth.mesh})

@@ -39,6 +39,7 @@ from .unknowns import collect, with_priors
 
 PAPER_ITERATIONS = 35  # of the DiffCP paper's stop rule
 MOST_STARTS = 1000
+UNSURE = "the motion can be predicted for a while only, or by simulations spread around the solution"
 ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
 
 
@@ -189,13 +190,14 @@ def default_parameters(cloth: Cloth) -> list[str]:
 
     Others (damping times, wind, curl) are fitted when they are named.
     """
-    own = {name: part for name, part in cloth.material.named_modules() if isinstance(part, PhysicalParameter)}
+    scalar = lambda part: isinstance(part, PhysicalParameter) and part.raw.ndim == 0  # noqa: E731
+    own = {name: cast("PhysicalParameter", part) for name, part in cloth.material.named_modules() if scalar(part)}
     names = [name for name, part in own.items() if bool((part.value != 0).any())]
     if cloth.contact is None:
         names = [name for name in names if name not in ONLY_IN_CONTACT]
     for key, effect in cast("Iterable[tuple[str, AbstractEffect]]", cloth.effects.items()):
         main = next(iter(effect.amplitudes))
-        if isinstance(getattr(effect, main), PhysicalParameter):
+        if scalar(getattr(effect, main)):
             names.append(f"{key}.{main}")
     return names
 
@@ -213,13 +215,16 @@ def _concluded(
     full, told, checked = search.objective, outcome.objective, outcome.checked
     final, warnings = checked.final, list(checked.warnings)
     covariance = covariance_of(told, checked, strata)
-    found = _refined(full, told, final, covariance, refining if not checked.withdrawn else [])
+    regular = not checked.withdrawn and checked.covariance is None
+    found = _refined(full, told, final, covariance, refining if regular else [])
     final, covariance, coarseness, uncorrected = found
     warnings += uncorrected
     end = full.seen(final.raw)
     before, after, null = [s.x for s in start], [s.x for s in end], [rigid_carry(e) for e in full.episodes]
     found = estimates(full.cloth, full.unknowns, final.raw, covariance)
-    profiled = {} if checked.warnings or checked.withdrawn else profiles(told, final, covariance, profile, search.tell)
+    sure = not (checked.warnings or checked.withdrawn)
+    profiled = profiles(told, final, covariance, profile, search.tell) if sure else {}
+    warnings += [] if sure or not profile else [f"no profile of {', '.join(profile)}: {UNSURE}"]
     found = with_profiles(found, profiled)
     fit: dict[str, Any] = _figures(full, before, after, null)
     fit |= _force_figures(full, start, end)

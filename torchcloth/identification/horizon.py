@@ -70,6 +70,8 @@ def _solved(
 ) -> tuple[Objective, Checked] | None:
     """On a share of the frames; None where derivatives do not hold."""
     part = objective.part(share)
+    if not part.told:
+        return None
     try:
         final = gauss_newton.minimise(part.problem(), start, ITERATIONS, lambda it: on_iterate(it, part), tolerance)
         checked = None if runaway(part, final) else check(part, final)

@@ -67,7 +67,7 @@ class Clock(AbstractNuisance):
 
     def see(self, frames: Frames, values: Tensor, episode: Episode) -> Frames:
         """Cubic between frames, by their velocities; at rest before the first and after the last."""
-        t = episode.times.to(frames.x)
+        t = (episode.times - episode.times[0]).to(frames.x)
         x, v = (path(t, frames.x, frames.v, t + values[0]) for path in (hermite, hermite_slope))
         return frames._replace(x=x, v=v)
 

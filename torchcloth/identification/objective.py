@@ -13,7 +13,7 @@ from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from . import gauss_newton
-from .blocks import BLOCKS, Block
+from .blocks import BLOCKS, USES, Block
 from .episodes import Episode
 from .identifiability import Reach
 from .journal import Journal, digest, facts_of
@@ -61,6 +61,17 @@ class Objective:
     def part(self, share: float) -> Objective:
         """The same for the first ``share`` of the frames."""
         return self._like([e.until(share).beyond(e.lookahead) for e in self.episodes], self.nuisances)
+
+    @property
+    def told(self) -> bool:
+        """Whether there are any data of the kinds in use."""
+        of = {
+            "points": lambda e: any(len(cloud) for cloud in e.clouds),
+            "markers": lambda e: e.markers is not None and bool(e.markers.isfinite().any()),
+            "force": lambda e: any(bool(w[1:].isfinite().any()) for w in e.wrenches.values()),
+        }
+        names = {block.name for block in self.blocks}
+        return any(there(e) for kind, there in of.items() if names & {*USES[kind]} for e in self.episodes)
 
     def beside(self, nuisances: Sequence[AbstractNuisance]) -> Objective:
         """The same with other nuisances."""

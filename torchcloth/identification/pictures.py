@@ -32,7 +32,7 @@ def draw(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray, fo
     figures, seen = {}, [k for k, e in enumerate(episodes) if any(len(e.positions(t)) for t in range(len(e.times)))]
     if seen:
         figures = {"fit": shapes(fit, seen[0], episodes[seen[0]], faces), "distances": distances(fit, episodes, faces)}
-    if any(e.wrenches for e in episodes):
+    if any(_felt(e) for e in episodes):
         figures["forces"] = forces(fit, episodes)
     figures["parameters"] = parameters(fit)
     for name in {"fit", "distances", "forces"} - figures.keys():
@@ -123,23 +123,29 @@ def forces(fit: Identification, episodes: Sequence[Episode]) -> Any:
     """Every gripper's force along its main direction, measured and simulated, one episode below the other."""
     from matplotlib.figure import Figure
 
-    felt = [(k, e) for k, e in enumerate(episodes) if e.wrenches]
-    columns = max(len(e.wrenches) for _, e in felt)
+    felt = [(k, e, own) for k, e in enumerate(episodes) if (own := _felt(e))]
+    columns = max(len(own) for *_, own in felt)
     figure = Figure(figsize=(6 * columns, 3 * len(felt) + 0.4))
     axes = figure.subplots(len(felt), columns, squeeze=False)
-    for row, (k, e) in zip(axes, felt, strict=True):
-        for axis, (name, measured) in zip(row, e.wrenches.items(), strict=False):
-            force, along = _main(measured[1:, :3])
+    for row, (k, e, own) in zip(axes, felt, strict=True):
+        for axis, (name, readings) in zip(row, own.items(), strict=False):
+            force, along = _main(readings)
             axis.plot(e.times[1:], force @ along, ".", color="black", markersize=4, label="measured")
             for label, source, colour in (("start", fit.forces_before, BEFORE), ("fitted", fit.forces_after, AFTER)):
                 axis.plot(e.times[1:], source[k][name][1:, :3] @ along, color=colour, label=label)
             axis.set(xlabel="time [s]", ylabel="force [N]")
             axis.set_title(f"{e.name}, {name}: along ({', '.join(f'{a:.2f}' for a in along.tolist())})", fontsize=10)
-        for axis in row[len(e.wrenches) :]:
+        for axis in row[len(own) :]:
             axis.set_axis_off()
     axes[0, 0].legend()
     figure.tight_layout()
     return figure
+
+
+def _felt(e: Episode) -> dict[str, Tensor]:
+    """Forces [T, 3] N after the first frame, of grippers that read any."""
+    forces = {name: wrench[1:, :3] for name, wrench in e.wrenches.items()}
+    return {name: force for name, force in forces.items() if bool(force.isfinite().all(-1).any())}
 
 
 def _main(force: Tensor) -> tuple[Tensor, Tensor]:

@@ -56,10 +56,12 @@ def scatter(problem: Problem, at: Iterate, episode: Tensor, strata: Tensor) -> T
         episode: [R] of every row.
         strata: [E] numbers of groups of replicates, within which the scatter counts.
     """
-    shifts = torch.stack([_without(problem, at, episode == e) for e in range(len(strata))])
+    rows = torch.bincount(episode, minlength=len(strata))
+    told = torch.nonzero((rows > 0) & (rows < len(episode)))[:, 0]  # without its only one a fit has no data
+    shifts = [_without(problem, at, episode == e) for e in told]
     total = torch.zeros_like(at.raw)
-    for stratum in strata.unique():
-        own = shifts[strata == stratum]
+    for stratum in strata[told].unique():
+        own = torch.stack([s for s, k in zip(shifts, strata[told], strict=True) if k == stratum])
         if len(own) < FEWEST:  # no scatter of their own: as far as each one pulls
             total += own.square().sum(0)
             continue

@@ -18,9 +18,8 @@ from .linearity import Checked
 from .nuisances import Placed
 from .objective import Objective
 from .statements import Estimate, Profile
-from .unknowns import Unknown, available, collect, needs_contact
+from .unknowns import TRUSTED, Unknown, available, collect, needs_contact
 
-TRUSTED = 0.25  # a parameter counts as identified when its standard error is below a quarter of its value
 MISSED = 1.3  # rms over the sensor noise above which what the model misses may matter more than the noise
 STEADY = 0.9  # of the rms distance from constant forces, above which nothing but a weight was seen in them
 CONFUSED = 0.95  # correlation above which two parameters are called hard to tell apart

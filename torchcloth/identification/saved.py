@@ -102,7 +102,8 @@ def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tup
         recording: an episode of the same cloth, fitted or not.
 
     Returns:
-        The cloth, and by name of every identified parameter (value, spread) as the ``priors`` of ``identify`` take it.
+        The cloth, and by name of every fitted parameter (value, spread) as the ``priors`` of ``identify`` take it; the
+        spread of what the data left open is that of its prior.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
@@ -111,8 +112,8 @@ def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tup
     model = read_saved(path)
     cloth = rebuilt(path, model, recording)
     names, out = available(cloth), {}
-    for name in model.identified:
-        value, std = model.values[name], model.stds[name]
+    for name, std in model.stds.items():
+        value = model.values[name]
         positive = name in names and _parameter(cloth, names[name]).domain == "positive"
         if name in names and std > 0:
             out[name] = (value, math.exp(std / value) if positive else std)

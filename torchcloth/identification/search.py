@@ -56,7 +56,7 @@ class Search:
             start = reached.raw
         elif early and method == "gauss-newton":
             part = full.part(EARLY)
-            start = self._early(part, start, iterations).raw
+            start = self._early(part, start, iterations).raw if part.told else start
             self.elsewhere += part.simulations
         final = self._to_the_end(method, start, iterations, rate)
         checked = linearity.check(full, final)

@@ -14,6 +14,7 @@ from ..errors import InvalidInput
 from ..parameters import PhysicalParameter, to_value
 
 DECADE = math.log(10.0)
+TRUSTED = 0.25  # a parameter counts as identified when its standard error is below a quarter of its value
 ABSENT = {  # effects that an episode's facts bring into the model
     "air": "the model has no air: give air.density in episode.json",
     "bending": "the model has no bending: give cloth.nominal.bending_stiffness in episode.json",
@@ -32,7 +33,7 @@ class Unknown:
         start: unconstrained start value.
         prior_std: standard deviation of the prior, in the unconstrained coordinate.
         mean: the prior's middle; None: the start.
-        measured: the prior is a measurement (areal density), not ignorance.
+        measured: known before the fit (areal density), by a prior narrower than ``TRUSTED``.
     """
 
     name: str
@@ -51,7 +52,7 @@ class Unknown:
     @property
     def longest_step(self) -> float:
         """Of one iteration: a factor of 2.7 on a log parameter, half the typical size of an amplitude."""
-        return 0.25 * self.prior_std if self.parameter.domain == "nonnegative" else 1.0
+        return 0.5 * self.typical or 1.0
 
     @property
     def typical(self) -> float:
@@ -166,7 +167,8 @@ def _around(unknown: Unknown, value: float, spread: float) -> Unknown:
     p = unknown.parameter
     mean = float(PhysicalParameter(value, p.unit, p.domain, name=f"priors[{unknown.name!r}]").raw.detach())
     std = math.log(spread) if p.domain == "positive" else spread / unknown.slope(mean)
-    return replace(unknown, mean=mean, prior_std=std, measured=True)
+    known = unknown.slope(mean) * std < TRUSTED * max(abs(value), unknown.typical)
+    return replace(unknown, mean=mean, prior_std=std, measured=unknown.measured or known)
 
 
 def overrides(unknowns: Sequence[Unknown], raw: Tensor) -> dict[str, Tensor]:

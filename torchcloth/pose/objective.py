@@ -61,8 +61,8 @@ def windows_of(times: Tensor, length: float) -> list[tuple[int, int]]:
     span = float(times[-1] - times[0])
     if length < 0.5 * float(times.diff().min()):  # one for each interval; not as many as so small a length asks for
         return list(pairwise(range(len(times))))
-    wanted = torch.linspace(float(times[0]), float(times[-1]), max(1, round(span / length)) + 1).to(times)
-    ends = (times[None] - wanted[:, None]).abs().argmin(1).unique().tolist()
+    wanted = torch.linspace(0.0, span, max(1, round(span / length)) + 1, dtype=times.dtype).to(times)
+    ends = (times[None] - times[0] - wanted[:, None]).abs().argmin(1).unique().tolist()
     return list(pairwise(ends))
 
 

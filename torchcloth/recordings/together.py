@@ -9,7 +9,7 @@ from zlib import crc32
 import numpy as np
 
 from ..errors import InvalidInput
-from .types import Collider, Recording
+from .types import Collider, GraspInfo, Recording
 
 INSIDE = 0.02  # m, that noise and a table's place may explain
 ALIKE, UPRIGHT = 0.005, 0.9999  # m, and cosine (0.8 degrees): a table that was measured twice
@@ -50,8 +50,15 @@ _DESCRIBED = {
     "data sheet": lambda r: {name: value for name, value in sorted(r.cloth.nominal.items()) if name != "units"},
     "gravity (m/s^2)": lambda r: r.gravity,
     "set of grasps": lambda r: sorted(r.grasps),
-    "place of a grasp (m)": lambda r: [g.uv.tolist() for _, g in sorted(r.grasps.items()) if g.uv is not None],
+    "vertices of a grasp": lambda r: [np.sort(g.vertices).tolist() for g in _grasps(r) if g.vertices is not None],
+    "radius of a grasp (m)": lambda r: [g.radius for g in _grasps(r) if g.uv is not None],
+    "air (whether its density is known)": lambda r: r.air_density is not None,
+    "place of a grasp (m)": lambda r: [g.uv.tolist() for g in _grasps(r) if g.uv is not None],
 }
+
+
+def _grasps(recording: Recording) -> list[GraspInfo]:
+    return [recording.grasps[name] for name in sorted(recording.grasps)]
 
 
 def _equal(a: object, b: object) -> bool:
