@@ -7,9 +7,6 @@ mean square is held against the one to be expected, tr(S K^-1 S) / n, for every 
 model the quotient follows a chi^2 with the effective number of cells for degrees of freedom (Satterthwaite 1946), which
 says what cannot be chance. Two engines never agree exactly, so what counts as a lack of fit must also be ``TOLERATED``
 times as large as expected. Where both meshes fold the cloth in different ways nothing can be judged.
-
-Cloth that snaps to another side is centimetres off from then on, and no cause makes or mends that: of what is wrong in
-a motion, the worst stretch of time counts for nothing where causes are asked how much of it they explain.
 """
 
 from __future__ import annotations
@@ -29,7 +26,7 @@ SENSOR = {"points": 5e-4, "edges": 8e-4, "markers": 3e-4, "force": 1e-2, "torque
 TOLERATED = 2.25  # times the expected RMS
 FOLDED = 3e-3  # m, that the finer mesh leaves of the difference: both meshes fold the cloth in different ways
 RARE = 0.01  # probability of a right model's leaving more
-FEW = 4  # stretches of time, of fewer none is left out
+FEW = 4  # stretches of time, of fewer none is the worst
 
 
 class Left(NamedTuple):
@@ -62,27 +59,17 @@ class Left(NamedTuple):
         """More than a right model would leave."""
         return self.stable and self.ratio > TOLERATED and self.p < RARE
 
-    @property
-    def worst(self) -> int | None:
-        """The stretch in which most is left beyond what is expected; None of few."""
-        beyond = {window: left - expected for window, (left, expected) in self.stretches.items()}
-        return max(beyond, key=lambda w: beyond[w]) if len(beyond) >= FEW else None
-
-    def rest(self, but: int | None) -> tuple[float, float]:
-        """Shares of ``left`` and ``expected``, squared, of all stretches but one."""
-        left, expected = zip((0.0, 0.0), *(share for w, share in self.stretches.items() if w != but), strict=True)
-        return sum(left), sum(expected)
-
     def as_dict(self) -> dict[str, Any]:
         """As diagnosis.json has it."""
         row = {key: value for key, value in self._asdict().items() if key != "stretches"}
         return {**row, "ratio": self.ratio, "lacking": self.lacking, "worst": self._worst()}
 
     def _worst(self) -> dict[str, float] | None:
-        window = self.worst
-        if window is None:
+        """The stretch in which most is left beyond what is expected, and what the others leave; None of few."""
+        if len(self.stretches) < FEW:
             return None
-        left, expected = self.rest(window)
+        window = max(self.stretches, key=lambda w: self.stretches[w][0] - self.stretches[w][1])
+        left, expected = (sum(share[i] for w, share in self.stretches.items() if w != window) for i in (0, 1))
         return {
             "from": window * STRETCH,
             "to": (window + 1) * STRETCH,
@@ -116,15 +103,12 @@ def _gone(before: Sequence[Left], after: Sequence[Left], seen: bool) -> float:
 
     Motions in which less is left than that make up for none in which it is more. Where both meshes do not agree, before
     or after, nothing is counted on either side: what vacuum folds away would come back as if a cause had brought it.
-    Nor is the stretch of each motion that is the worst after.
     """
     folded = {(row.motion, row.kind) for row in (*before, *after) if not row.stable}
-    worst = {(row.episode, row.kind): row.worst for row in after}
 
     def over(rows: Sequence[Left]) -> float:
         judged = [r for r in rows if r.seen is seen and (r.motion, r.kind) not in folded]
-        rests = [(r.rest(worst.get((r.episode, r.kind))), 1.0 if seen else r.expected**2) for r in judged]
-        return sum(max(0.0, left - expected) / unit for (left, expected), unit in rests)
+        return sum(max(0.0, r.left**2 - r.expected**2) / (1.0 if seen else r.expected**2) for r in judged)
 
     first, last = over(before), over(after)
     return 1.0 - last / first if first > 0 else float(last == 0)
