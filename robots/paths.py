@@ -40,6 +40,12 @@ class Path:
         return (np.ptp(around, axis=1) < STILL).all(1)
 
 
+def holding(recording: Recording) -> dict[str, Path]:
+    """Those of the grippers that hold the cloth, of all where nothing says so: others stand by. Raises as ``paths``."""
+    every = paths(recording)
+    return {name: path for name, path in every.items() if not recording.grasps or name in recording.grasps}
+
+
 def paths(recording: Recording) -> dict[str, Path]:
     """The grippers' paths by name; of an arm through its kinematics. Empty where no motion was recorded.
 

@@ -14,7 +14,7 @@ import torch
 
 from ..recordings import GripperMotion, PointClouds, Recording
 from ..robots import gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ..robots.paths import Path, paths  # pyright: ignore[reportMissingImports]
+from ..robots.paths import holding  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
 
 STILL, KNOT = 0.2, 0.01  # s, all stand still before and after; between knots
@@ -94,17 +94,12 @@ def possible(recordings: Sequence[Recording]) -> list[tuple[Experiment, Recordin
     found = []
     for experiment in LIBRARY:
         template = begins[PLANS[experiment.motion].lying]
-        if template is None or not _holding(template):
+        if template is None or not holding(template):
             continue
-        if experiment.motion == "stretch" and len(_holding(template)) < 2:
+        if experiment.motion == "stretch" and len(holding(template)) < 2:
             continue
         found.append((experiment, template))
     return found
-
-
-def _holding(recording: Recording) -> dict[str, Path]:
-    """Paths of grippers that hold the cloth: others stand by."""
-    return {name: path for name, path in paths(recording).items() if not recording.grasps or name in recording.grasps}
 
 
 def _lies(recording: Recording) -> bool:
@@ -119,7 +114,7 @@ def _lies(recording: Recording) -> bool:
 
 def planned(experiment: Experiment, template: Recording) -> Recording:
     """The experiment as an episode: what the grippers do, where the cloth begins; nothing is seen of it yet."""
-    plan, own = PLANS[experiment.motion], _holding(template)
+    plan, own = PLANS[experiment.motion], holding(template)
     start = max(p.t[0] for p in own.values())
     if template.points is not None:
         start = max(start, float(template.points.t[0] + template.clock_offset))
@@ -169,7 +164,7 @@ def _gripper(t: np.ndarray, path: np.ndarray, rotation: np.ndarray, template: Re
 
 def heading_of(recording: Recording) -> float:
     """rad about the vertical by which an episode's upper edge is turned from y; 0 with a single gripper."""
-    own = paths(recording)
+    own = holding(recording)
     if len(own) < 2:
         return 0.0
     first, last = (own[name].position[0] for name in (min(own), max(own)))  # left, right

@@ -15,7 +15,7 @@ from ..cloth import Cloth
 from ..identification.episodes import cloth_from, first_shape
 from ..losses import closest
 from ..recordings import Recording, extents
-from ..robots.paths import Path, paths  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..robots.paths import Path, holding  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
 FAR = 0.1  # m, of the first points from the first shape, half of them
 STRAY, REACH = 0.1, 1.1  # share of points, and lengths of the cloth from a gripper that holds it
@@ -34,8 +34,7 @@ class Seen:
         stream = recording.points if recording.points is not None else recording.markers
         self.t = np.zeros(0) if stream is None else stream.t + recording.clock_offset
         self.clouds = extents.seen(recording)
-        held = recording.grasps or paths(recording)
-        self.paths: dict[str, Path] = {name: path for name, path in paths(recording).items() if name in held}
+        self.paths: dict[str, Path] = holding(recording)
 
     @cached_property
     def cloth(self) -> Cloth:

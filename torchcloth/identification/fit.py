@@ -190,14 +190,14 @@ def default_parameters(cloth: Cloth) -> list[str]:
 
     Others (damping times, wind, curl) are fitted when they are named.
     """
-    scalar = lambda part: isinstance(part, PhysicalParameter) and part.raw.ndim == 0  # noqa: E731
-    own = {name: cast("PhysicalParameter", part) for name, part in cloth.material.named_modules() if scalar(part)}
+    own = {name: part for name, part in cloth.material.named_modules() if isinstance(part, PhysicalParameter)}
     names = [name for name, part in own.items() if bool((part.value != 0).any())]
     if cloth.contact is None:
         names = [name for name in names if name not in ONLY_IN_CONTACT]
     for key, effect in cast("Iterable[tuple[str, AbstractEffect]]", cloth.effects.items()):
         main = next(iter(effect.amplitudes))
-        if scalar(getattr(effect, main)):
+        part = getattr(effect, main)
+        if isinstance(part, PhysicalParameter) and part.raw.ndim == 0:  # a residual force has one for each term
             names.append(f"{key}.{main}")
     return names
 
