@@ -7,6 +7,7 @@ import linear_toys as toys
 import pytest
 
 from torchcloth.diagnosis import doubts, trials
+from torchcloth.diagnosis.comparison import Gain
 from torchcloth.diagnosis.stepwise import Found
 from torchcloth.diagnosis.trials import Step, _open, _rival, _themselves
 from torchcloth.diagnosis.verdict import _minor, _verdict
@@ -139,3 +140,17 @@ def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
     monkeypatch.delattr(doubts, "fit")
     current = SimpleNamespace(model=model)
     assert doubts.plainer(current, steps, None, [], print) == (current, steps)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("twin", "shows", "low", "worth"),
+    [("p", True, 1.0, True), ("p", True, -1.0, False), ("p", False, 1.0, False), ("", True, 1.0, False)],
+)
+def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, shows, low, worth):
+    """It mends nothing beside the parameter that has done it."""
+    gain = Gain(1e-3, 1e-3, 5.0, (low, 9.0), 0.0, (0.0, 0.0), (1e-3, 1e-3), (0.0, 0.0))
+    fitted = SimpleNamespace(model=SimpleNamespace(parameters=[toys.parameter("p")]))
+    row = SimpleNamespace(shows=shows)
+    c = SimpleNamespace(hypothesis=toys.hypothesis("m", twin=twin), fitted=fitted, row=row)
+    assert trials.worth_naming(c, gain) == worth  # type: ignore[arg-type]
+    assert not trials.worthwhile(gain)

@@ -10,7 +10,7 @@ from .fitting import Fitted, fit, renoised, weighed_alike, without_cause
 from .lacking import explained, lack_of_fit
 from .placebo import placebo
 from .setting import Progress, Setting, staged
-from .trials import CLEAR, FURTHER, Step, alone_in, known, worthwhile
+from .trials import CLEAR, FURTHER, Step, alone_in, known, worth_naming, worthwhile
 from .world import Hypothesis
 
 
@@ -27,7 +27,7 @@ def pruned(
         less = fit(less, setting, (), 0, staged(progress, f"without {name}"), current.noise, current.evidence)
         without, there = (predict(f, setting.names, step.best.alone) for f in weighed_alike(less, current))
         gain = compare(without, there, 0.0)
-        if sure and worthwhile(gain):
+        if sure and worth_naming(step.best, gain):
             continue
         steps = [s for s in steps if s is not step]
         left = less.model.others(hypotheses)

@@ -138,7 +138,7 @@ def one_step(
         return None
     best = useful[0]
     alike = lambda c: predict(renoised(c.fitted, noise, like), setting.names, best.alone)  # noqa: E731
-    possible = [*useful, *(c for c in others if worthwhile(c.gain) and _agreed(c, setting.names))]
+    possible = [*useful, *(c for c in others if worth_naming(c, c.gain) and _agreed(c, setting.names))]
     rivals = {c.hypothesis.name: c for c in reversed(possible) if c is not best and _rival(c, alike(c), best)}
     rivals |= {c.hypothesis.name: c for c in others if _open(c, alike(c), best)}
     return Step(best, chance, tried, [*reversed(rivals.values())], screened, current)
@@ -202,7 +202,7 @@ def _open(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
     """Predicts clearly better, though motions do not agree how large it is: the best of the others is not the cause."""
     h = c.hypothesis
     stands_in = bool(h.brings) and not h.matters(c.amplitude)
-    if h.effect == best.hypothesis.effect or stands_in or not (worthwhile(c.gain) and _plausible(c)):
+    if h.effect == best.hypothesis.effect or stands_in or not (worth_naming(c, c.gain) and _plausible(c)):
         return False
     over = compare(predicted, best.predicted, 0.0)
     return over.density < -CLEAR and over.ci95[1] < 0
@@ -213,7 +213,7 @@ def _plausible(c: Candidate) -> bool:
 
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:
-    return worthwhile(c.gain) and known(c.fitted, c.hypothesis.name, names, c)
+    return worth_naming(c, c.gain) and known(c.fitted, c.hypothesis.name, names, c)
 
 
 def _agreed(c: Candidate, names: Sequence[str]) -> bool:
@@ -228,6 +228,12 @@ def known(found: Fitted, name: str, names: Sequence[str], c: Candidate) -> bool:
     largest = PLAUSIBLE * abs(found.model.accepted[place].typical)
     least = max(c.sure * std, NORMAL * abs(c.row.bias))
     return least < abs(middle) and abs(found.model.amplitudes[place]) < largest
+
+
+def worth_naming(c: Candidate, gain: Gain) -> bool:
+    """As ``worthwhile``; what a parameter does already beside its data sheet must show there, and surely be a gain."""
+    twin = bool(c.hypothesis.twin) and c.hypothesis.twin in (p.name for p in c.fitted.model.parameters)
+    return gain.ci95[0] > 0 if twin and c.row.shows else worthwhile(gain)
 
 
 def worthwhile(gain: Gain) -> bool:
