@@ -17,6 +17,7 @@ from .bursts import calmed
 from .evidence import Evidence, gather
 from .fitting import prior_precision
 from .noise import unfitted, whitened
+from .pieces import if_possible
 from .setting import Progress, Setting
 from .steps import shifted
 from .world import Model
@@ -51,7 +52,7 @@ def approach(model: Model, setting: Setting, progress: Progress = lambda _: None
 def _possible(model: Model, coordinate: int, width: float) -> float:
     """The width, or as much of it as has a world on either side."""
     for _ in range(HALVINGS):
-        if all(shifted(model, coordinate, sign * width).possible for sign in (1.0, -1.0)):
+        if all(if_possible(shifted(model, coordinate, sign * width).world) for sign in (1.0, -1.0)):
             break
         width *= 0.5
     return width

@@ -21,7 +21,7 @@ from .cells import NAMES, Cells, aligned, cells_of
 from .evidence import Evidence
 from .fitting import Fitted, weighed
 from .noise import FLOOR, fit_noise
-from .pieces import side_by_side
+from .pieces import if_possible, side_by_side
 from .setting import Progress, Setting
 from .steps import step_sizes
 from .world import World
@@ -45,8 +45,9 @@ def unstable(found: Fitted, setting: Setting, progress: Progress = lambda _: Non
     drawn = torch.randn(DIRECTIONS, len(point), generator=rng, dtype=point.dtype)
     steps = drawn / drawn.norm(dim=1, keepdim=True) * sizes
     steps = torch.cat([steps, -steps])
-    beside = [near for step in steps if (near := found.model.at(point + step)).possible]
-    worlds, moved = [near.world() for near in beside], [near.point - point for near in beside]
+    beside = [found.model.at(point + step) for step in steps]
+    there = [(world, near.point - point) for near in beside if (world := if_possible(near.world))]
+    worlds, moved = [world for world, _ in there], [step for _, step in there]
     moved += [torch.zeros_like(point)] * (2 * DIRECTIONS)
     plain, keys = found.model.world(), []
     for k, e in enumerate(setting.episodes):

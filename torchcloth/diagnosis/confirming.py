@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 
 from ..errors import InvalidInput, RecordingError
+from ..identification.result import or_none
 from ..recordings import Recording
 from ..recordings.marks import alike, each_once, mark
 from ..recordings.together import together
@@ -66,8 +66,8 @@ class Confirmation:
 
 def _told(gain: Gain) -> dict[str, Any]:
     return {
-        "rms_before": None if math.isnan(gain.before) else gain.before,
-        "rms_after": None if math.isnan(gain.after) else gain.after,
+        "rms_before": or_none(gain.before),
+        "rms_after": or_none(gain.after),
         "unit": "m",
         "explained_fraction": gain.explained,
         "explained_ci95": list(gain.explained_ci95),

@@ -31,7 +31,7 @@ from .fitting import Fitted, prior_precision
 from .lacking import reference
 from .noise import Noise
 from .pieces import joined, nuisances, runs, side_by_side
-from .setting import LATE, Progress, Setting, foreseen
+from .setting import Progress, Setting, foreseen, surely_seen
 from .steps import both_ways, shifted
 from .stepwise import Found
 from .trials import HARDLY
@@ -188,8 +188,8 @@ def as_seen(frames: Frames, blank: Episode, setting: Setting, seed: int = 0) -> 
         weight = (weight / weight.sum(1, keepdim=True)).to(x)
         on = (weight[..., None] * x[face]).sum(1)
         clouds.append(on + noise * torch.randn(many, 3, generator=rng).to(x))
-    seen = replace(blank, clouds=clouds, wrenches={name: frames.wrench[name] for name in blank.wrenches})
-    return seen.unseen_after(float(blank.times[-1]) - LATE)
+    wrenches = {name: frames.wrench[name] for name in blank.wrenches}
+    return surely_seen(replace(blank, clouds=clouds, wrenches=wrenches))
 
 
 def _columns(question: Question) -> list[int]:

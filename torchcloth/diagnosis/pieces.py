@@ -92,18 +92,16 @@ def runs(
     beside = [partial(w.frames, e, dt) for w in near]
     modes = Held().modes(world.cloth, e) if with_held else ()
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m), dt) for m in modes]
-    changed = [_if_possible(partial(h.apply, world, h.typical)) for h in hypotheses]
+    changed = [if_possible(partial(h.apply, world, h.typical)) for h in hypotheses]
     moves = [c is not None and (c.cloth is not world.cloth or c.motions is not world.motions) for c in changed]
     first = [] if finer is None else [finer]  # it takes longest
     jobs = [*first, partial(world.simulated, e, dt), *beside, *held]
-    tried = [
-        partial(_if_possible, partial(c.frames, e, dt)) for c, own in zip(changed, moves, strict=True) if c and own
-    ]
+    tried = [partial(if_possible, partial(c.frames, e, dt)) for c, own in zip(changed, moves, strict=True) if c and own]
     done: list[Any] = side_by_side(lambda job: job(), [*jobs, *tried])
     plain, *sure = done[len(first) : len(jobs)]
     fine = plain if finer is None else done[0]
     rest = iter(done[len(jobs) :])
-    seen = lambda c: c and _if_possible(partial(c.seen, plain, e))  # noqa: E731
+    seen = lambda c: c and if_possible(partial(c.seen, plain, e))  # noqa: E731
     trials = [next(rest) if own else seen(c) for c, own in zip(changed, moves, strict=True)]
     return Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials)
 
@@ -115,7 +113,8 @@ def _finest(model: Model, setting: Setting, k: int) -> Frames:
     return replace(model, base=setting.finer.base).world().frames(setting.finer.episodes[k], setting.finer.dt)
 
 
-def _if_possible(work: Callable[[], T]) -> T | None:
+def if_possible(work: Callable[[], T]) -> T | None:
+    """What comes of it; None of what no world allows, or what cannot be simulated."""
     try:
         return work()
     except IMPOSSIBLE:

@@ -80,8 +80,12 @@ def foreseen(e: Episode) -> Episode:
 
     A cloth that stands still in its last frames instead is millimetres off, for no cause.
     """
-    further = e.beyond(LATE)
-    return further.unseen_after(float(further.times[-1]) - LATE)
+    return surely_seen(e.beyond(LATE))
+
+
+def surely_seen(e: Episode) -> Episode:
+    """Without what a late clock would see after the last frame."""
+    return e.unseen_after(float(e.times[-1]) - LATE)
 
 
 def staged(progress: Progress, stage: str) -> Progress:

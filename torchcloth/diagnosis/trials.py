@@ -119,15 +119,17 @@ def one_step(
             fits.append((row, fit(model, setting, (), 0, trial, unfitted(), current.evidence)))
     if not fits:
         return None
-    now = lambda fits: _compared(current, fits, setting.names, current.noise, current.evidence)  # noqa: E731
+    common = lambda like, fits: shared(like, [current.evidence, *(f.evidence for _, f in fits)])  # noqa: E731
+    now = lambda fits: _compared(current, fits, setting.names, current.noise, common(current.evidence, fits))  # noqa: E731
     likely = now(fits)
     settled = _settled(likely, setting, progress)
     for k, after in zip(settled, now(list(settled.values())), strict=True):
         likely[k] = _better(likely[k], after)
     likeliest = max(likely, key=lambda c: c.gain.density).fitted.evidence
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
-    noise, like = fit_noise(likeliest), shared(likeliest, [current.evidence, *(c.fitted.evidence for c in likely)])
-    tried = _compared(current, [(c.row, c.fitted) for c in likely], setting.names, noise, like)
+    fits = [(c.row, c.fitted) for c in likely]
+    noise, like = fit_noise(likeliest), common(likeliest, fits)
+    tried = _compared(current, fits, setting.names, noise, like)
     useful = _ranked(_themselves([c for c in tried if _useful(c, setting.names)]))
     others = [c for c in tried if c not in useful]
     beside = lambda c: placebo(renoised(c.fitted, noise, like), setting.names, c.alone)  # noqa: E731
@@ -168,8 +170,7 @@ def _better(before: Candidate, after: Candidate) -> Candidate:
 def _compared(
     current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise, like: Evidence
 ) -> list[Candidate]:
-    """Each fit beside the model without it, on motions held out; all by one noise, on what they share of ``like``."""
-    like = shared(like, [current.evidence, *(found.evidence for _, found in fits)])
+    """Each fit beside the model without it, on motions held out; all by one noise, on the cells of ``like``."""
     before, out = renoised(current, noise, like), []
     for row, found in fits:
         after = renoised(found, noise, like)

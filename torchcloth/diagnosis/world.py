@@ -13,7 +13,6 @@ from torch import Tensor
 from ..boundaries import AbstractBoundary
 from ..cloth import Cloth
 from ..effects import AbstractEffect
-from ..errors import InvalidInput
 from ..identification.episodes import Episode
 from ..identification.replays import Frames, Replay, frames_of
 from ..materials import AbstractMaterial
@@ -198,15 +197,6 @@ class Model:
             if amplitude:
                 world = hypothesis.apply(world, amplitude)
         return world
-
-    @property
-    def possible(self) -> bool:
-        """Whether there is such a world."""
-        try:
-            self.world()
-        except InvalidInput:
-            return False
-        return True
 
     @property
     def point(self) -> Tensor:

@@ -27,9 +27,10 @@ class BodyForce(AbstractEffect):
 
     def __init__(self, acceleration: Tensor) -> None:
         super().__init__()
-        shape = tuple(acceleration.shape) if isinstance(acceleration, Tensor) else type(acceleration).__name__
-        if not isinstance(shape, tuple) or len(shape) < 2 or shape[-1] != 3:
-            raise InvalidInput("acceleration", got=f"{shape}", expected="a tensor [V or 1, 3] m/s^2")
+        if not isinstance(acceleration, Tensor):
+            raise InvalidInput("acceleration", got=type(acceleration).__name__, expected="a tensor [V or 1, 3] m/s^2")
+        if acceleration.ndim < 2 or acceleration.shape[-1] != 3:
+            raise InvalidInput("acceleration", got=f"shape {tuple(acceleration.shape)}", expected="[V or 1, 3] m/s^2")
         self.acceleration = PhysicalParameter(acceleration, "m/s^2", "real", name="acceleration of a body force")
 
     def bind(self, mesh: Mesh) -> BodyForce:

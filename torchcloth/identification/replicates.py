@@ -58,10 +58,12 @@ def scatter(problem: Problem, at: Iterate, episode: Tensor, strata: Tensor) -> T
     """
     rows = torch.bincount(episode, minlength=len(strata))
     told = torch.nonzero((rows > 0) & (rows < len(episode)))[:, 0]  # without its only one a fit has no data
-    shifts = [_without(problem, at, episode == e) for e in told]
-    total = torch.zeros_like(at.raw)
-    for stratum in strata[told].unique():
-        own = torch.stack([s for s, k in zip(shifts, strata[told], strict=True) if k == stratum])
+    total, strata = torch.zeros_like(at.raw), strata[told]
+    if not len(told):
+        return total
+    shifts = torch.stack([_without(problem, at, episode == e) for e in told])
+    for stratum in strata.unique():
+        own = shifts[strata == stratum]
         if len(own) < FEWEST:  # no scatter of their own: as far as each one pulls
             total += own.square().sum(0)
             continue

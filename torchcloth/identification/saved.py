@@ -127,14 +127,12 @@ class SavedModel:
     Attributes:
         values: by name, fitted or not.
         stds: standard errors of the fitted parameters, by name.
-        identified: names of those that the data determined.
         correlation: [K, K] of the fitted parameters, in the order of ``stds``.
         left: m, rms distance that the fit left in its own episodes; NaN where nothing was seen.
     """
 
     values: dict[str, float]
     stds: dict[str, float]
-    identified: list[str]
     correlation: np.ndarray
     left: float
     contact: Contact | None
@@ -179,7 +177,6 @@ def _model(content: dict[str, Any]) -> SavedModel:
     return SavedModel(
         {str(name): _value(name, value) for name, value in model["values"].items()},
         {name: number(said[name]["std"], 0.0, f"{name}'s std") for name in correlation},
-        [name for name in correlation if said[name]["identifiable"] and said[name]["source"] == "data"],
         matrix,
         math.nan if left is None else number(left, 0.0),
         None if model["contact"] is None else _contact(**model["contact"]),

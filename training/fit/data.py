@@ -30,11 +30,11 @@ def found(data: Data) -> tuple[list[Recording], list[Recording]]:
             different cloths.
         RecordingError: an episode that cannot be trusted.
     """
-    train, val = _read(data.train, "data.train"), _read(data.val, "data.val")
-    both = {_place(r) for r in train} & {_place(r) for r in val}
-    if both:
+    places = _folders(data.train, "data.train"), _folders(data.val, "data.val")
+    if both := places[0].keys() & places[1].keys():
         got = f"{min(both)}, which is in data.train, too"
         raise InvalidInput("config: data.val", got=got, expected="episodes that are not trained with")
+    train, val = ([recordings.read(folder) for folder in own.values()] for own in places)
     motions = {r.split.get("motion") for r in train}
     for motion in data.val_motion:
         if motion not in motions:
@@ -52,7 +52,8 @@ def found(data: Data) -> tuple[list[Recording], list[Recording]]:
     return train, val
 
 
-def _read(patterns: Sequence[str], key: str) -> list[Recording]:
+def _folders(patterns: Sequence[str], key: str) -> dict[Path, Path]:
+    """As they are named, by where they are: each once."""
     folders: dict[Path, Path] = {}
     for pattern in patterns:
         if pattern.startswith(EXAMPLE):
@@ -64,11 +65,7 @@ def _read(patterns: Sequence[str], key: str) -> list[Recording]:
             raise InvalidInput(f"config: {key}", got=f"no folder that matches {pattern}", expected="episodes")
         for folder in map(Path, matches):
             folders.setdefault(folder.resolve(), folder)
-    return [recordings.read(folder) for folder in folders.values()]
-
-
-def _place(r: Recording) -> Path:
-    return Path(str(r.path)).resolve()
+    return folders
 
 
 class Deal(Sampler[list[int]]):
