@@ -94,3 +94,20 @@ def test_a_cell_that_does_not_follow_its_slope_is_left_out():
     assert len(less.white.value) == len(found.white.value) - 2
     assert float(less.covariance[0, 0]) >= float(found.covariance[0, 0]) * 0.5
     assert not torch.isin(keys, less.evidence.cells[0].key).any()
+
+
+@pytest.mark.parametrize("share", [0.4, 0.6])
+def test_what_forgets_how_it_began_is_left_out_only_where_that_is_more_than_it_is_off(share):
+    """Of the cells that are 3 mm off some are moved by 2 mm by another first shape, and twelve by 20."""
+    found = toys.fitted(toys.evidence(toys.smooth(3, 4), 1, ["one", "two"], torch.zeros(3).double(), 0))
+    cells = found.evidence.cells[0]
+    count = round(share * len(cells.value))
+    off = 3e-3 * (1 - 2 * (torch.arange(len(cells.value)) % 2)).double()
+    seen = found.evidence.cells[0] = cells._replace(value=off)
+    moved = off.clone()
+    moved[:count] += 2e-3
+    moved[:12] += 18e-3
+    same = torch.zeros(1).double()
+    keys = _jumped(found.evidence, 0, [seen._replace(value=moved)], [same])
+    assert keys.tolist() == cells.key[: count if share < 0.5 else 12].tolist()
+    assert len(_jumped(found.evidence, 0, [seen._replace(value=moved)], [same + 1e-9])) == count  # of parameters

@@ -73,6 +73,17 @@ def test_where_meshes_fold_apart_nothing_is_judged():
     assert not any(row.stable or row.lacking for row in rows)
 
 
+@pytest.mark.parametrize(("folded", "share"), [(0, 0.75), (2, 0.5), (3, 0.75)])
+def test_where_most_motions_fold_apart_what_is_held_out_says_how_much_is_mended(folded, share):
+    """Three of four motions are put right; of two that are judged one."""
+    wrong, right = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (3.0, 0.0))
+    rough = [torch.full_like(c.value, 0.03 if k < folded else 0.0) for k, c in enumerate(wrong.cells)]
+    start = toys.fitted(replace(wrong, numerics=rough))
+    end = toys.fitted(replace(wrong, cells=[*right.cells[:3], wrong.cells[3]], numerics=rough))
+    assert doubts.mended(start, end, MOTIONS) == pytest.approx(share, abs=0.1)
+    assert doubts.mended(start, toys.fitted(replace(right, numerics=rough)), MOTIONS) == 1.0
+
+
 def row(motion, left, expected=1e-3, kind="points", unit="m", stable=True, stretches=8, episode=0):
     """As much left in each of some stretches of time."""
     shares = {w: (left**2 / stretches, expected**2 / stretches) for w in range(stretches)}

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from .comparison import compare, of_episodes, predict
 from .fitting import Fitted, fit, renoised, weighed_alike, without_cause
 from .lacking import explained, lack_of_fit
+from .noise import floor_of
 from .placebo import placebo
 from .setting import Progress, Setting, staged
 from .trials import CLEAR, FURTHER, Step, alone_in, known, worth_naming, worthwhile
@@ -61,13 +62,20 @@ def plainer(
     return current, steps
 
 
-def mended(start: Fitted, end: Fitted, names: Sequence[str]) -> float:
+def mended(start: Fitted, end: Fitted, names: Sequence[str], alone: Collection[str] = ()) -> float:
     """Share of what is wrong that is gone; 1 where nothing is lacking any more.
 
-    Of less than half, more is still there: whatever makes it may well do what passed for the causes, too.
+    Of less than half, more is still there: whatever makes it may well do what passed for the causes, too. Where both
+    meshes agree about less than half of the motions, the share held out, of all.
     """
-    left = lack_of_fit(end, names)
-    return explained(lack_of_fit(start, names), left) if any(row.lacking for row in left) else 1.0
+    first, left = (lack_of_fit(found, names) for found in (start, end))
+    if not any(row.lacking for row in left):
+        return 1.0
+    folded = {row.episode for row in (*first, *left) if not row.stable}
+    if 2 * len(folded) <= len(names):
+        return explained(first, left)
+    before, after = (predict(f, names, alone) for f in weighed_alike(start, end))
+    return compare(before, after, floor_of(end.evidence, end.noise)).explained
 
 
 def unheard(start: Fitted, end: Fitted, steps: Sequence[Step], names: Sequence[str]) -> bool:

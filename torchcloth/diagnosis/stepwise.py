@@ -162,7 +162,7 @@ def _chain(
         best, before = step.best.fitted, current
         now = staged(progress, f"with {step.best.hypothesis.name}")
         current = fit(best.model, setting, (), FURTHER, now, before=start.evidence, here=best.evidence)
-        if steps and mended(before, current, setting.names) < HALF:
+        if steps and mended(before, current, setting.names, alone_in([*steps, step])) < HALF:
             current = before
             break
         steps, step = [*steps, step], None
@@ -176,7 +176,7 @@ def _chain(
         current = fit(current.model, setting, progress=now, before=here, here=here)
         current = current if enough(current) else asked(current, now)
         current, steps = pruned(current, steps, setting, hypotheses, progress)
-    share = mended(start, current, setting.names) if steps else 1.0
+    share = mended(start, current, setting.names, alone_in(steps)) if steps else 1.0
     if share < LEAST or (share < HALF and unheard(start, current, steps, setting.names)):
         return start, []
     return current, steps
