@@ -165,7 +165,8 @@ class Bending(AbstractEffect):
         spread = field.repeat_interleave(3, dim=-2)
         count = self.columns.shape[1]
         total = field.new_zeros(*field.shape[:-2], count, 1).index_add(-2, index, spread)
-        return total / torch.bincount(index, minlength=count).unsqueeze(-1)
+        here = field.new_zeros(count, 1).index_add(0, index, field.new_ones(len(index), 1))
+        return total / here
 
     def force(self, c: Coefficients, now: Moment) -> Tensor:
         """-Q (x + damping_time v) on each vertex, and what rest curvature adds."""
