@@ -16,7 +16,9 @@ SAME = 0.01  # of the way: float32, in another order; 0.001 measured after 40 ms
 OTHER = (
     0.10  # of the way: another discretisation or law, 40 ms after the start; 0.004 (Newton) and 0.03 (MuJoCo) measured
 )
-DERIVATIVE = 1e-3  # relative, two float32 implementations of the same scheme over 40 ms; 2e-5 measured
+# relative, two float32 implementations of the same scheme over 40 ms: 2e-5 measured on sheets; by E of a shirt, whose
+# parts cancel, the fused engine is 0.7e-3 and the reference 0.3e-3 from float64, and they were 1.4e-3 from each other
+DERIVATIVE = 2e-3
 ROUNDED = 1e-2  # the same on the tiny scenes, whose sheet is hardly strained: 0.8e-3 to 2e-3 measured, by E
 
 
