@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +16,7 @@ import torch
 from torchcloth.diagnosis import base_model, catalogue, fit, next_experiment, setting_of
 from torchcloth.diagnosis.cells import NAMES
 from torchcloth.diagnosis.evidence import central
-from torchcloth.diagnosis.experiments import LIBRARY, PLANS, Experiment, planned, possible
+from torchcloth.diagnosis.experiments import LIBRARY, PLANS, Experiment, heading_of, planned, possible
 from torchcloth.diagnosis.fitting import renoised
 from torchcloth.diagnosis.next_experiment import (
     Question,
@@ -27,6 +28,7 @@ from torchcloth.diagnosis.next_experiment import (
 )
 from torchcloth.diagnosis.noise import FLOOR, Noise
 from torchcloth.diagnosis.trials import HARDLY
+from torchcloth.recordings import Collider
 
 INDEPENDENT = Path(__file__).parents[1] / "independent"
 MOTIONS = """
@@ -44,10 +46,11 @@ print(json.dumps(found))
 
 def test_the_library_is_that_of_the_independent_engine():
     """Displacements and turns of both grippers, by the other code."""
-    asked = json.dumps([[e.motion, e.heading, e.speed] for e in LIBRARY])
+    template = sheets.episode()
+    own = float(np.rad2deg(heading_of(template)))
+    asked = json.dumps([[e.motion, e.heading + own, e.speed] for e in LIBRARY])
     run = [sys.executable, "-c", MOTIONS, asked]
     out = subprocess.run(run, cwd=INDEPENDENT, capture_output=True, text=True, check=True).stdout
-    template = sheets.episode()
     for experiment, paths in zip(LIBRARY, json.loads(out), strict=True):
         plan = planned(experiment, template)
         own = np.stack([plan.grippers[n].position for n in ("left", "right")])
@@ -60,10 +63,41 @@ def test_the_library_is_that_of_the_independent_engine():
         np.testing.assert_allclose(np.cos(along(own) - along(other)), 1.0, atol=1e-9)
 
 
+def test_an_experiment_begins_as_the_episode_that_it_repeats_and_is_turned_from_there():
+    template = sheets.episode()
+    begun = {n: np.asarray(g.position[0]) for n, g in template.grippers.items()}
+    centre = np.mean(list(begun.values()), axis=0)
+    for heading in (0.0, 90.0):
+        plan = planned(Experiment("swing", heading), template)
+        c, s = np.cos(np.deg2rad(heading)), np.sin(np.deg2rad(heading))
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        for name, place in begun.items():
+            np.testing.assert_allclose(plan.grippers[name].position[0], turn @ (place - centre) + centre, atol=1e-9)
+        way = np.ptp(plan.grippers["left"].position, axis=0)
+        edge = np.abs(turn @ (begun["left"] - begun["right"]))
+        assert way @ edge == pytest.approx(0.0, abs=1e-9)  # square to the edge
+        assert way.max() > 0.04
+    named = replace(template, grippers={"b": template.grippers["left"], "a": template.grippers["right"]}, grasps={})
+    assert abs(abs(heading_of(named) - heading_of(template)) - np.pi) < 1e-9  # hanging: either side
+
+
+def test_cloth_that_lies_is_dragged_away_from_where_it_lies():
+    hanging = sheets.episode()
+    flat = np.asarray(hanging.cloth.initial_vertices)
+    own = heading_of(hanging)
+    for side in (-1.0, 1.0):
+        down = side * (flat[..., 2:].max() - flat[..., 2:]) * np.array([np.cos(own), np.sin(own), 0.0])
+        lying = np.concatenate([flat[..., :2], 0 * flat[..., 2:]], -1) + down
+        table = {"table": Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]))}
+        recording = replace(hanging, cloth=replace(hanging.cloth, initial_vertices=lying), colliders=table)
+        way = planned(Experiment("drag"), recording).grippers["left"].position
+        assert (way[-1] - way[0]) @ down.reshape(-1, 3).mean(0) < 0
+
+
 def test_only_what_can_be_begun_is_asked_for():
     hanging = [str(e) for e, _ in possible([sheets.episode()])]
     assert len(hanging) == sum(not PLANS[e.motion].lying for e in LIBRARY)
-    assert "swing, the scene turned by 90 degrees" in hanging
+    assert "swing, grippers and cloth turned by 90 degrees" in hanging
     assert possible([]) == []
 
 
@@ -116,16 +150,19 @@ def smooth(*of):
 
 @pytest.mark.parametrize("said", ["causes", "minor"])
 def test_gravity_and_camera_are_told_apart_by_turning(said, monkeypatch):
-    """A sheet that leans with the room and one that the camera sees leaning turn apart when the sheet is turned."""
+    """A sheet that leans with the room and one that the camera sees leaning turn apart when the sheet is turned.
+
+    Its edge is along y here, where it hangs with a lean along y edgewise.
+    """
     found, content, setting = undecided(("env.gravity_tilt[y]", "obs.rotation[x]"), said)
     question = question_of(found, content)
     now = distances(question, information(question, []))
     told = {}
     for name in ("hang", "turn"):
-        slopes = whitened_slopes(question, planned(Experiment(name), setting.recordings[0]), setting)
+        slopes = whitened_slopes(question, planned(Experiment(name, -90.0), setting.recordings[0]), setting)
         told[name] = min(distances(question, information(question, [slopes])).values())
     monkeypatch.setattr(next_experiment, "central", smooth)
-    calm = whitened_slopes(question, planned(Experiment("turn"), setting.recordings[0]), setting)
+    calm = whitened_slopes(question, planned(Experiment("turn", -90.0), setting.recordings[0]), setting)
     assert min(distances(question, information(question, [calm])).values()) > told["turn"]  # ripples tell less
     least = min(now.values())
     assert told["turn"] - least > 10 * (told["hang"] - least) >= 0

@@ -187,6 +187,11 @@ def test_a_stream_that_cannot_be_read_is_invalid_data_and_a_missing_folder_is_no
     np.savez(tmp_path / "slow" / "points.npz", **arrays)
     assert main(["diagnose", *folders, "--out", str(tmp_path / "out")]) == 0
     assert "does not increase" in capsys.readouterr().out
+    kept = tmp_path / "out" / "progress" / "problem"  # of a diagnosis that was stopped
+    kept.parent.mkdir()
+    kept.touch()
+    assert main(["diagnose", *folders, "--out", str(tmp_path / "out"), "--resume"]) == 0
+    assert kept.exists()
     assert main(["diagnose", *folders, str(tmp_path / "none"), "--out", str(tmp_path / "other")]) == 2
     assert not (tmp_path / "other").exists()
 

@@ -110,6 +110,18 @@ def test_a_model_is_looked_at_beside_the_points(made):
     np.testing.assert_allclose(extended.sheets["cloth"].vertices, found, atol=1e-6)
 
 
+def test_a_late_clock_is_looked_at_beyond_the_last_frame(made, tmp_path):
+    folder, seen, blank = made
+    model = dx.load_model(folder / "extended.tcm")
+    late = model.at(torch.cat([model.point[:-1], model.point.new_tensor([0.03])]))
+    dx.save_model(tmp_path / "late.tcm", late, blank)
+    early = replace(seen, points=seen.points.only(seen.points.t < 0.6 * seen.points.t[-1]))  # the motion goes on
+    x = film_of_fit(early, tmp_path / "late.tcm").sheets["cloth"].vertices
+    np.testing.assert_allclose(x, dx.predicted(tmp_path / "late.tcm", early).frames.x.numpy(), atol=1e-6)
+    punctual = film_of_fit(early, folder / "extended.tcm").sheets["cloth"].vertices
+    assert np.abs(x[-1] - punctual[-1]).max() > 1e-3  # the clock matters there
+
+
 def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
     folder, seen, blank = made
     models = [str(folder / name) for name in ("base.tcm", "extended.tcm")]

@@ -1,5 +1,6 @@
 """Causes of a user's own come from a file: on the command line, and again where a model that has them is loaded."""
 
+import math
 import re
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import sheets
 import torch
 
 from torchcloth.cli import main
-from torchcloth.diagnosis import base_model, hypotheses, own_causes, register_file, setting_of
+from torchcloth.diagnosis import Hypothesis, base_model, hypotheses, own_causes, register_file, setting_of
 from torchcloth.errors import InvalidInput
 
 FILE = """
@@ -55,6 +56,23 @@ def test_what_is_no_file_of_causes_is_one_line(file, content, said, capsys):
         register_file(file)
     assert main(["diagnose", "nowhere", "--out", str(file.parent / "out"), "--causes", str(file)]) == 2
     assert capsys.readouterr().err.startswith("torchcloth: causes; got ")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"name": "residual.weave"}, "as laws of a residual force are called"),
+        ({"name": "air.drag_n"}, "which the catalogue has"),
+        ({"typical": math.nan}, "typical of 'my.damping'; got nan"),
+        ({"typical": math.inf}, "typical of 'my.damping'; got inf"),
+        ({"share": 0.0}, "share of 'my.damping'; got 0"),
+    ],
+)
+def test_causes_that_a_search_could_not_use_are_refused(change, said):
+    given = {"name": "my.damping", "unit": "1/s", "typical": 2.0, "apply": lambda world, _: world} | change
+    with pytest.raises(InvalidInput, match=said):
+        hypotheses.register(Hypothesis(**given))
+    assert given["name"] not in {h.name for h in hypotheses.registered()}
 
 
 def test_the_example_of_the_docs_is_one(file):

@@ -1,5 +1,6 @@
 """The whole: against truth, with right and wrong models, as one continuous motion."""
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -120,6 +121,7 @@ def test_markers_alone(scene):
     assert np.isfinite(found.std.numpy()).all()
     assert rms(found.x, scene, scene.hidden) < 0.6 * rms(found.alone, scene, scene.hidden)
     assert any("no points" in warning for warning in found.warnings)
+    assert math.isnan(found.fit["point_noise"])
     assert 0 < float(found.seen.double().mean()) < 1
     assert len(mesh.vertices) == found.x.shape[1]
 

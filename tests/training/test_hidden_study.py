@@ -4,8 +4,10 @@ import json
 from argparse import Namespace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from torchcloth.diagnosis.experiments import Experiment
 from torchcloth.errors import InvalidInput
 from torchcloth.training.studies import hidden
 from torchcloth.training.studies.checkout import module
@@ -143,12 +145,17 @@ def test_a_diagnosis_that_was_stopped_is_no_answer_and_goes_on(monkeypatch, tmp_
     assert ["--resume" in command for command in commands] == [False, True]
 
 
-def test_experiments_are_made_of_the_same_case_and_answered_with_all_episodes(called, tmp_path):
+def test_experiments_are_made_of_the_same_case_and_answered_with_all_episodes(called, tmp_path, monkeypatch):
+    monkeypatch.setattr(hidden, "read", lambda path: path)
+    monkeypatch.setattr(
+        hidden, "possible", lambda episodes: [(Experiment("hang"), None), (Experiment("turn"), episodes)]
+    )
+    monkeypatch.setattr(hidden, "heading_of", lambda template: np.deg2rad(5.0 * len(template)))
     made = []
     make = lambda *arguments: (made.append(arguments), (Path(arguments[-1]) / "e9").mkdir(parents=True))  # noqa: E731
     asked = ANSWER | {"next_experiment": {"motion": "turn", "heading": 90.0, "separates": ["a", "b"]}}
     found = hidden.experiments(tmp_path, "007", make, [tmp_path / "e1"], asked, 19)
-    assert made[0] == ("--motion", "turn", "--heading", "90.0", "--out", str(tmp_path / "episodes" / "007-proposed"))
+    assert made[0] == ("--motion", "turn", "--heading", "95.0", "--out", str(tmp_path / "episodes" / "007-proposed"))
     assert made[1][0] == "--motion"
     assert called[0][2:] == ["diagnose", "e1", "e9", "--out", "007-proposed"]
     assert found == {"proposed": ANSWER, "random": ANSWER}

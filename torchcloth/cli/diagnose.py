@@ -54,7 +54,8 @@ def _diagnose(options: argparse.Namespace) -> int:
                 episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume or None
             )
     path = diagnosis.write_diagnosis(answer, episodes, options.out)
-    clear(options.out / PROGRESS)
+    if answer.searched is not None:  # a stopped diagnosis goes on once the episodes can be read
+        clear(options.out / PROGRESS)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())
     written = (path.name, "report.html", answer.content["model"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,12 +66,14 @@ class Confirmation:
 
 
 def _told(gain: Gain) -> dict[str, Any]:
+    """Shares are of positions: null where none were seen."""
+    seen = not math.isnan(gain.before)
     return {
         "rms_before": or_none(gain.before),
         "rms_after": or_none(gain.after),
         "unit": "m",
-        "explained_fraction": gain.explained,
-        "explained_ci95": list(gain.explained_ci95),
+        "explained_fraction": gain.explained if seen else None,
+        "explained_ci95": list(gain.explained_ci95) if seen else None,
         "log_density": gain.density,
         "log_density_ci95": list(gain.ci95),
     }

@@ -62,7 +62,8 @@ class Experiment:
 
     Attributes:
         motion: one of ``PLANS``.
-        heading: degrees about the vertical, of the whole scene but the camera.
+        heading: degrees about the vertical by which grippers and cloth, and not the camera, are turned from how the
+            episode begins that is repeated.
         speed: 2 takes half the time.
     """
 
@@ -71,7 +72,7 @@ class Experiment:
     speed: float = 1.0
 
     def __str__(self) -> str:
-        turned = f", the scene turned by {self.heading:g} degrees" if self.heading else ""
+        turned = f", grippers and cloth turned by {self.heading:g} degrees" if self.heading else ""
         return f"{self.motion}{turned}" + (f", {self.speed:g} times as fast" if self.speed != 1 else "")
 
 
@@ -114,17 +115,16 @@ def _lies(recording: Recording) -> bool:
 
 def planned(experiment: Experiment, template: Recording) -> Recording:
     """The experiment as an episode: what the grippers do, where the cloth begins; nothing is seen of it yet."""
-    plan, own = PLANS[experiment.motion], holding(template)
-    start = max(p.t[0] for p in own.values())
-    if template.points is not None:
-        start = max(start, float(template.points.t[0] + template.clock_offset))
-    first = {name: tuple(part[0] for part in p.at(np.array([start]))) for name, p in own.items()}
+    plan = PLANS[experiment.motion]
+    first = _first(template)
     centre = np.mean([place for place, _ in first.values()], axis=0)
+    initial = template.cloth.initial_vertices
+    shape = np.asarray(template.cloth.vertices if initial is None else initial)
     heading = np.deg2rad(experiment.heading)
-    turn = about_z(heading - heading_of(template))[0]
+    turn, ahead = about_z(heading)[0], about_z(heading + heading_of(template))[0]
     knots = STILL + np.asarray(plan.t) / experiment.speed
     t = np.arange(round((knots[-1] + STILL) / KNOT) + 1) * KNOT
-    offset = minimum_jerk(t, knots, np.asarray(plan.offset)) @ about_z(heading)[0].T
+    offset = minimum_jerk(t, knots, np.asarray(plan.offset)) @ ahead.T
     apart, yaw = (minimum_jerk(t, knots, np.asarray(v)) if v else np.zeros(len(t)) for v in (plan.apart, plan.yaw))
     spin = about_z(yaw)
     grippers = {}
@@ -134,8 +134,6 @@ def planned(experiment: Experiment, template: Recording) -> Recording:
         outward = flat / max(float(np.linalg.norm(flat)), 1e-9)
         path = centre + offset + np.einsum("kab,kb->ka", spin, aside + 0.5 * apart[:, None] * outward)
         grippers[name] = _gripper(t, path, spin @ turn @ rotation, template, name)
-    initial = template.cloth.initial_vertices
-    shape = np.asarray(template.cloth.vertices if initial is None else initial)
     moved = (shape - centre) @ turn.T + centre
     frames = np.arange(int(t[-1] * RATE) + 1) / RATE
     points = np.repeat(moved.reshape(-1, 3)[:1], len(frames), axis=0)
@@ -162,14 +160,31 @@ def _gripper(t: np.ndarray, path: np.ndarray, rotation: np.ndarray, template: Re
     return replace(gripper_motion(Trajectory(torch.as_tensor(t), torch.as_tensor(pose), closed)), **zero)
 
 
+def _first(template: Recording) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """By holding gripper (position [3] m, rotation [3, 3]) when the cloth is seen first."""
+    own, seen = holding(template), template.markers if template.points is None else template.points
+    start = max(p.t[0] for p in own.values())
+    if seen is not None:
+        start = max(start, float(seen.t[0] + template.clock_offset))
+    return {name: (place[0], turn[0]) for name, path in own.items() for place, turn in [path.at(np.array([start]))]}
+
+
 def heading_of(recording: Recording) -> float:
-    """rad about the vertical by which an episode's upper edge is turned from y; 0 with a single gripper."""
-    own = holding(recording)
-    if len(own) < 2:
+    """rad about the vertical from x to where the cloth faces, square to its upper edge; 0 with a single gripper.
+
+    Of the two sides of the edge the one with the first gripper, by name, on its left; of cloth that lies on a table the
+    one where it does not lie.
+    """
+    first = _first(recording)
+    if len(first) < 2:
         return 0.0
-    first, last = (own[name].position[0] for name in (min(own), max(own)))  # left, right
-    edge = first - last
-    return float(np.arctan2(-edge[0], edge[1]))
+    left, right = (first[name][0] for name in (min(first), max(first)))
+    ahead = np.array([(left - right)[1], (right - left)[0]])
+    initial = recording.cloth.initial_vertices
+    if initial is not None and _lies(recording):
+        behind = initial.reshape(-1, 3).mean(0) - 0.5 * (left + right)
+        ahead = ahead * (-1.0 if ahead @ behind[:2] > 0 else 1.0)
+    return float(np.arctan2(ahead[1], ahead[0]))
 
 
 def minimum_jerk(t: np.ndarray, knots: np.ndarray, values: np.ndarray) -> np.ndarray:

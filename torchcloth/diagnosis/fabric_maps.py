@@ -54,7 +54,7 @@ def misfit_maps(evidence: Evidence, setting: Setting, title: str = "", limit: fl
                     np.ma.masked_array(field, ~inside), "RdBu_r", vmin=-limit, vmax=limit, extent=extent, origin="lower"
                 )
                 axis.imshow(grey, extent=extent, origin="lower")
-        axes[k, 0].set_ylabel(name, fontsize=9)
+        axes[k, 0].set_ylabel(name, fontsize=9, parse_math=False)
     figure.suptitle(title, fontsize=10)
     figure.colorbar(image, ax=axes, label="points off the surface, mm")  # pyright: ignore[reportPossiblyUnbound]
     return figure

@@ -6,12 +6,13 @@ What a user registers joins the search.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from ..errors import InvalidInput
 from ..recordings import Recording
 from . import air, fabric, grip, observer
-from .world import Hypothesis, Model
+from .world import RESIDUAL, Hypothesis, Model
 
 _registered: list[Hypothesis] = []
 
@@ -20,21 +21,32 @@ def register(hypothesis: Hypothesis) -> Hypothesis:
     """Let a hypothesis of one's own join every search; one of the same name that was registered before is replaced.
 
     Raises:
-        InvalidInput: a name of the catalogue, or a typical amplitude that it cannot have.
+        InvalidInput: a name of the catalogue or of a residual force's law, or a typical amplitude or share that it
+            cannot have.
     """
-    if hypothesis.typical == 0 or (hypothesis.typical < 0 and not hypothesis.signed):
-        expected = "another than 0" if hypothesis.signed else "a value > 0, or signed=True"
-        raise InvalidInput(f"typical of {hypothesis.name!r}", got=hypothesis.typical, expected=expected)
+    _check_size(hypothesis)
     forget(hypothesis.name)
-    if hypothesis.name in {h.name for h in known()}:
+    taken = "which the catalogue has" if hypothesis.name in {h.name for h in known()} else ""
+    if hypothesis.name.startswith(f"{RESIDUAL}."):
+        taken = "as laws of a residual force are called"
+    if taken:
         raise InvalidInput(
             "hypothesis",
-            got=f"the name {hypothesis.name!r}, which the catalogue has",
+            got=f"the name {hypothesis.name!r}, {taken}",
             expected="a name of its own",
             remedy=f"call it e.g. 'my.{hypothesis.name.partition('.')[2]}'",
         )
     _registered.append(hypothesis)
     return hypothesis
+
+
+def _check_size(hypothesis: Hypothesis) -> None:
+    wrong = hypothesis.typical == 0 or (hypothesis.typical < 0 and not hypothesis.signed)
+    if wrong or not math.isfinite(hypothesis.typical):
+        expected = "another than 0" if hypothesis.signed else "a value > 0, or signed=True"
+        raise InvalidInput(f"typical of {hypothesis.name!r}", got=hypothesis.typical, expected=expected)
+    if not 0 < hypothesis.share < math.inf:
+        raise InvalidInput(f"share of {hypothesis.name!r}", got=hypothesis.share, expected="a value > 0, e.g. 0.4")
 
 
 def forget(name: str) -> None:

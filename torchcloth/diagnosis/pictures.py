@@ -51,7 +51,7 @@ def residual_maps(answer: Diagnosis) -> Any:
             extent = (0, field.shape[1] * STRETCH, field.shape[0], 0)
             image = axis.imshow(field, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto", extent=extent)
             axis.set_yticks(np.arange(len(told)) + 0.5, told, fontsize=6)
-            axis.set_title(names[k] if row == 0 else "", fontsize=9)
+            axis.set_title(names[k] if row == 0 else "", fontsize=9, parse_math=False)
             if row == rows - 1:
                 axis.set_xlabel("time, s")
         axes[row, 0].set_ylabel(f"{('before', 'after')[row]}: part of the fabric,\nits middle u, v in cm", fontsize=9)
@@ -123,7 +123,7 @@ def courses(answer: Diagnosis, before: Predicted, after: Predicted | None) -> An
                 time, rms = _course(p, k)
                 axis.plot(time, 1e3 * rms, color=colour, label=label)
         axis.axhline(1e3 * answer.found.floor, color="#888888", ls=":", label="expected")
-        axis.set_title(names[k], fontsize=9)
+        axis.set_title(names[k], fontsize=9, parse_math=False)
         axis.set_xlabel("time, s")
     axes[0].set_ylim(bottom=0)
     axes[0].set_ylabel("held out, mm RMS")
@@ -157,14 +157,14 @@ def missing_force(found: MissingForce) -> Any:
 
 def _pressed(axis: Any, found: MissingForce, m: Missing, across: np.ndarray, along: np.ndarray, limit: float) -> Any:
     window, _ = m.strongest
-    u, v = (found.uv.numpy() - found.uv.numpy().min(0)).T
+    u, v = found.uv.numpy().T
     shown = axis.tripcolor(u, v, found.faces.numpy(), across, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="gouraud")
     sure = (m.certainty[window].numpy() > 0.5 * SURE) & (np.linalg.norm(along, axis=1) > 0.1 * limit)
-    length = max(float(u.max()), float(v.max())) / 6
+    length = max(float(np.ptp(u)), float(np.ptp(v))) / 6
     arrows = along[sure] * length / limit
     axis.quiver(u[sure], v[sure], *arrows.T, angles="xy", scale_units="xy", scale=1, width=0.006)
     begin, end = m.windows[window].tolist()
-    axis.set_title(f"{m.motion}\n{begin:.2f} to {end:.2f} s", fontsize=9)
+    axis.set_title(f"{m.motion}\n{begin:.2f} to {end:.2f} s", fontsize=9, parse_math=False)
     axis.set_aspect("equal")
     axis.tick_params(labelsize=7)
     return shown

@@ -12,8 +12,10 @@ from typing import Any
 from .._files import write_text
 from . import pictures
 from .comparison import predict
+from .fitting import weighed_alike
 from .glossary import GLOSSARY
-from .screening import Row
+from .screening import Row, screen
+from .trials import alone_in
 from .verdict import Diagnosis
 
 STYLE = """
@@ -39,15 +41,15 @@ def write_report(answer: Diagnosis, folder: Path) -> Path:
 def _evidence(answer: Diagnosis) -> list[str]:
     """Pictures and tables of a search."""
     found, motions = answer.found, answer.content["motions"]
-    before = predict(found.start, motions)
-    after = predict(found.end, motions) if found.steps else None
+    alike, alone = weighed_alike(found.start, found.end), alone_in(found.steps)
+    before, after = (predict(fitted, motions, alone) for fitted in alike)
     return [
         "<h2>Where and when</h2>",
         _image(pictures.residual_maps(answer), "Neither points nor markers were seen."),
         "<h2>Motions held out</h2>",
-        _image(pictures.courses(answer, before, after)),
+        _image(pictures.courses(answer, before, after if found.steps else None)),
         "<h2>What the residuals of the base model ask for</h2>",
-        _image(pictures.screening(found.steps[0].screened if found.steps else found.screened)),
+        _image(pictures.screening(screen(found.start))),
         "<h2>What is left</h2>" if found.steps else "<h2>All hypotheses</h2>",
         _table(found.screened),
         "<h2>Lack of fit</h2>",

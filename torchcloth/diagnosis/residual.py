@@ -21,9 +21,8 @@ from .comparison import Gain
 from .fitting import Fitted, fit
 from .setting import Progress, Setting
 from .stepwise import Found, extend, instead
-from .world import Hypothesis, Model, World
+from .world import RESIDUAL, Hypothesis, Model, World
 
-RESIDUAL = "residual"
 TRIED = 2  # laws that are fitted at each step
 NEARLY_ALL = 0.9  # of what can be explained, beyond which no law does clearly more
 FITTED = ("mass", "bend")  # everywhere alike they are parameters of the base model

@@ -25,7 +25,7 @@ from .missing import missing_force
 from .model_file import save_model
 from .next_experiment import propose
 from .report import write_report
-from .residual import doubted, learn_residual
+from .residual import doubted, is_residual, learn_residual
 from .setting import Progress, motions_of, setting_of, staged
 from .stepwise import Found, search
 from .verdict import Diagnosis, judge, refused
@@ -55,8 +55,8 @@ def diagnose(
             over, but refuse to where it could go on.
 
     Raises:
-        InvalidInput: fewer than two episodes, too few motions to hold one out, different cloths, one episode twice, or
-            a default dtype other than float64.
+        InvalidInput: fewer than two episodes, too few motions to hold one out, different cloths, one episode twice, a
+            default dtype other than float64, or a model with a residual force.
         RecordingError: an episode that lacks what is needed.
         SimulationDiverged: the base model cannot be simulated.
     """
@@ -75,6 +75,13 @@ def diagnose(
             got=torch.get_default_dtype(),
             expected="torch.float64: differences between simulations lose their digits in float32",
             remedy="torch.set_default_dtype(torch.float64)",
+        )
+    if model is not None and any(map(is_residual, model.accepted)):
+        raise InvalidInput(
+            "model",
+            got="one with a residual force, which is no cause",
+            expected="one without",
+            remedy="load_model(path, residual=False)",
         )
     if faults := check(recordings):
         return refused(faults, names)

@@ -20,6 +20,7 @@ from ..meshes import Mesh
 from ..recordings import Recording
 
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
+RESIDUAL = "residual"  # and a dot: names of laws that are no causes
 OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
 Motion = Callable[[Episode], Episode]  # what the robot really does, from what it says
 View = Callable[[Frames, Episode], Frames]  # what is seen, from what is there

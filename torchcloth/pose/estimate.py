@@ -119,7 +119,7 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         "force_share_max": float(shares.max()),
         "seen_share": float(seen.double().mean()),
         "std_rms": float(std.square().sum(-1).mean().sqrt()),
-        "point_noise": float(found.final.scale[0]) if any(len(c) for c in data.clouds) else math.nan,
+        "point_noise": _point_noise(objective, data, found),
         "converged": found.converged,
         "unknowns": len(raw),
         "seconds": time.perf_counter() - began,
@@ -148,6 +148,13 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
 def _distances(data: Episode, faces: Tensor, frames: Mapping[str, Tensor]) -> dict[str, Any]:
     found = {key: figures([x], [data], faces) for key, x in frames.items()}
     return {f"{what}_{key}": getattr(f, what) for what in ("chamfer", "rms") for key, f in found.items()}
+
+
+def _point_noise(objective: Corrected, data: Episode, found: Smoothed) -> float:
+    """m, standard deviation of the points beside the estimate; NaN where none were used."""
+    names = [block.name for block in objective.blocks]
+    seen = "points" in names and any(len(cloud) for cloud in data.clouds)
+    return float(found.final.scale[names.index("points")]) if seen else math.nan
 
 
 def _errors(objective: Corrected, data: Episode, found: Smoothed, x: Tensor, moved: Tensor, fields: Modes) -> Tensor:

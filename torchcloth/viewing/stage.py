@@ -135,7 +135,7 @@ class Stage:
             "animated": True,
             "path_effects": [withStroke(linewidth=3, foreground=PAPER)],
         }
-        self.title = self.axes.text(0.02, 0.975, self.film.title, fontsize=9, **common)
+        self.title = self.axes.text(0.02, 0.975, self.film.title, fontsize=9, parse_math=False, **common)
         clock = self.axes.text(0.98, 0.975, "", ha="right", fontsize=10, **common)
 
         def draw(frame: int) -> None:

@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchcloth._files import PROGRESS, write_text
+from torchcloth.diagnosis.experiments import heading_of, possible
 from torchcloth.errors import InvalidInput
+from torchcloth.recordings import read
 
 from ..kept import Kept
 from . import hidden_tables
@@ -139,12 +141,18 @@ def experiments(
     motions = module("independent", "motions").NAMES
     drawn = {"motion": str(rng.choice(motions)), "heading": float(rng.choice(HEADINGS)), "speed": 1.0}
     found = {}
-    for which, plan in (("proposed", proposed), ("random", drawn)):
+    for which, plan in (("proposed", turned(proposed, given)), ("random", drawn)):
         folder = out / "episodes" / f"{name}-{which}"
         asked = [part for key in drawn if plan.get(key) is not None for part in (f"--{key}", str(plan[key]))]
         make(*asked, "--out", str(folder))
         found[which] = answered([*given, *folder.iterdir()], out / "answers" / f"{name}-{which}")
     return found
+
+
+def turned(plan: Mapping[str, Any], given: Sequence[Path]) -> dict[str, Any]:
+    """An experiment with its heading from the world's x, which is not where the episode that it repeats begins."""
+    template = next(r for e, r in possible([read(path) for path in given]) if e.motion == plan["motion"])
+    return {**plan, "heading": plan["heading"] + float(np.rad2deg(heading_of(template)))}
 
 
 def _gain(
