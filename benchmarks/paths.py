@@ -97,10 +97,9 @@ def main() -> None:
         def tangents(cloth=cloth, state=state, driven=driven, along=along):
             return cloth.sensitivities(state, driven, times, along=along)
 
-        repeats = 1 if engine == "reference" else options.repeats
-        best, out = seconds(forward, repeats)
+        best, out = seconds(forward, options.repeats)
         ends.append(out.x)
-        rows.append((name, best, seconds(gradient, repeats)[0], seconds(tangents, repeats)[0]))
+        rows.append((name, best, seconds(gradient, options.repeats)[0], seconds(tangents, options.repeats)[0]))
         substeps = sum(cloth.plan(state, driven, times, None).counts)
     for x in ends[1:]:
         torch.testing.assert_close(x, ends[0], rtol=0, atol=1e-4)

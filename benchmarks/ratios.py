@@ -15,12 +15,14 @@ CONVENTIONS = {
     "one forward run of the same substeps; a gradient is forward and backward",
     "ratios linear_*": "time per triangle (per substep) at the largest over that at 800 triangles (250 substeps)",
     "forward_vs_taichi, forward_vs_warp, gradient_vs_*": "standard-everywhere: every triangle uses the grid, the same "
-    "grid work as theirs; ours takes 800 contact points through it, theirs 441 vertices and 800 elements",
+    "grid work as theirs but that they clear all nodes of a box about the scene; ours takes 800 contact points through "
+    "it, theirs 441 vertices and 800 elements",
     "*_default_*": "the same peers against torchcloth's default contact (case standard), where a sheet far from "
     "other layers needs no grid",
     "*_1s_*": "1 s in 6250 substeps and 25 frames; what a call costs however short it is no longer "
     "shows, as it does in the runs of 250 substeps",
-    "newton, mujoco": "sheet-800, without contact, like theirs; Newton's contact is on in case standard",
+    "newton, mujoco": "sheet-800, without contact, like theirs; MuJoCo computes in float64; Newton's "
+    "contact is on in case standard",
     "gradient": "of the mean squared end position by initial positions, Young's modulus and (torchcloth) the poses",
     "prepare_seconds": "building, compiling and a first run; Taichi and Warp keep compiled code between calls",
     "limits": "flops and bytes that the standard case needs at least, in torchcloth's scheme, against this machine's "

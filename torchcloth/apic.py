@@ -69,6 +69,8 @@ def step(
 
 
 def _masses(model: Model, state: ClothState, s: Surface) -> Tensor:
-    """[..., V + E, 1] kg."""
+    """[..., V + E, 1] kg; what triangles carry is not the vertices', what effects add is."""
     triangle = (model.areal_density * s.area / 4).expand(*s.n.shape[:-1], 1)
-    return torch.cat([(0.75 * model.mass).expand(*state.x.shape[:-1], 1), triangle], dim=-2)
+    vertex = model.mass.expand(*state.x.shape[:-1], 1)
+    corners = torch.cat([triangle / 3] * 3, dim=-2)
+    return torch.cat([vertex.index_add(-2, model.geometry.corners, corners, alpha=-1), triangle], dim=-2)

@@ -59,7 +59,7 @@ class Cloth(nn.Module):
             and c_F of the material.
         transfer: "mesh": elastic forces act on the vertices, the grid carries contact only. "apic": the usual material
             point method, everything through the grid, for comparison; one contact point per triangle, no play, no
-            collision damping, no added mass.
+            collision damping, no added mass; wrenches leave out what the grid takes up, some per cent of the weight.
         engine: what computes the substeps. "auto": the fused engine (C++, on the CPU, in float32 or float64) where it
             knows the parts, else the torch reference; ``print`` of the cloth tells which and why. "fused": an error
             where it cannot. "reference": always torch. The attribute of the same name may be set at any time.

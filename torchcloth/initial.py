@@ -33,11 +33,14 @@ def likeness(model: Model, x: Tensor) -> ClothState:
     return ClothState(x, x, x.new_empty(points, 3), _virgin(model, x))
 
 
+SETTLING = "cloth.settling"  # an effect that no user's can be called: names have no dots
+
+
 def damped(model: Model, rate: float) -> Model:
     """With mass damping of ``rate`` [1/s] beside all; grips do not slip yet."""
     damping = MassDamping(rate).to(model.geometry.area)
     kept = {name: part for name, part in model.effects.items() if part[0].grasp is None}
-    return model._replace(effects={**kept, "settling": (damping, damping.coefficients().detach())})
+    return model._replace(effects={**kept, SETTLING: (damping, damping.coefficients().detach())})
 
 
 def held(motion: Mapping[str, Trajectory], start: float, end: float) -> dict[str, Trajectory]:

@@ -3,14 +3,17 @@
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from torchcloth.benchmarks import contestants, limits, report
 from torchcloth.benchmarks.cases import engines, make
+from torchcloth.benchmarks.contestant import Outcome, Task
 from torchcloth.benchmarks.measure import Timing, peak, resident, sample
 from torchcloth.benchmarks.ratios import CONVENTIONS, ratios
-from torchcloth.benchmarks.suite import Plan, entries
+from torchcloth.benchmarks.suite import Bench, Entry, Plan, entries
 
 ISSUE = (
     "forward_vs_taichi",
@@ -69,6 +72,36 @@ def test_entries_have_keys_of_their_own():
         plan = Plan(("fused", "reference"), tuple(contestants.PEERS), fast=fast)
         keys = [entry.key(name) for entry in entries(plan) for name in entry.names]
         assert len(keys) == len(set(keys))
+
+
+@pytest.mark.parametrize(
+    ("broken", "counted"), [("fused", {"reference"}), ("reference", {"fused"}), ("", {"fused", "reference"})]
+)
+def test_who_is_wrong_is_not_counted_and_condemns_nobody(broken, counted):
+    """Whoever comes first."""
+    task = Task("standard", "gradient", 20, small=True)
+    x = task.scene().mesh.vertices + np.array([0.0, 0.0, -1e-4])
+    right = Outcome(x, 1.0, np.ones_like(x), 1.0)
+    wrong = Outcome(np.full_like(x, np.nan), 1.0, np.ones_like(x), 1.0)
+    stub = lambda name: SimpleNamespace(result=lambda: (wrong if name == broken else right,), threads=1)  # noqa: E731
+    bench = Bench(Plan(("fused", "reference")))
+    bench._workers.update({name: stub(name) for name in ("fused", "reference")})
+    entry = Entry(task, ("fused", "reference"))
+    bench._judge(entry, {"fused": 0.0, "reference": 0.0}, {"fused": [1.0], "reference": [2.0]})
+    assert set(bench.records) == {entry.key(name) for name in counted}
+    assert len(bench.notes) == 2 - len(counted)
+
+
+def test_the_fused_engine_is_held_against_the_reference():
+    task = Task("standard", "gradient", 20, small=True)
+    x = task.scene().mesh.vertices + np.array([0.0, 0.0, -1e-4])
+    right, other = Outcome(x, 1.0, np.ones_like(x), 1.0), Outcome(x, 1.0, -7 * np.ones_like(x), 1.0)
+    bench, entry = Bench(Plan(("fused", "reference"))), Entry(task, ("fused", "reference"))
+    for name, found in (("fused", other), ("reference", right)):
+        bench._workers[name] = SimpleNamespace(result=lambda found=found: (found,), threads=1)
+    bench._judge(entry, {"fused": 0.0, "reference": 0.0}, {"fused": [1.0], "reference": [2.0]})
+    assert set(bench.records) == {entry.key("reference")}
+    assert "derivative by positions" in bench.notes[entry.key("fused")]
 
 
 def test_samples_are_seconds_of_one_run():

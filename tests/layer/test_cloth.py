@@ -8,6 +8,7 @@ from small import sheet
 
 import torchcloth as tc
 from torchcloth import functional
+from torchcloth.boundaries import drive
 from torchcloth.errors import InvalidInput, SimulationDiverged, UnstableStep
 
 
@@ -46,6 +47,8 @@ def held():
         ),
         ({"hand": trajectory()._replace(t=torch.tensor([1.0, 0.0]))}, "do not increase"),
         ({"hand": trajectory()._replace(t=torch.tensor([0.5, 1.0]))}, "to cover"),
+        ({"hand": trajectory()._replace(t=torch.tensor([0, 1]))}, r"t; got int64; expected finite seconds"),
+        ({"hand": trajectory()._replace(t=torch.tensor([0.0, math.inf]))}, "infinite times"),
         ({"hand": trajectory()._replace(pose=torch.eye(4))}, r"pose \[\.\.\., K, 4, 4\]"),
         ({"hand": trajectory()._replace(closed=torch.tensor(True))}, r"closed \[K\]"),
         ({"hand": trajectory(pose=torch.full((2, 4, 4), math.nan))}, "NaN"),
@@ -121,6 +124,11 @@ def test_a_stiffness_changed_later_moves_the_limit():
         (lambda: tc.boundaries.Grasp([0], uv=[[0.0, 0.0]]), "exactly one"),
         (lambda: tc.boundaries.Grasp([16]), r"got \[16\]; expected indices in 0\.\.15"),
         (lambda: tc.boundaries.Grasp([]), "Grasp vertices"),
+        (lambda: tc.boundaries.Grasp(torch.arange(16) > 11), "Grasp vertices; got bool of shape .*flatnonzero"),
+        (lambda: tc.boundaries.Grasp([True, False]), "Grasp vertices; got bool"),
+        (lambda: tc.boundaries.Grasp([0.7, 1.2]), "Grasp vertices; got float64"),
+        (lambda: tc.boundaries.Grasp([[0, 1]]), r"Grasp vertices; got int64 of shape \(1, 2\)"),
+        (lambda: tc.boundaries.Grasp("ab"), "Grasp vertices"),
         (lambda: tc.boundaries.Grasp(uv=[[5.0, 5.0]]), "no vertex within"),
         (lambda: tc.boundaries.Grasp.corner("middle"), "lower-left"),
         (lambda: tc.boundaries.Plane(normal=(0.0, 0.0, 0.0)), "not all zero"),
@@ -366,6 +374,41 @@ def test_settling_brings_noise_to_rest():
     assert float(calm.v.abs().max()) == 0.0
     torch.testing.assert_close(calm.x[[3, 7]], noisy.x[[3, 7]], rtol=0, atol=1e-12)  # held where the hand is at 0 s
     assert float(speeds[1]) < 0.05 * float(speeds[0])  # released, the noise would ring
+
+
+def test_an_effect_of_any_name_acts_while_the_cloth_settles():
+    hold = {"hand": tc.boundaries.Grasp([3, 7, 11, 15])}
+    sags = []
+    for name in ("gravity", "settling"):
+        cloth = sheet(boundaries=dict(hold), effects={name: tc.effects.Gravity((0.0, 0.0, -9.81))})
+        with torch.no_grad():
+            sags.append(cloth.settle(cloth.rest_state(), {"hand": trajectory()}, duration=0.05).x)
+        hold = {"hand": tc.boundaries.Grasp([3, 7, 11, 15])}
+    assert torch.equal(*sags)
+    assert float(sags[0][:, 2].min()) < -1e-4
+
+
+@pytest.mark.parametrize("start", [0.0, 30.0])
+def test_in_float32_still_bodies_stand_still_and_moving_ones_are_smooth(start):
+    """What rounding does to a substep's motion must not add up, nor grow with time."""
+    a, b = torch.tensor(0.3).double(), torch.tensor(0.7).double()
+    turn = torch.eye(4).double()
+    turn[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0, -a, b], [a, 0, -0.2], [-b, 0.2, 0]]).double())
+    turn[:3, 3] = torch.tensor([0.4, -0.3, 0.5])
+    t = torch.linspace(0, 32, 321).double()
+    pose = turn.repeat(321, 1, 1)
+    still = tc.Trajectory(t, pose.float(), torch.ones(321, dtype=torch.bool))
+    pose = pose.clone()
+    pose[:, 0, 3] += torch.cos(0.5 * t)
+    moving = still._replace(pose=pose.float())
+    times = start + torch.arange(5001).double() * 1.2e-4
+    point = torch.tensor([0.1, 0.1, 0.0, 1.0])
+    total = torch.eye(4).double()
+    for step in drive(still, times).increment.double():
+        total = step @ total
+    assert float((total @ point.double() - point.double()).norm()) < 1e-9
+    speed = (drive(moving, times).increment.double() @ point.double() - point.double())[:, 0] / 1.2e-4
+    assert float((speed[1:] - speed[:-1]).abs().max()) < 3e-3  # m/s
 
 
 def test_the_motion_is_an_input_and_nothing_is_remembered():

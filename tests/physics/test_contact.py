@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth import functional, self_contact
+from torchcloth import apic, functional, self_contact
 from torchcloth.transfer import FADING, GAP, TOUCH
 
 SPACING, STIFFNESS, DENSITY = 0.01, 100.0, 0.15  # m, k h [N/m], kg/m^2
@@ -217,6 +217,15 @@ def test_the_usual_scheme_runs_beside_ours():
         tc.Cloth(mesh, tc.materials.AEP(1e5), DENSITY, contact=None, transfer="apic")
     with pytest.raises(tc.errors.InvalidInput, match="transfer"):
         tc.Cloth(mesh, tc.materials.AEP(1e5), DENSITY, transfer="flip")
+
+
+def test_all_that_weighs_is_on_the_grid_of_the_usual_scheme():
+    mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(5, 5))
+    cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), DENSITY, {"hem": tc.effects.LineMass(0.02)}, transfer="apic")
+    model, state = cloth.model(), cloth.rest_state()
+    carried = apic._masses(model, state, functional.surface(model.geometry, state.x, state.v))
+    torch.testing.assert_close(carried.sum(), model.mass.sum())
+    assert float(carried.min()) > 0
 
 
 def test_the_usual_scheme_brakes_a_turning_sheet_and_ours_does_not():

@@ -6,6 +6,7 @@ import pytest
 import torch
 from colliding import block
 
+import torchcloth as tc
 from torchcloth.boundaries import (
     Box,
     Capsule,
@@ -17,7 +18,7 @@ from torchcloth.boundaries import (
     Sphere,
     Stribeck,
 )
-from torchcloth.errors import InvalidInput, MissingDependency
+from torchcloth.errors import InvalidInput, MissingDependency, SimulationDiverged
 
 
 def test_state_brings_the_cell_along():
@@ -50,6 +51,16 @@ def test_a_mesh_solid_is_the_solid_that_its_mesh_draws(cell):
         inner = (p.abs() - torch.tensor(size) / 2).sort(-1).values[:, 1:2] < -2 * cell  # far from edges
         assert float(error[near].max()) < 0.5 * cell
         assert float(error[near & inner].max()) < 1e-7  # open3d computes in float32
+
+
+@pytest.mark.parametrize("engine", ["reference", "auto"])
+def test_a_cloth_that_is_lost_beside_a_mesh_is_said_to_diverge(engine):
+    solid = MeshSolid(*block((0.1, 0.08, 0.06), (0, 0, 0)), cell=0.01)
+    cloth = tc.Cloth(tc.meshes.rectangle(0.1, 0.1, resolution=(4, 4)), tc.materials.AEP(1e4), 0.2, {}, {"body": solid})
+    cloth.engine = engine
+    x = cloth.rest_state().x
+    with pytest.raises((SimulationDiverged, InvalidInput)), torch.no_grad():
+        cloth(cloth.state(x, torch.full_like(x, 1e200)), times=[0.0, 0.01])
 
 
 @pytest.mark.parametrize(

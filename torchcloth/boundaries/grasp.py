@@ -43,7 +43,7 @@ class Grasp(AbstractBoundary):
         self._uv, self.radius, self._stays = uv, float(radius), False
         self._corner: Corner | None = None
         self._place: str | None = None
-        self.register_buffer("index", torch.as_tensor([] if vertices is None else list(vertices), dtype=torch.long))
+        self.register_buffer("index", _indices([] if vertices is None else vertices))
         self.index: Tensor
 
     @classmethod
@@ -128,3 +128,16 @@ class Grasp(AbstractBoundary):
     def extra_repr(self) -> str:
         """One line of the data sheet."""
         return f"{len(self.index)} vertices"
+
+
+def _indices(vertices: Sequence[int]) -> Tensor:
+    """[H] int64. Truths and shares would pass for the numbers 0 and 1."""
+    found = np.asarray(vertices.cpu() if isinstance(vertices, Tensor) else vertices)
+    if found.ndim != 1 or (len(found) and found.dtype.kind not in "iu"):
+        raise InvalidInput(
+            "Grasp vertices",
+            got=f"{found.dtype} of shape {found.shape}",
+            expected="numbers of vertices",
+            remedy="of a mask numpy.flatnonzero(mask)",
+        )
+    return torch.as_tensor(found.astype(np.int64))

@@ -81,7 +81,7 @@ class MeshSolid(AbstractCollider):
         """Interpolated; beyond the grid the distance to it is added. Where the gradient vanishes: the z axis."""
         place = (p - self.origin) / self.cell
         kept = torch.minimum(place.clamp(min=0), (self.count - 1).to(place))
-        first = torch.minimum(kept.detach().long(), self.count - 2)
+        first = torch.minimum(kept.detach().nan_to_num().long().clamp(min=0), self.count - 2)  # of lost states, too
         value, gradient = self._interpolate(first, kept - first)
         length = safe_norm(gradient)
         flat = length < 1e-3

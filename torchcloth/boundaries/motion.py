@@ -37,6 +37,9 @@ def check(trajectory: Trajectory, name: str) -> None:
     if closed.dtype != torch.bool:
         got, remedy = str(closed.dtype).removeprefix("torch."), "for example closed > 0.5"
         raise InvalidInput(f"{where}.closed", got=got, expected="bool", remedy=remedy)
+    if not t.is_floating_point() or not bool(torch.isfinite(t).all()):
+        got = "NaN or infinite times" if t.is_floating_point() else str(t.dtype).removeprefix("torch.")
+        raise InvalidInput(f"{where}.t", got=got, expected="finite seconds, floating point")
     if not bool((t[1:] > t[:-1]).all()):
         raise InvalidInput(f"{where}.t", got="times that do not increase", expected="strictly increasing seconds")
     if not pose.is_floating_point() or not bool(torch.isfinite(pose).all()):
@@ -95,15 +98,20 @@ def interpolate(trajectory: Trajectory, times: Tensor) -> Tensor:
 
 
 def drive(trajectory: Trajectory, times: Tensor) -> Drive:
-    """Increments of motion over the substeps between consecutive ``times`` [N + 1] s."""
-    pose = interpolate(trajectory, times)
+    """Increments of motion over the substeps between consecutive ``times`` [N + 1] s, in the poses' precision.
+
+    They are resolved in float64: what float32 loses of a substep is alike in all of them, and would carry a body that
+    stands still by a millimetre a second.
+    """
+    given = trajectory.pose
+    pose = interpolate(trajectory._replace(pose=given.double()), times)
     before, after = pose[..., :-1, :, :], pose[..., 1:, :, :]
     turn = after[..., :3, :3] @ before[..., :3, :3].mT
     shift = after[..., :3, 3:] - turn @ before[..., :3, 3:]
     increment = torch.cat([torch.cat([turn, shift], dim=-1), after[..., 3:, :]], dim=-2)
     knot = last_knot(trajectory.t.to(times), times[:-1] + 1e-9).clamp(min=0)
     closed = trajectory.closed.cpu()[knot.cpu()]
-    return Drive(increment, after, tuple(closed.tolist()))
+    return Drive(increment.to(given), after.to(given), tuple(closed.tolist()))
 
 
 def _slopes(t: Tensor, pose: Tensor) -> Tensor:
