@@ -225,7 +225,7 @@ def test_all_that_weighs_is_on_the_grid_of_the_usual_scheme():
     model, state = cloth.model(), cloth.rest_state()
     carried = apic._masses(model, state, functional.surface(model.geometry, state.x, state.v))
     torch.testing.assert_close(carried.sum(), model.mass.sum())
-    assert float(carried.min()) > 0
+    assert bool((carried > 0).all())
 
 
 def test_the_usual_scheme_brakes_a_turning_sheet_and_ours_does_not():
