@@ -15,6 +15,8 @@ from .self_contact import first_directors
 from .types import ClothState, Memory, Trajectory
 from .validation import check_duration, check_mapping, check_positions
 
+SETTLING = "cloth.settling"  # an effect that no user's can be called: names have no dots
+
 
 def first_state(model: Model, x: Tensor, v: Tensor) -> ClothState:
     """Vertices at x [..., V, 3] with velocities v; directors along the normals, nothing remembered.
@@ -31,9 +33,6 @@ def likeness(model: Model, x: Tensor) -> ClothState:
     """A state with the right shapes and no physics."""
     points = 0 if model.grid is None else len(model.geometry.area) * len(model.grid.points)
     return ClothState(x, x, x.new_empty(points, 3), _virgin(model, x))
-
-
-SETTLING = "cloth.settling"  # an effect that no user's can be called: names have no dots
 
 
 def damped(model: Model, rate: float) -> Model:

@@ -377,13 +377,12 @@ def test_settling_brings_noise_to_rest():
 
 
 def test_an_effect_of_any_name_acts_while_the_cloth_settles():
-    hold = {"hand": tc.boundaries.Grasp([3, 7, 11, 15])}
     sags = []
     for name in ("gravity", "settling"):
-        cloth = sheet(boundaries=dict(hold), effects={name: tc.effects.Gravity((0.0, 0.0, -9.81))})
+        hold = {"hand": tc.boundaries.Grasp([3, 7, 11, 15])}
+        cloth = sheet(boundaries=hold, effects={name: tc.effects.Gravity((0.0, 0.0, -9.81))})
         with torch.no_grad():
             sags.append(cloth.settle(cloth.rest_state(), {"hand": trajectory()}, duration=0.05).x)
-        hold = {"hand": tc.boundaries.Grasp([3, 7, 11, 15])}
     assert torch.equal(*sags)
     assert float(sags[0][:, 2].min()) < -1e-4
 

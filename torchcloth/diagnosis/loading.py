@@ -10,8 +10,8 @@ import torch
 
 from ..cloth import Cloth
 from ..identification.episode_prediction import EpisodePrediction, with_errors
-from ..identification.episodes import episode
-from ..identification.replays import each
+from ..identification.episodes import Episode, episode
+from ..identification.replays import Frames, each
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from ..recordings.together import together
@@ -94,6 +94,11 @@ def _parameter(cloth: Cloth, name: str) -> PhysicalParameter:
     return cloth.get_submodule(available(cloth)[name])  # type: ignore[return-value]
 
 
+def watched(world: World, data: Episode) -> Frames:
+    """What an observer whose clock may be late has of all of an episode's frames."""
+    return each(world.frames(data.beyond(LATE)), lambda field: field[: len(data.times)])
+
+
 def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
     """Where the cloth goes in any episode, with errors from the covariance of the model's numbers.
 
@@ -105,8 +110,6 @@ def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
     covariance = torch.zeros(len(every), len(every)) if file.covariance is None else file.covariance
     shifts = every[: len(covariance)]  # a residual force, which comes last, has no errors
     worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]
-    further, count = data.beyond(LATE), len(data.times)
-    done = side_by_side(lambda w: w.frames(further), worlds)
-    frames, *beside = (each(f, lambda field: field[:count]) for f in done)
+    frames, *beside = side_by_side(lambda w: watched(w, data), worlds)
     slopes = directions(frames, beside, [step for _, step in shifts])
     return with_errors(world.cloth, data, frames, slopes, covariance, math.nan)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ..diagnosis import read_model
-from ..diagnosis.setting import LATE
+from ..diagnosis.loading import watched
 from ..identification import replayed
 from ..identification.episodes import episode
 from ..losses import closest
@@ -53,7 +53,7 @@ def _film_of_model(recording: Recording, path: str | Path, truth: bool) -> Film:
     model = read_model(path, recording).model
     world, data = model.world(), episode(model.base.cloth, recording)
     film = film_of(recording, truth=truth, times=data.times.numpy())
-    x = world.frames(data.beyond(LATE)).x[: len(data.times)].numpy()  # what a late clock sees
+    x = watched(world, data).x.numpy()
     film = with_cloth(film, x, world.cloth.mesh.faces, noise=recording.observation_noise_std)
     far = film.curves[DISTANCE].values if DISTANCE in film.curves else np.array([np.nan])
     distance = f", {np.nanmean(far):.2f} mm from the points" if np.isfinite(far).any() else ""
