@@ -75,7 +75,8 @@ def shapes(fit: Identification, k: int, episode: Episode, faces: np.ndarray) -> 
             )
             distance = 1e3 * _distance(clouds[i], frames[i], index)
             axis.scatter(*cloud.T, c=distance, s=5, cmap="inferno_r", vmin=0, vmax=worst, depthshade=False, zorder=2)
-            axis.set_title(f"{label}, t = {float(episode.times[i]):.2f} s: {distance.mean():.2f} mm", fontsize=10)
+            title = f"{label}, t = {float(episode.times[i]):.2f} s: {distance.mean():.2f} mm"
+            axis.set_title(title, fontsize=10, parse_math=False)
             axis.set(**{f"{a}lim": (m - half, m + half) for a, m in zip("xyz", middle, strict=True)})
             axis.set_box_aspect((1, 1, 1), zoom=1.15)
             axis.tick_params(labelsize=6)
@@ -84,7 +85,7 @@ def shapes(fit: Identification, k: int, episode: Episode, faces: np.ndarray) -> 
             axis.view_init(elev=12, azim=-60)
     scale = ScalarMappable(Normalize(0, worst), "inferno_r")
     figure.colorbar(scale, ax=axes, shrink=0.6, label="distance of a measured point from the surface [mm]")
-    figure.suptitle(f"{episode.name}: measured points over the simulated cloth (axes in m)", x=0.45)
+    figure.suptitle(f"{episode.name}: measured points over the simulated cloth (axes in m)", x=0.45, parse_math=False)
     return figure
 
 
@@ -134,7 +135,8 @@ def forces(fit: Identification, episodes: Sequence[Episode]) -> Any:
             for label, source, colour in (("start", fit.forces_before, BEFORE), ("fitted", fit.forces_after, AFTER)):
                 axis.plot(e.times[1:], source[k][name][1:, :3] @ along, color=colour, label=label)
             axis.set(xlabel="time [s]", ylabel="force [N]")
-            axis.set_title(f"{e.name}, {name}: along ({', '.join(f'{a:.2f}' for a in along.tolist())})", fontsize=10)
+            title = f"{e.name}, {name}: along ({', '.join(f'{a:.2f}' for a in along.tolist())})"
+            axis.set_title(title, fontsize=10, parse_math=False)
         for axis in row[len(own) :]:
             axis.set_axis_off()
     axes[0, 0].legend()

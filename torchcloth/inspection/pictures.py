@@ -35,7 +35,7 @@ def draw(report: Inspection, folder: str | Path) -> Path:
         _frame(figure.add_subplot(grid[1, column], projection="3d"), report, kind, i)
     _quality(figure.add_subplot(grid[1, 2]), report)
     name = report.recording.path.name if report.recording.path else "recording"
-    figure.suptitle(f"{name}: {report.recording.provenance}", fontsize=11)
+    figure.suptitle(f"{name}: {report.recording.provenance}", fontsize=11, parse_math=False)
     return save_figure(figure, folder / "inspection.png")
 
 
@@ -136,7 +136,7 @@ def _frame(axis: Any, report: Inspection, kind: str, i: int) -> None:
     axis.locator_params(nbins=4)
     for name in "xyz":
         getattr(axis, f"set_{name}label")(f"{name} [m]", fontsize=7, labelpad=-8)
-    axis.set_title(f"{kind}, frame {i}, t = {stream.t[i]:.2f} s", fontsize=10)
+    axis.set_title(f"{kind}, frame {i}, t = {stream.t[i]:.2f} s", fontsize=10, parse_math=False)
 
 
 def _quality(axis: Any, report: Inspection) -> None:
