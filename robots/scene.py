@@ -47,6 +47,9 @@ class Scene(nn.Module):
         super().__init__()
         if not arms:
             raise InvalidInput("arms is empty", expected="one arm or more")
+        if refused := [name for name in arms if "." in name or hasattr(nn.ModuleDict, name)]:
+            expected = "a name without dots that is no method of torch's ModuleDict"
+            raise InvalidInput("name of an arm", got=repr(refused[0]), expected=expected)
         self.arms = nn.ModuleDict(dict(arms))
         self.table = table
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 PROGRESS = "progress"  # folder in an output folder, while the work is not done
 
@@ -35,3 +38,16 @@ def write_text(path: Path, text: str) -> Path:
     with atomically(path) as part:
         part.write_text(text, encoding="utf-8")
     return path
+
+
+def as_json(content: Any) -> str:
+    """Text of a result; what is not a finite number is null."""
+    return json.dumps(_finite(content), indent=1, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from torchcloth._files import write_text
+from torchcloth._files import as_json, write_text
 from torchcloth.errors import InvalidInput, RecordingError, TorchclothError
 
 Case = Callable[[], dict[str, Any]]
@@ -53,10 +53,10 @@ class Kept:
             raise unreadable(path) from None
 
     def keep(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write a finished case; a crash leaves no half file."""
+        """Write a finished case, with null for what is not a number; a crash leaves no half file."""
         self.begin()
         self._path(name).parent.mkdir(exist_ok=True)
-        write_text(self._path(name), json.dumps(content, indent=1, allow_nan=False) + "\n")
+        write_text(self._path(name), as_json(content))
 
     def run(self, cases: Mapping[str, Case], jobs: int = 1) -> dict[str, dict[str, Any]]:
         """All cases by name, the missing ones computed in turn, ``jobs`` at a time, with progress."""

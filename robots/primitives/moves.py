@@ -42,7 +42,7 @@ class Move(NamedTuple):
 
     along: Vector = (0.0, 0.0, 0.0)  # m, straight shift
     bow: Vector = (0.0, 0.0, 0.0)  # m, half axis of an ellipse over that shift
-    roll: float = 0.0  # rad, about the axis to the heading's right
+    roll: float = 0.0  # rad, about the axis to the heading's left
     apart: float = 0.0  # m, by which the distance of two grippers grows, half at each
     least: float = 0.0  # s, takes at least so long
 
@@ -60,7 +60,7 @@ def action(
     Args:
         grips: where the grippers hold, at the start.
         moves: one after the other; those that go nowhere are left out.
-        heading: of the motion, from the world's x axis [rad]; rolls are about the horizontal axis to its right.
+        heading: of the motion, from the world's x axis [rad]; rolls are about the horizontal axis to its left.
         rest: time after the last move [s].
         limits: of the grippers.
         release: whether the grippers open at the end of the last move.

@@ -1,6 +1,7 @@
 """Fields: one value per triangle."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import torch
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import fit_fields, identify
+from torchcloth.identification import fields, fit_fields, identify
+from torchcloth.identification.blocks import blocks_for
 from torchcloth.identification.fields import NO_ERROR, laplacian
 
 STIFF = 4.0  # times, in the stripe
@@ -128,3 +130,18 @@ def test_identify_says_who_fits_fields(striped):
     recording = striped(frames=4, points=50)
     with pytest.raises(InvalidInput, match="a value for each triangle: fit_fields"):
         identify(start(recording), recording, ["youngs_modulus"])
+
+
+def test_pieces_of_cloth_that_do_not_touch_have_a_prior_each():
+    one = tc.meshes.rectangle(0.1, 0.1, triangles=8)
+    faces = np.concatenate([one.faces, np.asarray(one.faces) + len(one.vertices)])
+    two = tc.meshes.Mesh.build(
+        np.concatenate([one.vertices, np.asarray(one.vertices) + np.array([0.2, 0.0, 0.0])]), faces
+    )
+    cloth = with_field(tc.Cloth(two, tc.materials.AEP(1e5, 0.3), 0.2), torch.full((len(faces),), 1e5))
+    own = {"youngs_modulus": cloth.material.youngs_modulus}
+    prior = fields._Fields(cloth, own, [], None, blocks_for(None), 1.0).root
+    covariance = torch.linalg.inv(prior @ prior.mT)
+    count = len(one.faces)
+    assert float(covariance[:count, :count].mean()) == pytest.approx(math.log(10) ** 2)
+    assert float(covariance[:count, count:].abs().max()) < 1e-9

@@ -1,6 +1,7 @@
 """Errors from the scatter between episodes, where something differs between them that was not fitted."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import scipy.stats
@@ -8,8 +9,10 @@ import torch
 import toys
 
 from torchcloth import recordings as rec
-from torchcloth.identification import replicates
+from torchcloth.identification import gauss_newton, replicates
+from torchcloth.identification.considered import covariance_of
 from torchcloth.identification.gauss_newton import WINDOW, at_least, covariance, minimise, student
+from torchcloth.identification.linearity import Checked
 from torchcloth.identification.replicates import strata_of
 
 HIDDEN = 0.05  # standard deviation of what differs between episodes, in units of the unknowns
@@ -123,3 +126,62 @@ def named(name, **split):
 )
 def test_episodes_repeat_each_other_when_they_say_so(episodes, strata):
     assert strata_of(episodes).tolist() == strata
+
+
+def test_folders_of_one_name_are_other_episodes():
+    """Three days' "ep" are no repetitions; what repeats one is that of its own day."""
+
+    def at(path, **split):
+        return SimpleNamespace(path=Path(path), split=split)
+
+    assert strata_of([at(f"day{k}/ep") for k in range(3)]).tolist() == [0, 0, 0]
+    repeated = [at(f"day{k}/{name}", **said) for k in range(2) for name, said in REPEATED]
+    assert strata_of(repeated).tolist() == [1, 1, 1, 2, 2, 2]
+
+
+REPEATED = (("ep", {}), ("again", {"replicate_of": "ep"}), ("third", {"replicate_of": "again"}))
+
+
+def test_nuisances_of_an_episode_do_not_scatter():
+    """Without its own episode an offset goes back to its prior's middle: that says nothing of its error."""
+    torch.manual_seed(0)
+    episodes, frames, points, sigma = 4, 12, 16, 1e-4
+    offsets = 5e-3 * torch.ones(episodes)
+    slopes, frame, patch, own = [], [], [], []
+    for e in range(episodes):
+        jacobian = torch.zeros(frames, points, 1 + episodes)
+        jacobian[..., 0] = -0.01 * torch.rand(frames, points)
+        jacobian[..., 1 + e] = -(torch.rand(frames, points) > 0.5).double()
+        slopes.append(jacobian.reshape(-1, 1 + episodes))
+        t, where = torch.meshgrid(torch.arange(frames), torch.arange(points), indexing="ij")
+        frame.append(t.reshape(-1) + e * (frames + WINDOW))
+        patch.append(where.reshape(-1))
+        own.append(torch.full((frames * points,), e))
+    J, frame, patch, own = map(torch.cat, (slopes, frame, patch, own))
+    data = -J @ torch.cat([torch.ones(1), offsets]) + sigma * torch.randn(len(J))
+
+    def value(raw):
+        return data + J @ raw
+
+    problem = gauss_newton.Problem(
+        lambda raw: gauss_newton.Linearised(value(raw), J, torch.ones(len(J)), frame, patch),
+        lambda raw: (value(raw), patch),
+        lambda raw: raw,
+        torch.zeros(1 + episodes),
+        torch.tensor([2.3] + [2e-3] * episodes),
+        torch.ones(1 + episodes),
+        1e-6,
+    )
+    at = minimise(problem, torch.zeros(1 + episodes), 30, lambda _: False)
+    objective = SimpleNamespace(
+        problem=lambda: problem,
+        episodes=[SimpleNamespace(settles=False)] * episodes,
+        episode_of=lambda linear: own,
+        unknowns=[None],
+        nuisances=[],
+        cloth=SimpleNamespace(boundaries={}),
+    )
+    found = covariance_of(objective, Checked(at, None, [], [])).diagonal().sqrt()
+    alone = covariance(problem, at).diagonal().sqrt()
+    assert found[1:] == pytest.approx(alone[1:])
+    assert float(found[0]) > float(alone[0])

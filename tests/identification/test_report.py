@@ -166,11 +166,32 @@ def test_what_is_withdrawn_is_not_identified_by_its_prior_either(model):
     raw = torch.tensor([u.start for u in unknowns])
     fitted = estimates(model, unknowns, raw, torch.diag(torch.full((3,), 1e-12)))
     assert fitted.parameters["youngs_modulus"].source == fitted.parameters["areal_density"].source == "prior"
-    p = withdraw(fitted, unknowns).parameters
+    p = withdraw(fitted, unknowns, raw).parameters
     assert not any(e.identifiable for e in p.values())
-    assert p["youngs_modulus"].std == pytest.approx(1e4, rel=0.01)
+    assert p["youngs_modulus"].std == pytest.approx(8e4 * math.hypot(math.log(1.01), math.log(12.5)))
     assert p["youngs_modulus"].ci95 == pytest.approx((8e4, 1.0197e6), rel=1e-3)
     assert p["areal_density"].std == pytest.approx(0.005)
+
+
+def test_what_is_withdrawn_far_from_its_start_is_uncertain_by_the_way(model):
+    """Predictions read std over value as the error of a logarithm."""
+    unknowns = collect(model, ["youngs_modulus"], None)
+    for factor in (1e-3, 1e3):
+        raw = torch.tensor([unknowns[0].start + math.log(factor)])
+        e = withdraw(estimates(model, unknowns, raw, torch.eye(1)), unknowns, raw).parameters["youngs_modulus"]
+        assert e.std / e.value == pytest.approx(math.hypot(math.log(10), math.log(factor)))
+
+
+def test_friction_is_judged_against_a_friction_s_size():
+    mesh = tc.meshes.rectangle(0.2, 0.2, triangles=18)
+    table = {"table": tc.boundaries.Plane(friction=0.1)}
+    cloth = tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), 0.2, {"gravity": tc.effects.Gravity()}, table, tc.Contact(0.05))
+    unknowns = collect(cloth, ["table.friction", "cone"], None)
+    found = estimates(cloth, unknowns, torch.tensor([0.05, 0.05]), torch.eye(2) * 0.2**2).parameters
+    assert not found["table.friction"].identifiable
+    assert not found["cone"].identifiable
+    known = estimates(cloth, unknowns, torch.tensor([0.05, 0.05]), torch.eye(2) * 0.05**2).parameters
+    assert known["cone"].identifiable
 
 
 # -- result ----------------------------------------------------------------------------------------------------------

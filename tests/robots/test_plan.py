@@ -61,6 +61,14 @@ def finely(found, name, count=8000):
     return times, Spline.through(found.t, found.q[name]).at(times)[0]
 
 
+def test_an_arm_whose_base_is_learned_is_planned(rig, made):
+    base = rig["left"].base.float().requires_grad_()
+    arms = {"left": robots.load(rig["left"].model, frame=rig["left"].frame, base=base), "right": rig["right"]}
+    action, left, right = CASES["hang"]
+    found = plan(robots.Scene(arms, rig.table), action, holds={"left": Hold(*left), "right": Hold(*right)})
+    torch.testing.assert_close(found.q["left"], made["hang"][1].q["left"], rtol=0, atol=1e-4)
+
+
 def test_single_precision_arms_are_planned_in_double(made):
     action, left, right = CASES["hang"]
     holds = {"left": Hold(*left), "right": Hold(*right)}

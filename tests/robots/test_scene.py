@@ -50,6 +50,9 @@ def test_geometry_holds_both_arms(rig):
 def test_refuses_other_names(rig):
     with pytest.raises(InvalidInput, match="arms is empty"):
         robots.Scene({})
+    for name in ("arm.left", "keys"):
+        with pytest.raises(InvalidInput, match=f"name of an arm; got '{name}'"):
+            robots.Scene({name: rig["left"]})
     with pytest.raises(InvalidInput, match=r"q names other arms; got \['left'\]; expected \['left', 'right'\]"):
         rig({"left": rig["left"].home})
     with pytest.raises(InvalidInput, match="closed names unknown arms"):

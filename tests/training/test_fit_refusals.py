@@ -144,3 +144,10 @@ def test_episodes_are_dealt_once_each(count, per_step, world):
     passes = [alone[i : i + count] for i in range(0, len(alone), count)]
     assert all(sorted(p) == list(range(count)) for p in passes)
     assert per_step == count or len({tuple(p) for p in passes}) > 1
+
+
+def test_more_processes_than_the_config_says_are_refused(config, capsys, monkeypatch):
+    """Four that torchrun starts would each write the same files."""
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    assert main(["--config", config()]) == 2
+    assert "run.processes x run.nodes; got 1, started as one of 4 processes (WORLD_SIZE)" in capsys.readouterr().err

@@ -1,5 +1,6 @@
 """Studies on disk: what is finished is never done twice, and other settings are refused."""
 
+import math
 import threading
 
 import pytest
@@ -62,8 +63,8 @@ def test_settings_are_known_from_where_a_study_begins(tmp_path):
 
 def test_nothing_is_written_before_a_case_is_finished(tmp_path):
     assert Kept(tmp_path / "s", {}).find("a") is None
-    with pytest.raises(ValueError, match=r"NaN|nan|JSON"):
-        Kept(tmp_path / "s", {}).keep("a", {"value": float("nan")})
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        Kept(tmp_path / "s", {}).keep("a", {"value": object()})
     assert Kept(tmp_path / "s", {}).find("a") is None
 
 
@@ -78,3 +79,9 @@ def test_other_settings_damage_and_files_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidInput, match="a file; expected a folder"):
         Kept(tmp_path / "file", {})
+
+
+def test_what_is_not_a_number_does_not_lose_a_case(tmp_path):
+    kept = Kept(tmp_path, {"study": "s"})
+    found = kept.run({"a": lambda: {"seen": math.nan, "all": [1.0, math.inf]}})
+    assert found == {"a": {"seen": None, "all": [1.0, None]}}

@@ -26,7 +26,9 @@ def covariance_of(objective: Objective, checked: Checked, strata: Tensor | None 
     own = gauss_newton.covariance(problem, final)
     if count >= FEWEST:
         strata = torch.zeros(count, dtype=torch.int64) if strata is None else strata
-        own = gauss_newton.at_least(own, scatter(problem, final, objective.episode_of(final.linear), strata))
+        spread = scatter(problem, final, objective.episode_of(final.linear), strata)
+        spread[len(objective.unknowns) :] = 0.0  # an episode's own nuisance is lost without it, and scatters nowhere
+        own = gauss_newton.at_least(own, spread)
     if checked.withdrawn:  # nothing of it will be used
         return own
     if not final.converged:  # the answer of a search that was cut short is as uncertain as the way that is left

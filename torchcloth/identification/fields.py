@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from .._files import write_text
@@ -90,7 +91,7 @@ def fit_fields(
 
     The prior is a graph Laplacian over the triangles, in the unconstrained coordinate (a logarithm for stiffnesses):
     sum over inner edges of length / distance of the centres * difference^2 / (2 contrast^2), which does not depend on
-    the mesh, and a factor of 10 for all values together.
+    the mesh, and a factor of 10 for all values of a piece of cloth together.
 
     Args:
         cloth: model and start values, with fields, e.g. ``AEP(torch.full((F,), 1e5))``; left unchanged.
@@ -153,7 +154,9 @@ class _Fields(Objective):
         self.start = torch.cat([part.raw.detach().double() for part in own.values()])
         self.middle = self.start
         precision = laplacian(cloth.mesh) / contrast**2
-        precision = precision + torch.full_like(precision, 1 / (DECADE * len(precision)) ** 2)
+        piece = torch.as_tensor(connected_components(precision.numpy())[1])
+        together = (piece[:, None] == piece).to(precision)  # of each piece of cloth, the mean
+        precision = precision + together / (DECADE * together.sum(0)) ** 2
         self.root = torch.linalg.cholesky(torch.block_diag(*[precision] * len(own)))
 
     def _parts(self, raw: Tensor) -> dict[str, Tensor]:

@@ -243,7 +243,7 @@ def _concluded(
     if outcome.reached is not None:
         fit |= {"starts": outcome.reached.tried, "starts_agreeing": outcome.reached.agree}
     if checked.withdrawn or worthless(fit):  # slopes of chaos, or of elsewhere, promise tiny errors
-        found = withdraw(found, full.unknowns)
+        found = withdraw(found, full.unknowns, final.raw)
     warnings += [outcome.unfinished] if outcome.unfinished else []
     warnings += skewed(found, [name for name in checked.curved if name not in profiled])
     used = [x[: len(e.times)] for x, e in zip(after, told.episodes, strict=True)]

@@ -82,7 +82,7 @@ def minimise(
     on_iterate: Callable[[Iterate], bool],
     tolerance: float = 0.1,
 ) -> Iterate:
-    """Minimise the robust cost until a step is below ``tolerance`` standard errors.
+    """Minimise the robust cost until a step is below ``tolerance`` standard errors, damped or not.
 
     ``on_iterate`` sees the start and every accepted point and returns True to stop.
 
@@ -98,8 +98,8 @@ def minimise(
             break
         trial, gain, damping = _step(problem, current, damping)
         if trial is None:
-            if current.exact:  # no step helps: as good as it gets
-                converged = True
+            if current.exact:  # no step helps
+                converged = _is_near(problem, current, tolerance)
                 break
             current = _linearise(problem, current.raw)
             continue
@@ -107,7 +107,7 @@ def minimise(
         misled = misled + 1 if gain < MISLED[0] else 0
         stop = on_iterate(current) or misled == MISLED[1]
         if _is_small(problem, before, trial.raw - before.raw, tolerance):
-            if before.exact:
+            if before.exact and _is_near(problem, before, tolerance):
                 converged = True
                 break
             current = _linearise(problem, trial.raw)
@@ -120,7 +120,7 @@ def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None
     """(accepted point or None, actual over predicted decrease, next damping)."""
     gradient, hessian = normal_equations(problem, at)
     now = cost(problem, at, at.raw, at.linear.value)
-    low, high = (problem.clip(at.raw + sign * problem.longest) - at.raw for sign in (-1, 1))
+    low, high = _reach(problem, at)
     for _ in range(6):
         step = bounded(hessian + damping * torch.diag(hessian.diagonal()), -gradient, low, high)
         raw = at.raw + step
@@ -133,6 +133,12 @@ def _step(problem: Problem, at: Iterate, damping: float) -> tuple[Iterate | None
                 return _updated(problem, at, raw, step, value, patch), gain, max(damping / 5, 1e-6)
         damping = max(10 * damping, 1e-2)
     return None, 0.0, damping
+
+
+def _reach(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
+    """[K], the longest steps down and up."""
+    low, high = (problem.clip(at.raw + sign * problem.longest) - at.raw for sign in (-1, 1))
+    return low, high
 
 
 def _try(problem: Problem, raw: Tensor) -> tuple[Tensor | None, Tensor | None]:
@@ -234,6 +240,12 @@ def _is_small(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> 
     """Below ``tolerance`` standard errors in every direction."""
     _, hessian = normal_equations(problem, at)
     return float(step @ hessian @ step) < tolerance**2
+
+
+def _is_near(problem: Problem, at: Iterate, tolerance: float) -> bool:
+    """Whether the step that is not damped, and so not short for that, is small."""
+    gradient, hessian = normal_equations(problem, at)
+    return _is_small(problem, at, bounded(hessian, -gradient, *_reach(problem, at)), tolerance)
 
 
 def covariance(problem: Problem, at: Iterate) -> Tensor:

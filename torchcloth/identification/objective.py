@@ -266,7 +266,7 @@ class Objective:
     def _ask(self, question: str, raw: Tensor, work: Callable[[], Any]) -> Any:
         if self.journal is None:
             return work()
-        return self.journal.ask(f"{question}-{digest([len(e.times) for e in self.episodes])}", raw, work)
+        return self.journal.ask(f"{question}-{digest([(e.observed, len(e.times)) for e in self.episodes])}", raw, work)
 
     def secants(self, raw: Tensor, steps: Tensor) -> tuple[gauss_newton.Linearised, Reach]:
         """The same with one-sided differences over finite ``steps`` of the fabric's unknowns, and how far these reach.

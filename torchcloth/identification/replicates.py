@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable, Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -29,17 +30,30 @@ def strata_of(recordings: Sequence[Recording]) -> Tensor:
 
 def keys_of(recordings: Sequence[Recording]) -> list[Hashable]:
     """Equal for episodes of one ``split.motion``, or that repeat one (``split.replicate_of``)."""
-    named = {r.path.name: r for r in recordings if r.path is not None}
-    return [_key(r, named) for r in recordings]
+    placed = {r.path.resolve(): r for r in recordings if r.path is not None}
+    names = Counter(path.name for path in placed)
+    alone = {path.name: r for path, r in placed.items() if names[path.name] == 1}
+    return [_key(r, placed, alone) for r in recordings]
 
 
-def _key(recording: Recording, named: dict[str, Recording]) -> Hashable:
-    """The motion of the episode that was repeated first, or its name."""
+def _key(recording: Recording, placed: dict[Path, Recording], alone: dict[str, Recording]) -> Hashable:
+    """The motion of the episode that was repeated first, or its name; its folder where several have that name."""
     passed = []
-    while (of := recording.split.get("replicate_of")) in named and of not in passed:
-        recording, passed = named[of], [*passed, of]
-    own = id(recording) if recording.path is None else recording.path.name
-    return recording.split.get("motion") or of or own
+    while (first := _original(recording, placed, alone)) is not None and first not in passed:
+        recording, passed = first, [*passed, first]
+    said = recording.split.get("motion") or recording.split.get("replicate_of")
+    if said or recording.path is None:
+        return said or id(recording)
+    return recording.path.name if recording.path.name in alone else str(recording.path.resolve())
+
+
+def _original(recording: Recording, placed: dict[Path, Recording], alone: dict[str, Recording]) -> Recording | None:
+    """What it repeats: the episode beside it of that name, or the only one anywhere; None where there is none."""
+    of = recording.split.get("replicate_of")
+    if of is None:
+        return None
+    beside = None if recording.path is None else placed.get(recording.path.resolve().parent / of)
+    return alone.get(of) if beside is None else beside
 
 
 def scatter(problem: Problem, at: Iterate, episode: Tensor, strata: Tensor) -> Tensor:

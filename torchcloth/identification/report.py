@@ -75,18 +75,21 @@ def nuisance_estimates(
     return out
 
 
-def withdraw(found: Found, unknowns: Sequence[Unknown]) -> Found:
+def withdraw(found: Found, unknowns: Sequence[Unknown], raw: Tensor) -> Found:
     """No parameter counts as identified, because the model does not describe these data: errors are the priors'.
 
-    Nor one that was measured beforehand: the fit's value of it is not the measured one.
+    Nor one that was measured beforehand: the fit's value of it is not the measured one. ``raw``: where the fit ended;
+    standard errors are of values there, with the way from the prior's middle, and intervals reach over both.
     """
     prior = {u.name: _absent(u, "data") for u in unknowns}
+    ends = zip(unknowns, raw.tolist(), strict=False)
+    stds = {u.name: u.slope(r) * math.hypot(u.prior_std, r - u.middle) for u, r in ends}
     parameters = dict(found.parameters)
     for name, e in found.parameters.items():
         if name in prior:
             p = prior[name]
             interval = (min(p.ci95[0], e.value), max(p.ci95[1], e.value))
-            parameters[name] = replace(e, std=p.std, ci95=interval, identifiable=False)
+            parameters[name] = replace(e, std=stds[name], ci95=interval, identifiable=False)
         else:
             parameters[name] = replace(e, identifiable=False)
     if "membrane_stiffness" in parameters and "youngs_modulus" in parameters:

@@ -124,13 +124,14 @@ class Search:
 
     def _from_several(self, start: Tensor, count: int, iterations: int) -> starts.Reached:
         part, found = self.objective.part(EARLY), []
+        part = part if part.told else self.objective
         for raw in starts.spread(self.objective.unknowns, start, count):
             try:
                 found.append(self._early(part, raw, iterations))
             except (SimulationDiverged, UnstableStep):
                 if raw is start:
                     raise
-        self.elsewhere += part.simulations
+        self.elsewhere += part.simulations if part is not self.objective else 0
         return starts.best(part.problem(), found)
 
     def _why(self, iterations: int) -> str:

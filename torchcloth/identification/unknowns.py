@@ -19,6 +19,7 @@ ABSENT = {  # effects that an episode's facts bring into the model
     "air": "the model has no air: give air.density in episode.json",
     "bending": "the model has no bending: give cloth.nominal.bending_stiffness in episode.json",
 }
+TYPICAL = {"friction": 0.3, "excess": 0.1, "cone": 0.3}  # amplitudes of parts that are no effects, by their own name
 PRIOR_LOGIT = 1.0  # of logit(2 nu): around 0.2, 95 % of the prior between 0.04 and 0.42
 
 
@@ -142,7 +143,8 @@ def _unknown(cloth: Cloth, name: str, path: str) -> Unknown:
     else:
         owner, _, own = path.rpartition(".")
         size = getattr(cloth.get_submodule(owner), "amplitudes", {}).get(own)
-        std = 2.0 * (max(1.0, start) if size is None else size.typical)  # undeclared: the start says how large it is
+        # undeclared: the start says how large it is
+        std = 2.0 * (TYPICAL.get(own, max(1.0, abs(start))) if size is None else size.typical)
     return Unknown(name, f"{path}.raw", parameter, start, std)
 
 

@@ -155,7 +155,7 @@ def _observe(
     for i, t in enumerate(done.t):
         shot = capture(look, done.x[i], staged.mesh.faces, hidden(i), rng=rng)
         paths.append(_save(encode(shot.depth, DEPTH_SCALE), images / f"{i:06d}.png"))
-        if len(shot.points) >= THINNEST:
+        if len(shot.points) >= THINNEST or i == 0:  # the first shape is that of the first frame
             times.append(t)
             clouds.append(shot.points)
             if look.noise is not None:

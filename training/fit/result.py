@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchcloth._files import atomically, write_text
+from torchcloth._files import as_json, atomically, write_text
 
 from .config import Config
 from .learned import summary
@@ -57,7 +56,7 @@ def save(
             np.savez(part, **fields)
     else:
         (folder / "fields.npz").unlink(missing_ok=True)  # of an earlier run
-    write_text(folder / "fit.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_text(folder / "fit.json", as_json(content))
     return content
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 import warnings
 from dataclasses import asdict, replace
@@ -88,6 +89,7 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
     if config.run.processes * config.run.nodes > data.per_step:
         got, expected = config.run.processes * config.run.nodes, f"at most {data.per_step}, the episodes at a step"
         raise InvalidInput("config: run.processes", got=got, expected=expected)
+    _check_processes(config.run)
     module = FitModule(asdict(config), description, _problem(config, cloth, data))
     initial = module.now()
     trainer = _trainer(config, folder)
@@ -105,6 +107,17 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
         episodes = [str(r.path) for r in train]
         result.show(result.save(folder, config, module, initial, figures, episodes), folder)
     return module
+
+
+def _check_processes(run: Run) -> None:
+    """Of a launcher that starts others than the config says, each would take itself for the only one."""
+    started = os.environ.get("WORLD_SIZE", "")
+    if started.isdigit() and int(started) != run.processes * run.nodes:
+        raise InvalidInput(
+            "config: run.processes x run.nodes",
+            got=f"{run.processes * run.nodes}, started as one of {started} processes (WORLD_SIZE)",
+            expected="as many as torchrun or the cluster starts",
+        )
 
 
 def _trainer(config: Config, folder: Path) -> pl.Trainer:

@@ -41,7 +41,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compute what is missing, then print and draw everything."""
     source = find(options.source) / swings.SOURCE
-    kept = Kept(options.out, {"study": "air", "fast": options.fast})
+    kept = Kept(options.out, {"study": "air", "fast": options.fast, "source": str(source.resolve())})
     fitted, held = swings.split(source, fast=False)
     held = held[4:5] if options.fast else held
     groups = {f"group-{k + 1}": names for k, names in enumerate(grouped(fitted)[: 1 if options.fast else GROUPS])}

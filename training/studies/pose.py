@@ -219,10 +219,15 @@ def _rows(name: str, case: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, .
         label = method if model == "geometry" else f"{method}: {model}"
         more = ("–",) * 4
         if "coverage" in own:
-            shares = (f"{own[key]:.3f}" for key in ("coverage", "coverage_hidden"))
+            shares = (_shown(own[key], 3) for key in ("coverage", "coverage_hidden"))
             more = (*shares, f"{1e3 * own['std_rms']:.2f}", f"{100 * own['force_share']:.1f} %")
-        out.append((motion, label, f"{own['all']:.2f}", f"{own['hidden']:.2f}", *more))
+        out.append((motion, label, f"{own['all']:.2f}", _shown(own["hidden"], 2), *more))
     return out
+
+
+def _shown(value: float | None, digits: int) -> str:
+    """A dash where nothing is hidden."""
+    return "–" if value is None else f"{value:.{digits}f}"
 
 
 def _print(rows: list[tuple[str, ...]]) -> None:

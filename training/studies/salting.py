@@ -83,7 +83,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compute what is missing, then print and write salting.json."""
     source = find(options.source) / swings.SOURCE
-    kept = Kept(options.out, {"study": "salting", "fast": options.fast})
+    kept = Kept(options.out, {"study": "salting", "fast": options.fast, "source": str(source.resolve())})
     found = kept.run({"all": partial(salted, source, options.fast)})["all"]
     path = write_text(options.out / "salting.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
     show(found)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchcloth._files import write_text
+from torchcloth._files import as_json, write_text
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -38,7 +37,7 @@ def show(*parts: Any) -> None:
 
 def write(path: Path, result: dict[str, Any]) -> None:
     """Write a result; what is not a number is null."""
-    write_text(path, json.dumps(_finite(result), indent=1, allow_nan=False) + "\n")
+    write_text(path, as_json(result))
 
 
 def number(value: float | None, digits: int = 4) -> str:
@@ -54,11 +53,3 @@ def percent(share: float | None) -> str:
 def mm(length: float | None) -> str:
     """Millimetres with two digits behind the point."""
     return "–" if length is None or math.isnan(length) else f"{1e3 * length:.2f}"
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -32,7 +32,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compute what is missing, then print and draw everything."""
     source = find(options.source)
-    kept = Kept(options.out, {"study": "measured", "fast": options.fast})
+    kept = Kept(options.out, {"study": "measured", "fast": options.fast, "source": str(source.resolve())})
     there = [name for name in SOURCES if (source / name).is_dir()]
     result: dict[str, Any] = {}
     if tension.NYLON in there:
@@ -90,6 +90,7 @@ def _swings(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, 
             "swings-free": partial(free_swings.match, source, fitted, options.fast),
         }
     )
+    clear(_journal(options.out))
     fits = {part.removeprefix("swings-"): content for part, content in found.items()}
     models = {"vacuum": dict.fromkeys(swings.NAMES, 0.0), "textbook": swings.START}
     models |= {part: content["values"] for part, content in fits.items()}
@@ -107,18 +108,20 @@ def _swings(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, 
 
 
 def _fit(source: Path, names: list[str], out: Path, fast: bool) -> dict[str, Any]:
-    """A fit of many runs as a case; its journal lasts until it is kept."""
-    journal = out / "progress" / "whole"
-    fit = swings.fit(source, names, journal, fast)
+    """A fit of many runs as a case; its journal lasts until that is kept."""
+    fit = swings.fit(source, names, _journal(out), fast)
     fit.save(out / "swings")
     content = fit.as_dict()
-    clear(journal)
     return {
         "ratios": swings.ratios(content["parameters"]),
         "values": {name: fit.parameters[name].value for name in swings.NAMES},
         "fit": content["fit"],
         "warnings": fit.warnings,
     }
+
+
+def _journal(out: Path) -> Path:
+    return out / "progress" / "whole"
 
 
 def _sample(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
