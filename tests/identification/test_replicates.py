@@ -178,6 +178,7 @@ def test_nuisances_of_an_episode_do_not_scatter():
         episodes=[SimpleNamespace(settles=False)] * episodes,
         episode_of=lambda linear: own,
         unknowns=[None],
+        start=torch.zeros(1 + episodes),
         nuisances=[],
         cloth=SimpleNamespace(boundaries={}),
     )
