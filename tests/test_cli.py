@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from importlib import metadata
+from importlib import metadata, util
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from torchcloth import recordings
 from torchcloth.cli import main
 from torchcloth.cli.folders import check_file, check_folder
 from torchcloth.errors import InvalidInput
+from torchcloth.observe import render
 
 COMMAND = [sys.executable, "-m", "torchcloth.cli"]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "80", "PYTHONUNBUFFERED": "1"}
@@ -227,6 +228,23 @@ def test_doctor_says_what_is_installed(capsys):
     said = capsys.readouterr().out
     assert f"torchcloth {metadata.version('torchcloth')}" in said
     assert re.search(r"^engine +(built|will be built|not available)", said, re.MULTILINE)
+    assert re.search(r"^trimesh +installed$", said, re.MULTILINE)
+
+
+def test_doctor_tells_a_package_that_cannot_be_imported_from_one_that_works(capsys, monkeypatch):
+    """As open3d without the system's libusb: it is there, and of no use."""
+    loading = {"open3d": ImportError("libusb-1.0.so.0: cannot open shared object file")}
+    monkeypatch.setattr(util, "find_spec", lambda name: object())
+
+    def load(name):
+        raise loading[name]
+
+    monkeypatch.setattr(render, "import_module", load)
+    assert main(["doctor"]) == 0
+    said = capsys.readouterr().out
+    assert re.search(
+        r"^open3d +cannot be imported: libusb-1.0.so.0: .*; pip install .*libusb-1.0-0", said, re.MULTILINE
+    )
     assert re.search(r"^trimesh +installed$", said, re.MULTILINE)
 
 

@@ -105,6 +105,50 @@ def test_two_precisions_are_refused(vertices, points):
         closest(points.float(), vertices, FACES)
 
 
+NOT_POINTS = {
+    "two columns": lambda p: p[:, :2],  # each of the first three reached the compiled search as if it had three
+    "one column": lambda p: p[:, :1],
+    "one point": lambda p: p[0],
+    "four columns": lambda p: torch.cat([p, p[:, :1]], 1),
+    "six columns": lambda p: torch.cat([p, p], 1),
+    "several frames": lambda p: p[None],
+}
+
+
+@pytest.mark.parametrize("shape", NOT_POINTS)
+def test_what_is_not_points_is_refused(vertices, points, shape):
+    wrong = NOT_POINTS[shape](points)
+    for ask in (closest, chamfer_to_surface, lambda p, x, _: chamfer_to_vertices(p, x)):
+        with pytest.raises(InvalidInput, match=r"points; got shape .*expected \[N, 3\] in metres"):
+            ask(wrong, vertices, FACES)
+        with pytest.raises(InvalidInput, match=r"vertices; got shape .*expected \[N, 3\] in metres"):
+            ask(points, NOT_POINTS[shape](vertices), FACES)
+
+
+@pytest.mark.parametrize("frames", [3, 40])
+def test_faces_do_not_index_time(vertices, points, frames):
+    with pytest.raises(InvalidInput, match="vertices; got shape"):
+        chamfer_to_surface(points, vertices.expand(frames, -1, -1), FACES)
+
+
+@pytest.mark.parametrize(
+    "faces",
+    [FACES[:0], FACES[0], FACES[:, :2], FACES.double(), FACES.bool(), FACES.byte(), FACES - 1, FACES + len(FACES)],
+    ids=["none", "one", "edges", "floats", "flags", "bytes", "below", "above"],
+)
+def test_what_is_not_triangles_of_the_vertices_is_refused(vertices, points, faces):
+    for ask in (closest, chamfer_to_surface):
+        with pytest.raises(InvalidInput, match="faces; got"):
+            ask(points, vertices, faces)
+
+
+def test_no_points_have_no_mean_distance_and_hit_nothing(vertices, points):
+    for distance in (lambda p: chamfer_to_surface(p, vertices, FACES), lambda p: chamfer_to_vertices(p, vertices)):
+        with pytest.raises(InvalidInput, match=r"points; got .* N >= 1"):
+            distance(points[:0])
+    assert all(len(part) == 0 for part in closest(points[:0], vertices, FACES))
+
+
 def test_a_triangle_without_an_edge_is_as_near_as_its_place(vertices, points):
     bare = vertices[FACES].clone()
     bare[0, 1] = bare[0, 0]

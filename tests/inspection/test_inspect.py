@@ -12,6 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from swinging import clouds, episode, markers, motion, path, pattern
 
+from torchcloth import meshes
 from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
 from torchcloth.inspection import draw, inspect, show
@@ -40,6 +41,21 @@ def test_a_lag_that_the_recording_states_is_no_news():
     assert report.lag.stated == 0.2
     assert not any("clocks differ" in note for note in report.notes)
     assert any("set clock_offset to -0.2" in n for n in inspect(replace(recording, clock_offset=0.0)).notes)
+
+
+def test_an_arm_that_holds_nothing_is_drawn_and_not_followed():
+    """It moves on its own, also while the cloth stands: neither lag nor noise are its business."""
+    recording = episode(markers=markers(lag=0.1, **GRID))
+    alone, hand = inspect(recording), recording.grippers["hand"]
+    idle = np.stack([0.8 + 0.1 * np.sin(3.1 * hand.t), 0.1 * np.cos(2.3 * hand.t), 0.4 + 0 * hand.t], -1)
+    grasp = rec.GraspInfo(uv=np.array([[0.15, 0.3]]), radius=0.02)
+    both = {**recording.grippers, "idle": replace(hand, position=idle)}
+    found = inspect(replace(recording, grippers=both, grasps={"hand": grasp}))
+    assert set(found.paths) == {"hand", "idle"}
+    assert found.lag.told
+    assert (found.lag.value, found.lag.std) == (alone.lag.value, alone.lag.std)
+    assert found.noise["markers"] == alone.noise["markers"]
+    assert not inspect(replace(recording, grippers=both)).lag.std < 2 * alone.lag.std  # where nothing says who holds
 
 
 def test_its_standard_error_is_honest():
@@ -128,6 +144,14 @@ def test_a_wrong_size_throughout_is_seen_where_the_size_is_known():
     stream = markers(**GRID)
     large = replace(stream, xyz=1.2 * stream.xyz)
     assert inspect(episode(markers=large)).frames["markers"].rejected.all()
+
+
+def test_a_cloth_whose_mesh_lies_folded_may_be_seen_open(needs_open3d):
+    mesh = meshes.rectangle(0.3, 0.3, resolution=(5, 5))
+    folded = mesh.vertices * 1.0
+    folded[:, 0] = np.abs(folded[:, 0] - 0.15)
+    cloth = rec.ClothInfo(areal_density=0.2, vertices=folded, faces=mesh.faces, uv=mesh.uv)
+    assert not inspect(replace(episode(points=clouds()), cloth=cloth)).frames["points"].rejected.any()
 
 
 def test_clouds_outliers_crop_area_and_strangers(needs_open3d):

@@ -256,6 +256,23 @@ def test_load_keeps_an_obj_with_texture_seams_sewn(tmp_path):
     np.testing.assert_array_equal(mesh.rest, laid)
 
 
+@pytest.mark.parametrize(("scale", "area"), [(1 / 0.3, 1.0), (100.0, 900.0), (0.001, 9e-08)])
+def test_load_refuses_texture_coordinates_for_a_pattern(tmp_path, scale, area):
+    """From 0 to 1, as a texture has them, they would be a cloth of 1 m that lies compressed to 0.3 m."""
+    flat = tc.meshes.rectangle(0.3, 0.3, resolution=(5, 5))
+    (tmp_path / "sheet.obj").write_text(obj.dump(flat.vertices, flat.faces, scale * flat.uv))
+    with pytest.raises(InvalidInput, match=rf"sheet.obj: vt; got {area:g} m\^2 .* 0.09 m\^2; .*vt must be in metres"):
+        tc.meshes.load(tmp_path / "sheet.obj")
+
+
+def test_load_takes_a_cloth_that_lies_folded_for_what_it_is(tmp_path):
+    flat = tc.meshes.rectangle(0.3, 0.3, resolution=(5, 5))
+    folded = flat.vertices * 1.0
+    folded[:, 0] = np.abs(folded[:, 0] - 0.15)
+    (tmp_path / "sheet.obj").write_text(obj.dump(folded, flat.faces, flat.uv))
+    assert tc.meshes.load(tmp_path / "sheet.obj").area.sum() == pytest.approx(0.09)
+
+
 def test_load_refuses_a_damaged_obj(tmp_path):
     path = tmp_path / "sheet.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 7")

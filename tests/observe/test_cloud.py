@@ -25,6 +25,20 @@ def test_points_project_back_to_their_pixels_and_depths():
     np.testing.assert_allclose(z, depth[rows, columns], atol=1e-12)
 
 
+def test_too_far_is_no_place():
+    """Where nothing came back ROS writes infinity (REP 118), or NaN."""
+    depth = np.zeros((576, 640))
+    depth[300, 300:303] = 1.0, np.inf, np.nan
+    pixels, _ = CAMERA.project(to_points(CAMERA, depth))
+    np.testing.assert_allclose(pixels, [[300, 300]], atol=1e-8)
+
+
+def test_points_that_are_nowhere_are_in_no_cube():
+    points = np.array([[np.nan] * 3, [0.0, 0, 0], [0, np.inf, 0], [0.001, 0, 0], [0.5, 0, 0]])
+    np.testing.assert_array_equal(thin_to_spacing(points, 0.01), points[[1, 4]])
+    assert thin_to_spacing(points[:1], 0.01).shape == (0, 3)
+
+
 def test_noise_moves_points_along_their_rays_only():
     depth = np.full((576, 640), 1.1, np.float32)
     noisy = DepthNoise(jitter=0.0).apply(depth, np.random.default_rng(0))

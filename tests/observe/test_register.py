@@ -43,6 +43,14 @@ def test_without_its_lens_the_image_is_that_of_an_ideal_camera(render, meshes):
     assert error.max() < 5e-3
 
 
+def test_too_far_is_seen_by_nobody(render, rectangle):
+    camera = DepthCamera(40, 30, np.array([[50.0, 0, 19.5], [0, 50, 14.5], [0, 0, 1]]), np.eye(4))
+    depth = render(camera, [rectangle(-0.1, 0.1, -0.1, 0.1, 0.8)])[0]
+    far = np.where(depth > 0, depth, np.inf)
+    np.testing.assert_array_equal(reproject(far, camera, camera), reproject(depth, camera, camera))
+    assert not steep(far, 0.02).any()
+
+
 def test_depth_laid_onto_colour_is_what_the_colour_camera_would_have_seen(render, meshes, color_camera):
     found = reproject(render(KINECT, meshes)[0], KINECT, color_camera)
     true = render(color_camera, meshes)[0]

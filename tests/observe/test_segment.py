@@ -35,6 +35,8 @@ def pose(x, y, z):
         {"neighbours": -1},
         {"radius": 0.01, "company": 0},
         {"above": np.nan},
+        {"deviations": 0},
+        {"deviations": np.inf},
         {"low": (-1.0, -1.0)},
         {"low": (np.nan, 0.0, 0.0)},
         {"low": (0.0, 0.0, 1.0), "high": (1.0, 1.0, 0.0)},
@@ -47,6 +49,26 @@ def pose(x, y, z):
 def test_stages_that_would_take_all_or_fail_are_refused(options):
     with pytest.raises(InvalidInput, match="|".join(options)):
         Segmentation(**options)
+
+
+def test_colours_from_0_to_1_are_refused():
+    """Taken for bytes they would all be black, and no point would be left."""
+    points, colors = np.zeros((3, 3)), np.tile([0.75, 0.12, 0.16], (3, 1))
+    how = Segmentation(hsv=((0.95, 0.4, 0.2), (0.05, 1.0, 1.0)), neighbours=None, gap=None)
+    with pytest.raises(InvalidInput, match=r"colors; got float64; expected uint8.*multiply by 255"):
+        segment(points, how, colors=colors)
+    assert len(segment(points, how, colors=(255 * colors).astype(np.uint8)).points) == 3
+
+
+def test_pixels_that_are_too_far_were_not_seen():
+    """Infinity (REP 118): no point, and no edge for what stands before it."""
+    depth = np.zeros((CAMERA.height, CAMERA.width))
+    depth[100:110, 100:110] = 1.0
+    how = Segmentation(neighbours=None, gap=None)
+    plain, depth[depth == 0] = segment_depth(CAMERA, depth, how), np.inf
+    found = segment_depth(CAMERA, depth, how)
+    assert (found.came, found.removed) == (plain.came, plain.removed) == (100, {"edge": 0})
+    np.testing.assert_array_equal(found.points, plain.points)
 
 
 def test_corners_may_be_arrays_and_masks_bytes():

@@ -1,8 +1,16 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from torchcloth.errors import InvalidInput
-from torchcloth.observe import solid_mesh
+from torchcloth.observe import solid_mesh, solid_meshes
+
+
+@pytest.mark.parametrize(("pose", "at"), [(np.tile(np.eye(4), (4, 1, 1)), None), (np.eye(4), 0)])
+def test_poses_of_many_moments_need_one_of_them(pose, at):
+    with pytest.raises(InvalidInput, match=r"pose; got shape .*; expected \[4, 4\] of one moment; of many: .*at=k"):
+        solid_meshes([SimpleNamespace(kind="sphere", size=(0.1,), pose=pose)], at)
 
 
 def volume(vertices, faces):

@@ -126,6 +126,45 @@ def test_markers_alone(scene):
     assert len(mesh.vertices) == found.x.shape[1]
 
 
+def few(recording, count):
+    """With at most so many points a frame."""
+    rng, points = np.random.default_rng(0), recording.points
+    clouds = [rng.permutation(points.frame(i))[:count] for i in range(len(points))]
+    counts = np.array([len(cloud) for cloud in clouds])
+    return replace(recording, points=rec.PointClouds(points.t, np.concatenate(clouds), counts))
+
+
+def test_few_points_of_unknown_noise_are_not_taken_for_exact(scene):
+    """Too few to tell noise from shape: taken as exact, they made every error three times as large."""
+    sparse, cloth = few(scene.recording, 60), model(scene, twins.TRUE)
+    stated = estimate_pose(cloth, sparse, modes=4, window=0.18)
+    unknown = estimate_pose(cloth, replace(sparse, observation_noise_std=None), modes=4, window=0.18)
+    assert unknown.fit["std_rms"] == pytest.approx(stated.fit["std_rms"], rel=0.2)
+    assert coverage(unknown, scene)[0] > 0.88
+
+
+@pytest.mark.parametrize("use", ["markers", "force"])
+@pytest.mark.parametrize("noise", [1e-3, None])
+def test_what_is_not_used_was_not_seen(scene, use, noise):
+    """The points are there, and tell of distances only: all else is as if they were not."""
+    uv = np.array([[0.1, 0.1], [0.2, 0.2]])
+    xyz = np.stack([twins.bilinear(x, twins.FIT, uv) for x in scene.truth.numpy()])
+    pull = np.random.default_rng(0).normal(0, 0.05, (len(scene.recording.grippers["left"].t), 3))
+    grippers = {name: replace(motion, force=pull) for name, motion in scene.recording.grippers.items()}
+    markers = rec.Markers(scene.recording.points.t, xyz, uv)
+    whole = replace(scene.recording, grippers=grippers, markers=markers, observation_noise_std=noise)
+    ask = partial(estimate_pose, model(scene, WRONG), modes=4, window=0.18, use=[use])
+    found, alone = ask(whole), ask(replace(whole, points=None))
+    torch.testing.assert_close(found.x, alone.x)
+    torch.testing.assert_close(found.std, alone.std)
+    assert torch.equal(found.seen, alone.seen)
+    assert bool(found.seen.any()) == (use == "markers")
+    said = [[w for w in e.warnings if "rigidly" not in w] for e in (found, alone)]  # that is of distances
+    assert said[0] == said[1]
+    assert math.isfinite(found.fit["chamfer_after"])
+    assert math.isnan(found.fit["point_noise"])
+
+
 @pytest.mark.parametrize(
     ("options", "match"),
     [

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
+from torchcloth import meshes
 from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
-from torchcloth.recordings.extents import check_size, of_another_size
+from torchcloth.recordings.extents import check_size, of_another_size, size
 
 FRAMES, POINTS = 5, 60
 
@@ -41,3 +43,20 @@ def test_a_few_points_show_no_size(sheet):
     first = rec.PointClouds(sheet.points.t, np.ones((FRAMES, 3)), np.ones(FRAMES, int))
     assert of_another_size(replace(sheet, points=first)) is None
     assert of_another_size(replace(times(sheet, 1e3), cloth=rec.ClothInfo(areal_density=0.2))) is None
+
+
+def test_a_cloth_that_lies_folded_is_as_long_as_its_pattern():
+    mesh = meshes.rectangle(0.3, 0.3, resolution=(5, 5))
+    folded = mesh.vertices * 1.0
+    folded[:, 0] = np.abs(folded[:, 0] - 0.15)
+    info = partial(rec.ClothInfo, areal_density=0.2, faces=mesh.faces)
+    for uv in (mesh.uv, mesh.pattern):
+        assert size(info(vertices=folded, uv=uv)) == pytest.approx((0.3 * 2**0.5, 0.09))
+    assert size(info(vertices=folded)) == pytest.approx((np.hypot(0.15, 0.3), 0.09))  # all that is known of it
+    assert size(info(vertices=mesh.vertices, uv=mesh.uv + 5.0)) == pytest.approx((0.3 * 2**0.5, 0.09))
+
+
+def test_panels_that_lie_apart_in_the_pattern_are_no_longer_for_it():
+    shirt = meshes.shirt()
+    found, _ = size(rec.ClothInfo(areal_density=0.2, vertices=shirt.vertices, faces=shirt.faces, uv=shirt.pattern))
+    assert found == pytest.approx(np.linalg.norm(np.ptp(shirt.vertices, axis=0)))

@@ -57,6 +57,15 @@ def refused(episode, message):
     assert text.startswith(str(episode))
 
 
+def test_texture_coordinates_are_no_pattern(episode):
+    """From 0 to 1 on a sheet of 0.3 m x 0.2 m: where episode.json gives no sheet, nothing else tells their unit."""
+    edit_json(episode, ["cloth", "sheet"], DROP)
+    mesh = episode / "cloth.obj"
+    unit = lambda row: f"vt {float(row[1]) / 0.3!r} {float(row[2]) / 0.2!r}"  # noqa: E731
+    mesh.write_text(re.sub(r"vt (\S+) (\S+)", unit, mesh.read_text()))
+    refused(episode, r"cloth.obj: vt; got 1 m\^2 .* 0.06 m\^2; expected about the same; vt must be in metres")
+
+
 MIRROR = np.diag([-1.0, 1, 1, 1]).tolist()
 MILLI = [[1, 0, 0, 500.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 SHEAR = [[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

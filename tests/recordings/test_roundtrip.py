@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import torchcloth as tc
 from torchcloth import recordings as rec
@@ -172,6 +173,36 @@ def test_frames_and_images(episode, recording):
         list(camera.depth.files())  # nor handed on
     with pytest.raises(RecordingError, match="wrong size"):
         replace(camera.depth, size=(6, 8)).load(1)
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "RGB", "RGBA"])
+def test_a_mask_is_what_is_painted(tmp_path, mode):
+    """An alpha channel paints nothing, be the background opaque or cut out."""
+    painted = np.zeros((6, 8), bool)
+    painted[1:3, 2:5] = True
+    image = Image.fromarray(painted.astype(np.uint8) * np.uint8(255)).convert(mode)
+    image.save(tmp_path / "opaque.png")
+    paths = [tmp_path / "opaque.png"]
+    if mode in ("LA", "RGBA"):
+        cut = Image.new(mode, (8, 6), "white")
+        cut.putalpha(Image.fromarray(painted.astype(np.uint8) * np.uint8(255)))
+        cut.save(tmp_path / "cut.png")
+        paths.append(tmp_path / "cut.png")
+    stream = rec.ImageStream("mask", np.arange(len(paths)), np.arange(len(paths)) / 10, tuple(paths), (8, 6))
+    for i in range(len(stream)):
+        np.testing.assert_array_equal(stream.load(i), painted)
+
+
+def test_quaternions_of_few_digits_are_made_unit(episode):
+    """Others stay as they are, to the bit."""
+    exact = rec.read(episode).grippers["left"].quat_wxyz
+    with np.load(episode / "motion.npz") as stored:
+        arrays = dict(stored)
+    arrays["left/quat_wxyz"][1] *= 1.0009
+    np.savez(episode / "motion.npz", **arrays)
+    read = rec.read(episode).grippers["left"].quat_wxyz
+    np.testing.assert_array_equal(read[[0, *range(2, len(read))]], exact[[0, *range(2, len(read))]])
+    np.testing.assert_allclose(read[1], exact[1], rtol=0, atol=1e-12)
 
 
 def test_require(recording):

@@ -9,6 +9,8 @@ import pytest
 
 import torchcloth
 from torchcloth import meshes, recordings
+from torchcloth.errors import MissingDependency
+from torchcloth.observe.render import open3d_or_refuse
 from torchcloth.viewing import Cloud, Curve, Film, Plane, Sheet, Solid, Trace
 
 EXAMPLE = Path(torchcloth.__file__).parent / "examples" / "bimanual_swing"
@@ -55,6 +57,14 @@ def film() -> Film:
         traces={"grippers/one": Trace(poses[:, :3, 3], poses)},
         curves={"force/one": Curve(np.linspace(1.0, 1.5, 11), np.arange(11.0), "N")},
     )
+
+
+@pytest.fixture(scope="session")
+def needs_open3d():
+    try:
+        open3d_or_refuse()
+    except MissingDependency as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="session")

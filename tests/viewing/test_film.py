@@ -23,6 +23,15 @@ def test_parts_must_have_the_films_frames(film):
             )
 
 
+def test_a_sheet_that_is_somewhere_nowhere_is_refused(film):
+    """As a simulation that diverged leaves it."""
+    cloth = film.sheets["cloth"]
+    x = cloth.vertices.copy()
+    x[3:, 5, 1] = np.nan
+    with pytest.raises(InvalidInput, match="vertices of 'cloth'; got a place that is not finite in frame 3"):
+        replace(film, sheets={"cloth": replace(cloth, vertices=x)})
+
+
 def test_times_must_increase(film):
     with pytest.raises(InvalidInput, match="increasing"):
         Film(title="", times=np.array([0.0, 0.0]))

@@ -34,7 +34,7 @@ def at(stage, point, frame=0):
     return stage.pixels(frame)[row, column] / 255
 
 
-@pytest.mark.parametrize("look", [(0.0, 20.0), (130.0, 35.0), ABOVE, None])
+@pytest.mark.parametrize("look", [(0.0, 20.0), (130.0, 35.0), (0.0, 90.0), (70.0, -90.0), ABOVE, None])
 def test_the_camera_sees_everything(film, look):
     camera = camera_for(film, (400, 300), look)
     low, high = film.box()
@@ -45,6 +45,13 @@ def test_the_camera_sees_everything(film, look):
     assert (pixels.max(0) < [400, 300]).all()
     spread = np.ptp(pixels, axis=0) / [400, 300]
     assert spread.max() > 0.6  # and it is not far away
+
+
+@pytest.mark.parametrize("end", [90.0, -90.0])
+def test_straight_above_and_below_are_where_steep_ones_lead_to(film, end, tmp_path):
+    cameras = [camera_for(film, (400, 300), (30.0, elevation)) for elevation in (end, end * (1 - 1e-5))]
+    np.testing.assert_allclose(cameras[0].T_world_camera, cameras[1].T_world_camera, rtol=0, atol=1e-4)
+    assert picture(film, tmp_path / "a.png", look=(30.0, end)).is_file()
 
 
 @pytest.mark.filterwarnings("error")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from torchcloth.errors import MissingDependency
+from torchcloth.observe import DepthCamera
 from torchcloth.recordings import Camera, ImageStream
 from torchcloth.viewing import View, with_cloth, write_rrd
 from torchcloth.viewing.colours import colours
@@ -42,11 +43,15 @@ def whole(film, tmp_path):
 
 @pytest.fixture
 def read(whole, tmp_path):
+    return read_back(whole, tmp_path)
+
+
+def read_back(film, folder):
     """Entity path -> columns -> values of all its chunks; the timeline as "time" in seconds."""
     from rerun.chunk import RrdReader
 
     found = {}
-    for chunk in RrdReader(write_rrd(whole, tmp_path / "film.rrd")).stream():
+    for chunk in RrdReader(write_rrd(film, folder / "film.rrd")).stream():
         batch = chunk.to_record_batch()
         columns = found.setdefault(chunk.entity_path, {})
         for name in batch.schema.names:
@@ -119,6 +124,47 @@ def test_depth_images_come_at_their_frames(read, whole):
     pixels = [np.frombuffer(bytes(buffer[0]), np.uint16) for buffer in entity["DepthImage:buffer"]]
     assert [set(p.tolist()) for p in pixels] == [{700}, {701}]
     assert entity["DepthImage:meter"][0] == pytest.approx([1000.0])
+
+
+SLOPE = np.array([0.3, -0.2, 1.0])  # of a wall that stands 0.8 m before the camera
+
+
+def wall(rays):
+    """Depth [...] m of the wall along rays [..., 2] (x / z, y / z)."""
+    return 0.8 / (rays @ SLOPE[:2] + SLOPE[2])
+
+
+@pytest.fixture
+def bent(film, tmp_path):
+    """(The film with a camera whose lens is strongly distorted, before a wall; that camera)."""
+    from PIL import Image
+
+    K, distortion = np.array([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0])
+    lens = DepthCamera(64, 48, K, np.eye(4), distortion=distortion)
+    Image.fromarray(np.rint(1e4 * wall(lens.grid)).astype(np.uint16)).save(tmp_path / "wall.png")
+    stream = ImageStream("depth", np.arange(1), np.array([1.0]), (tmp_path / "wall.png",), (64, 48))
+    camera = Camera(**lens.calibration(), depth_scale=1e-4, depth=stream)
+    return replace(film, views={"cam": View(camera, np.array([0, *[-1] * 5]))}), lens
+
+
+def test_a_lens_is_taken_out_for_the_pinhole(bent, tmp_path, needs_open3d):
+    film, lens = bent
+    found = read_back(film, tmp_path)
+    assert "Pinhole:image_from_camera" in found["/world/cam"]
+    buffer = found["/world/cam/depth"]["DepthImage:buffer"][0][0]
+    depth = 1e-4 * np.frombuffer(bytes(buffer), np.uint16).reshape(48, 64)
+    expected = wall(lens.rectified().grid)
+    assert np.abs(expected - wall(lens.grid)).max() > 0.02  # what came of it under the pinhole as it was
+    seen = depth > 0
+    assert seen.mean() > 0.9
+    np.testing.assert_allclose(depth[seen], expected[seen], rtol=0, atol=1e-3)
+
+
+def test_without_open3d_a_distorted_image_is_placed_nowhere(bent, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    found = read_back(bent[0], tmp_path)
+    assert "DepthImage:buffer" in found["/world/cam/depth"]
+    assert "Pinhole:image_from_camera" not in found["/world/cam"]
 
 
 def test_curves_are_scalars_at_their_own_times(read, whole):

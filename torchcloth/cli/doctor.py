@@ -37,5 +37,18 @@ def _doctor(options: argparse.Namespace) -> int:
     print(f"{'engine':20s} {library.status()}")
     for name, extra in PACKAGES.items():
         state = "installed" if find_spec(name) else f'missing: pip install "torchcloth[{extra}]"'
+        if name == "open3d" and find_spec(name):  # it may lack a library of the system
+            state = _open3d()
         print(f"{name:20s} {state}")
     return 0
+
+
+def _open3d() -> str:
+    from ..errors import MissingDependency
+    from ..observe.render import open3d_or_refuse
+
+    try:
+        open3d_or_refuse()
+    except MissingDependency as error:
+        return f"cannot be imported: {error.got}; {error.remedy}"
+    return "installed"

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import MissingDependency, TorchclothError
 from ..recordings import Recording, extents, ticks
 from ..recordings.ticks import Stream
-from ..robots.paths import Path, paths  # pyright: ignore[reportMissingImports] - mapped from robots/
+from ..robots.paths import Path, holding, paths  # pyright: ignore[reportMissingImports] - mapped from robots/
 from . import frames, images, noise
 from .frames import Frames
 from .images import Depth
@@ -79,18 +79,18 @@ def inspect(recording: Recording) -> Inspection:
     """
     notes: list[str] = []
     try:
-        moved = paths(recording)
+        moved, holds = paths(recording), holding(recording)  # an arm that stands by tells nothing of the cloth
     except TorchclothError as error:  # joints without an arm that is known here: all else can still be looked at
-        moved = {}
+        moved = holds = {}
         notes.append(f"no gripper paths, so no lag: {error}")
     seen: dict[str, Frames] = {}
     if recording.markers is not None:
         seen["markers"] = frames.of_markers(recording.markers, recording.cloth)
     if recording.points is not None:
-        held = _held(recording.points.t + recording.clock_offset, moved)
+        held = _held(recording.points.t + recording.clock_offset, holds)
         seen["points"], more = frames.of_clouds(recording.points, recording.cloth, held)
         notes += more
-    late = lag(recording, moved, {name: ~found.rejected for name, found in seen.items()})
+    late = lag(recording, holds, {name: ~found.rejected for name, found in seen.items()})
     shift = -recording.clock_offset if late is None else late.trusted
     depth = {}
     for name, camera in recording.cameras.items():
@@ -104,21 +104,21 @@ def inspect(recording: Recording) -> Inspection:
         {name: ticks.ticks(kind, t) for name, (kind, t) in ticks.times(recording).items()},
         moved,
         late,
-        _noises(recording, moved, seen, shift),
+        _noises(recording, holds, seen, shift),
         seen,
         depth,
-        notes + _remarks(recording, moved, late),
+        notes + _remarks(recording, holds, late),
     )
 
 
-def _held(t: np.ndarray, moved: dict[str, Path]) -> np.ndarray:
-    """[T, G, 3] m, where the grippers are at times on the motion clock."""
-    return np.stack([path.at(t)[0] for path in moved.values()], 1) if moved else np.zeros((len(t), 0, 3))
+def _held(t: np.ndarray, holds: dict[str, Path]) -> np.ndarray:
+    """[T, G, 3] m, where the grippers that hold are at times on the motion clock."""
+    return np.stack([path.at(t)[0] for path in holds.values()], 1) if holds else np.zeros((len(t), 0, 3))
 
 
-def _noises(recording: Recording, moved: dict[str, Path], seen: dict[str, Frames], shift: float) -> dict[str, Noise]:
+def _noises(recording: Recording, holds: dict[str, Path], seen: dict[str, Frames], shift: float) -> dict[str, Noise]:
     def still(t: np.ndarray) -> np.ndarray:
-        return np.all([path.still(t - shift) for path in moved.values()], axis=0) if moved else np.zeros(len(t), bool)
+        return np.all([path.still(t - shift) for path in holds.values()], axis=0) if holds else np.zeros(len(t), bool)
 
     found = {}
     if (markers := recording.markers) is not None:
@@ -128,10 +128,10 @@ def _noises(recording: Recording, moved: dict[str, Path], seen: dict[str, Frames
     return {name: value for name, value in found.items() if value is not None}
 
 
-def _remarks(recording: Recording, moved: dict[str, Path], late: Lag | None) -> list[str]:
+def _remarks(recording: Recording, holds: dict[str, Path], late: Lag | None) -> list[str]:
     """What a person should do about it."""
     remarks = []
-    if late is None and moved:
+    if late is None and holds:
         remarks.append("no lag: too few observed frames")
     if late is not None and not late.told:
         remarks.append(f"the recording does not tell a lag: {CANNOT}")

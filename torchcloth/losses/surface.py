@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .._math import cross, dot, safe_norm
 from .nearest import nearest
+from .shapes import check_places, check_triangles
 
 
 class Hits(NamedTuple):
@@ -28,14 +29,17 @@ def closest(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 4_000_
     """Exact closest points on a triangle mesh.
 
     Args:
-        points: [N, 3] m.
+        points: [N, 3] m; N may be 0.
         vertices: [V, 3] m.
         faces: [F, 3] int64.
         chunk: point-triangle pairs per pass, where torch searches.
 
     Raises:
-        InvalidInput: two precisions, or numbers that are not finite.
+        InvalidInput: other shapes, no faces, indices of no vertex, two precisions, or numbers that are not finite.
     """
+    check_places(points, "points")
+    check_places(vertices, "vertices")
+    check_triangles(faces, len(vertices))
     with torch.no_grad():
         points, vertices = points.detach(), vertices.detach()
         face, weights = nearest(points, vertices[faces], chunk)
@@ -64,7 +68,11 @@ def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tenso
 
     Differentiable in ``vertices``. Its floor is the sensor noise, and it is blind to motion within the surface: use it
     to report, and ``residuals`` to infer.
+
+    Raises:
+        InvalidInput: as `closest`, or no points, which have no mean.
     """
+    check_places(points, "points", least=1)
     return distances(points, vertices, closest(points, vertices, faces)).mean()
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .shapes import check_places
+
 
 def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
     """One-sided Chamfer distance cloud -> vertices [m]: mean over the points of the distance to the nearest vertex.
@@ -14,7 +16,12 @@ def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
     Args:
         points: [N, 3] m.
         vertices: [V, 3] m, differentiable.
+
+    Raises:
+        InvalidInput: other shapes, or none of either.
     """
+    check_places(points, "points", least=1)
+    check_places(vertices, "vertices", least=1)
     with torch.no_grad():
         nearest = torch.cdist(points, vertices).argmin(-1)
     return (points - vertices[nearest]).norm(dim=-1).mean()

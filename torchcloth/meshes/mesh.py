@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from ..errors import InvalidInput
 from . import topology
 
+UNLIKE = 4.0  # times the mesh's area, beyond which a pattern is in another unit
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -193,6 +195,21 @@ def signed_area(rest: np.ndarray) -> np.ndarray:
     """[F] m^2 from corners [F, 3, 2]."""
     a, b = rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0]
     return 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def check_metres(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray, place: str) -> None:
+    """Refuse pattern coordinates [F, 3, 2] of a file that are not in metres, as those of textures are not.
+
+    However the cloth lies, folded or sewn, its triangles are about as large as in its pattern.
+    """
+    pattern, lying = np.abs(signed_area(corners)).sum(), signed_area(_flatten(vertices[faces])).sum()
+    if not lying / UNLIKE < pattern < lying * UNLIKE:
+        raise InvalidInput(
+            f"{place}: vt",
+            got=f"{pattern:.3g} m^2 in the pattern of a mesh of {lying:.3g} m^2",
+            expected="about the same",
+            remedy="vt must be in metres: scale it, or export without texture coordinates",
+        )
 
 
 def per_vertex(faces: np.ndarray, corners: np.ndarray) -> np.ndarray | None:

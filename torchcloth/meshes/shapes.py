@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InvalidInput, MissingDependency
 from . import obj
-from .mesh import Mesh
+from .mesh import Mesh, check_metres
 
 
 def rectangle(
@@ -57,7 +57,8 @@ def load(path: str | Path) -> Mesh:
     edges as ``seams``.
 
     Raises:
-        InvalidInput: missing or unreadable file, or not a usable triangle mesh.
+        InvalidInput: missing or unreadable file, not a usable triangle mesh, or texture coordinates that are not in
+            metres.
         MissingDependency: trimesh, which reads all but OBJ, is not installed.
     """
     path = Path(path)
@@ -66,7 +67,7 @@ def load(path: str | Path) -> Mesh:
     if path.suffix.lower() not in (".obj", ".ply"):  # others know no vertices that triangles share
         raise InvalidInput("mesh file", got=str(path), expected="an OBJ or PLY file")
     if path.suffix.lower() == ".obj":
-        return Mesh.build(*_read_obj(path))
+        return _in_metres(Mesh.build(*_read_obj(path)), path)
     try:
         import trimesh
     except ImportError as error:
@@ -76,7 +77,14 @@ def load(path: str | Path) -> Mesh:
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, OSError) as error:
         raise InvalidInput("mesh file", got=f"{path} ({error})", expected="a readable OBJ or PLY file") from error
     uv = getattr(mesh.visual, "uv", None)
-    return Mesh.build(mesh.vertices, mesh.faces, None if uv is None or len(uv) != len(mesh.vertices) else uv)
+    uv = None if uv is None or len(uv) != len(mesh.vertices) else uv
+    return _in_metres(Mesh.build(mesh.vertices, mesh.faces, uv), path)
+
+
+def _in_metres(mesh: Mesh, path: Path) -> Mesh:
+    if mesh.pattern is not None:
+        check_metres(mesh.vertices, mesh.faces, mesh.pattern, str(path))
+    return mesh
 
 
 def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:

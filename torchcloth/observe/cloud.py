@@ -26,9 +26,14 @@ def to_points(camera: DepthCamera, depth: Array, mask: Array | None = None) -> A
     for name, image in (("depth", depth), ("mask", mask)):
         if image is not None and np.shape(image) != shape:
             raise InvalidInput(name, got=f"shape {np.shape(image)}", expected=f"{shape}, the camera's size")
-    wanted = depth > 0 if mask is None else (depth > 0) & np.asarray(mask, bool)
+    wanted = has_reading(depth) if mask is None else has_reading(depth) & np.asarray(mask, bool)
     rows, columns = np.nonzero(wanted & np.isfinite(camera.grid[..., 0]))
     return camera.at_pixels(rows, columns, depth[rows, columns])
+
+
+def has_reading(depth: Array) -> Array:
+    """Pixels [H, W] whose depth says where something is: ROS writes NaN for none and infinity for too far (REP 118)."""
+    return (depth > 0) & (depth < np.inf)
 
 
 def erode(mask: Array, pixels: int = 1) -> Array:
@@ -61,7 +66,7 @@ def thin_to_spacing(points: Array, spacing: float) -> Array:
     outliers are seldom nearest to the mean).
 
     Args:
-        points: [N, 3] m.
+        points: [N, 3] m; those that are not finite are in no cube.
         spacing: m.
     """
     return np.asarray(points, dtype=float)[spaced(points, spacing)]
@@ -72,8 +77,10 @@ def spaced(points: Array, spacing: float) -> Array:
     points = np.asarray(points, dtype=float)
     if not spacing > 0:
         raise InvalidInput("spacing", got=spacing, expected="a positive length in m")
-    if len(points) == 0:
-        return np.zeros(0, int)
+    known = np.flatnonzero(np.isfinite(points).all(1))
+    if len(known) == 0:
+        return known
+    points = points[known]
     _, cell = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()
     counts = np.bincount(cell)
@@ -81,4 +88,4 @@ def spaced(points: Array, spacing: float) -> Array:
     distance = ((points - mean[cell]) ** 2).sum(1)
     order = np.lexsort((np.arange(len(points)), distance, cell))
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    return np.sort(order[first])
+    return known[np.sort(order[first])]

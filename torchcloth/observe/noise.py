@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ..errors import InvalidInput
+from .cloud import has_reading
 
 Array = np.ndarray
 
@@ -172,7 +173,8 @@ def lost_edges(depth: Array, edge_range: float) -> Array:
 
 def neighbourhood(depth: Array, reach: int = 1) -> tuple[Array, Array]:
     """Nearest and farthest depth [H, W] within ``reach`` px of each pixel, inf and -inf where there is none."""
-    near, far = np.where(depth > 0, depth, np.inf), np.where(depth > 0, depth, -np.inf)
+    known = has_reading(depth)
+    near, far = np.where(known, depth, np.inf), np.where(known, depth, -np.inf)
     for _ in range(reach):
         near, far = _window(near, np.minimum), _window(far, np.maximum)
     return near, far

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..errors import InvalidInput
 from .camera import DepthCamera
+from .cloud import has_reading
 from .noise import lost_edges
 from .render import render_depth
 
@@ -31,7 +32,7 @@ def reproject(depth: Array, source: DepthCamera, target: DepthCamera, edge: floa
     depth = np.asarray(depth)
     if depth.shape != (source.height, source.width):
         raise InvalidInput("depth", got=f"shape {depth.shape}", expected=f"{(source.height, source.width)}, the source")
-    good = (depth > 0) & np.isfinite(source.grid[..., 0])
+    good = has_reading(depth) & np.isfinite(source.grid[..., 0])
     index = np.where(good, np.cumsum(good).reshape(good.shape) - 1, -1)
     rows, columns = np.nonzero(good)
     vertices = source.at_pixels(rows, columns, depth[good])
@@ -68,4 +69,4 @@ def steep(depth: Array, edge: float) -> Array:
     """Pixels [H, W] whose 3 x 3 neighbourhood spans more than ``edge`` m: edges, where pixels fly, and slopes that are
     seen at a grazing angle, where a sensor tells as little.
     """
-    return (np.asarray(depth) > 0) & lost_edges(np.asarray(depth), edge)
+    return has_reading(np.asarray(depth)) & lost_edges(np.asarray(depth), edge)

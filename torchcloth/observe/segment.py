@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InvalidInput
 from .camera import DepthCamera
-from .cloud import spaced, to_points
+from .cloud import has_reading, spaced, to_points
 from .register import steep
 from .render import open3d_or_refuse
 
@@ -67,10 +67,12 @@ class Segmentation:
     normals: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("edge", "robot", "flat", "deviations", "radius", "gap", "reach", "spacing", "normals"):
+        for name in ("edge", "robot", "flat", "radius", "gap", "reach", "spacing", "normals"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < np.inf:
                 raise InvalidInput(name, got=value, expected="None or a finite number that is not negative")
+        if not 0 < self.deviations < np.inf:  # of 0, half of every cloud would be outliers
+            raise InvalidInput("deviations", got=self.deviations, expected="a finite number > 0")
         for name in ("neighbours", "company", "crowd"):
             value = getattr(self, name)
             if value is not None and not (value >= 1 and value == int(value)):
@@ -141,7 +143,7 @@ def segment_depth(
     """
     depth = np.asarray(depth)
     _check_sizes(camera, depth, mask, colors)
-    wanted = (depth > 0) & np.isfinite(camera.grid[..., 0])
+    wanted = has_reading(depth) & np.isfinite(camera.grid[..., 0])
     if mask is not None:
         wanted &= np.asarray(mask, dtype=bool)
     taken = steep(depth, how.edge) & wanted if how.edge else np.zeros_like(wanted)
@@ -185,7 +187,8 @@ def segment(
 
     Raises:
         MissingDependency: open3d cannot be imported.
-        InvalidInput: points that are not [N, 3] and finite, or no colours for ``how.hsv``.
+        InvalidInput: points that are not [N, 3] and finite, or no colours for ``how.hsv``, or
+            colours that are no whole numbers.
     """
     points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
@@ -193,6 +196,9 @@ def segment(
     shape = None if colors is None else np.shape(colors)
     if how.hsv is not None and shape != points.shape:
         raise InvalidInput("colors", got=f"shape {shape}", expected=f"{points.shape}, since hsv is given")
+    if how.hsv is not None and np.asarray(colors).dtype.kind not in "iu":
+        got, remedy = np.asarray(colors).dtype, "from 0 to 1: multiply by 255 and convert"
+        raise InvalidInput("colors", got=got, expected="uint8, 0 to 255", remedy=remedy)
     cloud = _Cloud(points)
     if how.low is not None or how.high is not None:
         cloud.keep("crop", lambda p, _: _inside(p, how))

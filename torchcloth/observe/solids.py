@@ -56,11 +56,11 @@ def solid_mesh(kind: str, size: tuple[float, ...], pose: Array, segments: int = 
     Args:
         kind: "box", "cylinder" or "sphere".
         size: m; box: edges x, y, z; cylinder: radius, length along z; sphere: radius.
-        pose: [4, 4] of the centre in the world, m.
+        pose: [4, 4] of the centre in the world, m, of one moment.
         segments: corners of a circle; the mesh lies inside the true solid by up to radius * (1 - cos(pi / segments)).
 
     Raises:
-        InvalidInput: an unknown kind, or sizes that do not fit it.
+        InvalidInput: an unknown kind, sizes that do not fit it, or poses of many moments.
     """
     wanted = {"box": 3, "cylinder": 2, "sphere": 1}
     if kind not in wanted:
@@ -72,6 +72,9 @@ def solid_mesh(kind: str, size: tuple[float, ...], pose: Array, segments: int = 
     else:
         vertices, faces = _turned(*_outline(kind, size, segments), segments)
     pose = np.asarray(pose, dtype=float)
+    if pose.shape != (4, 4):
+        got = f"shape {pose.shape}"
+        raise InvalidInput("pose", got=got, expected="[4, 4] of one moment", remedy="of many: solid_meshes(..., at=k)")
     return vertices @ pose[:3, :3].T + pose[:3, 3], faces
 
 

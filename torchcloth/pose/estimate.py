@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..identification.blocks import blocks_for
 from ..identification.episodes import Episode, episode
-from ..identification.misfit import figures
+from ..identification.misfit import LEAST_SCALE, figures
 from ..identification.nuisances import chosen, foreseen, implied
 from ..identification.null import rigid_carry
 from ..identification.report import estimates, nuisance_estimates
@@ -105,21 +106,22 @@ def estimate_pose(
 
 def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: float, began: float) -> PoseEstimate:
     data, cloth, raw = objective.episodes[0].until(1.0), objective.cloth, found.raw
+    used = _used(data, [block.name for block in objective.blocks])
     ends = [data.times[[first, min(last, data.observed - 1)]] for first, last in objective.correction.windows]
     with torch.no_grad():
         frames, moved = objective.tangents(raw)
         x, v, along = frames.x[: data.observed], frames.v[: data.observed], moved.x[:, : data.observed]
         alone, null = objective.frames(objective.start)[0][: data.observed], rigid_carry(data)
-        std = _errors(objective, data, found, x, along, fields)
+        std = _errors(objective, used, found, x, along, fields)
         last = objective.last_state(raw)
-    seen, shares = seen_vertices(x, data, cloth.mesh), _shares(objective, raw, gravity)
+    seen, shares = seen_vertices(x, used, cloth.mesh), _shares(objective, raw, gravity)
     fit = _distances(data, objective.faces, {"after": x, "alone": alone, "null": null})
     fit |= {
         "force_share": float(shares.square().mean().sqrt()),
         "force_share_max": float(shares.max()),
         "seen_share": float(seen.double().mean()),
         "std_rms": float(std.square().sum(-1).mean().sqrt()),
-        "point_noise": _point_noise(objective, data, found),
+        "point_noise": _point_noise(objective, used, found),
         "converged": found.converged,
         "unknowns": len(raw),
         "seconds": time.perf_counter() - began,
@@ -141,8 +143,14 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         parameters={u.name: fabric[u.name] for u in objective.unknowns},
         nuisances=next(iter(nuisance_estimates([data], objective.placed, raw, found.covariance).values())),
         fit=fit,
-        warnings=warnings_of(fit, shares, seen, data, ends),
+        warnings=warnings_of(fit, shares, seen, used, ends),
     )
+
+
+def _used(data: Episode, blocks: Sequence[str]) -> Episode:
+    """What the estimate has seen: the rest of the episode tells of its distances only."""
+    clouds = data.clouds if "points" in blocks else [cloud[:0] for cloud in data.clouds]
+    return replace(data, clouds=clouds, markers=data.markers if "markers" in blocks else None)
 
 
 def _distances(data: Episode, faces: Tensor, frames: Mapping[str, Tensor]) -> dict[str, Any]:
@@ -150,21 +158,20 @@ def _distances(data: Episode, faces: Tensor, frames: Mapping[str, Tensor]) -> di
     return {f"{what}_{key}": getattr(f, what) for what in ("chamfer", "rms") for key, f in found.items()}
 
 
-def _point_noise(objective: Corrected, data: Episode, found: Smoothed) -> float:
+def _point_noise(objective: Corrected, used: Episode, found: Smoothed) -> float:
     """m, standard deviation of the points beside the estimate; NaN where none were used."""
     names = [block.name for block in objective.blocks]
-    seen = "points" in names and any(len(cloud) for cloud in data.clouds)
-    return float(found.final.scale[names.index("points")]) if seen else math.nan
+    return float(found.final.scale[names.index("points")]) if any(map(len, used.clouds)) else math.nan
 
 
-def _errors(objective: Corrected, data: Episode, found: Smoothed, x: Tensor, moved: Tensor, fields: Modes) -> Tensor:
+def _errors(objective: Corrected, used: Episode, found: Smoothed, x: Tensor, moved: Tensor, fields: Modes) -> Tensor:
     """[T, V, 3] m, of what was estimated, and of what is finer than it."""
     root = found.root.to(moved)
     variance = torch.stack([(root.mT @ frame.flatten(1)).square().sum(0) for frame in moved.unbind(1)])
     held = _held(objective.cloth)
-    noise = data.noise or objective.blocks[0].floor
+    least, usual = used.noise or LEAST_SCALE, used.noise or _point_noise(objective, used, found)
     coarse = len(objective.correction.modes)
-    finer = unexplained(x, data, objective.faces, fields, coarse, held, noise)
+    finer = unexplained(x, used, objective.faces, fields, coarse, held, least, usual)
     return (variance.reshape(x.shape) + finer.square().unsqueeze(-1)).sqrt()
 
 

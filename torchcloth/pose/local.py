@@ -30,7 +30,7 @@ class _Frame(NamedTuple):
 
 
 def unexplained(
-    x: Tensor, episode: Episode, faces: Tensor, modes: Modes, coarse: int, held: Tensor, noise: float
+    x: Tensor, episode: Episode, faces: Tensor, modes: Modes, coarse: int, held: Tensor, noise: float, usual: float
 ) -> Tensor:
     """[T, V] m, root mean square of the field given the residuals: large where they show it, or where none are.
 
@@ -42,10 +42,11 @@ def unexplained(
         coarse: how many of them are the forces'.
         held: [H] vertices that lie where the grippers are.
         noise: least standard deviation of a point [m].
+        usual: what it is taken for [m] where points are too few to tell it from the field.
     """
     basis = _basis(modes, coarse, held).to(x)
     frames = [_rows(cloud, x[t], faces, basis, noise) for t, cloud in enumerate(episode.clouds)]
-    noise = max(noise, _noise(frames))
+    noise = max(noise, _noise(frames) or usual)
     sizes = _smoothed(torch.tensor([_size(frame, noise) for frame in frames]).to(x))
     return torch.stack([_left(frame, size * basis, size, noise) for frame, size in zip(frames, sizes, strict=True)])
 

@@ -17,7 +17,7 @@ FARTHEST_BASE = 100.0  # m; a base or camera may stand far from a map's origin, 
 LONGEST_EPISODE = 86_400.0  # s
 HUGE = 1e100  # stands for infinity: nothing physical comes near, and squares of smaller numbers stay finite
 UNIT_TOLERANCE = 1e-3  # quaternions and rotations are often stored as float32 or with four digits
-EXACT = 1e-9  # of R R^T: nothing was rounded
+EXACT = 1e-9  # of R R^T or a length: nothing was rounded
 
 _KINDS = {"float": ("iuf", np.float64), "int": ("iu", np.int64), "bool": ("b", np.bool_)}
 _NAME = re.compile(r"[^./\\\x00][^/\\\x00]*")
@@ -97,13 +97,19 @@ def metres(points: np.ndarray, place: str) -> None:
         raise RecordingError(f"{place} looks like millimetres", got=got, expected="metres", remedy="multiply by 0.001")
 
 
-def unit(vectors: np.ndarray, place: str) -> None:
-    """Refuse vectors or quaternions [..., D] that are not of length one."""
-    length = np.linalg.norm(vectors, axis=-1).reshape(-1)
-    worst = int(np.argmax(np.abs(length - 1)))
-    if abs(length[worst] - 1) > UNIT_TOLERANCE:
-        got = f"length {length[worst]:.6g} at sample {worst}"
+def unit(vectors: np.ndarray, place: str) -> np.ndarray:
+    """Vectors or quaternions [..., D] of length one; those that were stored with few digits are made so.
+
+    Raises:
+        RecordingError: they are none.
+    """
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    off = np.abs(length - 1)
+    if off.max() > UNIT_TOLERANCE:
+        worst = int(np.argmax(off))
+        got = f"length {length.reshape(-1)[worst]:.6g} at sample {worst}"
         raise RecordingError(f"{place} is not unit", got=got, expected="length 1", remedy="normalise it")
+    return np.where(off < EXACT, vectors, vectors / length)
 
 
 def transform(matrix: np.ndarray, place: str) -> np.ndarray:

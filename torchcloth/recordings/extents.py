@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ..errors import RecordingError
+from ..meshes import topology
 from .types import ClothInfo, Recording
 
 TOO_WIDE, TOO_NARROW = 0.65, 0.03  # of the cloth's length: half of the points lie within so much of their middle
@@ -31,10 +32,21 @@ def size(cloth: ClothInfo) -> tuple[float | None, float | None]:
     if cloth.vertices is not None and cloth.faces is not None:
         a, b, c = (cloth.vertices[cloth.faces[:, k]] for k in range(3))
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-        return float(np.linalg.norm(np.ptp(cloth.vertices, axis=0))), float(area)
+        lying = float(np.linalg.norm(np.ptp(cloth.vertices, axis=0)))
+        return max(lying, _cut(cloth.faces, cloth.uv)), float(area)
     if cloth.sheet is not None:
         return float(np.hypot(*cloth.sheet)), float(np.prod(cloth.sheet))
     return None, None
+
+
+def _cut(faces: np.ndarray, uv: np.ndarray | None) -> float:
+    """Longest diagonal of a panel in the pattern, m: where the mesh lies folded, the cloth is longer than it lies."""
+    if uv is None:
+        return 0.0
+    corners = uv[faces] if uv.ndim == 2 else uv
+    panel = topology.panels(faces, corners)
+    each = (corners[panel == k].reshape(-1, 2) for k in np.unique(panel))
+    return max(float(np.linalg.norm(np.ptp(own, axis=0))) for own in each)
 
 
 def seen(recording: Recording) -> list[np.ndarray]:

@@ -114,7 +114,14 @@ class ImageStream:
             raise RecordingError(
                 f"{place} has the wrong size", got=pixels.shape[1::-1], expected=f"{self.size}, as calibrated"
             )
-        return np.any(pixels.reshape(*self.size[::-1], -1), axis=-1, keepdims=False) if self.kind == "mask" else pixels
+        return _painted(pixels.reshape(*self.size[::-1], -1)) if self.kind == "mask" else pixels
+
+
+def _painted(pixels: np.ndarray) -> np.ndarray:
+    """[H, W] bool of [H, W, C]: what is neither black nor, where the last channel is alpha, transparent."""
+    if pixels.shape[-1] in (2, 4):
+        pixels = pixels[..., :-1] * (pixels[..., -1:] > 0)
+    return np.any(pixels, axis=-1, keepdims=False)
 
 
 def pillow() -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import InvalidInput, RecordingError
 from ..meshes import obj
-from ..meshes.mesh import per_vertex
+from ..meshes.mesh import check_metres, per_vertex
 from . import checks
 from .checks import Fields
 from .files import Folder
@@ -82,8 +82,7 @@ def collider(fields: Fields) -> Collider:
     plane = fields.inside("plane")
     if not plane.rest:
         raise RecordingError(f"{fields.place} is of an unknown shape", got=sorted(fields.rest), expected="plane")
-    point, normal = plane.array("point", 3), plane.array("normal", 3)
-    checks.unit(normal, plane.at("normal"))
+    point, normal = plane.array("point", 3), checks.unit(plane.array("normal", 3), plane.at("normal"))
     return Collider(point, normal, fields.maybe(fields.number, "friction", least=0), fields.left(plane=plane))
 
 
@@ -136,12 +135,13 @@ def _mesh(folder: Folder, file: str) -> tuple[np.ndarray, np.ndarray, np.ndarray
     """Vertices, faces, and pattern coordinates per vertex, or per corner where panels are sewn."""
     try:
         vertices, faces, corners = obj.parse(folder.text(file), folder.place(file))
+        checks.metres(vertices, f"{folder.place(file)}: v")
+        if corners is None:
+            return vertices, faces, None
+        checks.metres(corners, f"{folder.place(file)}: vt")
+        check_metres(vertices, faces, corners, folder.place(file))
     except InvalidInput as error:
         raise RecordingError(error.what, got=error.got, expected=error.expected, remedy=error.remedy) from error
-    checks.metres(vertices, f"{folder.place(file)}: v")
-    if corners is None:
-        return vertices, faces, None
-    checks.metres(corners, f"{folder.place(file)}: vt")
     uv = per_vertex(faces, corners)
     return vertices, faces, corners if uv is None else uv
 

@@ -141,7 +141,7 @@ def _pose(fields: Fields, shared: dict[str, Any]) -> dict[str, np.ndarray]:
     knots = len(shared["t"])
     position, quat = fields.array("position", knots, 3), fields.array("quat_wxyz", knots, 4)
     checks.metres(position, fields.at("position"))
-    checks.unit(quat, fields.at("quat_wxyz"))
+    quat = checks.unit(quat, fields.at("quat_wxyz"))
     if shared["closed"] is None:
         raise RecordingError(
             f"{fields.at('closed')} is missing", expected=f"[{knots}] bool", remedy="say when the gripper holds"

@@ -111,7 +111,7 @@ class Film:
         notes: what could not be shown, and why.
 
     Raises:
-        InvalidInput: a part whose frames are not those of ``times``.
+        InvalidInput: a part whose frames are not those of ``times``, or a sheet that is not finite.
     """
 
     title: str
@@ -134,6 +134,10 @@ class Film:
         for name, frames in self._frames():
             if len(frames) != len(self.times) and not (name in self.solids and len(frames) == 1):
                 raise InvalidInput(f"{name!r}", got=f"{len(frames)} frames", expected=f"{len(self.times)}, as times")
+        for name, sheet in self.sheets.items():
+            if (bad := ~np.isfinite(sheet.vertices).all((1, 2))).any():
+                got, remedy = f"a place that is not finite in frame {bad.argmax()}", "take the frames before"
+                raise InvalidInput(f"vertices of {name!r}", got=got, expected="metres", remedy=remedy)
 
     def __len__(self) -> int:
         return len(self.times)

@@ -15,6 +15,7 @@ FOCAL = 2.2  # image heights: a long lens, so that lengths can be compared
 MARGIN = 0.06  # of the image, left free around what the film is about
 ABOVE = 0.15  # m, shown of the arms above the grippers
 TURN = 20.0  # degrees, by which the eye stands beside the recorded camera, or beside straight on
+STRAIGHT = 1e-6  # rad from straight above or below, where up in the image is away from the eye's azimuth, or towards it
 ELEVATIONS = (12.0, 55.0)  # degrees, of the eye above what it looks at
 LIGHT = np.array([-0.3, -0.6, -0.75])  # direction to the light, in the camera's axes (x right, y down, z forward)
 DOT = 0.0038  # of the image's height, radius of a point
@@ -56,16 +57,18 @@ def camera_for(film: Film, size: tuple[int, int], look: tuple[float, float] | No
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
     azimuth, elevation = np.radians(_direction(film, (low + high) / 2) if look is None else look)
     towards = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    up = np.array([0.0, 0.0, 1.0]) if abs(np.cos(elevation)) > STRAIGHT else -np.sin(elevation) * level
     K = np.array([[FOCAL * height, 0, (width - 1) / 2], [0, FOCAL * height, (height - 1) / 2], [0, 0, 1]])
     half = (1 - 2 * MARGIN) * np.array([width, height]) / 2 / (FOCAL * height)
     target = (low + high) / 2
     for _ in range(4):  # the middle of the image depends on the distance, a little
-        axes = look_at(target + towards, target)[:3, :3]
+        axes = look_at(target + towards, target, up)[:3, :3]
         local = (corners - target) @ axes
         distance = float((np.abs(local[:, :2]) / half - local[:, 2:]).max())
         seen = local[:, :2] / (local[:, 2:] + distance)
         target = target + axes[:, :2] @ ((seen.max(0) + seen.min(0)) / 2 * distance)
-    return DepthCamera(width, height, K, look_at(target + distance * towards, target))
+    return DepthCamera(width, height, K, look_at(target + distance * towards, target, up))
 
 
 def _direction(film: Film, centre: Array) -> tuple[float, float]:

@@ -10,6 +10,8 @@ import numpy as np
 from .._files import atomically
 from ..errors import MissingDependency
 from ..meshes.mesh import vertex_normals
+from ..observe import DepthCamera, decode, encode, reproject
+from ..observe.render import open3d_or_refuse
 from .colours import colours
 from .film import Film, Solid, Trace, View
 from .geometry import Array, quaternions
@@ -26,6 +28,8 @@ WINDOW, NEARER = (800, 600), 0.5  # pixels; its lens is wider than that of pictu
 
 def write_rrd(film: Film, path: str | Path) -> Path:
     """Write a film for rerun's viewer: shapes in the world, curves, depth images, on the timeline "time".
+
+    Depth images of a distorted lens are written as an ideal lens would have taken them.
 
     Args:
         film: what to show.
@@ -129,24 +133,34 @@ class _Writer:
         self._poses(f"{name}/now", trace.poses)
 
     def _view(self, name: str, view: View) -> None:
-        camera, rr = view.camera, self.rr
+        camera, rr, taken = view.camera, self.rr, DepthCamera.of(view.camera)
         self._poses(name, camera.T_world_camera[None])
-        self._static(
-            name,
-            rr.Pinhole(
+        straight = taken.lens.plain or not (view.index >= 0).any() or _rays_can_be_cast()
+        if straight:  # rerun knows no other lens
+            pinhole = rr.Pinhole(
                 image_from_camera=camera.K,
                 resolution=[camera.width, camera.height],
                 camera_xyz=rr.ViewCoordinates.RDF,
                 image_plane_distance=IMAGE_PLANE,
-            ),
-        )
+            )
+            self._static(name, pinhole)
+        scale = float(camera.depth_scale or 1)
         for frame, time in enumerate(self.film.times):
             raw = view.raw(frame)
             if raw is not None:
+                if straight and not taken.lens.plain:
+                    raw = encode(reproject(decode(raw, scale), taken, taken.rectified()), scale)
                 self.stream.set_time(TIME, duration=float(time))
-                self.stream.log(
-                    self._path(WORLD, f"{name}/depth"), rr.DepthImage(raw, meter=1.0 / float(camera.depth_scale or 1))
-                )
+                self.stream.log(self._path(WORLD, f"{name}/depth"), rr.DepthImage(raw, meter=1.0 / scale))
+
+
+def _rays_can_be_cast() -> bool:
+    """Whether a lens can be taken out; images of a distorted one are else shown as they are, and placed nowhere."""
+    try:
+        open3d_or_refuse()
+    except MissingDependency:
+        return False
+    return True
 
 
 def _layout(film: Film) -> Any:

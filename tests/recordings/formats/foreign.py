@@ -167,7 +167,7 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
                 bag.write(connection, ns + 1_500_000, store.serialize_cdr(message, kind))  # logged 1.5 ms later
 
         put("/closed", std + "Bool", [(stamps[0], make(std + "Bool", True)), (stamps[3], make(std + "Bool", False))])
-        poses, joints, wrenches = [], [], []
+        poses, joints, wrenches, sensed = [], [], [], []
         for i, ns in enumerate(stamps):
             w, x, y, z = quat[i].tolist()
             orientation = make(geometry + "Quaternion", x, y, z, w)
@@ -180,14 +180,17 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
             joints.append((ns, state))
             both = [make(geometry + "Vector3", *part.tolist()) for part in np.split(force[i], 2)]
             wrench = make(geometry + "Wrench", *both)
-            wrenches.append((ns, make(geometry + "WrenchStamped", header(ns, "sensor"), wrench)))
+            wrenches.append((ns, make(geometry + "WrenchStamped", header(ns), wrench)))
+            sensed.append((ns, make(geometry + "WrenchStamped", header(ns, "sensor"), wrench)))
         put("/left/pose", geometry + "PoseStamped", poses)
         put("/joint_states", sensor + "JointState", joints)
         put("/left/ft", geometry + "WrenchStamped", wrenches)
+        put("/left/ft_sensor", geometry + "WrenchStamped", sensed)
         put("/cloth", sensor + "PointCloud2", [(stamps[i], cloud(stamps[i], c)) for i, c in enumerate(clouds)])
         put("/lens/info", sensor + "CameraInfo", [(stamps[0], info(stamps[0]))])
         put("/lens/depth", sensor + "Image", [(stamps[i], image(stamps[i], "16UC1", d)) for i, d in enumerate(depth)])
         metres = [(d / 1000).astype(np.float32) for d in depth]
+        metres[0][0, :3] = 20.0, np.inf, np.nan  # a far wall, too far, no reading: none is in the episode's range
         put(
             "/lens/metres",
             sensor + "Image",
@@ -223,10 +226,12 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
             },
         },
     }
+    fine = [5 * d for d in depth]  # in units of 0.2 mm
+    fine[0][0, :3] = 0
     images = {
         "cam0/depth": depth,
         "cam0/color": color,
-        "cam1/depth": [5 * d for d in depth],  # in units of 0.2 mm
+        "cam1/depth": fine,
         "cam1/color": [decoded(c) for c in compressed],
     }
     arrays = {

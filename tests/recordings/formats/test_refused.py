@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ import foreign
 
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.recordings import formats
+from torchcloth.recordings.formats.bag import Message
+from torchcloth.recordings.formats.ros2_cameras import BagImages
 
 
 @pytest.fixture(scope="module")
@@ -174,14 +177,16 @@ def test_tum_may_track_the_hand(copy):
     hand = formats.read(truth.path, scene=truth.write_scene()).grippers["hand"]
     np.testing.assert_allclose(hand.t, 0.000496 + np.arange(10) / 100, atol=1e-12)
     np.testing.assert_array_equal(hand.position[0], [0.5, 0.1, 1.5])
-    np.testing.assert_array_equal(hand.quat_wxyz[0], [0.0, 0.70710678, 0.70710678, 0.0])
+    np.testing.assert_allclose(hand.quat_wxyz[0], [0.0, 0.5**0.5, 0.5**0.5, 0.0], atol=1e-15)  # its file has 8 digits
 
 
+BASE = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 WRONG_SOURCES = {
     "no topic": (["motion", "left", "pose"], "/nothing", r"pose is not in the bag; got '/nothing'; expected one of"),
     "other type": (["motion", "left", "pose"], "/cloth", "is of another type; got sensor_msgs/msg/PointCloud2"),
     "other frame": (["motion", "left", "frame"], "table", "frame 'table' is unknown"),
     "wrench frame": (["motion", "left", "wrench_frame"], "tool", "wrench_frame is unclear"),
+    "sensor's wrench": (["motion", "left", "wrench"], "/left/ft_sensor", "is in another frame; got 'sensor'; .*world"),
     "joint name": (["motion", "arm", "joints", "names"], ["j0", "elbow"], r"lacks joints; got \['elbow'\]"),
     "closed": (["motion", "arm", "closed"], "yes", "closed is not in the bag"),
     "late": (["motion", "left", "closed"], 3, "closed is unclear; got 3"),
@@ -208,19 +213,37 @@ def test_without_a_mapping_the_topics_are_listed(copy):
     refuse(truth, r"no topic is mapped; got the topics /closed \(Bool\), /cloth \(PointCloud2\)")
 
 
-def test_frames_are_placed_in_the_world(copy):
-    """A pose given in the frame of a robot's base, a wrench given in the gripper's."""
+def test_a_depth_behind_the_lens_is_refused():
+    body = SimpleNamespace(encoding="32FC1", is_bigendian=0, height=1, width=2, step=8)
+    body.data = np.array([1.0, -0.5], np.float32).view(np.uint8)
+    with pytest.raises(RecordingError, match=r"out of range; got -0\.5 m; expected depth >= 0"):
+        BagImages(None, "/depth", "depth")._pixels(Message("/depth", 0, body, "take: /depth"))
+
+
+@pytest.mark.parametrize("topic", ["/left/ft", "/left/ft_sensor"])
+def test_a_wrench_turns_with_the_frame_that_places_it(copy, topic):
+    """Given in the axes of a robot's base, as its gripper's pose is."""
     truth = copy("ros2")
-    base = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    truth.scene["robots"]["arm"]["T_world_base"] = base.tolist()
-    truth.scene["source"]["motion"]["left"] |= {"frame": "arm", "wrench_frame": "gripper"}
+    truth.scene["robots"]["arm"]["T_world_base"] = BASE.tolist()
+    truth.scene["source"]["motion"]["left"] |= {"frame": "arm", "wrench": topic}
+    left = formats.read(truth.path, scene=truth.write_scene()).grippers["left"]
+    np.testing.assert_allclose(left.force, truth.arrays["left/force"] @ BASE[:3, :3].T, atol=1e-15)
+    np.testing.assert_allclose(left.torque, truth.arrays["left/torque"] @ BASE[:3, :3].T, atol=1e-15)
+
+
+@pytest.mark.parametrize("topic", ["/left/ft", "/left/ft_sensor"])
+def test_frames_are_placed_in_the_world(copy, topic):
+    """A pose given in the frame of a robot's base, a wrench given in the gripper's, whatever its own is called."""
+    truth = copy("ros2")
+    truth.scene["robots"]["arm"]["T_world_base"] = BASE.tolist()
+    truth.scene["source"]["motion"]["left"] |= {"frame": "arm", "wrench": topic, "wrench_frame": "gripper"}
     left = formats.read(truth.path, scene=truth.write_scene()).grippers["left"]
     there = truth.arrays["left/position"]
-    np.testing.assert_allclose(left.position, there @ base[:3, :3].T + base[:3, 3], atol=1e-15)
+    np.testing.assert_allclose(left.position, there @ BASE[:3, :3].T + BASE[:3, 3], atol=1e-15)
     from scipy.spatial.transform import Rotation
 
     local = Rotation.from_quat(truth.arrays["left/quat_wxyz"], scalar_first=True)
-    world = Rotation.from_matrix(base[:3, :3]) * local
+    world = Rotation.from_matrix(BASE[:3, :3]) * local
     assert (world * Rotation.from_quat(left.quat_wxyz, scalar_first=True).inv()).magnitude().max() < 1e-14
     np.testing.assert_allclose(left.force, world.apply(truth.arrays["left/force"]), atol=1e-14)
 

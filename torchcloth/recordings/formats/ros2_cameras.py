@@ -132,10 +132,10 @@ class BagImages(ImageSource):
             raise RecordingError(f"{message.place} is no {self.kind} image", got=message.body.encoding)
         if pixels.dtype.kind == "f":
             units = np.round(np.where(np.isfinite(pixels), pixels, 0.0) / FINE)
-            if units.min() < 0 or units.max() > FARTHEST:
-                got = f"{units.min() * FINE:g} to {units.max() * FINE:g} m"
-                raise RecordingError(f"{message.place} is out of range", got=got, expected="0 to 13 m")
-            return units.astype(np.uint16)
+            if units.min() < 0:
+                got = f"{units.min() * FINE:g} m"
+                raise RecordingError(f"{message.place} is out of range", got=got, expected="depth >= 0")
+            return np.where(units <= FARTHEST, units, 0).astype(np.uint16)  # what lies beyond is invalid
         if self.kind == "color" and pixels.ndim == 2:
             return np.repeat(pixels[..., None], 3, axis=2)
         return np.ascontiguousarray(pixels)

@@ -75,6 +75,9 @@ class MotionTopics:
             pose = [ros2_messages.position(body.pose.position), ros2_messages.quaternion(body.pose.orientation)]
             self._poses.append((ros2_messages.stamp(body, message.place), message.logged, np.concatenate(pose)))
         elif message.topic == self.wrench:
+            if self.wrench_frame == "world":
+                remedy = f'set "frame" in {self.place}, or "wrench_frame": "gripper"'
+                must_be_world(message, self.frame, remedy)
             both = [ros2_messages.position(body.wrench.force), ros2_messages.position(body.wrench.torque)]
             self._wrenches.append((ros2_messages.stamp(body, message.place), np.concatenate(both)))
         elif self.joints:
@@ -127,6 +130,8 @@ class MotionTopics:
             if self.wrench_frame == "gripper":
                 turns = pose_matrix(out["position"], out["quat_wxyz"], self.place)[:, :3, :3]
                 at_knots = np.einsum("kij,kj->ki", turns, at_knots)
+            elif self.frame is not None:  # as the poses; the torque's point is the gripper in every frame
+                at_knots = at_knots @ self.frame[:3, :3].T
             found[key] = at_knots
         return found
 

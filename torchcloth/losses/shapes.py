@@ -1,0 +1,26 @@
+"""What distances can be taken between: a wrong shape would reach the compiled search as a wrong length."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInput
+
+
+def check_places(places: Tensor, name: str, least: int = 0) -> None:
+    """Refuse what is not [N, 3] with N >= least."""
+    if places.ndim != 2 or places.shape[1] != 3 or len(places) < least:
+        expected = "[N, 3] in metres" + (f", N >= {least}" if least else "")
+        raise InvalidInput(name, got=f"shape {tuple(places.shape)}", expected=expected, remedy="pass one frame at once")
+
+
+def check_triangles(faces: Tensor, count: int) -> None:
+    """Refuse what is not [F, 3] of indices below ``count``, F > 0."""
+    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or faces.dtype not in (torch.int32, torch.int64):
+        got = f"shape {tuple(faces.shape)} of {faces.dtype}"
+        raise InvalidInput("faces", got=got, expected="[F, 3] int64, F > 0")
+    low, high = (int(end) for end in faces.aminmax())
+    if low < 0 or high >= count:
+        got = f"indices {low} to {high}"
+        raise InvalidInput("faces", got=got, expected=f"indices of the {count} vertices", remedy="pass the mesh's own")
