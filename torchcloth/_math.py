@@ -18,11 +18,34 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
     return torch.linalg.cross(a, b)
 
 
+def times(a: Tensor, b: Tensor) -> Tensor:
+    """Matrix times vector: [..., 3, 3], [..., 3] -> [..., 3]."""
+    return (a @ b.unsqueeze(-1)).squeeze(-1)
+
+
 def safe_norm(a: Tensor) -> Tensor:
     """Length over the last axis, kept; value and derivative 0 at a = 0 (the plain square root gives NaN there)."""
     squared = dot(a, a)
     zero = squared == 0
     return torch.where(zero, torch.zeros_like(squared), torch.where(zero, 1.0, squared).sqrt())
+
+
+def loaded(resistance: Tensor | None, change: Tensor) -> Tensor:
+    """(1 + B) y: what changes the velocity of cloth by y [..., 3] and that of the air that moves along, per mass.
+
+    ``resistance`` is B [..., 3, 3], the mass of that air over the cloth's own; None: there is none.
+    """
+    return change if resistance is None else change + times(resistance, change)
+
+
+def resisted(resistance: Tensor | None, change: Tensor) -> Tensor:
+    """(1 + B)^-1 y, the inverse; written so that B = 0 changes nothing, bitwise."""
+    return change if resistance is None else change - withheld(resistance, change)
+
+
+def withheld(resistance: Tensor, change: Tensor) -> Tensor:
+    """(1 + B)^-1 B y: by how much the air lessens a change."""
+    return torch.linalg.solve(torch.eye(3).to(change) + resistance, times(resistance, change))
 
 
 def last_knot(t: Tensor, times: Tensor) -> Tensor:

@@ -8,8 +8,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from ._math import cross
-from .boundaries import Drive
+from ._math import cross, loaded
+from .boundaries import AbstractCollider, Drive
 from .effects import AbstractEffect
 from .errors import InvalidInput
 from .model import Model, assemble
@@ -75,19 +75,6 @@ def resistance_of(model: Model, s: Surface, x: Tensor) -> Tensor | None:
     return (total / model.mass).unflatten(-1, (3, 3))
 
 
-def resisted(resistance: Tensor | None, change: Tensor) -> Tensor:
-    """(1 + B)^-1 y, written so that B = 0 changes nothing, bitwise."""
-    if resistance is None:
-        return change
-    excess = (resistance @ change.unsqueeze(-1)).squeeze(-1)
-    return change - torch.linalg.solve(torch.eye(3).to(change) + resistance, excess)
-
-
-def _loaded(resistance: Tensor | None, change: Tensor) -> Tensor:
-    """(1 + B) y: what a gripper gives the cloth and the air that moves along."""
-    return change if resistance is None else change + (resistance @ change.unsqueeze(-1)).squeeze(-1)
-
-
 def constrain(
     model: Model,
     x: Tensor,
@@ -101,10 +88,13 @@ def constrain(
     impulses: Impulses = {}
     for name, boundary in model.boundaries.items():
         drive = drives.get(name)
-        after = boundary.apply(x, v, dt, drive, substep)
+        if isinstance(boundary, AbstractCollider):
+            after = boundary.apply(x, v, dt, drive, substep, resistance)
+        else:
+            after = boundary.apply(x, v, dt, drive, substep)
         if drive is not None:
-            after = _slipped(model, name, v, after, dt)
-            momentum = model.mass * _loaded(resistance, after - v)
+            after = _slipped(model, name, v, after, dt, resistance)
+            momentum = model.mass * loaded(resistance, after - v)
             arm = x - _origin(drive, substep)
             impulses[name] = torch.cat([momentum.sum(-2), cross(arm, momentum).sum(-2)], dim=-1)
         v = after
@@ -117,9 +107,9 @@ def _origin(drive: Drive, substep: int) -> Tensor:
     return (end - step[..., None, :3, 3]) @ step[..., :3, :3]
 
 
-def _slipped(model: Model, grasp: str, free: Tensor, held: Tensor, dt: float) -> Tensor:
+def _slipped(model: Model, grasp: str, free: Tensor, held: Tensor, dt: float, resistance: Tensor | None) -> Tensor:
     for effect, c in model.effects.values():
         if effect.grasp == grasp:
             index = cast("Tensor", model.boundaries[grasp].index)
-            held = effect.loosen(c, index, free, held, model.mass, dt)
+            held = effect.loosen(c, index, free, held, model.mass, dt, resistance)
     return held

@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from . import apic
-from ._math import dot
+from ._math import dot, resisted
 from .boundaries import Drive
-from .dynamics import Impulses, added, constrain, resistance_of, resisted, vertex_forces
+from .dynamics import Impulses, added, constrain, resistance_of, vertex_forces
 from .model import Geometry, Model, surface
 from .relaxation import relaxed
 from .self_contact import Layers, add_columns, director_energy, follow, near_layers, pressure, repulsion

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ._math import resisted
 from .boundaries import Drive
-from .dynamics import resisted
 from .model import Model
 from .types import ClothState, Memory, Moment, Surface
 

@@ -159,12 +159,15 @@ def test_batch(sampling):
     agree(cloth, moves(cloth, (3,)), falling(cloth, 4e-3, (3,)))
 
 
-def test_what_bodies_give_with_the_air():
-    effects = {"air": AddedMass(0.1)}
-    pose = torch.eye(4)
-    pose[2, 3] = -0.1
-    for sampling in (None, 0.01):
-        cloth = sheet({"box": Box((0.08, 0.09, 0.2), pose, 0.3, moving=True, sampling=sampling)}, effects)
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("sampling", [None, 0.01])
+def test_what_bodies_give_with_the_air(law, sampling):
+    slope = 0.0 if law == "elliptic" else 0.03  # its axis lies in the plane
+    for body in (
+        Box((0.08, 0.09, 0.2), turned(-0.1), LAWS[law](), moving=True, sampling=sampling),
+        Plane(normal=(slope, 0.0, 1.0), friction=LAWS[law](), sampling=sampling),
+    ):
+        cloth = sheet({"box": body}, {"air": AddedMass(0.1)})
         agree(cloth, moves(cloth), falling(cloth, 1e-3))
 
 
@@ -178,11 +181,12 @@ def test_what_bodies_give_with_the_air():
     ],
     ids=["holds", "slips", "opens", "closes"],
 )
-def test_grips(hold, mobility, closed):
-    cloth = sheet({"hand": Grasp([0, 1, 6, 7]), "floor": Plane()}, {"slip": GripSlip("hand", mobility, hold)})
+@pytest.mark.parametrize("air", [{}, {"air": AddedMass(0.1)}], ids=["vacuum", "air"])
+def test_grips(hold, mobility, closed, air):
+    cloth = sheet({"hand": Grasp([0, 1, 6, 7]), "floor": Plane()}, {"slip": GripSlip("hand", mobility, hold), **air})
     state = falling(cloth)
     agree(cloth, {"hand": path(closed=closed)}, state)
-    perfect = sheet({"hand": Grasp([0, 1, 6, 7]), "floor": Plane()})
+    perfect = sheet({"hand": Grasp([0, 1, 6, 7]), "floor": Plane()}, air)
     assert torch.equal(run(cloth, state).x, run(perfect, state).x) == (hold == 100.0)
 
 

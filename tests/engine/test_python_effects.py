@@ -70,7 +70,7 @@ class Slippery(Pull):
 
     grasp = "left"
 
-    def loosen(self, c, index, free, held, mass, dt):
+    def loosen(self, c, index, free, held, mass, dt, resistance):
         return held + c * (free - held)
 
 

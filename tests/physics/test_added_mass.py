@@ -7,6 +7,8 @@ import torch
 
 import torchcloth as tc
 from torchcloth import functional
+from torchcloth._math import loaded
+from torchcloth.dynamics import resistance_of
 
 DENSITY = 0.18
 DEPTH = 0.1  # m of air
@@ -125,6 +127,63 @@ def test_a_gripper_feels_the_air_that_it_moves():
         hand = {"hand": tc.Trajectory(t, pose, torch.ones(41, dtype=bool))}
         wrench = cloth(cloth.rest_state(), hand, [0.0, 0.1, 0.3]).wrench["hand"]
         assert float(wrench[-1, axis]) == pytest.approx(-2.0 * inertia * 0.06, rel=1e-3)
+
+
+@pytest.mark.parametrize("engine", ["reference", "fused"])
+def test_a_grip_yields_to_what_moves_the_air_too(engine):
+    """The same plate, from hands that hold 0.03 N: more than the cloth's inertia asks for, less than with its air's."""
+    boundaries = {"hand": tc.boundaries.Grasp(range(16))}
+    cloth = sheet({**air(), "slip": tc.effects.GripSlip("hand", 1e3, 0.03)}, boundaries)
+    cloth.engine = engine
+    t = torch.linspace(0.0, 0.4, 41)
+    for axis, pull in ((2, 0.03), (0, 2.0 * DENSITY * 0.06)):
+        pose = torch.eye(4).repeat(41, 1, 1)
+        pose[:, axis, 3] = t * t
+        hand = {"hand": tc.Trajectory(t, pose, torch.ones(41, dtype=bool))}
+        rollout = cloth(cloth.rest_state(), hand, torch.linspace(0.0, 0.3, 31))
+        torch.testing.assert_close(rollout.wrench["hand"][3:, axis], torch.full((28,), -pull), rtol=0.02, atol=0)
+
+
+@pytest.mark.parametrize("engine", ["reference", "fused"])
+@pytest.mark.parametrize("sampling", [None, 0.02])
+def test_air_makes_no_cloth_slip(engine, sampling):
+    """Friction is mu times the push, and the weight is what it was: a sheet slides down a slope as in vacuum."""
+    angle = math.atan(0.6)
+    gravity = tc.effects.Gravity((9.81 * math.sin(angle), 0.0, -9.81 * math.cos(angle)))
+    for mu in (0.4, 0.7):
+        floor = {"floor": tc.boundaries.Plane(friction=mu, sampling=sampling)}
+        slid = []
+        for effects in ({}, air(0.3)):
+            cloth = sheet({"gravity": gravity, **effects}, floor)
+            cloth.engine = engine
+            slid.append(cloth(cloth.rest_state(), times=[0.0, 0.2]).x[-1, :, 0])
+        start = cloth.rest_state().x[:, 0]
+        expected = 0.5 * 9.81 * max(math.sin(angle) - mu * math.cos(angle), 0.0) * 0.2**2
+        torch.testing.assert_close(slid[0] - start, torch.full((16,), expected), rtol=0.01, atol=2e-5)
+        torch.testing.assert_close(slid[1], slid[0], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.5])
+def test_what_stops_cloth_and_air_pushes_along_the_normal(turn):
+    """A sheet aslant meets a smooth floor: no impulse along the floor, and no energy comes from it."""
+    pose = torch.eye(4)
+    pose[0, 0], pose[0, 1], pose[1, 0], pose[1, 1] = (math.cos(turn), -math.sin(turn), math.sin(turn), math.cos(turn))
+    floor = tc.boundaries.Plane(friction=0.0, moving=True, pose=pose)
+    cloth = sheet(air(0.3), {"floor": floor})
+    x = cloth.rest_state().x
+    aslant = torch.stack([x[:, 0], 0.8 * x[:, 1], 0.6 * x[:, 1]], -1)
+    speed = torch.tensor([0.1, 0.2, -0.5]).expand(16, 3)
+    still = {"floor": tc.Trajectory(torch.tensor([0.0, 1.0]), torch.eye(4).repeat(2, 1, 1), torch.ones(2, dtype=bool))}
+    model, state = cloth.model(), cloth.state(aslant, speed)
+    drives = {name: tc.boundaries.drive(t, torch.tensor([0.0, 1e-4])) for name, t in still.items()}
+    after, impulses = functional.step(model, state, 1e-4, drives, 0)
+    assert float(after.v[aslant[:, 2] < 1e-9, 2].abs().max()) < 1e-12
+    given = impulses["floor"][:3]
+    assert float(given[2]) > 1e-3
+    assert float(given[:2].abs().max()) < 1e-12 * float(given[2])
+    inertia = resistance_of(model, functional.surface(model.geometry, aslant, speed), aslant)
+    energy = [0.5 * float((model.mass * v * loaded(inertia, v)).sum()) for v in (speed, after.v)]
+    assert energy[1] < energy[0]
 
 
 @pytest.mark.parametrize("options", [{"length": -0.1}, {"density": 0.0}])

@@ -99,7 +99,7 @@ def test_gradients_at_no_pull_are_finite():
     with torch.enable_grad():
         v = torch.zeros(24, 3, requires_grad=True)
         index, mass = cloth.boundaries["hand"].index, cloth.model().mass.detach()
-        out = effect.loosen(effect.coefficients(), index, v, 0 * v, mass, 1e-4)
+        out = effect.loosen(effect.coefficients(), index, v, 0 * v, mass, 1e-4, None)
         gradients = torch.autograd.grad(out.sum(), [v, *effect.parameters()])
     assert all(torch.isfinite(g).all() for g in gradients)
 

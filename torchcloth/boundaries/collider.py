@@ -9,7 +9,7 @@ from typing import NamedTuple, TypedDict, cast
 import torch
 from torch import Tensor
 
-from .._math import dot
+from .._math import dot, times, withheld
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from .base import AbstractBoundary, Drive
@@ -36,7 +36,9 @@ class AbstractCollider(AbstractBoundary):
     A point may move along the normal only as far as the surface's tangent plane at the nearest place, carried along
     with the body to the end of the substep (Signorini's condition, linearised; exact for planes). The push that this
     needs feeds the friction, which acts on the slip against the body's material velocity. A point that is inside may
-    not go deeper and is moved out at a bounded speed, so that a bad start adds little energy.
+    not go deeper and is moved out at a bounded speed, so that a bad start adds little energy. Air that moves along with
+    the cloth resists what stops it: without friction the impulse that cloth and air get together is along the surface's
+    normal, and friction is mu times that, whatever part of it the air takes.
 
     Args:
         friction: mu [-] of Coulomb's law, or a law: ``Coulomb``, ``Stribeck``, ``Elliptic``.
@@ -101,34 +103,46 @@ class AbstractCollider(AbstractBoundary):
             self.points = TrianglePoints(mesh, self.sampling).to(self.friction.raw.device)
         return self
 
-    def apply(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
-        """Stop what approaches; first the points on edges and triangles, then, exactly, the vertices."""
+    def apply(
+        self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int, resistance: Tensor | None = None
+    ) -> Tensor:
+        """Stop what approaches; first the points on edges and triangles, then, exactly, the vertices.
+
+        ``resistance`` [..., V, 3, 3] is the mass of the air that moves along, over the vertices' own; None: none does.
+        """
         motion = (None, None) if drive is None else (d[..., substep, :, :] for d in (drive.increment, drive.pose))
         place = self._placed(*motion)
         if self.points is not None:
-            contact = self._contact(self.points.at(x), dt, place)
+            air = None if resistance is None else self.points.at(resistance.flatten(-2)).unflatten(-1, (3, 3))
+            contact = self._contact(self.points.at(x), dt, place, air)
             for _ in range(PASSES):
                 v = v + self.points.share(self._change(contact, self.points.at(v)))
-        return v + self._change(self._contact(x, dt, place), v)
+        return v + self._change(self._contact(x, dt, place, resistance), v)
 
     def _placed(self, increment: Tensor | None, pose: Tensor | None) -> _Place:
         own = self.pose
         return _Place(increment, own if pose is None else pose if own is None else pose @ own)
 
-    def _contact(self, x: Tensor, dt: float, place: _Place) -> _Contact:
+    def _contact(self, x: Tensor, dt: float, place: _Place, resistance: Tensor | None) -> _Contact:
         carried = place.carried(x)
         distance, normal = self.distance(place.inside(carried))
         least = ((self.offset - distance) / dt).clamp(max=self.recovery)
-        return _Contact(place, None if carried is x else (carried - x) / dt, normal, least)
+        air = None if resistance is None else _Air.of(place.tensor_inwards(resistance), normal)
+        return _Contact(place, None if carried is x else (carried - x) / dt, normal, least, air)
 
     def _change(self, contact: _Contact, v: Tensor) -> Tensor:
         """Change of velocity of points [..., N, 3], exactly 0 for those that are free."""
-        place, own, normal, least = contact
+        place, own, normal, least, air = contact
         slip = place.inwards(v if own is None else v - own)
         approach = dot(slip, normal)
         push = (least - approach).clamp(min=0)
         slip = slip - approach * normal
-        return place.outwards(push * normal - self.friction.taken(slip, push) * slip)
+        if air is None:
+            return place.outwards(push * normal - self.friction.taken(slip, push) * slip)
+        aside = push * air.aside
+        slip = slip + aside
+        taken = self.friction.taken(slip, push * air.pushed(slip))
+        return place.outwards(push * normal + aside - taken * slip)
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""
@@ -156,6 +170,13 @@ class _Place(NamedTuple):
         """World vectors in the shape's axes."""
         return v if self.pose is None else v @ self.pose[..., :3, :3]
 
+    def tensor_inwards(self, b: Tensor) -> Tensor:
+        """World tensors [..., N, 3, 3] in the shape's axes."""
+        if self.pose is None:
+            return b
+        turn = self.pose[..., None, :3, :3]
+        return turn.mT @ b @ turn
+
     def outwards(self, v: Tensor) -> Tensor:
         """Vectors of the shape in world axes."""
         return v if self.pose is None else v @ self.pose[..., :3, :3].mT
@@ -168,6 +189,29 @@ class _Contact(NamedTuple):
     own: Tensor | None  # [..., N, 3] m/s, material velocity of the body, world axes; None: it stands still
     normal: Tensor  # [..., N, 3], the shape's axes
     least: Tensor  # [..., N, 1] m/s, normal velocity that the points must have at least, relative to the body
+    air: _Air | None  # that moves along; None: there is none
+
+
+class _Air(NamedTuple):
+    """How points with air that moves along answer a push, in the shape's axes."""
+
+    resistance: Tensor  # [..., N, 3, 3]
+    aside: Tensor  # [..., N, 3], tangential, change of velocity with one of 1 along the normal: sheets give way aslant
+    push: Tensor  # [..., N, 1], impulse per mass that such a change takes
+
+    @classmethod
+    def of(cls, resistance: Tensor, normal: Tensor) -> _Air:
+        """W n = n - (1 + B)^-1 B n answers the impulse n: over n . W n, what changes the normal velocity by 1."""
+        less = withheld(resistance, normal)
+        along = dot(less, normal)
+        push = 1 / (1 - along)
+        return cls(resistance, push * (along * normal - less), push)
+
+    def pushed(self, slip: Tensor) -> Tensor:
+        """Push that counts for friction, of 1: as inertia along the normal is more, and along the slip [..., N, 3]."""
+        squared = dot(slip, slip)
+        along = dot(slip, times(self.resistance, slip))
+        return self.push / (1 + along / torch.where(squared > 0, squared, 1.0))
 
 
 def _rigid(pose: Tensor) -> Tensor:

@@ -99,10 +99,20 @@ class AbstractEffect(nn.Module, ABC):
         """m/(N s): most speed that ``loosen`` gives for a force; viscous forces on what yields much take no stages."""
         return 0.0 if self.grasp is None else math.inf
 
-    def loosen(self, c: Any, index: Tensor, free: Tensor, held: Tensor, mass: Tensor, dt: float) -> Tensor:
+    def loosen(
+        self,
+        c: Any,
+        index: Tensor,
+        free: Tensor,
+        held: Tensor,
+        mass: Tensor,
+        dt: float,
+        resistance: Tensor | None,
+    ) -> Tensor:
         """Velocities of the held vertices ``index`` in an imperfect grip, from those ``free`` of it and ``held`` by it.
 
-        All of ``free``, ``held`` and the result are [..., V, 3] m/s.
+        All of ``free``, ``held`` and the result are [..., V, 3] m/s. ``resistance`` [..., V, 3, 3] is the mass of the
+        air that moves along, over the ``mass`` [..., V, 1] kg of the vertices; None: none does.
         """
         return held
 

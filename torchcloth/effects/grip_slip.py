@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._math import safe_norm
+from .._math import dot, loaded, safe_norm, times
 from ..parameters import PhysicalParameter
 from .base import AbstractEffect, Amplitude
 
@@ -59,15 +59,29 @@ class GripSlip(AbstractEffect):
         """The mobility."""
         return float(c.mobility.detach().max())
 
-    def loosen(self, c: Coefficients, index: Tensor, free: Tensor, held: Tensor, mass: Tensor, dt: float) -> Tensor:
+    def loosen(
+        self,
+        c: Coefficients,
+        index: Tensor,
+        free: Tensor,
+        held: Tensor,
+        mass: Tensor,
+        dt: float,
+        resistance: Tensor | None,
+    ) -> Tensor:
         """The patch moves on with the same velocity all over, so that its pull falls to what the law says."""
         patch = mass.index_select(-2, index)
+        air = None if resistance is None else resistance.index_select(-3, index)
         change = (held - free).index_select(-2, index)
-        impulse = (patch * change).sum(-2, keepdim=True)
+        impulse = (patch * loaded(air, change)).sum(-2, keepdim=True)
         size = safe_norm(impulse)
+        inertia = patch.sum(-2, keepdim=True)
+        if air is not None:
+            way = impulse / torch.where(size > 0, size, 1.0)
+            inertia = inertia + dot(way, times((patch.unsqueeze(-1) * air).sum(-3, keepdim=True), way))
         slips = size > c.hold * dt
         excess = torch.where(slips, 1 - c.hold * dt / torch.where(slips, size, 1.0), 0.0)
-        creep = -(c.mobility * excess / (dt + c.mobility * patch.sum(-2, keepdim=True))) * impulse
+        creep = -(c.mobility * excess / (dt + c.mobility * inertia)) * impulse
         creep = creep.expand(*creep.shape[:-2], len(index), 3)
         return held.expand(*creep.shape[:-2], -1, -1).index_add(-2, index, creep)
 

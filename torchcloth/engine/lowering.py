@@ -142,6 +142,12 @@ class Lowering:
             return loop.call("scaled3", mass, change)
         return loop.call("loaded", loop.load(self.resistance, at), mass, change)
 
+    def air_per_own(self, loop: Loop) -> list[int]:
+        """Registers of the mass of the air that moves along with a vertex, over its own; none without."""
+        if self.resistance is None:
+            return []
+        return loop.call("per_own", loop.load(self.resistance), loop.load(self.mass))
+
 
 def remembered(model: Model, state: ClothState) -> dict[str, Tensor]:
     """Internal variables, and the directors where there is contact."""

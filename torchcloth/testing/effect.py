@@ -81,7 +81,7 @@ class EffectContract(Contract):
                 now = now._replace(memory=effect.evolve(c, now))
             index = torch.arange(3)
             held = v.index_fill(-2, index, 0.0)
-            loose = effect.loosen(c, index, v, held, mass, 1e-3)
+            loose = effect.loosen(c, index, v, held, mass, 1e-3, None)
             found = {
                 "force": effect.force(c, now),
                 "viscous": effect.viscous(c, now),

@@ -38,17 +38,19 @@ class Body:
         placed = loop.call("place", x, *(loop.load(field) for field in (*self._place, self._low.dt)))
         return self._distance(loop, placed[:3]), placed[3:]
 
-    def change(self, loop: Loop, x: list[int], v: list[int]) -> list[int]:
-        """Change of the velocities ``v`` at ``x``, exactly 0 where nothing touches."""
+    def change(self, loop: Loop, x: list[int], v: list[int], air: list[int]) -> list[int]:
+        """Change of the velocities ``v`` at ``x``, exactly 0 where nothing touches; ``air`` per own mass goes along."""
         contact, own = self.seen(loop, x)
         if self._place is None or own is None:
-            return self._response(loop, v, contact)
+            return self._response(loop, v, contact, air)
         pose = loop.load(self._place[1])
-        return loop.call("outwards", self._response(loop, loop.call("inwards", v, own, pose), contact), pose)
+        air = air and loop.call("tensor_inwards", air, pose)
+        return loop.call("outwards", self._response(loop, loop.call("inwards", v, own, pose), contact, air), pose)
 
-    def _response(self, loop: Loop, slip: list[int], contact: list[int]) -> list[int]:
-        numbers = (self._low.dt, self.limits, *self._numbers)
-        return loop.call(self._law, slip, contact, *(loop.load(field) for field in numbers))
+    def _response(self, loop: Loop, slip: list[int], contact: list[int], air: list[int]) -> list[int]:
+        numbers = [loop.load(field) for field in (self._low.dt, self.limits, *self._numbers)]
+        law = f"{self._law}_in_air" if air else self._law
+        return loop.call(law, slip, contact, *numbers, air)
 
 
 def _place(low: Lowering, name: str, solid: AbstractCollider) -> tuple[Field, Field] | None:

@@ -56,17 +56,23 @@ def _collide(low: Lowering, name: str, solid: AbstractCollider, velocity: Veloci
     if solid.points is not None:
         points.collide(low, solid.points, body, velocity)
     loop = velocity.loop
-    velocity.now = loop.call("plus3", velocity.now, body.change(loop, loop.load(low.x.now), velocity.now))
+    change = body.change(loop, loop.load(low.x.now), velocity.now, low.air_per_own(loop))
+    velocity.now = loop.call("plus3", velocity.now, change)
 
 
 def _slip(low: Lowering, rows: int, loop: Loop, free: Field, held: list[int], c: Any) -> tuple[Loop, list[int]]:
     """(a new loop over the held vertices, their velocities in it)."""
-    pull, still = low.program.temporary(1, 4), low.program.temporary(free.rows, 3)
-    loop.add(loop.call("pull", loop.load(low.mass, rows), loop.load(free), held), pull)
+    masses = [low.mass] if low.resistance is None else [low.mass, low.resistance]
+    pull, *patch = (low.program.temporary(1, comps) for comps in (3, *(m.comps for m in masses)))
+    still = low.program.temporary(free.rows, 3)
+    loop.add(low.momentum(loop, loop.call("change", held, loop.load(free)), rows), pull)
+    for own, total in zip(masses, patch, strict=True):
+        loop.add(loop.load(own, rows), total)
     loop.put(held, still)
     loop = low.loop(free.rows)
-    fields = (pull, low.parameter(c.mobility), low.parameter(c.hold), low.dt)
-    return loop, loop.call("creep", loop.load(still), *(loop.load(field) for field in fields))
+    fields = (pull, *patch, low.parameter(c.mobility), low.parameter(c.hold), low.dt)
+    law = "creep" if low.resistance is None else "creep_in_air"
+    return loop, loop.call(law, loop.load(still), *(loop.load(field) for field in fields))
 
 
 def _report(low: Lowering, name: str, loop: Loop, rows: int | None, before: list[int], after: list[int]) -> None:

@@ -22,12 +22,13 @@ from .body import Body
 
 
 class Points(NamedTuple):
-    """Constants of the points."""
+    """Constants of the points, and the air around them."""
 
     corners: list[int]  # three tables [P]
     weight: Field  # [P, 3]
     mobile: Field  # [P, 3] weights times the corners' mobilities
     tables: PointTables
+    air: Field | None  # [V, 6] that moves along, over the vertices' own mass
 
 
 def collide(low: Lowering, given: TrianglePoints, body: Body, velocity: Velocities) -> None:
@@ -68,11 +69,21 @@ def _pass(low: Lowering, points: Points, body: Body, before: Field) -> Field:
 def _change(low: Lowering, loop: Loop, points: Points, body: Body, v: Field) -> list[int]:
     """Wanted change of the points' velocities."""
     weight = loop.load(points.weight)
-    at = [
-        loop.call("at_point", *(loop.load(field, corner) for corner in points.corners), weight)
-        for field in (low.x.now, v)
-    ]
-    return body.change(loop, *at)
+    corners = lambda field: [loop.load(field, corner) for corner in points.corners]  # noqa: E731
+    x, now = (loop.call("at_point", *corners(field), weight) for field in (low.x.now, v))
+    if points.air is None:
+        return body.change(loop, x, now, [])
+    around = corners(points.air)
+    halves = [loop.call("at_point", *(b[k : k + 3] for b in around), weight) for k in (0, 3)]
+    return body.change(loop, x, now, [*halves[0], *halves[1]])
+
+
+def _air(low: Lowering) -> Field | None:
+    if low.resistance is None:
+        return None
+    loop, air = low.loop(low.vertices), low.program.temporary(low.vertices, 6)
+    loop.put(low.air_per_own(loop), air)
+    return air
 
 
 def _points(low: Lowering, given: TrianglePoints) -> Points:
@@ -89,6 +100,7 @@ def _points(low: Lowering, given: TrianglePoints) -> Points:
         constant(weight.T),
         constant(mobile.T),
         PointTables(table(faces), table(starts), faces.shape[1]),
+        _air(low),
     )
 
 

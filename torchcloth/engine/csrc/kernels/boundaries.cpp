@@ -53,38 +53,32 @@ struct Impulse {
     }
 };
 
-// Mass, velocity free and held of a held vertex -> what the gripper gives it, mass of the patch. effects/grip_slip.py
-struct Pull {
-    static constexpr const char* name = "pull";
-    static constexpr int inputs = 7, outputs = 4;
-    template <class T>
-    static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const T mass = r.number();
-        const auto before = r.vec(), after = r.vec();
-        Write<T> w{out};
-        w.vec(mass * (after - before)), w.number(1.0 * mass);
-    }
-};
-
-// Velocity of a held vertex, pull and mass of the patch, mobility, hold, dt -> velocity. effects/grip_slip.py
-struct Creep {
-    static constexpr const char* name = "creep";
-    static constexpr int inputs = 10, outputs = 3;
-    static constexpr auto fixed = bits(9, 1);
+// Velocity of a held vertex, pull and mass(es) of the patch, mobility, hold, dt -> velocity. effects/grip_slip.py
+template <bool AIR>
+struct Creeping {
+    static constexpr int inputs = AIR ? 16 : 10, outputs = 3;
+    static constexpr auto fixed = bits(inputs - 1, 1);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
         const auto v = r.vec(), pull = r.vec();
-        const T mass = r.number(), mobility = r.number(), hold = r.number(), dt = r.number();
-        const T size = safe_norm(pull), slips = less(hold * dt, size);
+        T mass = r.number();
+        const T size = safe_norm(pull);
+        if constexpr (AIR) {
+            const auto way = pull / select(less(0.0, size), size, 1.0);
+            mass = mass + dot(way, r.symmetric() * way);
+        }
+        const T mobility = r.number(), hold = r.number(), dt = r.number();
+        const T slips = less(hold * dt, size);
         const T excess = select(slips, 1.0 - hold * dt / select(slips, size, 1.0), 0.0);
         Write<T>{out}.vec(v - (mobility * excess / (dt + mobility * mass)) * pull);
     }
 };
+struct Creep : Creeping<false> { static constexpr const char* name = "creep"; };
+struct CreepInAir : Creeping<true> { static constexpr const char* name = "creep_in_air"; };
 
 }  // namespace
 
-TC_KERNELS(boundary_kernels, Grasp, Change, Impulse, Pull, Creep)
+TC_KERNELS(boundary_kernels, Grasp, Change, Impulse, Creep, CreepInAir)
 
 }  // namespace tc

@@ -63,10 +63,37 @@ struct Outwards {
     }
 };
 
+// Mass of the air that moves along, own mass -> the first over the second. dynamics.py
+struct PerOwn {
+    static constexpr const char* name = "per_own";
+    static constexpr int inputs = 7, outputs = 6;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto air = r.symmetric();
+        Write<T>{out}.symmetric(air / r.number());
+    }
+};
+
+// A symmetric tensor, pose -> the tensor in the shape's axes.
+struct TensorInwards {
+    static constexpr const char* name = "tensor_inwards";
+    static constexpr int inputs = 22, outputs = 6;
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto b = r.symmetric();
+        const auto R = r.pose().R;
+        const Vec<T> x{R.a.x, R.b.x, R.c.x}, y{R.a.y, R.b.y, R.c.y}, z{R.a.z, R.b.z, R.c.z};
+        const auto bx = b * x, by = b * y, bz = b * z;
+        Write<T>{out}.symmetric({dot(x, bx), dot(x, by), dot(x, bz), dot(y, by), dot(y, bz), dot(z, bz)});
+    }
+};
+
 // mu
 template <class T>
 struct CoulombLaw {
-    static constexpr const char* name = "coulomb";
+    static constexpr const char *name = "coulomb", *in_air = "coulomb_in_air";
     static constexpr int inputs = 1;
     T mu;
     constexpr CoulombLaw(const T* in) : mu(in[0]) {}
@@ -77,7 +104,7 @@ struct CoulombLaw {
 // mu of fast slip, excess at rest, speed
 template <class T>
 struct StribeckLaw : CoulombLaw<T> {
-    static constexpr const char* name = "stribeck";
+    static constexpr const char *name = "stribeck", *in_air = "stribeck_in_air";
     static constexpr int inputs = 3;
     T excess, speed;
     constexpr StribeckLaw(const T* in) : CoulombLaw<T>(in), excess(in[1]), speed(in[2]) {}
@@ -90,7 +117,7 @@ struct StribeckLaw : CoulombLaw<T> {
 // mu along the axis, ratio of the mu across to it, axis
 template <class T>
 struct EllipticLaw : CoulombLaw<T> {
-    static constexpr const char* name = "elliptic";
+    static constexpr const char *name = "elliptic", *in_air = "elliptic_in_air";
     static constexpr int inputs = 5;
     T ratio;
     Vec<T> axis;
@@ -101,11 +128,12 @@ struct EllipticLaw : CoulombLaw<T> {
     }
 };
 
-// Slip, distance, normal, dt, offset, recovery, the law's numbers -> change of velocity, in the shape's axes.
-template <template <class> class Law>
+// Slip, distance, normal, dt, offset, recovery, the law's numbers, mass of the air that moves along over the own ->
+// change of velocity, in the shape's axes.
+template <template <class> class Law, bool AIR>
 struct Response {
-    static constexpr const char* name = Law<Sym>::name;
-    static constexpr int inputs = 10 + Law<Sym>::inputs, outputs = 3;
+    static constexpr const char* name = AIR ? Law<Sym>::in_air : Law<Sym>::name;
+    static constexpr int inputs = 10 + Law<Sym>::inputs + (AIR ? 6 : 0), outputs = 3;
     static constexpr auto fixed = bits(7, 3);
     template <class T>
     static constexpr void run(const T* in, T* out) {
@@ -118,17 +146,35 @@ struct Response {
         const T wanted = (offset - distance) / dt;
         const T least = select(less(recovery, wanted), recovery, wanted);
         const T approach = dot(v, normal), push = at_least(least - approach, 0.0);
-        const auto slip = v - approach * normal;
+        const auto free = v - approach * normal;
+        if constexpr (AIR) {
+            const auto air = Read<T>{r.at + Law<T>::inputs}.symmetric();
+            const auto held = air * normal;
+            const auto withheld = solve(Symmetric<T>{1.0 + air.xx, air.xy, air.xz, 1.0 + air.yy, air.yz, 1.0 + air.zz}, held);
+            const T along = dot(withheld, normal), given = push / (1.0 - along);
+            const auto aside = given * (along * normal - withheld), slip = free + aside;
+            const T squared = dot(slip, slip);
+            const T inert = 1.0 + dot(slip, air * slip) / select(less(0.0, squared), squared, 1.0);
+            Write<T>{out}.vec(push * normal + aside - taken(law, slip, given / inert) * slip);
+        } else {
+            Write<T>{out}.vec(push * normal - taken(law, free, push) * free);
+        }
+    }
+    template <class T>
+    static constexpr T taken(Law<T> law, Vec<T> slip, T push) {
         const T size = law.size(slip), limit = law.coefficient(size) * push;
         const T sticks = less(0.0, limit) * (1.0 - less(limit, size));
-        const T taken = select(sticks, 1.0, limit / select(less(0.0, size), size, 1.0));
-        Write<T>{out}.vec(push * normal - taken * slip);
+        return select(sticks, 1.0, limit / select(less(0.0, size), size, 1.0));
     }
 };
+template <template <class> class Law>
+using Bare = Response<Law, false>;
+template <template <class> class Law>
+using InAir = Response<Law, true>;
 
 }  // namespace
 
-TC_KERNELS(collider_kernels, Compose, Place, Inwards, Outwards, Response<CoulombLaw>, Response<StribeckLaw>,
-           Response<EllipticLaw>)
+TC_KERNELS(collider_kernels, Compose, Place, Inwards, Outwards, PerOwn, TensorInwards, Bare<CoulombLaw>,
+           Bare<StribeckLaw>, Bare<EllipticLaw>, InAir<CoulombLaw>, InAir<StribeckLaw>, InAir<EllipticLaw>)
 
 }  // namespace tc
