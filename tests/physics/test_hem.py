@@ -47,6 +47,34 @@ def test_lines_by_vertex_pairs():
         assert float(mass[torch.as_tensor(bottom)].sum()) == float(mass.sum())
 
 
+@pytest.mark.parametrize("resolution", [(5, 6), (4, 6), (12, 7)])
+def test_a_path_is_the_same_line_on_every_mesh(resolution):
+    """Along edges or between them, aslant, or half beside the cloth: mass, and where its middle lies."""
+    mesh = tc.meshes.rectangle(0.3, 0.2, resolution=resolution)
+    for path, length in (
+        ([[0.15, 0.0], [0.15, 0.2]], 0.2),
+        ([[0.05, 0.04], [0.2, 0.17]], None),
+        ([[0.1, 0.1], [0.4, 0.1]], 0.2),
+        ([[0.02, 0.02], [0.1, 0.02], [0.1, 0.15]], 0.21),
+    ):
+        mass = extra(mesh, 0.02, path=path).numpy()
+        points = np.asarray(path)
+        long = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        assert mass.sum() == pytest.approx(0.02 * (long.sum() if length is None else length), rel=1e-7)
+        inside = np.minimum(points, [0.3, 0.2])
+        long = np.linalg.norm(np.diff(inside, axis=0), axis=1)
+        middle = ((inside[1:] + inside[:-1]) / 2 * long[:, None]).sum(0) / long.sum()
+        np.testing.assert_allclose(mass @ mesh.uv / mass.sum(), middle, atol=1e-8)
+        assert (mass > -1e-10).all()
+    along, pairs = (extra(mesh, 0.02, **given) for given in ({"path": [[0, 0], [0.3, 0]]}, {"edges": _bottom(mesh)}))
+    torch.testing.assert_close(along, pairs, rtol=1e-6, atol=1e-10)
+
+
+def _bottom(mesh):
+    bottom = np.flatnonzero(mesh.uv[:, 1] < 1e-9)
+    return np.stack([bottom[:-1], bottom[1:]], -1)
+
+
 def test_seams_are_counted_once():
     """A sheet of two panels that lie apart on the pattern."""
     flat = tc.meshes.rectangle(0.3, 0.2, resolution=(4, 6))
@@ -100,6 +128,10 @@ def test_a_batch_of_hems():
         {"edges": [0, 1]},
         {"edges": [[0.0, 1.0]]},
         {"edges": np.zeros((0, 2), int)},
+        {"path": [0.1, 0.2]},
+        {"path": [[0.1, 0.2]]},
+        {"path": [[0.1, np.nan], [0.2, 0.1]]},
+        {"path": [[100.0, 0.0], [100.0, 200.0]]},
     ],
 )
 def test_refusals(options):

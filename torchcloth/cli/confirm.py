@@ -59,13 +59,14 @@ def _confirm(options: argparse.Namespace) -> int:
 
 def _print(found: Any) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title="Episodes that neither model has seen", title_justify="left")
     for head in ("motion", "base, mm", "extended, mm", "explained", "log density"):
         table.add_column(head, justify="left" if head == "motion" else "right")
     for name, gain in found.motions.items():
-        table.add_row(name, *_cells(gain))
+        table.add_row(escape(name), *_cells(gain))
     table.add_section()
     table.add_row("all", *_cells(found.whole))
     console = Console()

@@ -70,6 +70,7 @@ def progress_line() -> Iterator[Callable[[str], None]]:
         yield lambda text: None if text.endswith("left") else print(text, flush=True)
         return
     from rich.console import Console
+    from rich.markup import escape
 
     with Console(stderr=True).status("") as status:
-        yield status.update
+        yield lambda text: status.update(escape(text))

@@ -48,7 +48,6 @@ def _pose(options: argparse.Namespace) -> int:
     import torch
 
     from .. import recordings, viewing
-    from ..identification import is_fitted
     from ..pose.tables import print_pose
 
     torch.set_default_dtype(torch.float64)
@@ -63,10 +62,18 @@ def _pose(options: argparse.Namespace) -> int:
     film = viewing.film_of_pose(recording, estimate, truth=options.truth)
     picture = viewing.picture(film, options.out / "pose.png", size=PICTURE)
     print_pose(estimate)
-    if options.fit is not None and options.fit.suffix != ".tcm" and is_fitted(options.fit, recording):
+    if options.fit is not None and _used(options.fit, recording):
         print("note: the fit used this episode: it counts twice, and the errors of the fabric's values are too small")
     print("result: " + ", ".join(str(path) for path in (*files, picture)))
     return 0
+
+
+def _used(fit: Path, recording: Recording) -> bool:
+    """Whether the fit or model has seen this episode."""
+    from .. import diagnosis
+    from ..identification import is_fitted
+
+    return diagnosis.was_fitted(fit, recording) if fit.suffix == ".tcm" else is_fitted(fit, recording)
 
 
 def _model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:

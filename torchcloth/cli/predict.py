@@ -97,7 +97,7 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
 
     from .. import recordings
     from .._files import atomically
-    from ..diagnosis import predicted
+    from ..diagnosis import predicted, was_fitted
     from ..identification import is_fitted, pictures, predict_episode, prediction_report
 
     if options.seen is None:
@@ -112,7 +112,7 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
         np.savez_compressed(file, t=t, vertices=vertices, std=std, interval=interval, faces=faces)
     picture = pictures.save_figure(prediction_report.predicted(found), out / "prediction.png")
     prediction_report.print_predicted(found)
-    if not of_model and is_fitted(fit, recording):
+    if was_fitted(fit, recording) if of_model else is_fitted(fit, recording):
         print("note: this episode was fitted: its distances are residuals, not errors of a prediction")
     print(f"result:   {path}\nframes:   {out / 'prediction.npz'}\npicture:  {picture}")
     return 0

@@ -13,7 +13,16 @@ from .fitting import Fitted, fit
 from .gate import Fault, check, read_episodes
 from .hypotheses import catalogue, register
 from .lacking import lack_of_fit
-from .loading import begin_with, beside_the_cloth, cloth_for, load, load_world, predicted, uncertain
+from .loading import (
+    begin_with,
+    beside_the_cloth,
+    cloth_for,
+    load,
+    load_world,
+    predicted,
+    uncertain,
+    was_fitted,
+)
 from .missing import MissingForce, missing_force
 from .model_file import load_model, read_model, save_model
 from .noise import fit_noise
@@ -69,5 +78,6 @@ __all__ = [
     "search",
     "setting_of",
     "uncertain",
+    "was_fitted",
     "write_diagnosis",
 ]

@@ -46,39 +46,45 @@ class Drift(NamedTuple):
 
 
 def drifts(found: Fitted, names: Sequence[str]) -> list[Drift]:
-    """One for each axis; none where fewer than four of the motions ``names`` have forces and can be judged."""
-    later = lambda c: bool(((c.block == SEEN) & (c.time > c.time.min())).any())  # noqa: E731
+    """One for each axis; none where fewer than four of the motions ``names`` have such forces and can be judged."""
+    later = lambda c: len(c.time) and bool(((c.block == SEEN) & (c.time > c.time.min())).any())  # noqa: E731
     every: dict[str, list[tuple[Tensor, Tensor]]] = {}
     for k, (name, cells) in enumerate(zip(names, found.evidence.cells, strict=True)):
         if later(cells) and stable(found, k):
             every.setdefault(name, []).append(_rates(found, k))
     if len(every) < FEWEST:
         return []
-    rates, variances = (torch.stack(column) for column in zip(*map(_together, every.values()), strict=True))
+    rates, known = (torch.stack(column) for column in zip(*map(_together, every.values()), strict=True))
     rows = []
-    for axis, rate, variance in zip(AXES, rates.mT, variances.mT, strict=True):
-        mean, std, freedom = _pooled(rate, variance)
+    for axis, rate, information in zip(AXES, rates.mT, known.mT, strict=True):
+        tells = information > 0  # cells of one axis may all jump
+        if int(tells.sum()) < FEWEST:
+            continue
+        mean, std, freedom = _pooled(rate[tells], 1 / information[tells])
         rows.append(Drift(axis, mean, std, min(1.0, len(AXES) * _beyond(abs(mean) / std, freedom))))
     return rows
 
 
 def _together(repeats: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """(rates, variances) [axes] of one motion: repetitions of it share whatever the model gets wrong there."""
-    known = [1 / variance for _, variance in repeats]
-    total = torch.stack(known).sum(0)
-    return torch.stack([w * rate for w, (rate, _) in zip(known, repeats, strict=True)]).sum(0) / total, 1 / total
+    """(rates, information) [axes] of one motion: repetitions of it share whatever the model gets wrong there."""
+    total = torch.stack([known for _, known in repeats]).sum(0)
+    return torch.stack([known * rate for rate, known in repeats]).sum(0) / _or_one(total), total
+
+
+def _or_one(information: Tensor) -> Tensor:
+    return torch.where(information > 0, information, 1.0)
 
 
 def _rates(found: Fitted, k: int) -> tuple[Tensor, Tensor]:
-    """(rates, variances) [axes] of one episode with forces in more than one window."""
+    """(rates, information: inverse variances) [axes] of one episode with forces in more than one window."""
     cells = found.evidence.cells[k]
     axis = torch.arange(len(AXES))
     here = (cells.block == SEEN)[:, None] & (cells.patch[:, None] % 3 == axis)
     since = torch.where(here, (cells.time - cells.time.min())[:, None], 0.0)
     still, moved = right(found, k)
     weighed = torch.linalg.solve(still + moved @ moved.mT, since)
-    variance = 1 / (weighed * since).sum(0)
-    return variance * (weighed.mT @ cells.value), variance
+    information = (weighed * since).sum(0)
+    return weighed.mT @ cells.value / _or_one(information), information
 
 
 def _pooled(rate: Tensor, variance: Tensor) -> tuple[float, float, float]:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from ..effects import Bending, CreasingBending, Gravity, LineMass, RestShape
+from ..errors import InvalidInput
 from ..materials import OrthotropicAEP
-from ..meshes import Mesh
 from .world import Hypothesis, World
 
-MIDDLE = 1e-6  # m
 MOST = 0.9  # share by which one stiffness may fall short of another
 YIELD = 30.0  # 1/m, beyond which bent cloth keeps a crease
 
@@ -67,18 +64,14 @@ def _density(world: World, share: float) -> World:
     return new
 
 
-def _middle(mesh: Mesh) -> np.ndarray:
-    """[N, 2] edges of the mesh along v that are nearest to half the width."""
-    uv = mesh.vertices[:, :2] if mesh.uv is None else mesh.uv
-    u, sides = uv[:, 0], np.unique(np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    upright = np.abs(np.diff(u[sides], axis=1)[:, 0]) < MIDDLE
-    off = np.abs(u[sides].mean(1) - 0.5 * (u.min() + u.max()))
-    return sides[upright & (off < off[upright].min() + MIDDLE)] if upright.any() else sides[:0]
-
-
 def _seam(world: World, mass: float) -> World:
-    edges = _middle(world.cloth.mesh)
-    return world.with_cloth({"seam": LineMass(mass, edges)}) if len(edges) else world
+    """Along v, at half the width of the pattern, whatever the mesh: vertices may lie to either side."""
+    pattern = world.cloth.mesh.pattern
+    if pattern is None:
+        raise InvalidInput("mesh", got="no pattern coordinates", expected="a pattern: the seam is along its v")
+    low, high = pattern.min((0, 1)), pattern.max((0, 1))
+    middle = 0.5 * (low[0] + high[0])
+    return world.with_cloth({"seam": LineMass(mass, path=[[middle, low[1]], [middle, high[1]]])})
 
 
 def _tilt(axis: int, world: World, angle: float) -> World:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InvalidInput, RecordingError
-from ..recordings import Recording, checks, read
+from ..recordings import Recording, checks, extents, read
 from ..recordings.reading import EPISODE
 from ..recordings.ticks import times
 from ..recordings.together import name_of, same_cloth
@@ -25,6 +25,7 @@ TICKS, EVEN, BEAT = 8, 0.05, 0.15  # frames to either side that tick evenly; usu
 DROPPED = 0.5  # share of the frames
 SLOWEST = 3.0  # s between frames: 240 Hz in milliseconds are 4
 COVERED = 0.5  # share of the frames that the motion must cover
+IMAGES = ("depth", "color", "mask")  # streams of a camera, which nothing here is compared with
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def check(recordings: Sequence[Recording]) -> list[Fault]:
 
 def somewhere_seen(recordings: Sequence[Recording]) -> None:
     """Raises InvalidInput where nothing says where the cloth is: forces alone do not."""
-    if not any(r.points is not None or r.markers is not None for r in recordings):
+    if not any(len(cloud) for r in recordings for cloud in extents.seen(r)[1:]):
         raise InvalidInput(
             "episodes",
             got="none with points or markers",
@@ -100,7 +101,9 @@ def _faults(recording: Recording) -> Iterator[tuple[str, str]]:
 
 
 def _stamps(recording: Recording) -> Iterator[tuple[str, str]]:
-    for name, (_, t) in times(recording).items():
+    for name, (kind, t) in times(recording).items():
+        if kind in IMAGES:
+            continue
         checks.increasing(t, f"the stamps of {name}")
         between = np.diff(t)
         if not len(between):

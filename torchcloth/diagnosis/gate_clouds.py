@@ -72,6 +72,16 @@ class Seen:
         """[T, G, 3] m, where the grippers are."""
         return np.stack([path.at(self.t)[0] for path in self.paths.values()], 1)
 
+    @cached_property
+    def holding(self) -> np.ndarray:
+        """The same while they hold; NaN once they have let go."""
+        out = self.held.copy()
+        for k, name in enumerate(self.paths):
+            motion = self.recording.joints.get(name) or self.recording.grippers[name]
+            knot = np.searchsorted(motion.t, self.t + 1e-9, side="right").clip(min=1) - 1
+            out[~np.asarray(motion.closed, dtype=bool)[knot], k] = np.nan
+        return out
+
 
 def _nearest(cloud: np.ndarray, at: np.ndarray) -> np.ndarray:
     """[G] m, mean distance of the nearest points from each gripper."""
@@ -103,7 +113,7 @@ def places(seen: Seen) -> Iterator[tuple[str, str]]:
             )
         return
     if seen.paths:
-        stray = np.mean([_beyond(c, at, REACH * seen.length) for c, at in zip(seen.clouds, seen.held, strict=True)])
+        stray = np.mean([_beyond(c, at, REACH * seen.length) for c, at in zip(seen.clouds, seen.holding, strict=True)])
         if stray > STRAY:
             yield (
                 f"{100 * stray:.0f} % of the points lie farther from a gripper than the cloth reaches",

@@ -7,7 +7,6 @@ asks the same questions in the same order, and finds the answers of before, bit 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from importlib import metadata
 from pathlib import Path
 
 from torch import Tensor
@@ -45,4 +44,4 @@ def _problem(model: Model, setting: Setting) -> list[object]:
     cloth = model.base.cloth
     data = [part for e in setting.episodes for part in e.identity()]
     parts = [(p.name, p.step, p.std) for p in model.parameters]
-    return [metadata.version("torchcloth"), setting.dt, parts, *digests(), *facts_of(cloth), setting.rest, *data]
+    return [setting.dt, parts, *digests(), *facts_of(cloth), setting.rest, *data]

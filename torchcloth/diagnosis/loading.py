@@ -14,6 +14,7 @@ from ..identification.episodes import Episode, episode
 from ..identification.replays import Frames, each
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
+from ..recordings.marks import alike, mark
 from ..recordings.together import together
 from .cells import directions
 from .model_file import ModelFile, load_model, of_fabric, read_model
@@ -56,7 +57,7 @@ def cloth_for(path: str | Path, recording: Recording) -> Cloth:
 
 def beside_the_cloth(model: Model) -> dict[str, float]:
     """Amplitudes of accepted causes that are in robot or observer and not in the cloth."""
-    found, world = {}, model.world()
+    found, world = {}, model.base  # each once: a patch that is wider already may have no room to be wider yet
     for h, amplitude in zip(model.accepted, model.amplitudes, strict=True):
         if h.apply(world, amplitude).cloth is world.cloth:
             found[h.name] = amplitude
@@ -75,6 +76,12 @@ def uncertain(file: ModelFile) -> dict[str, tuple[float, float]]:
             up, value, down = p.value(c + std), p.value(c), p.value(c - std)
             out[p.name] = (value, math.sqrt(up / down) if positive else abs(up - down) / 2)
     return out
+
+
+def was_fitted(path: str | Path, recording: Recording) -> bool:
+    """Whether a model was fitted to this episode; raises as ``read_model``."""
+    own = mark(recording)
+    return any(alike(kept, own) for kept in read_model(path).episodes)
 
 
 def begin_with(path: str | Path, recordings: Sequence[Recording]) -> tuple[Model, list[Recording]]:

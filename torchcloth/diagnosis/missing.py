@@ -77,12 +77,13 @@ class MissingForce:
         return (m.force * self.area[:, None]).sum(1)
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of diagnosis.json: the middle of the force when it is the most certain, motion by motion."""
+        """The content of diagnosis.json: when the force is the most certain and what pushes alike then, by motion."""
         return {"weight": self.weight, "gain": self.gain, "motions": [self._told(m) for m in self.parts]}
 
     def _told(self, m: Missing) -> dict[str, Any]:
-        w, _ = m.strongest
-        weight = m.force[w].square().sum(-1) * self.area
+        w, v = m.strongest
+        alike = (m.force[w] @ m.force[w, v] / m.force[w, v].norm().clamp(min=1e-30)).clamp(min=0.0)
+        weight = alike.square() * self.area  # what pushes the other way has its middle elsewhere
         middle = (weight[:, None] * self.uv).sum(0) / weight.sum()
         nearest = int((self.uv - middle).norm(dim=1).argmin())
         certain = float(m.certainty[w].max())

@@ -70,7 +70,7 @@ def save_model(
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     with atomically(Path(path)) as part, zipfile.ZipFile(part, "w") as file:
-        file.writestr(CONTENT, json.dumps(content, indent=1, allow_nan=False))
+        file.writestr(CONTENT, json.dumps(content, indent=1, allow_nan=False, default=float))
         file.writestr(ARRAYS, buffer.getvalue())
     return Path(path)
 

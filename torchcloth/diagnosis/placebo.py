@@ -78,6 +78,6 @@ def _exchanged(found: Fitted, place: int, rng: torch.Generator) -> Tensor:
 
 def _from(to: Cells, donor: Cells, place: int, rng: torch.Generator) -> Tensor:
     """[C] slopes of the donor's cells in another order of the windows; zero where it has no such cell."""
-    order = torch.randperm(int(max(to.window.max(), donor.window.max())) + 1, generator=rng)
+    order = torch.randperm(int(torch.cat([to.window, donor.window, to.window.new_zeros(1)]).max()) + 1, generator=rng)
     key = to._replace(window=order[to.window]).key
     return aligned(key, donor.key, donor.jacobian[:, place])

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from .._files import write_text
+from .._files import as_json, write_text
 from ..errors import InvalidInput
 from ..recordings import Recording
 from ..recordings.marks import each_once, mark
@@ -144,6 +144,6 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
         start, end = answer.found.start, answer.found.end
         save_model(folder / BASE, start.model, scene, start.covariance, episodes=said)
         save_model(folder / EXTENDED, end.model, scene, end.covariance, residual, said)
-    path = write_text(folder / RESULT, json.dumps(answer.content, indent=1, allow_nan=False) + "\n")
+    path = write_text(folder / RESULT, as_json(answer.content))
     write_report(answer, folder)
     return path

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ..errors import InvalidInput
 from ..identification.episodes import Episode, episode
 from ..identification.replicates import keys_of
 from ..identification.sheet import Sheet, sheet_for
@@ -29,11 +30,14 @@ def simply(question: Sequence[object], point: Tensor, work: Callable[[], Piece])
 def motions_of(recordings: Sequence[Recording]) -> list[str]:
     """What each episode says its motion is, or that of the one it repeats; one that does not say is one of its own."""
     originals = {r.split.get("replicate_of") for r in recordings} - {None}
-    out = []
+    given, out = {r.split.get("motion") for r in recordings}, []
     for k, (r, key) in enumerate(zip(recordings, keys_of(recordings), strict=True)):
         original = r.path is not None and r.path.name in originals
         says = original or r.split.get("motion") or r.split.get("replicate_of")
-        out.append(str(key) if says else f"episode {k}")
+        own = f"episode {k}"
+        while own in given:
+            own += "'"
+        out.append(str(key) if says else own)
     return out
 
 
@@ -64,7 +68,7 @@ def setting_of(model: Model, recordings: Sequence[Recording]) -> Setting:
 
 def _setting(model: Model, recordings: Sequence[Recording]) -> Setting:
     cloth = model.base.cloth
-    episodes = tuple(foreseen(episode(cloth, r)) for r in recordings)
+    episodes = tuple(_telling(foreseen(episode(cloth, r))) for r in recordings)
     mesh = cloth.mesh
     pattern = torch.as_tensor(mesh.vertices).double()
     if mesh.uv is not None:
@@ -81,6 +85,19 @@ def foreseen(e: Episode) -> Episode:
     A cloth that stands still in its last frames instead is millimetres off, for no cause.
     """
     return surely_seen(e.beyond(LATE))
+
+
+def _telling(e: Episode) -> Episode:
+    """Raises InvalidInput for one that says nothing: its first frame is where the simulation starts."""
+    seen = any(len(c) for c in e.clouds[1:]) or (e.markers is not None and bool(e.markers[1:].isfinite().any()))
+    if not seen and not any(bool(w[1:].isfinite().any()) for w in e.wrenches.values()):
+        raise InvalidInput(
+            "episode",
+            got=f"{e.name}, in which nothing is seen or felt after its first frame and before its last {LATE:g} s",
+            expected="frames with points, markers or forces",
+            remedy="leave it out, or record longer",
+        )
+    return e
 
 
 def surely_seen(e: Episode) -> Episode:

@@ -71,7 +71,8 @@ def _sized(row: dict[str, Any]) -> str:
 
 
 def _size(row: dict[str, Any]) -> str:
-    return f"{row['effect']} = {row['amplitude']:.4g} {row['unit']}"
+    unit = "" if row["unit"] == "-" else f" {row['unit']}"
+    return f"{row['effect']} = {row['amplitude']:.4g}{unit}"
 
 
 def _lacking(content: dict[str, Any]) -> list[str]:
@@ -87,10 +88,11 @@ def _lacking(content: dict[str, Any]) -> list[str]:
     missing = content["missing_force"] or {"motions": []}
     for m in (m for m in missing["motions"] if m["sure"]):
         where = ", ".join(f"{1e3 * c:.0f}" for c in m["at"])
-        size = sum(c * c for c in m["pressure"]) ** 0.5 / missing["weight"]
+        size = sum(c * c for c in m["pressure"]) ** 0.5
+        share = 100 * size / missing["weight"]
         out.append(
-            f"  A force of {100 * size:.0f} % of the weight is missing in {m['motion']}, about "
-            f"({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
+            f"  A pressure of {size:.2g} Pa ({share:.0f} % of what the cloth weighs there) is missing in "
+            f"{m['motion']}, about ({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
         )
     return out + _residual(content["residual"])
 
@@ -119,6 +121,12 @@ def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> lis
     out += [
         f"{p.name} is {far:.1f} standard deviations from its data sheet: it does another's job"
         for p, far in found.end.model.strained
+    ]
+    causes = list(zip(found.end.model.accepted, found.end.model.amplitudes, strict=True))
+    out += [
+        f"{h.name} = {amplitude:.3g} comes on top of the {h.typical:g} that {earlier.name} brought"
+        for k, (h, amplitude) in enumerate(causes)
+        for earlier in [e for e, _ in causes[:k] if e.brings == h.name][:1]
     ]
     if found.repeats is None:
         out.append("floor: sensor only; no episode repeats another, so what repetitions differ by is not known")

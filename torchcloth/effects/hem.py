@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Literal
 
 import numpy as np
@@ -14,9 +15,11 @@ from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from .base import AbstractEffect, Amplitude
 
+ON_EDGE = 1e-9  # barycentric weight, by which a line may be beside a triangle
+
 
 class LineMass(AbstractEffect):
-    """Extra mass along edges of the mesh, at rest lengths: hems, seams, piping. It has weight only with ``Gravity``.
+    """Extra mass along lines of the cloth, at rest lengths: hems, seams, piping. It has weight only with ``Gravity``.
 
     Contact between layers sees the areal density alone; the line's own bending stiffness is not modelled.
 
@@ -24,16 +27,22 @@ class LineMass(AbstractEffect):
         mass_per_length: m_h [kg/m], >= 0: a number, or [B, 1] for a batch. Two extra layers of 150 g/m^2, 15 mm wide,
             have 4.5e-3.
         edges: "boundary" (all free edges), "seams", or vertex pairs [N, 2] that are edges of the mesh.
+        path: [N, 2] m, places on the pattern that straight lines join, instead of edges. They cross the triangles as
+            they lie, and every vertex has the part of the line that is nearest to it by barycentric weights: the
+            same line on every mesh. What leaves the pattern has no mass.
 
     Raises:
-        InvalidInput: negative mass, edges that the mesh does not have (when bound).
+        InvalidInput: negative mass; when bound, edges that the mesh does not have, or a path beside its pattern.
     """
 
     amplitudes = {"mass_per_length": Amplitude("kg/m", 4.5e-3, 1e-3, ("areal_density", "gravity.tilt"))}
     per_triangle = ()
 
     def __init__(
-        self, mass_per_length: float | Tensor = 4.5e-3, edges: Literal["boundary", "seams"] | ArrayLike = "boundary"
+        self,
+        mass_per_length: float | Tensor = 4.5e-3,
+        edges: Literal["boundary", "seams"] | ArrayLike = "boundary",
+        path: ArrayLike | None = None,
     ) -> None:
         super().__init__()
         if isinstance(mass_per_length, Tensor) and mass_per_length.ndim and mass_per_length.shape[-1] != 1:
@@ -44,14 +53,18 @@ class LineMass(AbstractEffect):
             raise InvalidInput("edges", got=repr(edges), expected='"boundary", "seams" or vertex pairs [N, 2]')
         self.mass_per_length = PhysicalParameter(mass_per_length, "kg/m", "nonnegative", name="mass per length")
         self.edges = edges if isinstance(edges, str) else np.asarray(edges)
+        self.path = None if path is None else _checked(np.asarray(path, dtype=np.float64))
         self.register_buffer("length", torch.zeros(0, 1), persistent=False)
-        self.length: Tensor  # [V, 1] m, half of each line edge at the vertex
+        self.length: Tensor  # [V, 1] m, of the line, at each vertex
 
     def bind(self, mesh: Mesh) -> LineMass:
         """Half the rest length of every edge goes to each of its ends."""
-        found, length = _rest_lengths(mesh)
-        place = _places(found, self._pairs(mesh))
-        share = np.bincount(found[place].ravel(), np.repeat(length[place] / 2, 2), minlength=len(mesh.vertices))
+        if self.path is None:
+            found, length = _rest_lengths(mesh)
+            place = _places(found, self._pairs(mesh))
+            share = np.bincount(found[place].ravel(), np.repeat(length[place] / 2, 2), minlength=len(mesh.vertices))
+        else:
+            share = _crossed(mesh, self.path)
         raw = self.mass_per_length.raw
         self.length = torch.as_tensor(share, dtype=torch.get_default_dtype(), device=raw.device).unsqueeze(-1)
         return self
@@ -95,3 +108,42 @@ def _places(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:
             "edges", got=f"{len(unknown)} pairs that no triangle joins (first: {unknown[0]})", expected="mesh edges"
         )
     return np.array([row[pair] for pair in wanted])
+
+
+def _checked(path: np.ndarray) -> np.ndarray:
+    if path.ndim != 2 or path.shape[1] != 2 or len(path) < 2 or not np.isfinite(path).all():
+        raise InvalidInput("path", got=f"shape {path.shape}", expected="[N, 2] m on the pattern, N > 1, finite")
+    return path
+
+
+def _crossed(mesh: Mesh, path: np.ndarray) -> np.ndarray:
+    """[V] m of the path's lines at each vertex: of what lies in a triangle, its corners' mean weights."""
+    if mesh.pattern is None:
+        raise InvalidInput("path", got="a mesh without pattern coordinates", expected="one that has them (vt)")
+    share = sum(_within(mesh, mesh.pattern, start, end) for start, end in itertools.pairwise(path))
+    if not np.any(share):
+        raise InvalidInput("path", got="lines beside the pattern", expected="lines across it", remedy="metres?")
+    return np.asarray(share)
+
+
+def _within(mesh: Mesh, corners: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """[V] m of one line through triangles [F, 3, 2]; what lies along an edge is shared by its triangles."""
+    sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], -1)
+    offset = np.stack([start, end]) - corners[:, :1]  # [F, 2, 2]
+    second = np.linalg.solve(sides[:, None], offset[..., None])[..., 0]
+    weight = np.concatenate([1 - second.sum(-1, keepdims=True), second], -1)  # [F, 2, 3], linear along the line
+    a, slope = weight[:, 0] + ON_EDGE, weight[:, 1] - weight[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        zero = -a / slope
+    out = np.where(slope == 0, a < 0, False).any(-1)
+    enters = np.where(slope > 0, zero, 0.0).max(-1).clip(min=0.0)
+    leaves = np.where(slope < 0, zero, 1.0).min(-1).clip(max=1.0)
+    there = np.flatnonzero((leaves > enters) & ~out)
+    enters, leaves = enters[there, None], leaves[there, None]
+    ends = np.unique(np.concatenate([enters, leaves]))
+    middle, length = 0.5 * (ends[1:] + ends[:-1]), np.diff(ends)
+    covers = (enters < middle) & (middle < leaves)  # [F', pieces]
+    part = np.where(covers, length / covers.sum(0).clip(min=1), 0.0)
+    moment = (part[..., None] * (weight[there, 0][:, None] + middle[:, None] * slope[there][:, None])).sum(1)
+    total = np.linalg.norm(end - start) * moment
+    return np.bincount(mesh.faces[there].ravel(), total.ravel(), minlength=len(mesh.vertices))

@@ -10,6 +10,7 @@ import hashlib
 import pickle
 import shutil
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -31,23 +32,24 @@ class Journal:
     Args:
         folder: made when the first answer is written; it must be a journal's or not exist.
         problem: what the answers depend on beside the questions: data, model, options.
-        resume: take up what the folder holds; False: empty it; None: likewise, unless it could be taken up.
+        resume: take up what the folder holds; False: empty it; None: neither, there must be nothing.
 
     Raises:
-        InvalidInput: nothing to resume, a journal of another problem, a folder of other things, or, where nothing was
-            said, what could be resumed.
+        InvalidInput: nothing to resume, a journal of another problem or program, a folder of other things, or, where
+            nothing was said, work that was stopped.
     """
 
     def __init__(self, folder: str | Path, problem: Sequence[object], resume: bool | None) -> None:
-        self.folder, self.key = Path(folder), digest([FORMAT, torch.__version__, *problem])
+        self.folder, self.key = Path(folder), digest([FORMAT, torch.__version__, program(), *problem])
         self.recalled = 0
         stamp = self.folder / "problem"
         if not resume:
-            if resume is None and stamp.exists() and stamp.read_text() == self.key:
+            if resume is None and stamp.exists():
+                same = stamp.read_text() == self.key
                 raise InvalidInput(
                     "resume",
-                    got=f"nothing, and in {self.folder} the same work, stopped",
-                    expected="--resume, to go on from there, or another folder",
+                    got=f"nothing, and in {self.folder} {'the same' if same else 'other'} work, stopped",
+                    expected="--resume, to go on from there, or another folder" if same else "another folder",
                     remedy=f"to start over, delete {self.folder}",
                 )
             clear(self.folder)
@@ -62,9 +64,9 @@ class Journal:
         if stamp.read_text() != self.key:
             raise InvalidInput(
                 "resume",
-                got=f"{self.folder} of another fit",
-                expected="the same episodes, parameters and options",
-                remedy="start again without resuming",
+                got=f"{self.folder} of another fit, or of another version of torchcloth",
+                expected="the same episodes, parameters, options and program",
+                remedy=f"to start over, delete {self.folder}",
             )
 
     def ask(self, question: str, raw: Tensor, work: Callable[[], T]) -> T:
@@ -85,6 +87,14 @@ class Journal:
             (self.folder / "problem").write_text(self.key)
         with atomically(path) as part:
             torch.save(answer, part)
+
+
+@cache
+def program() -> str:
+    """A fingerprint of the library's sources: what other physics has answered is no answer."""
+    root = Path(__file__).resolve().parents[1]
+    files = sorted(path for path in root.rglob("*") if path.suffix in (".py", ".h", ".cpp"))
+    return digest([part for path in files for part in (str(path.relative_to(root)), path.read_bytes())])
 
 
 def clear(folder: Path) -> None:

@@ -87,7 +87,7 @@ def judged(truth: Truth, answer: Answer) -> dict[str, Any]:
         "no_answer": "refused" in answer or "failed" in answer,
     }
     if asked:
-        found = [_best(causes, w) for w in asked]
+        found = _matched(causes, asked)
         out |= {
             "found": [c is not None and bool(c.alike & w.names) for c, w in zip(found, asked, strict=True)],
             "covered": [c is not None for c in found],
@@ -114,13 +114,17 @@ def verdict(answer: Answer) -> str:
     return next((word for word in ("refused", "failed") if word in answer), str(answer.get("verdict")))
 
 
-def _best(causes: Sequence[Named], w: Wanted) -> Named | None:
-    """The cause that stands for an effect: by its name, else by its class, else by a rival."""
+def _matched(causes: Sequence[Named], asked: Sequence[Wanted]) -> list[Named | None]:
+    """The cause that stands for each effect, one for one: by its name, else by its class, else by a rival."""
+    left = list(causes)
+    out: list[Named | None] = [None for _ in asked]
     for part in (lambda c: {c.best}, lambda c: c.alike, lambda c: c.all):
-        for cause in causes:
-            if part(cause) & w.names:
-                return cause
-    return None
+        for k, w in enumerate(asked):
+            cause = None if out[k] else next((c for c in left if part(c) & w.names), None)
+            if cause is not None:
+                out[k] = cause
+                left = [c for c in left if c is not cause]
+    return out
 
 
 def _invisible(answer: Answer, w: Wanted) -> bool:
