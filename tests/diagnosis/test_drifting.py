@@ -36,6 +36,25 @@ def told(seed, *rates, names="abcd"):
     return drifts(toys.fitted(evidence(seed, *rates)), names)
 
 
+def test_an_axis_of_which_too_few_motions_know_is_left_out():
+    """Cells of one axis may all jump, or all of an episode."""
+    whole = evidence(3, *[0.1] * toys.EPISODES)
+
+    def less(c, keep):
+        return type(c)(*(column[keep] for column in c))
+
+    cells = [less(c, c.patch % 3 != 0) for c in whole.cells]
+    some = _of(whole, cells)
+    assert [row.axis for row in some] == ["y", "z"]
+    cells = [less(c, torch.zeros(len(c.time), dtype=torch.bool)) if k == 0 else c for k, c in enumerate(whole.cells)]
+    assert _of(whole, cells) == [], "three motions are too few"
+
+
+def _of(evidence, cells):
+    numerics = [n[: len(c.value)] for n, c in zip(evidence.numerics, cells, strict=True)]
+    return drifts(toys.fitted(replace(evidence, cells=cells, numerics=numerics)), range(toys.EPISODES))
+
+
 def test_a_right_model_drifts_by_chance_as_often_as_it_says():
     rows = [row for seed in range(60) for row in told(seed, *[0.0] * toys.EPISODES)]
     size = torch.tensor([row.rate / row.std for row in rows])

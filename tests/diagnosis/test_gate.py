@@ -17,6 +17,7 @@ from torchcloth.cli import main
 from torchcloth.diagnosis import check, diagnose
 from torchcloth.diagnosis.gate import somewhere_seen
 from torchcloth.errors import InvalidInput
+from torchcloth.recordings.images import ImageStream
 
 GENERATE = Path(__file__).parents[1] / "independent" / "generate.py"
 AHEAD, DEEP = np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.0, 0.6])
@@ -122,7 +123,26 @@ def with_bystander(recording):
     return replace(recording, grippers={**recording.grippers, "idle": idle})
 
 
+def letting_go(recording):
+    """The left gripper opens after a third and goes away; clouds as they were."""
+    own = recording.grippers["left"]
+    open_ = np.arange(len(own.t)) >= len(own.t) // 3
+    away = own.position + np.array([0.0, 0.0, 0.6]) * open_[:, None]
+    left = replace(own, position=away, closed=~open_)
+    return replace(recording, grippers={**recording.grippers, "left": left})
+
+
+def with_images(recording):
+    """Of a camera whose pictures stop for half a second: nothing is compared with them."""
+    t = np.array([0.0, 0.02, 0.04, 0.06, 0.6, 0.62, 0.64])
+    (name, own), *_ = recording.cameras.items()
+    camera = replace(own, color=ImageStream("color", np.arange(len(t)), t, (), (640, 480)))
+    return replace(recording, cameras={name: camera})
+
+
 GOOD |= {
+    "a gripper that lets go": letting_go,
+    "pictures with a gap": with_images,
     "one marker": lambda r: with_markers(r, 1),
     "three markers": lambda r: with_markers(r, 3),
     "a gripper that stands by": with_bystander,
@@ -222,3 +242,22 @@ def test_a_bar_in_view_is_no_mirror(tmp_path, seed):
     made = [sys.executable, GENERATE, "--motion", "shake", *SMALL, *barred, "--seed", str(seed), "--out", out]
     subprocess.run(made, check=True)
     assert check([rec.read(out)]) == []
+
+
+def test_an_episode_that_says_nothing_is_refused_by_name(tmp_path, capsys):
+    """Two frames, of which the first begins the simulation and the last is what a late clock would see."""
+    good = [sheets.episode(motion) for motion in ("slow", "fast")]
+    points = good[1].points
+    short = rec.PointClouds(points.t[:2], points.xyz[: points.counts[:2].sum()], points.counts[:2])
+    cut = {name: _until(g, points.t[1] + 0.01) for name, g in good[1].grippers.items()}
+    episodes = [good[0], replace(good[1], points=short, grippers=cut, split={"motion": "fast"})]
+    folders = [str(rec.write(r, tmp_path / r.split["motion"])) for r in episodes]
+    assert main(["diagnose", *folders, "--out", str(tmp_path / "out")]) == 2
+    assert "fast, in which nothing is seen or felt" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out" / "progress").exists()
+
+
+def _until(motion, end):
+    kept = motion.t <= end + 1e-9
+    t, place, turn, closed = (c[kept] for c in (motion.t, motion.position, motion.quat_wxyz, motion.closed))
+    return rec.GripperMotion(t, place, turn, closed)

@@ -60,6 +60,27 @@ def test_what_is_not_in_the_cloth_is_beside_it(made, tmp_path):
     assert len(dx.load_world(tmp_path / "late.tcm").views) == 1
 
 
+def test_a_grip_that_is_wider_is_in_the_cloth(made):
+    """By 30 mm, of which the pattern has room for once."""
+    _, _, blank = made
+    by = {h.name: h for h in dx.catalogue(dx.base_model(blank), [blank])}
+    wide = dx.base_model(blank).plus(by["grip.width"], 0.03).plus(by["obs.clock"], 0.01)
+    assert dx.beside_the_cloth(wide) == {"obs.clock": 0.01}
+
+
+def test_a_model_knows_its_episodes(made):
+    folder, fast, blank = made
+    assert dx.was_fitted(folder / "extended.tcm", blank)
+    assert not dx.was_fitted(folder / "extended.tcm", fast)
+
+
+def test_numbers_of_any_precision_are_kept(made, tmp_path):
+    _, _, blank = made
+    own = replace(blank.cloth, areal_density=np.float32(0.2))
+    path = dx.save_model(tmp_path / "m.tcm", dx.base_model(blank), replace(blank, cloth=own))
+    assert dx.load(path).areal_density.value.item() == pytest.approx(0.2)
+
+
 def test_another_scene_keeps_the_fabric_and_another_fabric_is_refused(made):
     folder, seen, _ = made
     elsewhere = replace(seen, grasps={"left": seen.grasps["left"]})

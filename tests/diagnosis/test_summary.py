@@ -45,3 +45,14 @@ def test_what_lacks_in_one_stretch_of_time_only_is_said_to():
 
     assert "Lacking: points of swing (6.5 times what is expected, 1.2 but for 1.4 to 1.6 s)." in told(1.2)
     assert "Lacking: points of swing (6.5 times what is expected)." in told(4.0)
+
+
+def test_numbers_without_a_unit_have_none():
+    cause = {"effect": "air.drag_n", "amplitude": 1.19, "unit": "-", "ci95": [1.05, 1.32], "class": [], "rivals": []}
+    assert "Cause: air.drag_n = 1.19 (95 %: 1.05 to 1.32)." in summary("identified", causes=[cause])
+
+
+def test_a_missing_force_is_a_pressure_at_a_place():
+    part = {"motion": "swing", "at": [0.1, 0.2], "from": 0.2, "to": 0.4, "pressure": [0.0, 3.0, 4.0], "sure": True}
+    (line,) = (t for t in summary("unexplained", missing_force={"weight": 2.0, "motions": [part]}) if "missing" in t)
+    assert "A pressure of 5 Pa (250 % of what the cloth weighs there) is missing in swing, about (100, 200) mm" in line

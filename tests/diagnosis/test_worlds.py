@@ -16,6 +16,7 @@ from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
 from torchcloth.diagnosis.setting import LATE, motions_of, setting_of
 from torchcloth.diagnosis.steps import one_way, step_sizes
+from torchcloth.diagnosis.wording import on_top
 from torchcloth.diagnosis.world import Hypothesis
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification.sheet import sheet_of
@@ -352,3 +353,29 @@ def test_a_late_clock_sees_only_frames_that_were_simulated():
     assert float(off(late[used]).max()) < 6e-4  # of cubics through frames 50 ms apart
     assert float(off(model.world().frames(e).x[used]).max()) > 4e-3
     assert float((late[-1] - model.world().frames(e).x[-1]).norm(dim=-1).max()) < 1e-9  # stands still there
+
+
+@pytest.mark.parametrize("columns", [7, 8])
+def test_a_seam_is_the_same_on_every_mesh(columns):
+    """Where no line of vertices lies in the middle, too."""
+    seam = next(h for h in fabric.HYPOTHESES if h.name == "mass.seam")
+    model = base_model(sheets.episode(resolution=(columns, 7)))
+    for world in (model.world(), refined(model, [])[0].world()):
+        mass = (seam.apply(world, 0.02).cloth.model().mass - world.cloth.model().mass)[:, 0].detach().numpy()
+        assert mass.sum() == pytest.approx(0.02 * sheets.SIDE, rel=1e-6)
+        assert mass @ world.cloth.mesh.uv[:, 0] / mass.sum() == pytest.approx(sheets.SIDE / 2, abs=1e-6)
+        assert np.abs(world.cloth.mesh.uv[mass > 1e-9, 0] - sheets.SIDE / 2).max() < 0.7 * sheets.SIDE / (columns - 1)
+
+
+def test_drag_beside_wind_says_what_it_counts_from(made):
+    model, _ = made
+    by = {h.name: h for h in EVERY}
+    both = model.plus(by["air.wind[x]"], 0.3).plus(by["air.drag_n"], 0.4)
+    assert both.world().cloth.effects["air"].normal.value.item() == pytest.approx(1.6)
+    assert on_top(both) == ["air.drag_n = 0.4 comes on top of the 1.2 that air.wind[x] brought"]
+    assert on_top(model.plus(by["air.drag_n"], 0.4).plus(by["air.wind[x]"], 0.3)) == []
+
+
+def test_an_episode_without_a_motion_has_a_name_that_no_other_has():
+    named = replace(RECORDING, split={"motion": "episode 1"})
+    assert len(set(motions_of([named, replace(RECORDING, split={})]))) == 2

@@ -8,7 +8,7 @@ import torch
 import twins
 
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import identify
+from torchcloth.identification import identify, journal
 from torchcloth.identification.episodes import episode
 from torchcloth.identification.journal import Journal, digest
 from torchcloth.identification.objective import Objective
@@ -47,10 +47,27 @@ def test_a_damaged_answer_is_computed_anew(tmp_path, damage):
 def test_another_problem_is_refused(tmp_path):
     Journal(tmp_path / "j", ["a", torch.zeros(3)], resume=False).ask("rows", POINT, answer(1.0))
     Journal(tmp_path / "j", ["a", torch.zeros(3)], resume=True)
-    with pytest.raises(InvalidInput, match="of another fit; expected the same episodes"):
+    with pytest.raises(InvalidInput, match=r"of another fit, or of another version .*; expected the same episodes"):
         Journal(tmp_path / "j", ["a", torch.ones(3)], resume=True)
     with pytest.raises(InvalidInput, match=r"resume; got no .*; expected what an interrupted run left"):
         Journal(tmp_path / "nowhere", ["a"], resume=True)
+
+
+def test_stopped_work_is_not_deleted_by_other_work(tmp_path):
+    """A command into the same folder: hours may lie there."""
+    kept = Journal(tmp_path / "j", ["a"], resume=None)
+    kept.ask("rows", POINT, answer(1.0))
+    for problem, said in ((["a"], "the same work"), (["b"], "other work")):
+        with pytest.raises(InvalidInput, match=f"{said}, stopped; .*delete"):
+            Journal(tmp_path / "j", problem, resume=None)
+    assert float(Journal(tmp_path / "j", ["a"], resume=True).ask("rows", POINT, answer(2.0))[0]) == 1.0
+
+
+def test_another_program_answers_anew(tmp_path, monkeypatch):
+    Journal(tmp_path / "j", ["a"], resume=None).ask("rows", POINT, answer(1.0))
+    monkeypatch.setattr(journal, "program", lambda: "another")
+    with pytest.raises(InvalidInput, match="another version of torchcloth"):
+        Journal(tmp_path / "j", ["a"], resume=True)
 
 
 def test_without_resuming_nothing_is_found(tmp_path):

@@ -57,6 +57,15 @@ def test_a_single_is_found_by_name_or_class_and_covered_by_rivals():
     assert by_rival["amplitudes"] == [None]
 
 
+def test_one_cause_is_not_both_of_two_effects():
+    both = hidden("double", ("air.drag_n", 1.2), ("air.linear", 2.0), kind="two")
+    vague = judged(both, answer(cause("air.drag_n", 1.2, alike=["air.linear", "damp.bend"])))
+    assert (vague["found"], vague["right"]) == ([True, False], False)
+    told = judged(both, answer(cause("air.linear", 2.0, alike=["air.drag_n"]), cause("air.drag_n", 1.2)))
+    assert (told["found"], told["right"]) == ([True, True], True)
+    assert [a["error"] for a in told["amplitudes"]] == pytest.approx([0.0, 0.0])
+
+
 def test_an_axis_is_no_other_name_and_counts_once():
     tilt = hidden("single", ("env.gravity_tilt", 0.01))
     found = judged(tilt, answer(cause("env.gravity_tilt[x]", 0.011, alike=["env.gravity_tilt[y]"])))

@@ -202,7 +202,7 @@ def _maps(evidence: Evidence, parts: Sequence[int], mapped: Own) -> list[np.ndar
     for cells in evidence.cells:
         own = mapped(cells)
         patch, window = (cells.patch[own] // 3).tolist(), cells.window[own].numpy()
-        field = np.full((len(parts), int(cells.window.max()) + 1), np.nan)
+        field = np.full((len(parts), 1 + max(cells.window.tolist(), default=0)), np.nan)
         field[[row[p] for p in patch], window] = 1e3 * cells.value[own].numpy()
         out.append(field)
     return out

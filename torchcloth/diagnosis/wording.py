@@ -10,6 +10,7 @@ from .lacking import TOLERATED, Left
 from .screening import MUCH, Row
 from .stepwise import Found
 from .trials import PLAUSIBLE
+from .world import Model
 
 NEARLY = 0.9  # of the largest amplitude that is believed: fits end a little beyond what slopes ask for
 
@@ -122,12 +123,7 @@ def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> lis
         f"{p.name} is {far:.1f} standard deviations from its data sheet: it does another's job"
         for p, far in found.end.model.strained
     ]
-    causes = list(zip(found.end.model.accepted, found.end.model.amplitudes, strict=True))
-    out += [
-        f"{h.name} = {amplitude:.3g} comes on top of the {h.typical:g} that {earlier.name} brought"
-        for k, (h, amplitude) in enumerate(causes)
-        for earlier in [e for e, _ in causes[:k] if e.brings == h.name][:1]
-    ]
+    out += on_top(found.end.model)
     if found.repeats is None:
         out.append("floor: sensor only; no episode repeats another, so what repetitions differ by is not known")
     if "bending" not in found.start.model.base.cloth.effects:
@@ -150,6 +146,16 @@ def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> lis
     if len(names) < 8:
         out.append(f"{len(names)} episodes show little of their own spread: the explained share's interval is doubled")
     return out
+
+
+def on_top(model: Model) -> list[str]:
+    """Amplitudes that count from what another cause brought along."""
+    causes = list(zip(model.accepted, model.amplitudes, strict=True))
+    return [
+        f"{h.name} = {amplitude:.3g} comes on top of the {h.typical:g} that {earlier.name} brought"
+        for k, (h, amplitude) in enumerate(causes)
+        for earlier in [e for e, _ in causes[:k] if e.brings == h.name][:1]
+    ]
 
 
 def _is_too_large(row: Row) -> bool:
