@@ -15,7 +15,7 @@ from . import functional
 from .boundaries import AbstractBoundary
 from .effects import AbstractEffect
 from .engine.choice import Choice, Setting, check_setting, choose, still_drives
-from .errors import InvalidInput
+from .errors import InvalidInput, TorchclothError
 from .initial import damped, first_state, held, likeness
 from .intervals import Plan, run
 from .materials import AbstractMaterial
@@ -34,6 +34,7 @@ from .validation import (
     check_grasps,
     check_motions,
     check_names,
+    check_parameters,
     check_rate,
     check_state,
     check_step,
@@ -108,8 +109,9 @@ class Cloth(nn.Module):
         check_grasps(dict(self._parts()), self.boundaries)
         self.contact, self._grid = contact, None if contact is None else contact.grid(mesh)
         self._store_geometry()
-        for parameter in self.parameters():  # tensors keep their precision until a cloth has one
-            parameter.data = parameter.data.to(self._area.dtype)
+        for own in (*self.parameters(), *self.buffers()):  # tensors keep their precision until a cloth has one
+            if own.is_floating_point():
+                own.data = own.data.to(self._area.dtype)
         for part in (*self.effects.values(), *self.boundaries.values()):
             _OWNERS[part] = ref(self)
 
@@ -282,6 +284,7 @@ class Cloth(nn.Module):
     ) -> Plan:
         """What ``forward`` does, checked."""
         frames = check_times(times)
+        check_parameters(self)
         motion = check_motions(motion, self.boundaries, frames, self._area)
         model, limit = self._stepping(dt)
         check_substeps(frames[-1] - frames[0], limit, dt)
@@ -293,6 +296,7 @@ class Cloth(nn.Module):
     ) -> Plan:
         """What ``settle`` does, checked."""
         frames = [start, start + duration]
+        check_parameters(self)
         motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
         model, step = self._stepping()
         check_substeps(duration, step)
@@ -341,4 +345,8 @@ class Cloth(nn.Module):
         """Data sheet: size, contact, step."""
         size = f"{len(self.mesh.vertices)} vertices, {len(self.mesh.faces)} triangles, {self.mesh.area.sum():.4g} m^2"
         grid = "none" if self._grid is None else self._grid.words
-        return f"{size}\ncontact: {grid}\nstable step: {self.stable_step():.3g} s\nengine: {self.engine_in_use}"
+        try:
+            step, engine = f"{self.stable_step():.3g} s", self.engine_in_use
+        except TorchclothError as error:  # of a cloth that cannot be simulated, which one prints to see why
+            step, engine = str(error), "none"
+        return f"{size}\ncontact: {grid}\nstable step: {step}\nengine: {engine}"

@@ -46,16 +46,19 @@ class PhysicalParameter(nn.Module):
         unit: SI unit, "-" when dimensionless.
         domain: "positive", "unit_half" (Poisson's ratio), "nonnegative" or "real".
         name: how messages call it.
+        axes: trailing axes of its own, behind those of a batch.
 
     Raises:
         InvalidInput: no number or tensor, outside the domain or not finite.
     """
 
-    def __init__(self, value: float | Tensor, unit: str, domain: Domain = "positive", *, name: str = "parameter"):
+    def __init__(
+        self, value: float | Tensor, unit: str, domain: Domain = "positive", *, name: str = "parameter", axes: int = 1
+    ) -> None:
         super().__init__()
         if domain not in _DOMAINS:
             raise InvalidInput("domain", got=repr(domain), expected=f"one of {sorted(_DOMAINS)}")
-        self.unit, self.label = unit, name
+        self.unit, self.label, self.axes = unit, name, axes
         self.domain: Domain = domain
         self.raw = nn.Parameter(self._to_raw(value))
 

@@ -16,7 +16,7 @@ from .forward_mode import real_tangents
 from .initial import damped, held
 from .intervals import Interval, Plan, check_finite, collect
 from .model import Model
-from .parameters import called
+from .parameters import PhysicalParameter, called
 from .types import ClothState, Rollout, Trajectory
 from .validation import check_numbers
 
@@ -90,9 +90,9 @@ class _Walk:
         changes = [k for k in range(self.count) if any(bool(tangent[k].any()) for tangent in given.values())]
         if not changes:
             return {}
-        values, batch = dict(self.cloth.named_parameters()), self.plan.state.x.ndim - 2
+        batch = self.plan.state.x.ndim - 2
         with forward_ad.dual_level(), real_tangents():
-            entries = _dual_copies(values, {name: tangent[changes] for name, tangent in given.items()}, batch)
+            entries = _dual_copies(self.cloth, {name: tangent[changes] for name, tangent in given.items()}, batch)
             found = called(_Built(self.cloth, self.build, work), entries, ())
             tangents = ((key, forward_ad.unpack_dual(dual).tangent) for key, dual in found.items())
             moved = {key: tangent for key, tangent in tangents if tangent is not None}
@@ -149,9 +149,9 @@ def _by_copies(
     settle: float,
 ) -> tuple[Rollout, Rollout]:
     """K dual copies side by side: what every engine can do."""
-    state, batch, values = plan.state, plan.state.x.ndim - 2, dict(cloth.named_parameters())
+    state, batch = plan.state, plan.state.x.ndim - 2
     with forward_ad.dual_level(), real_tangents():
-        entries = _dual_copies(values, along.parameters, batch)
+        entries = _dual_copies(cloth, along.parameters, batch)
         many = state.map(lambda field: field.expand(count, *field.shape).contiguous())
         if along.state is not None:
             many = _both(many, _tangent_of(state, along, count), forward_ad.make_dual)
@@ -175,18 +175,30 @@ class _Replay(nn.Module):
         return self.cloth(state, motion, frames, dt=dt)
 
 
-def _dual_copies(values: Mapping[str, Tensor], along: Mapping[str, Tensor], batch: int) -> dict[str, Tensor]:
-    """Parameters as K copies in front of ``batch`` other axes, each dual along its direction."""
-    return {
-        f"cloth.{name}": forward_ad.make_dual(*_copies(values[name], tangent, len(tangent), batch))
-        for name, tangent in along.items()
-    }
+def _dual_copies(cloth: nn.Module, along: Mapping[str, Tensor], batch: int) -> dict[str, Tensor]:
+    """Parameters as K copies in front of ``batch`` other axes, each dual along its direction, wherever they are."""
+    out = {}
+    for name, tangent in along.items():
+        value, part = cloth.get_parameter(name), cloth.get_submodule(name.rpartition(".")[0])
+        axes = part.axes if isinstance(part, PhysicalParameter) else 1
+        dual = forward_ad.make_dual(*_copies(value, tangent, len(tangent), batch, axes))
+        out |= dict.fromkeys((f"cloth.{same}" for same in _places(cloth, value)), dual)
+    return out
 
 
-def _copies(value: Tensor, tangent: Tensor, count: int, batch: int) -> tuple[Tensor, Tensor]:
-    """K copies of a parameter as a batch in front of ``batch`` others, and their tangents."""
+def _places(cloth: nn.Module, value: Tensor) -> list[str]:
+    """Names of a parameter that several parts share, once for each part."""
+    owners: dict[nn.Module, str] = {}
+    for name, other in cloth.named_parameters(remove_duplicate=False):
+        if other is value:
+            owners.setdefault(cloth.get_submodule(name.rpartition(".")[0]), name)
+    return list(owners.values())
+
+
+def _copies(value: Tensor, tangent: Tensor, count: int, batch: int, axes: int) -> tuple[Tensor, Tensor]:
+    """K copies of a parameter, with so many axes of its own, in front of ``batch`` others, and their tangents."""
     own = value.shape if value.ndim else torch.Size((1,))  # a number would be taken for a field
-    ones = (1,) * max(0, batch + 1 - len(own))
+    ones = (1,) * max(0, batch + axes - len(own))
     full = value.detach().reshape(1, *ones, *own).expand(count, *ones, *own).contiguous()
     return full, tangent.to(full).reshape(full.shape).contiguous()
 

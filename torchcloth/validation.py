@@ -20,6 +20,7 @@ from .parameters import PhysicalParameter
 from .transfer import Contact
 from .types import ClothState, Trajectory
 
+FRAMES = "at least two, increasing, finite seconds"
 MOST_SUBSTEPS = 10_000_000  # of one simulation: a minute of the stiffest cloth; poses of more fill the memory
 
 
@@ -83,20 +84,30 @@ def check_rate(rate: float) -> None:
 
 def check_times(times: Tensor | Sequence[float]) -> list[float]:
     """Frame times as a list of increasing seconds."""
-    flat = torch.as_tensor(times, dtype=torch.float64)
+    try:
+        flat = torch.as_tensor(times, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InvalidInput("times", got=f"{times!r:.40}", expected=FRAMES) from error
     frames = flat.tolist() if flat.ndim == 1 else []
     if len(frames) < 2 or not np.all(np.isfinite(frames)) or not np.all(np.diff(frames) > 0):
         got = f"shape {tuple(flat.shape)}, first {frames[:3]}"
-        raise InvalidInput("times", got=got, expected="at least two, increasing, finite seconds")
+        raise InvalidInput("times", got=got, expected=FRAMES)
     return frames
+
+
+def check_parameters(cloth: nn.Module) -> None:
+    """No NaN: comparisons with one are false, so a threshold of NaN would pass for an effect that is not there."""
+    for name, parameter in cloth.named_parameters():
+        if bool(parameter.isnan().any()):
+            raise InvalidInput(name, got="NaN", expected="a number", remedy="look at the optimiser's last step")
 
 
 def check_step(dt: float | None, limit: float) -> float:
     """The substep to use [s]: the limit, or the user's if it is no larger."""
     if dt is None:
         return limit
-    if not dt > 0:
-        raise InvalidInput("dt", got=f"{dt:g} s", expected="a step > 0")
+    if not isinstance(dt, int | float) or not dt > 0:
+        raise InvalidInput("dt", got=repr(dt), expected="a step > 0 in seconds, or None")
     if dt > limit * (1 + 1e-9):
         raise UnstableStep(
             "dt",

@@ -36,7 +36,7 @@ class Plate(NamedTuple):
     def largest(self) -> Tensor:
         """Bound [] N m on P's eigenvalues."""
         direct = torch.maximum(self.warp, self.weft) + self.cross.abs()
-        return torch.maximum(direct, self.twist.expand_as(direct)).amax()
+        return torch.maximum(direct, self.twist).amax()
 
 
 class Operator(nn.Module):

@@ -31,7 +31,9 @@ class BodyForce(AbstractEffect):
             raise InvalidInput("acceleration", got=type(acceleration).__name__, expected="a tensor [V or 1, 3] m/s^2")
         if acceleration.ndim < 2 or acceleration.shape[-1] != 3:
             raise InvalidInput("acceleration", got=f"shape {tuple(acceleration.shape)}", expected="[V or 1, 3] m/s^2")
-        self.acceleration = PhysicalParameter(acceleration, "m/s^2", "real", name="acceleration of a body force")
+        self.acceleration = PhysicalParameter(
+            acceleration, "m/s^2", "real", name="acceleration of a body force", axes=2
+        )
 
     def bind(self, mesh: Mesh) -> BodyForce:
         """Check that there is one for each vertex, or one for all."""

@@ -184,7 +184,8 @@ def _places(mesh: Mesh, held: Sequence[int]) -> np.ndarray:
     """[places, V] weights in [0, 1]."""
     x, edges = mesh.vertices, mesh.boundary_edges
     edge = _distances(x, x[edges[:, 0]], x[edges[:, 1]]) if len(edges) else np.full(len(x), np.inf)
-    size = edge.max() if len(edges) else float(np.ptp(x, axis=0).max())
+    # where every vertex lies on the rim there is no inside, and all of the cloth is near it
+    size = edge.max() if len(edges) and edge.max() > 0 else float(np.ptp(x, axis=0).max())
     near = np.exp(-3 * edge / size)
     inside = np.minimum(edge / size, 1.0) ** 2
     grip = np.zeros(len(x))

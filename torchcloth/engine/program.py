@@ -166,12 +166,13 @@ class Program:
             stage.emit(self._handle, self._api)
         key = self._key()
         with _KEEPING:  # nobody may run a program that another thread is still handing over
-            known = _KEPT.setdefault(key, self)
-            _KEPT.move_to_end(key)
-            if known is self:
-                self._hand_over()
+            known = _KEPT.get(key)
+            if known is None:
+                self._hand_over()  # what is interrupted is not kept: it would pass for the whole
+                _KEPT[key] = known = self
                 while len(_KEPT) > MOST_KEPT:
                     _KEPT.popitem(last=False)
+            _KEPT.move_to_end(key)
         self._written.clear()
         return known
 
@@ -212,11 +213,11 @@ class Program:
 
     def _hand_over(self) -> None:
         self._handle = ctypes.c_void_p(getattr(library(), f"tc_new_{self._letter}")())
+        _check(not self._handle)
         for name, arguments in self._written:
             done = self._call(name, *(_for_c(a) for a in arguments))
-            if name not in ("field", "table"):  # they give a number
-                _check(done or 0)
-        self._call("ready")
+            _check(done < 0 if name in ("field", "table") else done)  # these give a number
+        _check(self._call("ready"))
         self.number = next(_NUMBERS)
         _KNOWN[self.number] = self
 

@@ -36,8 +36,9 @@ def _compiled(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor] | None:
     points, corners = points.contiguous(), corners.contiguous()
     face, weights = torch.empty(len(points), dtype=torch.int64), torch.empty_like(points)
     into = face.data_ptr(), weights.data_ptr()
-    getattr(lib, f"tc_nearest_{letter}")(points.data_ptr(), len(points), corners.data_ptr(), len(corners), *into)
-    return None if bool((face < 0).any()) else (face, weights)
+    find = getattr(lib, f"tc_nearest_{letter}")
+    failed = find(points.data_ptr(), len(points), corners.data_ptr(), len(corners), *into)
+    return None if failed or bool((face < 0).any()) else (face, weights)
 
 
 def _closest(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..errors import InvalidInput
 from .shapes import check_places
 
 
@@ -22,6 +23,9 @@ def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
     """
     check_places(points, "points", least=1)
     check_places(vertices, "vertices", least=1)
+    if points.dtype != vertices.dtype:
+        raise InvalidInput("points", got=points.dtype, expected=f"the vertices' precision, {vertices.dtype}")
     with torch.no_grad():
-        nearest = torch.cdist(points, vertices).argmin(-1)
+        # by products of the coordinates, distances would lose their digits far from the origin
+        nearest = torch.cdist(points, vertices, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
     return (points - vertices[nearest]).norm(dim=-1).mean()

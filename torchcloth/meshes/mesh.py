@@ -54,7 +54,7 @@ class Mesh:
                 than two at an edge.
         """
         x = np.array(vertices, dtype=np.float64)
-        f = np.array(faces, dtype=np.int64)
+        f = _indices(np.asarray(faces))
         _check_triangles(x, f)
         pattern = None if uv is None else _per_corner(np.array(uv, dtype=np.float64), f, len(x))
         rest = _flatten(x[f]) if pattern is None else _turned_over(f, pattern)
@@ -217,6 +217,13 @@ def per_vertex(faces: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
     values = np.zeros((faces.max() + 1, corners.shape[-1]))
     values[faces] = corners
     return values if np.array_equal(values[faces], corners) else None
+
+
+def _indices(faces: np.ndarray) -> np.ndarray:
+    """As integers, and none that would become one by being cut off."""
+    if faces.dtype.kind not in "iu" and (faces.dtype.kind != "f" or not np.array_equal(faces, np.trunc(faces))):
+        raise InvalidInput("faces", got=f"numbers of {faces.dtype}", expected="vertex indices [F, 3]")
+    return faces.astype(np.int64)
 
 
 def _check_triangles(x: np.ndarray, f: np.ndarray) -> None:

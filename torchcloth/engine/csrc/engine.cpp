@@ -26,6 +26,14 @@ int guarded(F work) {
     }
 }
 
+// The number that the work gives; -1 when it fails.
+template <class F>
+int numbered(F work) {
+    int number = -1;
+    guarded([&] { number = work(); });
+    return number;
+}
+
 template <class R>
 struct Engine {
     tc::Program<R> program;
@@ -57,32 +65,44 @@ struct Engine {
 #define TC_API extern "C" __attribute__((visibility("default")))
 // Every function exists for float (f) and double (d).
 #define TC_BOTH(R, s)                                                                                                  \
-    TC_API void* tc_new_##s() { return new Engine<R>(); }                                                              \
-    TC_API void tc_free_##s(void* e) { delete static_cast<Engine<R>*>(e); }                                            \
-    TC_API int tc_field_##s(void* e, int kind, int rows, int comps, int near, int vertices, const R* data) {    \
-        auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
-        const int f = p.field(tc::Kind(kind), rows, comps, near, vertices);                                            \
-        if (data) {                                                                                                    \
-            p.constants[f].reset(p.fields[f].size());                                                                  \
-            for (int r = 0; r < rows; r++)                                                                             \
-                for (int c = 0; c < comps; c++)                                                                        \
-                    p.constants[f].data[p.fields[f].place(r) + c] = data[r * comps + c];                              \
-        }                                                                                                              \
-        return f;                                                                                                      \
+    TC_API void* tc_new_##s() {                                                                                        \
+        void* made = nullptr;                                                                                          \
+        guarded([&] { made = new Engine<R>(); });                                                                      \
+        return made;                                                                                                   \
     }                                                                                                                  \
-    TC_API void tc_pair_##s(void* e, int state, int next) { static_cast<Engine<R>*>(e)->program.next[state] = next; }  \
+    TC_API void tc_free_##s(void* e) { delete static_cast<Engine<R>*>(e); }                                            \
+    TC_API int tc_field_##s(void* e, int kind, int rows, int comps, int near, int vertices, const R* data) {           \
+        auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
+        return numbered([&] {                                                                                          \
+            const int f = p.field(tc::Kind(kind), rows, comps, near, vertices);                                        \
+            if (data) {                                                                                                \
+                p.constants[f].reset(p.fields[f].size());                                                              \
+                for (int r = 0; r < rows; r++)                                                                         \
+                    for (int c = 0; c < comps; c++)                                                                    \
+                        p.constants[f].data[p.fields[f].place(r) + c] = data[r * comps + c];                           \
+            }                                                                                                          \
+            return f;                                                                                                  \
+        });                                                                                                            \
+    }                                                                                                                  \
+    TC_API int tc_pair_##s(void* e, int state, int next) {                                                             \
+        return guarded([&] { static_cast<Engine<R>*>(e)->program.next.at(state) = next; });                            \
+    }                                                                                                                  \
     TC_API int tc_table_##s(void* e, const int* data, int count) {                                                     \
         auto& tables = static_cast<Engine<R>*>(e)->program.tables;                                                     \
-        tables.emplace_back(data, data + count);                                                                       \
-        tables.back().resize(tc::round_up(count, tc::LANES<float>), count ? data[count - 1] : 0);                      \
-        return int(tables.size()) - 1;                                                                                 \
+        return numbered([&] {                                                                                          \
+            tables.emplace_back(data, data + count);                                                                   \
+            tables.back().resize(tc::round_up(count, tc::LANES<float>), count ? data[count - 1] : 0);                  \
+            return int(tables.size()) - 1;                                                                             \
+        });                                                                                                            \
     }                                                                                                                  \
-    TC_API void tc_loop_##s(void* e, int items, int list, int counted, int flat, int again) {                          \
+    TC_API int tc_loop_##s(void* e, int items, int list, int counted, int flat, int again) {                           \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
         auto& p = engine.program;                                                                                      \
-        p.stages.push_back(                                                                                            \
-            std::make_unique<tc::Loop<R>>(p, engine.kernels.data(), items, list, counted, flat != 0));                 \
-        p.stages.back()->again = again != 0;                                                                           \
+        return guarded([&] {                                                                                           \
+            p.stages.push_back(                                                                                        \
+                std::make_unique<tc::Loop<R>>(p, engine.kernels.data(), items, list, counted, flat != 0));             \
+            p.stages.back()->again = again != 0;                                                                       \
+        });                                                                                                            \
     }                                                                                                                  \
     TC_API int tc_transfer_##s(void* e, int code, int field, int table, int offset, int share, int by, int feeds) {    \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
@@ -101,15 +121,15 @@ struct Engine {
             contact->x = fields[0], contact->base = fields[1], contact->grid.assign(fields + 2, fields + count);       \
             contact->spacing = R(lengths[0]), contact->skin = R(lengths[1]), contact->chunk = limits[0];               \
             contact->place.assign(places, places + 3 * each);                                                          \
-            if (limits[2] != tc::Search<R>::MOST) throw std::logic_error("patches of another size: stages.py");       \
+            if (limits[2] != tc::Search<R>::MOST) throw std::logic_error("patches of another size: stages.py");        \
             contact->search.fill(corners, triangles, R(lengths[2]), limits[1], order, starts, meet, apart);            \
             program.words = (triangles + 31) / 32, program.rows = tc::LISTS, program.counts = tc::COUNTS;              \
             program.stages.push_back(std::move(contact));                                                              \
         });                                                                                                            \
     }                                                                                                                  \
-    TC_API void tc_per_mass_##s(void* e, int mass, int given, int out, double least) {                                 \
-        static_cast<Engine<R>*>(e)->program.stages.push_back(                                                          \
-            std::make_unique<tc::PerMass<R>>(mass, given, out, R(least)));                                             \
+    TC_API int tc_per_mass_##s(void* e, int mass, int given, int out, double least) {                                  \
+        auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
+        return guarded([&] { p.stages.push_back(std::make_unique<tc::PerMass<R>>(mass, given, out, R(least))); });     \
     }                                                                                                                  \
     TC_API int tc_move_##s(void* e, int code, int field, int table, int reg) {                                         \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
@@ -141,17 +161,21 @@ struct Engine {
             engine.program.registers = std::max(engine.program.registers, out + tc::CELL);                             \
         });                                                                                                            \
     }                                                                                                                  \
-    TC_API void tc_sieve_##s(void* e, int list, int x, int reach, int dt, int corners, int starts, int triangles,      \
+    TC_API int tc_sieve_##s(void* e, int list, int x, int reach, int dt, int corners, int starts, int triangles,       \
                              double steep) {                                                                           \
         auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
-        p.lists = std::max(p.lists, list + 1);                                                                         \
-        p.stages.push_back(                                                                                            \
-            std::make_unique<tc::Sieve<R>>(p, list, x, reach, dt, corners, starts, triangles, steep));                 \
+        return guarded([&] {                                                                                           \
+            p.lists = std::max(p.lists, list + 1);                                                                     \
+            p.stages.push_back(                                                                                        \
+                std::make_unique<tc::Sieve<R>>(p, list, x, reach, dt, corners, starts, triangles, steep));             \
+        });                                                                                                            \
     }                                                                                                                  \
-    TC_API void tc_stencil_##s(void* e, int table, int weight, int x, int y, int shape) {                              \
-        static_cast<Engine<R>*>(e)->stencil(table, weight, x, y, tc::Shape(shape));                                    \
+    TC_API int tc_stencil_##s(void* e, int table, int weight, int x, int y, int shape) {                               \
+        return guarded([&] { static_cast<Engine<R>*>(e)->stencil(table, weight, x, y, tc::Shape(shape)); });           \
     }                                                                                                                  \
-    TC_API void tc_ready_##s(void* e) { static_cast<Engine<R>*>(e)->program.lay_out(); }                               \
+    TC_API int tc_ready_##s(void* e) {                                                                                 \
+        return guarded([&] { static_cast<Engine<R>*>(e)->program.lay_out(); });                                        \
+    }                                                                                                                  \
     TC_API int64_t tc_size_##s(void* e, int full) {                                                                    \
         auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
         return int64_t(full ? p.record_size : p.state_size);                                                           \
@@ -165,9 +189,9 @@ struct Engine {
             mode == 0 ? run.forward() : mode == 1 ? run.reverse() : run.tangent();                                     \
         });                                                                                                            \
     }                                                                                                                  \
-    TC_API void tc_nearest_##s(const R* points, int64_t many, const R* corners, int64_t count, int64_t* face,          \
+    TC_API int tc_nearest_##s(const R* points, int64_t many, const R* corners, int64_t count, int64_t* face,           \
                                R* weights) {                                                                           \
-        tc::nearest(points, many, corners, count, face, weights);                                                      \
+        return guarded([&] { tc::nearest(points, many, corners, count, face, weights); });                             \
     }
 
 TC_BOTH(float, f)

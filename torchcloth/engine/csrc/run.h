@@ -141,7 +141,11 @@ class Run {
             }
         };
         std::vector<std::thread> threads;
-        for (int64_t i = 1; i < workers; i++) threads.emplace_back(loop);
+        try {
+            threads.reserve(workers - 1);
+            for (int64_t i = 1; i < workers; i++) threads.emplace_back(loop);
+        } catch (const std::exception&) {  // no more are to be had: those that are do all of it
+        }
         loop();
         for (auto& thread : threads) thread.join();
         if (failure) std::rethrow_exception(failure);

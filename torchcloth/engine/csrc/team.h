@@ -158,13 +158,18 @@ class Team {
     // other processes keep from running. What a job throws would end the process.
     template <class F>
     void run(int parts, const F& job) {
-        const int helped = std::min(parts, 1 + seats.own);
+        int helped = std::min(parts, 1 + seats.own);
         if (habit.alone || helped == 1 || (delayed && Clock::now() < delayed_until)) {
             for (int part = 0; part < parts; part++) job(part);
             return;
         }
         delayed = false;
-        while (int(others.size()) < helped - 1) others.push_back(Pool::own().hire());
+        try {
+            others.reserve(helped - 1);
+            while (int(others.size()) < helped - 1) others.push_back(Pool::own().hire());
+        } catch (const std::exception&) {  // no more threads are to be had
+            helped = 1 + int(others.size());
+        }
         auto call = [](const void* to, int part) { (*static_cast<const F*>(to))(part); };
         for (int part = 1; part < helped; part++) others[part - 1]->give(&job, call, part);
         [&]() noexcept {  // the others may be at it still

@@ -1,0 +1,67 @@
+"""A program reaches the library whole or not at all, and memory that runs out ends a call, not Python."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+import torchcloth as tc
+from torchcloth.engine import program
+
+
+def falling(density):
+    mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(3, 4))
+    cloth = tc.Cloth(
+        mesh, tc.materials.AEP(1e5, 0.3), density, {"g": tc.effects.Gravity()}, contact=None, engine="fused"
+    )
+    with torch.no_grad():
+        return cloth(cloth.rest_state(), times=[0.0, 0.01]).x[-1, :, 2]
+
+
+@pytest.mark.parametrize("at", [0, 1, 7])
+def test_an_interrupted_program_is_made_anew(monkeypatch, at):
+    """Half of one, kept for later, would be a cloth without gravity, or a crash."""
+    monkeypatch.setattr(program, "_KEPT", type(program._KEPT)())
+    call, made = program.Program._call, []
+
+    def interrupted(self, name, *arguments):
+        if name != "free":  # of a program of an earlier test
+            made.append(name)
+            if len(made) == at + 1:
+                raise KeyboardInterrupt
+        return call(self, name, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(program.Program, "_call", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            falling(0.2)
+    torch.testing.assert_close(falling(0.2), torch.full((12,), -0.5 * 9.81 * 1e-4), rtol=0.1, atol=0)
+
+
+SHORT = """
+import resource, sys, torch, torchcloth as tc
+torch.set_num_threads(16)
+def cloth(n):
+    mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(n, n))
+    effects = {"g": tc.effects.Gravity(), "b": tc.effects.Bending(1e-5)}
+    return tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), 0.2, effects, contact=None, engine="fused")
+small, large = cloth(4), cloth(30)
+with torch.no_grad():
+    small(small.rest_state(), times=[0.0, 0.001])
+    used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + int(sys.argv[1]) * 2**20, resource.RLIM_INFINITY))
+    try:
+        large(large.rest_state(), times=[0.0, 0.001])
+        many = small.state(small.rest_state().x.expand(16, -1, -1).contiguous())
+        small(many, times=[0.0, 0.01])
+    except (MemoryError, RuntimeError):
+        pass
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of memory as Linux has them")
+@pytest.mark.parametrize("megabytes", [3, 4, 12, 40])
+def test_too_little_memory_is_an_error(megabytes):
+    done = subprocess.run([sys.executable, "-c", SHORT, str(megabytes)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-2000:]
