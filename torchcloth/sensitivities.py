@@ -179,7 +179,9 @@ def _dual_copies(cloth: nn.Module, along: Mapping[str, Tensor], batch: int) -> d
     """Parameters as K copies in front of ``batch`` other axes, each dual along its direction, wherever they are."""
     out = {}
     for name, tangent in along.items():
-        value, part = cloth.get_parameter(name), cloth.get_submodule(name.rpartition(".")[0])
+        path, _, own = name.rpartition(".")
+        part = cloth.get_submodule(path)
+        value = getattr(part, own)  # a plain tensor inside of `called`
         axes = part.axes if isinstance(part, PhysicalParameter) else 1
         dual = forward_ad.make_dual(*_copies(value, tangent, len(tangent), batch, axes))
         out |= dict.fromkeys((f"cloth.{same}" for same in _places(cloth, value)), dual)
