@@ -25,7 +25,7 @@ def candidate(name, typical, amplitude, **options):
 def ended(best, *rivals):
     """A search with one cause and what predicts as well."""
     best, *rivals = (candidate(*one) for one in (best, *rivals))
-    step = Step(best, None, [best, *rivals], rivals, [], None)  # type: ignore[arg-type]
+    step = Step(best, None, [best, *rivals], rivals, [], None, None)  # type: ignore[arg-type]
     model = Model(None, (), toys.torch.zeros(0), (best.hypothesis,), (best.amplitude,))  # type: ignore[arg-type]
     return Found(None, SimpleNamespace(model=model), [step], [], None, 0.0, 0.0, None, None)  # type: ignore[arg-type]
 
@@ -50,7 +50,7 @@ def test_a_rival_that_joins_the_model_beside_a_cause_is_none_any_more():
     found = ended(SCALE_LARGE, BIAS, EXTRINSIC)
     other = candidate(*BIAS)
     model = Model(None, (), toys.torch.zeros(0), (*found.end.model.accepted, other.hypothesis), (0.01, BIAS[2]))  # type: ignore[arg-type]
-    second = Step(other, None, [other], [], [], None)  # type: ignore[arg-type]
+    second = Step(other, None, [other], [], [], None, None)  # type: ignore[arg-type]
     both = replace(found, end=SimpleNamespace(model=model), steps=[*found.steps, second])  # type: ignore[arg-type]
     assert [h.name for h, _ in found.alike(found.steps[0])] == ["obs.depth_scale", "obs.depth_bias", "obs.extrinsic[x]"]
     assert [h.name for h, _ in both.alike(both.steps[0])] == ["obs.depth_scale", "obs.extrinsic[x]"]
@@ -117,7 +117,7 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
     camera = toys.hypothesis("obs.extrinsic[y]", 4e-3)
     base = Model(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
     current = SimpleNamespace(model=base.plus(wind.hypothesis, left), evidence=None)
-    step = Step(wind, None, [wind, drag], [drag], [], None)  # type: ignore[arg-type]
+    step = Step(wind, None, [wind, drag], [drag], [], None, None)  # type: ignore[arg-type]
     monkeypatch.setattr(doubts, "without_cause", lambda found, name: found.model.without(name))
     monkeypatch.setattr(doubts, "fit", lambda model, *_, **__: SimpleNamespace(model=model, noise=None, evidence=None))
     monkeypatch.setattr(doubts, "renoised", lambda found, *_: found)
@@ -136,7 +136,7 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
 def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
     drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, brings="air.drag_n")
     model = Model(None, (), toys.torch.zeros(0), (wind.hypothesis, drag.hypothesis), (0.01, 1.4))  # type: ignore[arg-type]
-    steps = [Step(c, None, [wind, drag], [], [], None) for c in (wind, drag)]  # type: ignore[arg-type]
+    steps = [Step(c, None, [wind, drag], [], [], None, None) for c in (wind, drag)]  # type: ignore[arg-type]
     monkeypatch.delattr(doubts, "fit")
     current = SimpleNamespace(model=model)
     assert doubts.plainer(current, steps, None, [], print) == (current, steps)  # type: ignore[arg-type]

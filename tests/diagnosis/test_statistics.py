@@ -8,7 +8,7 @@ import torch
 
 from torchcloth.diagnosis.cells import NAMES as KINDS
 from torchcloth.diagnosis.cells import Cells
-from torchcloth.diagnosis.classes import alike, correlations
+from torchcloth.diagnosis.classes import TOLD, alike, correlations, fitted_alike
 from torchcloth.diagnosis.comparison import compare, predict, spread
 from torchcloth.diagnosis.evidence import as_rough
 from torchcloth.diagnosis.fitting import renoised, step_of, weighed_alike
@@ -308,3 +308,22 @@ def test_what_a_leap_makes_large_is_not_ruled_out_by_slopes(reached, worth, said
     """Large effects bend the fit until slopes there ask for less than there is."""
     asks = Row(toys.hypothesis("a"), 0.2, 0.01, 0.0, 400.0, 1e-2, 0.0, reached, worth, "absent")
     assert _decided(asks) == said
+
+
+def test_two_that_were_fitted_are_alike_where_what_lies_between_them_is_within_three_standard_deviations():
+    found = asked([0.0] * 5)
+    unit = float(found.white.jacobian[:, 3].norm())
+
+    def moved(chi_squared):
+        """Another model: what it says is so far from what the first one says."""
+        far = chi_squared**0.5 / unit
+        cells = [c._replace(value=c.value + far * c.jacobian[:, 3]) for c in found.evidence.cells]
+        fewer = [Cells(*(column[1:] for column in c)) for c in cells]  # cells that only one of them has do not count
+        numerics = [n[1:] for n in found.evidence.numerics]
+        return replace(found, evidence=replace(found.evidence, cells=fewer, numerics=numerics))
+
+    for louder in (1.0, 3.0):  # by the noise that is given, not by that of the fits
+        noise = Noise(found.noise.level * louder)
+        floor = whitened(found.evidence, noise).jacobian[:, 3].norm() / unit
+        assert fitted_alike(found, moved(0.8 * TOLD / float(floor) ** 2), noise)
+        assert not fitted_alike(moved(1.3 * TOLD / float(floor) ** 2), found, noise)

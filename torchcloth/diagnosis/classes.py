@@ -1,6 +1,7 @@
 """Hypotheses that these data cannot tell from each other.
 
-D_ij = a_i^2 V_ii (1 - rho_ij^2) is the chi^2 by which i at amplitude a_i can be told from j at its best amplitude.
+D_ij = a_i^2 V_ii (1 - rho_ij^2) is the chi^2 by which i at amplitude a_i can be told from j at its best amplitude, by
+slopes; of two that were fitted it is the square of what lies between the two models.
 """
 
 from __future__ import annotations
@@ -9,7 +10,10 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from .fitting import Fitted
+from .bursts import unweighted
+from .evidence import shared
+from .fitting import Fitted, renoised
+from .noise import Noise
 from .screening import Row, projection
 
 TOLD = 9.0  # chi^2, three standard deviations
@@ -40,3 +44,10 @@ def alike(found: Fitted, row: Row, amplitude: float, others: Sequence[Row]) -> l
         if other.hypothesis.effect != row.hypothesis.effect and (abs(r) > ALIKE or told < TOLD):
             out.append(other)
     return out
+
+
+def fitted_alike(one: Fitted, other: Fitted, noise: Noise) -> bool:
+    """Two models that cannot be told from each other where either was fitted, whatever slopes said elsewhere."""
+    like = shared(one.evidence, [other.evidence])
+    mine, others = (unweighted(renoised(found, noise, like).white).value for found in (one, other))
+    return float((mine - others).square().sum()) < TOLD

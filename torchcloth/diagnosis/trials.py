@@ -64,6 +64,7 @@ class Step:
     rivals: list[Candidate]
     screened: list[Row]
     before: Fitted  # the model without it, with slopes along everything that was asked about
+    noise: Noise  # by which they were compared
 
     def instead(self, name: str) -> Step | None:
         """With another of the causes that were tried; None: it was not."""
@@ -143,7 +144,7 @@ def one_step(
     possible = [*useful, *(c for c in others if worth_naming(c, c.gain) and _agreed(c, setting.names))]
     rivals = {c.hypothesis.name: c for c in reversed(possible) if c is not best and _rival(c, alike(c), best)}
     rivals |= {c.hypothesis.name: c for c in others if _open(c, alike(c), best)}
-    return Step(best, chance, tried, [*reversed(rivals.values())], screened, current)
+    return Step(best, chance, tried, [*reversed(rivals.values())], screened, current, noise)
 
 
 def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> dict[int, tuple[Row, Fitted]]:
