@@ -164,5 +164,5 @@ def _run(command: list[str]) -> None:
         first = next((line.strip() for line in lines if "error" in line), lines[-1] if lines else "no message")
         raise Unbuilt(
             f"{command[0]} failed (exit code {done.returncode}): {first}",
-            "name a compiler for C++20 in CXX (g++ 11 or clang++ 15 and later)",
+            "name a compiler for C++20 in CXX (g++ 12 or clang++ 15, or later)",
         )

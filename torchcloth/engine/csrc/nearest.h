@@ -43,7 +43,7 @@ struct Nearest {
     int64_t find(const R* at, Place<R>& found) {
         constexpr int L = LANES<R>;
         const Vec<R> point{at[0], at[1], at[2]};
-        Wide<R> least(double(std::numeric_limits<R>::max()));
+        Wide<R> least{double(std::numeric_limits<R>::max())};
         for (size_t k = 0; k < x.size(); k++) {
             const Wide<R> dx = x[k] - Wide<R>(point.x), dy = y[k] - Wide<R>(point.y), dz = z[k] - Wide<R>(point.z);
             distance[k] = sqrt(dx * dx + dy * dy + dz * dz);

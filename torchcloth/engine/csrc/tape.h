@@ -278,7 +278,13 @@ struct Spread {
     }
     Wide<R> operator()(const Wide<R>& pack) const {
         if constexpr (BESIDE<R, N> == 1) return Wide<R>(typename Wide<R>::Lanes{} + pack.v[index[0]]);
-        else return Wide<R>(__builtin_shuffle(pack.v, index));
+        typename Wide<R>::Lanes out;
+#ifdef __clang__  // makes one permutation of these
+        for (int i = 0; i < LANES<R>; i++) out[i] = pack.v[index[i]];
+#else
+        out = __builtin_shuffle(pack.v, index);
+#endif
+        return Wide<R>(out);
     }
 };
 
