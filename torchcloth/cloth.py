@@ -33,8 +33,8 @@ from .validation import (
     check_fields,
     check_grasps,
     check_motions,
-    check_names,
     check_parameters,
+    check_parts,
     check_rate,
     check_state,
     check_step,
@@ -89,6 +89,8 @@ class Cloth(nn.Module):
         engine: Setting = "auto",
     ) -> None:
         super().__init__()
+        effects, boundaries = {} if effects is None else effects, {} if boundaries is None else boundaries
+        check_parts(mesh, material, effects, boundaries, contact)
         self.engine = engine
         self.transfer: Literal["mesh", "apic"] = transfer
         if transfer != "mesh":
@@ -99,10 +101,8 @@ class Cloth(nn.Module):
                 check_field(path, part.raw, len(mesh.faces))
         self.areal_density = PhysicalParameter(areal_density, "kg/m^2", name="areal_density")
         check_field("areal_density", self.areal_density.raw, len(mesh.faces))
-        effects, boundaries = effects or {}, boundaries or {}
         check_fields(effects, len(mesh.faces))
         check_axes(mesh, {"material": material, **effects})
-        check_names([*effects, *boundaries])
         self._check_free([*effects.items(), *boundaries.items()])
         self.effects = nn.ModuleDict({name: part.bind(mesh) for name, part in effects.items()})
         self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in boundaries.items()})

@@ -88,6 +88,9 @@ class PhysicalParameter(nn.Module):
             tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).detach().clone()
         except (TypeError, ValueError, RuntimeError) as error:
             raise InvalidInput(self.label, got=f"{value!r:.40}", expected="a number or a tensor") from error
+        if tensor.is_complex() or not tensor.numel():
+            got = "complex numbers" if tensor.is_complex() else f"none, shape {tuple(tensor.shape)}"
+            raise InvalidInput(self.label, got=got, expected="real numbers, one at least")
         if not tensor.is_floating_point():
             tensor = tensor.to(torch.get_default_dtype())
         interval = _DOMAINS[self.domain]

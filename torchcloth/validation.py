@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .boundaries import Grasp
+from .boundaries import AbstractBoundary, Grasp
 from .boundaries.motion import check as check_motion
 from .boundaries.motion import check_cover
 from .effects import AbstractEffect
@@ -22,6 +22,31 @@ from .types import ClothState, Trajectory
 
 FRAMES = "at least two, increasing, finite seconds"
 MOST_SUBSTEPS = 10_000_000  # of one simulation: a minute of the stiffest cloth; poses of more fill the memory
+
+
+def check_parts(
+    mesh: Mesh,
+    material: AbstractMaterial,
+    effects: Mapping[str, AbstractEffect],
+    boundaries: Mapping[str, AbstractBoundary],
+    contact: Contact | None,
+) -> None:
+    """What a cloth is made of, each of its kind."""
+    _check_kind("mesh", mesh, Mesh, "a Mesh, as torchcloth.meshes makes them")
+    _check_kind("material", material, AbstractMaterial, "a material, of torchcloth.materials or derived from one")
+    for what, parts, kind in (("effects", effects, AbstractEffect), ("boundaries", boundaries, AbstractBoundary)):
+        _check_kind(what, parts, (Mapping, nn.ModuleDict), f"a dict of names and {what}")
+        check_names(parts)
+        for name, part in parts.items():
+            _check_kind(f"{what}: {name}", part, kind, f"an {kind.__name__}, as those of torchcloth.{what}")
+    if contact is not None:
+        _check_kind("contact", contact, Contact, "Contact(...) or None")
+
+
+def _check_kind(what: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
+    if not isinstance(value, kind):
+        got = f"the class {value.__name__}, not one of it" if isinstance(value, type) else type(value).__name__
+        raise InvalidInput(what, got=got, expected=expected)
 
 
 def check_field(name: str, raw: Tensor, triangles: int | None) -> None:
@@ -53,7 +78,7 @@ def check_fields(effects: Mapping[str, AbstractEffect], triangles: int) -> None:
                 check_field(f"effects.{name}.{path}", part.raw, triangles if path in effect.per_triangle else None)
 
 
-def check_names(names: Iterable[str]) -> None:
+def check_names(names: Iterable[object]) -> None:
     """Of effects and boundaries, as torch's ModuleDict takes them."""
     for name in names:
         if not isinstance(name, str) or not name or "." in name or hasattr(nn.ModuleDict, name):
@@ -175,7 +200,7 @@ def check_motions(
 
 def check_positions(x: Tensor, v: Tensor, vertices: int) -> None:
     """Refuse positions [..., V, 3] and velocities for another number of vertices, or not finite."""
-    if x.shape[-2:] != (vertices, 3):
+    if x.shape[-2:] != (vertices, 3) or not x.numel():
         raise InvalidInput("x", got=f"shape {tuple(x.shape)}", expected=f"[..., {vertices}, 3] in metres")
     if v.shape != x.shape:
         raise InvalidInput("v", got=f"shape {tuple(v.shape)}", expected=f"x's, {tuple(x.shape)}")

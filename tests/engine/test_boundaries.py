@@ -159,6 +159,18 @@ def test_batch(sampling):
     agree(cloth, moves(cloth, (3,)), falling(cloth, 4e-3, (3,)))
 
 
+def test_a_batch_of_ellipses():
+    along, across = torch.tensor([[0.1], [0.4]]), torch.tensor([[0.5], [0.2]])
+    together, alone = (sheet({"table": Plane(friction=Elliptic(*mu))}) for mu in ((along, across), (0.4, 0.2)))
+    state = falling(together, 4e-3, (2,))
+    agree(together, {}, state)
+    times = (0.0, 4e-3)
+    first, second = (alone(alone.state(x, v), times=times).x[-1] for x, v in zip(state.x, state.v, strict=True))
+    both = together(state, times=times).x[:, -1]
+    torch.testing.assert_close(both[1], second)
+    assert not torch.allclose(both[0], first)
+
+
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("sampling", [None, 0.01])
 def test_what_bodies_give_with_the_air(law, sampling):

@@ -112,3 +112,28 @@ def test_axes_need_a_pattern(part):
     with pytest.raises(InvalidInput, match="no pattern coordinates; expected uv"):
         tc.Cloth(tc.meshes.Mesh.build(mesh.vertices, mesh.faces), material, 0.2, effects)
     tc.Cloth(mesh, material, 0.2, effects)
+
+
+@pytest.mark.parametrize(
+    ("what", "given", "got"),
+    [
+        ("mesh", None, "NoneType"),
+        ("material", tc.materials.AEP, "the class AEP"),
+        ("effects", [tc.effects.Gravity()], "list"),
+        ("effects", {"air": 3}, "int"),
+        ("effects", {"table": tc.boundaries.Plane()}, "Plane"),
+        ("boundaries", {"gravity": tc.effects.Gravity()}, "Gravity"),
+        ("contact", "fine", "str"),
+        ("areal_density", torch.tensor(0.2 + 0.1j), "complex numbers"),
+        ("areal_density", torch.zeros(0, 1), "none"),
+    ],
+)
+def test_what_is_no_part_is_refused(what, given, got):
+    parts = {"mesh": sheet().mesh, "material": tc.materials.AEP(1e5, 0.3), "areal_density": 0.2}
+    with pytest.raises(InvalidInput, match=f"^{what}.*got {got}"):
+        tc.Cloth(**(parts | {what: given}))
+
+
+def test_no_scenes_are_no_state():
+    with pytest.raises(InvalidInput, match=r"^x; got shape \(0, 9, 3\)"):
+        sheet(3).state(torch.zeros(0, 9, 3))

@@ -79,18 +79,18 @@ class Elliptic(Coulomb):
     ``across == along`` is Coulomb's law, bitwise.
 
     Args:
-        along: mu of slip along ``axis`` [-], > 0.
-        across: mu of slip perpendicular to it [-], > 0.
+        along: mu of slip along ``axis`` [-], > 0; a batch is [B, 1].
+        across: mu of slip perpendicular to it [-], > 0; a batch is [B, 1].
         axis: [3], in the surface, in the shape's own coordinates; normalised here.
 
     Raises:
         InvalidInput: a coefficient that is not positive, or no direction.
     """
 
-    def __init__(self, along: float, across: float, axis: Sequence[float] = (1.0, 0.0, 0.0)) -> None:
+    def __init__(self, along: float | Tensor, across: float | Tensor, axis: Sequence[float] = (1.0, 0.0, 0.0)) -> None:
         super().__init__(along)
-        if not along > 0:
-            raise InvalidInput("along", got=f"{along:g}", expected="a coefficient > 0")
+        if not bool((self.raw > 0).all()):
+            raise InvalidInput("along", got=f"{float(self.raw.min()):g}", expected="a coefficient > 0")
         self.ratio = PhysicalParameter(across / along, "-", name="friction across over along")
         self.register_buffer("axis", direction("friction axis", axis))
         self.axis: Tensor
