@@ -10,7 +10,7 @@ torch.set_num_threads(1)
 
 
 def pytest_collection_modifyitems(items):
-    """The longest first: at the end one of two workers would wait for it."""
+    """The longest first: at the end one of the workers would wait for it."""
     items.sort(key=lambda item: item.path.name != "test_notebooks.py")
 
 

@@ -66,7 +66,7 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     """The first step ends strained; the second sees the causes of both fits, or those of the new one alone."""
     strained, anew = found(OFTEN + 1), found(0.2)
     looked, row = [], SimpleNamespace(hypothesis=CAUSE)
-    first = Step(Candidate(row, strained, None, None, set(), 0.0), None, [], [], [], strained)  # type: ignore[arg-type]
+    first = Step(Candidate(row, strained, None, None, set(), 0.0), None, [], [], [], strained, None)  # type: ignore[arg-type]
     monkeypatch.setattr(stepwise, "resettled", lambda *_: anew)
     monkeypatch.setattr(stepwise, "fit", lambda *_, **__: strained)
     monkeypatch.setattr(stepwise, "predicts_better", lambda *_: 1.0 if better else -1.0)
@@ -86,7 +86,7 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     """A fit that still has far to go may take back what a cause was accepted for."""
     far, near = replace(found(0.1), ahead=ahead), found(0.1)
     row = SimpleNamespace(hypothesis=CAUSE)
-    first = Step(Candidate(row, far, None, None, set(), 0.0), None, [], [], [], far)  # type: ignore[arg-type]
+    first = Step(Candidate(row, far, None, None, set(), 0.0), None, [], [], [], far, None)  # type: ignore[arg-type]
     doubted, fits = [], iter([far, far, near, near])  # fitted, then asked about the other causes
     monkeypatch.setattr(stepwise, "fit", lambda *_, **__: next(fits))
     monkeypatch.setattr(stepwise, "screen", lambda f: [])
