@@ -16,7 +16,7 @@ from .noise import floor_of
 from .repeats import Repeats, pairs_of, repeats
 from .screening import Row, screen
 from .setting import Progress, Setting, staged
-from .trials import FURTHER, TRIED, Step, alone_in, begun_with, one_step
+from .trials import FURTHER, TRIED, Candidate, Step, alone_in, begun_with, one_step
 from .world import Hypothesis, Model
 
 MOST = 4  # causes
@@ -51,10 +51,14 @@ class Found:
         """Those that stay in the model without a name: they, or what predicts as well, are too small to matter."""
         return [s for s in self.steps if s not in self.causes]
 
-    def alike(self, step: Step) -> list[tuple[Hypothesis, float]]:
-        """A step's cause in the end and its rivals, with amplitudes; no rival is what joined the model beside it."""
+    def rivals(self, step: Step) -> list[Candidate]:
+        """A step's rivals in the end; none is what joined the model beside its cause."""
         there = {s.best.hypothesis.name for s in self.steps}
-        rivals = [(c.hypothesis, c.amplitude) for c in step.rivals if c.hypothesis.name not in there]
+        return [c for c in step.rivals if c.hypothesis.name not in there]
+
+    def alike(self, step: Step) -> list[tuple[Hypothesis, float]]:
+        """A step's cause in the end and its rivals, with amplitudes."""
+        rivals = [(c.hypothesis, c.amplitude) for c in self.rivals(step)]
         return [(step.best.hypothesis, self.amplitude(step)), *rivals]
 
     def amplitude(self, step: Step) -> float:

@@ -161,14 +161,13 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
     others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in beaten]
     kin = [r.hypothesis.name for r in alike(step.before, best.row, amplitude, others)]
-    rivals = found.alike(step)[1:]
-    left = [c for c in step.rivals if c.hypothesis in [rival for rival, _ in rivals]]
-    kin += [c.hypothesis.name for c in left if fitted_alike(best.fitted, c.fitted, step.noise)]
+    rivals = found.rivals(step)
+    kin += [c.hypothesis.name for c in rivals if fitted_alike(best.fitted, c.fitted, step.noise)]
     return {
         **_told(h, amplitude),
         "ci95": [amplitude - NORMAL * std, amplitude + NORMAL * std],
         "class": sorted({h.name, *kin, *h.kin}),
-        "rivals": [_told(rival, a) for rival, a in rivals],
+        "rivals": [_told(c.hypothesis, c.amplitude) for c in rivals],
         "gain_mm": 1e3 * (best.gain.before - best.gain.after),
         "placebo": {"log_density": step.placebo.gain, "chance": step.placebo.chance},
         "share_of_explainable": _share(found, best.gain),
