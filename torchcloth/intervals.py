@@ -23,6 +23,7 @@ from .types import ClothState, Rollout, Trajectory
 from .validation import check_extent
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
+AT_ONCE = 4096  # substeps of one call, which nobody can interrupt and whose drives lie ready
 
 
 class Interval(NamedTuple):
@@ -75,16 +76,34 @@ class Plan(NamedTuple):
     longest: float  # m, extent that the contact grid has room for
 
     def intervals(self) -> Iterator[Interval]:
-        """One after the other; the motion is resolved for all of them at once, which costs what one of them does."""
-        found = [
+        """One after the other."""
+        whole, first = self.drives(), 0
+        for interval in self._bare():
+            last = first + interval.count
+            yield interval._replace(moves={name: _part(drive, first, last) for name, drive in whole.items()})
+            first = last
+
+    def stretches(self) -> Iterator[tuple[list[Interval], dict[str, Drive]]]:
+        """Intervals that one call of the engine may take together, with the drives of all of them."""
+        whole, first, some = self.drives(), 0, []
+        for interval in (*self._bare(), None):
+            count = sum(i.count for i in some)
+            if some and (interval is None or count + interval.count > AT_ONCE):
+                yield some, {name: _part(drive, first, first + count) for name, drive in whole.items()}
+                first, some = first + count, []
+            some += [] if interval is None else [interval]
+
+    def drives(self) -> dict[str, Drive]:
+        """The motion, resolved for all intervals at once, which costs what one of them does."""
+        found = self._bare()
+        return _drives(self.motion, torch.cat([*(i.times()[:-1] for i in found), found[-1].times()[-1:]]))
+
+    def _bare(self) -> list[Interval]:
+        """Without drives."""
+        return [
             Interval(self.model, self.motion, start, end, count, self.choice.fused)
             for (start, end), count in zip(pairwise(self.frames), self.counts, strict=True)
         ]
-        drives, first = _drives(self.motion, torch.cat([*(i.times()[:-1] for i in found), found[-1].times()[-1:]])), 0
-        for interval in found:
-            last = first + interval.count
-            yield interval._replace(moves={name: _part(whole, first, last) for name, whole in drives.items()})
-            first = last
 
     def check(self, state: ClothState) -> None:
         """Refuse a cloth that has been torn apart."""
@@ -98,13 +117,38 @@ def run(plan: Plan, checkpoint: bool) -> Rollout:
     Raises:
         SimulationDiverged: the state lost finiteness.
     """
-    state, states, impulses = plan.state, [plan.state], []
+    fused, state, states, impulses = plan.choice.fused, plan.state, [plan.state], []
+    # a contact grid must be looked after between frames
+    if fused is not None and plan.longest == float("inf") and fused.is_plain(state, plan.motion):
+        for some, drives in plan.stretches():
+            for state, given in _together(fused, some, states[-1], drives):
+                states.append(state)
+                impulses.append(given)
+        return collect(plan, states, impulses)
     for interval in plan.intervals():
         state, given = advance(interval, state, checkpoint)
         plan.check(state)
         states.append(state)
         impulses.append(given)
     return collect(plan, states, impulses)
+
+
+def _together(
+    fused: Fused, some: Sequence[Interval], state: ClothState, drives: Mapping[str, Drive]
+) -> list[tuple[ClothState, Impulses]]:
+    """Simulate intervals in one call: what ``advance`` gives of each.
+
+    Raises:
+        SimulationDiverged: as there.
+    """
+    counts = torch.tensor([i.count for i in some])
+    steps = torch.tensor([i.dt for i in some], dtype=torch.float64).repeat_interleave(counts)
+    found = fused.frames(state, steps, drives, tuple(counts.cumsum(0).tolist()))
+    after = [s for s, _ in found]
+    if not bool(torch.isfinite(torch.stack([s.x for s in after])).all()):
+        for interval, before, own in zip(some, [state, *after], after, strict=False):
+            check_finite(interval, before, own)
+    return found
 
 
 def collect(plan: Plan, states: Sequence[ClothState], impulses: Sequence[Impulses]) -> Rollout:

@@ -171,7 +171,7 @@ def tangents_transpose(cloth, motion, state: ClothState, substeps: int, dt: floa
         drives = drives_of(motion, substeps, dt, {name: t.pose for name, t in motion.items()})
         engine = fused.Fused(cloth.model()._replace(stages=stages), state, drives)
         assert engine.torch_parts is None, f"not on the engine: {engine.torch_parts.parts}"
-        job = engine.job(state, dt, drives, substeps)
+        job = engine.job(state, torch.full((substeps,), dt), drives)
         varied = {field for field in job.inputs if field != engine.low.dt}  # the step itself is not differentiated
         results, records = running.forward(job, 1)
         seeds = {f: scaled(noise(t.shape, k, t.dtype), t) for k, (f, t) in enumerate(results.items())}

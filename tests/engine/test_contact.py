@@ -157,7 +157,7 @@ def test_batch():
 def test_recomputed_substeps_are_bitwise_the_recorded_ones():
     cloth, state = folded(tc.Contact(spacing=SPACING))
     with torch.no_grad():
-        job = fused.Fused(cloth.model(), state, {}).job(state, 5e-5, {}, 120)
+        job = fused.Fused(cloth.model(), state, {}).job(state, torch.full((120,), 5e-5), {})
     found = []
     for every in (1, 7, 120):
         results, records = running.forward(job, every)

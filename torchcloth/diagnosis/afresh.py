@@ -16,9 +16,9 @@ from .approach import approach
 from .evidence import asked_about
 from .fitting import Fitted, fit, leap, leap_with, with_cause
 from .noise import unfitted, whitened
-from .pieces import IMPOSSIBLE
 from .setting import Progress, Setting, staged
 from .world import Hypothesis, Model
+from .worlds import IMPOSSIBLE
 
 WORTH_TRYING = 0.5  # of what the best promises
 

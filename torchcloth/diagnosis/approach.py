@@ -17,10 +17,10 @@ from .bursts import calmed
 from .evidence import Evidence, gather
 from .fitting import prior_precision
 from .noise import unfitted, whitened
-from .pieces import if_possible
 from .setting import Progress, Setting
 from .steps import shifted
 from .world import Model
+from .worlds import if_possible
 
 SWEEPS = 2
 FARTHEST = 1.2  # widths, of one sweep

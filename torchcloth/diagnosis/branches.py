@@ -23,10 +23,11 @@ from .cells import NAMES, Cells, aligned, cells_of, mean_over
 from .evidence import Evidence
 from .fitting import Fitted, weighed
 from .noise import FLOOR, fit_noise
-from .pieces import if_possible, side_by_side
+from .pieces import side_by_side
 from .setting import Progress, Setting
 from .steps import step_sizes
 from .world import World
+from .worlds import if_possible
 
 DIRECTIONS = 2  # random ones of parameters, and as many of the first shape, each there and back
 FIRST, WAVES, SHORTEST = 1e-3, 8, 0.5  # m RMS, that a first shape may be off; plane waves in it; of the cloth's size

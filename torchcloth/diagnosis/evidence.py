@@ -16,6 +16,7 @@ from .pieces import asked_piece, overlapping, piece_of
 from .setting import Progress, Setting
 from .steps import both_ways
 from .world import Hypothesis, Model, Parameter
+from .worlds import Worlds
 
 NUMERICS = 1 / 3  # of the difference between two meshes is left on the finer one (second order)
 
@@ -57,11 +58,12 @@ def gather(
     """
     raw, shifts = shifts is not None, both_ways(model) if shifts is None else list(shifts)
     own = len(shifts)
+    worlds = Worlds(model, shifts, setting.finer and setting.finer.base)
 
     def ask(k: int, asked: list[Hypothesis]) -> Piece:
         slopes = None if before is None else _known_slopes(before, k)
         question = [k, [h.name for h in model.accepted], _told(asked), shifts, *(slopes or ())]
-        return setting.kept(question, model.point, partial(piece_of, model, setting, k, asked, slopes, shifts))
+        return setting.kept(question, model.point, partial(piece_of, worlds, setting, k, asked, slopes))
 
     pieces, possible = _pieces(setting, _of_their_own(model, hypotheses), progress, ask)
     cells, stds, numerics = [], [], []
@@ -86,9 +88,11 @@ def asked_about(
 ) -> Evidence:
     """``here``, the evidence at the model's point, with slopes along these hypotheses; only they are simulated."""
 
+    worlds = Worlds(model)
+
     def ask(k: int, asked: list[Hypothesis]) -> Piece:
         question = [k, "asked", [h.name for h in model.accepted], _told(asked)]
-        return setting.kept(question, model.point, partial(asked_piece, model, setting, k, asked))
+        return setting.kept(question, model.point, partial(asked_piece, worlds, setting, k, asked))
 
     pieces, possible = _pieces(setting, _of_their_own(model, hypotheses), progress, ask)
     cells = []

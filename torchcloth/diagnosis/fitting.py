@@ -12,9 +12,9 @@ from ..identification.bounds import bounded
 from .bursts import calmed, densities, unweighted
 from .evidence import Evidence, as_held, as_rough, asked_about, gather, shared
 from .noise import Noise, Whitened, fit_noise, unfitted, whitened
-from .pieces import IMPOSSIBLE
 from .setting import Progress, Setting, staged
 from .world import Hypothesis, Model
+from .worlds import IMPOSSIBLE
 
 ENOUGH = 2.0  # log density that a further step is expected to gain, below which the search ends
 ITERATIONS = 5  # at most

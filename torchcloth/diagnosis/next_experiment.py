@@ -32,9 +32,10 @@ from .lacking import reference
 from .noise import Noise
 from .pieces import joined, nuisances, runs, side_by_side
 from .setting import Progress, Setting, foreseen, surely_seen
-from .steps import both_ways, shifted
+from .steps import both_ways
 from .stepwise import Found
 from .trials import HARDLY
+from .worlds import Worlds
 
 NEEDED = (1.64 + 0.84) ** 2  # chi^2: told apart in 80 % of cases at 5 %
 MOST_REPEATS = 10
@@ -64,12 +65,13 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
         return None
     names = list(question.amplitudes)
     now = distances(question, information(question, []))
+    worlds = Worlds(question.fitted.model, both_ways(question.fitted.model))
 
     def ask(choice: tuple[Experiment, Recording]) -> tuple[Experiment, Tensor] | None:
         experiment, template = choice
         progress(str(experiment))
         try:
-            return experiment, whitened_slopes(question, planned(experiment, template), setting)
+            return experiment, whitened_slopes(question, planned(experiment, template), setting, worlds)
         except (TorchclothError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             return None  # it cannot be simulated, so it says nothing
 
@@ -149,14 +151,16 @@ def distances(question: Question, left: Tensor) -> dict[tuple[str, ...], float]:
     return out
 
 
-def whitened_slopes(question: Question, recording: Recording, setting: Setting) -> Tensor:
-    """[C, own + causes] of an experiment that has not been done, by the present model on the coarser mesh."""
+def whitened_slopes(question: Question, recording: Recording, setting: Setting, worlds: Worlds | None = None) -> Tensor:
+    """[C, own + causes] of an experiment that has not been done, by the present model on the coarser mesh.
+
+    ``worlds``: of the question's model and beside it, where other experiments have them, too.
+    """
     found, model = question.fitted, question.fitted.model
     hypotheses = [found.evidence.hypotheses[k] for k in _columns(question)]
-    world, blank = model.world(), foreseen(episode(model.base.cloth, recording))
-    shifts = both_ways(model)
-    near = [shifted(model, k, step).world() for k, step in shifts]
-    done = runs(world, blank, setting.dt, hypotheses, near, with_held=True)
+    worlds = worlds or Worlds(model, both_ways(model))
+    world, shifts, blank = worlds.plain, worlds.shifts, foreseen(episode(model.base.cloth, recording))
+    done = runs(worlds, blank, setting.dt, hypotheses, with_held=True)
     trials = [t for t in done.trials if t is not None]
     if len(trials) < len(hypotheses):
         raise InvalidInput("experiment", got="a cause that it cannot be simulated with", expected="another experiment")

@@ -12,35 +12,34 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..identification.episodes import Episode
 from ..identification.nuisances import Camera, Clock, Held, Rim, Tare
 from ..identification.replays import Frames
 from .cells import Cells, Piece, aligned, cells_of, directions
 from .setting import Setting
-from .steps import shifted, taken
-from .world import Hypothesis, Model, World
+from .steps import taken
+from .world import Hypothesis, World
+from .worlds import Worlds, if_possible
 
-IMPOSSIBLE = (InvalidInput, SimulationDiverged, UnstableStep)  # no world has such values, or none that is stable
 CLOCK, SHIFT, TURN, GRASP, RIM, TARE = 3e-3, 5e-4, 1e-3, 1.5e-3, 2e-3, 0.1  # standard deviations between episodes
 T = TypeVar("T")
 U = TypeVar("U")
 
 
 def piece_of(
-    model: Model,
+    worlds: Worlds,
     setting: Setting,
     k: int,
     hypotheses: Sequence[Hypothesis],
     known: Sequence[Tensor] | None,
-    shifts: Sequence[tuple[int, float]],
 ) -> Piece:
     """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
-    e, world = setting.episodes[k], model.world()
-    steps = [taken(model, coordinate, step) for coordinate, step in shifts]
-    beside = [shifted(model, coordinate, step).world() for coordinate, step in shifts]
-    fine = partial(_finest, model, setting, k)
-    found = runs(world, e, setting.dt, hypotheses, beside, with_held=known is None, finer=fine)
+    if setting.finer is None:
+        raise ValueError("a setting without a finer one")
+    e, world, finer = setting.episodes[k], worlds.plain, setting.finer
+    steps = [taken(worlds.model, coordinate, step) for coordinate, step in worlds.shifts]
+    fine = partial(worlds.finest.frames, finer.episodes[k], finer.dt)
+    found = runs(worlds, e, setting.dt, hypotheses, with_held=known is None, finer=fine)
     able = torch.tensor([t is not None for t in found.trials], dtype=torch.bool)
     typical = [h.typical for h, t in zip(hypotheses, found.trials, strict=True) if t is not None]
     base = world.seen(found.plain, e)
@@ -52,16 +51,15 @@ def piece_of(
         key, slopes, std = known
         coarse = cells_of(base, moved, e, setting.sheet, setting.rest)
         coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, aligned(coarse.key, key, slopes)], 1))
-    finer: Setting = setting.finer  # type: ignore[assignment]
     kept, difference = _replaced(coarse, cells_of(found.fine, None, finer.episodes[k], finer.sheet, finer.rest))
     return Piece(kept, std, difference, able)
 
 
-def asked_piece(model: Model, setting: Setting, k: int, hypotheses: Sequence[Hypothesis]) -> Piece:
-    """Slopes of the k-th episode along hypotheses alone."""
-    e, world = setting.episodes[k], model.world()
-    found = runs(world, e, setting.dt, hypotheses, (), with_held=False)
-    base, moved = world.seen(found.plain, e), [t for t in found.trials if t is not None]
+def asked_piece(worlds: Worlds, setting: Setting, k: int, hypotheses: Sequence[Hypothesis]) -> Piece:
+    """Slopes of the k-th episode along hypotheses alone; ``worlds`` without shifts."""
+    e = setting.episodes[k]
+    found = runs(worlds, e, setting.dt, hypotheses, with_held=False)
+    base, moved = worlds.plain.seen(found.plain, e), [t for t in found.trials if t is not None]
     able = torch.tensor([t is not None for t in found.trials], dtype=torch.bool)
     typical = [h.typical for h, t in zip(hypotheses, found.trials, strict=True) if t is not None]
     slopes = directions(base, moved, typical) if moved else None
@@ -80,19 +78,19 @@ class Runs(NamedTuple):
 
 
 def runs(
-    world: World,
+    worlds: Worlds,
     e: Episode,
     dt: float | None,
     hypotheses: Sequence[Hypothesis],
-    near: Sequence[World],
     with_held: bool,
     finer: Callable[[], Frames] | None = None,
 ) -> Runs:
-    """An episode in a world, in those ``near``, with every hypothesis and with held places off, side by side."""
-    beside = [partial(w.frames, e, dt) for w in near]
+    """An episode in a world, in those beside it, with every hypothesis and with held places off, side by side."""
+    world = worlds.plain
+    beside = [partial(w.frames, e, dt) for w in worlds.beside]
     modes = Held().modes(world.cloth, e) if with_held else ()
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m), dt) for m in modes]
-    changed = [if_possible(partial(h.apply, world, h.typical)) for h in hypotheses]
+    changed = [worlds.changed(h) for h in hypotheses]
     moves = [c is not None and (c.cloth is not world.cloth or c.motions is not world.motions) for c in changed]
     first = [] if finer is None else [finer]  # it takes longest
     jobs = [*first, partial(world.simulated, e, dt), *beside, *held]
@@ -104,21 +102,6 @@ def runs(
     seen = lambda c: c and if_possible(partial(c.seen, plain, e))  # noqa: E731
     trials = [next(rest) if own else seen(c) for c, own in zip(changed, moves, strict=True)]
     return Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials)
-
-
-def _finest(model: Model, setting: Setting, k: int) -> Frames:
-    """The episode on the finer mesh."""
-    if setting.finer is None:
-        raise ValueError("a setting without a finer one")
-    return replace(model, base=setting.finer.base).world().frames(setting.finer.episodes[k], setting.finer.dt)
-
-
-def if_possible(work: Callable[[], T]) -> T | None:
-    """What comes of it; None of what no world allows, or what cannot be simulated."""
-    try:
-        return work()
-    except IMPOSSIBLE:
-        return None
 
 
 def side_by_side(work: Callable[[T], U], items: Sequence[T]) -> list[U]:

@@ -10,11 +10,11 @@ from .comparison import Gain, Predicted, compare, predict, spread, telling
 from .evidence import Evidence, shared
 from .fitting import Fitted, fit, renoised, with_cause
 from .noise import Noise, fit_noise, unfitted
-from .pieces import IMPOSSIBLE
 from .placebo import Placebo, placebo
 from .screening import MUCH, PRESENT, Row
 from .setting import Progress, Setting, staged
 from .world import Hypothesis, Model
+from .worlds import IMPOSSIBLE
 
 TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 2  # steps of the likelier ones among them

@@ -14,7 +14,7 @@ from ..boundaries import Drive
 from ..dynamics import Impulses, added
 from ..model import Model
 from ..self_contact import CHUNK
-from ..types import ClothState
+from ..types import ClothState, Trajectory
 from . import conversion, running
 from .fields import Field
 from .operators import Rollout
@@ -50,7 +50,8 @@ class Fused:
         checkpoint: bool = True,
     ) -> tuple[ClothState, Impulses]:
         """As ``functional.rollout``. ``checkpoint``: the adjoint keeps to a budget of memory, and recomputes beyond."""
-        fixed, moves = self.coefficients(dt, state.x.shape[:-2]), self.moves(state, drives)
+        steps = torch.full((first + substeps,), dt, dtype=torch.float64)
+        fixed, moves = self.coefficients(_batch(state)), self.moves(state, drives, steps)
         if self.torch_parts is None:
             return self._call(state, fixed | _cut(moves, first, first + substeps), substeps, checkpoint)
         total: Impulses = {}
@@ -65,22 +66,40 @@ class Fused:
             total = added(total, impulses)
         return state, total
 
-    def job(self, state: ClothState, dt: float, drives: Mapping[str, Drive], substeps: int) -> Job:
-        """What the engine is given, as plain numbers; without parts in torch."""
-        batch, program = state.x.shape[:-2], self.low.program
-        found = conversion.flat(self.low, conversion.state_inputs(self.low, state), batch) | self.moves(state, drives)
-        found |= self.coefficients(dt, batch)
-        return Job(program, {field: found[field] for field in program.inputs}, batch.numel(), substeps)
+    def frames(
+        self, state: ClothState, steps: Tensor, drives: Mapping[str, Drive], ends: tuple[int, ...]
+    ) -> list[tuple[ClothState, Impulses]]:
+        """States after so many substeps each, with the impulses since the one before; ``steps``: [substeps] s.
 
-    def coefficients(self, dt: float, batch: torch.Size) -> dict[Field, Tensor]:
+        Of what ``is_plain``.
+        """
+        results, _ = running.forward(self.job(state, steps, drives)._replace(ends=ends))
+        frames = zip(*(t.unbind(1) for t in results.values()), strict=True)
+        as_frame = lambda row: conversion.outcome(self.low, state, dict(zip(results, row, strict=True)), _batch(state))  # noqa: E731
+        return [as_frame(row) for row in frames]
+
+    def is_plain(self, state: ClothState, motion: Mapping[str, Trajectory]) -> bool:
+        """The engine runs by itself on numbers from which nobody wants a derivative."""
+        given = [state.x, state.v, state.d3, *state.memory.values(), *self.low.inputs.values()]
+        return self.torch_parts is None and _are_numbers([*given, *(m.pose for m in motion.values())])
+
+    def job(self, state: ClothState, steps: Tensor, drives: Mapping[str, Drive]) -> Job:
+        """What the engine is given, as plain numbers; without parts in torch."""
+        batch, program = _batch(state), self.low.program
+        found = conversion.flat(self.low, conversion.state_inputs(self.low, state), batch)
+        found |= self.coefficients(batch) | self.moves(state, drives, steps)
+        return Job(program, {field: found[field] for field in program.inputs}, batch.numel(), len(steps))
+
+    def coefficients(self, batch: torch.Size) -> dict[Field, Tensor]:
         """Inputs that stay the same over the substeps of a call."""
         if not self._coefficients:
             self._coefficients = conversion.flat(self.low, self.low.inputs, batch)
-        return self._coefficients | {self.low.dt: torch.full((1, 1, 1), dt, dtype=self.low.program.dtype)}
+        return self._coefficients
 
-    def moves(self, state: ClothState, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
-        """Inputs with a row for every substep."""
-        return conversion.flat(self.low, conversion.drive_inputs(self.low, drives), state.x.shape[:-2])
+    def moves(self, state: ClothState, drives: Mapping[str, Drive], steps: Tensor) -> dict[Field, Tensor]:
+        """Inputs with a row for every substep; ``steps``: [substeps] s."""
+        found = {**conversion.drive_inputs(self.low, drives), self.low.dt: steps.unsqueeze(-1)}
+        return conversion.flat(self.low, found, _batch(state))
 
     def _shared(
         self,
@@ -108,7 +127,7 @@ class Fused:
         checkpoint: bool,
         force: Tensor | None = None,
     ) -> tuple[ClothState, Impulses]:
-        low, program, batch = self.low, self.low.program, state.x.shape[:-2]
+        low, program, batch = self.low, self.low.program, _batch(state)
         begin = conversion.state_inputs(low, state)
         if low.torch_force is not None and force is not None:
             begin[low.torch_force] = force
@@ -139,6 +158,10 @@ def rollout(model: Model, state: ClothState, dt: float, drives: Mapping[str, Dri
         Unfused: a part without kernels.
     """
     return Fused(model, state, drives).rollout(state, dt, drives, substeps)
+
+
+def _batch(state: ClothState) -> torch.Size:
+    return state.x.shape[:-2]
 
 
 def _cut(moves: Mapping[Field, Tensor], first: int, last: int) -> dict[Field, Tensor]:

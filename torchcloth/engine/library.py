@@ -45,6 +45,8 @@ class Call(ctypes.Structure):
         ("records", ctypes.c_void_p),
         ("every", ctypes.c_int64),
         ("worth", ctypes.c_double),
+        ("ends", ctypes.POINTER(ctypes.c_int64)),
+        ("frames", ctypes.c_int64),
     ]
 
 

@@ -78,7 +78,7 @@ class Lowering:
         self.x, self.v = (State(*self.program.state(self.vertices, 3)) for _ in range(2))
         kept = {key: value for key, value in remembered(model, state).items() if key not in in_torch}
         self.memory = {key: State(*self.program.state(*value.shape[-2:])) for key, value in kept.items()}
-        self.dt = self.program.parameter(1, 1)
+        self.dt = self.program.drive(1)
         self.mass = self.parameter(model.mass)
         self.force = self.program.temporary(self.vertices, 3)
         self.pulls: list[tuple[str, tuple[Field, ...]]] = []

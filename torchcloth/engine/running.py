@@ -25,12 +25,18 @@ class Job(NamedTuple):
     inputs: Mapping[Field, Tensor]  # parameters, states, drives
     scenes: int
     substeps: int
+    ends: tuple[int, ...] = ()  # substeps after which there are results, the last after all; (): only then
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Axis of the results, between scenes and rows; () where they come once."""
+        return (len(self.ends),) if self.ends else ()
 
 
 def forward(job: Job, every: int = 0) -> tuple[dict[Field, Tensor], Tensor]:
-    """(nexts and sums [scenes, rows, comps], records); ``every``: substeps between records, 0 for none."""
+    """(nexts and sums [scenes, (frames,) rows, comps], records); ``every``: substeps between records, 0 for none."""
     like = next(iter(job.inputs.values()))
-    results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in job.program.outputs}
+    results = {f: like.new_empty(job.scenes, *job.frames, f.rows, f.comps) for f in job.program.outputs}
     records = like.new_empty(job.scenes, record_size(job.program, job.substeps, every))
     ports = _ports(job)
     for f, tensor in results.items():
@@ -55,10 +61,13 @@ def reverse(
 
 
 def tangent(job: Job, dots: Mapping[Field, Tensor], directions: int) -> tuple[dict[Field, Tensor], dict[Field, Tensor]]:
-    """(nexts and sums, their tangents [scenes, directions, rows, comps]) of inputs [scenes or 1, directions, ...]."""
+    """(nexts and sums, their tangents [scenes, directions, (frames,) rows, comps]).
+
+    ``dots``: of inputs [scenes or 1, directions, rows or substeps, comps].
+    """
     like = next(iter(job.inputs.values()))
-    results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in job.program.outputs}
-    moved = {f: like.new_empty(job.scenes, directions, f.rows, f.comps) for f in results}
+    results = {f: like.new_empty(job.scenes, *job.frames, f.rows, f.comps) for f in job.program.outputs}
+    moved = {f: like.new_empty(job.scenes, directions, *job.frames, f.rows, f.comps) for f in results}
     ports = _ports(job)
     for f, tensor in results.items():
         ports[f.id].result, ports[f.id].dot_result = tensor.data_ptr(), moved[f].data_ptr()
@@ -98,5 +107,7 @@ def _ports(job: Job):
 def _run(job: Job, ports, mode: int, records: Tensor, every: int, directions: int = 0) -> None:
     threads = torch.get_num_threads()
     pointer = ctypes.cast(ports, ctypes.POINTER(Port))
-    call = Call(pointer, job.scenes, job.substeps, directions, threads, records.data_ptr(), every, WORTH)
-    job.program.run(call, mode)
+    ends = job.ends or (job.substeps,)
+    marks = (ctypes.c_int64 * len(ends))(*ends)
+    numbers = (job.scenes, job.substeps, directions, threads, records.data_ptr(), every, WORTH, marks, len(ends))
+    job.program.run(Call(pointer, *numbers), mode)

@@ -46,7 +46,7 @@ class FusedTangents:
         """(state, its tangents [K, ...], impulses, their tangents) after the substeps; ``driven``: drives' tangents."""
         low, batch = self.fused.low, state.x.shape[:-2]
         program = low.program
-        values = self.fused.job(state, dt, drives, substeps).inputs
+        values = self.fused.job(state, torch.full((substeps,), dt, dtype=torch.float64), drives).inputs
         dots = conversion.state_inputs(low, moved) | self._inputs(state, drives)
         if driven:
             dots |= {f: t for f, t in conversion.drive_inputs(low, driven).items() if f.comps > 1}  # not the flags

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from .._math import cross, dot, safe_norm
 from .nearest import nearest
@@ -83,11 +84,27 @@ def distances(points: Tensor, vertices: Tensor, hits: Hits) -> Tensor:
 
 def _on_boundary(faces: Tensor, face: Tensor, weights: Tensor) -> Tensor:
     """[N] bool, whether the closest point lies on an edge that only one triangle has, or is an end of one."""
-    edges = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], dim=1).sort(-1).values
-    number = edges[..., 0] * (faces.max() + 1) + edges[..., 1]  # one number for each edge: sorts far faster than rows
-    _, inverse, count = number.flatten().unique(return_inverse=True, return_counts=True)
-    open_edge = (count[inverse] == 1).reshape(-1, 3)  # the edge opposite to each corner
-    rim = torch.zeros(int(faces.max()) + 1, dtype=torch.bool, device=faces.device)
-    rim[edges[open_edge].flatten()] = True
+    open_edge, rim = _boundary(faces)
     corner = rim[faces[face].gather(-1, weights.argmax(-1, keepdim=True)).squeeze(-1)] & (weights >= 1).any(-1)
     return ((weights <= 0) & open_edge[face]).any(-1) | corner
+
+
+def _boundary(faces: Tensor) -> tuple[Tensor, Tensor]:
+    """([F, 3] bool, whether the edge opposite to each corner is open; [V] bool, whether a vertex is an end of one).
+
+    Remembered for as long as the faces are there and nobody writes to them.
+    """
+    version, found = _KNOWN.get(faces) or (None, None)
+    if found is None or version != faces._version:
+        edges = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], dim=1).sort(-1).values
+        number = edges[..., 0] * (faces.max() + 1) + edges[..., 1]  # one for each edge: sorts far faster than rows
+        _, inverse, count = number.flatten().unique(return_inverse=True, return_counts=True)
+        open_edge = (count[inverse] == 1).reshape(-1, 3)
+        rim = torch.zeros(int(faces.max()) + 1, dtype=torch.bool, device=faces.device)
+        rim[edges[open_edge].flatten()] = True
+        found = open_edge, rim
+        _KNOWN[faces] = faces._version, found
+    return found
+
+
+_KNOWN: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
