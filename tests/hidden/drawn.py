@@ -54,7 +54,6 @@ _COMMON: tuple[Plan, ...] = (
 REDUCED = Size(19, 13, (*_COMMON, ("shake", 0.0, 1.5)), (*_COMMON, ("drag-fast", 0.0, 1.0)))
 _FAST: Plan = ("swing-fast", 0.0, 1.3)
 SMALL = Size(13, 9, (_FAST, ("turn", 0.0, 3.0)), (_FAST, ("drag-fast", 0.0, 1.3)), 0.0795, (0.075, 0.075))
-FOLDING = 1.3  # speed
 UNSEEN: Plan = ("swing", 45.0, 1.4)  # of no case
 
 
@@ -167,7 +166,7 @@ def _plans(size: Size, rng: np.random.Generator) -> tuple[Plan, ...]:
 def _where(size: Size, rng: np.random.Generator, *names: str) -> tuple[Plan, ...]:
     """Motions in which the effects show."""
     partners = [(SINGLES | OUTSIDE)[name] for name in names]
-    special = tuple((p.motion, 0.0, FOLDING) for p in partners if p.motion)
+    special = tuple(dict.fromkeys(plan for p in partners for plan in p.shown))
     plans = size.table if any(p.table for p in partners) else _plans(size, rng)
     return (*plans[: len(plans) - len(special)], *special)
 

@@ -19,7 +19,8 @@ class Partner:
         sign: of the library's amplitude over the generator's; 0: not comparable.
         headed: takes a heading: one of the world's four.
         axis: of the library's amplitude; what is headed has the world's.
-        table: shows on a table only; ``motion``: in this one, which then is among the case's.
+        table: shows on a table only.
+        shown: motions in which it shows, where the usual ones hardly do: they are among the case's.
         beside: further effects that must be there for this one to be felt; naming them is right, too.
     """
 
@@ -30,12 +31,14 @@ class Partner:
     headed: bool = False
     axis: str = ""
     table: bool = False
-    motion: str = ""
+    shown: tuple[tuple[str, float, float], ...] = ()  # motion, heading in degrees, speed
     beside: tuple[tuple[str, float], ...] = ()
 
 
 BOTH = (1, -1)
 DRAG = (("air.drag_n", 1.2),)
+DRAGGED = (("drag", 90.0, 1.0), ("drag-fast", 0.0, 1.0))  # once, friction hides behind the density
+FOLDED = (("fold", 0.0, 1.3),)
 SINGLES = {
     "air.drag_n": Partner(("air.drag_n",)),
     "air.drag_t": Partner(("air.drag_t",)),
@@ -59,7 +62,7 @@ SINGLES = {
     "mass.seam": Partner(("mass.seam",)),
     "grip.slip": Partner(("grip.slip",)),
     "grip.width": Partner(("grip.width",)),
-    "contact.mu": Partner(("contact.mu",), signs=BOTH, table=True),
+    "contact.mu": Partner(("contact.mu",), signs=BOTH, table=True, shown=DRAGGED),
     "env.gravity_tilt": Partner(("env.gravity_tilt",), headed=True),
     "obs.extrinsic": Partner(("obs.extrinsic", "robot.base"), headed=True),
     "obs.clock": Partner(("obs.clock",), signs=BOTH, sign=-1.0),
@@ -68,8 +71,8 @@ SINGLES = {
     "robot.regrasp": Partner(("robot.regrasp",), signs=BOTH),
     "obs.depth_scale": Partner(("obs.depth_scale",), signs=BOTH),
     "obs.depth_bias": Partner(("obs.depth_bias",), signs=BOTH),
-    "contact.aniso": Partner(("contact.aniso",), table=True),
-    "plast.crease": Partner(("plast.crease",), table=True, motion="fold"),
+    "contact.aniso": Partner(("contact.aniso",), table=True, shown=DRAGGED),
+    "plast.crease": Partner(("plast.crease",), table=True, shown=FOLDED),
 }
 # not hidden, and why
 LEFT_OUT = {
