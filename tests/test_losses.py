@@ -50,6 +50,18 @@ def test_closest_points_against_trimesh(vertices, points):
     torch.testing.assert_close((points - hits.on(vertices)).norm(dim=-1), distance, rtol=1e-10, atol=1e-12)
 
 
+def test_faces_that_are_written_to_or_made_in_inference_have_their_own_rim(vertices):
+    """Which edges are open is remembered by the faces."""
+    faces, beyond = FACES.clone(), vertices.mean(0) + torch.tensor([1.0, 0.0, 0.0])
+    assert bool(closest(beyond[None], vertices, faces).beyond)
+    with torch.inference_mode():
+        assert bool(closest(beyond[None], vertices, FACES + 0).beyond)
+    alone = closest(vertices[faces[0]].mean(0)[None], vertices, faces)
+    faces[1:] = faces[0]  # all edges are of many triangles: none is open
+    assert not bool(closest(beyond[None], vertices, faces).beyond)
+    assert not bool(alone.beyond)
+
+
 def test_closest_points_on_triangles_of_all_sizes(points):
     """Triangles are left out by their bounding spheres, so large ones, whose centres are far away, must stay in."""
     triangles = pytest.importorskip("trimesh").triangles

@@ -23,7 +23,10 @@ from .types import ClothState, Rollout, Trajectory
 from .validation import check_extent
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
-AT_ONCE = 4096  # substeps of one call, which nobody can interrupt and whose drives lie ready
+AT_ONCE, FEW = (
+    4_000_000,
+    250,
+)  # vertices times substeps of one call, which nobody can interrupt; fewer vertices count so
 
 
 class Interval(NamedTuple):
@@ -85,13 +88,14 @@ class Plan(NamedTuple):
 
     def stretches(self) -> Iterator[tuple[list[Interval], dict[str, Drive]]]:
         """Intervals that one call of the engine may take together, with the drives of all of them."""
-        whole, first, some = self.drives(), 0, []
+        whole, first, last, some = self.drives(), 0, 0, []
+        most = AT_ONCE // max(self.state.x.numel() // 3, FEW)
         for interval in (*self._bare(), None):
-            count = sum(i.count for i in some)
-            if some and (interval is None or count + interval.count > AT_ONCE):
-                yield some, {name: _part(drive, first, first + count) for name, drive in whole.items()}
-                first, some = first + count, []
-            some += [] if interval is None else [interval]
+            if some and (interval is None or last - first + interval.count > most):
+                yield some, {name: _part(drive, first, last) for name, drive in whole.items()}
+                first, some = last, []
+            if interval is not None:
+                last, some = last + interval.count, [*some, interval]
 
     def drives(self) -> dict[str, Drive]:
         """The motion, resolved for all intervals at once, which costs what one of them does."""
@@ -146,8 +150,12 @@ def _together(
     found = fused.frames(state, steps, drives, tuple(counts.cumsum(0).tolist()))
     after = [s for s, _ in found]
     if not bool(torch.isfinite(torch.stack([s.x for s in after])).all()):
+        first = 0
         for interval, before, own in zip(some, [state, *after], after, strict=False):
-            check_finite(interval, before, own)
+            last = first + interval.count
+            moves = {name: _part(drive, first, last) for name, drive in drives.items()}
+            check_finite(interval._replace(moves=moves), before, own)
+            first = last
     return found
 
 

@@ -97,3 +97,32 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     end, _ = stepwise._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert doubted == ([far, near] if ahead else [far])
     assert end is doubted[-1]
+
+
+@pytest.mark.parametrize(("lacking", "surely", "named"), [(True, 1.0, True), (False, 1.0, False), (False, 26.0, True)])
+def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(monkeypatch, lacking, surely, named):
+    """The fit has made up for half an effect, and nulls' causes promise something as well."""
+    start, tried = found(0.1), []
+    gain = SimpleNamespace(ci95=(surely, 99.0))
+    first = Step(Candidate(None, start, None, gain, set(), 0.0), None, [], [], [], start, None)  # type: ignore[arg-type]
+    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: lacking)
+    monkeypatch.setattr(stepwise, "screen", lambda f: [])
+    monkeypatch.setattr(stepwise, "afresh", lambda *a: tried.append(a[-1]) or [])
+    monkeypatch.setattr(stepwise, "one_step", lambda *_: first)
+    monkeypatch.setattr(stepwise, "_chain", lambda *a: (start, [a[-1]]))
+    _, steps = stepwise._anew(start, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
+    assert steps == ([first] if named else [])
+    assert tried == [0.0 if lacking else stepwise.MUCH]
+
+
+@pytest.mark.parametrize(("least", "tried"), [(0.0, ["much", "half"]), (5.0, ["much"]), (20.0, [])])
+def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
+    promised = [(10.0, "much", None), (5.0, "half", None), (1.0, "little", None)]
+    causes = [toys.hypothesis(name, 2.0) for _, name, _ in promised]
+    monkeypatch.setattr(afresh, "fit", lambda *_, **__: found(0.0))
+    monkeypatch.setattr(afresh, "asked_about", lambda here, *_: here)
+    monkeypatch.setattr(afresh, "_promises", lambda _: promised)
+    monkeypatch.setattr(afresh, "WORTH_TRYING", 0.4)
+    monkeypatch.setattr(afresh, "with_cause", lambda _, h: h)
+    begun = afresh.afresh(found(0.0), None, causes, 4, lambda _: None, least)  # type: ignore[arg-type]
+    assert [h.name for h, _ in begun] == tried

@@ -65,7 +65,7 @@ def check_cover(trajectory: Trajectory, name: str, start: float, end: float) -> 
     Raises:
         InvalidInput: it begins later or ends earlier.
     """
-    t = trajectory.t
+    t = trajectory.t.detach()
     slack = 1e-6 + 4 * torch.finfo(t.dtype).eps * abs(end)
     if float(t[0]) > start + slack or float(t[-1]) < end - slack:
         raise InvalidInput(

@@ -1,8 +1,8 @@
 """Causes tried from the data sheet, where the fitted model leads to none, and fits begun there anew.
 
-A large effect bends the numbers that are fitted without it, until slopes there point away from it. The data sheet does
-not know of the effect, and is often nearer. What pulls and what pushes need not be alike, so signed causes are asked
-about both ways.
+An effect bends the numbers that are fitted without it, until slopes there ask for little of it or point away from it.
+The data sheet does not know of the effect, and is often nearer. What pulls and what pushes need not be alike, so signed
+causes are asked about both ways.
 """
 
 from __future__ import annotations
@@ -24,11 +24,16 @@ WORTH_TRYING = 0.5  # of what the best promises
 
 
 def afresh(
-    start: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], tried: int, progress: Progress = lambda _: None
+    start: Fitted,
+    setting: Setting,
+    hypotheses: Sequence[Hypothesis],
+    tried: int,
+    progress: Progress = lambda _: None,
+    least: float = 0.0,
 ) -> list[tuple[Hypothesis, Model]]:
     """The ``tried`` causes that promise most, each with the model to which one joint step from the data sheet leads.
 
-    Without those that promise little beside the best.
+    Without those that promise little beside the best, or at most ``least`` in log density.
     """
     sheet = replace(start.model, values=torch.zeros_like(start.model.values))
     away = [replace(h, typical=-h.typical) for h in hypotheses if h.signed]
@@ -39,7 +44,7 @@ def afresh(
     promised = sorted((pair for found in ways for pair in _promises(found)), key=lambda pair: -pair[0])
     likely: dict[str, Fitted] = {}
     for gained, name, found in promised:
-        if gained > WORTH_TRYING * promised[0][0]:
+        if gained > max(least, WORTH_TRYING * promised[0][0]):
             likely.setdefault(name, found)
     named = {h.name: h for h in hypotheses}
     return [(named[name], with_cause(found, named[name])) for name, found in list(likely.items())[:tried]]

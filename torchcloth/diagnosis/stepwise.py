@@ -14,10 +14,11 @@ from .fitting import Fitted, fit, weighed_alike
 from .lacking import is_lacking
 from .noise import floor_of
 from .repeats import Repeats, pairs_of, repeats
-from .screening import Row, screen
+from .screening import MUCH, Row, screen
 from .setting import Progress, Setting, staged
-from .trials import FURTHER, TRIED, Candidate, Step, alone_in, begun_with, one_step
+from .trials import FURTHER, SURELY, TRIED, Candidate, Step, alone_in, begun_with, one_step
 from .world import Hypothesis, Model
+from .worlds import if_possible
 
 MOST = 4  # causes
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
@@ -82,16 +83,29 @@ def search(
     if any(map(len, jumping)):
         setting, start = replace(setting, unstable=jumping), without(start, jumping)
     current, steps = _chain(start, setting, hypotheses, progress, TRIED)
-    if not steps and is_lacking(start, setting.names):
-        screened = screen(start)
-        rows = {row.hypothesis.name: row for row in screened}
-        asked = [row.hypothesis for row in screened if row.sight]
-        begun = [(rows[h.name], model) for h, model in afresh(start, setting, asked, TRIED, progress)]
-        if first := one_step(start, setting, begun, screened, progress):
-            current, steps = _chain(start, setting, hypotheses, progress, TRIED, first)
+    if not steps:
+        current, steps = _anew(start, setting, hypotheses, progress)
     able = {h.name for h in start.evidence.hypotheses}
     impossible = tuple(h.name for h in model.others(hypotheses) if h.name not in able)
     return replace(_found(start, current, steps, setting), impossible=impossible)
+
+
+def _anew(
+    start: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
+) -> tuple[Fitted, list[Step]]:
+    """As ``_chain``, with a first cause that is begun at the data sheet.
+
+    Where nothing is lacking any more, it must surely gain what nulls' causes do not.
+    """
+    lacking, screened = is_lacking(start, setting.names), screen(start)
+    rows = {row.hypothesis.name: row for row in screened}
+    asked = [row.hypothesis for row in screened if row.sight]
+    least = 0.0 if lacking else MUCH
+    likely = if_possible(lambda: afresh(start, setting, asked, TRIED, progress, least)) or []
+    first = one_step(start, setting, [(rows[h.name], model) for h, model in likely], screened, progress)
+    if first is None or not (lacking or first.best.gain.ci95[0] > SURELY):
+        return start, []
+    return _chain(start, setting, hypotheses, progress, TRIED, first)
 
 
 def extend(

@@ -20,6 +20,7 @@ TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 2  # steps of the likelier ones among them
 HARDLY = 0.2  # of what the better of two models gains, in density and squares, that two engines may differ by
 VERY_MUCH = 25.0  # log density; nulls' causes that ask for too little to show reach 16, and 27 once
+SURELY = 25.0  # log density held out, beyond which no null's cause surely gains: of what no other motion predicts
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 MUCH_OF_ALL = 1 / 3  # that is wrong, of which predictions say that it is there
@@ -215,7 +216,9 @@ def _plausible(c: Candidate) -> bool:
 
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:
-    return worth_naming(c, c.gain) and known(c.fitted, c.hypothesis.name, names, c)
+    """What one motion alone tells has predicted no other one: it must surely gain what nulls' causes do not."""
+    sure = not c.alone or c.gain.ci95[0] > SURELY
+    return sure and worth_naming(c, c.gain) and known(c.fitted, c.hypothesis.name, names, c)
 
 
 def _agreed(c: Candidate, names: Sequence[str]) -> bool:

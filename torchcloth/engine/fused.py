@@ -74,14 +74,17 @@ class Fused:
         Of what ``is_plain``.
         """
         results, _ = running.forward(self.job(state, steps, drives)._replace(ends=ends))
-        frames = zip(*(t.unbind(1) for t in results.values()), strict=True)
-        as_frame = lambda row: conversion.outcome(self.low, state, dict(zip(results, row, strict=True)), _batch(state))  # noqa: E731
-        return [as_frame(row) for row in frames]
+        found = []
+        for row in zip(*(t.unbind(1) for t in results.values()), strict=True):
+            found.append(conversion.outcome(self.low, state, dict(zip(results, row, strict=True)), _batch(state)))
+        last, impulses = found[-1]
+        return [*found[:-1], (last.map(torch.clone), impulses)]  # who keeps it keeps no other frames
 
     def is_plain(self, state: ClothState, motion: Mapping[str, Trajectory]) -> bool:
         """The engine runs by itself on numbers from which nobody wants a derivative."""
         given = [state.x, state.v, state.d3, *state.memory.values(), *self.low.inputs.values()]
-        return self.torch_parts is None and _are_numbers([*given, *(m.pose for m in motion.values())])
+        moves = [part for m in motion.values() for part in (m.t, m.pose)]
+        return self.torch_parts is None and _are_numbers([*given, *moves])
 
     def job(self, state: ClothState, steps: Tensor, drives: Mapping[str, Drive]) -> Job:
         """What the engine is given, as plain numbers; without parts in torch."""

@@ -79,7 +79,7 @@ class Program:
         return self._field(Kind.DRIVE, 1, comps)
 
     def sum(self, comps: int) -> Field:
-        """Added up over all substeps."""
+        """Added up over the substeps before a result."""
         return self._field(Kind.SUM, 1, comps)
 
     def nodes(self) -> Field:

@@ -25,7 +25,7 @@ class Job(NamedTuple):
     inputs: Mapping[Field, Tensor]  # parameters, states, drives
     scenes: int
     substeps: int
-    ends: tuple[int, ...] = ()  # substeps after which there are results, the last after all; (): only then
+    ends: tuple[int, ...] = ()  # of values: substeps after which there are results, the last after all; (): only then
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -61,13 +61,10 @@ def reverse(
 
 
 def tangent(job: Job, dots: Mapping[Field, Tensor], directions: int) -> tuple[dict[Field, Tensor], dict[Field, Tensor]]:
-    """(nexts and sums, their tangents [scenes, directions, (frames,) rows, comps]).
-
-    ``dots``: of inputs [scenes or 1, directions, rows or substeps, comps].
-    """
+    """(nexts and sums, their tangents [scenes, directions, rows, comps]) of inputs [scenes or 1, directions, ...]."""
     like = next(iter(job.inputs.values()))
-    results = {f: like.new_empty(job.scenes, *job.frames, f.rows, f.comps) for f in job.program.outputs}
-    moved = {f: like.new_empty(job.scenes, directions, *job.frames, f.rows, f.comps) for f in results}
+    results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in job.program.outputs}
+    moved = {f: like.new_empty(job.scenes, directions, f.rows, f.comps) for f in results}
     ports = _ports(job)
     for f, tensor in results.items():
         ports[f.id].result, ports[f.id].dot_result = tensor.data_ptr(), moved[f].data_ptr()

@@ -92,10 +92,11 @@ def _on_boundary(faces: Tensor, face: Tensor, weights: Tensor) -> Tensor:
 def _boundary(faces: Tensor) -> tuple[Tensor, Tensor]:
     """([F, 3] bool, whether the edge opposite to each corner is open; [V] bool, whether a vertex is an end of one).
 
-    Remembered for as long as the faces are there and nobody writes to them.
+    Remembered for as long as the faces are there and torch does not write to them.
     """
+    now = None if faces.is_inference() else faces._version  # which inference tensors have not
     version, found = _KNOWN.get(faces) or (None, None)
-    if found is None or version != faces._version:
+    if found is None or now is None or version != now:
         edges = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], dim=1).sort(-1).values
         number = edges[..., 0] * (faces.max() + 1) + edges[..., 1]  # one for each edge: sorts far faster than rows
         _, inverse, count = number.flatten().unique(return_inverse=True, return_counts=True)
@@ -103,7 +104,7 @@ def _boundary(faces: Tensor) -> tuple[Tensor, Tensor]:
         rim = torch.zeros(int(faces.max()) + 1, dtype=torch.bool, device=faces.device)
         rim[edges[open_edge].flatten()] = True
         found = open_edge, rim
-        _KNOWN[faces] = faces._version, found
+        _KNOWN[faces] = now, found
     return found
 
 

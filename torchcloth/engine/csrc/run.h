@@ -10,8 +10,8 @@
 namespace tc {
 
 // What the caller hands in and gets back for one field, each [scenes, rows, components] or, for drives,
-// [scenes, substeps, components], and for results [scenes, frames, rows, components]; tangents have the directions
-// after the scenes. Null: not given, not wanted.
+// [scenes, substeps, components], and for results of values [scenes, frames, rows, components]; tangents have the
+// directions after the scenes. Null: not given, not wanted.
 struct Port {
     const void* value;    // of parameters, states, drives
     int64_t stride;       // numbers between scenes; 0: all share one
@@ -29,8 +29,8 @@ struct Call {
     void* records;      // [scenes, records_size]
     int64_t every;      // substeps between records; 0: none
     double worth;       // operations of a substep for which another thread is worth while
-    const int64_t* ends;  // substeps after which there are results, the last after all
-    int64_t frames;       // how many those are; 1 where there are records
+    const int64_t* ends;  // of values: substeps after which there are results
+    int64_t frames;       // how many those are
 };
 
 // Numbers for one scene: [1 + ceil(substeps / every), record_size, or state_size where every > 1], then the triangles
@@ -74,8 +74,9 @@ class Run {
                 after = call.every == 1 ? record(scene, k + 1) : other(m, row);
                 substep(m, scene, k, row, after);
                 row = after;
-                if (k + 1 == call.ends[frame]) finish(m, scene, row, frame++);
+                if (k + 1 == call.ends[frame] && frame + 1 < call.frames) finish(m, scene, row, frame++);
             }
+            finish(m, scene, row, frame);
             learn(m, Mode::value);
         });
     }
@@ -111,7 +112,6 @@ class Run {
             m.rows.reset(2 * program.record_size);
             R *row = m.rows.data, *after = nullptr;
             start(m, scene, row);
-            int64_t frame = 0;
             for (int64_t k = 0; k < call.substeps; k++) {
                 after = other(m, row);
                 point(m, scene, k, row, after);
@@ -119,10 +119,9 @@ class Run {
                 for (size_t f = 0; f < program.fields.size(); f++)
                     if (program.next[f] >= 0) std::swap(m.scene.dot[f], m.scene.dot[program.next[f]]);
                 row = after;
-                if (k + 1 < call.ends[frame]) continue;
-                save_dots(m, scene, group, frame);
-                finish(m, scene, row, frame++, group.first == 0);
             }
+            if (group.first == 0) finish(m, scene, row, 0);
+            save_dots(m, scene, group);
             learn(m, Mode::tangent);
         });
     }
@@ -265,16 +264,15 @@ class Run {
             if (field.kind == Kind::state) load(row + field.offset, field, call.ports[f].value, scene * call.ports[f].stride, 1);
         }
     }
-    // Results of a frame; ``told``: nobody else gives them. Sums begin anew.
-    void finish(Memory& m, int64_t scene, const R* row, int64_t frame, bool told = true) const {
+    // Results of a frame; sums begin anew.
+    void finish(Memory& m, int64_t scene, const R* row, int64_t frame) const {
         for (size_t f = 0; f < program.fields.size(); f++) {
             const Field& field = program.fields[f];
             const int64_t at = (scene * call.frames + frame) * outer(field);
-            if (program.next[f] >= 0 && told) unload(call.ports[program.next[f]].result, at, field, row + field.offset, 1);
+            if (program.next[f] >= 0) unload(call.ports[program.next[f]].result, at, field, row + field.offset, 1);
             if (field.kind != Kind::sum) continue;
-            if (told) unload(call.ports[f].result, at, field, m.scene.value[f], 1);
+            unload(call.ports[f].result, at, field, m.scene.value[f], 1);
             m.values[f].clear();
-            if (m.dots[f].data) m.dots[f].clear();
         }
     }
 
@@ -365,10 +363,10 @@ class Run {
                 load(m.dots[f].data, field, port.dot, scene * port.dot_stride + direction * outer(field), group.size, which);
         });
     }
-    void save_dots(Memory& m, int64_t scene, const Group& group, int64_t frame) const {
+    void save_dots(Memory& m, int64_t scene, const Group& group) const {
         each_dot(group, [&](size_t f, int64_t direction, int which) {
             const Field& field = program.fields[f];
-            const int64_t at = ((scene * call.directions + direction) * call.frames + frame) * outer(field);
+            const int64_t at = (scene * call.directions + direction) * outer(field);
             if (program.next[f] >= 0) unload(call.ports[program.next[f]].dot_result, at, field, m.scene.dot[f], group.size, which);
             if (field.kind == Kind::sum) unload(call.ports[f].dot_result, at, field, m.scene.dot[f], group.size, which);
         });

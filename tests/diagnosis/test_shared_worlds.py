@@ -1,0 +1,66 @@
+"""Worlds about a model's point are made once, whoever asks, and are those that the model makes."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import sheets
+import torch
+
+from torchcloth.diagnosis.base_model import base_model
+from torchcloth.diagnosis.hypotheses import catalogue
+from torchcloth.diagnosis.steps import both_ways, shifted
+from torchcloth.diagnosis.world import Hypothesis
+from torchcloth.diagnosis.worlds import Worlds
+from torchcloth.errors import InvalidInput
+
+RECORDING = sheets.episode()
+
+
+@pytest.fixture
+def model():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield base_model(RECORDING)
+    torch.set_default_dtype(before)
+
+
+def numbers(world):
+    return [p.tolist() for p in world.cloth.parameters()]
+
+
+def test_they_are_those_of_the_model(model):
+    shifts = both_ways(model)
+    worlds = Worlds(model, shifts, model.base)
+    assert numbers(worlds.plain) == numbers(worlds.finest) == numbers(model.world())
+    assert [numbers(w) for w in worlds.beside] == [numbers(shifted(model, *s).world()) for s in shifts]
+    drag = next(h for h in catalogue(model, [RECORDING]) if h.name == "air.drag_n")
+    changed = worlds.changed(drag)
+    assert changed is not None
+    assert numbers(changed) == numbers(drag.apply(model.world(), drag.typical))
+
+
+def test_each_is_made_once_by_many_threads(model):
+    worlds, calls = Worlds(model, both_ways(model)), []
+
+    def apply(world, amplitude):
+        calls.append(amplitude)
+        return world
+
+    both = [Hypothesis("a", "-", 2.0, apply, signed=True), Hypothesis("a", "-", -2.0, apply, signed=True)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda k: worlds.changed(both[k % 2]), range(40)))
+        plain = set(map(id, pool.map(lambda _: worlds.plain, range(40))))
+    assert sorted(calls) == [-2.0, 2.0]
+    assert len(plain) == 1
+    assert [id(w) for w in worlds.beside] == [id(w) for w in worlds.beside]
+
+
+def test_what_no_world_allows_is_none(model):
+    def apply(world, amplitude):
+        calls.append(amplitude)
+        raise InvalidInput("grip", got="too wide", expected="less")
+
+    calls = []
+    worlds, never = Worlds(model), Hypothesis("a", "-", 1.0, apply)
+    assert worlds.changed(never) is worlds.changed(never) is None
+    assert calls == [1.0]

@@ -1,0 +1,111 @@
+"""Frames that one call of the engine gives together are those that it gives one by one."""
+
+import pytest
+import torch
+from clothes import opening, sheet, start
+
+import torchcloth as tc
+from torchcloth import intervals
+from torchcloth.engine import running
+from torchcloth.errors import SimulationDiverged
+
+END = 0.02
+UNEVEN = (0.0, 0.003, 0.0035, 0.011, END)  # substeps of another length in each interval
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(before)
+
+
+def one_by_one(monkeypatch):
+    monkeypatch.setattr("torchcloth.engine.fused.Fused.is_plain", lambda *_: False)
+
+
+def slipping():
+    """A cloth that remembers, whose grip yields."""
+    effects = {
+        "gravity": tc.effects.Gravity(),
+        "slip": tc.effects.GripSlip("right", 0.5, 0.0),
+        "friction": tc.effects.ShearFriction(1.0),
+        "bending": tc.effects.Bending(1e-4, damping_time=1e-3),
+    }
+    return sheet("fused", effects=effects)
+
+
+@pytest.mark.parametrize("make", [lambda: sheet("fused"), slipping], ids=["plain", "slipping"])
+@pytest.mark.parametrize("batch", [(), (3,), (2, 2)], ids=str)
+def test_frames_together_are_frames_one_by_one(make, batch, monkeypatch):
+    cloth = make()
+    with torch.no_grad():
+        together = cloth(start(cloth, batch), opening(END), UNEVEN)
+        one_by_one(monkeypatch)
+        apart = cloth(start(cloth, batch), opening(END), UNEVEN)
+    assert torch.equal(together.x, apart.x)
+    assert torch.equal(together.v, apart.v)
+    assert together.wrench.keys() == apart.wrench.keys() == {"left", "right"}
+    assert all(torch.equal(together.wrench[name], apart.wrench[name]) for name in apart.wrench)
+    assert together.state.memory.keys() == apart.state.memory.keys()
+    assert all(torch.equal(together.state.memory[key], apart.state.memory[key]) for key in apart.state.memory)
+
+
+def test_long_simulations_are_cut_into_calls(monkeypatch):
+    cloth, calls = sheet("fused"), []
+    forward = running.forward
+    monkeypatch.setattr(running, "forward", lambda job, every=0: calls.append(job.ends) or forward(job, every))
+    with torch.no_grad():
+        whole = cloth(start(cloth), opening(END), UNEVEN)
+        assert len(calls) == 1
+        monkeypatch.setattr(intervals, "AT_ONCE", 2 * calls[0][0] * intervals.FEW)
+        cut = cloth(start(cloth), opening(END), UNEVEN)
+    assert 1 < len(calls[1:]) < len(UNEVEN)
+    assert torch.equal(whole.x, cut.x)
+    assert all(torch.equal(whole.wrench[name], cut.wrench[name]) for name in whole.wrench)
+
+
+@pytest.mark.parametrize("wanted", ["cloth", "t", "pose"])
+def test_who_wants_gradients_gets_them_and_the_same_frames(wanted):
+    cloth, motion = sheet("fused"), opening(END)
+    with torch.no_grad():
+        together = cloth(start(cloth), motion, UNEVEN)
+    if wanted != "cloth":
+        cloth.requires_grad_(False)
+        leaf = getattr(motion["left"], wanted).clone().requires_grad_()
+        motion["left"] = motion["left"]._replace(**{wanted: leaf})
+    apart = cloth(start(cloth), motion, UNEVEN)
+    assert apart.x.requires_grad
+    assert torch.equal(together.x, apart.x)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_nobody_drives_it(dtype, monkeypatch):
+    cloth = sheet("fused", boundaries={}).to(dtype)
+    with torch.no_grad():
+        together = cloth(start(cloth), times=UNEVEN)
+        one_by_one(monkeypatch)
+        apart = cloth(start(cloth), times=UNEVEN)
+    assert together.x.dtype == dtype
+    assert torch.equal(together.x, apart.x)
+
+
+def test_who_keeps_the_last_state_keeps_no_other_frames():
+    cloth = sheet("fused")
+    with torch.no_grad():
+        last = cloth(start(cloth), opening(END), UNEVEN).state
+    assert last.x.untyped_storage().nbytes() == last.x.numel() * last.x.element_size()
+
+
+def test_a_cloth_that_is_lost_is_told_alike(monkeypatch):
+    cloth = sheet("fused", material=tc.materials.AEP(1e5, 0.3))
+    torn, told = start(cloth), []
+    torn = torn._replace(v=torn.v * 1e155)  # its square overflows
+    for apart in (False, True):
+        if apart:
+            one_by_one(monkeypatch)
+        with torch.no_grad(), pytest.raises(SimulationDiverged) as error:
+            cloth(torn, opening(END), UNEVEN)
+        told.append(str(error.value))
+    assert told[0] == told[1]
