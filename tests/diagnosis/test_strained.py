@@ -7,7 +7,7 @@ import linear_toys as toys
 import pytest
 import torch
 
-from torchcloth.diagnosis import afresh, stepwise
+from torchcloth.diagnosis import afresh, stepwise, trials
 from torchcloth.diagnosis.afresh import resettled
 from torchcloth.diagnosis.trials import Candidate, Step
 from torchcloth.diagnosis.world import OFTEN
@@ -126,3 +126,14 @@ def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
     monkeypatch.setattr(afresh, "with_cause", lambda _, h: h)
     begun = afresh.afresh(found(0.0), None, causes, 4, lambda _: None, least)  # type: ignore[arg-type]
     assert [h.name for h, _ in begun] == tried
+
+
+@pytest.mark.parametrize(
+    ("alone", "surely", "useful"), [(set(), 1.0, True), ({"fold"}, 17.0, False), ({"fold"}, 26.0, True)]
+)
+def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, alone, surely, useful):
+    """No other motion has predicted it: friction of one fold gained 38 (17 to 68) and was not there."""
+    monkeypatch.setattr(trials, "worth_naming", lambda *_: True)
+    monkeypatch.setattr(trials, "known", lambda *_: True)
+    gain, row = SimpleNamespace(ci95=(surely, 99.0)), SimpleNamespace(hypothesis=CAUSE)
+    assert trials._useful(Candidate(row, None, None, gain, alone, 2.0), ["fold", "hang"]) == useful  # type: ignore[arg-type]
