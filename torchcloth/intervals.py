@@ -23,10 +23,8 @@ from .types import ClothState, Rollout, Trajectory
 from .validation import check_extent
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
-AT_ONCE, FEW = (
-    4_000_000,
-    250,
-)  # vertices times substeps of one call, which nobody can interrupt; fewer vertices count so
+AT_ONCE = 4_000_000  # vertices times substeps of one call, which nobody can interrupt
+FEW = 250  # vertices, as which fewer count
 
 
 class Interval(NamedTuple):

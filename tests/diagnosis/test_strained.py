@@ -99,8 +99,13 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     assert end is doubted[-1]
 
 
-@pytest.mark.parametrize(("lacking", "surely", "named"), [(True, 1.0, True), (False, 1.0, False), (False, 26.0, True)])
-def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(monkeypatch, lacking, surely, named):
+@pytest.mark.parametrize(
+    ("motions", "lacking", "surely", "named"),
+    [("abc", True, 1.0, True), ("abc", False, 1.0, False), ("abc", False, 26.0, True), ("aab", False, 26.0, False)],
+)
+def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(
+    monkeypatch, motions, lacking, surely, named
+):
     """The fit has made up for half an effect, and nulls' causes promise something as well."""
     start, tried = found(0.1), []
     gain = SimpleNamespace(ci95=(surely, 99.0))
@@ -110,9 +115,9 @@ def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(m
     monkeypatch.setattr(stepwise, "afresh", lambda *a: tried.append(a[-1]) or [])
     monkeypatch.setattr(stepwise, "one_step", lambda *_: first)
     monkeypatch.setattr(stepwise, "_chain", lambda *a: (start, [a[-1]]))
-    _, steps = stepwise._anew(start, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
+    _, steps = stepwise._anew(start, SimpleNamespace(names=[*motions]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
     assert steps == ([first] if named else [])
-    assert tried == [0.0 if lacking else stepwise.MUCH]
+    assert tried == ([] if motions == "aab" else [0.0 if lacking else stepwise.MUCH])
 
 
 @pytest.mark.parametrize(("least", "tried"), [(0.0, ["much", "half"]), (5.0, ["much"]), (20.0, [])])

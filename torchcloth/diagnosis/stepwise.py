@@ -22,6 +22,7 @@ from .worlds import if_possible
 
 MOST = 4  # causes
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
+FEWEST = 3  # motions, of which one is held out: two name only what is overwhelming, and that is lacking
 LEAST = 1 / 3  # of what is wrong, that all causes explain beside something else
 HALF = 0.5  # the same of a further cause, and of what only motions tell that do not fit; of what is gained, a law more
 
@@ -98,6 +99,8 @@ def _anew(
     Where nothing is lacking any more, it must surely gain what nulls' causes do not.
     """
     lacking, screened = is_lacking(start, setting.names), screen(start)
+    if not lacking and len(set(setting.names)) < FEWEST:
+        return start, []
     rows = {row.hypothesis.name: row for row in screened}
     asked = [row.hypothesis for row in screened if row.sight]
     least = 0.0 if lacking else MUCH

@@ -17,8 +17,8 @@ namespace tc {
 
 // constant: of the mesh. parameter: an input with a derivative. state: at the start of the substep; its `next` at the
 // end. temporary: within a substep; a kept one is recorded, because the reverse sweep reads it. drive: one row per
-// substep. sum: added up over the substeps of a frame. nodes, points: of contact, which sees to their memory; what loops over points
-// tell each other lies there as in registers, pack by pack.
+// substep. sum: added up over the substeps of a frame. nodes, points: of contact, which sees to their memory; what loops
+// over points tell each other lies there as in registers, pack by pack.
 enum class Kind : int { constant, parameter, state, next, temporary, kept, drive, sum, nodes, points };
 
 struct Field {
