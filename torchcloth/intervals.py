@@ -59,10 +59,13 @@ def _drives(motion: Mapping[str, Trajectory], times: Tensor) -> dict[str, Drive]
     return {name: drive(trajectory, times) for name, trajectory in motion.items()}
 
 
-def _part(whole: Drive, first: int, last: int) -> Drive:
+def _parts(drives: Mapping[str, Drive], first: int, last: int) -> dict[str, Drive]:
     """Some of the substeps."""
-    increment, pose = (field[..., first:last, :, :] for field in (whole.increment, whole.pose))
-    return Drive(increment, pose, whole.closed[first:last])
+    some = slice(first, last)
+    return {
+        name: Drive(whole.increment[..., some, :, :], whole.pose[..., some, :, :], whole.closed[some])
+        for name, whole in drives.items()
+    }
 
 
 class Plan(NamedTuple):
@@ -81,7 +84,7 @@ class Plan(NamedTuple):
         whole, first = self.drives(), 0
         for interval in self._bare():
             last = first + interval.count
-            yield interval._replace(moves={name: _part(drive, first, last) for name, drive in whole.items()})
+            yield interval._replace(moves=_parts(whole, first, last))
             first = last
 
     def stretches(self) -> Iterator[tuple[list[Interval], dict[str, Drive]]]:
@@ -90,7 +93,7 @@ class Plan(NamedTuple):
         most = AT_ONCE // max(self.state.x.numel() // 3, FEW)
         for interval in (*self._bare(), None):
             if some and (interval is None or last - first + interval.count > most):
-                yield some, {name: _part(drive, first, last) for name, drive in whole.items()}
+                yield some, _parts(whole, first, last)
                 first, some = last, []
             if interval is not None:
                 last, some = last + interval.count, [*some, interval]
@@ -151,8 +154,7 @@ def _together(
         first = 0
         for interval, before, own in zip(some, [state, *after], after, strict=False):
             last = first + interval.count
-            moves = {name: _part(drive, first, last) for name, drive in drives.items()}
-            check_finite(interval._replace(moves=moves), before, own)
+            check_finite(interval._replace(moves=_parts(drives, first, last)), before, own)
             first = last
     return found
 

@@ -4,7 +4,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import sheets
-import torch
 
 from torchcloth.diagnosis.base_model import base_model
 from torchcloth.diagnosis.hypotheses import catalogue
@@ -18,10 +17,7 @@ RECORDING = sheets.episode()
 
 @pytest.fixture
 def model():
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
-    yield base_model(RECORDING)
-    torch.set_default_dtype(before)
+    return base_model(RECORDING)
 
 
 def numbers(world):

@@ -13,14 +13,6 @@ END = 0.02
 UNEVEN = (0.0, 0.003, 0.0035, 0.011, END)  # substeps of another length in each interval
 
 
-@pytest.fixture(autouse=True)
-def _float64():
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(before)
-
-
 def one_by_one(monkeypatch):
     monkeypatch.setattr("torchcloth.engine.fused.Fused.is_plain", lambda *_: False)
 

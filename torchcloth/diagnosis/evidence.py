@@ -87,7 +87,6 @@ def asked_about(
     progress: Progress = lambda _: None,
 ) -> Evidence:
     """``here``, the evidence at the model's point, with slopes along these hypotheses; only they are simulated."""
-
     worlds = Worlds(model)
 
     def ask(k: int, asked: list[Hypothesis]) -> Piece:

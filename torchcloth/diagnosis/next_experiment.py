@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -57,6 +58,11 @@ class Question:
     amplitudes: Mapping[str, float]
     pairs: tuple[tuple[str, str], ...] = ()
 
+    @cached_property
+    def worlds(self) -> Worlds:
+        """Of the model and beside it, for all experiments."""
+        return Worlds(self.fitted.model, both_ways(self.fitted.model))
+
 
 def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress: Progress) -> dict | None:
     """The content of ``next_experiment``; None where nothing is open, or nothing can be done about it."""
@@ -65,13 +71,12 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
         return None
     names = list(question.amplitudes)
     now = distances(question, information(question, []))
-    worlds = Worlds(question.fitted.model, both_ways(question.fitted.model))
 
     def ask(choice: tuple[Experiment, Recording]) -> tuple[Experiment, Tensor] | None:
         experiment, template = choice
         progress(str(experiment))
         try:
-            return experiment, whitened_slopes(question, planned(experiment, template), setting, worlds)
+            return experiment, whitened_slopes(question, planned(experiment, template), setting)
         except (TorchclothError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             return None  # it cannot be simulated, so it says nothing
 
@@ -151,16 +156,13 @@ def distances(question: Question, left: Tensor) -> dict[tuple[str, ...], float]:
     return out
 
 
-def whitened_slopes(question: Question, recording: Recording, setting: Setting, worlds: Worlds | None = None) -> Tensor:
-    """[C, own + causes] of an experiment that has not been done, by the present model on the coarser mesh.
-
-    ``worlds``: of the question's model and beside it, where other experiments have them, too.
-    """
+def whitened_slopes(question: Question, recording: Recording, setting: Setting) -> Tensor:
+    """[C, own + causes] of an experiment that has not been done, by the present model on the coarser mesh."""
     found, model = question.fitted, question.fitted.model
     hypotheses = [found.evidence.hypotheses[k] for k in _columns(question)]
-    worlds = worlds or Worlds(model, both_ways(model))
-    world, shifts, blank = worlds.plain, worlds.shifts, foreseen(episode(model.base.cloth, recording))
-    done = runs(worlds, blank, setting.dt, hypotheses, with_held=True)
+    world, shifts = question.worlds.plain, question.worlds.shifts
+    blank = foreseen(episode(model.base.cloth, recording))
+    done = runs(question.worlds, blank, setting.dt, hypotheses, with_held=True)
     trials = [t for t in done.trials if t is not None]
     if len(trials) < len(hypotheses):
         raise InvalidInput("experiment", got="a cause that it cannot be simulated with", expected="another experiment")

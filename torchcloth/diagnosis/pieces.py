@@ -34,9 +34,8 @@ def piece_of(
     known: Sequence[Tensor] | None,
 ) -> Piece:
     """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
-    if setting.finer is None:
-        raise ValueError("a setting without a finer one")
-    e, world, finer = setting.episodes[k], worlds.plain, setting.finer
+    e, world = setting.episodes[k], worlds.plain
+    finer: Setting = setting.finer  # type: ignore[assignment]
     steps = [taken(worlds.model, coordinate, step) for coordinate, step in worlds.shifts]
     fine = partial(worlds.finest.frames, finer.episodes[k], finer.dt)
     found = runs(worlds, e, setting.dt, hypotheses, with_held=known is None, finer=fine)

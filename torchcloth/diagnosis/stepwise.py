@@ -98,9 +98,10 @@ def _anew(
 
     Where nothing is lacking any more, it must surely gain what nulls' causes do not.
     """
-    lacking, screened = is_lacking(start, setting.names), screen(start)
+    lacking = is_lacking(start, setting.names)
     if not lacking and len(set(setting.names)) < FEWEST:
         return start, []
+    screened = screen(start)
     rows = {row.hypothesis.name: row for row in screened}
     asked = [row.hypothesis for row in screened if row.sight]
     least = 0.0 if lacking else MUCH

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from threading import RLock
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from .steps import shifted
@@ -30,18 +30,18 @@ class Worlds:
 
     def __init__(self, model: Model, shifts: Sequence[tuple[int, float]] = (), finer: World | None = None) -> None:
         self.model, self.shifts, self._finer = model, list(shifts), finer
-        self._made: dict[object, World | None] = {}
+        self._made: dict[object, Any] = {}
         self._making = RLock()
 
     @property
     def plain(self) -> World:
         """At the point."""
-        return self._sure("plain", self.model.world)
+        return self._once("plain", self.model.world)
 
     @property
     def beside(self) -> list[World]:
         """At the points beside."""
-        return [self._sure(k, lambda s=s: shifted(self.model, *s).world()) for k, s in enumerate(self.shifts)]
+        return [self._once(k, lambda s=s: shifted(self.model, *s).world()) for k, s in enumerate(self.shifts)]
 
     @property
     def finest(self) -> World:
@@ -49,20 +49,14 @@ class Worlds:
         if self._finer is None:
             raise ValueError("no finer mesh")
         base = self._finer
-        return self._sure("finest", lambda: replace(self.model, base=base).world())
+        return self._once("finest", lambda: replace(self.model, base=base).world())
 
     def changed(self, hypothesis: Hypothesis) -> World | None:
         """With a hypothesis at its typical amplitude; None: no such world."""
         name = (hypothesis.name, hypothesis.typical)
         return self._once(name, lambda: if_possible(lambda: hypothesis.apply(self.plain, hypothesis.typical)))
 
-    def _sure(self, key: object, make: Callable[[], World]) -> World:
-        found = self._once(key, make)
-        if found is None:
-            raise ValueError("a world that was not made")
-        return found
-
-    def _once(self, key: object, make: Callable[[], World | None]) -> World | None:
+    def _once(self, key: object, make: Callable[[], T]) -> T:
         with self._making:
             if key not in self._made:
                 self._made[key] = make()
