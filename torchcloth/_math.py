@@ -58,24 +58,25 @@ def hermite(t: Tensor, value: Tensor, slope: Tensor, times: Tensor) -> Tensor:
 
     ``value`` and ``slope``, its derivative, are [..., K, A, B].
     """
-    k, step, s = _between_knots(t, times)
-    return (
-        (2 * s**3 - 3 * s**2 + 1) * value.index_select(-3, k)
-        + (s**3 - 2 * s**2 + s) * step * slope.index_select(-3, k)
-        + (3 * s**2 - 2 * s**3) * value.index_select(-3, k + 1)
-        + (s**3 - s**2) * step * slope.index_select(-3, k + 1)
-    )
+    k, _, s = _between_knots(t, times)
+    a, b, c, d = _cubics(t, value, slope, k)
+    return torch.addcmul(a, s, torch.addcmul(b, s, torch.addcmul(c, s, d)))
 
 
 def hermite_slope(t: Tensor, value: Tensor, slope: Tensor, times: Tensor) -> Tensor:
     """Derivative of ``hermite`` by ``times``; the first and last slope beyond."""
     k, step, s = _between_knots(t, times)
-    chord = (value.index_select(-3, k + 1) - value.index_select(-3, k)) / step
-    return (
-        6 * (s - s**2) * chord
-        + (3 * s**2 - 4 * s + 1) * slope.index_select(-3, k)
-        + (3 * s**2 - 2 * s) * slope.index_select(-3, k + 1)
-    )
+    _, b, c, d = _cubics(t, value, slope, k)
+    return torch.addcmul(b, s, torch.addcmul(2 * c, 3 * s, d)) / step
+
+
+def _cubics(t: Tensor, value: Tensor, slope: Tensor, k: Tensor) -> tuple[Tensor, ...]:
+    """Coefficients [..., N, A, B] of each power, from the constant on, of the share of the way from the knots ``k``."""
+    rise = value[..., 1:, :, :] - value[..., :-1, :, :]
+    step = (t[1:] - t[:-1])[:, None, None]
+    first, last = step * slope[..., :-1, :, :], step * slope[..., 1:, :, :]
+    found = (value[..., :-1, :, :], first, 3 * rise - 2 * first - last, first + last - 2 * rise)
+    return torch.stack(found, -3).index_select(-4, k).unbind(-3)
 
 
 def _between_knots(t: Tensor, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:

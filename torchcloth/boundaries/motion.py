@@ -86,14 +86,15 @@ def interpolate(trajectory: Trajectory, times: Tensor) -> Tensor:
     t, times = ((some - origin).to(pose) for some in (trajectory.t.to(times), times))
     if len(t) == 1:
         return pose.expand(*pose.shape[:-3], len(times), 4, 4)
-    mixed = hermite(t, pose, _slopes(t, pose), times)
-    first = mixed[..., :3, 0]
+    told = torch.cat([pose[..., :3, :2], pose[..., :3, 3:]], dim=-1)  # the third column follows from the first two
+    mixed = hermite(t, told, _slopes(t, told), times)
+    first = mixed[..., 0]
     first = first * dot(first, first).rsqrt()
-    second = mixed[..., :3, 1]
+    second = mixed[..., 1]
     second = second - dot(first, second) * first
     second = second * dot(second, second).rsqrt()
     rotation = torch.stack([first, second, cross(first, second)], dim=-1)
-    top = torch.cat([rotation, mixed[..., :3, 3:]], dim=-1)
+    top = torch.cat([rotation, mixed[..., 2:]], dim=-1)
     return torch.cat([top, pose.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)], dim=-2)
 
 
@@ -114,11 +115,11 @@ def drive(trajectory: Trajectory, times: Tensor) -> Drive:
     return Drive(increment.to(given), after.to(given), tuple(closed.tolist()))
 
 
-def _slopes(t: Tensor, pose: Tensor) -> Tensor:
-    """Derivative of each knot's pose [..., K, 4, 4] 1/s: central differences weighted for uneven knots."""
+def _slopes(t: Tensor, value: Tensor) -> Tensor:
+    """Derivative at each knot [..., K, A, B] 1/s: central differences weighted for uneven knots."""
     h = (t[1:] - t[:-1])[:, None, None]
-    secant = (pose[..., 1:, :, :] - pose[..., :-1, :, :]) / h
+    secant = (value[..., 1:, :, :] - value[..., :-1, :, :]) / h
     if len(t) == 2:
-        return secant.expand_as(pose)
+        return secant.expand_as(value)
     inner = (h[1:] * secant[..., :-1, :, :] + h[:-1] * secant[..., 1:, :, :]) / (h[1:] + h[:-1])
     return torch.cat([secant[..., :1, :, :], inner, secant[..., -1:, :, :]], dim=-3)
