@@ -87,7 +87,7 @@ def asked_about(
     progress: Progress = lambda _: None,
 ) -> Evidence:
     """``here``, the evidence at the model's point, with slopes along these hypotheses; only they are simulated."""
-    worlds = Worlds(model)
+    worlds = Worlds(model, (), setting.finer and setting.finer.base)
 
     def ask(k: int, asked: list[Hypothesis]) -> Piece:
         question = [k, "asked", [h.name for h in model.accepted], _told(asked)]

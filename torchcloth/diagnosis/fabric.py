@@ -85,7 +85,7 @@ def _tilt(axis: int, world: World, angle: float) -> World:
 OF_BENDING = ("damp.bend", "plast.crease", "bend.aniso", "rest.curl")  # effects that change a cloth's bending
 HYPOTHESES = (
     Hypothesis("damp.bend", "s", 0.05, lambda w, a: _bending(w, damping_time=a)),
-    Hypothesis("plast.crease", "1/s", 5.0, lambda w, a: _bending(w, mobility=a)),
+    Hypothesis("plast.crease", "1/s", 5.0, lambda w, a: _bending(w, mobility=a), finer=True),
     Hypothesis("bend.aniso", "-", -0.6, lambda w, a: _bending(w, weft=a), signed=True, low=-MOST),
     Hypothesis("elas.ortho", "-", 0.5, lambda w, a: _moduli(w, weft=a), signed=True, high=MOST),
     Hypothesis("elas.shear", "-", -0.6, lambda w, a: _moduli(w, shear=a), signed=True, low=-MOST),

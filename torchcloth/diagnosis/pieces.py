@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -37,33 +37,60 @@ def piece_of(
     e, world = setting.episodes[k], worlds.plain
     finer: Setting = setting.finer  # type: ignore[assignment]
     steps = [taken(worlds.model, coordinate, step) for coordinate, step in worlds.shifts]
-    fine = partial(worlds.finest.frames, finer.episodes[k], finer.dt)
-    found = runs(worlds, e, setting.dt, hypotheses, with_held=known is None, finer=fine)
-    able = torch.tensor([t is not None for t in found.trials], dtype=torch.bool)
-    typical = [h.typical for h, t in zip(hypotheses, found.trials, strict=True) if t is not None]
-    base = world.seen(found.plain, e)
-    moved = directions(base, [*found.beside, *(t for t in found.trials if t is not None)], [*steps, *typical])
+    found = runs(worlds, e, setting.dt, hypotheses, known is None, (finer.episodes[k], finer.dt))
+    base, able = world.seen(found.plain, e), [t is not None for t in found.trials]
+    sides = [*zip(found.beside, steps, worlds.finer_beside, strict=True), *_trials(worlds, hypotheses, found)]
+    moved, fine = _slopes(base, sides, False), _slopes(found.fine, sides, True)
     if known is None:
         other, std = nuisances(world, base, found.held, e)
-        coarse = cells_of(base, joined(moved, other), e, setting.sheet, setting.rest)
+        coarse = cells_of(base, other if moved is None else joined(moved, other), e, setting.sheet, setting.rest)
     else:
         key, slopes, std = known
         coarse = cells_of(base, moved, e, setting.sheet, setting.rest)
         coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, aligned(coarse.key, key, slopes)], 1))
-    kept, difference = _replaced(coarse, cells_of(found.fine, None, finer.episodes[k], finer.sheet, finer.rest))
-    return Piece(kept, std, difference, able)
+    finer_cells = cells_of(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest)
+    kept, difference = _replaced(_woven(coarse, finer_cells, sides), finer_cells)
+    return Piece(kept, std, difference, torch.tensor(able, dtype=torch.bool))
 
 
 def asked_piece(worlds: Worlds, setting: Setting, k: int, hypotheses: Sequence[Hypothesis]) -> Piece:
     """Slopes of the k-th episode along hypotheses alone; ``worlds`` without shifts."""
-    e = setting.episodes[k]
-    found = runs(worlds, e, setting.dt, hypotheses, with_held=False)
-    base, moved = worlds.plain.seen(found.plain, e), [t for t in found.trials if t is not None]
-    able = torch.tensor([t is not None for t in found.trials], dtype=torch.bool)
-    typical = [h.typical for h, t in zip(hypotheses, found.trials, strict=True) if t is not None]
-    slopes = directions(base, moved, typical) if moved else None
+    e, finer = setting.episodes[k], setting.finer if any(map(worlds.is_finer, hypotheses)) else None
+    found = runs(worlds, e, setting.dt, hypotheses, False, finer and (finer.episodes[k], finer.dt))
+    base, able = worlds.plain.seen(found.plain, e), [t is not None for t in found.trials]
+    sides = list(_trials(worlds, hypotheses, found))
+    cells = cells_of(base, _slopes(base, sides, False), e, setting.sheet, setting.rest)
+    if finer is not None:
+        fine = _slopes(found.fine, sides, True)
+        cells = _woven(cells, cells_of(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest), sides)
     none = torch.zeros(0, dtype=torch.float64)
-    return Piece(cells_of(base, slopes, e, setting.sheet, setting.rest), none, none, able)
+    return Piece(cells, none, none, torch.tensor(able, dtype=torch.bool))
+
+
+Side = tuple[Frames, float, bool]  # beside the point, by which step, and whether on the finer mesh
+
+
+def _trials(worlds: Worlds, hypotheses: Sequence[Hypothesis], found: Runs) -> Iterator[Side]:
+    """Of what could be simulated."""
+    for h, frames in zip(hypotheses, found.trials, strict=True):
+        if frames is not None:
+            yield frames, h.typical, worlds.is_finer(h)
+
+
+def _slopes(base: Frames, sides: Sequence[Side], finer: bool) -> Frames | None:
+    """Along those on one mesh; None: there are none."""
+    own = [(frames, step) for frames, step, fine in sides if fine == finer]
+    return directions(base, *zip(*own, strict=True)) if own else None
+
+
+def _woven(coarse: Cells, fine: Cells, sides: Sequence[Side]) -> Cells:
+    """The coarse cells, first with a column for each side, from its own mesh."""
+    first = [k for k, (*_, finer) in enumerate(sides) if not finer]
+    last = [k for k, (*_, finer) in enumerate(sides) if finer]
+    own, rest = coarse.jacobian[:, : len(first)], coarse.jacobian[:, len(first) :]
+    columns = torch.cat([own, aligned(coarse.key, fine.key, fine.jacobian)], 1)
+    order = torch.argsort(torch.tensor([*first, *last], dtype=torch.int64))
+    return coarse._replace(jacobian=torch.cat([columns[:, order], rest], 1))
 
 
 class Runs(NamedTuple):
@@ -71,9 +98,9 @@ class Runs(NamedTuple):
 
     fine: Frames  # on the finer mesh; the plain ones where nobody asked
     plain: Frames  # what happens, whoever looks on
-    beside: list[Frames]  # along the model's own coordinates
+    beside: list[Frames]  # along the model's own coordinates, each on the mesh of its slopes
     held: list[Frames]  # with the held places off
-    trials: list[Frames | None]  # with each hypothesis; None: cannot be simulated
+    trials: list[Frames | None]  # with each hypothesis, likewise; None: cannot be simulated
 
 
 def runs(
@@ -82,25 +109,38 @@ def runs(
     dt: float | None,
     hypotheses: Sequence[Hypothesis],
     with_held: bool,
-    finer: Callable[[], Frames] | None = None,
+    finer: tuple[Episode, float | None] | None = None,
 ) -> Runs:
-    """An episode in a world, in those beside it, with every hypothesis and with held places off, side by side."""
-    world = worlds.plain
-    beside = [partial(w.frames, e, dt) for w in worlds.beside]
+    """An episode in a world, in those beside it, with every hypothesis and with held places off, side by side.
+
+    ``finer``: the same episode on the finer mesh, and its step; needed for what has its slopes there.
+    """
+    world, own = worlds.plain, (e, dt)
+    on = lambda fine: finer if fine and finer else own  # noqa: E731
+    beside = [partial(w.frames, *on(fine)) for w, fine in zip(worlds.beside, worlds.finer_beside, strict=True)]
     modes = Held().modes(world.cloth, e) if with_held else ()
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m), dt) for m in modes]
     changed = [worlds.changed(h) for h in hypotheses]
-    moves = [c is not None and (c.cloth is not world.cloth or c.motions is not world.motions) for c in changed]
-    first = [] if finer is None else [finer]  # it takes longest
+    moves = [c is not None and _moves(c, worlds.like(h)) for c, h in zip(changed, hypotheses, strict=True)]
+    first = [partial(worlds.finest.frames, *finer)] if finer else []  # it takes longest
     jobs = [*first, partial(world.simulated, e, dt), *beside, *held]
-    tried = [partial(if_possible, partial(c.frames, e, dt)) for c, own in zip(changed, moves, strict=True) if c and own]
+    tried = [
+        partial(if_possible, partial(c.frames, *on(worlds.is_finer(h))))
+        for c, h, other in zip(changed, hypotheses, moves, strict=True)
+        if c and other
+    ]
     done: list[Any] = side_by_side(lambda job: job(), [*jobs, *tried])
     plain, *sure = done[len(first) : len(jobs)]
-    fine = plain if finer is None else done[0]
+    fine = done[0] if finer else plain
     rest = iter(done[len(jobs) :])
     seen = lambda c: c and if_possible(partial(c.seen, plain, e))  # noqa: E731
-    trials = [next(rest) if own else seen(c) for c, own in zip(changed, moves, strict=True)]
+    trials = [next(rest) if other else seen(c) for c, other in zip(changed, moves, strict=True)]
     return Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials)
+
+
+def _moves(changed: World, world: World) -> bool:
+    """More than how it is looked at has changed."""
+    return changed.cloth is not world.cloth or changed.motions is not world.motions
 
 
 def side_by_side(work: Callable[[T], U], items: Sequence[T]) -> list[U]:

@@ -121,6 +121,7 @@ class Hypothesis:
             tells of the hypothesis.
         low, high: amplitudes that a world can have.
         brings: another hypothesis, which comes along at its typical amplitude where the world has none of it.
+        finer: its slopes are taken on the finer mesh, for it acts in folds that the given one is too coarse for.
     """
 
     name: str
@@ -136,6 +137,7 @@ class Hypothesis:
     low: float = -math.inf
     high: float = math.inf
     brings: str = ""
+    finer: bool = False
 
     @property
     def effect(self) -> str:

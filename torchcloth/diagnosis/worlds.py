@@ -40,21 +40,41 @@ class Worlds:
 
     @property
     def beside(self) -> list[World]:
-        """At the points beside."""
-        return [self._once(k, lambda s=s: shifted(self.model, *s).world()) for k, s in enumerate(self.shifts)]
+        """At the points beside; on the finer mesh along what has its slopes there."""
+        made = lambda k, s: shifted(self._on_finer if self.finer_beside[k] else self.model, *s).world()  # noqa: E731
+        return [self._once(k, lambda k=k, s=s: made(k, s)) for k, s in enumerate(self.shifts)]
 
     @property
     def finest(self) -> World:
         """At the point, on the finer mesh."""
-        if self._finer is None:
-            raise ValueError("no finer mesh")
-        base = self._finer
-        return self._once("finest", lambda: replace(self.model, base=base).world())
+        return self._once("finest", lambda: self._on_finer.world())
 
     def changed(self, hypothesis: Hypothesis) -> World | None:
-        """With a hypothesis at its typical amplitude; None: no such world."""
+        """With a hypothesis at its typical amplitude, on its own mesh; None: no such world."""
         name = (hypothesis.name, hypothesis.typical)
-        return self._once(name, lambda: if_possible(lambda: hypothesis.apply(self.plain, hypothesis.typical)))
+        return self._once(
+            name, lambda: if_possible(lambda: hypothesis.apply(self.like(hypothesis), hypothesis.typical))
+        )
+
+    def like(self, hypothesis: Hypothesis) -> World:
+        """Without a hypothesis, on the mesh on which its slopes are taken."""
+        return self.finest if self.is_finer(hypothesis) else self.plain
+
+    def is_finer(self, hypothesis: Hypothesis) -> bool:
+        """Its slopes are taken on the finer mesh; there must be one."""
+        return hypothesis.finer and self._finer is not None
+
+    @property
+    def finer_beside(self) -> list[bool]:
+        """Which points beside are looked at on the finer mesh."""
+        own = [*(False for _ in self.model.parameters), *map(self.is_finer, self.model.accepted)]
+        return [own[coordinate] for coordinate, _ in self.shifts]
+
+    @property
+    def _on_finer(self) -> Model:
+        if self._finer is None:
+            raise ValueError("no finer mesh")
+        return replace(self.model, base=self._finer)
 
     def _once(self, key: object, make: Callable[[], T]) -> T:
         with self._making:

@@ -1,0 +1,87 @@
+"""Causes that act in folds have their slopes on the finer mesh, each in its own column."""
+
+from dataclasses import replace
+
+import pytest
+import sheets
+import torch
+
+from torchcloth.diagnosis.base_model import base_model
+from torchcloth.diagnosis.cells import aligned, cells_of, directions
+from torchcloth.diagnosis.evidence import asked_about, gather
+from torchcloth.diagnosis.hypotheses import catalogue
+from torchcloth.diagnosis.pieces import runs
+from torchcloth.diagnosis.refined import refined
+from torchcloth.diagnosis.setting import setting_of
+from torchcloth.diagnosis.worlds import Worlds
+
+RECORDING = sheets.episode()
+
+
+@pytest.fixture(scope="module")
+def made():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    model = base_model(RECORDING)
+    yield model, setting_of(model, [RECORDING])
+    torch.set_default_dtype(before)
+
+
+@pytest.fixture(scope="module")
+def asked(made):
+    """Three of the catalogue; the middle one only on the finer mesh."""
+    by = {h.name: h for h in catalogue(made[0], [RECORDING])}
+    return [by["air.drag_n"], replace(by["bend.aniso"], finer=True), by["mass.hem"]]
+
+
+def on_finer(made, hypothesis, key, model=None):
+    """Slopes by simulations of the finer mesh alone, for the cells of ``key``."""
+    model, setting = model or made[0], made[1]
+    finer, world = setting.finer, refined(model, [RECORDING])[0].world()
+    e = finer.episodes[0]
+    base, moved = world.frames(e), hypothesis.apply(world, hypothesis.typical).frames(e)
+    found = cells_of(base, directions(base, [moved], [hypothesis.typical]), e, finer.sheet, finer.rest)
+    return aligned(key, found.key, found.jacobian)[:, 0]
+
+
+def test_creases_are_one():
+    model = base_model(RECORDING)
+    assert [h.name for h in catalogue(model, [RECORDING]) if h.finer] == ["plast.crease"]
+
+
+def test_its_column_is_of_the_finer_mesh_and_the_others_as_before(made, asked):
+    model, setting = made
+    found, usual = gather(model, setting, asked), gather(model, setting, [replace(h, finer=False) for h in asked])
+    place = found.own + 1
+    own = found.cells[0].jacobian[:, place]
+    assert torch.equal(own, on_finer(made, asked[1], found.cells[0].key))
+    changed = [k for k in range(usual.cells[0].jacobian.shape[1]) if k != place]
+    assert torch.equal(found.cells[0].jacobian[:, changed], usual.cells[0].jacobian[:, changed])
+    assert not torch.allclose(own, usual.cells[0].jacobian[:, place], rtol=1e-3)
+
+
+def test_who_asks_later_is_told_the_same(made, asked):
+    model, setting = made
+    at_once, known = gather(model, setting, asked), gather(model, setting, asked[:1])
+    later = asked_about(known, model, setting, asked)
+    assert torch.equal(at_once.cells[0].jacobian, later.cells[0].jacobian)
+
+
+def test_an_accepted_one_keeps_its_mesh(made, asked):
+    """Beside a small amplitude, too: its own column is about what it was asked by, from the finer mesh."""
+    model, setting = made
+    cause = replace(asked[1], step=1.0)  # slopes by the typical amplitude, both ways
+    found = gather(model.plus(cause), setting)
+    place = len(model.point)
+    column = 0.5 * sum(
+        on_finer(made, replace(cause, typical=sign * cause.typical), found.cells[0].key) for sign in (1.0, -1.0)
+    )
+    torch.testing.assert_close(found.cells[0].jacobian[:, place], column, rtol=1e-9, atol=1e-12)
+
+
+def test_without_a_finer_mesh_it_is_as_the_others(made, asked):
+    """As where experiments are planned."""
+    model, setting = made
+    done = runs(Worlds(model), setting.episodes[0], None, asked, with_held=False)
+    coarse = asked[1].apply(model.world(), asked[1].typical).frames(setting.episodes[0])
+    assert torch.equal(done.trials[1].x, coarse.x)
