@@ -34,9 +34,9 @@ def asked(made):
     return [by["air.drag_n"], replace(by["bend.aniso"], finer=True), by["mass.hem"]]
 
 
-def on_finer(made, hypothesis, key, model=None):
+def on_finer(made, hypothesis, key):
     """Slopes by simulations of the finer mesh alone, for the cells of ``key``."""
-    model, setting = model or made[0], made[1]
+    model, setting = made
     finer, world = setting.finer, refined(model, [RECORDING])[0].world()
     e = finer.episodes[0]
     base, moved = world.frames(e), hypothesis.apply(world, hypothesis.typical).frames(e)
@@ -85,3 +85,15 @@ def test_without_a_finer_mesh_it_is_as_the_others(made, asked):
     done = runs(Worlds(model), setting.episodes[0], None, asked, with_held=False)
     coarse = asked[1].apply(model.world(), asked[1].typical).frames(setting.episodes[0])
     assert torch.equal(done.trials[1].x, coarse.x)
+
+
+def test_what_does_nothing_on_the_given_mesh_is_not_simulated_on_the_finer(made, asked):
+    model, setting = made
+    (crease,) = (h for h in catalogue(model, [RECORDING]) if h.name == "plast.crease")
+    e, finer = setting.episodes[0], (setting.finer.episodes[0], None)
+    worlds = Worlds(model, (), setting.finer.base)
+    slack = replace(crease, apply=lambda world, amplitude: world.with_cloth())  # another cloth, which moves alike
+    none, some = (runs(worlds, e, None, [h], with_held=False, finer=finer) for h in (slack, asked[1]))
+    assert (none.fine, none.refined) == (None, set())
+    assert some.fine is not None
+    assert some.refined == {0}

@@ -37,9 +37,9 @@ def piece_of(
     e, world = setting.episodes[k], worlds.plain
     finer: Setting = setting.finer  # type: ignore[assignment]
     steps = [taken(worlds.model, coordinate, step) for coordinate, step in worlds.shifts]
-    found = runs(worlds, e, setting.dt, hypotheses, known is None, (finer.episodes[k], finer.dt))
+    found = runs(worlds, e, setting.dt, hypotheses, known is None, (finer.episodes[k], finer.dt), with_fine=True)
     base, able = world.seen(found.plain, e), [t is not None for t in found.trials]
-    sides = [*zip(found.beside, steps, worlds.finer_beside, strict=True), *_trials(worlds, hypotheses, found)]
+    sides = [*zip(found.beside, steps, worlds.finer_beside, strict=True), *_trials(hypotheses, found)]
     moved, fine = _slopes(base, sides, False), _slopes(found.fine, sides, True)
     if known is None:
         other, std = nuisances(world, base, found.held, e)
@@ -48,19 +48,19 @@ def piece_of(
         key, slopes, std = known
         coarse = cells_of(base, moved, e, setting.sheet, setting.rest)
         coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, aligned(coarse.key, key, slopes)], 1))
-    finer_cells = cells_of(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest)
+    finer_cells = cells_of(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest)  # type: ignore[arg-type]
     kept, difference = _replaced(_woven(coarse, finer_cells, sides), finer_cells)
     return Piece(kept, std, difference, torch.tensor(able, dtype=torch.bool))
 
 
 def asked_piece(worlds: Worlds, setting: Setting, k: int, hypotheses: Sequence[Hypothesis]) -> Piece:
     """Slopes of the k-th episode along hypotheses alone; ``worlds`` without shifts."""
-    e, finer = setting.episodes[k], setting.finer if any(map(worlds.is_finer, hypotheses)) else None
+    e, finer = setting.episodes[k], setting.finer
     found = runs(worlds, e, setting.dt, hypotheses, False, finer and (finer.episodes[k], finer.dt))
     base, able = worlds.plain.seen(found.plain, e), [t is not None for t in found.trials]
-    sides = list(_trials(worlds, hypotheses, found))
+    sides = list(_trials(hypotheses, found))
     cells = cells_of(base, _slopes(base, sides, False), e, setting.sheet, setting.rest)
-    if finer is not None:
+    if finer is not None and found.fine is not None:
         fine = _slopes(found.fine, sides, True)
         cells = _woven(cells, cells_of(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest), sides)
     none = torch.zeros(0, dtype=torch.float64)
@@ -70,17 +70,17 @@ def asked_piece(worlds: Worlds, setting: Setting, k: int, hypotheses: Sequence[H
 Side = tuple[Frames, float, bool]  # beside the point, by which step, and whether on the finer mesh
 
 
-def _trials(worlds: Worlds, hypotheses: Sequence[Hypothesis], found: Runs) -> Iterator[Side]:
+def _trials(hypotheses: Sequence[Hypothesis], found: Runs) -> Iterator[Side]:
     """Of what could be simulated."""
-    for h, frames in zip(hypotheses, found.trials, strict=True):
+    for k, (h, frames) in enumerate(zip(hypotheses, found.trials, strict=True)):
         if frames is not None:
-            yield frames, h.typical, worlds.is_finer(h)
+            yield frames, h.typical, k in found.refined
 
 
-def _slopes(base: Frames, sides: Sequence[Side], finer: bool) -> Frames | None:
+def _slopes(base: Frames | None, sides: Sequence[Side], finer: bool) -> Frames | None:
     """Along those on one mesh; None: there are none."""
     own = [(frames, step) for frames, step, fine in sides if fine == finer]
-    return directions(base, *zip(*own, strict=True)) if own else None
+    return directions(base, *zip(*own, strict=True)) if own and base else None
 
 
 def _woven(coarse: Cells, fine: Cells, sides: Sequence[Side]) -> Cells:
@@ -96,11 +96,12 @@ def _woven(coarse: Cells, fine: Cells, sides: Sequence[Side]) -> Cells:
 class Runs(NamedTuple):
     """All simulations of one episode."""
 
-    fine: Frames  # on the finer mesh; the plain ones where nobody asked
+    fine: Frames | None  # on the finer mesh; None where nobody asked
     plain: Frames  # what happens, whoever looks on
     beside: list[Frames]  # along the model's own coordinates, each on the mesh of its slopes
     held: list[Frames]  # with the held places off
-    trials: list[Frames | None]  # with each hypothesis, likewise; None: cannot be simulated
+    trials: list[Frames | None]  # with each hypothesis; None: cannot be simulated
+    refined: set[int]  # which of these are on the finer mesh
 
 
 def runs(
@@ -110,10 +111,18 @@ def runs(
     hypotheses: Sequence[Hypothesis],
     with_held: bool,
     finer: tuple[Episode, float | None] | None = None,
+    with_fine: bool = False,
 ) -> Runs:
     """An episode in a world, in those beside it, with every hypothesis and with held places off, side by side.
 
-    ``finer``: the same episode on the finer mesh, and its step; needed for what has its slopes there.
+    Args:
+        worlds: about the model's point.
+        e: the episode.
+        dt: its substep [s]; None: the stable one.
+        hypotheses: with each of which it is simulated.
+        with_held: with held places off, too.
+        finer: the same episode and substep on the finer mesh; None: all slopes are taken on the given one.
+        with_fine: on the finer mesh in any case, and not only if something has its slopes there.
     """
     world, own = worlds.plain, (e, dt)
     on = lambda fine: finer if fine and finer else own  # noqa: E731
@@ -121,21 +130,40 @@ def runs(
     modes = Held().modes(world.cloth, e) if with_held else ()
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m), dt) for m in modes]
     changed = [worlds.changed(h) for h in hypotheses]
-    moves = [c is not None and _moves(c, worlds.like(h)) for c, h in zip(changed, hypotheses, strict=True)]
-    first = [partial(worlds.finest.frames, *finer)] if finer else []  # it takes longest
+    moves = [c is not None and _moves(c, world) for c in changed]
+    first = [partial(worlds.finest.frames, *finer)] if with_fine and finer else []  # it takes longest
     jobs = [*first, partial(world.simulated, e, dt), *beside, *held]
     tried = [
-        partial(if_possible, partial(c.frames, *on(worlds.is_finer(h))))
-        for c, h, other in zip(changed, hypotheses, moves, strict=True)
-        if c and other
+        partial(if_possible, partial(c.frames, *own)) for c, other in zip(changed, moves, strict=True) if c and other
     ]
     done: list[Any] = side_by_side(lambda job: job(), [*jobs, *tried])
     plain, *sure = done[len(first) : len(jobs)]
-    fine = done[0] if finer else plain
     rest = iter(done[len(jobs) :])
     seen = lambda c: c and if_possible(partial(c.seen, plain, e))  # noqa: E731
     trials = [next(rest) if other else seen(c) for c, other in zip(changed, moves, strict=True)]
-    return Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials)
+    fine = done[0] if first else None
+    unmoved = world.seen(plain, e).x
+    folds = {
+        k: h
+        for k, (h, t) in enumerate(zip(hypotheses, trials, strict=True))
+        if worlds.is_finer(h) and t is not None and not torch.equal(t.x, unmoved)
+    }
+    if finer and folds:
+        fine, again = _refined(worlds, list(folds.values()), finer, fine)
+        for k, frames in zip(folds, again, strict=True):
+            trials[k] = frames
+    return Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials, set(folds) if finer else set())
+
+
+def _refined(
+    worlds: Worlds, hypotheses: Sequence[Hypothesis], finer: tuple[Episode, float | None], fine: Frames | None
+) -> tuple[Frames, list[Frames | None]]:
+    """On the finer mesh: (the episode, if it is not there yet, the episode with each hypothesis)."""
+    first = [] if fine else [partial(worlds.finest.frames, *finer)]
+    changed = [worlds.changed(h, finer=True) for h in hypotheses]
+    tried = [partial(if_possible, partial(c.frames, *finer)) if c else lambda: None for c in changed]
+    done: list[Any] = side_by_side(lambda job: job(), [*first, *tried])
+    return fine or done[0], done[len(first) :]
 
 
 def _moves(changed: World, world: World) -> bool:

@@ -121,7 +121,8 @@ class Hypothesis:
             tells of the hypothesis.
         low, high: amplitudes that a world can have.
         brings: another hypothesis, which comes along at its typical amplitude where the world has none of it.
-        finer: its slopes are taken on the finer mesh, for it acts in folds that the given one is too coarse for.
+        finer: its slopes are taken on the finer mesh where it does something on the given one: it acts in folds, for
+            which that is too coarse.
     """
 
     name: str

@@ -49,16 +49,10 @@ class Worlds:
         """At the point, on the finer mesh."""
         return self._once("finest", lambda: self._on_finer.world())
 
-    def changed(self, hypothesis: Hypothesis) -> World | None:
-        """With a hypothesis at its typical amplitude, on its own mesh; None: no such world."""
-        name = (hypothesis.name, hypothesis.typical)
-        return self._once(
-            name, lambda: if_possible(lambda: hypothesis.apply(self.like(hypothesis), hypothesis.typical))
-        )
-
-    def like(self, hypothesis: Hypothesis) -> World:
-        """Without a hypothesis, on the mesh on which its slopes are taken."""
-        return self.finest if self.is_finer(hypothesis) else self.plain
+    def changed(self, hypothesis: Hypothesis, finer: bool = False) -> World | None:
+        """With a hypothesis at its typical amplitude, on the finer mesh if asked for; None: no such world."""
+        h, world = hypothesis, lambda: self.finest if finer else self.plain
+        return self._once((h.name, h.typical, finer), lambda: if_possible(lambda: h.apply(world(), h.typical)))
 
     def is_finer(self, hypothesis: Hypothesis) -> bool:
         """Its slopes are taken on the finer mesh; there must be one."""
