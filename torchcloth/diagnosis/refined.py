@@ -1,7 +1,7 @@
 """The same model on a mesh twice as fine: what differs is numerics, no physics.
 
 Residuals are taken on the finer mesh, slopes on the coarser: an error of the slopes costs an iteration, an error of the
-residuals would be named as a cause.
+residuals would be named as a cause. Slopes along what acts in folds, which a coarse mesh loses, are none there.
 """
 
 from __future__ import annotations
