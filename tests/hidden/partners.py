@@ -38,7 +38,7 @@ class Partner:
 BOTH = (1, -1)
 DRAG = (("air.drag_n", 1.2),)
 DRAGGED = (("drag", 90.0, 1.0), ("drag-fast", 0.0, 1.0))  # once, friction hides behind the density
-FOLDED = (("fold", 0.0, 1.3), ("fold", 90.0, 1.0))  # what one motion alone tells predicts no other
+FOLDED = (("fold", 0.0, 1.3),)
 SINGLES = {
     "air.drag_n": Partner(("air.drag_n",)),
     "air.drag_t": Partner(("air.drag_t",)),
