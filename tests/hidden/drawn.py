@@ -6,7 +6,7 @@ from a secret. Twenty numbers in a row hold every family at its share.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import beside  # noqa: F401
 import numpy as np
@@ -141,8 +141,8 @@ def case(seed: int, size: Size = REDUCED) -> Case:
         "next experiment": _next,
     }[family]
     parts = {"kind": "", "effects": (), "plans": _plans(size, rng)} | draw(rng, turn, slot, size)
-    takes = tuple(_take(plan, parts.get("regrasp", 0.0), rng) for plan in parts.pop("plans"))
-    parts.pop("regrasp", None)
+    regrasp = parts.pop("regrasp", 0.0)
+    takes = _balanced(tuple(_take(plan, regrasp, rng) for plan in parts.pop("plans")), regrasp)
     order = rng.permutation(len(takes))
     given = {"nodes": size.nodes, "fabric": _fabric(rng), "said": _sheet(rng, 0.15)} | parts
     pad = float(np.random.default_rng([seed, 17]).uniform(*size.pads))
@@ -179,6 +179,19 @@ def _take(plan: Plan, regrasp: float, rng: np.random.Generator) -> Take:
     # the whole sheet lies further along its own width than the robot says
     own = (Hidden("robot.base", shift, {"heading": heading + 90.0}),) if regrasp else ()
     return Take(motion, float(heading), float(speed), own)
+
+
+def _balanced(takes: tuple[Take, ...], regrasp: float) -> tuple[Take, ...]:
+    """Shifts that cancel among episodes of one heading: what all share would be a robot or a camera that is off."""
+    alike = np.array([round(take.heading / 90) for take in takes])
+    shifts = np.array([take.own[0].amplitude if take.own else 0.0 for take in takes])
+    for heading in set(alike.tolist()):
+        shifts[alike == heading] -= shifts[alike == heading].mean()
+    shifts *= min(1.0, regrasp / max(np.abs(shifts).max(), 1e-12))
+    return tuple(
+        replace(take, own=tuple(replace(own, amplitude=float(shift)) for own in take.own))
+        for take, shift in zip(takes, shifts, strict=True)
+    )
 
 
 def _fabric(rng: np.random.Generator) -> dict[str, float]:

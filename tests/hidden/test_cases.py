@@ -91,6 +91,9 @@ def test_nulls_hold_nothing_that_matters():
         shifts = [take.own[0].amplitude for take in hard.takes]
         assert np.abs(shifts).max() <= 4e-3
         assert len(set(shifts)) == len(shifts)
+        alike = np.array([round(take.heading / 90) for take in hard.takes])
+        for heading in (0, 1):  # what all episodes shared would be a robot that stands elsewhere
+            assert abs(np.mean(np.array(shifts)[alike == heading])) < 1e-12
 
 
 def test_the_case_of_a_number_is_always_the_same_and_order_tells_nothing():
