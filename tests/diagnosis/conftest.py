@@ -15,3 +15,17 @@ def _doubles():
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(before)
+
+
+@pytest.fixture(scope="module")
+def made():
+    """The base model of ``sheets.episode()``, and its setting."""
+    import sheets
+
+    from torchcloth.diagnosis import base_model, setting_of
+
+    before, recording = torch.get_default_dtype(), sheets.episode()
+    torch.set_default_dtype(torch.float64)
+    model = base_model(recording)
+    yield model, setting_of(model, [recording])
+    torch.set_default_dtype(before)

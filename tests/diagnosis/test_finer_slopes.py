@@ -12,19 +12,9 @@ from torchcloth.diagnosis.evidence import asked_about, gather
 from torchcloth.diagnosis.hypotheses import catalogue
 from torchcloth.diagnosis.pieces import runs
 from torchcloth.diagnosis.refined import refined
-from torchcloth.diagnosis.setting import setting_of
 from torchcloth.diagnosis.worlds import Worlds
 
 RECORDING = sheets.episode()
-
-
-@pytest.fixture(scope="module")
-def made():
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
-    model = base_model(RECORDING)
-    yield model, setting_of(model, [RECORDING])
-    torch.set_default_dtype(before)
 
 
 @pytest.fixture(scope="module")

@@ -27,15 +27,6 @@ from torchcloth.recordings.together import together
 RECORDING = sheets.episode()
 
 
-@pytest.fixture(scope="module")
-def made():
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
-    model = base_model(RECORDING)
-    yield model, setting_of(model, [RECORDING])
-    torch.set_default_dtype(before)
-
-
 EVERY = [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES]
 NAMES = [h.name for h in EVERY if h.needs(RECORDING)]
 

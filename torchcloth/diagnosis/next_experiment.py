@@ -166,7 +166,7 @@ def whitened_slopes(question: Question, recording: Recording, setting: Setting) 
     trials = [t for t in done.trials if t is not None]
     if len(trials) < len(hypotheses):
         raise InvalidInput("experiment", got="a cause that it cannot be simulated with", expected="another experiment")
-    base = world.seen(done.plain, blank)
+    base = done.plain
     seen = as_seen(base, blank, setting)
     moved = directions(base, [*done.beside, *trials], [*(s for _, s in shifts), *(h.typical for h in hypotheses)])
     other, std = nuisances(world, base, done.held, seen)

@@ -38,7 +38,7 @@ def piece_of(
     finer: Setting = setting.finer  # type: ignore[assignment]
     steps = [taken(worlds.model, coordinate, step) for coordinate, step in worlds.shifts]
     found = runs(worlds, e, setting.dt, hypotheses, known is None, (finer.episodes[k], finer.dt), with_fine=True)
-    base, able = world.seen(found.plain, e), [t is not None for t in found.trials]
+    base, able = found.plain, [t is not None for t in found.trials]
     sides = [*zip(found.beside, steps, worlds.finer_beside, strict=True), *_trials(hypotheses, found)]
     moved, fine = _slopes(base, sides, False), _slopes(found.fine, sides, True)
     if known is None:
@@ -57,7 +57,7 @@ def asked_piece(worlds: Worlds, setting: Setting, k: int, hypotheses: Sequence[H
     """Slopes of the k-th episode along hypotheses alone; ``worlds`` without shifts."""
     e, finer = setting.episodes[k], setting.finer
     found = runs(worlds, e, setting.dt, hypotheses, False, finer and (finer.episodes[k], finer.dt))
-    base, able = worlds.plain.seen(found.plain, e), [t is not None for t in found.trials]
+    base, able = found.plain, [t is not None for t in found.trials]
     sides = list(_trials(hypotheses, found))
     cells = cells_of(base, _slopes(base, sides, False), e, setting.sheet, setting.rest)
     if finer is not None and found.fine is not None:
@@ -97,7 +97,7 @@ class Runs(NamedTuple):
     """All simulations of one episode."""
 
     fine: Frames | None  # on the finer mesh; None where nobody asked
-    plain: Frames  # what happens, whoever looks on
+    plain: Frames  # at the point
     beside: list[Frames]  # along the model's own coordinates, each on the mesh of its slopes
     held: list[Frames]  # with the held places off
     trials: list[Frames | None]  # with each hypothesis; None: cannot be simulated
@@ -121,7 +121,7 @@ def runs(
         dt: its substep [s]; None: the stable one.
         hypotheses: with each of which it is simulated.
         with_held: with held places off, too.
-        finer: the same episode and substep on the finer mesh; None: all slopes are taken on the given one.
+        finer: the same episode and substep on the finer mesh; None: the worlds have none.
         with_fine: on the finer mesh in any case, and not only if something has its slopes there.
     """
     world, own = worlds.plain, (e, dt)
@@ -137,22 +137,21 @@ def runs(
         partial(if_possible, partial(c.frames, *own)) for c, other in zip(changed, moves, strict=True) if c and other
     ]
     done: list[Any] = side_by_side(lambda job: job(), [*jobs, *tried])
-    plain, *sure = done[len(first) : len(jobs)]
+    happens, *sure = done[len(first) : len(jobs)]
     rest = iter(done[len(jobs) :])
-    seen = lambda c: c and if_possible(partial(c.seen, plain, e))  # noqa: E731
+    seen = lambda c: c and if_possible(partial(c.seen, happens, e))  # noqa: E731
     trials = [next(rest) if other else seen(c) for c, other in zip(changed, moves, strict=True)]
-    fine = done[0] if first else None
-    unmoved = world.seen(plain, e).x
+    fine, plain = done[0] if first else None, world.seen(happens, e)
     folds = {
         k: h
         for k, (h, t) in enumerate(zip(hypotheses, trials, strict=True))
-        if worlds.is_finer(h) and t is not None and not torch.equal(t.x, unmoved)
+        if worlds.is_finer(h) and t is not None and not torch.equal(t.x, plain.x)
     }
     if finer and folds:
         fine, again = _refined(worlds, list(folds.values()), finer, fine)
         for k, frames in zip(folds, again, strict=True):
             trials[k] = frames
-    return Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials, set(folds) if finer else set())
+    return Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials, set(folds))
 
 
 def _refined(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from threading import RLock
 from typing import Any, TypeVar
 
@@ -41,8 +42,9 @@ class Worlds:
     @property
     def beside(self) -> list[World]:
         """At the points beside; on the finer mesh along what has its slopes there."""
-        made = lambda k, s: shifted(self._on_finer if self.finer_beside[k] else self.model, *s).world()  # noqa: E731
-        return [self._once(k, lambda k=k, s=s: made(k, s)) for k, s in enumerate(self.shifts)]
+        make = lambda shift, finer: shifted(self._on_finer if finer else self.model, *shift).world()  # noqa: E731
+        sides = enumerate(zip(self.shifts, self.finer_beside, strict=True))
+        return [self._once(k, partial(make, *side)) for k, side in sides]
 
     @property
     def finest(self) -> World:
