@@ -59,6 +59,17 @@ def test_a_step_into_the_impossible_is_not_taken(looks, iterations):
     assert seen[-1] == (0.0, 1)
 
 
+@pytest.mark.parametrize(("promised", "steps"), [([9.0, 0.0, 0.0, 0.0], 3), ([0.0], 0), ([9.0, 9.0, 9.0], 3)])
+def test_it_goes_on_while_steps_gain_whatever_slopes_promise(looks, monkeypatch, promised, steps):
+    """From 0 to 0.4, where the data are, by 0.2 a step: the third gains nothing any more."""
+    seen, model = looks
+    ahead = iter(promised)
+    monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.2]).double(), next(ahead, 0.0)))
+    found = fit(model, None)  # type: ignore[arg-type]
+    assert float(found.model.point[0]) == pytest.approx(0.2 * steps)
+    assert len(seen) == steps + 1
+
+
 def test_where_it_begins_must_be_possible(looks):
     seen, model = looks
     seen.edge = -1.0

@@ -64,6 +64,7 @@ CATALOGUE = {
     "contact.adhesion": Effect("table", "adhesion", "Pa", 1.5, "lift", ("gap",)),
     "env.gravity_tilt": Effect("weight", "tilt", "rad", 0.01, "hang", ("heading",)),
     "obs.extrinsic": Effect("sensor", "shift", "m", 4e-3, "hang", ("heading", "rotation")),
+    "obs.rotation": Effect("sensor", "lean", "rad", 0.02, "hang", ("heading",)),
     "obs.depth_scale": Effect("sensor", "scale", "-", 0.015, "hang"),
     "obs.depth_bias": Effect("sensor", "offset", "m", 5e-3, "hang"),
     "obs.clock": Effect("sensor", "delay", "s", 0.03, "swing-fast"),

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from flex_sheet import SheetSpec, bilinear
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 from torchcloth.recordings import PointClouds
 
@@ -34,6 +35,7 @@ class SensorSpec:
         delay: s, by which the stamps are later than the light.
         shift: m, by which the camera is believed to stand further along ``heading`` degrees than it does;
             ``rotation`` rad, by which it is believed to be turned about the vertical.
+        lean: rad, by which it is believed to be turned, about what it looks at, around ``heading`` by the right hand.
         scale: -, share by which depths read too large; ``offset`` m is added to them.
     """
 
@@ -48,6 +50,7 @@ class SensorSpec:
     shift: float = 0.0
     heading: float = 0.0
     rotation: float = 0.0
+    lean: float = 0.0
     scale: float = 0.0
     offset: float = 0.0
 
@@ -81,8 +84,8 @@ def _measured(spec: SensorSpec, points: Array, noise: Array, walk: Array) -> Arr
     slow = spec.bias / np.sqrt(2.18) * (walk @ modes)
     depth = depth * (1 + spec.scale) + spec.offset + spec.noise * noise + slow
     found = ray / np.linalg.norm(ray, axis=1, keepdims=True) * depth[:, None]
-    turn, shift = _believed(spec)
-    return EYE + found @ turn.T + shift
+    turn, place = _believed(spec)
+    return place + found @ turn.T
 
 
 def pinhole(spec: SensorSpec) -> dict[str, object]:
@@ -90,19 +93,21 @@ def pinhole(spec: SensorSpec) -> dict[str, object]:
     ahead = (TARGET - EYE) / np.linalg.norm(TARGET - EYE)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
-    turn, shift = _believed(spec)
+    turn, place = _believed(spec)
     pose = np.eye(4)
     pose[:3, :3] = turn @ np.stack([right, np.cross(ahead, right), ahead], 1)
-    pose[:3, 3] = EYE + shift
+    pose[:3, 3] = place
     lens = np.array([[504.0, 0.0, 320.0], [0.0, 504.0, 288.0], [0.0, 0.0, 1.0]])
     return {"width": 640, "height": 576, "K": lens, "T_world_camera": pose}
 
 
 def _believed(spec: SensorSpec) -> tuple[Array, Array]:
-    """Turn [3, 3] and shift [3] m of the camera's believed pose from its true one."""
-    c, s, angle = np.cos(spec.rotation), np.sin(spec.rotation), np.deg2rad(spec.heading)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return turn, spec.shift * np.array([np.cos(angle), np.sin(angle), 0.0])
+    """Turn [3, 3] of the camera's believed pose from its true one, and its believed place [3] m."""
+    angle = np.deg2rad(spec.heading)
+    along = np.array([np.cos(angle), np.sin(angle), 0.0])
+    lean = Rotation.from_rotvec(spec.lean * along).as_matrix()
+    turn = lean @ Rotation.from_rotvec([0.0, 0.0, spec.rotation]).as_matrix()
+    return turn, EYE + (lean - np.eye(3)) @ (EYE - TARGET) + spec.shift * along
 
 
 def _image(points: Array) -> Array:

@@ -13,7 +13,7 @@ from effects import CATALOGUE, hide, parse
 from flex_sheet import SheetSpec, grid, rest_points
 from motions import GRIPPERS, NAMES, minimum_jerk, motion
 from scene import GripSpec, Scene, _grip, believed, evenly, hooks, play, stable_step
-from sensor import EYE, SensorSpec, see
+from sensor import EYE, TARGET, SensorSpec, see
 from sizes import size
 
 from torchcloth import recordings
@@ -160,6 +160,14 @@ def test_a_wrong_camera_moves_everything_rigidly():
     np.testing.assert_allclose(
         seen(shift=4e-3, heading=90.0).xyz - a, np.broadcast_to([0, 4e-3, 0], a.shape), atol=1e-12
     )
+
+
+def test_a_camera_that_leans_turns_the_cloth_about_what_it_looks_at():
+    lean, here, there = 0.02, seen().xyz - TARGET, seen(lean=0.02, heading=90.0).xyz - TARGET
+    along = np.array([0.0, 1.0, 0.0])
+    np.testing.assert_allclose(there @ along, here @ along, atol=1e-12)
+    turned = here * np.cos(lean) + np.cross(along, here) * np.sin(lean)
+    np.testing.assert_allclose(there[:, [0, 2]], turned[:, [0, 2]], atol=1e-12)
 
 
 def test_the_slow_bias_has_about_its_size_and_lasts():

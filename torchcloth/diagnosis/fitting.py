@@ -16,7 +16,7 @@ from .setting import Progress, Setting, staged
 from .world import Hypothesis, Model
 from .worlds import IMPOSSIBLE
 
-ENOUGH = 2.0  # log density that a further step is expected to gain, below which the search ends
+ENOUGH = 2.0  # log density that a further step should gain, and that the last one did, below which the search ends
 ITERATIONS = 5  # at most
 LONGEST = 1.0  # prior standard deviations, of a step
 SWEEPS = 4  # of weighing stretches anew
@@ -63,7 +63,8 @@ def fit(
 
     Fits are compared with the same ``noise``; None: estimated. The nuisances' slopes are those of ``before``, if given.
     ``here`` is the evidence at the model's point, where that is known already: nothing of it is simulated again. A step
-    into what is ``IMPOSSIBLE`` is not taken.
+    into what is ``IMPOSSIBLE`` is not taken. Slopes promise too little where cloth ripples, so the search ends only
+    where the last step gained little, too.
     """
     about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
 
@@ -73,18 +74,19 @@ def fit(
             return gather(at, setting, (), staged(progress, f"fit {steps + 1}"), before)
         return gather(at, setting, hypotheses, staged(progress, about), before)
 
-    asked = here is None and not iterations
+    asked, gained = here is None and not iterations, 0.0
     here = here or look(model, 0)
     for taken in range(1, iterations + 1):
-        before = before or here
-        step, ahead = leap(whitened(here, noise or fit_noise(here)), model)
-        if ahead < ENOUGH:
+        before, level = before or here, noise or fit_noise(here)
+        step, ahead = leap(whitened(here, level), model)
+        if max(ahead, gained) < ENOUGH:
             break
-        further = model.at(model.point + step)
+        further, last = model.at(model.point + step), (model, here)
         try:
             model, here, asked = further, look(further, taken), taken == iterations
         except IMPOSSIBLE:
             break
+        gained = posterior(model, here, level, here) - posterior(*last, level, here)
     if hypotheses and not asked:
         here = here if before is None else as_held(here, before)
         here = asked_about(here, model, setting, hypotheses, staged(progress, about))
@@ -96,6 +98,12 @@ def weighed(model: Model, evidence: Evidence, noise: Noise) -> Fitted:
     white = calmed(whitened(evidence, noise))
     _, ahead = leap(white, model)
     return Fitted(model, evidence, noise, white, torch.linalg.inv(curvature(white, model)), ahead)
+
+
+def posterior(model: Model, evidence: Evidence, noise: Noise, like: Evidence) -> float:
+    """Log density of the data and of the model's coordinates, by the scatter and on the cells of ``like``."""
+    white = whitened(as_rough(evidence, shared(like, [evidence])), noise)
+    return float(densities(white.value, white.stretch).sum() - 0.5 * prior_precision(model) @ model.point.square())
 
 
 def with_cause(found: Fitted, hypothesis: Hypothesis) -> Model:

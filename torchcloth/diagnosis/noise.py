@@ -58,6 +58,11 @@ def unfitted() -> Noise:
     return Noise(UNFITTED * least().level)
 
 
+def to_fit_by(noise: Noise) -> Noise:
+    """The smaller levels of these and of ``unfitted``: what a model leaves that may be wrong is not all noise."""
+    return Noise(torch.minimum(noise.level, unfitted().level))
+
+
 class Whitened(NamedTuple):
     """All episodes' cells in units in which a true model's are independent and of variance one."""
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from .comparison import Gain, Predicted, compare, predict, spread, telling
 from .evidence import Evidence, shared
 from .fitting import Fitted, fit, renoised, with_cause
-from .noise import Noise, fit_noise, unfitted
+from .noise import Noise, fit_noise, to_fit_by
 from .placebo import Placebo, placebo
 from .screening import MUCH, PRESENT, Row
 from .setting import Progress, Setting, staged
@@ -17,7 +17,7 @@ from .world import Hypothesis, Model
 from .worlds import IMPOSSIBLE
 
 TRIED = 4  # hypotheses that are fitted at each step
-FURTHER = 2  # steps of the likelier ones among them
+FURTHER = 3  # steps of the likelier ones among them
 HARDLY = 0.2  # of what the better of two models gains, in density and squares, that two engines may differ by
 VERY_MUCH = 25.0  # log density; nulls' causes that ask for too little to show reach 16, and 27 once
 SURELY = 25.0  # log density held out, beyond which no null's cause surely gains: of what no other motion predicts
@@ -115,16 +115,17 @@ def one_step(
         progress: called with one line for each episode that is simulated.
     """
     fits: list[tuple[Row, Fitted]] = []
+    by = to_fit_by(current.noise)
     for row, model in begun:
         trial = staged(progress, f"trying {row.hypothesis.name}")
         with suppress(*IMPOSSIBLE):
-            fits.append((row, fit(model, setting, (), 0, trial, unfitted(), current.evidence)))
+            fits.append((row, fit(model, setting, (), 0, trial, by, current.evidence)))
     if not fits:
         return None
     common = lambda like, fits: shared(like, [current.evidence, *(f.evidence for _, f in fits)])  # noqa: E731
     now = lambda fits: _compared(current, fits, setting.names, current.noise, common(current.evidence, fits))  # noqa: E731
     likely = now(fits)
-    settled = _settled(likely, setting, progress)
+    settled = _settled(likely, setting, by, progress)
     for k, after in zip(settled, now(list(settled.values())), strict=True):
         likely[k] = _better(likely[k], after)
     likeliest = max(likely, key=lambda c: c.gain.density).fitted.evidence
@@ -148,7 +149,9 @@ def one_step(
     return Step(best, chance, tried, [*reversed(rivals.values())], screened, current, noise)
 
 
-def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> dict[int, tuple[Row, Fitted]]:
+def _settled(
+    tried: list[Candidate], setting: Setting, noise: Noise, progress: Progress
+) -> dict[int, tuple[Row, Fitted]]:
     """The likelier ones, by number, where further steps lead: one step does for small effects only.
 
     Likely is what predicts well or still has far to go: a large effect that is half fitted predicts nothing.
@@ -159,7 +162,7 @@ def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> di
         found = c.fitted
         if expected > max(0.0, 0.5 * max(hope)) and found.ahead > CLEAR:
             further = staged(progress, f"trying {c.hypothesis.name} further")
-            found = fit(found.model, setting, (), FURTHER, further, unfitted(), found.evidence, found.evidence)
+            found = fit(found.model, setting, (), FURTHER, further, noise, found.evidence, found.evidence)
             out[k] = (c.row, found)
     return out
 
