@@ -225,8 +225,11 @@ def _useful(c: Candidate, names: Sequence[str]) -> bool:
 
 
 def _agreed(c: Candidate, names: Sequence[str]) -> bool:
-    """Of what predicts as well as a cause, less is asked than of a cause: it need not be there, it cannot be told."""
-    return known(c.fitted, c.hypothesis.name, names, replace(c, sure=NORMAL))
+    """Of what predicts as well as a cause, less is asked than of a cause: it need not be there, it cannot be told.
+
+    Halves of the one motion that tells of it need not agree: a law that is not quite right differs from early to late.
+    """
+    return known(c.fitted, c.hypothesis.name, names, replace(c, sure=0.0 if c.alone else NORMAL))
 
 
 def known(found: Fitted, name: str, names: Sequence[str], c: Candidate) -> bool:
