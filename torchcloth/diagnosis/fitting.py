@@ -86,7 +86,7 @@ def fit(
             model, here, asked = further, look(further, taken), taken == iterations
         except IMPOSSIBLE:
             break
-        gained = posterior(model, here, level, here) - posterior(*last, level, here)
+        gained = _posterior(model, here, level, here) - _posterior(*last, level, here)
     if hypotheses and not asked:
         here = here if before is None else as_held(here, before)
         here = asked_about(here, model, setting, hypotheses, staged(progress, about))
@@ -98,12 +98,6 @@ def weighed(model: Model, evidence: Evidence, noise: Noise) -> Fitted:
     white = calmed(whitened(evidence, noise))
     _, ahead = leap(white, model)
     return Fitted(model, evidence, noise, white, torch.linalg.inv(curvature(white, model)), ahead)
-
-
-def posterior(model: Model, evidence: Evidence, noise: Noise, like: Evidence) -> float:
-    """Log density of the data and of the model's coordinates, by the scatter and on the cells of ``like``."""
-    white = whitened(as_rough(evidence, shared(like, [evidence])), noise)
-    return float(densities(white.value, white.stretch).sum() - 0.5 * prior_precision(model) @ model.point.square())
 
 
 def with_cause(found: Fitted, hypothesis: Hypothesis) -> Model:
@@ -164,6 +158,12 @@ def leap(white: Whitened, model: Model, start: Tensor | None = None) -> tuple[Te
     gained = densities(after, plain.stretch).sum() - densities(plain.value, plain.stretch).sum()
     pull = 0.5 * precision @ ((model.point + step) ** 2 - model.point**2)
     return step, float(gained - pull)
+
+
+def _posterior(model: Model, evidence: Evidence, noise: Noise, like: Evidence) -> float:
+    """Log density of the data and of the model's coordinates, by the scatter and on the cells of ``like``."""
+    white = whitened(as_rough(evidence, shared(like, [evidence])), noise)
+    return float(densities(white.value, white.stretch).sum() - 0.5 * prior_precision(model) @ model.point.square())
 
 
 def _columns(white: Whitened, columns: Sequence[int]) -> Whitened:
