@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from torchcloth.diagnosis import fitting
+from torchcloth.diagnosis.cells import Cells
 from torchcloth.diagnosis.fitting import fit, with_cause
 from torchcloth.errors import SimulationDiverged
 
@@ -16,11 +17,14 @@ TRUTH = torch.tensor([0.4]).double()
 
 @pytest.fixture
 def looks(monkeypatch):
-    """(where the fit looked, with how many hypotheses); worlds beyond ``looks.edge`` are impossible."""
+    """(where the fit looked, with how many hypotheses).
+
+    Worlds beyond ``looks.edge`` are impossible, windows before ``looks.hidden`` are not met at 0.
+    """
     there = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0))
 
     class Looks(list):
-        edge = torch.inf
+        edge, hidden = torch.inf, 0
 
     seen = Looks()
 
@@ -30,7 +34,10 @@ def looks(monkeypatch):
         if at > seen.edge:
             raise SimulationDiverged("x", got="nan", expected="numbers")
         cells = [c._replace(value=c.value + c.jacobian[:, 0] * at) for c in there.evidence.cells]
-        return replace(there.evidence, cells=cells, hypotheses=list(hypotheses))
+        kept = [c.window >= (seen.hidden if at == 0.0 else 0) for c in cells]
+        cells = [Cells(*(column[k] for column in c)) for c, k in zip(cells, kept, strict=True)]
+        numerics = [n[k] for n, k in zip(there.evidence.numerics, kept, strict=True)]
+        return replace(there.evidence, cells=cells, numerics=numerics, hypotheses=list(hypotheses))
 
     def asked_about(here, model, setting, hypotheses, progress):
         seen.append((float(model.point[0]), len(hypotheses)))
@@ -68,6 +75,14 @@ def test_it_goes_on_while_steps_gain_whatever_slopes_promise(looks, monkeypatch,
     found = fit(model, None)  # type: ignore[arg-type]
     assert float(found.model.point[0]) == pytest.approx(0.2 * steps)
     assert len(seen) == steps + 1
+
+
+def test_what_only_the_later_point_meets_is_no_loss(looks, monkeypatch):
+    seen, model = looks
+    seen.hidden = 5  # of six
+    ahead = iter([9.0])
+    monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.2]).double(), next(ahead, 0.0)))
+    assert float(fit(model, None).model.point[0]) == pytest.approx(0.6)  # type: ignore[arg-type]
 
 
 def test_where_it_begins_must_be_possible(looks):

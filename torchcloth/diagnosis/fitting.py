@@ -86,7 +86,8 @@ def fit(
             model, here, asked = further, look(further, taken), taken == iterations
         except IMPOSSIBLE:
             break
-        gained = _posterior(model, here, level, here) - _posterior(*last, level, here)
+        like = shared(here, [last[1]])
+        gained = _posterior(model, here, level, like) - _posterior(*last, level, like)
     if hypotheses and not asked:
         here = here if before is None else as_held(here, before)
         here = asked_about(here, model, setting, hypotheses, staged(progress, about))
@@ -162,7 +163,7 @@ def leap(white: Whitened, model: Model, start: Tensor | None = None) -> tuple[Te
 
 def _posterior(model: Model, evidence: Evidence, noise: Noise, like: Evidence) -> float:
     """Log density of the data and of the model's coordinates, by the scatter and on the cells of ``like``."""
-    white = whitened(as_rough(evidence, shared(like, [evidence])), noise)
+    white = whitened(as_rough(evidence, like), noise)
     return float(densities(white.value, white.stretch).sum() - 0.5 * prior_precision(model) @ model.point.square())
 
 
