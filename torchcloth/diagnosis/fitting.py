@@ -74,20 +74,19 @@ def fit(
             return gather(at, setting, (), staged(progress, f"fit {steps + 1}"), before)
         return gather(at, setting, hypotheses, staged(progress, about), before)
 
-    asked, gained = here is None and not iterations, 0.0
+    asked = here is None and not iterations
+    last: tuple[Noise, Model, Evidence] | None = None
     here = here or look(model, 0)
     for taken in range(1, iterations + 1):
         before, level = before or here, noise or fit_noise(here)
         step, ahead = leap(whitened(here, level), model)
-        if max(ahead, gained) < ENOUGH:
+        if ahead < ENOUGH and not (last and _gained(*last, model, here) >= ENOUGH):
             break
-        further, last = model.at(model.point + step), (model, here)
+        further, last = model.at(model.point + step), (level, model, here)
         try:
             model, here, asked = further, look(further, taken), taken == iterations
         except IMPOSSIBLE:
             break
-        like = shared(here, [last[1]])
-        gained = _posterior(model, here, level, like) - _posterior(*last, level, like)
     if hypotheses and not asked:
         here = here if before is None else as_held(here, before)
         here = asked_about(here, model, setting, hypotheses, staged(progress, about))
@@ -152,19 +151,24 @@ def leap(white: Whitened, model: Model, start: Tensor | None = None) -> tuple[Te
         start: step from which weights are taken at first; None: none.
     """
     step = torch.zeros_like(model.point) if start is None else start
-    plain, precision = unweighted(white), prior_precision(model)
+    plain = unweighted(white)
     for _ in range(SWEEPS):
         step, _ = step_of(calmed(plain, step), model, LONGEST)
-    after = plain.value + plain.jacobian[:, : len(step)] @ step
-    gained = densities(after, plain.stretch).sum() - densities(plain.value, plain.stretch).sum()
-    pull = 0.5 * precision @ ((model.point + step) ** 2 - model.point**2)
-    return step, float(gained - pull)
+    return step, _posterior(plain, model, step) - _posterior(plain, model)
 
 
-def _posterior(model: Model, evidence: Evidence, noise: Noise, like: Evidence) -> float:
-    """Log density of the data and of the model's coordinates, by the scatter and on the cells of ``like``."""
-    white = whitened(as_rough(evidence, like), noise)
-    return float(densities(white.value, white.stretch).sum() - 0.5 * prior_precision(model) @ model.point.square())
+def _gained(noise: Noise, first: Model, there: Evidence, second: Model, here: Evidence) -> float:
+    """Log density from the first to the second, on the cells of both and by the scatter at the second."""
+    like = shared(here, [there])
+    white = lambda evidence: whitened(as_rough(evidence, like), noise)  # noqa: E731
+    return _posterior(white(here), second) - _posterior(white(there), first)
+
+
+def _posterior(plain: Whitened, model: Model, step: Tensor | None = None) -> float:
+    """Log density of unweighted cells and of the model's coordinates: as they are, or after a ``step`` by slopes."""
+    value = plain.value if step is None else plain.value + plain.jacobian[:, : len(step)] @ step
+    point = model.point if step is None else model.point + step
+    return float(densities(value, plain.stretch).sum() - 0.5 * prior_precision(model) @ point.square())
 
 
 def _columns(white: Whitened, columns: Sequence[int]) -> Whitened:

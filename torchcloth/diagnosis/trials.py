@@ -125,7 +125,7 @@ def one_step(
     common = lambda like, fits: shared(like, [current.evidence, *(f.evidence for _, f in fits)])  # noqa: E731
     now = lambda fits: _compared(current, fits, setting.names, current.noise, common(current.evidence, fits))  # noqa: E731
     likely = now(fits)
-    settled = _settled(likely, setting, by, progress)
+    settled = _settled(likely, setting, progress)
     for k, after in zip(settled, now(list(settled.values())), strict=True):
         likely[k] = _better(likely[k], after)
     likeliest = max(likely, key=lambda c: c.gain.density).fitted.evidence
@@ -149,9 +149,7 @@ def one_step(
     return Step(best, chance, tried, [*reversed(rivals.values())], screened, current, noise)
 
 
-def _settled(
-    tried: list[Candidate], setting: Setting, noise: Noise, progress: Progress
-) -> dict[int, tuple[Row, Fitted]]:
+def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> dict[int, tuple[Row, Fitted]]:
     """The likelier ones, by number, where further steps lead: one step does for small effects only.
 
     Likely is what predicts well or still has far to go: a large effect that is half fitted predicts nothing.
@@ -162,7 +160,7 @@ def _settled(
         found = c.fitted
         if expected > max(0.0, 0.5 * max(hope)) and found.ahead > CLEAR:
             further = staged(progress, f"trying {c.hypothesis.name} further")
-            found = fit(found.model, setting, (), FURTHER, further, noise, found.evidence, found.evidence)
+            found = fit(found.model, setting, (), FURTHER, further, found.noise, found.evidence, found.evidence)
             out[k] = (c.row, found)
     return out
 
