@@ -19,8 +19,9 @@ from ..identification.replays import Frames
 from ..pose.modes import modes_of
 from ..pose.objective import windows_of
 from .cells import aligned, cells_of
-from .fitting import Fitted, prior_precision
+from .fitting import Fitted
 from .lacking import reference
+from .leaping import prior_precision
 from .pushes import Pushes, pushed
 from .setting import Progress, Setting
 

@@ -16,7 +16,8 @@ from torch import Tensor
 from .bursts import calmed, unweighted
 from .cells import Cells, aligned
 from .comparison import likelihood
-from .fitting import Fitted, leap
+from .fitting import Fitted
+from .leaping import leap
 from .noise import Whitened
 from .world import Model
 
