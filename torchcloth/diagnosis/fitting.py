@@ -56,8 +56,8 @@ def fit(
 
     Fits are compared with the same ``noise``; None: estimated. The nuisances' slopes are those of ``before``, if given.
     ``here`` is the evidence at the model's point, where that is known already: nothing of it is simulated again. A step
-    into what is ``IMPOSSIBLE`` is not taken; one that is goes on in ``strides``. Slopes promise too little where cloth
-    ripples, so the search ends only where the last stride gained little, too; where there was none, the last step.
+    into what is ``IMPOSSIBLE`` is not taken. A step goes on in ``strides``. Slopes promise too little where cloth ripples,
+    so the search ends only where the last stride gained little, too; where there was none, the last step.
     """
     about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
 
