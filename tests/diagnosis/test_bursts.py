@@ -9,7 +9,7 @@ import torch
 from torchcloth.diagnosis.bursts import FREEDOM, calmed, densities, weights
 from torchcloth.diagnosis.cells import stretches
 from torchcloth.diagnosis.comparison import compare, predict
-from torchcloth.diagnosis.leaping import step_of
+from torchcloth.diagnosis.fitting import step_of
 from torchcloth.diagnosis.noise import Noise, whitened
 
 SLOPES = toys.smooth(1, 4)  # three parameters, one nuisance

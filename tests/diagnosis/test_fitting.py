@@ -44,7 +44,6 @@ def looks(monkeypatch):
         return replace(here, hypotheses=list(hypotheses))
 
     monkeypatch.setattr(fitting, "gather", gather)
-    monkeypatch.setattr(fitting, "further", lambda model, here, noise, step, _: (model.at(model.point + step), None))
     monkeypatch.setattr(fitting, "asked_about", asked_about)
     return seen, there.model
 
@@ -76,16 +75,6 @@ def test_it_goes_on_while_steps_gain_whatever_slopes_promise(looks, monkeypatch,
     found = fit(model, None)  # type: ignore[arg-type]
     assert float(found.model.point[0]) == pytest.approx(0.2 * steps)
     assert len(seen) == steps + 1
-
-
-@pytest.mark.parametrize(("gained", "steps"), [(0.5, 1), (9.0, 3)])
-def test_it_goes_on_while_strides_gain(looks, monkeypatch, gained, steps):
-    """What they gained is known; what the look behind them says beside that does not count."""
-    _, model = looks
-    ahead = iter([9.0])
-    monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.2]).double(), next(ahead, 0.0)))
-    monkeypatch.setattr(fitting, "further", lambda m, here, noise, step, _: (m.at(m.point + step), gained))
-    assert float(fit(model, None, iterations=3).model.point[0]) == pytest.approx(0.2 * steps)  # type: ignore[arg-type]
 
 
 def test_what_only_the_later_point_meets_is_no_loss(looks, monkeypatch):

@@ -6,7 +6,7 @@ import linear_toys as toys
 import torch
 
 from torchcloth.diagnosis.bursts import calmed
-from torchcloth.diagnosis.leaping import leap
+from torchcloth.diagnosis.fitting import leap
 from torchcloth.diagnosis.placebo import placebo
 
 SLOPES = toys.smooth(1, 4)  # two parameters, a cause, a nuisance

@@ -11,8 +11,7 @@ from torchcloth.diagnosis.cells import Cells
 from torchcloth.diagnosis.classes import TOLD, alike, correlations, fitted_alike
 from torchcloth.diagnosis.comparison import compare, predict, spread
 from torchcloth.diagnosis.evidence import as_rough
-from torchcloth.diagnosis.fitting import renoised, weighed_alike
-from torchcloth.diagnosis.leaping import step_of
+from torchcloth.diagnosis.fitting import renoised, step_of, weighed_alike
 from torchcloth.diagnosis.noise import ROUGH, Noise, fit_noise, floor_of, whitened
 from torchcloth.diagnosis.screening import Row, _decided, screen
 from torchcloth.diagnosis.trials import CLEAR

@@ -14,8 +14,7 @@ import torch
 
 from .approach import approach
 from .evidence import asked_about
-from .fitting import Fitted, fit, with_cause
-from .leaping import leap, leap_with
+from .fitting import Fitted, fit, leap, leap_with, with_cause
 from .noise import unfitted, whitened
 from .setting import Progress, Setting, staged
 from .world import Hypothesis, Model

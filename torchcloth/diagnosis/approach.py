@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .bursts import calmed
 from .evidence import Evidence, gather
-from .leaping import prior_precision
+from .fitting import prior_precision
 from .noise import unfitted, whitened
 from .setting import Progress, Setting
 from .steps import shifted

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from .bursts import densities, unweighted, weights
 from .cells import SEEN, aligned
-from .fitting import Fitted
-from .leaping import curvature, prior_precision, step_of
+from .fitting import Fitted, curvature, prior_precision, step_of
 from .noise import Whitened
 
 ALONE = 0.7  # share of the information, of a motion without which a cause cannot be sized

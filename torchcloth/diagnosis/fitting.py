@@ -8,17 +8,18 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .bursts import calmed
+from ..identification.bounds import bounded
+from .bursts import calmed, densities, unweighted
 from .evidence import Evidence, as_held, as_rough, asked_about, gather, shared
-from .leaping import columns, curvature, gained, leap, leap_with
 from .noise import Noise, Whitened, fit_noise, unfitted, whitened
 from .setting import Progress, Setting, staged
-from .strides import further
 from .world import Hypothesis, Model
 from .worlds import IMPOSSIBLE
 
 ENOUGH = 2.0  # log density that a further step should gain, and that the last one did, below which the search ends
 ITERATIONS = 5  # at most
+LONGEST = 1.0  # prior standard deviations, of a step
+SWEEPS = 4  # of weighing stretches anew
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,12 @@ class Fitted:
     ahead: float
 
 
+def prior_precision(model: Model) -> Tensor:
+    """[P + A] of the coordinates; amplitudes are known to a few times their typical size."""
+    stds = [*(p.std for p in model.parameters), *(2.0 * abs(h.typical) for h in model.accepted)]
+    return torch.tensor(stds, dtype=torch.float64) ** -2
+
+
 def fit(
     model: Model,
     setting: Setting,
@@ -56,8 +63,8 @@ def fit(
 
     Fits are compared with the same ``noise``; None: estimated. The nuisances' slopes are those of ``before``, if given.
     ``here`` is the evidence at the model's point, where that is known already: nothing of it is simulated again. A step
-    into what is ``IMPOSSIBLE`` is not taken. A step goes on in ``strides``. Slopes promise too little where cloth ripples,
-    so the search ends only where the last stride gained little, too; where there was none, the last step.
+    into what is ``IMPOSSIBLE`` is not taken. Slopes promise too little where cloth ripples, so the search ends only
+    where the last step gained little, too.
     """
     about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
 
@@ -68,20 +75,18 @@ def fit(
         return gather(at, setting, hypotheses, staged(progress, about), before)
 
     asked = here is None and not iterations
-    lately: float | None = 0.0
+    last: tuple[Noise, Model, Evidence] | None = None
     here = here or look(model, 0)
     for taken in range(1, iterations + 1):
         before, level = before or here, noise or fit_noise(here)
         step, ahead = leap(whitened(here, level), model)
-        if ahead < ENOUGH and lately < ENOUGH:
+        if ahead < ENOUGH and not (last and _gained(*last, model, here) >= ENOUGH):
             break
-        there, lately = further(model, here, level, step, setting)
-        first, then = model, here
+        further, last = model.at(model.point + step), (level, model, here)
         try:
-            model, here, asked = there, look(there, taken), taken == iterations
+            model, here, asked = further, look(further, taken), taken == iterations
         except IMPOSSIBLE:
             break
-        lately = gained(level, first, then, model, here) if lately is None else lately
     if hypotheses and not asked:
         here = here if before is None else as_held(here, before)
         here = asked_about(here, model, setting, hypotheses, staged(progress, about))
@@ -117,9 +122,57 @@ def without_cause(found: Fitted, name: str) -> Model:
     index = found.model.place(name)
     white, place = whitened(found.evidence, unfitted()), len(found.model.parameters) + index
     less = white._replace(value=white.value - found.model.amplitudes[index] * white.jacobian[:, place])
-    less = columns(less, [k for k in range(found.evidence.own) if k != place])
+    less = _columns(less, [k for k in range(found.evidence.own) if k != place])
     model = found.model.without(name)
     return model.at(model.point + leap(less, model)[0])
+
+
+def leap_with(white: Whitened, model: Model, place: int) -> tuple[Tensor, float]:
+    """As ``leap``, of a model whose last cause has the slopes in column ``place``, begun from several amplitudes.
+
+    A stretch that only this cause describes hardly counts until it does.
+    """
+    own, h = len(model.point) - 1, model.accepted[-1]
+    slopes = _columns(white, [*range(own), place])
+    starts = [0.0, h.typical, *([-h.typical] if h.signed else [])]
+    none = torch.zeros_like(model.point)
+    tried = [leap(slopes, model, torch.cat([none[:-1], none.new_tensor([a])])) for a in starts]
+    return max(tried, key=lambda pair: pair[1])
+
+
+def leap(white: Whitened, model: Model, start: Tensor | None = None) -> tuple[Tensor, float]:
+    """(step of the model's coordinates, log density that it is expected to gain), where slopes hold that far.
+
+    The likeliest step for noise whose level differs from stretch to stretch, by least squares with ever new weights.
+
+    Args:
+        white: slopes along the model's coordinates first.
+        model: as in ``step_of``; no coordinate goes farther than ``LONGEST`` prior standard deviations.
+        start: step from which weights are taken at first; None: none.
+    """
+    step = torch.zeros_like(model.point) if start is None else start
+    plain = unweighted(white)
+    for _ in range(SWEEPS):
+        step, _ = step_of(calmed(plain, step), model, LONGEST)
+    return step, _posterior(plain, model, step) - _posterior(plain, model)
+
+
+def _gained(noise: Noise, first: Model, there: Evidence, second: Model, here: Evidence) -> float:
+    """Log density from the first to the second, on the cells of both and by the scatter at the second."""
+    like = shared(here, [there])
+    white = lambda evidence: whitened(as_rough(evidence, like), noise)  # noqa: E731
+    return _posterior(white(here), second) - _posterior(white(there), first)
+
+
+def _posterior(plain: Whitened, model: Model, step: Tensor | None = None) -> float:
+    """Log density of unweighted cells and of the model's coordinates: as they are, or after a ``step`` by slopes."""
+    value = plain.value if step is None else plain.value + plain.jacobian[:, : len(step)] @ step
+    point = model.point if step is None else model.point + step
+    return float(densities(value, plain.stretch).sum() - 0.5 * prior_precision(model) @ point.square())
+
+
+def _columns(white: Whitened, columns: Sequence[int]) -> Whitened:
+    return white._replace(jacobian=white.jacobian[:, columns])
 
 
 def weighed_alike(first: Fitted, second: Fitted) -> tuple[Fitted, Fitted]:
@@ -132,3 +185,26 @@ def renoised(found: Fitted, noise: Noise, like: Evidence) -> Fitted:
     """The same weighed by another noise, on the cells of ``like`` and with stretches as rough as those."""
     evidence = as_rough(found.evidence, like)
     return replace(found, evidence=evidence, noise=noise, white=calmed(whitened(evidence, noise)))
+
+
+def step_of(white: Whitened, model: Model, longest: float = torch.inf) -> tuple[Tensor, float]:
+    """(Gauss-Newton step of the model's coordinates, log density that it is expected to gain).
+
+    Args:
+        white: slopes along the model's coordinates first.
+        model: coordinates stop at their ends, amplitudes without a sign at zero, and what stays free makes up for it.
+        longest: step of one coordinate, in prior standard deviations.
+    """
+    point, precision = model.point, prior_precision(model)
+    uphill = white.jacobian[:, : len(point)].mT @ white.value + precision * point
+    low, high = (reached - point for reached in model.ends)
+    limit = longest * precision.rsqrt()
+    square = curvature(white, model)
+    step = bounded(square, -uphill, torch.maximum(low, -limit), torch.minimum(high, limit))
+    return step, -float(uphill @ step + 0.5 * step @ square @ step)
+
+
+def curvature(white: Whitened, model: Model) -> Tensor:
+    """[P + A, P + A] inverse covariance of the model's coordinates."""
+    own = white.jacobian[:, : len(model.point)]
+    return own.mT @ own + torch.diag(prior_precision(model))

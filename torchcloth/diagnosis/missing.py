@@ -19,9 +19,8 @@ from ..identification.replays import Frames
 from ..pose.modes import modes_of
 from ..pose.objective import windows_of
 from .cells import aligned, cells_of
-from .fitting import Fitted
+from .fitting import Fitted, prior_precision
 from .lacking import reference
-from .leaping import prior_precision
 from .pushes import Pushes, pushed
 from .setting import Progress, Setting
 

@@ -28,9 +28,8 @@ from ..recordings import Recording
 from .cells import cells_of, directions
 from .evidence import central
 from .experiments import Experiment, planned, possible
-from .fitting import Fitted
+from .fitting import Fitted, prior_precision
 from .lacking import reference
-from .leaping import prior_precision
 from .noise import Noise
 from .pieces import joined, nuisances, runs, side_by_side
 from .setting import Progress, Setting, foreseen, surely_seen

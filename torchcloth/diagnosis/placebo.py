@@ -16,8 +16,7 @@ from torch import Tensor
 from .bursts import calmed, unweighted
 from .cells import Cells, aligned
 from .comparison import likelihood
-from .fitting import Fitted
-from .leaping import leap
+from .fitting import Fitted, leap
 from .noise import Whitened
 from .world import Model
 

@@ -20,8 +20,7 @@ from torch import Tensor
 
 from .cells import SEEN
 from .evidence import NUMERICS
-from .fitting import Fitted
-from .leaping import curvature, leap, leap_with, prior_precision
+from .fitting import Fitted, curvature, leap, leap_with, prior_precision
 from .world import Hypothesis
 
 Decision = Literal["present", "absent", "inconclusive", "unresolvable"]

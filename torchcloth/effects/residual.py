@@ -34,7 +34,7 @@ LAWS = {
     "along": Law("Pa s/m", 0.2, "opposes motion along the cloth, in proportion to speed"),
     "along2": Law("Pa s^2/m^2", 0.3, "opposes motion along the cloth, growing as speed squared"),
     "mass": Law("kg/m^2", 0.1, "is weight and inertia"),
-    "strain_rate": Law("N s/m", 0.15, "opposes stretching and shearing, in proportion to their speed"),
+    "strain_rate": Law("N s/m", 0.5, "opposes stretching and shearing, in proportion to their speed"),
     "bend": Law("N m", 1e-4, "opposes bending"),
 }
 PLACES = {"": "everywhere", "edge": "near the free edges", "grip": "near the grippers", "inside": "far from the edges"}
