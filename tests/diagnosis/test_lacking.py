@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from torchcloth.diagnosis import doubts, lack_of_fit
+from torchcloth.diagnosis.cells import Cells
 from torchcloth.diagnosis.lacking import RARE, SENSOR, Left, explained
 
 NAMES = ["a"]
@@ -82,6 +83,18 @@ def test_where_most_motions_fold_apart_what_is_held_out_says_how_much_is_mended(
     end = toys.fitted(replace(wrong, cells=[*right.cells[:3], wrong.cells[3]], numerics=rough))
     assert doubts.mended(start, end, MOTIONS) == pytest.approx(share, abs=0.1)
     assert doubts.mended(start, toys.fitted(replace(right, numerics=rough)), MOTIONS) == 1.0
+
+
+def test_how_much_is_mended_is_counted_on_cells_that_both_fits_have():
+    """What the start finds elsewhere on the cloth is wrong in the end, too, and has not come with the causes."""
+    wrong, right = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (3.0, 0.0))
+    elsewhere = torch.arange(len(wrong.cells[0].value)) % 8 == 0
+    cells = [c._replace(value=torch.where(elsewhere, 0.05, c.value)) for c in right.cells]
+    met = [Cells(*(column[~elsewhere] for column in c)) for c in wrong.cells]
+    numerics = [n[~elsewhere] for n in wrong.numerics]
+    start, end = toys.fitted(replace(wrong, cells=met, numerics=numerics)), toys.fitted(replace(right, cells=cells))
+    assert explained(lack_of_fit(start, MOTIONS), lack_of_fit(end, MOTIONS)) < 0
+    assert doubts.mended(start, end, MOTIONS) > 0.9
 
 
 def row(motion, left, expected=1e-3, kind="points", unit="m", stable=True, stretches=8, episode=0):

@@ -6,8 +6,9 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from .comparison import compare, of_episodes, predict
+from .evidence import shared
 from .fitting import Fitted, fit, renoised, weighed_alike, without_cause
-from .lacking import explained, lack_of_fit
+from .lacking import explained, is_lacking, lack_of_fit
 from .noise import floor_of
 from .placebo import placebo
 from .setting import Progress, Setting, staged
@@ -66,11 +67,13 @@ def mended(start: Fitted, end: Fitted, names: Sequence[str], alone: Collection[s
     """Share of what is wrong that is gone; 1 where nothing is lacking any more.
 
     Of less than half, more is still there: whatever makes it may well do what passed for the causes, too. Where both
-    meshes agree about less than half of the motions, the share held out, of all.
+    meshes agree about less than half of the motions, the share held out, of all. Of cells that both fits have: points
+    that vacuum finds on another part of the cloth would come back as if the causes had brought what is wrong with them.
     """
-    first, left = (lack_of_fit(found, names) for found in (start, end))
-    if not any(row.lacking for row in left):
+    if not is_lacking(end, names):
         return 1.0
+    alike = (replace(f, evidence=shared(f.evidence, [other.evidence])) for f, other in ((start, end), (end, start)))
+    first, left = (lack_of_fit(found, names) for found in alike)
     folded = {row.episode for row in (*first, *left) if not row.stable}
     if 2 * len(folded) <= len(names):
         return explained(first, left)
