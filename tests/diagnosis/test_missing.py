@@ -94,6 +94,28 @@ def test_pushes_are_those_of_a_body_force(planted):
     assert torch.allclose(moved.x[0], difference, atol=1e-2 * float(difference.abs().max()))
 
 
+@pytest.mark.parametrize("size", [1e30, torch.nan])
+def test_where_pushes_grow_without_end_nothing_is_asked(planted, monkeypatch, size):
+    """Of one motion that is unstable from half a second on; what the other says is as it was."""
+    found, setting = planted
+    usual, unstable = missing.pushed, setting.episodes[1]
+
+    def growing(world, episode, *rest):
+        frames, moved = usual(world, episode, *rest)
+        late = (episode.times - episode.times[0] > 0.5)[:, None, None]
+        return frames, moved if episode is not unstable else moved._replace(x=torch.where(late, size, moved.x))
+
+    plain = missing_force(found, setting, window=STRETCH)
+    monkeypatch.setattr(missing, "pushed", growing)
+    answer = missing_force(found, setting, window=STRETCH)
+    assert [part.until for part in answer.parts] == [None, pytest.approx(0.4)]
+    assert answer.parts[0].force == pytest.approx(plain.parts[0].force, rel=0.05, abs=0.02 * answer.weight)
+    assert bool(answer.parts[1].force.isfinite().all())
+    late = answer.parts[1].windows[:, 0] > 0.5
+    assert float(answer.parts[1].certainty[late].max()) < 1e-6
+    assert [m["until"] for m in answer.as_dict()["motions"]] == [None, pytest.approx(0.4)]
+
+
 def test_slopes_of_any_size_have_a_posterior():
     """Information over more orders than numbers have digits; where it is tame, the textbook's formula."""
     rng = torch.Generator().manual_seed(0)
@@ -120,7 +142,7 @@ def test_two_forces_against_each_other_are_told_at_one_of_them():
     force = torch.zeros(1, len(uv), 3).double()
     force[0, :, 1] = torch.where(uv[:, 0] < 0.05, 5.0, torch.where(uv[:, 0] > 0.15, -4.0, 0.0))
     part = missing.Missing(
-        "swing", torch.tensor([[0.0, 0.2]]), force, torch.full_like(force, 0.2), torch.zeros_like(force)
+        "swing", torch.tensor([[0.0, 0.2]]), force, torch.full_like(force, 0.2), torch.zeros_like(force), None
     )
     area = torch.full((len(uv),), 1e-4).double()
     (told,) = missing.MissingForce([part], 1.0, 2.0, uv, torch.zeros(0, 3), area).as_dict()["motions"]

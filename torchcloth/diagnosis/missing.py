@@ -3,7 +3,8 @@
 A pressure that is smooth over the fabric and constant within ``WINDOW`` is asked for beside the model: the likeliest
 one under a prior whose size the data set (weak-constraint variational assimilation, Tremolet 2006), beside the noise
 that a right model would leave (``lacking.reference``). Tangents along all directions cost about as much as the
-adjoint's twenty passes of conjugate gradients, and give its errors too.
+adjoint's twenty passes of conjugate gradients, and give its errors too. Where the motion is unstable they grow without
+end: from there on folds decide, and nothing is asked.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..identification.episodes import Episode
 from ..identification.replays import Frames
 from ..pose.modes import modes_of
 from ..pose.objective import windows_of
-from .cells import aligned, cells_of
+from .cells import STRETCH, Cells, aligned, cells_of
 from .fitting import Fitted, prior_precision
 from .lacking import reference
 from .pushes import Pushes, pushed
@@ -28,6 +30,7 @@ WINDOW, MODES = 0.2, 8  # s, fields for each axis
 LEVELS = 10 ** torch.linspace(-2.5, 1.5, 41, dtype=torch.float64)  # m/s^2, prior standard deviation of a field
 SWEEPS = 15  # of learning the size window by window
 GRAVITY = 9.81  # m/s^2
+FARTHEST = 10.0  # times the square of a motion's duration, that 1 m/s^2 may move the cloth: free flight has half of it
 SURE = 4.0  # standard errors; a chi of three numbers exceeds it once in 900 places
 
 
@@ -39,6 +42,7 @@ class Missing(NamedTuple):
     force: Tensor  # [W, V, 3] Pa, world axes
     std: Tensor  # [W, V, 3] Pa
     x: Tensor  # [W, V, 3] m, where the cloth is in the middle of each
+    until: float | None  # s, from the first frame: from then on pushes grow without end, and nothing was asked
 
     @property
     def certainty(self) -> Tensor:
@@ -97,6 +101,7 @@ class MissingForce:
             "total": self.total(m)[w].tolist(),
             "standard_errors": certain,
             "sure": certain > SURE,
+            "until": m.until,
         }
 
 
@@ -126,7 +131,8 @@ def missing_force(
     for name, p, e in zip(setting.names, parts, setting.episodes, strict=True):
         here = slice(first, first := first + 3 * modes * len(p.windows))
         force, std = (density[:, None] * f for f in _spread(answer.mean[here], answer.covariance[here, here], fields))
-        told.append(Missing(name, torch.stack([e.times[list(w)] - e.times[0] for w in p.windows]), force, std, p.x))
+        windows = torch.stack([e.times[list(w)] - e.times[0] for w in p.windows])
+        told.append(Missing(name, windows, force, std, p.x, p.until))
     weight = GRAVITY * float((density * area).sum() / area.sum())
     return MissingForce(told, gain, weight, setting.rest[:, :2], torch.as_tensor(world.cloth.mesh.faces), area)
 
@@ -138,6 +144,7 @@ class _Asked(NamedTuple):
     slopes: Tensor  # [C, own + W * M * 3]
     windows: list[tuple[int, int]]
     x: Tensor  # [W, V, 3]
+    until: float | None  # s, from the first frame
 
 
 def _asked(found: Fitted, setting: Setting, k: int, fields: Tensor, window: float, progress: Progress) -> _Asked:
@@ -146,8 +153,17 @@ def _asked(found: Fitted, setting: Setting, k: int, fields: Tensor, window: floa
     windows = windows_of(e.times, window)
     frames, moved = pushed(found.model.world(), e, Pushes(windows, modal(windows, fields)), setting.dt)
     middle = torch.tensor([(first + last) // 2 for first, last in windows])
-    value, slopes = whitened_beside(found, setting, k, frames, moved)
-    return _Asked(value, slopes, windows, frames.x[middle])
+    count = _foreseen(e, moved)
+    value, slopes = whitened_beside(found, setting, k, frames, moved, count)
+    last = int(found.evidence.cells[k].window.max()) if len(found.evidence.cells[k].window) else 0
+    return _Asked(value, slopes, windows, frames.x[middle], count * STRETCH if count <= last else None)
+
+
+def _foreseen(e: Episode, moved: Frames) -> int:
+    """Stretches of time of the cells before the first in which a push moves the cloth farther than any could."""
+    since = e.times - e.times[0]
+    far = ~(moved.x.abs().amax((0, 2, 3)) < FARTHEST * float(since[-1]) ** 2)  # not a number is far
+    return int(since[far.nonzero()[0]] / STRETCH) if bool(far.any()) else int(since[-1] / STRETCH) + 1
 
 
 def modal(windows: Sequence[tuple[int, int]], fields: Tensor) -> Tensor:
@@ -157,12 +173,18 @@ def modal(windows: Sequence[tuple[int, int]], fields: Tensor) -> Tensor:
     return torch.einsum("wu,kvb->wukvb", torch.eye(count).to(fields), unit).flatten(1, 2)
 
 
-def whitened_beside(found: Fitted, setting: Setting, k: int, frames: Frames, moved: Frames) -> tuple[Tensor, Tensor]:
-    """(residuals [C], slopes [C, own + K]) along the model's own coordinates, then along ``moved``; both whitened."""
-    e, cells, stds = setting.episodes[k], found.evidence.cells[k], found.evidence.stds[k]
+def whitened_beside(
+    found: Fitted, setting: Setting, k: int, frames: Frames, moved: Frames, count: int
+) -> tuple[Tensor, Tensor]:
+    """(residuals [C], slopes [C, own + K]) along the model's own coordinates, then along ``moved``; both whitened.
+
+    Of cells in the first ``count`` stretches of time.
+    """
+    e, stds, told = setting.episodes[k], found.evidence.stds[k], found.evidence.cells[k].window < count
+    cells = Cells(*(column[told] for column in found.evidence.cells[k]))
     coarse = cells_of(frames, moved, e, setting.sheet, setting.rest)
     slopes = aligned(cells.key, coarse.key, coarse.jacobian)
-    noise, _ = reference(cells, found.evidence.numerics[k])
+    noise, _ = reference(cells, found.evidence.numerics[k][told])
     root = torch.linalg.cholesky(noise.covariance(cells, cells.jacobian[:, -len(stds) :], stds))
     both = torch.cat([cells.value[:, None], cells.jacobian[:, : found.evidence.own], slopes], 1)
     both = torch.linalg.solve_triangular(root, both, upper=False)

@@ -95,6 +95,9 @@ def _lacking(content: dict[str, Any]) -> list[str]:
             f"  A pressure of {size:.2g} Pa ({share:.0f} % of what the cloth weighs there) is missing in "
             f"{m['motion']}, about ({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
         )
+    unasked = [f"{m['motion']} from {m['until']:.1f} s on" for m in missing["motions"] if m["until"] is not None]
+    if unasked:
+        out.append(f"  What force is missing there cannot be asked: small pushes grow without end in {', '.join(unasked)}.")
     return out + _residual(content["residual"])
 
 
