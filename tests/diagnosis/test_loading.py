@@ -167,6 +167,19 @@ def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
         dx.confirm(*models, [seen, blank])
 
 
+@pytest.mark.parametrize("other", ["data sheet", "set of grasps"])
+def test_another_cloth_confirms_nothing(made, other):
+    folder, _, _ = made
+    unseen = sheets.episode("lift", duration=0.4)
+    if other == "data sheet":
+        nominal = {**unseen.cloth.nominal, "membrane_stiffness": 77.0}
+        unseen = replace(unseen, cloth=replace(unseen.cloth, nominal=nominal))
+    else:
+        unseen = replace(unseen, grasps=dict(list(unseen.grasps.items())[:1]))
+    with pytest.raises(InvalidInput, match=f"another {other} than in base.tcm"):
+        dx.confirm(folder / "base.tcm", folder / "extended.tcm", [unseen])
+
+
 def test_a_table_that_one_episode_has_is_in_the_scene_of_all(made):
     folder, _, _ = made
     plane = rec.Collider(np.array([0.0, 0.0, 1.004]), np.array([0.0, 0.0, 1.0]), 0.4)
@@ -177,8 +190,11 @@ def test_a_table_that_one_episode_has_is_in_the_scene_of_all(made):
     assert one.after == pytest.approx(other.after, rel=1e-9)
 
 
-def test_the_bases_figures_do_not_depend_on_what_it_is_compared_with(made, tmp_path):
-    """Beside the true cause, a third of it, and a wrong one, which fits no better and is not confirmed."""
+def test_the_bases_metres_hardly_depend_on_what_it_is_compared_with(made, tmp_path):
+    """Beside the true cause, a third of it, and a wrong one, which fits no better and is not confirmed.
+
+    All are compared on what both models meet, which differs a little.
+    """
     folder, seen, blank = made
     base = dx.base_model(blank)
     by = {h.name: h for h in dx.catalogue(base, [blank])}
@@ -186,8 +202,9 @@ def test_the_bases_figures_do_not_depend_on_what_it_is_compared_with(made, tmp_p
     for name, amplitude in (("air.drag_n", TRUE), ("air.drag_n", 0.3 * TRUE), ("obs.clock", 0.02)):
         path = dx.save_model(tmp_path / f"{name}-{amplitude}.tcm", base.plus(by[name], amplitude), blank)
         found.append(dx.confirm(folder / "base.tcm", path, [seen]))
-    assert len({f.whole.before for f in found}) == 1
-    assert len({f.motions["fast"].before for f in found}) == 1
+    for f in found:
+        assert f.whole.before == pytest.approx(found[0].whole.before, rel=0.03)
+        assert f.motions["fast"].before == pytest.approx(found[0].motions["fast"].before, rel=0.03)
     assert found[0].whole.after < found[1].whole.after < 0.9 * found[1].whole.before
     assert [f.confirmed for f in found] == [True, True, False]
     assert all(f.floor < 1e-3 for f in found), "half a millimetre a point, of which a cell has several"

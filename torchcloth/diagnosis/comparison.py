@@ -189,7 +189,8 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     low, high = (float(np.quantile(sums, q)) for q in (0.025, 0.975))
     total, share = float(density.sum()), _share(squares.sum(0), floor)
     few = 2.0 if len(set(owner.tolist())) < FEW else 1.0
-    left, right = (share + few * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
+    ends = (share + few * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
+    left, right = (min(max(end, -1.0), 1.0) for end in ends)
     counts = one.smooth * torch.maximum(*(weights(p.white, p.stretch) for p in (one, two)))
     seen, felt = counts * one.seen, counts * (one.kind == SEEN)
     calm = _calm(one, two, seen)

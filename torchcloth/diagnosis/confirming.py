@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
@@ -14,7 +14,7 @@ from ..errors import InvalidInput, RecordingError
 from ..identification.result import or_none
 from ..recordings import Recording
 from ..recordings.marks import alike, each_once, mark
-from ..recordings.together import together
+from ..recordings.together import same_cloth, together
 from .cells import aligned
 from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
 from .evidence import Evidence, as_held, as_rough, gather, shared
@@ -27,10 +27,10 @@ from .setting import Progress, setting_of, staged
 from .world import Model
 
 CONVENTION = (
-    "SI units. rms: root mean square of mean residuals over parts of the fabric and 0.2 s, without what clock, camera, "
-    "grasp, rim and tare of the episode explain within their priors. No parameter was fitted. ci95: by resampling "
-    "stretches of 0.4 s. explained: share of rms_before^2 - floor^2, over parts that both models meet. log_density: of "
-    "the extended over the base model, by the noise that the extended one leaves."
+    "SI units. rms: root mean square of mean residuals over parts of the fabric and 0.2 s that both models meet, without "
+    "what clock, camera, grasp, rim and tare of the episode explain within their priors. No parameter was fitted. ci95: "
+    "by resampling stretches of 0.4 s. explained: share of rms_before^2 - floor^2. log_density: of the extended over the "
+    "base model, by the noise that the extended one leaves."
 )
 
 
@@ -86,7 +86,7 @@ def confirm(
 
     Args:
         base, extended: model files; ``diagnose`` writes both.
-        recordings: episodes of the same cloth, held at the same places.
+        recordings: episodes of the same cloth and by the same data sheet, held by the same grasps.
         progress: called with one line for each episode that is simulated.
 
     Raises:
@@ -100,6 +100,8 @@ def confirm(
     somewhere_seen(recordings)
     scene = together(recordings)
     files = [read_model(path, scene) for path in (base, extended)]
+    for path, file in zip((base, extended), files, strict=True):
+        same_cloth([replace(file.scene, path=Path(path)), scene], anywhere=True)
     _refuse_no_extension(*(file.model for file in files))
     for recording in recordings:
         _refuse_seen(recording, files)
@@ -109,35 +111,15 @@ def confirm(
         for file, setting, stage in zip(files, settings, ("base", "extended"), strict=True)
     ]
     noise, like = fit_noise(found[1]), shared(found[1], found[:1])
-    before, after = (_judged(f.model, e, noise, like) for f, e in zip(files, found, strict=True))
+    whole = [as_it_is(_as_fitted(f.model, e, unfitted())) for f, e in zip(files, found, strict=True)]
+    before, after = (_judged(f.model, e, w, noise, like) for f, e, w in zip(files, found, whole, strict=True))
     floor, source = min(floor_of(e, least()) for e in found), "sensor only"  # slow errors may be the models' own
-    if (repeated := repeats(after.whole, pairs_of(recordings, settings[1].episodes))) is not None:
+    if (repeated := repeats(whole[1], pairs_of(recordings, settings[1].episodes))) is not None:
         floor, source = repeated.rms, "repetitions"
     names = settings[0].names
     motions = {name: [k for k, own in enumerate(names) if own == name] for name in dict.fromkeys(names)}
-    of = {name: _gain(before.of(own), after.of(own), floor) for name, own in motions.items()}
-    return Confirmation(_gain(before, after, floor), of, floor, source)
-
-
-class _Judged(NamedTuple):
-    """One model on episodes that it was not fitted to."""
-
-    whole: Predicted  # all that it meets, in metres by nobody's noise
-    alike: Predicted  # the same where the other model meets it, too, with densities by the extended one's noise
-
-    def of(self, episodes: Sequence[int]) -> _Judged:
-        return _Judged(*(of_episodes(p, episodes) for p in self))
-
-
-def _gain(before: _Judged, after: _Judged, floor: float) -> Gain:
-    """Each model's rms over all that it meets; what is compared, over what both do."""
-    gain = compare(before.alike, after.alike, floor)
-    return gain._replace(before=_rms(before.whole), after=_rms(after.whole))
-
-
-def _rms(p: Predicted) -> float:
-    """NaN where nothing was seen."""
-    return float(p.value[p.seen].square().mean().sqrt())
+    of = {name: compare(of_episodes(before, own), of_episodes(after, own), floor) for name, own in motions.items()}
+    return Confirmation(compare(before, after, floor), of, floor, source)
 
 
 def _refuse_no_extension(base: Model, extended: Model) -> None:
@@ -169,14 +151,13 @@ def _refuse_seen(recording: Recording, files: Sequence[ModelFile]) -> None:
         )
 
 
-def _judged(model: Model, evidence: Evidence, noise: Noise, like: Evidence) -> _Judged:
+def _judged(model: Model, evidence: Evidence, whole: Predicted, noise: Noise, like: Evidence) -> Predicted:
     """Density by ``noise``, on the cells, as rough and with the nuisances of ``like``; metres by nobody's noise.
 
-    So the base's figures are the same whatever it is compared with.
+    So the base's metres are the same whatever it is compared with, on cells that both have.
     """
-    whole = as_it_is(_as_fitted(model, evidence, unfitted()))
     alike = as_it_is(_as_fitted(model, as_rough(as_held(evidence, like), like), noise))
-    return _Judged(whole, alike._replace(value=aligned(alike.place, whole.place, whole.value)))
+    return alike._replace(value=aligned(alike.place, whole.place, whole.value))
 
 
 def _as_fitted(model: Model, evidence: Evidence, noise: Noise) -> Fitted:

@@ -20,11 +20,14 @@ def name_of(recording: Recording, k: int) -> str:
     return recording.path.name if recording.path is not None else f"episode {k}"
 
 
-def same_cloth(recordings: Sequence[Recording]) -> None:
-    """Raises InvalidInput where the episodes do not describe one cloth, held at the same places."""
+def same_cloth(recordings: Sequence[Recording], anywhere: bool = False) -> None:
+    """Raises InvalidInput where the episodes do not describe one cloth, held at the same places.
+
+    With ``anywhere`` the mesh, gravity and places of grasps may differ, but not which there are.
+    """
     first = recordings[0]
     for k, other in enumerate(recordings[1:], 1):
-        for what, of in _DESCRIBED.items():
+        for what, of in (_CLOTH if anywhere else _CLOTH | _SCENE).items():
             a, b = of(first), of(other)
             if not _equal(a, b):
                 raise InvalidInput(
@@ -35,21 +38,23 @@ def same_cloth(recordings: Sequence[Recording]) -> None:
                 )
 
 
-_DESCRIBED = {
+_CLOTH = {
     "cloth (width and height of the pattern, m)": lambda r: (
         None if (b := r.cloth.pattern_box()) is None else b[1] - b[0]
     ),
+    "areal density (kg/m^2)": lambda r: r.cloth.areal_density,
+    "thickness (m)": lambda r: r.cloth.thickness,
+    "data sheet": lambda r: {name: value for name, value in sorted(r.cloth.nominal.items()) if name != "units"},
+    "set of grasps": lambda r: sorted(r.grasps),
+}
+_SCENE = {
     "mesh (vertices, triangles)": lambda r: (
         None if r.cloth.faces is None else [r.cloth.faces.max() + 1, len(r.cloth.faces)]
     ),
     "numbering of the mesh (checksum of its triangles)": lambda r: (
         None if r.cloth.faces is None else f"{crc32(r.cloth.faces.astype('<i8').tobytes()):08x}"
     ),
-    "areal density (kg/m^2)": lambda r: r.cloth.areal_density,
-    "thickness (m)": lambda r: r.cloth.thickness,
-    "data sheet": lambda r: {name: value for name, value in sorted(r.cloth.nominal.items()) if name != "units"},
     "gravity (m/s^2)": lambda r: r.gravity,
-    "set of grasps": lambda r: sorted(r.grasps),
     "vertices of a grasp": lambda r: [np.sort(g.vertices).tolist() for g in _grasps(r) if g.vertices is not None],
     "radius of a grasp (m)": lambda r: [g.radius for g in _grasps(r) if g.uv is not None],
     "air (whether its density is known)": lambda r: r.air_density is not None,
