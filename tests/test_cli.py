@@ -211,12 +211,24 @@ def test_help_lists_the_verbs(capsys):
         assert re.search(rf"^ +{verb} ", said, re.MULTILINE)
 
 
-@pytest.mark.parametrize("arguments", [[], ["identify"], ["conquer"], ["identify", "x", "--iterations", "few"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["identify"], ["conquer"], ["identify", "x", "--iterations", "few"], ["identify", "x", "--out", ""]],
+)
 def test_wrong_usage_is_exit_code_2(capsys, arguments):
     with pytest.raises(SystemExit) as stopped:
         main(arguments)
     assert stopped.value.code == 2
-    assert "usage: torchcloth" in capsys.readouterr().err
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("torchcloth")
+    assert line.endswith("--help")
+
+
+def test_a_diagnosis_does_not_replace_the_model_that_it_starts_from(capsys, tmp_path):
+    (tmp_path / "base.tcm").write_text("mine")
+    assert main(["diagnose", "a", "b", "--model", str(tmp_path / "base.tcm"), "--out", str(tmp_path)]) == 2
+    assert "another folder" in capsys.readouterr().err
+    assert (tmp_path / "base.tcm").read_text() == "mine"
 
 
 def test_version(capsys):

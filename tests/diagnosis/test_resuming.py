@@ -77,7 +77,10 @@ def test_another_diagnosis_is_not_resumed(episodes, counted, tmp_path):
 def test_the_command_says_how_to_go_on(episodes, counted, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(run, "catalogue", lambda *_: [])
     folders = [str(rec.write(e, tmp_path / e.split["motion"])) for e in episodes]
-    out, counted["stop"] = tmp_path / "out", 2
+    out, counted["stop"] = tmp_path / "out", 0
+    assert main(["diagnose", *folders, "--out", str(out)]) == 130
+    assert capsys.readouterr().err.splitlines() == ["torchcloth: stopped; nothing was kept yet"]
+    counted["stop"] = 2
     assert main(["diagnose", *folders, "--out", str(out)]) == 130
     assert capsys.readouterr().err.splitlines() == ["torchcloth: stopped; `--resume` goes on from there"]
     assert len(list((out / "progress").glob("episode*.pt"))) == 2

@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib import metadata
+from typing import NoReturn
 
 from ..errors import InvalidInput, TorchclothError
 from . import bench, confirm, convert, diagnose, doctor, identify, inspect, pose, predict, simulate, view
@@ -40,7 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"torchcloth: {said}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"torchcloth: stopped{getattr(options, 'stopped', '')}", file=sys.stderr)
+        said = getattr(options, "stopped", "")
+        print(f"torchcloth: stopped{said(options) if callable(said) else said}", file=sys.stderr)
         return 130
 
 
@@ -55,8 +57,15 @@ def _of_system(error: OSError) -> TorchclothError:
     )
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage of all options."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; to do: see {self.prog} --help\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="torchcloth", description="Differentiable cloth for robotics.")
+    parser = _Parser(prog="torchcloth", description="Differentiable cloth for robotics.")
     parser.add_argument("--version", action="version", version=metadata.version("torchcloth"))
     verbs = parser.add_subparsers(required=True, metavar="VERB")
     for verb in VERBS:

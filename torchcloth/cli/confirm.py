@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._files import write_text
 from .diagnose import progress_line
-from .folders import check_folder
+from .folders import check_folder, place
 
 if TYPE_CHECKING:
     from ..diagnosis import Gain
@@ -31,7 +31,7 @@ def add(verbs: Any) -> None:
     parser.add_argument("episodes", nargs="+", metavar="EPISODE", help="folders of the same cloth's episodes")
     parser.add_argument(
         "--out",
-        type=Path,
+        type=place,
         metavar="DIR",
         help="folder for the result, which replaces the last (EXTENDED's folder/confirmation)",
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
-from .folders import check_folder
+from .folders import check_folder, place
 
 if TYPE_CHECKING:
     from ..recordings import Recording
@@ -28,7 +28,7 @@ def add(verbs: Any) -> None:
         'under "source" which topic or column is what. Without it the message says what to write.',
     )
     convert.add_argument("source", type=Path, metavar="SRC", help="file or folder to read")
-    convert.add_argument("target", type=Path, metavar="DST", help=f"episode folder to write, or a file ending {MCAP}")
+    convert.add_argument("target", type=place, metavar="DST", help=f"episode folder to write, or a file ending {MCAP}")
     convert.add_argument("--from", dest="format", choices=FORMATS, help="what SRC must be (default: found by content)")
     convert.add_argument("--scene", type=Path, metavar="FILE", help="JSON with what the recording does not tell")
     convert.add_argument("--episode", type=int, metavar="N", help="which one, where SRC holds many (LeRobot)")

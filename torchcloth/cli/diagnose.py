@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from .._files import PROGRESS
-from .folders import check_folder
-from .identify import STOPPED
+from ..errors import InvalidInput
+from .folders import check_folder, how_to_go_on, place
 
 
 def add(verbs: Any) -> None:
@@ -24,20 +24,22 @@ def add(verbs: Any) -> None:
     )
     parser.add_argument("episodes", nargs="+", metavar="EPISODE", help="folders of one cloth's episodes")
     parser.add_argument("--model", metavar="MODEL", help="a .tcm file to start from (default: A-EP in vacuum)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result")
+    parser.add_argument("--out", type=place, required=True, metavar="DIR", help="folder for the result")
     parser.add_argument("--resume", action="store_true", help="go on with a diagnosis that was stopped")
-    parser.set_defaults(run=_diagnose, stopped=STOPPED)
+    parser.set_defaults(run=_diagnose, stopped=how_to_go_on)
 
 
 def _diagnose(options: argparse.Namespace) -> int:
     import torch
 
     from .. import diagnosis
+    from ..diagnosis.run import RESULT
     from ..identification.journal import clear
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
     check_folder(options.out)
+    _refuse_own_result(options)
     episodes, faults = diagnosis.read_episodes(options.episodes)
     if faults:
         answer = diagnosis.refused(faults)
@@ -45,22 +47,40 @@ def _diagnose(options: argparse.Namespace) -> int:
         model = None
         if options.model is not None:
             model, episodes = diagnosis.begin_with(options.model, episodes)
+        seconds = sum(float(e.points.t[-1] - e.points.t[0]) for e in episodes if e.points is not None)
         print(
-            f"{len(episodes)} episodes: a third of a minute each second of them, up to one and a half with causes",
+            f"{len(episodes)} episodes, {seconds:.0f} s of points: some {max(1, round(seconds / 3)):.0f} minutes of a "
+            "core, up to four times as many where causes are found",
             flush=True,
         )
         with progress_line() as progress:
             answer = diagnosis.diagnose(
                 episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume or None
             )
+    replaced = (options.out / RESULT).exists()
     path = diagnosis.write_diagnosis(answer, episodes, options.out)
     if answer.searched is not None:  # a stopped diagnosis goes on once the episodes can be read
         clear(options.out / PROGRESS)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())
-    written = (path.name, "report.html", answer.content["model"])
+    written = (path.name, "report.html", answer.content.get("base"), answer.content["model"])
     print("\n".join(str(path.parent / name) for name in written if name))
+    if replaced:
+        print("the last diagnosis there is replaced")
     return 0
+
+
+def _refuse_own_result(options: argparse.Namespace) -> None:
+    """A model to start from that the result would replace."""
+    from ..diagnosis.run import BASE, EXTENDED
+
+    own = [(options.out / name).resolve() for name in (BASE, EXTENDED)]
+    if options.model is not None and Path(options.model).resolve() in own:
+        raise InvalidInput(
+            "--out",
+            got=f"{options.out}, where the result would replace {options.model}",
+            expected="another folder than that of --model",
+        )
 
 
 @contextmanager

@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import tempfile
 from pathlib import Path
 
+from .._files import PROGRESS
 from ..errors import InvalidInput
+
+
+def place(text: str) -> Path:
+    """A path to write to, as argparse wants it: an empty one, of a variable that is not set, is none."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError(f"got {text!r}; expected a path")
+    return Path(text)
+
+
+def how_to_go_on(options: argparse.Namespace) -> str:
+    """Of a command that was stopped and keeps what it has done."""
+    kept = (options.out / PROGRESS).exists()
+    return "; `--resume` goes on from there" if kept else "; nothing was kept yet"
 
 
 def check_folder(path: Path, option: str = "--out") -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from .._files import PROGRESS
 from ..errors import InvalidInput
 from . import fields
-from .folders import check_folder
+from .folders import check_folder, how_to_go_on, place
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -23,19 +23,18 @@ if TYPE_CHECKING:
     from ..recordings import Recording
 
 DEMO = "bimanual_swing"
-STOPPED = "; `--resume` goes on from there"
 
 
 def add(verbs: Any) -> None:
     """The verbs and their options."""
     identify = verbs.add_parser("identify", help="fit fabric parameters to recorded episodes")
     identify.add_argument("episodes", nargs="+", metavar="EPISODE", help="folder of a recording")
-    identify.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result and pictures")
-    identify.set_defaults(run=_identify, stopped=STOPPED, unsaid=None)  # work is not thrown away unasked
+    identify.add_argument("--out", type=place, required=True, metavar="DIR", help="folder for the result and pictures")
+    identify.set_defaults(run=_identify, stopped=how_to_go_on, unsaid=None)  # work is not thrown away unasked
     _add_options(identify)
     demo = verbs.add_parser("demo", help="identify the shipped example")
-    demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default out/demo")
-    demo.set_defaults(run=_demo, stopped=STOPPED, unsaid=False)
+    demo.add_argument("--out", type=place, default=Path("out/demo"), metavar="DIR", help="default out/demo")
+    demo.set_defaults(run=_demo, stopped=how_to_go_on, unsaid=False)
     _add_options(demo)
 
 

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
 from typing import Any
 
 from .._files import write_text
-from .folders import check_folder
+from .folders import check_folder, place
 
 
 def add(verbs: Any) -> None:
     """The verb."""
     inspect = verbs.add_parser("inspect", help="streams, rates, gaps, lag, noise, rejected frames of an episode")
     inspect.add_argument("episode", metavar="EPISODE", help="folder of a recording")
-    inspect.add_argument("--out", type=Path, metavar="DIR", help="also write inspection.json and inspection.png")
+    inspect.add_argument("--out", type=place, metavar="DIR", help="also write inspection.json and inspection.png")
     inspect.add_argument("--json", action="store_true", help="print inspection.json instead of tables")
     inspect.set_defaults(run=_inspect)
 

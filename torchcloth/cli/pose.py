@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
-from .folders import check_folder
+from .folders import check_folder, place
 from .identify import assignments, nuisances_of, say_what_is_beside
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def add(verbs: Any) -> None:
     pose.add_argument("--use", nargs="+", choices=["points", "markers", "force"], help="kinds of data (default: all)")
     pose.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
     pose.add_argument("--truth", action="store_true", help="show the true cloth of a synthetic episode in the picture")
-    pose.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result and the picture")
+    pose.add_argument("--out", type=place, required=True, metavar="DIR", help="folder for the result and the picture")
     pose.set_defaults(run=_pose)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from .._files import write_text
 from ..errors import InvalidInput
-from .folders import check_folder
+from .folders import check_folder, place
 
 TABLE = "table.json"  # of a folder with readings of a tension machine
 STRIP = ("angle", "length", "width", "preload", "strain")  # options that no episode has
@@ -33,7 +33,7 @@ def add(verbs: Any) -> None:
         help="tension.json or identification.json, the folder that holds it, or a .tcm file of `diagnose`",
     )
     add("seen", type=Path, nargs="?", metavar="SEEN", help="a tension table or an episode: to predict and compare with")
-    add("--out", type=Path, metavar="DIR", help="folder for prediction.json and pictures (FIT's folder/prediction)")
+    add("--out", type=place, metavar="DIR", help="folder for prediction.json and pictures (FIT's folder/prediction)")
     add("--angle", type=float, metavar="DEGREES", help="of the strip, from the warp")
     add("--length", type=float, metavar="M", help="of the strip (as fitted)")
     add("--width", type=float, metavar="M", help="of the cloth that carries the force (as fitted)")

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput, TorchclothError
-from .folders import check_folder
+from .folders import check_folder, place
 
 if TYPE_CHECKING:
     from ..recordings import Recording
@@ -38,7 +38,7 @@ def add(verbs: Any) -> None:
     option = parser.add_argument
     option("--garment", nargs="+", required=True, metavar="NAME", help="shirt, trousers, dress, sheet")
     option("--motion", nargs="+", required=True, metavar="NAME", help=", ".join(MOTIONS))
-    option("--out", type=Path, required=True, metavar="DIR", help="folder for the episodes, a GIF of each, an overview")
+    option("--out", type=place, required=True, metavar="DIR", help="folder for episodes, a GIF of each, an overview")
     option("--fabric", metavar="PRESET", help="a published fabric instead of the garment's own")
     option("--seed", type=int, default=Order.seed, metavar="N", help="of the sensor's errors and the cloth's place (0)")
     option("--triangles", type=int, default=Order.triangles, metavar="N", help="of the cloth, about (800)")

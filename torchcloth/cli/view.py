@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
-from .folders import check_file
+from .folders import check_file, place
 
 if TYPE_CHECKING:
     from ..viewing import Film
@@ -27,7 +27,7 @@ def add(verbs: Any) -> None:
     )
     view.add_argument(
         "--out",
-        type=Path,
+        type=place,
         metavar="FILE",
         help=".gif, .png, .rrd (rerun), .html or .viser; left out: a server for the browser",
     )

@@ -27,10 +27,10 @@ from .setting import Progress, setting_of, staged
 from .world import Model
 
 CONVENTION = (
-    "SI units. rms: root mean square of mean residuals over parts of the fabric and 0.2 s that both models meet, without "
-    "what clock, camera, grasp, rim and tare of the episode explain within their priors. No parameter was fitted. ci95: "
-    "by resampling stretches of 0.4 s. explained: share of rms_before^2 - floor^2. log_density: of the extended over the "
-    "base model, by the noise that the extended one leaves."
+    "SI units. rms: root mean square of mean residuals over parts of the fabric and 0.2 s that both models meet, "
+    "without what clock, camera, grasp, rim and tare of the episode explain within their priors. No parameter was "
+    "fitted. ci95: by resampling stretches of 0.4 s. explained: share of rms_before^2 - floor^2. log_density: of the "
+    "extended over the base model, by the noise that the extended one leaves."
 )
 
 

@@ -63,6 +63,8 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
         out.append(f"Cannot be seen in these data: {', '.join(r['effect'] for r in content['unresolvable'])}.")
     if content["next_experiment"]:
         out.append(f"Next experiment: {content['next_experiment']['why']}")
+    elif verdict == "ambiguous":
+        out.append("Next experiment: none of the short motions that were tried would tell these apart.")
     return [*out, *(f"Warning: {text}." for text in content["warnings"])]
 
 
@@ -97,7 +99,9 @@ def _lacking(content: dict[str, Any]) -> list[str]:
         )
     unasked = [f"{m['motion']} from {m['until']:.1f} s on" for m in missing["motions"] if m["until"] is not None]
     if unasked:
-        out.append(f"  What force is missing there cannot be asked: small pushes grow without end in {', '.join(unasked)}.")
+        out.append(
+            f"  What force is missing there cannot be asked: small pushes grow without end in {', '.join(unasked)}."
+        )
     return out + _residual(content["residual"])
 
 
