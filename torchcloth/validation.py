@@ -132,7 +132,7 @@ def check_step(dt: float | None, limit: float) -> float:
     if dt is None:
         return limit
     if not isinstance(dt, int | float) or not dt > 0:
-        raise InvalidInput("dt", got=repr(dt), expected="a step > 0 in seconds, or None")
+        raise InvalidInput("dt", got=repr(dt), expected="a step > 0 in seconds, or none: the stable one")
     if dt > limit * (1 + 1e-9):
         raise UnstableStep(
             "dt",

@@ -138,7 +138,7 @@ def test_use_is_checked(pulled, model):
     with pytest.raises(InvalidInput, match=r"use; got 'forces'; expected some of points, markers, force"):
         blocks_for(["forces"])
     still = replace(pulled, grippers={n: replace(m, force=None) for n, m in pulled.grippers.items()})
-    with pytest.raises(InvalidInput, match="use; got no data of this kind"):
+    with pytest.raises(InvalidInput, match="which no episode has"):
         identify(model, still, ["youngs_modulus"], use=["force"])
 
 

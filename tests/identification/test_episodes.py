@@ -107,7 +107,7 @@ def test_motion_that_no_grasp_needs_is_left_aside(recording, model):
 
 
 def test_an_episode_without_points_is_refused(recording, model):
-    with pytest.raises(RecordingError, match="has no points, which identify needs"):
+    with pytest.raises(RecordingError, match="has no points, which a fit needs"):
         episode(model, replace(recording, points=None))
 
 

@@ -94,5 +94,5 @@ def test_what_follows_the_chamfer_distance_needs_something_seen(felt, options):
 
 def test_nothing_seen_and_nothing_felt_is_refused(felt):
     silent = {name: replace(m, force=None) for name, m in felt.grippers.items()}
-    with pytest.raises(RecordingError, match="has no points, which identify needs"):
+    with pytest.raises(RecordingError, match="has no points, which a fit needs"):
         episode(cloth_from(felt), replace(felt, grippers=silent))

@@ -70,7 +70,11 @@ def _checked(options: argparse.Namespace) -> tuple[int, int] | None:
         return None
     found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", options.size)
     if found is None or suffix not in PICTURES:
-        raise InvalidInput("--size", got=repr(options.size), expected="WIDTHxHEIGHT in pixels, with a GIF or PNG")
+        raise InvalidInput(
+            "--size",
+            got=repr(options.size),
+            expected="WIDTHxHEIGHT in pixels, of two to four digits, with a GIF or PNG",
+        )
     from ..viewing.stage import check_size
 
     return check_size((int(found[1]), int(found[2])))

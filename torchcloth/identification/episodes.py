@@ -255,7 +255,7 @@ def _frame_times(
     if not seen:
         felt = streams.felt(recording, needed)
         if not len(felt):
-            recording.require("points", by="identify")
+            recording.require("points", by="a fit")
         start = max(float(motion[key].t[0]) for key in needed)
         return _overlap(felt[felt >= start - streams.SAME], motion, needed)
     first = seen[0]

@@ -298,7 +298,8 @@ class Objective:
                     parts.append((b, first, rows))
             first += len(episode.times) + gauss_newton.WINDOW  # windows do not reach across episodes
         if not parts:
-            raise InvalidInput("use", got="no data of this kind", expected="data that an episode has")
+            asked = ", ".join(block.name for block in self.blocks)
+            raise InvalidInput("use", got=f"{asked}, which no episode has", expected="kinds of data that one has")
         double, count = torch.float64, len(self.start)
         jacobians = [r.value.new_zeros(len(r.value), count) if r.jacobian is None else r.jacobian for *_, r in parts]
         value = torch.cat([r.value for *_, r in parts]).to(double)

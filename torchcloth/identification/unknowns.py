@@ -161,13 +161,13 @@ def with_priors(unknowns: Sequence[Unknown], priors: Mapping[str, tuple[float, f
         positive = unknowns[names.index(name)].parameter.domain == "positive"
         if len(pair) != 2 or not (math.isfinite(pair[1]) and pair[1] > (1.0 if positive else 0.0)):
             expected = "(value, factor > 1)" if positive else "(value, standard deviation > 0)"
-            raise InvalidInput(f"priors[{name!r}]", got=pair, expected=expected)
+            raise InvalidInput(f"prior of {name}", got=pair, expected=expected)
     return [_around(u, *priors[u.name]) if u.name in priors else u for u in unknowns]
 
 
 def _around(unknown: Unknown, value: float, spread: float) -> Unknown:
     p = unknown.parameter
-    mean = float(PhysicalParameter(value, p.unit, p.domain, name=f"priors[{unknown.name!r}]").raw.detach())
+    mean = float(PhysicalParameter(value, p.unit, p.domain, name=f"prior of {unknown.name}").raw.detach())
     std = math.log(spread) if p.domain == "positive" else spread / unknown.slope(mean)
     known = unknown.slope(mean) * std < TRUSTED * max(abs(value), unknown.typical)
     return replace(unknown, mean=mean, prior_std=std, measured=unknown.measured or known)

@@ -128,7 +128,7 @@ def find(name: str) -> Fabric:
         InvalidInput: no such fabric.
     """
     if name not in fabrics():
-        raise InvalidInput("preset", got=repr(name), expected=f"one of {', '.join(fabrics())}")
+        raise InvalidInput("fabric", got=repr(name), expected=f"one of {', '.join(fabrics())}")
     return fabrics()[name]
 
 

@@ -32,7 +32,9 @@ def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
                 corners += [(ring[0], *pair) for pair in pairwise(ring[1:])]
         except ValueError as error:
             raise InvalidInput(
-                f"{place} is damaged at line {number}", got=repr(line[:60]), expected="v, vt or f"
+                f"{place} is damaged at line {number}",
+                got=repr(line[:60]),
+                expected="v X Y Z, vt U V or f with numbers of vertices",
             ) from error
     vertices = _rows(v, f"{place}: v", 3)
     index = _rows(corners, f"{place}: f", 3, 2).astype(np.int64)

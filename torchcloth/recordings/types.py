@@ -255,7 +255,7 @@ STREAMS: dict[str, tuple[Callable[[Recording], Any], str]] = {
         "record segmented cloth points into points.npz, or cut them out of the depth images (docs/formats.md)",
     ),
     "markers": (_of_recording("markers"), "record tracked points into markers.npz"),
-    "truth": (_of_recording("truth"), "read a synthetic episode with with_truth=True"),
+    "truth": (_of_recording("truth"), "only synthetic episodes have it; in Python read(path, with_truth=True)"),
     "grippers": (_of_recording("grippers"), "write NAME/position, NAME/quat_wxyz and NAME/closed into motion.npz"),
     "joints": (_of_recording("joints"), "write NAME/t and NAME/q into motion.npz"),
     "force": (_of_motions("force"), "write NAME/force [K, 3] in N, world axes, into motion.npz"),
