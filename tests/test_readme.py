@@ -21,9 +21,11 @@ def run(block: str) -> dict:
 
 def test_the_layer():
     (block,) = (b for b in BLOCKS if "arm.motion" in b)
-    q = run(block)["q"]
+    scope = run(block)
+    q = scope["q"]
     assert torch.isfinite(q.grad).all()
     assert float(q.grad.abs().max()) > 0
+    assert float(scope["off"]) < 2e-3, "of a centimetre"
 
 
 def test_a_shirt_is_lifted():

@@ -15,7 +15,7 @@ from outside the simulator: closed forms, symmetry, conservation, finite differe
 computed finer. Figures are in float64 on one CPU core unless the case says otherwise; below a thousandth of the mark
 only that is said, and where a sheet crumples the last digits may differ between machines.
 
-Marks are those of the design (issue 3) unless the case says otherwise; a *finding* is reported and has no mark.
+Marks are those that the design set, unless the case says otherwise; a *finding* is reported and has no mark.
 *Absent*: what the case measures is not built yet; *failed*: the case gave no figure. Both count as missed.
 
 """
