@@ -61,7 +61,9 @@ def _predict(options: argparse.Namespace) -> int:
     if options.fit.name in (TENSION, RESULT) or options.fit.suffix == ".tcm":
         known = [options.fit.name] if options.fit.is_file() else []
     if not known:
-        raise InvalidInput("FIT", got=options.fit, expected=f"{TENSION} or {RESULT}, or the folder that holds it")
+        raise InvalidInput(
+            "FIT", got=options.fit, expected=f"{TENSION}, {RESULT} or the folder that holds it, or a .tcm file"
+        )
     name = TENSION if of_strip or (options.seen is None and known == [TENSION]) else RESULT
     if name not in known:
         what = "a strip" if of_strip else "an episode"

@@ -34,8 +34,8 @@ def read_result(path: str | Path, name: str, parse: Callable[[dict[str, Any]], T
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError:
-        models = ", ".join(sorted(p.name for p in path.parent.glob("*.tcm")))
-        remedy = f"or a model of that folder: {models}" if models else ""
+        models = ", ".join(sorted(map(str, path.parent.glob("*.tcm"))))
+        remedy = f"or a model: {models}" if models else ""
         raise InvalidInput(
             "fit", got=f"no {path}", expected=f"{name}, or the folder that holds it", remedy=remedy
         ) from None
