@@ -154,7 +154,7 @@ def test_a_prior_of_ones_own(model, brief):
     ("priors", "said"),
     [
         ({"stiffness": (1.0, 2.0)}, r"priors; got 'stiffness'; expected some of youngs_modulus"),
-        ({"youngs_modulus": (5e4, 0.5)}, r"priors\['youngs_modulus'\]; got .*; expected \(value, factor > 1\)"),
+        ({"youngs_modulus": (5e4, 0.5)}, r"prior of youngs_modulus; got .*; expected \(value, factor > 1\)"),
         ({"youngs_modulus": (-5e4, 2.0)}, r"expected a value > 0"),
     ],
 )

@@ -134,7 +134,7 @@ def test_grippers_alone_go_as_fast_as_asked(tmp_path):
     [
         (["--garment", "hat"], "garment; got 'hat'; expected one of shirt, trousers, dress, sheet"),
         (["--motion", "iron"], "motion; got 'iron'"),
-        (["--fabric", "velcro"], "preset; got 'velcro'"),
+        (["--fabric", "velcro"], "fabric; got 'velcro'"),
         (["--triangles", "3"], "triangles; got 3"),
         (["--triangles", "1000000000"], "triangles; got 1000000000; expected 50 to 100000"),
         (["--rate", "nan"], "rate; got nan"),
