@@ -54,7 +54,7 @@ def test_numbers_without_a_unit_have_none():
 
 def test_a_missing_force_is_a_pressure_at_a_place():
     part = {"motion": "swing", "at": [0.1, 0.2], "from": 0.2, "to": 0.4, "pressure": [0.0, 3.0, 4.0], "sure": True}
-    part |= {"until": None}
+    part["until"] = None
     (line,) = (t for t in summary("unexplained", missing_force={"weight": 2.0, "motions": [part]}) if "missing" in t)
     assert "A pressure of 5 Pa (250 % of what the cloth weighs there) is missing in swing, about (100, 200) mm" in line
     until = summary(
