@@ -9,7 +9,7 @@ import torch
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
-from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, search, setting_of, write_diagnosis
+from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, run, search, setting_of, write_diagnosis
 from torchcloth.diagnosis.pictures import residual_maps
 from torchcloth.diagnosis.verdict import judge
 from torchcloth.errors import InvalidInput
@@ -59,6 +59,22 @@ def test_an_amplitude_that_no_world_can_have_ends_a_fit_and_not_the_diagnosis(wi
     model = base_model(recordings[0])
     found = search(model, setting_of(model, recordings), [replace(drag, name="user.brittle", apply=brittle)])
     assert all(amplitude <= drag.typical for amplitude in found.end.model.amplitudes)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "following", "warned"),
+    [("ambiguous", None, True), ("ambiguous", {"why": "it tells"}, False), ("unexplained", None, False)],
+)
+def test_rivals_that_no_motion_would_tell_apart_are_warned_of(with_drag, monkeypatch, verdict, following, warned):
+    """Only where experiments were tried: an answer of a search alone says nothing of them."""
+    recordings, answer = with_drag
+    open_ = replace(answer, verdict=verdict)
+    for name, result in (("search", None), ("doubted", None), ("_judged", open_), ("propose", following)):
+        monkeypatch.setattr(run, name, lambda *_, result=result: result)
+    content = diagnose(recordings, hypotheses=[]).content
+    assert content["next_experiment"] == following
+    assert (run.NONE_TELLS in content["warnings"]) is warned
+    assert run.NONE_TELLS not in answer.content["warnings"]
 
 
 def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):

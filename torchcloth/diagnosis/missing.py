@@ -155,8 +155,8 @@ def _asked(found: Fitted, setting: Setting, k: int, fields: Tensor, window: floa
     middle = torch.tensor([(first + last) // 2 for first, last in windows])
     count = _foreseen(e, moved)
     value, slopes = whitened_beside(found, setting, k, frames, moved, count)
-    last = int(found.evidence.cells[k].window.max()) if len(found.evidence.cells[k].window) else 0
-    return _Asked(value, slopes, windows, frames.x[middle], count * STRETCH if count <= last else None)
+    unasked = bool((found.evidence.cells[k].window >= count).any())
+    return _Asked(value, slopes, windows, frames.x[middle], count * STRETCH if unasked else None)
 
 
 def _foreseen(e: Episode, moved: Frames) -> int:

@@ -32,6 +32,7 @@ from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
 
 OPEN = ("ambiguous", "inconclusive", "unexplained")  # verdicts that another experiment may change
+NONE_TELLS = "no short motion was found that would tell the causes from what they cannot be told from"
 RESULT, BASE, EXTENDED = "diagnosis.json", "base.tcm", "extended.tcm"
 
 
@@ -100,8 +101,9 @@ def diagnose(
         following = None
         if answer.verdict in OPEN:
             following = propose(found, answer.content, setting, staged(progress, "next experiment"))
+    warnings = [*answer.content["warnings"], *([NONE_TELLS] if answer.verdict == "ambiguous" and not following else [])]
     files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
-    return replace(answer, content=answer.content | files | {"next_experiment": following})
+    return replace(answer, content=answer.content | files | {"next_experiment": following, "warnings": warnings})
 
 
 @contextmanager

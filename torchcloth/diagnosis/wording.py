@@ -63,8 +63,6 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
         out.append(f"Cannot be seen in these data: {', '.join(r['effect'] for r in content['unresolvable'])}.")
     if content["next_experiment"]:
         out.append(f"Next experiment: {content['next_experiment']['why']}")
-    elif verdict == "ambiguous":
-        out.append("Next experiment: none of the short motions that were tried would tell these apart.")
     return [*out, *(f"Warning: {text}." for text in content["warnings"])]
 
 
