@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from torchcloth.diagnosis import fitting
-from torchcloth.diagnosis.cells import Cells
 from torchcloth.diagnosis.fitting import fit, with_cause
 from torchcloth.errors import SimulationDiverged
 
@@ -35,7 +34,7 @@ def looks(monkeypatch):
             raise SimulationDiverged("x", got="nan", expected="numbers")
         cells = [c._replace(value=c.value + c.jacobian[:, 0] * at) for c in there.evidence.cells]
         kept = [c.window >= (seen.hidden if at == 0.0 else 0) for c in cells]
-        cells = [Cells(*(column[k] for column in c)) for c, k in zip(cells, kept, strict=True)]
+        cells = [c.rows(k) for c, k in zip(cells, kept, strict=True)]
         numerics = [n[k] for n, k in zip(there.evidence.numerics, kept, strict=True)]
         return replace(there.evidence, cells=cells, numerics=numerics, hypotheses=list(hypotheses))
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from torchcloth.diagnosis import doubts, lack_of_fit
-from torchcloth.diagnosis.cells import Cells
 from torchcloth.diagnosis.lacking import RARE, SENSOR, Left, explained
 
 NAMES = ["a"]
@@ -90,7 +89,7 @@ def test_how_much_is_mended_is_counted_on_cells_that_both_fits_have():
     wrong, right = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (3.0, 0.0))
     elsewhere = torch.arange(len(wrong.cells[0].value)) % 8 == 0
     cells = [c._replace(value=torch.where(elsewhere, 0.05, c.value)) for c in right.cells]
-    met = [Cells(*(column[~elsewhere] for column in c)) for c in wrong.cells]
+    met = [c.rows(~elsewhere) for c in wrong.cells]
     numerics = [n[~elsewhere] for n in wrong.numerics]
     start, end = toys.fitted(replace(wrong, cells=met, numerics=numerics)), toys.fitted(replace(right, cells=cells))
     assert explained(lack_of_fit(start, MOTIONS), lack_of_fit(end, MOTIONS)) < 0

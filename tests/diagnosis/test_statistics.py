@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from torchcloth.diagnosis.cells import NAMES as KINDS
-from torchcloth.diagnosis.cells import Cells
 from torchcloth.diagnosis.classes import TOLD, alike, correlations, fitted_alike
 from torchcloth.diagnosis.comparison import compare, predict, spread
 from torchcloth.diagnosis.evidence import as_rough
@@ -234,7 +233,7 @@ def test_models_that_meet_other_cells_are_compared_on_those_that_both_meet():
     """The same residuals are no gain, whichever of the two has met fewer of them."""
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
     rough = replace(ev, cells=[c._replace(rough=1e-3 * torch.rand(len(c.value))) for c in ev.cells])
-    fewer = [Cells(*(column[5:] for column in c)) for c in rough.cells]
+    fewer = [c.rows(slice(5, None)) for c in rough.cells]
     less = replace(ev, cells=[c._replace(spread=2 * c.spread) for c in fewer], numerics=[n[5:] for n in ev.numerics])
     for own, taken in zip(ev.cells, as_rough(ev, less).cells, strict=True):
         assert torch.equal(taken.key, own.key[5:])
@@ -247,7 +246,7 @@ def test_models_that_meet_other_cells_are_compared_on_those_that_both_meet():
 
 def test_an_episode_without_a_cell_says_nothing():
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
-    none = Cells(*(column[:0] for column in ev.cells[0]))
+    none = ev.cells[0].rows(slice(0))
     empty = replace(ev, cells=[none, *ev.cells[1:]], numerics=[ev.numerics[0][:0], *ev.numerics[1:]])
     rest = replace(ev, cells=ev.cells[1:], numerics=ev.numerics[1:], stds=ev.stds[1:])
     noise = fit_noise(empty)
@@ -318,7 +317,7 @@ def test_two_that_were_fitted_are_alike_where_what_lies_between_them_is_within_t
         """Another model: what it says is so far from what the first one says."""
         far = chi_squared**0.5 / unit
         cells = [c._replace(value=c.value + far * c.jacobian[:, 3]) for c in found.evidence.cells]
-        fewer = [Cells(*(column[1:] for column in c)) for c in cells]  # cells that only one of them has do not count
+        fewer = [c.rows(slice(1, None)) for c in cells]  # cells that only one of them has do not count
         numerics = [n[1:] for n in found.evidence.numerics]
         return replace(found, evidence=replace(found.evidence, cells=fewer, numerics=numerics))
 

@@ -80,7 +80,7 @@ def _begun(e: Episode, world: World, rng: torch.Generator) -> list[Episode]:
 def without(found: Fitted, keys: Sequence[Tensor]) -> Fitted:
     """The same fit, weighed anew by the cells that do not jump; slopes take care of what moves the solution."""
     stable = [~torch.isin(c.key, k) for c, k in zip(found.evidence.cells, keys, strict=True)]
-    cells = [Cells(*(column[s] for column in c)) for c, s in zip(found.evidence.cells, stable, strict=True)]
+    cells = [c.rows(s) for c, s in zip(found.evidence.cells, stable, strict=True)]
     numerics = [n[s] for n, s in zip(found.evidence.numerics, stable, strict=True)]
     evidence = replace(found.evidence, cells=cells, numerics=numerics)
     return weighed(found.model, evidence, fit_noise(evidence))

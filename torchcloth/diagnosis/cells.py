@@ -44,6 +44,10 @@ class Cells(NamedTuple):
         """[C] the same for the same cell of another model."""
         return (self.block * 10_000 + self.patch) * 1000 + self.window
 
+    def rows(self, index: Tensor | slice) -> Cells:
+        """Those cells alone, by a mask, numbers or a slice."""
+        return Cells(*(column[index] for column in self))
+
 
 class Piece(NamedTuple):
     """What one episode says."""
@@ -144,7 +148,7 @@ def _averaged(rows: Rows, block: int, episode: Episode, sheet: Sheet, rest: Tens
         add(share * times[rows.frame]),
         torch.zeros_like(mean),
     )
-    return Cells(*(column[count >= min(FEWEST, float(count.max()))] for column in found))
+    return found.rows(count >= min(FEWEST, float(count.max())))
 
 
 def _inliers(value: Tensor, index: Tensor, size: int) -> Tensor:

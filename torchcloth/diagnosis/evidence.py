@@ -71,7 +71,7 @@ def gather(
         use = [*range(own), *(own + i for i, h in enumerate(simulated) if h in possible)]
         use += range(own + len(simulated), piece.cells.jacobian.shape[1])
         stable = ~torch.isin(piece.cells.key, setting.unstable[k]) if setting.unstable else slice(None)
-        found = Cells(*(column[stable] for column in piece.cells))
+        found = piece.cells.rows(stable)
         found = found._replace(jacobian=found.jacobian[:, use])
         cells.append(found if raw else central(found, shifts, len(model.parameters)))
         numerics.append(piece.numerics[stable])
@@ -178,7 +178,7 @@ def shared(like: Evidence, others: Sequence[Evidence]) -> Evidence:
         kept = torch.ones_like(own.key, dtype=torch.bool)
         for other in others:
             kept &= torch.isin(own.key, other.cells[k].key)
-        cells.append(Cells(*(column[kept] for column in own)))
+        cells.append(own.rows(kept))
         numerics.append(difference[kept])
     return replace(like, cells=cells, numerics=numerics)
 

@@ -20,7 +20,7 @@ from ..identification.episodes import Episode
 from ..identification.replays import Frames
 from ..pose.modes import modes_of
 from ..pose.objective import windows_of
-from .cells import STRETCH, Cells, aligned, cells_of
+from .cells import STRETCH, aligned, cells_of
 from .fitting import Fitted, prior_precision
 from .lacking import reference
 from .pushes import Pushes, pushed
@@ -181,7 +181,7 @@ def whitened_beside(
     Of cells in the first ``count`` stretches of time.
     """
     e, stds, told = setting.episodes[k], found.evidence.stds[k], found.evidence.cells[k].window < count
-    cells = Cells(*(column[told] for column in found.evidence.cells[k]))
+    cells = found.evidence.cells[k].rows(told)
     coarse = cells_of(frames, moved, e, setting.sheet, setting.rest)
     slopes = aligned(cells.key, coarse.key, coarse.jacobian)
     noise, _ = reference(cells, found.evidence.numerics[k][told])

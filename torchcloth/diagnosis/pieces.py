@@ -188,7 +188,7 @@ def overlapping(work: Callable[[T], U], items: Sequence[T]) -> Generator[U, None
 def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
     """(cells that both have, with the slopes of the first and the values of the second; first minus second)."""
     both = torch.isin(coarse.key, fine.key)
-    kept = Cells(*(column[both] for column in coarse))
+    kept = coarse.rows(both)
     order = torch.argsort(fine.key)
     place = order[torch.searchsorted(fine.key[order], kept.key)]
     return kept._replace(value=fine.value[place], spread=fine.spread[place]), kept.value - fine.value[place]

@@ -21,7 +21,7 @@ import torch
 from torchcloth._files import write_text
 from torchcloth.diagnosis import Hypothesis, base_model, catalogue, fit, screen, setting_of
 from torchcloth.diagnosis.approach import approach
-from torchcloth.diagnosis.cells import Cells, aligned
+from torchcloth.diagnosis.cells import aligned
 from torchcloth.diagnosis.evidence import Evidence
 from torchcloth.diagnosis.fitting import Fitted, weighed
 from torchcloth.recordings import Camera, PointClouds, Recording
@@ -120,7 +120,7 @@ def difference(plain: Fitted, salted: Fitted) -> Fitted:
     cells, numerics = [], []
     for a, b, n in zip(plain.evidence.cells, salted.evidence.cells, plain.evidence.numerics, strict=True):
         both = torch.isin(a.key, b.key)
-        kept = Cells(*(column[both] for column in a))
+        kept = a.rows(both)
         cells.append(kept._replace(value=aligned(kept.key, b.key, b.value) - kept.value))
         numerics.append(torch.zeros_like(n[both]))
     evidence: Evidence = replace(plain.evidence, cells=cells, numerics=numerics)
