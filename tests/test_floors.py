@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 COMPANIONS = ("benchmarks", "robots", "training")  # folders of their own, installed as torchcloth.robots, ...
 
 FLOORS = (
-    ("errors", "_files", "_math", "forward_mode"),
+    ("errors", "_files", "_math", "_remembered", "forward_mode"),
     ("types", "parameters", "_vectors"),
     ("meshes",),
     ("materials", "effects", "boundaries", "transfer"),

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils.weak import WeakTensorKeyDictionary
 
+from ._remembered import Remembered
 from .errors import InvalidInput, UnstableStep
 from .materials import Stiffness
 from .model import Model
@@ -74,16 +74,17 @@ def limits_of(model: Model, gradient: Tensor) -> Limits:
     lighter = _lighter(model)
     stiffness = model.material.stiffness(model.coefficients)
     numbers = (*stiffness, model.areal_density, *([] if model.rest is None else [model.rest]))
-    hangs_on = (gradient._version, spacing, *((t.dtype, t.detach().tolist()) for t in numbers))
-    before, squared = _KNOWN.get(gradient) or (None, 0.0)
-    if before != hangs_on:
+    beside = (spacing, *((t.dtype, t.detach().tolist()) for t in numbers))
+
+    def find() -> float:
         shape = gradient if model.rest is None else grown_gradient(gradient, model.rest)
         try:
-            squared = squared_frequency(shape, model.areal_density, stiffness, spacing)
+            return squared_frequency(shape, model.areal_density, stiffness, spacing)
         except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage] - not finite, or its square
             largest = max(float(t.max()) for t in stiffness)
             raise UnstableStep("stiffness", got=f"{largest:.3g} N/m", expected="a fabric's: the step is 0 s") from error
-        _KNOWN[gradient] = hangs_on, squared
+
+    squared = _KNOWN.of(gradient, find, beside)
     return Limits(lighter * squared + elastic, max(0.0, damping - viscous), viscous)
 
 
@@ -98,7 +99,7 @@ def _lighter(model: Model) -> float:
     return float((1 - sum(added) / mass).clamp(min=1.0).max()) if added else 1.0
 
 
-_KNOWN: WeakTensorKeyDictionary = WeakTensorKeyDictionary()  # by the gradient, which belongs to one mesh
+_KNOWN: Remembered[float] = Remembered()  # by the gradient, which belongs to one mesh
 
 
 def squared_frequency(gradient: Tensor, density: Tensor, stiffness: Stiffness, spacing: float | None) -> float:

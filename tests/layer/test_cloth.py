@@ -438,3 +438,15 @@ def test_trajectories_cover_the_times_also_far_from_zero(held):
         held(held.rest_state(), motion, (begin + 999.0, begin + 999.1))
     with pytest.raises(InvalidInput, match="to cover"):
         held.settle(held.rest_state(), motion, start=begin + 50.0, duration=0.1)
+
+
+@pytest.mark.parametrize("engine", ["reference", "fused"])
+def test_a_cloth_may_be_made_and_run_in_inference_mode(engine):
+    def run():
+        cloth = sheet(contact=tc.Contact(), boundaries={"table": tc.boundaries.Plane()})
+        cloth.engine = engine
+        return cloth(cloth.rest_state(), {}, times=[0.0, 0.01])
+
+    with torch.inference_mode():
+        inferred = run()
+    assert torch.equal(inferred.x, run().x)

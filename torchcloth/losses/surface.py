@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils.weak import WeakTensorKeyDictionary
 
 from .._math import cross, dot, safe_norm
+from .._remembered import Remembered
 from .nearest import nearest
 from .shapes import check_places, check_triangles
 
@@ -90,22 +90,18 @@ def _on_boundary(faces: Tensor, face: Tensor, weights: Tensor) -> Tensor:
 
 
 def _boundary(faces: Tensor) -> tuple[Tensor, Tensor]:
-    """([F, 3] bool, whether the edge opposite to each corner is open; [V] bool, whether a vertex is an end of one).
-
-    Remembered for as long as the faces are there and torch does not write to them.
-    """
-    now = None if faces.is_inference() else faces._version  # which inference tensors have not
-    version, found = _KNOWN.get(faces) or (None, None)
-    if found is None or now is None or version != now:
-        edges = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], dim=1).sort(-1).values
-        number = edges[..., 0] * (faces.max() + 1) + edges[..., 1]  # one for each edge: sorts far faster than rows
-        _, inverse, count = number.flatten().unique(return_inverse=True, return_counts=True)
-        open_edge = (count[inverse] == 1).reshape(-1, 3)
-        rim = torch.zeros(int(faces.max()) + 1, dtype=torch.bool, device=faces.device)
-        rim[edges[open_edge].flatten()] = True
-        found = open_edge, rim
-        _KNOWN[faces] = now, found
-    return found
+    """([F, 3] bool, whether the edge opposite to each corner is open; [V] bool, whether a vertex is an end of one)."""
+    return _KNOWN.of(faces, lambda: _find_boundary(faces))
 
 
-_KNOWN: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+_KNOWN: Remembered[tuple[Tensor, Tensor]] = Remembered()
+
+
+def _find_boundary(faces: Tensor) -> tuple[Tensor, Tensor]:
+    edges = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], dim=1).sort(-1).values
+    number = edges[..., 0] * (faces.max() + 1) + edges[..., 1]  # one for each edge: sorts far faster than rows
+    _, inverse, count = number.flatten().unique(return_inverse=True, return_counts=True)
+    open_edge = (count[inverse] == 1).reshape(-1, 3)
+    rim = torch.zeros(int(faces.max()) + 1, dtype=torch.bool, device=faces.device)
+    rim[edges[open_edge].flatten()] = True
+    return open_edge, rim
