@@ -150,6 +150,14 @@ def test_a_prior_of_ones_own(model, brief):
     assert fit.parameters["poisson_ratio"].source == "prior"
 
 
+def test_what_counts_as_large_does_not_depend_on_how_vague_a_prior_is(model):
+    """An amplitude is judged against its typical size, and a wider prior is no knowledge."""
+    own = collect(model, ["air.normal"], None)
+    (vague,), (narrow,) = (with_priors(own, {"air.normal": (1.2, std)}) for std in (10.0, 0.5))
+    assert own[0].typical == vague.typical == narrow.typical == pytest.approx(1.2)
+    assert (vague.prior_std, narrow.prior_std) == pytest.approx((10.0, 0.5))
+
+
 @pytest.mark.parametrize(
     ("priors", "said"),
     [

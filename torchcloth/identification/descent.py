@@ -93,7 +93,7 @@ def _round(
         before = objective.clip(objective.unscaled(scaled.detach()))
         values.append(float(optimiser.step(closure)))
         if on_iterate(before, objective):
-            return before, used, True
+            return before, used + 1, True
         if len(values) > objective.patience and values[-1 - objective.patience] - values[-1] < SETTLED:
-            return before, used, False
+            return before, used + 1, False
     return objective.clip(objective.unscaled(scaled.detach())), iterations, False

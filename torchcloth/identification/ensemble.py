@@ -64,7 +64,12 @@ class Settled(NamedTuple):
 
 
 def resolved(
-    objective: Objective, failed: Checked, known: Within | None, rounds: int, on_round: Callable[[Tensor], object]
+    objective: Objective,
+    failed: Checked,
+    known: Within | None,
+    rounds: int,
+    on_round: Callable[[Tensor], object],
+    strata: Tensor | None = None,
 ) -> Checked | None:
     """All frames by simulations spread around the solution; None where they cannot be had.
 
@@ -74,11 +79,12 @@ def resolved(
         known: what the beginning told; it becomes the prior of what the other frames tell.
         rounds: at most so many.
         on_round: called with every point the search comes to.
+        strata: as of ``covariance_of``.
     """
     before, problem = objective.simulations, objective.problem()
     raw, mask, note = failed.final.raw, None, ""
     if known is not None:
-        own = covariance_of(known.objective, known.checked).diagonal().sqrt()
+        own = covariance_of(known.objective, known.checked, strata).diagonal().sqrt()
         raw, mask = known.checked.final.raw, later(objective, known.objective)
         problem = problem._replace(prior_mean=raw, prior_std=torch.minimum(own, problem.prior_std))
         note = f" after the first {known.until:.2f} s"

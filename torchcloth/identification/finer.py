@@ -89,7 +89,8 @@ def mesh_step(objective: Objective, final: gauss_newton.Iterate, recordings: Seq
     for b in linear.kind.unique():
         own, other = linear.kind == b, rows.kind == b
         if int(own.sum()) == int(other.sum()):  # along the rim other points may count: it is left as it is
-            changed[own] = rows.value[other] - linear.value[own]
+            before, after = linear.value[own], rows.value[other]
+            changed[own] = torch.where((before == 0) | (after == 0), 0.0, after - before)  # 0: a piece not seen
     weighted = final.influence()[0][:, None] * linear.jacobian
     return -torch.linalg.solve(gauss_newton.information(objective.problem(), final), weighted.mT @ changed)
 

@@ -134,10 +134,10 @@ def identify(
     start = objective.raw(guess or {})
     if journal is not None:
         objective.journal = Journal(journal, [method, stop, rate, starts, *objective.identity(), start], resume)
-    search = Search(objective, stop, on_progress)
+    search = Search(objective, stop, on_progress, strata_of(episodes_in))
     before = objective.seen(objective.start)
     outcome = search.run(method, start, iterations, rate, not warm_start and stop != "paper", starts)
-    found = _concluded(search, before, outcome, began, profile, strata_of(episodes_in), episodes_in if refine else [])
+    found = _concluded(search, before, outcome, began, profile, episodes_in if refine else [])
     return replace(found, model=model_of(cloth, found, episodes_in, dt))
 
 
@@ -208,13 +208,12 @@ def _concluded(
     outcome: Outcome,
     began: float,
     profile: Sequence[str],
-    strata: Tensor,
     refining: Sequence[Recording],
 ) -> Identification:
     """From where a search ended to statements."""
     full, told, checked = search.objective, outcome.objective, outcome.checked
     final, warnings = checked.final, list(checked.warnings)
-    covariance = covariance_of(told, checked, strata)
+    covariance = covariance_of(told, checked, search.strata)
     regular = not checked.withdrawn and checked.covariance is None
     found = _refined(full, told, final, covariance, refining if regular else [])
     final, covariance, coarseness, uncorrected = found
@@ -238,11 +237,12 @@ def _concluded(
         **_counts(told, final),
         **coarseness,
     }
-    if bool((strata > 0).any()):
-        fit["replicates"] = int((strata > 0).sum())
+    if search.strata is not None and bool((search.strata > 0).any()):
+        fit["replicates"] = int((search.strata > 0).sum())
     if outcome.reached is not None:
         fit |= {"starts": outcome.reached.tried, "starts_agreeing": outcome.reached.agree}
-    if checked.withdrawn or worthless(fit):  # slopes of chaos, or of elsewhere, promise tiny errors
+    withdrawn = checked.withdrawn or worthless(fit)
+    if withdrawn:  # slopes of chaos, or of elsewhere, promise tiny errors
         found = withdraw(found, full.unknowns, final.raw)
     warnings += [outcome.unfinished] if outcome.unfinished else []
     warnings += skewed(found, [name for name in checked.curved if name not in profiled])
@@ -250,7 +250,7 @@ def _concluded(
     rms = figures(used, told.episodes, full.faces).rms
     warnings += warnings_of(full.cloth, full.episodes, found, {**fit, "rms_after": rms}, after, full.faces)
     keys = {u.name: u.key.removesuffix(".raw") for u in full.unknowns}
-    nuisances = nuisance_estimates(full.episodes, full.placed, final.raw, covariance)
+    nuisances = nuisance_estimates(full.episodes, full.placed, final.raw, covariance, withdrawn)
     return Identification(
         found.parameters,
         fit,
@@ -263,7 +263,7 @@ def _concluded(
         keys,
         nuisances,
         influences(full.unknowns, final.raw, checked.reach, found.parameters),
-        combinations(full.unknowns, final.raw, covariance),
+        [] if withdrawn else combinations(full.unknowns, final.raw, covariance),
         profiles=profiled,
         forces_before=[_observed_forces(s.wrench, e) for s, e in zip(start, full.episodes, strict=True)],
         forces_after=[_observed_forces(s.wrench, e) for s, e in zip(end, full.episodes, strict=True)],

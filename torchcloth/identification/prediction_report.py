@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .episode_prediction import EpisodePrediction
+from .gauss_newton import NORMAL
 from .pictures import AFTER, BEFORE, NULL
 from .tension_prediction import Band, TensionPrediction
 
@@ -75,7 +76,7 @@ def draw_band(axis: Any, x: np.ndarray, band: Band, order: np.ndarray | slice = 
     """A curve and its intervals."""
     low, high = band.ci95
     axis.fill_between(x, low[order], high[order], color=AFTER, alpha=0.18, linewidth=0, label="all parts")
-    inner = 1.96 * band.parameters
+    inner = NORMAL * band.parameters
     ends = ((band.value - inner)[order], (band.value + inner)[order])
     axis.fill_between(x, *ends, color=AFTER, alpha=0.45, linewidth=0, label="by parameters")
     axis.plot(x, band.value[order], color=AFTER, label="predicted")

@@ -14,6 +14,7 @@ from ..cloth import Cloth
 from ..materials import AEP
 from .considered import covariance_of
 from .episodes import Episode
+from .gauss_newton import NORMAL
 from .linearity import Checked
 from .nuisances import Placed
 from .objective import Objective
@@ -53,16 +54,24 @@ def estimates(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, covariance
     return Found(parameters, correlation)
 
 
-def undecided(objective: Objective, checked: Checked) -> list[str]:
-    """Fitted parameters that a solution leaves open."""
-    found = estimates(objective.cloth, objective.unknowns, checked.final.raw, covariance_of(objective, checked))
+def undecided(objective: Objective, checked: Checked, strata: Tensor | None) -> list[str]:
+    """Fitted parameters that a solution leaves open; ``strata`` as of ``covariance_of``."""
+    covariance = covariance_of(objective, checked, strata)
+    found = estimates(objective.cloth, objective.unknowns, checked.final.raw, covariance)
     return [u.name for u in objective.unknowns if not (u.measured or found.parameters[u.name].identifiable)]
 
 
 def nuisance_estimates(
-    episodes: Sequence[Episode], placed: Sequence[Sequence[Placed]], raw: Tensor, covariance: Tensor
+    episodes: Sequence[Episode],
+    placed: Sequence[Sequence[Placed]],
+    raw: Tensor,
+    covariance: Tensor,
+    withdrawn: bool = False,
 ) -> dict[str, dict[str, Estimate]]:
-    """For every episode what was found of its nuisances; known when the data say more than the prior."""
+    """For every episode what was found of its nuisances; known when the data say more than the prior.
+
+    ``withdrawn``: the fit means nothing, and errors are the priors', as of ``withdraw``.
+    """
     deviation, out = covariance.diagonal().sqrt(), {}
     for i, (episode, own) in enumerate(zip(episodes, placed, strict=True)):
         name = episode.name if episode.name not in out else f"{episode.name} ({i + 1})"
@@ -70,8 +79,12 @@ def nuisance_estimates(
         for p in own:
             numbers = zip(p.names, p.units, p.stds, raw[p.where].tolist(), deviation[p.where].tolist(), strict=True)
             for part, unit, prior, value, std in numbers:
-                interval = (value - 1.96 * std, value + 1.96 * std)
-                out[name][part] = Estimate(value, std, interval, unit, 0.0, std < 0.5 * prior, "nuisance")
+                interval = (value - NORMAL * std, value + NORMAL * std)
+                known = std < 0.5 * prior and not withdrawn
+                if withdrawn:
+                    std = math.hypot(prior, value)
+                    interval = (min(-NORMAL * prior, value), max(NORMAL * prior, value))
+                out[name][part] = Estimate(value, std, interval, unit, 0.0, known, "nuisance")
     return out
 
 
@@ -185,7 +198,7 @@ def warnings_of(
 def _estimate(unknown: Unknown, raw: float, deviation: float) -> Estimate:
     value = unknown.value(raw)
     std = unknown.slope(raw) * deviation
-    low, high = (unknown.value(unknown.clip(raw + sign * 1.96 * deviation)) for sign in (-1, 1))
+    low, high = (unknown.value(unknown.clip(raw + sign * NORMAL * deviation)) for sign in (-1, 1))
     identifiable = std < TRUSTED * max(abs(value), unknown.typical)
     return Estimate(
         value,
@@ -200,7 +213,7 @@ def _estimate(unknown: Unknown, raw: float, deviation: float) -> Estimate:
 
 def _absent(unknown: Unknown, source: str) -> Estimate:
     """A material parameter that was not fitted: only its prior is known."""
-    value, spread = unknown.value(unknown.middle), 1.96 * unknown.prior_std
+    value, spread = unknown.value(unknown.middle), NORMAL * unknown.prior_std
     low, high = (unknown.value(unknown.clip(unknown.middle + sign * spread)) for sign in (-1, 1))
     std = unknown.slope(unknown.middle) * unknown.prior_std
     return Estimate(value, std, (low, high), unknown.parameter.unit, value, False, source)

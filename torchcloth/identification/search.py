@@ -36,10 +36,12 @@ class Outcome(NamedTuple):
 
 
 class Search:
-    """Keeps the history and knows when to stop."""
+    """Keeps the history and knows when to stop; ``strata`` [E]: ``replicates.strata_of``."""
 
-    def __init__(self, objective: Objective, stop: str, on_progress: Progress | None) -> None:
-        self.objective, self.stop, self.on_progress = objective, stop, on_progress
+    def __init__(
+        self, objective: Objective, stop: str, on_progress: Progress | None, strata: Tensor | None = None
+    ) -> None:
+        self.objective, self.stop, self.on_progress, self.strata = objective, stop, on_progress, strata
         self.history: list[dict[str, Any]] = []
         self.elsewhere = 0  # simulations of parts of the episodes
 
@@ -64,7 +66,7 @@ class Search:
             told, checked = self._resolve(checked, start, iterations)
         else:
             told = full
-        why = self._undecided(iterations) if method in CHAMFER else self._why(iterations)
+        why = self._undecided() if method in CHAMFER else self._why()
         why = "" if checked.final.converged else why
         sure = not why and checked.covariance is None
         lost = "" if sure or checked.withdrawn else astray(told, checked)
@@ -79,9 +81,10 @@ class Search:
         """Where tangents fail: what the beginning tells, and of the rest what is told by simulations spread around."""
         full = self.objective
         found = horizon.within(full, failed, start, self._judge)
-        if found is not None and not undecided(found.objective, found.checked):
+        if found is not None and not undecided(found.objective, found.checked, self.strata):
             return found.objective, found.checked
-        wide = ensemble.resolved(full, failed, found, iterations, lambda raw: self.record(raw, full))
+        record = lambda raw: self.record(raw, full)  # noqa: E731
+        wide = ensemble.resolved(full, failed, found, iterations, record, self.strata)
         if wide is None:
             return (full, failed) if found is None else (found.objective, found.checked)
         return full, wide
@@ -103,7 +106,7 @@ class Search:
     def record(self, raw: Tensor, objective: Objective) -> bool:
         """One more iteration; whether the search may stop here."""
         now, values = objective.figures(raw), objective.values(raw)
-        share = objective.episodes[0].observed / self.objective.episodes[0].observed
+        share = sum(e.observed for e in objective.episodes) / sum(e.observed for e in self.objective.episodes)
         entry = {"iteration": len(self.history), "frames": share, "chamfer": now.chamfer, "rms": now.rms}
         self.history.append({**entry, **values})
         if self.on_progress is not None:
@@ -134,12 +137,13 @@ class Search:
         self.elsewhere += part.simulations if part is not self.objective else 0
         return starts.best(part.problem(), found)
 
-    def _why(self, iterations: int) -> str:
+    def _why(self) -> str:
         if self.stop == "paper" and self.history[-1]["chamfer"] < PAPER_CHAMFER:
             return "stopped by the paper's rule, Chamfer below 1.5 cm: the values still depend on the start"
-        return f"stopped after {iterations} iterations before converging: the search is unfinished, so are its errors"
+        done = len(self.history) - 1
+        return f"stopped after {done} iterations before converging: the search is unfinished, so are its errors"
 
-    def _undecided(self, iterations: int) -> str:
+    def _undecided(self) -> str:
         if self.stop == "paper" and self.history[-1]["chamfer"] < PAPER_CHAMFER:
-            return self._why(iterations)
+            return self._why()
         return "gradient descent has no test of convergence: values and errors may be those of an unfinished search"

@@ -46,7 +46,7 @@ def _width(unknown: Unknown) -> float:
 
 def best(problem: gauss_newton.Problem, found: Sequence[gauss_newton.Iterate]) -> Reached:
     """The end point of least robust cost, measured by the same scales for all."""
-    judge = min(found, key=lambda at: float(at.scale[0]))  # the one that explains most: its noise is the smallest
+    judge = min(found, key=lambda at: float(at.scale.log().sum()))  # explains most: its noise is the smallest
     costs = [gauss_newton.cost(problem, judge, at.raw, at.linear.value) for at in found]
     winner = found[costs.index(min(costs))]
     hessian = torch.linalg.inv(gauss_newton.covariance(problem, winner))

@@ -122,6 +122,7 @@ def fit_tension(
 
     found = gauss_newton.minimise(readings.problem(), readings.start, iterations, note)
     if readings.weigh(found.linear.value):
+        seen.pop()  # where the second search begins
         found = gauss_newton.minimise(readings.problem(), found.raw, iterations, note)
     return _statements(readings, found, len(seen) - 1)
 

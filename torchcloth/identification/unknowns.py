@@ -33,6 +33,7 @@ class Unknown:
         parameter: the parameter at its start value.
         start: unconstrained start value.
         prior_std: standard deviation of the prior, in the unconstrained coordinate.
+        typical: size of an amplitude, which may be zero, in its unit; 0 of any other parameter.
         mean: the prior's middle; None: the start.
         measured: known before the fit (areal density), by a prior narrower than ``TRUSTED``.
     """
@@ -42,6 +43,7 @@ class Unknown:
     parameter: PhysicalParameter
     start: float
     prior_std: float
+    typical: float = 0.0
     measured: bool = False
     mean: float | None = None
 
@@ -54,11 +56,6 @@ class Unknown:
     def longest_step(self) -> float:
         """Of one iteration: a factor of 2.7 on a log parameter, half the typical size of an amplitude."""
         return 0.5 * self.typical or 1.0
-
-    @property
-    def typical(self) -> float:
-        """Amplitudes may be zero: they are judged against their typical size (half their prior)."""
-        return 0.5 * self.prior_std if self.parameter.domain in ("nonnegative", "real") else 0.0
 
     @property
     def size(self) -> float:
@@ -136,6 +133,7 @@ def _unknown(cloth: Cloth, name: str, path: str) -> Unknown:
     if not isinstance(parameter, PhysicalParameter):
         raise InvalidInput("parameter to fit", got=repr(name), expected="a scalar physical parameter")
     start = float(parameter.raw.detach())
+    typical = 0.0
     if parameter.domain == "positive":
         std = DECADE
     elif parameter.domain == "unit_half":
@@ -144,8 +142,9 @@ def _unknown(cloth: Cloth, name: str, path: str) -> Unknown:
         owner, _, own = path.rpartition(".")
         size = getattr(cloth.get_submodule(owner), "amplitudes", {}).get(own)
         # undeclared: the start says how large it is
-        std = 2.0 * (TYPICAL.get(own, max(1.0, abs(start))) if size is None else size.typical)
-    return Unknown(name, f"{path}.raw", parameter, start, std)
+        typical = TYPICAL.get(own, max(1.0, abs(start))) if size is None else size.typical
+        std = 2.0 * typical
+    return Unknown(name, f"{path}.raw", parameter, start, std, typical)
 
 
 def with_priors(unknowns: Sequence[Unknown], priors: Mapping[str, tuple[float, float]]) -> list[Unknown]:
