@@ -14,8 +14,8 @@ import torch
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
-from torchcloth.diagnosis import check, diagnose
-from torchcloth.diagnosis.gate import somewhere_seen
+from torchcloth.diagnosis import base_model, check, diagnose, setting_of
+from torchcloth.diagnosis.setting import somewhere_seen
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings.images import ImageStream
 
@@ -223,11 +223,16 @@ def test_what_was_not_searched_has_no_model(turned):
         _ = answer.model
 
 
-def test_forces_alone_do_not_say_where_the_cloth_is(turned):
+def test_forces_alone_do_not_say_where_the_cloth_goes(turned):
+    """Nor do points in the frame where the simulation starts, and in the last ones, of which a late clock sees none."""
+    model = base_model(turned)
+    ends = np.isin(np.arange(len(turned.points)), (0, len(turned.points) - 1))
     blind = [replace(turned, points=None, markers=None, split={"motion": m}) for m in "ab"]
     with pytest.raises(InvalidInput, match="none with points or markers"):
-        somewhere_seen(blind)
-    somewhere_seen([turned, *blind])
+        somewhere_seen(setting_of(model, blind))
+    somewhere_seen(setting_of(model, [turned, *blind]))
+    with pytest.raises(InvalidInput, match="after its first frame"):
+        somewhere_seen(setting_of(model, [replace(turned, points=turned.points.only(ends))]))
 
 
 def test_small_episodes_of_the_same_engine_pass():

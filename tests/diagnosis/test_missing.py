@@ -135,16 +135,17 @@ def test_slopes_of_any_size_have_a_posterior():
         torch.linalg.cholesky(fewer.mT @ fewer + torch.diag(torch.cat([known, (1e3 * sizes) ** -2])))
 
 
-def test_two_forces_against_each_other_are_told_at_one_of_them():
-    """Half way between them there is none."""
-    u = torch.linspace(0.0, 0.2, 21).double()
+@pytest.mark.parametrize(("other", "pressure"), [(-4.0, 5.0), (4.0, (5.0**3 + 4.0**3) / (5.0**2 + 4.0**2))])
+def test_two_forces_are_told_at_one_of_them(other, pressure):
+    """Half way between them there is none; what pushes the other way is no part of it."""
+    u = torch.linspace(0.0, 0.2, 20).double()
     uv = torch.cartesian_prod(u, u)
     force = torch.zeros(1, len(uv), 3).double()
-    force[0, :, 1] = torch.where(uv[:, 0] < 0.05, 5.0, torch.where(uv[:, 0] > 0.15, -4.0, 0.0))
+    force[0, :, 1] = torch.where(uv[:, 0] < 0.05, 5.0, torch.where(uv[:, 0] > 0.15, other, 0.0))
     part = missing.Missing(
         "swing", torch.tensor([[0.0, 0.2]]), force, torch.full_like(force, 0.2), torch.zeros_like(force), None
     )
     area = torch.full((len(uv),), 1e-4).double()
     (told,) = missing.MissingForce([part], 1.0, 2.0, uv, torch.zeros(0, 3), area).as_dict()["motions"]
-    assert told["pressure"] == [0.0, 5.0, 0.0]
-    assert told["at"] == pytest.approx([0.02, 0.1], abs=0.006)
+    assert told["pressure"] == pytest.approx([0.0, pressure, 0.0])
+    assert told["at"][0] < 0.05

@@ -39,6 +39,22 @@ def test_a_file_registers_and_what_depends_on_it_knows_its_content(file):
     assert len(own_causes.digests()) == 1
 
 
+def test_what_the_file_imports_counts_as_well_and_it_may_be_run_again(file, monkeypatch):
+    """What is registered again is the same object then; a search that goes on depends on where it comes from."""
+    helper = file.parent / "my_helper_of_causes.py"
+    helper.write_text(FILE.format(typical=2.0).replace("register(", "CAUSE = ("))
+    file.write_text(
+        "from torchcloth.diagnosis import register\nfrom my_helper_of_causes import CAUSE\nregister(CAUSE)\n"
+    )
+    monkeypatch.syspath_prepend(str(file.parent))
+    first, before = register_file(file), own_causes.digests()
+    assert register_file(file) == first
+    assert own_causes.digests() == before
+    helper.write_text(helper.read_text() + "# another law\n")
+    register_file(file)
+    assert own_causes.digests() != before
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [

@@ -1,5 +1,6 @@
 """Noise, screening, classes and comparison on linear toys: against theory, and against what must not matter."""
 
+import math
 from dataclasses import replace
 
 import linear_toys as toys
@@ -7,14 +8,16 @@ import pytest
 import torch
 
 from torchcloth.diagnosis.cells import NAMES as KINDS
+from torchcloth.diagnosis.cells import SEEN
 from torchcloth.diagnosis.classes import TOLD, alike, correlations, fitted_alike
-from torchcloth.diagnosis.comparison import compare, predict, spread
+from torchcloth.diagnosis.comparison import compare, of_episodes, predict, spread
 from torchcloth.diagnosis.evidence import as_rough
 from torchcloth.diagnosis.fitting import renoised, step_of, weighed_alike
 from torchcloth.diagnosis.noise import ROUGH, Noise, fit_noise, floor_of, whitened
 from torchcloth.diagnosis.screening import Row, _decided, screen
 from torchcloth.diagnosis.trials import CLEAR
 from torchcloth.diagnosis.wording import _is_too_large, _too_large
+from torchcloth.errors import InvalidInput
 
 NAMES = ["a", "b", "c"]
 SLOPES = toys.smooth(1, 6)  # two parameters, three hypotheses, one nuisance
@@ -255,6 +258,14 @@ def test_an_episode_without_a_cell_says_nothing():
     alike = as_rough(ev, empty)
     assert [len(c.value) for c in alike.cells] == [0, *(len(c.value) for c in ev.cells[1:])]
     assert torch.isfinite(whitened(alike, noise).value).all()
+    blind = toys.fitted(empty)
+    first = of_episodes(predict(blind, list("wxyz")), [0])
+    gain = compare(first, first, 1e-3)  # of a motion alone
+    assert math.isnan(gain.before)
+    assert (gain.density, gain.ci95) == (0.0, (0.0, 0.0))
+    forces = replace(ev, cells=[c._replace(block=torch.full_like(c.block, SEEN)) for c in ev.cells])
+    with pytest.raises(InvalidInput, match="no place on the cloth"):
+        floor_of(forces, noise)
 
 
 def test_a_true_cause_predicts_motions_that_were_held_out():

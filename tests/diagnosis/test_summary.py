@@ -24,7 +24,9 @@ def test_drifts_are_told_with_what_would_tell_more():
     x = {"axis": "x", "rate": 0.001, "std": 0.004, "p": 1.0, "lacking": False}
     z = {"axis": "z", "rate": -0.0196, "std": 0.0041, "p": 6e-6, "lacking": True}
     (line,) = (line for line in summary("unexplained", drifts=[x, z]) if "drift" in line)
-    assert line.startswith("Forces along z drift from the simulation's by -20 mN/s (standard error 4)")
+    assert line.startswith(
+        "The force on each gripper along z drifts from the simulation's by -20 mN/s (standard error 4)"
+    )
     assert "Empty grippers" in line
 
 
@@ -56,7 +58,7 @@ def test_a_missing_force_is_a_pressure_at_a_place():
     part = {"motion": "swing", "at": [0.1, 0.2], "from": 0.2, "to": 0.4, "pressure": [0.0, 3.0, 4.0], "sure": True}
     part["until"] = None
     (line,) = (t for t in summary("unexplained", missing_force={"weight": 2.0, "motions": [part]}) if "missing" in t)
-    assert "A pressure of 5 Pa (250 % of what the cloth weighs there) is missing in swing, about (100, 200) mm" in line
+    assert "A pressure of 5 Pa (250 % of the cloth's own weight) is missing in swing, about (100, 200) mm" in line
     until = summary(
         "unexplained", missing_force={"weight": 2.0, "motions": [part, part | {"motion": "hang", "until": 0.6}]}
     )

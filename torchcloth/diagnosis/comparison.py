@@ -178,8 +178,10 @@ def _adjusted(found: Fitted, k: int, likely: Tensor) -> Tensor:
 
 
 def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) -> Gain:
-    """How much better the second predicts; intervals by resampling stretches of time."""
+    """How much better the second predicts; intervals by resampling stretches of time. Not, where they share no cell."""
     one, two = _both(first, second)
+    if not len(one.value):
+        return Gain(np.nan, np.nan, 0.0, (0.0, 0.0), 0.0, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
     owner, density, squares = _blocks(one, two)
     rng = np.random.default_rng(seed)
     drawn = [_draw(owner, rng) for _ in range(DRAWS)]

@@ -19,11 +19,11 @@ from .cells import aligned
 from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
 from .evidence import Evidence, as_held, as_rough, gather, shared
 from .fitting import Fitted
-from .gate import check, somewhere_seen
+from .gate import check
 from .model_file import ModelFile, read_model
 from .noise import Noise, fit_noise, floor_of, least, unfitted, whitened
 from .repeats import pairs_of, repeats
-from .setting import Progress, setting_of, staged
+from .setting import Progress, setting_of, somewhere_seen, staged
 from .world import Model
 
 CONVENTION = (
@@ -97,7 +97,6 @@ def confirm(
     if faults := check(recordings):
         raise RecordingError(str(faults[0]))
     each_once(recordings)
-    somewhere_seen(recordings)
     scene = together(recordings)
     files = [read_model(path, scene) for path in (base, extended)]
     for path, file in zip((base, extended), files, strict=True):
@@ -106,6 +105,7 @@ def confirm(
     for recording in recordings:
         _refuse_seen(recording, files)
     settings = [setting_of(file.model, recordings) for file in files]
+    somewhere_seen(settings[0])
     found = [
         gather(file.model, setting, (), staged(progress, stage))
         for file, setting, stage in zip(files, settings, ("base", "extended"), strict=True)

@@ -83,13 +83,14 @@ def mended(start: Fitted, end: Fitted, names: Sequence[str], alone: Collection[s
 
 def unheard(start: Fitted, end: Fitted, steps: Sequence[Step], names: Sequence[str]) -> bool:
     """Of the causes, motions that fit in the end say nothing, where some do."""
-    lacking = {row.motion for row in lack_of_fit(end, names) if row.lacking}
-    sound = [k for k, name in enumerate(names) if name not in lacking]
+    left = lack_of_fit(end, names)  # a motion whose cells all jump is not among them
+    sound = {row.motion for row in left} - {row.motion for row in left if row.lacking}
+    told = [k for k, name in enumerate(names) if name in sound]
     alone = alone_in(steps)
-    if not sound:
+    if not told:
         return False
     first, last = (predict(f, names, alone) for f in weighed_alike(start, end))
-    return not worthwhile(compare(of_episodes(first, sound), of_episodes(last, sound), 0.0))
+    return not worthwhile(compare(of_episodes(first, told), of_episodes(last, told), 0.0))
 
 
 def predicts_better(one: Fitted, other: Fitted, names: Sequence[str]) -> float:

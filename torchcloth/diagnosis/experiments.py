@@ -1,7 +1,8 @@
 """Short, safe motions from where the grippers are: what may be asked of a robot to tell causes apart.
 
-All keep within 16 cm of the first pose on a table and 5 cm in the air, and stretch the cloth by at most 1 cm. They are
-those of ``tests/independent/motions.py``, so that another engine can carry an experiment out.
+On a table all keep within 16 cm of the first pose, but for the lift (40 cm up), in the air within 5 cm, and stretch the
+cloth by at most 1 cm. They are those of ``tests/independent/motions.py``, so that another engine can carry an
+experiment out.
 """
 
 from __future__ import annotations

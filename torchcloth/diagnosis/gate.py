@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InvalidInput, RecordingError
-from ..recordings import Recording, checks, extents, read
+from ..errors import RecordingError
+from ..recordings import Recording, checks, read
 from ..recordings.reading import EPISODE
 from ..recordings.ticks import times
 from ..recordings.together import name_of, same_cloth
@@ -58,17 +58,6 @@ def check(recordings: Sequence[Recording]) -> list[Fault]:
         name = name_of(recording, k)
         found += [Fault(name, what, remedy) for what, remedy in _faults(recording)]
     return found
-
-
-def somewhere_seen(recordings: Sequence[Recording]) -> None:
-    """Raises InvalidInput where nothing says where the cloth is: forces alone do not."""
-    if not any(len(cloud) for r in recordings for cloud in extents.seen(r)[1:]):
-        raise InvalidInput(
-            "episodes",
-            got="none with points or markers",
-            expected="at least one that says where the cloth is",
-            remedy="record a depth camera or markers (docs/episode.md)",
-        )
 
 
 def read_episodes(folders: Sequence[str | Path]) -> tuple[list[Recording], list[Fault]]:

@@ -7,7 +7,8 @@ What a user registers joins the search.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from ..errors import InvalidInput
 from ..recordings import Recording
@@ -15,6 +16,7 @@ from . import air, fabric, grip, observer
 from .world import RESIDUAL, Hypothesis, Model
 
 _registered: list[Hypothesis] = []
+_notes: list[list[Hypothesis]] = []
 
 
 def register(hypothesis: Hypothesis) -> Hypothesis:
@@ -36,7 +38,8 @@ def register(hypothesis: Hypothesis) -> Hypothesis:
             expected="a name of its own",
             remedy=f"call it e.g. 'my.{hypothesis.name.partition('.')[2]}'",
         )
-    _registered.append(hypothesis)
+    for joined in (_registered, *_notes):
+        joined.append(hypothesis)
     return hypothesis
 
 
@@ -52,6 +55,16 @@ def _check_size(hypothesis: Hypothesis) -> None:
 def forget(name: str) -> None:
     """Take a registered hypothesis out again."""
     _registered[:] = [h for h in _registered if h.name != name]
+
+
+@contextmanager
+def noted() -> Iterator[list[Hypothesis]]:
+    """What is registered meanwhile, anew or again."""
+    _notes.append([])
+    try:
+        yield _notes[-1]
+    finally:
+        _notes.pop()
 
 
 def known() -> list[Hypothesis]:

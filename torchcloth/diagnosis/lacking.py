@@ -104,10 +104,10 @@ def _gone(before: Sequence[Left], after: Sequence[Left], seen: bool) -> float:
     Motions in which less is left than that make up for none in which it is more. Where both meshes do not agree, before
     or after, nothing is counted on either side: what vacuum folds away would come back as if a cause had brought it.
     """
-    folded = {(row.motion, row.kind) for row in (*before, *after) if not row.stable}
+    folded = {(row.episode, row.kind) for row in (*before, *after) if not row.stable}
 
     def over(rows: Sequence[Left]) -> float:
-        judged = [r for r in rows if r.seen is seen and (r.motion, r.kind) not in folded]
+        judged = [r for r in rows if r.seen is seen and (r.episode, r.kind) not in folded]
         return sum(max(0.0, r.left**2 - r.expected**2) / (1.0 if seen else r.expected**2) for r in judged)
 
     first, last = over(before), over(after)

@@ -89,7 +89,9 @@ class MissingForce:
         alike = (m.force[w] @ m.force[w, v] / m.force[w, v].norm().clamp(min=1e-30)).clamp(min=0.0)
         weight = alike.square() * self.area  # what pushes the other way has its middle elsewhere
         middle = (weight[:, None] * self.uv).sum(0) / weight.sum()
-        nearest = int((self.uv - middle).norm(dim=1).argmin())
+        pressure = (weight[:, None] * m.force[w]).sum(0) / weight.sum()
+        if alike[(self.uv - middle).norm(dim=1).argmin()] < 0.5 * alike[v]:  # it lies between two places
+            middle = self.uv[v]
         certain = float(m.certainty[w].max())
         return {
             "motion": m.motion,
@@ -97,7 +99,7 @@ class MissingForce:
             "at": middle.tolist(),
             "from": float(m.windows[w, 0]),
             "to": float(m.windows[w, 1]),
-            "pressure": m.force[w, nearest].tolist(),
+            "pressure": pressure.tolist(),
             "total": self.total(m)[w].tolist(),
             "standard_errors": certain,
             "sure": certain > SURE,

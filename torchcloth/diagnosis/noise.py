@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..errors import InvalidInput
 from .cells import NAMES, SEEN, Cells, mean_over, stretches
 from .evidence import NUMERICS, Evidence
 
@@ -100,7 +101,7 @@ def fit_noise(evidence: Evidence, sweeps: int = 2) -> Noise:
     factors = 10 ** torch.linspace(-0.5, 1.75, 10, dtype=torch.float64)
     for sweep in range(sweeps):
         for b in present:
-            tried = [*(FLOOR[NAMES[b]] * factors)] if sweep == 0 else level[b] * factors[:4] ** 0.3
+            tried = [*(FLOOR[NAMES[b]] * factors)] if sweep == 0 else level[b] * factors[:5] ** 0.3
             best = max(tried, key=lambda v: _likelihood(evidence, _with(level, b, v)))
             level = _with(level, b, best)
     return Noise(level)
@@ -155,4 +156,11 @@ def floor_of(evidence: Evidence, noise: Noise) -> float:
         own = cells.block < SEEN
         variance = noise.plain(cells)[own]
         total, count = total + float(variance.sum()), count + int(own.sum())
+    if not count:
+        raise InvalidInput(
+            "episodes",
+            got="no place on the cloth that finer and coarser meshes and neighbouring values find alike",
+            expected="some",
+            remedy="shorter or slower motions, with more of the cloth in view",
+        )
     return (total / count) ** 0.5

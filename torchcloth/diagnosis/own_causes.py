@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import runpy
+import sys
 import traceback
+from collections.abc import Iterable
 from pathlib import Path
 
 from ..errors import InvalidInput
@@ -11,7 +13,9 @@ from ..identification.journal import digest
 from . import hypotheses
 from .world import Hypothesis
 
-_files: dict[str, str] = {}  # digest of the content, by path
+_files: dict[Path, str] = {}  # digest of the content and of what it imports, by path
+_imports: dict[Path, set[Path]] = {}  # a second run of it in this process imports nothing any more
+_NOT_ONES_OWN = {*sys.stdlib_module_names, "torchcloth"}
 EXPECTED = "a Python file that calls torchcloth.diagnosis.register(Hypothesis(...))"
 
 
@@ -24,21 +28,30 @@ def register_file(path: str | Path) -> list[Hypothesis]:
     path = Path(path)
     if not path.is_file():
         raise InvalidInput("causes", got=f"no file {path}", expected=EXPECTED)
-    before = list(hypotheses.registered())
+    before = set(sys.modules)
     try:
-        runpy.run_path(str(path))
+        with hypotheses.noted() as found:
+            runpy.run_path(str(path))
     except (Exception, SystemExit) as error:  # whatever a user's file does wrong
         lines = [part.lineno for part in traceback.extract_tb(error.__traceback__) if part.filename == str(path)]
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
         where = f"{path}{f', line {line}' if line else ''}"
         raise InvalidInput("causes", got=f"{type(error).__name__} in {where}: {error}", expected=EXPECTED) from None
-    found = [h for h in hypotheses.registered() if h not in before]
     if not found:
         raise InvalidInput("causes", got=f"{path}, which registers nothing", expected=EXPECTED)
-    _files[str(path.resolve())] = digest([path.read_bytes()])
+    imports = _imports.setdefault(path.resolve(), set())
+    imports |= _sources(set(sys.modules) - before)
+    _files[path.resolve()] = digest([p.read_bytes() for p in (path, *sorted(imports))])
     return found
 
 
+def _sources(names: Iterable[str]) -> set[Path]:
+    """Files of these modules that somebody may edit: of no installed package."""
+    modules = (sys.modules.get(name) for name in names if name.partition(".")[0] not in _NOT_ONES_OWN)
+    files = (Path(f).resolve() for m in modules if (f := getattr(m, "__file__", None)))
+    return {f for f in files if f.suffix == ".py" and "site-packages" not in f.parts}
+
+
 def digests() -> list[str]:
-    """Of the files that were run: what a diagnosis that goes on depends on."""
+    """Of the files that were run, and of what they import: what a diagnosis that goes on depends on."""
     return sorted(_files.values())

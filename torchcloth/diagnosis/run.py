@@ -17,7 +17,7 @@ from ..recordings import Recording
 from ..recordings.marks import each_once, mark
 from ..recordings.together import together
 from .base_model import base_model
-from .gate import check, somewhere_seen
+from .gate import check
 from .hypotheses import catalogue
 from .keeping import kept_in
 from .lacking import lack_of_fit
@@ -26,7 +26,7 @@ from .model_file import save_model
 from .next_experiment import propose
 from .report import write_report
 from .residual import doubted, is_residual, learn_residual
-from .setting import Progress, motions_of, setting_of, staged
+from .setting import Progress, motions_of, setting_of, somewhere_seen, staged
 from .stepwise import Found, search
 from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
@@ -87,11 +87,11 @@ def diagnose(
     if faults := check(recordings):
         return refused(faults, names)
     each_once(recordings)
-    somewhere_seen(recordings)
     model = model or base_model(together(recordings))
     asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
     plan = hashlib.sha256(json.dumps([[h.name, h.typical, h.share] for h in asked]).encode()).hexdigest()[:16]
     setting = setting_of(model, recordings)
+    somewhere_seen(setting)
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     many = torch.get_num_threads()

@@ -18,6 +18,7 @@ from .refined import refined
 from .world import Model, World
 
 LATE = 0.05  # s, by which a clock may be late and its last frames still be simulated
+MEANWHILE = f"after its first frame and before its last {LATE:g} s"
 Progress = Callable[[str], None]
 Kept = Callable[[Sequence[object], Tensor, Callable[[], Piece]], Piece]  # (question, point, work) -> answer
 
@@ -89,15 +90,29 @@ def foreseen(e: Episode) -> Episode:
 
 def _telling(e: Episode) -> Episode:
     """Raises InvalidInput for one that says nothing: its first frame is where the simulation starts."""
-    seen = any(len(c) for c in e.clouds[1:]) or (e.markers is not None and bool(e.markers[1:].isfinite().any()))
-    if not seen and not any(bool(w[1:].isfinite().any()) for w in e.wrenches.values()):
+    if not _seen(e) and not any(bool(w[1:].isfinite().any()) for w in e.wrenches.values()):
         raise InvalidInput(
             "episode",
-            got=f"{e.name}, in which nothing is seen or felt after its first frame and before its last {LATE:g} s",
+            got=f"{e.name}, in which nothing is seen or felt {MEANWHILE}",
             expected="frames with points, markers or forces",
             remedy="leave it out, or record longer",
         )
     return e
+
+
+def _seen(e: Episode) -> bool:
+    return any(len(c) for c in e.clouds[1:]) or (e.markers is not None and bool(e.markers[1:].isfinite().any()))
+
+
+def somewhere_seen(setting: Setting) -> None:
+    """Raises InvalidInput where nothing says where the cloth goes: forces alone do not."""
+    if not any(map(_seen, setting.episodes)):
+        raise InvalidInput(
+            "episodes",
+            got=f"none with points or markers {MEANWHILE}",
+            expected="at least one that says where the cloth goes",
+            remedy="record a depth camera or markers (docs/episode.md)",
+        )
 
 
 def surely_seen(e: Episode) -> Episode:

@@ -88,8 +88,7 @@ def _likely(screened: Sequence[Row]) -> list[Row]:
     there ask for less of it than there is; so what gains very much is fitted, however little it asks for.
     """
     asks = lambda r: r.worth > VERY_MUCH or (r.shows and (r.worth > MUCH or r.excess > PRESENT))  # noqa: E731
-    sane = lambda r: abs(r.reached) < PLAUSIBLE * abs(r.hypothesis.typical)  # noqa: E731
-    likely = [r for r in screened if r.decision == "present" or (asks(r) and sane(r))]
+    likely = [r for r in screened if r.decision == "present" or asks(r)]
     return sorted(likely, key=lambda r: -r.worth)
 
 
@@ -123,11 +122,15 @@ def one_step(
     if not fits:
         return None
     common = lambda like, fits: shared(like, [current.evidence, *(f.evidence for _, f in fits)])  # noqa: E731
-    now = lambda fits: _compared(current, fits, setting.names, current.noise, common(current.evidence, fits))  # noqa: E731
-    likely = now(fits)
+    alike = lambda fits, those: _compared(  # noqa: E731
+        current, fits, setting.names, current.noise, common(current.evidence, those)
+    )
+    likely = alike(fits, fits)
     settled = _settled(likely, setting, progress)
-    for k, after in zip(settled, now(list(settled.values())), strict=True):
-        likely[k] = _better(likely[k], after)
+    first, further = [fits[k] for k in settled], list(settled.values())
+    both = (alike(own, [*fits, *further]) for own in (first, further))
+    for k, before, after in zip(settled, *both, strict=True):
+        likely[k] = _better(before, after)
     likeliest = max(likely, key=lambda c: c.gain.density).fitted.evidence
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
     fits = [(c.row, c.fitted) for c in likely]

@@ -159,7 +159,8 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     place, amplitude = found.end.model.place(h.name), found.amplitude(step)
     std = (float(_errors(found, names, best.alone)[count + place]) ** 2 + best.row.bias**2) ** 0.5
     beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
-    others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in beaten]
+    apart = beaten | {s.best.hypothesis.name for s in found.steps} - {h.name}
+    others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in apart]
     kin = [r.hypothesis.name for r in alike(step.before, best.row, amplitude, others)]
     rivals = found.rivals(step)
     kin += [c.hypothesis.name for c in rivals if fitted_alike(best.fitted, c.fitted, step.noise)]

@@ -80,9 +80,9 @@ def _lacking(content: dict[str, Any]) -> list[str]:
     """Where the fit is lacking, and what force would mend it."""
     drifting, rows = ([row for row in content[key] if row["lacking"]] for key in ("drifts", "lack_of_fit"))
     told = [
-        f"Forces along {d['axis']} drift from the simulation's by {1e3 * d['rate']:.0f} mN/s (standard error "
-        f"{1e3 * d['std']:.0f}) in all motions alike: cloth that gains or loses weight, or sensors. Empty grippers, "
-        "recorded as long, would tell."
+        f"The force on each gripper along {d['axis']} drifts from the simulation's by {1e3 * d['rate']:.0f} mN/s "
+        f"(standard error {1e3 * d['std']:.0f}) in all motions alike: cloth that gains or loses weight, or "
+        "sensors. Empty grippers, recorded as long, would tell."
         for d in drifting
     ]
     out = [*told, *([f"Lacking: {', '.join(map(_left, rows))}."] if rows else [])]
@@ -92,7 +92,7 @@ def _lacking(content: dict[str, Any]) -> list[str]:
         size = sum(c * c for c in m["pressure"]) ** 0.5
         share = 100 * size / missing["weight"]
         out.append(
-            f"  A pressure of {size:.2g} Pa ({share:.0f} % of what the cloth weighs there) is missing in "
+            f"  A pressure of {size:.2g} Pa ({share:.0f} % of the cloth's own weight) is missing in "
             f"{m['motion']}, about ({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
         )
     unasked = [f"{m['motion']} from {m['until']:.1f} s on" for m in missing["motions"] if m["until"] is not None]
@@ -165,8 +165,7 @@ def on_top(model: Model) -> list[str]:
 
 def _is_too_large(row: Row) -> bool:
     """It would mend much, if it were believed."""
-    asked = max(abs(row.amplitude), abs(row.reached))
-    return row.shows and row.worth > MUCH and asked > NEARLY * PLAUSIBLE * abs(row.hypothesis.typical)
+    return row.shows and row.worth > MUCH and abs(row.amplitude) > NEARLY * PLAUSIBLE * abs(row.hypothesis.typical)
 
 
 def _too_large(row: Row) -> str:
