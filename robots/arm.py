@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torchcloth._surroundings import full_precision
 from torchcloth.errors import InvalidInput
 from torchcloth.types import Trajectory
 
@@ -133,6 +134,7 @@ class Arm(nn.Module):
         """Name, frame and joints, for ``print(arm)``."""
         return f"{self.name!r}, frame={self.frame!r}, joints={list(self.joint_names)}"
 
+    @full_precision()
     def forward(self, q: Tensor) -> Tensor:
         """Pose of ``frame`` in the world.
 
@@ -157,6 +159,7 @@ class Arm(nn.Module):
             bodies.append(bodies[-1] @ joint)
         return torch.stack(bodies, dim=-3)
 
+    @full_precision()
     def jacobian(self, q: Tensor) -> Tensor:
         """Geometric Jacobian at the origin of ``frame``, in world axes.
 
@@ -175,6 +178,7 @@ class Arm(nn.Module):
         angular = torch.where(slides, 0.0, axis)
         return torch.cat([linear, angular], dim=-1).mT
 
+    @full_precision()
     def motion(
         self,
         q: Tensor,
@@ -207,6 +211,7 @@ class Arm(nn.Module):
         """
         q = self._checked(q)
         t = torch.as_tensor(t).to(q)
+        closed, stop = (None if mask is None else torch.as_tensor(mask) for mask in (closed, stop))
         trajectories.check_waypoints(q, t, closed=closed, stop=stop)
         sampled = trajectories.interpolate(q, t, stop, period)
         if check_limits:
@@ -215,6 +220,7 @@ class Arm(nn.Module):
         held = torch.ones_like(t, dtype=torch.bool) if closed is None else closed.to(t.device)
         return Trajectory(sampled.t, self(sampled.q), held[sampled.waypoint])
 
+    @full_precision()
     def inverse(
         self,
         pose: Tensor,
@@ -243,7 +249,7 @@ class Arm(nn.Module):
         Raises:
             InvalidInput: names the first pose that cannot be reached and the joints at their limits.
         """
-        pose = pose.detach().to(self.base)
+        pose = torch.as_tensor(pose).detach().to(self.base)
         if pose.ndim not in (2, 3) or pose.shape[-2:] != (4, 4) or len(pose) == 0:
             raise InvalidInput("pose has the wrong shape", got=tuple(pose.shape), expected="(K, 4, 4) or (4, 4)")
         check_rigid("pose", pose)
@@ -253,6 +259,7 @@ class Arm(nn.Module):
         q = inverse.solve(self, poses, start, target, self._limits[2:4], tolerance, iterations)
         return q.reshape(*pose.shape[:-2], -1)
 
+    @full_precision()
     def geometry(self, q: Tensor) -> list[Primitive]:
         """The boxes, cylinders and spheres of the links from the root to ``frame``.
 
@@ -284,6 +291,9 @@ class Arm(nn.Module):
             got = f"{q.dtype} {tuple(q.shape)}"
             expected = f"floating (..., {joints}): {names}"
             raise InvalidInput(f"{name} has the wrong shape or type", got=got, expected=expected)
+        if self.base.dtype not in (torch.float32, torch.float64):
+            got = str(self.base.dtype).removeprefix("torch.")
+            raise InvalidInput("precision of the arm", got=got, expected="float32 or float64", remedy="use arm.float()")
         return q.to(self.base.dtype)
 
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchcloth.errors import RecordingError
 from torchcloth.recordings import GripperMotion, JointMotion, Recording
+from torchcloth.recordings.together import check_recording
 from torchcloth.types import Trajectory
 
 from .arm import Arm, load
@@ -29,6 +30,7 @@ def replay(recording: Recording, dtype: torch.dtype = torch.float64) -> dict[str
         RecordingError: joints without an arm to replay them on, or no motion at all.
         InvalidInput: the arm's model or frame is unknown.
     """
+    check_recording(recording)
     out = {}
     for name, motion in recording.grippers.items():
         pose = _poses(motion.position, motion.quat_wxyz)

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 COMPANIONS = ("benchmarks", "robots", "training")  # folders of their own, installed as torchcloth.robots, ...
 
 FLOORS = (
-    ("errors", "_files", "_math", "_remembered", "forward_mode"),
+    ("errors", "_files", "_math", "_remembered", "_surroundings", "forward_mode"),
     ("types", "parameters", "_vectors"),
     ("meshes",),
     ("materials", "effects", "boundaries", "transfer"),
@@ -25,7 +25,7 @@ FLOORS = (
     ("functional", "stability", "recordings", "engine"),
     ("losses",),
     ("observe", "validation"),
-    ("initial", "intervals"),
+    ("initial", "intervals", "parts"),
     ("sensitivities",),
     ("cloth", "robots"),
     ("identification", "plan", "testing"),
@@ -40,7 +40,7 @@ FLOORS = (
 
 # Rooms that must know less than their floor allows.
 ONLY = {
-    "robots": {"errors", "types", "recordings"},  # tensors cross to the cloth, nothing else
+    "robots": {"errors", "types", "recordings", "_surroundings"},  # tensors cross to the cloth, nothing else
     "recordings": {"errors", "types", "meshes"},  # an episode can be read without any physics
     "observe": {"errors", "meshes", "losses"},  # it sees where cloth is, and knows nothing of how it moves
 }

@@ -1,5 +1,6 @@
 """Distances against brute force, signs, edges and derivatives."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -267,3 +268,19 @@ def test_float32(vertices, points):
     got = chamfer_to_surface(points.float(), vertices.float(), FACES)
     assert got.dtype == torch.float32
     torch.testing.assert_close(got.double(), exact, rtol=1e-5, atol=0)
+
+
+def test_arrays_are_taken_as_recordings_and_meshes_hold_them():
+    mesh = tc.meshes.rectangle(0.3, 0.2, resolution=(4, 3))
+    x, cloud = torch.as_tensor(mesh.vertices), np.add(mesh.vertices, [0.01, 0.0, 0.02])
+    wanted = chamfer_to_surface(torch.as_tensor(cloud), x, torch.as_tensor(mesh.faces))
+    assert torch.equal(chamfer_to_surface(cloud, x, mesh.faces), wanted)
+    assert torch.equal(chamfer_to_vertices(cloud, x), chamfer_to_vertices(torch.as_tensor(cloud), x))
+
+
+def test_gradients_by_torch_func_are_those_of_backward():
+    mesh = tc.meshes.rectangle(0.3, 0.2, resolution=(4, 3))
+    x, faces = torch.as_tensor(mesh.vertices), torch.as_tensor(mesh.faces)
+    cloud, own = x + torch.tensor([0.01, 0.0, 0.02]), x.clone().requires_grad_()
+    (wanted,) = torch.autograd.grad(chamfer_to_surface(cloud, own, faces), own)
+    torch.testing.assert_close(torch.func.grad(lambda x: chamfer_to_surface(cloud, x, faces))(x), wanted)

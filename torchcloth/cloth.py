@@ -5,23 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Literal, cast
-from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from . import functional
+from ._surroundings import full_precision
 from .boundaries import AbstractBoundary
 from .effects import AbstractEffect
 from .engine.choice import Choice, Setting, check_setting, choose, still_drives
-from .errors import InvalidInput, TorchclothError
+from .errors import TorchclothError
 from .initial import damped, first_state, held, likeness
 from .intervals import Plan, run
 from .materials import AbstractMaterial
 from .meshes import Mesh
 from .model import Geometry, Model, vertex_mass
 from .parameters import PhysicalParameter
+from .parts import Parts, check_free
 from .sensitivities import Directions, sensitivities
 from .stability import limits_of
 from .strain import inverse_growth
@@ -43,8 +44,6 @@ from .validation import (
     check_transfer,
     expand_state,
 )
-
-_OWNERS: WeakKeyDictionary[nn.Module, ref[Cloth]] = WeakKeyDictionary()  # of effects and boundaries
 
 
 class Cloth(nn.Module):
@@ -103,29 +102,16 @@ class Cloth(nn.Module):
         check_field("areal_density", self.areal_density.raw, len(mesh.faces))
         check_fields(effects, len(mesh.faces))
         check_axes(mesh, {"material": material, **effects})
-        self._check_free([*effects.items(), *boundaries.items()])
-        self.effects = nn.ModuleDict({name: part.bind(mesh) for name, part in effects.items()})
-        self.boundaries = nn.ModuleDict({name: part.bind(mesh) for name, part in boundaries.items()})
+        check_free(mesh, [*effects.items(), *boundaries.items()])
+        self.effects, self.boundaries = Parts("effects", mesh), Parts("boundaries", mesh)
+        self.effects.update(effects)
+        self.boundaries.update(boundaries)
         check_grasps(dict(self._parts()), self.boundaries)
         self.contact, self._grid = contact, None if contact is None else contact.grid(mesh)
         self._store_geometry()
         for own in (*self.parameters(), *self.buffers()):  # tensors keep their precision until a cloth has one
             if own.is_floating_point():
                 own.data = own.data.to(self._area.dtype)
-        for part in (*self.effects.values(), *self.boundaries.values()):
-            _OWNERS[part] = ref(self)
-
-    def _check_free(self, parts: Iterable[tuple[str, nn.Module]]) -> None:
-        """Refuse what is bound to another cloth's mesh: it would be bound anew under that one's feet."""
-        for name, part in parts:
-            owner = None if (known := _OWNERS.get(part)) is None else known()
-            if owner is not None and not owner.mesh.same(self.mesh):
-                raise InvalidInput(
-                    name,
-                    got="an effect or boundary of another cloth, bound to its mesh",
-                    expected="one of its own",
-                    remedy="make it anew, or copy.deepcopy it",
-                )
 
     def _store_geometry(self) -> None:
         gradient, area = self.mesh.shape_gradient, self.mesh.area
@@ -135,7 +121,7 @@ class Cloth(nn.Module):
             "_gradient": torch.as_tensor(gradient, dtype=dtype),
             "_area": torch.as_tensor(area, dtype=dtype).unsqueeze(-1),
             "_share": torch.as_tensor(self.mesh.vertex_area, dtype=dtype).unsqueeze(-1),
-            "_vertices": torch.as_tensor(self.mesh.vertices, dtype=dtype),
+            "_vertices": torch.tensor(self.mesh.vertices, dtype=dtype),
             "_points": torch.zeros(0, 3, dtype=dtype) if self._grid is None else self._grid.points,
             "_apart": None if self._grid is None else self._grid.apart,
         }
@@ -162,7 +148,7 @@ class Cloth(nn.Module):
 
     def rest_state(self) -> ClothState:
         """The mesh as it was given, at rest."""
-        return self.state(self._vertices)
+        return self.state(self._vertices.clone())  # what a caller does to it is not done to the cloth
 
     def state(self, x: Tensor, v: Tensor | None = None) -> ClothState:
         """A state from vertex positions [..., V, 3] m and velocities (None: at rest), directors along the normals."""
@@ -172,6 +158,7 @@ class Cloth(nn.Module):
 
     # -- simulation -----------------------------------------------------------------------------------------------
 
+    @full_precision()
     def forward(
         self,
         state: ClothState,
@@ -197,6 +184,7 @@ class Cloth(nn.Module):
         """
         return run(self.plan(state, motion or {}, times, dt), checkpoint)
 
+    @full_precision()
     def settle(
         self,
         state: ClothState,
@@ -250,6 +238,12 @@ class Cloth(nn.Module):
         """
         return sensitivities(self, state, motion or {}, times, along, dt, settle)
 
+    def clip_(self) -> None:
+        """Take amplitudes that an optimiser's step has made negative back to zero; call it after every step."""
+        for part in self.modules():
+            if isinstance(part, PhysicalParameter):
+                part.clip_()
+
     def stable_step(self) -> float:
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
         return self._stepping()[1]
@@ -275,16 +269,18 @@ class Cloth(nn.Module):
             rest=inverse_growth(effect.growth(c) for effect, c in effects.values()),
         )
 
+    @full_precision()
     def energy(self, state: ClothState) -> dict[str, Tensor]:
         """Energies by name, each [...] J."""
-        return functional.energy(self.model(), state)
+        model = self.model()
+        check_state(state, likeness(model, self._vertices), finite=False)
+        return functional.energy(model, state)
 
     def plan(
         self, state: ClothState, motion: Mapping[str, Trajectory], times: Tensor | Sequence[float], dt: float | None
     ) -> Plan:
         """What ``forward`` does, checked."""
         frames = check_times(times)
-        check_parameters(self)
         motion = check_motions(motion, self.boundaries, frames, self._area)
         model, limit = self._stepping(dt)
         check_substeps(frames[-1] - frames[0], limit, dt)
@@ -296,7 +292,6 @@ class Cloth(nn.Module):
     ) -> Plan:
         """What ``settle`` does, checked."""
         frames = [start, start + duration]
-        check_parameters(self)
         motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
         model, step = self._stepping()
         check_substeps(duration, step)
@@ -315,6 +310,7 @@ class Cloth(nn.Module):
 
     def _stepping(self, dt: float | None = None) -> tuple[Model, float]:
         """The parts, with the stages that the step needs, and the step [s]: the stable one, or the user's."""
+        check_parameters(self, self._area.dtype)
         model = self.model()
         limits = limits_of(model, self._gradient)
         step = check_step(dt, limits.step)

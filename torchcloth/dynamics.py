@@ -89,9 +89,9 @@ def constrain(
     for name, boundary in model.boundaries.items():
         drive = drives.get(name)
         if isinstance(boundary, AbstractCollider):
-            after = boundary.apply(x, v, dt, drive, substep, resistance)
+            after = boundary.constrain(x, v, dt, drive, substep, resistance)
         else:
-            after = boundary.apply(x, v, dt, drive, substep)
+            after = boundary.constrain(x, v, dt, drive, substep)
         if drive is not None:
             after = _slipped(model, name, v, after, dt, resistance)
             momentum = model.mass * loaded(resistance, after - v)

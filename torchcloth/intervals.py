@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from copy import copy
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint as recompute
 
 from . import functional
 from .boundaries import Drive, drive
 from .dynamics import Impulses, added
 from .engine.choice import Choice
-from .engine.fused import Fused
+from .engine.fused import Fused, recomputes
 from .errors import SimulationDiverged
+from .model import as_it_is
 from .self_contact import CHUNK
 from .types import ClothState, Rollout, Trajectory
 from .validation import check_extent
 
-ModuleT = TypeVar("ModuleT", bound=nn.Module)
 AT_ONCE = 4_000_000  # vertices times substeps of one call, which nobody can interrupt
 FEW = 250  # vertices, as which fewer count
 
@@ -189,25 +188,16 @@ def _by_reference(
     interval: Interval, state: ClothState, drives: Mapping[str, Drive], checkpoint: bool
 ) -> tuple[ClothState, Impulses]:
     total: Impulses = {}
-    store = checkpoint and torch.is_grad_enabled()
+    store = checkpoint and recomputes()
     model = interval.model
     if store:
-        model = model._replace(boundaries={name: _as_it_is(part) for name, part in model.boundaries.items()})
+        model = as_it_is(model)
     for first in range(0, interval.count, CHUNK):
         substeps = min(CHUNK, interval.count - first)
         run = partial(functional.rollout, model, dt=interval.dt, drives=drives, substeps=substeps, first=first)
-        state, impulses = recompute(run, state, use_reentrant=False, preserve_rng_state=False) if store else run(state)
+        state, impulses = recompute(run, state, use_reentrant=False) if store else run(state)
         total = added(total, impulses)
     return state, total
-
-
-def _as_it_is(part: ModuleT) -> ModuleT:
-    """A shallow copy that keeps the parameters of the moment: those of ``functional_call`` go before the backward."""
-    own = copy(part)
-    own.__dict__ = part.__dict__.copy()
-    own._parameters = part._parameters.copy()
-    own._modules = {name: None if inner is None else _as_it_is(inner) for name, inner in part._modules.items()}
-    return own
 
 
 def check_finite(interval: Interval, before: ClothState, after: ClothState) -> None:

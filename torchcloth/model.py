@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from copy import copy
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ._math import cross, dot
 from .boundaries import AbstractBoundary
@@ -14,6 +15,8 @@ from .effects import AbstractEffect
 from .materials import AbstractMaterial
 from .transfer import Grid
 from .types import Surface
+
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
 class Geometry(NamedTuple):
@@ -45,6 +48,26 @@ class Model(NamedTuple):
     transfer: Literal["mesh", "apic"] = "mesh"  # where elastic forces act: on the vertices, or through the grid
     rest: Tensor | None = None  # [..., E or 1, 4]: F_E = F A for a rest shape that differs from the pattern
     stages: int = 0  # in which viscous forces act, see relaxation.py; 0: with all other forces
+
+
+def as_it_is(model: Model) -> Model:
+    """With parts that keep the parameters of the moment, for a backward pass that computes again.
+
+    Those of ``functional_call`` have gone by then.
+    """
+    return model._replace(
+        material=_kept(model.material),
+        effects={name: (_kept(effect), c) for name, (effect, c) in model.effects.items()},
+        boundaries={name: _kept(boundary) for name, boundary in model.boundaries.items()},
+    )
+
+
+def _kept(part: ModuleT) -> ModuleT:
+    own = copy(part)
+    own.__dict__ = part.__dict__.copy()
+    own._parameters = part._parameters.copy()
+    own._modules = {name: None if inner is None else _kept(inner) for name, inner in part._modules.items()}
+    return own
 
 
 def vertex_mass(geometry: Geometry, density: Tensor, share: Tensor) -> Tensor:

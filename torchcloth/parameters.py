@@ -39,7 +39,7 @@ class PhysicalParameter(nn.Module):
 
     The stored tensor ``raw`` is unconstrained (log for positive, logit for (0, 0.5)), so any optimiser step stays
     legal. Amplitudes of effects are ``nonnegative``: stored as they are, because amplitude 0 must be exactly zero and
-    keep a gradient there; an optimiser has to project them (``tc.identify`` does).
+    keep a gradient there; after a step of an optimiser ``clip_`` takes them back (``tc.identify`` does so).
 
     Args:
         value: physical value in ``unit``; a number or a tensor (one value per triangle, or [B, 1] for a batch).
@@ -82,6 +82,12 @@ class PhysicalParameter(nn.Module):
                     self.label, got=f"shape {tuple(new.shape)}", expected=f"shape {tuple(self.raw.shape)}"
                 )
             self.raw.copy_(new)
+
+    @torch.no_grad()
+    def clip_(self) -> None:
+        """Take an amplitude that a step has made negative back to zero."""
+        if self.domain == "nonnegative":
+            self.raw.clamp_(min=0.0)
 
     def _to_raw(self, value: float | Tensor) -> Tensor:
         try:

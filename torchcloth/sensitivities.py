@@ -9,6 +9,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 
+from ._surroundings import full_precision
 from .boundaries import Drive
 from .engine.tangents import FusedTangents
 from .errors import InvalidInput
@@ -31,7 +32,9 @@ class Directions(NamedTuple):
     motion: Mapping[str, Tensor] = {}  # of the poses [K, ..., knots, 4, 4] of a boundary's trajectory
 
 
+@torch.inference_mode(False)  # in which tangents are lost
 @torch.no_grad()
+@full_precision()
 def sensitivities(
     cloth: Any,
     state: ClothState,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -34,13 +34,21 @@ def check_parts(
     """What a cloth is made of, each of its kind."""
     _check_kind("mesh", mesh, Mesh, "a Mesh, as torchcloth.meshes makes them")
     _check_kind("material", material, AbstractMaterial, "a material, of torchcloth.materials or derived from one")
-    for what, parts, kind in (("effects", effects, AbstractEffect), ("boundaries", boundaries, AbstractBoundary)):
+    for what, parts in (("effects", effects), ("boundaries", boundaries)):
         _check_kind(what, parts, (Mapping, nn.ModuleDict), f"a dict of names and {what}")
-        check_names(parts)
         for name, part in parts.items():
-            _check_kind(f"{what}: {name}", part, kind, f"an {kind.__name__}, as those of torchcloth.{what}")
+            check_part(what, name, part)
     if contact is not None:
         _check_kind("contact", contact, Contact, "Contact(...) or None")
+
+
+def check_part(what: str, name: object, part: object) -> None:
+    """One of the "effects" or "boundaries"."""
+    if not isinstance(name, str) or not name or "." in name or hasattr(nn.ModuleDict, name):
+        expected = "a name without dots that is no method of torch's ModuleDict"
+        raise InvalidInput("name of an effect or boundary", got=repr(name), expected=expected)
+    kind = {"effects": AbstractEffect, "boundaries": AbstractBoundary}[what]
+    _check_kind(f"{what}: {name}", part, kind, f"an {kind.__name__}, as those of torchcloth.{what}")
 
 
 def _check_kind(what: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
@@ -78,20 +86,12 @@ def check_fields(effects: Mapping[str, AbstractEffect], triangles: int) -> None:
                 check_field(f"effects.{name}.{path}", part.raw, triangles if path in effect.per_triangle else None)
 
 
-def check_names(names: Iterable[object]) -> None:
-    """Of effects and boundaries, as torch's ModuleDict takes them."""
-    for name in names:
-        if not isinstance(name, str) or not name or "." in name or hasattr(nn.ModuleDict, name):
-            expected = "a name without dots that is no method of torch's ModuleDict"
-            raise InvalidInput("name of an effect or boundary", got=repr(name), expected=expected)
-
-
-def check_numbers(what: str, values: object) -> None:
-    """Refuse what is not a tensor of finite real numbers."""
+def check_numbers(what: str, values: object, finite: bool = True) -> None:
+    """Refuse what is not a tensor of real numbers, and finite ones."""
     if not isinstance(values, Tensor) or not values.is_floating_point():
         got = values.dtype if isinstance(values, Tensor) else type(values).__name__
         raise InvalidInput(what, got=str(got).removeprefix("torch."), expected="a tensor of real numbers")
-    if not bool(torch.isfinite(values.detach()).all()):
+    if finite and not bool(torch.isfinite(values.detach()).all()):
         raise InvalidInput(what, got="NaN or infinite entries", expected="finite numbers")
 
 
@@ -120,17 +120,38 @@ def check_times(times: Tensor | Sequence[float]) -> list[float]:
     return frames
 
 
-def check_parameters(cloth: nn.Module) -> None:
-    """No NaN: comparisons with one are false, so a threshold of NaN would pass for an effect that is not there."""
+def check_parameters(cloth: nn.Module, dtype: torch.dtype) -> None:
+    """What an optimiser's step may have brought, or a part of another precision.
+
+    No NaN: comparisons with one are false, so a threshold of NaN would pass for an effect that is not there. And no
+    amplitude below zero, which would drive what it should brake.
+    """
     for name, parameter in cloth.named_parameters():
         if bool(parameter.isnan().any()):
             raise InvalidInput(name, got="NaN", expected="a number", remedy="look at the optimiser's last step")
+    for name, part in cloth.named_modules():
+        if not isinstance(part, PhysicalParameter):
+            continue
+        if part.raw.dtype != dtype:
+            got, expected = (str(own).removeprefix("torch.") for own in (part.raw.dtype, dtype))
+            raise InvalidInput(
+                name, got=got, expected=f"{expected}, as the cloth's", remedy=f"cloth.to(torch.{expected})"
+            )
+        if part.domain == "nonnegative" and bool((part.raw < 0).any()):
+            raise InvalidInput(
+                name,
+                got=f"{float(part.raw.detach().min()):.4g} {part.unit}",
+                expected="a value >= 0",
+                remedy="call the cloth's clip_() after every step of an optimiser",
+            )
 
 
 def check_step(dt: float | None, limit: float) -> float:
     """The substep to use [s]: the limit, or the user's if it is no larger."""
     if dt is None:
         return limit
+    if isinstance(dt, np.number | np.ndarray | Tensor) and dt.ndim == 0:
+        dt = float(dt)
     if not isinstance(dt, int | float) or not dt > 0:
         raise InvalidInput("dt", got=repr(dt), expected="a step > 0 in seconds, or none: the stable one")
     if dt > limit * (1 + 1e-9):
@@ -208,13 +229,13 @@ def check_positions(x: Tensor, v: Tensor, vertices: int) -> None:
         raise InvalidInput("x", got="NaN or infinite entries", expected="finite positions in metres")
 
 
-def check_state(state: ClothState, like: ClothState) -> None:
+def check_state(state: ClothState, like: ClothState, finite: bool = True) -> None:
     """Refuse a state that was made for another cloth (than ``like``, one of the right shapes), or is not finite."""
     remedy = "make states with this cloth's rest_state() or state()"
     if not isinstance(state, ClothState):
         raise InvalidInput("state", got=type(state).__name__, expected="a ClothState", remedy=remedy)
     for name, field in _named(state).items():
-        check_numbers(f"state.{name}", field)
+        check_numbers(f"state.{name}", field, finite)
         if field.dtype != like.x.dtype or field.device != like.x.device:
             got, expected = (f"{t.dtype} on {t.device}".removeprefix("torch.") for t in (field, like.x))
             raise InvalidInput(f"state.{name}", got=got, expected=f"{expected}, as the cloth's", remedy=remedy)

@@ -23,7 +23,7 @@ class Floor(AbstractBoundary):
     def bind(self, mesh):
         return self
 
-    def apply(self, x, v, dt, drive, substep):
+    def constrain(self, x, v, dt, drive, substep):
         low = x[..., 2:] + dt * v[..., 2:] < -0.02
         return torch.where(low, -v, v)
 

@@ -265,3 +265,20 @@ def test_the_density_was_weighed_wherever_the_fit_starts():
     cloth.areal_density.set(1.3 * made.cloth.areal_density)
     found = identify(cloth, made, ["youngs_modulus", "air.normal"]).parameters["areal_density"]
     assert found.value == pytest.approx(made.cloth.areal_density, abs=3 * made.cloth.areal_density_std)
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode, lambda: torch.autocast("cpu", torch.bfloat16)])
+@pytest.mark.parametrize("method", ["gauss-newton", "adam"])
+def test_a_fit_takes_gradients_of_its_own(model, brief, method, mode):
+    """Whatever its caller wants of his tensors, as where a trainer validates."""
+    ask = lambda: identify(model, brief, ["youngs_modulus"], method=method, iterations=1)  # noqa: E731
+    wanted = ask().parameters["youngs_modulus"]
+    with mode():
+        found = ask().parameters["youngs_modulus"]
+    assert (found.value, found.std) == (wanted.value, wanted.std)
+
+
+def test_a_path_is_no_recording(model, tmp_path):
+    for given in ("episodes/one", tmp_path, ["episodes/one"]):
+        with pytest.raises(InvalidInput, match=r"recording; got '.*'; expected a Recording; read it: "):
+            identify(model, given)

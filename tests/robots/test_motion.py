@@ -1,5 +1,8 @@
 """Joint waypoints to pose trajectories."""
 
+import copy
+
+import numpy as np
 import pytest
 import torch
 
@@ -108,6 +111,19 @@ def test_limits_are_refused_by_name(arm, waypoints, crane):
         own.motion(q, [0.0, 1.0])
     q[1] = torch.tensor([100.0, 0.2, 0.0])  # a continuous joint has neither limit
     assert own.motion(q, [0.0, 1.0]).pose.isfinite().all()
+
+
+def test_takes_masks_as_recordings_hold_them(arm, waypoints):
+    held, stop = [True, True, False, False], [True, False, False, True]
+    wanted = arm.motion(waypoints, TIMES, torch.tensor(held), stop=torch.tensor(stop))
+    for make in (list, np.array):
+        found = arm.motion(waypoints.numpy(), TIMES.numpy(), make(held), stop=make(stop))
+        assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
+
+
+def test_refuses_half_the_digits(arm):
+    with pytest.raises(InvalidInput, match=r"precision of the arm; got float16; expected float32 or float64"):
+        copy.deepcopy(arm).half()(arm.home)
 
 
 def test_refuses_what_does_not_match(arm, waypoints):

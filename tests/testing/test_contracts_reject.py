@@ -200,14 +200,14 @@ def boundary_contract(kind):
 
 
 class PlainNorm(tc.boundaries.Plane):
-    def apply(self, x, v, dt, drive, substep):
-        after = super().apply(x, v, dt, drive, substep)
+    def constrain(self, x, v, dt, drive, substep):
+        after = super().constrain(x, v, dt, drive, substep)
         return after + 0 * v.norm(dim=-1, keepdim=True).sqrt()
 
 
 class Brakes(tc.boundaries.Plane):
-    def apply(self, x, v, dt, drive, substep):
-        after = super().apply(x, v, dt, drive, substep)
+    def constrain(self, x, v, dt, drive, substep):
+        after = super().constrain(x, v, dt, drive, substep)
         return 0.9 * after
 
 
@@ -217,9 +217,9 @@ class FarAway(tc.boundaries.Plane):
 
 
 class DetachedFriction(tc.boundaries.Plane):
-    def apply(self, x, v, dt, drive, substep):
+    def constrain(self, x, v, dt, drive, substep):
         value = self.friction.value
-        after = super().apply(x, v, dt, drive, substep)
+        after = super().constrain(x, v, dt, drive, substep)
         return after - 0.1 * (value - value.detach()) * (after - v)
 
 
@@ -275,20 +275,20 @@ class ThrowsOut(Sphere):
 
 
 class HalfHearted(Sphere):
-    def apply(self, x, v, dt, drive, substep):
-        return (super().apply(x, v, dt, drive, substep) + v) / 2
+    def constrain(self, x, v, dt, drive, substep):
+        return (super().constrain(x, v, dt, drive, substep) + v) / 2
 
 
 class TooSticky(Sphere):
-    def apply(self, x, v, dt, drive, substep):
-        after = super().apply(x, v, dt, drive, substep)
+    def constrain(self, x, v, dt, drive, substep):
+        after = super().constrain(x, v, dt, drive, substep)
         return after + 0.01 * (after - v)
 
 
 class StandsStill(Sphere):
-    def apply(self, x, v, dt, drive, substep):
+    def constrain(self, x, v, dt, drive, substep):
         still = None if drive is None else drive._replace(increment=torch.eye(4).to(drive.pose).expand_as(drive.pose))
-        return super().apply(x, v, dt, still, substep)
+        return super().constrain(x, v, dt, still, substep)
 
 
 @pytest.mark.parametrize(
@@ -322,14 +322,14 @@ def grasp_contract(kind):
 
 
 class Drifts(tc.boundaries.Grasp):
-    def apply(self, x, v, dt, drive, substep):
-        after = super().apply(x, v, dt, drive, substep)
+    def constrain(self, x, v, dt, drive, substep):
+        after = super().constrain(x, v, dt, drive, substep)
         return after if drive is None else after * (1 + 1e-9)
 
 
 class NeverOpens(tc.boundaries.Grasp):
-    def apply(self, x, v, dt, drive, substep):
-        return super().apply(x, v, dt, drive._replace(closed=(True,) * len(drive.closed)), substep)
+    def constrain(self, x, v, dt, drive, substep):
+        return super().constrain(x, v, dt, drive._replace(closed=(True,) * len(drive.closed)), substep)
 
 
 class KeepsQuiet(tc.boundaries.Grasp):

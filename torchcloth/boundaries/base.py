@@ -39,5 +39,5 @@ class AbstractBoundary(nn.Module, ABC):
         return None
 
     @abstractmethod
-    def apply(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
+    def constrain(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
         """New velocities [..., V, 3] from positions at the start of the substep and velocities free of the boundary."""

@@ -76,7 +76,7 @@ class AbstractCollider(AbstractBoundary):
         self.driven = bool(moving)
         self.offset, self.sampling, self.recovery = float(offset), sampling, float(recovery)
         self.points: TrianglePoints | None = None
-        self.register_buffer("pose", None if pose is None else _rigid(pose))
+        self.register_buffer("pose", None if pose is None else _rigid(pose), persistent=False)
         self.pose: Tensor | None
 
     @abstractmethod
@@ -103,7 +103,7 @@ class AbstractCollider(AbstractBoundary):
             self.points = TrianglePoints(mesh, self.sampling).to(self.friction.raw.device)
         return self
 
-    def apply(
+    def constrain(
         self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int, resistance: Tensor | None = None
     ) -> Tensor:
         """Stop what approaches; first the points on edges and triangles, then, exactly, the vertices.

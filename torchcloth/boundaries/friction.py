@@ -92,7 +92,7 @@ class Elliptic(Coulomb):
         if not bool((self.raw > 0).all()):
             raise InvalidInput("along", got=f"{float(self.raw.min()):g}", expected="a coefficient > 0")
         self.ratio = PhysicalParameter(across / along, "-", name="friction across over along")
-        self.register_buffer("axis", direction("friction axis", axis))
+        self.register_buffer("axis", direction("friction axis", axis), persistent=False)
         self.axis: Tensor
 
     def _size(self, slip: Tensor) -> Tensor:

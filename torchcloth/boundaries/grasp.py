@@ -43,7 +43,7 @@ class Grasp(AbstractBoundary):
         self._uv, self.radius, self._stays = uv, float(radius), False
         self._corner: Corner | None = None
         self._place: str | None = None
-        self.register_buffer("index", _indices([] if vertices is None else vertices))
+        self.register_buffer("index", _indices([] if vertices is None else vertices), persistent=False)
         self.index: Tensor
 
     @classmethod
@@ -114,7 +114,7 @@ class Grasp(AbstractBoundary):
         """All while it is closed."""
         return self.index if drive is not None and drive.closed[substep] else None
 
-    def apply(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
+    def constrain(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
         """Held vertices arrive exactly where the body carries them."""
         if drive is None or self.held(drive, substep) is None:
             return v

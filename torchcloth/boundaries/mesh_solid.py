@@ -66,10 +66,10 @@ class MeshSolid(AbstractCollider):
         axes = [origin[k] + cell * np.arange(int(count[k])) for k in range(3)]
         values = _signed_distances(x, f, np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3))
         dtype = torch.get_default_dtype()
-        self.register_buffer("values", torch.as_tensor(values, dtype=dtype))
-        self.register_buffer("cell", torch.tensor(cell, dtype=dtype))
-        self.register_buffer("origin", torch.as_tensor(origin, dtype=dtype))
-        self.register_buffer("count", torch.as_tensor(count.astype(np.int64)))
+        self.register_buffer("values", torch.as_tensor(values, dtype=dtype), persistent=False)
+        self.register_buffer("cell", torch.tensor(cell, dtype=dtype), persistent=False)
+        self.register_buffer("origin", torch.as_tensor(origin, dtype=dtype), persistent=False)
+        self.register_buffer("count", torch.as_tensor(count.astype(np.int64)), persistent=False)
         self.register_buffer("up", torch.tensor([0.0, 0.0, 1.0], dtype=dtype), persistent=False)
         self.up: Tensor
         self.values: Tensor

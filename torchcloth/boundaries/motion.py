@@ -45,6 +45,8 @@ def check(trajectory: Trajectory, name: str) -> None:
     if not pose.is_floating_point() or not bool(torch.isfinite(pose).all()):
         got = "NaN or infinite entries" if pose.is_floating_point() else str(pose.dtype)
         raise InvalidInput(f"{where}.pose", got=got, expected="finite poses")
+    if not pose.numel():
+        raise InvalidInput(f"{where}.pose", got=f"none, shape {tuple(pose.shape)}", expected="one scene at least")
     rotation = pose.detach()[..., :3, :3]
     error = (rotation @ rotation.mT - torch.eye(3).to(rotation)).abs().amax()
     if float(error) > 1e-2 or bool((dot(cross(*rotation.unbind(-1)[:2]), rotation[..., 2]) < 0).any()):

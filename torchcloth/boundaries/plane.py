@@ -35,8 +35,8 @@ class Plane(AbstractCollider):
         **options: Unpack[Options],
     ) -> None:
         super().__init__(friction, **options)
-        self.register_buffer("point", place("plane point", point))
-        self.register_buffer("normal", direction("plane normal", normal))
+        self.register_buffer("point", place("plane point", point), persistent=False)
+        self.register_buffer("normal", direction("plane normal", normal), persistent=False)
         self.point: Tensor
         self.normal: Tensor
         if isinstance(friction, Elliptic) and float((friction.axis * self.normal).sum().abs()) > 1e-5:

@@ -38,7 +38,7 @@ class Sphere(AbstractCollider):
     ) -> None:
         super().__init__(friction, **options)
         self.radius = PhysicalParameter(radius, "m", name="radius")
-        self.register_buffer("centre", place("centre", centre))
+        self.register_buffer("centre", place("centre", centre), persistent=False)
         self.register_buffer("up", place("up", (0.0, 0.0, 1.0)), persistent=False)
         self.centre: Tensor
         self.up: Tensor
@@ -95,8 +95,8 @@ class _Axial(AbstractCollider):
         if not float((b - a).norm()) > 0:
             raise InvalidInput("axis", got=f"from {start} to {end}", expected="two different points")
         self.radius = PhysicalParameter(radius, "m", name="radius")
-        self.register_buffer("start", a)
-        self.register_buffer("end", b)
+        self.register_buffer("start", a, persistent=False)
+        self.register_buffer("end", b, persistent=False)
         aside = cross(b - a, torch.eye(3).to(a)[(b - a).abs().argmin()])
         self.register_buffer("aside", aside / aside.norm(), persistent=False)
         self.start: Tensor

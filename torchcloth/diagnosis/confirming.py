@@ -10,11 +10,12 @@ from typing import Any
 
 import torch
 
+from .._surroundings import own_gradients
 from ..errors import InvalidInput, RecordingError
 from ..identification.result import or_none
 from ..recordings import Recording
 from ..recordings.marks import alike, each_once, mark
-from ..recordings.together import same_cloth, together
+from ..recordings.together import listed, same_cloth, together
 from .cells import aligned
 from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
 from .evidence import Evidence, as_held, as_rough, gather, shared
@@ -79,6 +80,7 @@ def _told(gain: Gain) -> dict[str, Any]:
     }
 
 
+@own_gradients()
 def confirm(
     base: str | Path, extended: str | Path, recordings: Sequence[Recording], progress: Progress = lambda _: None
 ) -> Confirmation:
@@ -94,6 +96,7 @@ def confirm(
             another cloth, or one that a model was fitted to.
         RecordingError: a file that is no model, or an episode that cannot be believed.
     """
+    recordings = listed(recordings)
     if faults := check(recordings):
         raise RecordingError(str(faults[0]))
     each_once(recordings)

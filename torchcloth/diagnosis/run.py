@@ -12,10 +12,11 @@ from pathlib import Path
 import torch
 
 from .._files import as_json, write_text
+from .._surroundings import own_gradients
 from ..errors import InvalidInput
 from ..recordings import Recording
 from ..recordings.marks import each_once, mark
-from ..recordings.together import together
+from ..recordings.together import listed, together
 from .base_model import base_model
 from .gate import check
 from .hypotheses import catalogue
@@ -36,6 +37,7 @@ NONE_TELLS = "no short motion was found that would tell the causes from what the
 RESULT, BASE, EXTENDED = "diagnosis.json", "base.tcm", "extended.tcm"
 
 
+@own_gradients()
 def diagnose(
     recordings: Sequence[Recording],
     model: Model | None = None,
@@ -61,6 +63,7 @@ def diagnose(
         RecordingError: an episode that lacks what is needed.
         SimulationDiverged: the base model cannot be simulated.
     """
+    recordings = listed(recordings)
     names = motions_of(recordings)
     if len(set(names)) < 2:
         each_once(recordings)  # a copy needs no other name

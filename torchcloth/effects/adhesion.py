@@ -53,8 +53,8 @@ class Adhesion(AbstractEffect):
             raise InvalidInput("adhesion gap", got=f"{gap:g} m", expected="a length > 0")
         self.stress = PhysicalParameter(stress, "Pa", "nonnegative", name="adhesion stress")
         self.gap = float(gap)
-        self.register_buffer("point", place("adhesion point", point))
-        self.register_buffer("normal", direction("adhesion normal", normal))
+        self.register_buffer("point", place("adhesion point", point), persistent=False)
+        self.register_buffer("normal", direction("adhesion normal", normal), persistent=False)
         self.register_buffer("area", torch.zeros(0, 1), persistent=False)
         self.point: Tensor
         self.normal: Tensor

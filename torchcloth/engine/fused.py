@@ -55,14 +55,13 @@ class Fused:
         if self.torch_parts is None:
             return self._call(state, fixed | _cut(moves, first, first + substeps), substeps, checkpoint)
         total: Impulses = {}
+        again = checkpoint and recomputes()
+        parts = self.torch_parts.as_they_are() if again else self.torch_parts
         last = first + substeps
         for begin in range(first, last, CHUNK):
             chunk = range(begin, min(begin + CHUNK, last))
-            run = partial(self._shared, self.torch_parts, dt, fixed, moves, chunk)
-            again = checkpoint and torch.is_grad_enabled()
-            state, impulses = (
-                recompute(run, state, use_reentrant=False, preserve_rng_state=False) if again else run(state)
-            )
+            run = partial(self._shared, parts, dt, fixed, moves, chunk)
+            state, impulses = recompute(run, state, use_reentrant=False) if again else run(state)
             total = added(total, impulses)
         return state, total
 
@@ -170,6 +169,11 @@ def _batch(state: ClothState) -> torch.Size:
 def _cut(moves: Mapping[Field, Tensor], first: int, last: int) -> dict[Field, Tensor]:
     """The rows of some substeps."""
     return {field: rows[:, first:last].contiguous() for field, rows in moves.items()}
+
+
+def recomputes() -> bool:
+    """Whether a backward pass may come that can compute again; ``torch.func`` knows of no tensors that are not kept."""
+    return torch.is_grad_enabled() and not torch._C._are_functorch_transforms_active()
 
 
 def _are_numbers(inputs: list[Tensor]) -> bool:

@@ -47,7 +47,7 @@ class Program:
         self._written: list[tuple[str, tuple]] = []
 
     def __del__(self) -> None:
-        if self._handle is not None:
+        if getattr(self, "_handle", None) is not None:  # there is none where ``__init__`` was not run
             self._call("free")
 
     # -- fields ---------------------------------------------------------------------------------------------------

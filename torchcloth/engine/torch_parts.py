@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from contextlib import nullcontext
+from copy import copy
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from torch import Tensor
 from ..boundaries import Drive
 from ..dynamics import force_of, vertex_forces
 from ..effects import AbstractEffect
-from ..model import Model, assemble, surface
+from ..model import Model, as_it_is, assemble, surface
 from ..strain import evolve, membrane_stress
 from ..types import ClothState, Memory, Moment
 from .constants import is_wrapped, readable
@@ -44,6 +45,12 @@ class TorchParts:
     def __init__(self, model: Model, parts: Collection[str]) -> None:
         effects = {name: part for name, part in model.effects.items() if f"effects.{name}" in parts}
         self.model, self.parts = model._replace(effects=effects), frozenset(parts)
+
+    def as_they_are(self) -> TorchParts:
+        """See ``model.as_it_is``."""
+        own = copy(self)
+        own.model = as_it_is(self.model)
+        return own
 
     def force(self, state: ClothState, dt: float) -> tuple[Tensor, Memory]:
         """(force on the vertices [..., V, 3] N, internal variables of these parts) at the start of a substep."""

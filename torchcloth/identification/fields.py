@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from .._files import write_text
+from .._surroundings import own_gradients
 from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..meshes import Mesh
@@ -74,6 +75,7 @@ class FieldFit:
         return write_text(folder / RESULT, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
+@own_gradients()
 def fit_fields(
     cloth: Cloth,
     recordings: Recording | Sequence[Recording],

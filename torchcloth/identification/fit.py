@@ -11,6 +11,7 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor
 
+from .._surroundings import own_gradients
 from ..cloth import Cloth
 from ..effects import AbstractEffect
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
@@ -43,6 +44,7 @@ UNSURE = "the motion can be predicted for a while only, or by simulations spread
 ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
 
 
+@own_gradients()
 def identify(
     cloth: Cloth,
     recordings: Recording | Sequence[Recording],

@@ -8,17 +8,17 @@ from ..errors import InvalidInput
 from ..recordings import Recording
 from ..recordings.extents import check_size
 from ..recordings.marks import each_once
-from ..recordings.together import same_cloth
+from ..recordings.together import listed, same_cloth
 
 
 def given(recordings: Recording | Sequence[Recording]) -> list[Recording]:
     """The episodes of a fit.
 
     Raises:
-        InvalidInput: none, one twice, or different cloths.
+        InvalidInput: none, one twice, different cloths, or something that is no recording.
         RecordingError: one was seen in another unit than metres.
     """
-    found = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    found = listed(recordings)
     if not found:
         raise InvalidInput("recordings", got="none", expected="at least one episode")
     same_cloth(found)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from .._files import write_text
+from .._surroundings import own_gradients
 from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
@@ -79,6 +80,7 @@ class TensionFit:
         return set_identified(cloth, self.keys, self.parameters)
 
 
+@own_gradients()
 def fit_tension(
     cloth: Cloth,
     tables: ForceDisplacement | Sequence[ForceDisplacement],

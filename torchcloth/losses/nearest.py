@@ -35,9 +35,11 @@ def _compiled(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor] | None:
         return None
     points, corners = points.contiguous(), corners.contiguous()
     face, weights = torch.empty(len(points), dtype=torch.int64), torch.empty_like(points)
-    into = face.data_ptr(), weights.data_ptr()
-    find = getattr(lib, f"tc_nearest_{letter}")
-    failed = find(points.data_ptr(), len(points), corners.data_ptr(), len(corners), *into)
+    try:
+        own, into = (points.data_ptr(), corners.data_ptr()), (face.data_ptr(), weights.data_ptr())
+    except RuntimeError:  # tensors of torch.func have no memory
+        return None
+    failed = getattr(lib, f"tc_nearest_{letter}")(own[0], len(points), own[1], len(corners), *into)
     return None if failed or bool((face < 0).any()) else (face, weights)
 
 

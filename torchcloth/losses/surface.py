@@ -38,6 +38,7 @@ def closest(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 4_000_
     Raises:
         InvalidInput: other shapes, no faces, indices of no vertex, two precisions, or numbers that are not finite.
     """
+    points, vertices, faces = (torch.as_tensor(given) for given in (points, vertices, faces))
     check_places(points, "points")
     check_places(vertices, "vertices")
     check_triangles(faces, len(vertices))
@@ -73,6 +74,7 @@ def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tenso
     Raises:
         InvalidInput: as `closest`, or no points, which have no mean.
     """
+    points = torch.as_tensor(points)
     check_places(points, "points", least=1)
     return distances(points, vertices, closest(points, vertices, faces)).mean()
 

@@ -21,6 +21,7 @@ def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
     Raises:
         InvalidInput: other shapes, or none of either.
     """
+    points, vertices = torch.as_tensor(points), torch.as_tensor(vertices)
     check_places(points, "points", least=1)
     check_places(vertices, "vertices", least=1)
     if points.dtype != vertices.dtype:

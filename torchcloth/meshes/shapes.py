@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import index
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,11 @@ def rectangle(
         cells = max(1.0, triangles / 2.0)
         columns = max(1, round((cells * width / height) ** 0.5))
         resolution = (columns + 1, max(1, round(cells / columns)) + 1)
-    nx, ny = resolution
+    try:
+        nx, ny = (index(n) for n in resolution)
+    except (TypeError, ValueError):
+        expected = "numbers of vertices along both sides, (NX, NY)"
+        raise InvalidInput("resolution", got=repr(resolution), expected=expected) from None
     if nx < 2 or ny < 2:
         raise InvalidInput("resolution", got=resolution, expected="at least 2 vertices along each side")
     u, v = np.meshgrid(np.linspace(0.0, width, nx), np.linspace(0.0, height, ny), indexing="ij")

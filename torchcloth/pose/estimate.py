@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._surroundings import own_gradients
 from ..boundaries import Grasp
 from ..cloth import Cloth
 from ..errors import InvalidInput
@@ -23,6 +24,7 @@ from ..identification.report import estimates, nuisance_estimates
 from ..identification.unknowns import collect, with_priors
 from ..recordings import Recording
 from ..recordings.extents import check_size
+from ..recordings.together import check_recording
 from .local import unexplained
 from .modes import Modes, modes_of
 from .objective import Corrected, Correction, pushable, windows_of
@@ -36,6 +38,7 @@ FIRST_GUESS = 0.5  # m/s^2, of the corrective force; its size is then learnt fro
 Progress = Callable[[str, float], None]
 
 
+@own_gradients()
 def estimate_pose(
     cloth: Cloth,
     recording: Recording,
@@ -83,6 +86,7 @@ def estimate_pose(
     began = time.perf_counter()
     if not (math.isfinite(window) and window > 0):
         raise InvalidInput("window", got=window, expected="a time > 0 in s")
+    check_recording(recording)
     check_size(recording)
     data, fields = episode(cloth, recording), modes_of(cloth.mesh)
     coarse = modes_of(cloth.mesh, modes).fields.to(data.initial)

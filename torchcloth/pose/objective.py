@@ -75,7 +75,7 @@ def pushable(cloth: Cloth) -> Cloth:
     if CORRECTION in cloth.effects:
         raise InvalidInput("effects of the cloth", got=repr(CORRECTION), expected="another name: the estimate needs it")
     own = copy.deepcopy(cloth)
-    own.effects[CORRECTION] = BodyForce(torch.zeros_like(own.rest_state().x)).bind(own.mesh)
+    own.effects[CORRECTION] = BodyForce(torch.zeros_like(own.rest_state().x))
     return own
 
 

@@ -47,7 +47,9 @@ def _check(target: Path, marker: str, overwrite: bool) -> None:
         return
     if not overwrite:
         raise RecordingError(f"{target} exists", expected="a new name", remedy="pass overwrite=True to replace it")
-    if target.is_symlink() or not (target / marker).is_file():
+    if target.is_symlink():
+        raise RecordingError(f"{target} is a link", expected="a folder to replace", remedy="name what it points to")
+    if not (target / marker).is_file():
         raise RecordingError(f"{target} holds no {marker}", expected="one to replace", remedy="choose another name")
 
 

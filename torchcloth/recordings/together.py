@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from os import PathLike
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -13,6 +15,27 @@ from .types import Collider, GraspInfo, Recording
 
 INSIDE = 0.02  # m, that noise and a table's place may explain
 ALIKE, UPRIGHT = 0.005, 0.9999  # m, and cosine (0.8 degrees): a table that was measured twice
+
+
+def check_recording(value: object) -> None:
+    """Raises InvalidInput for what is no recording, such as its path."""
+    if not isinstance(value, Recording):
+        got = repr(str(value)) if isinstance(value, str | PathLike) else type(value).__name__
+        remedy = "read it: torchcloth.recordings.read(path)"
+        raise InvalidInput("recording", got=got, expected="a Recording", remedy=remedy)
+
+
+def listed(recordings: Recording | Sequence[Recording]) -> list[Recording]:
+    """One or several.
+
+    Raises:
+        InvalidInput: something among them is no recording.
+    """
+    given: Any = recordings
+    found: list[Any] = list(given) if isinstance(given, Iterable) and not isinstance(given, str) else [given]
+    for recording in found:
+        check_recording(recording)
+    return found
 
 
 def name_of(recording: Recording, k: int) -> str:

@@ -16,6 +16,7 @@ from . import checks, images, streams
 from .files import Folder, save_npz
 from .placing import place
 from .reading import EPISODE, FORMAT, VERSION, read_folder
+from .together import check_recording
 from .types import Camera, ClothInfo, GraspInfo, Recording
 
 MESH, INITIAL = "cloth.obj", "cloth_initial.npy"
@@ -49,6 +50,7 @@ def write(
     Raises:
         RecordingError: the target exists, or the recording would be refused by `read`, or the disk fails.
     """
+    check_recording(recording)
 
     def fill(part: Path, shown: Path) -> None:
         _fill(part, recording, compact, on_image)

@@ -71,7 +71,7 @@ class BoundaryContract(Contract):
         return None
 
     def _apply(self, boundary: AbstractBoundary, x: Tensor, v: Tensor, pose: Tensor | None = None) -> Tensor:
-        return boundary.apply(x, v, self.dt, None if pose is None else self._drive(pose), 1)
+        return boundary.constrain(x, v, self.dt, None if pose is None else self._drive(pose), 1)
 
     def _inputs(self) -> dict[str, Tensor]:
         x, v = self.sample()
@@ -163,7 +163,7 @@ class GraspContract(BoundaryContract):
         x, v = self.sample()
         start, wild = x[held], v
         for k in range(self.substeps):
-            v = boundary.apply(x, v + 0.1 * wild, self.dt, motion, k)
+            v = boundary.constrain(x, v + 0.1 * wild, self.dt, motion, k)
             x = x + self.dt * v
         turn = pose[-1, :3, :3] @ pose[0, :3, :3].mT
         expected = (start - pose[0, :3, 3]) @ turn.mT + pose[-1, :3, 3]
@@ -179,5 +179,5 @@ class GraspContract(BoundaryContract):
     def test_an_open_gripper_lets_go(self) -> None:
         """Velocities pass untouched."""
         x, v = self.sample()
-        after = self._boundary().apply(x, v, self.dt, self._drive(self._pose(), False), 0)
+        after = self._boundary().constrain(x, v, self.dt, self._drive(self._pose(), False), 0)
         demand(torch.equal(after, v), "an open gripper changes the cloth")

@@ -101,7 +101,7 @@ class ColliderContract(BoundaryContract):
         """What starts outside ends outside, but for the curvature within one substep."""
         body = self._body()
         x, v = self._at(0.001 * samples.normal((200, 1), 5).abs())
-        after = body.apply(x, v, self.dt, None, 0)
+        after = body.constrain(x, v, self.dt, None, 0)
         curved = float((self.dt * after.detach()).norm(dim=-1).max()) ** 2 / self.extent
         deepest = float(body.clearance(x + self.dt * after)[0].detach().min())
         demand(deepest >= -curved - self.rounding, f"{-deepest:.2e} m deep after a substep")
@@ -111,18 +111,18 @@ class ColliderContract(BoundaryContract):
         body = self._body(recovery=0.05)
         x, v = self._at(torch.full((200, 1), -0.1 * self.extent, dtype=torch.float64))
         distance, normal = (part.detach() for part in body.clearance(x))
-        still = body.apply(x, torch.zeros_like(x), self.dt, None, 0).detach()
+        still = body.constrain(x, torch.zeros_like(x), self.dt, None, 0).detach()
         speed = dot(still, normal)
         demand((distance < 0).all(), "the trial did not start inside")
         demand((speed > 0).all() and (still.norm(dim=-1) <= 0.05 * (1 + 1e-9)).all(), "not moved out at <= 0.05 m/s")
-        moved = dot(body.apply(x, v, self.dt, None, 0).detach(), normal)
+        moved = dot(body.constrain(x, v, self.dt, None, 0).detach(), normal)
         demand((moved >= 0.05 * (1 - 1e-9)).all(), "what is inside goes deeper")
 
     def test_friction_stays_in_the_cone(self) -> None:
         """It opposes the slip, takes at most mu times the push, and exactly that from what still slips."""
         body = self._body()
         x, v = self._at(torch.zeros(200, 1, dtype=torch.float64))
-        after, normal = body.apply(x, v, self.dt, None, 0).detach(), body.clearance(x)[1].detach()
+        after, normal = body.constrain(x, v, self.dt, None, 0).detach(), body.clearance(x)[1].detach()
         change, mu = after - v, float(body.friction.value.detach())
         push, slip, left = dot(change, normal), v - dot(v, normal) * normal, after - dot(after, normal) * normal
         taken = (change - push * normal).norm(dim=-1, keepdim=True)
@@ -140,7 +140,7 @@ class ColliderContract(BoundaryContract):
         weight, along = samples.normal(tuple(x.shape), 6), samples.normal((2, *x.shape), 7)
 
         def answer(x: Tensor, v: Tensor) -> Tensor:
-            return (weight * body.apply(x, v, self.dt, motion, k)).sum()
+            return (weight * body.constrain(x, v, self.dt, motion, k)).sum()
 
         forward = torch.func.jvp(answer, (x, v), (along[0], along[1]))[1]
         leaves = (x.clone().requires_grad_(), v.clone().requires_grad_())
@@ -159,7 +159,7 @@ class ColliderContract(BoundaryContract):
         carried = (world @ step[:3, :3].mT + step[:3, 3] - world) / self.dt
         moving = self._body(moving=True)
         demand(moving.driven, "a moving collider must declare driven = True")
-        got = moving.apply(world, v @ turn.mT + carried, self.dt, motion, k).detach()
-        fixed = self._body(moving=False).apply(x, v, self.dt, None, k).detach()
+        got = moving.constrain(world, v @ turn.mT + carried, self.dt, motion, k).detach()
+        fixed = self._body(moving=False).constrain(x, v, self.dt, None, k).detach()
         close(got, fixed @ turn.mT + carried, 1e-9, "a moving body answers differently from a fixed one")
         demand((origin.abs() > 0.01).any(), "the body did not travel")

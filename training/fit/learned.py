@@ -98,12 +98,10 @@ class Learned(nn.Module):
         parts = [(raw[a] - raw[b]).square().mean() for raw in self.raw().values() if raw.ndim]
         return torch.stack(parts).sum() if parts else self._places.new_zeros(())
 
-    @torch.no_grad()
     def clip(self) -> None:
         """Amplitudes are stored as they are: back to 0 where a step made them negative."""
         for name in (*self.what.parameters, *self.what.fields):
-            if self.parameter(name).domain == "nonnegative":
-                self.parameter(name).raw.clamp_(min=0.0)
+            self.parameter(name).clip_()
 
     @torch.no_grad()
     def settled(self) -> dict[str, Tensor]:

@@ -1,0 +1,191 @@
+"""What people do with a module of torch's, done to a cloth."""
+
+import copy
+
+import pytest
+import torch
+from small import sheet
+from torch import nn
+from torch.func import functional_call
+
+import torchcloth as tc
+from torchcloth.effects import AbstractEffect
+from torchcloth.errors import InvalidInput
+
+ENGINES = ["fused", "reference"]
+
+
+class Learned(AbstractEffect):
+    """A force by a network."""
+
+    def __init__(self, *layers):
+        super().__init__()
+        self.network = nn.Sequential(nn.Linear(3, 4), nn.Tanh(), *layers, nn.Linear(4, 3))
+
+    def coefficients(self):
+        return None
+
+    def force(self, c, now):
+        return 0.02 * self.network(now.v + now.x)
+
+
+def held(effects=None, engine="auto"):
+    cloth = sheet(effects=effects, boundaries={"hand": tc.boundaries.Grasp.corner("upper-left")})
+    cloth.engine = engine
+    t = torch.linspace(0.0, 0.04, 5)
+    pose = torch.eye(4).repeat(5, 1, 1)
+    pose[:, 2, 3] = 0.5 * t
+    return cloth, {"hand": tc.Trajectory(t, pose, torch.ones(5, dtype=torch.bool))}
+
+
+def loss_of(cloth, motion, **options):
+    return cloth(cloth.rest_state(), motion, times=(0.0, 0.04), **options).x[-1].square().sum()
+
+
+# -- optimisers ------------------------------------------------------------------------------------------------------
+
+
+def test_a_step_below_zero_is_refused_by_name_and_can_be_taken_back():
+    cloth, motion = held({"bending": tc.effects.Bending(1e-4), "damping": tc.effects.MassDamping(1e-4)})
+    optimiser = torch.optim.Adam(cloth.parameters(), lr=1e-2)
+    loss_of(cloth, motion).backward()
+    optimiser.step()
+    with pytest.raises(InvalidInput, match=r"effects\.(bending|damping)\..*; expected a value >= 0; call .*clip_"):
+        loss_of(cloth, motion)
+    assert "expected a value >= 0" in repr(cloth)  # which is how one looks for what is wrong
+    cloth.clip_()
+    assert float(cloth.effects["bending"].stiffness.value) >= 0.0
+    assert loss_of(cloth, motion).isfinite()
+
+
+def test_a_state_is_the_callers():
+    cloth, _ = held()
+    cloth.rest_state().x.add_(0.5)
+    assert float(cloth.rest_state().x[:, 2].abs().max()) == 0.0
+    assert float(torch.as_tensor(cloth.mesh.vertices)[:, 2].abs().max()) == 0.0
+    cloth.requires_grad_(False)
+    cloth.rest_state().x.requires_grad_()
+    assert not cloth.rest_state().x.requires_grad
+
+
+# -- modules ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_checkpoint_carries_what_is_learned_and_no_scene():
+    """A fit that is loaded into another experiment must not move its table, nor what is held."""
+    of = lambda n, z, corner: sheet(  # noqa: E731
+        n,
+        effects={"sticky": tc.effects.Adhesion(point=(0.0, 0.0, z))},
+        boundaries={
+            "table": tc.boundaries.Plane(point=(0.0, 0.0, z), friction=tc.boundaries.Elliptic(0.4, 0.2)),
+            "ball": tc.boundaries.Sphere(0.1, (0.0, 0.0, z - 1)),
+            "hand": tc.boundaries.Grasp.corner(corner),
+        },
+    )
+    one, other = of(5, -0.1, "upper-left"), of(4, -0.5, "lower-right")
+    one.material.youngs_modulus.set(7e4)
+    before = other.boundaries["hand"].index.clone()
+    other.load_state_dict(one.state_dict())
+    assert float(other.material.youngs_modulus.value) == pytest.approx(7e4)
+    assert torch.equal(other.boundaries["hand"].index, before)
+    assert float(other.boundaries["table"].point[2]) == -0.5
+    assert one.state_dict().keys() == dict(one.named_parameters()).keys()
+
+
+def test_modules_with_a_cloth_can_be_gone_through():
+    cloth, _ = held()
+    seen = []
+    nn.Sequential(nn.Linear(2, 2), cloth).apply(lambda part: seen.append(type(part)))
+    assert tc.boundaries.Grasp in seen
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_parts_that_come_later_are_bound_as_the_first_ones_are(engine):
+    cloth, motion = held({"gravity": tc.effects.Gravity()}, engine)
+    late = sheet(effects={"gravity": tc.effects.Gravity()})
+    late.engine = engine
+    late = late.double()
+    late.boundaries["hand"] = tc.boundaries.Grasp.corner("upper-left")
+    late.effects["bending"] = tc.effects.Bending(1e-5)
+    cloth.effects["bending"] = tc.effects.Bending(1e-5)
+    first, second = (own(own.rest_state(), motion, times=(0.0, 0.04)).x for own in (cloth, copy.deepcopy(late)))
+    assert torch.equal(first, second)
+    with pytest.raises(InvalidInput, match="effects: table; got Plane"):
+        late.effects["table"] = tc.boundaries.Plane()
+    with pytest.raises(InvalidInput, match="another cloth"):
+        sheet(5).boundaries["hand"] = late.boundaries["hand"]
+
+
+# -- gradients -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_gradients_that_are_computed_again_are_of_the_parameters_of_the_call(engine):
+    """Those of ``functional_call`` are gone when the backward pass comes."""
+    torch.manual_seed(0)
+    cloth, motion = held({"learned": Learned()}, engine)
+    weights = {k: (1.5 * p.detach()).requires_grad_() for k, p in cloth.named_parameters() if "network" in k}
+    found = []
+    for checkpoint in (True, False):
+        options = {"times": (0.0, 0.04), "checkpoint": checkpoint}
+        x = functional_call(cloth, weights, (cloth.rest_state(), motion), options).x[-1]
+        found.append(torch.autograd.grad(x.square().sum(), list(weights.values())))
+    torch.testing.assert_close(found[0], found[1], rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_what_is_drawn_is_drawn_again(engine):
+    cloth, motion = held({"learned": Learned(nn.Dropout(0.3))}, engine)
+    found, weights = [], list(cloth.effects["learned"].parameters())
+    for checkpoint in (True, False):
+        torch.manual_seed(3)
+        found.append(torch.autograd.grad(loss_of(cloth, motion, checkpoint=checkpoint), weights))
+    torch.testing.assert_close(found[0], found[1], rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_gradients_by_torch_func_are_those_of_backward(engine):
+    cloth, motion = held({"gravity": tc.effects.Gravity()}, engine)
+    x = cloth.rest_state().x
+    loss = lambda x: cloth(cloth.state(x), motion, times=(0.0, 0.02)).x[-1].square().sum()  # noqa: E731
+    own = x.clone().requires_grad_()
+    (wanted,) = torch.autograd.grad(loss(own), own)
+    torch.testing.assert_close(torch.func.grad(loss)(x), wanted, rtol=1e-9, atol=1e-15)
+
+
+# -- modes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_slopes_are_the_same_in_inference_mode(engine):
+    cloth, motion = held({"gravity": tc.effects.Gravity()}, engine)
+    lifted = torch.zeros_like(motion["hand"].pose[None])
+    lifted[..., 2, 3] = motion["hand"].t
+    along = tc.Directions({"material.youngs_modulus.raw": torch.ones(1)}, motion={"hand": lifted})
+    ask = lambda: cloth.sensitivities(cloth.rest_state(), motion, (0.0, 0.04), along=along)[1].x  # noqa: E731
+    wanted = ask()
+    with torch.inference_mode():
+        found = ask()
+    assert float(wanted.abs().max()) > 0
+    assert torch.equal(found, wanted)
+
+
+def test_autocast_takes_no_digits():
+    cloth, motion = held({"gravity": tc.effects.Gravity()}, "reference")
+    cloth, motion = cloth.float(), {"hand": motion["hand"]._replace(pose=motion["hand"].pose.float())}
+    arm = tc.robots.load("rizon4", frame="tcp_closed", dtype=torch.float32)
+    q = torch.stack([arm.home, arm.home + 0.05])
+    ask = lambda: (cloth(cloth.rest_state(), motion, times=(0.0, 0.04)).x, arm(q), arm.jacobian(q))  # noqa: E731
+    wanted = ask()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = ask()
+    for a, b in zip(found, wanted, strict=True):
+        assert a.dtype == b.dtype
+        assert torch.equal(a, b)
+
+
+def test_another_precision_of_one_parameter_is_named():
+    cloth, motion = held()
+    cloth.material.youngs_modulus.float()
+    with pytest.raises(InvalidInput, match=r"material\.youngs_modulus; got float32; expected float64"):
+        loss_of(cloth, motion)

@@ -1,0 +1,52 @@
+"""Effects and boundaries of a cloth, bound to its mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+from weakref import WeakKeyDictionary, ref
+
+import torch
+from torch import nn
+
+from .boundaries import AbstractBoundary
+from .effects import AbstractEffect
+from .errors import InvalidInput
+from .meshes import Mesh
+from .validation import check_axes, check_fields, check_part
+
+
+class Parts(nn.ModuleDict):
+    """By name. What is put in, also later, is bound to the mesh and takes the precision and device of the others."""
+
+    _like: torch.Tensor
+
+    def __init__(self, what: str, mesh: Mesh) -> None:
+        super().__init__()
+        self._what, self._mesh = what, mesh
+        self.register_buffer("_like", torch.zeros(0), persistent=False)
+
+    def __setitem__(self, key: str, module: Any) -> None:
+        check_part(self._what, key, module)
+        check_free(self._mesh, [(key, module)])
+        if isinstance(module, AbstractEffect):
+            check_fields({key: module}, len(self._mesh.faces))
+            check_axes(self._mesh, {key: module})
+        super().__setitem__(key, module.bind(self._mesh).to(self._like))
+        _OWNERS[module] = ref(self)
+
+
+def check_free(mesh: Mesh, parts: Iterable[tuple[str, AbstractEffect | AbstractBoundary]]) -> None:
+    """Refuse what is bound to another cloth's mesh: it would be bound anew under that one's feet."""
+    for name, part in parts:
+        owner = None if (known := _OWNERS.get(part)) is None else known()
+        if owner is not None and not owner._mesh.same(mesh):
+            raise InvalidInput(
+                name,
+                got="an effect or boundary of another cloth, bound to its mesh",
+                expected="one of its own",
+                remedy="make it anew, or copy.deepcopy it",
+            )
+
+
+_OWNERS: WeakKeyDictionary[nn.Module, ref[Parts]] = WeakKeyDictionary()
