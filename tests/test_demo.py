@@ -37,7 +37,7 @@ def test_the_fit_is_as_near_as_the_sensor_allows(done):
 def test_poissons_ratio_is_not_claimed(done):
     """It moves this cloth by less than the noise: whoever states it has not looked at the errors."""
     estimate = done[1]["parameters"]["poisson_ratio"]
-    assert not estimate["identifiable"] or abs(estimate["value"] - 0.3) < 3 * estimate["std"]
+    assert not estimate["identifiable"]
 
 
 def test_the_demo_leaves_pictures(done):

@@ -51,14 +51,18 @@ def test_an_amplitude_that_no_world_can_have_ends_a_fit_and_not_the_diagnosis(wi
     recordings, _ = with_drag
     (drag,) = (h for h in asked(recordings) if h.name == "air.drag_n")
 
+    refused = []
+
     def brittle(world, amplitude):
         if amplitude > drag.typical:
+            refused.append(amplitude)
             raise InvalidInput("brittle", got=amplitude, expected="no more than typical")
         return drag.apply(world, amplitude)
 
     model = base_model(recordings[0])
     found = search(model, setting_of(model, recordings), [replace(drag, name="user.brittle", apply=brittle)])
     assert all(amplitude <= drag.typical for amplitude in found.end.model.amplitudes)
+    assert refused
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,8 @@ RECORDING = sheets.episode()
 
 EVERY = [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES]
 NAMES = [h.name for h in EVERY if h.needs(RECORDING)]
+# of which a gentle swing shows nothing: tests of their own have scenes for them
+HARDLY = ("air.drag_t", "damp.kv", "plast.crease", "elas.stiffen", "env.gravity_tilt[x]", "grip.slip")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -45,7 +47,9 @@ def test_nothing_at_zero_and_twice_as_much_at_twice(made, name):
     share = (0.05, 0.1)
     moved = [(model.world([(h, s * h.typical)]).frames(e), s) for s in share]
     small, twice = ((f.x - base.x).norm() + (f.edge - base.edge).norm() for f, _ in moved)
-    if float(twice) > 1e-4:  # m, of all vertices and frames together: else the substep, chosen anew, shows
+    shows = float(twice) > 1e-4  # m, of all vertices and frames together: else the substep, chosen anew, does
+    assert shows == (name not in HARDLY), float(twice)
+    if shows:
         assert float(twice / small) == pytest.approx(2.0, rel=0.15)
 
 

@@ -97,7 +97,8 @@ def test_another_layer_is_not_beyond_the_rim():
     x[over, 2] = 8e-3
     x[over, 0] = SIDE - x[over, 0] + 0.02  # the upper rim lies 2 cm inside the lower one
     generator = torch.Generator().manual_seed(0)
-    weights = torch.distributions.Dirichlet(torch.ones(3)).sample((FRAMES, 600))
+    weights = -torch.rand(FRAMES, 600, 3, generator=generator).log()  # over their sum: evenly over a triangle
+    weights = weights / weights.sum(-1, keepdim=True)
     faces = torch.as_tensor(MESH.faces)[torch.randint(len(MESH.faces), (FRAMES, 600), generator=generator)]
     cloud = list((weights.unsqueeze(-1) * x[faces]).sum(-2))
     given = scene(cloud)

@@ -87,7 +87,7 @@ def test_it_moves_towards_what_a_finer_mesh_finds(recording, model):
 
 
 def test_a_mesh_that_is_fine_already_is_hardly_corrected(recording):
-    """With the truth's own spacing halved the step is below half a standard error."""
+    """With the truth's own spacing halved the step is below a standard error."""
     fine = finer_cloth(twins.at(recording))
     episode = finer_recording(recording, twins.at(recording).mesh, fine.mesh)
     coarse, finer = (
@@ -95,6 +95,7 @@ def test_a_mesh_that_is_fine_already_is_hardly_corrected(recording):
         for c, r in ((twins.at(recording), recording), (fine, episode))
     )
     assert finer < 0.6 * coarse
+    assert finer < 1.0
 
 
 def test_a_sewn_mesh_keeps_its_pattern():

@@ -45,7 +45,7 @@ def test_every_unknown_has_its_slope(objective):
     exact = objective.linearise(raw)
     assert exact.jacobian.shape[1] == 1 + 2 * (1 + 6 + 6 + 1 + 6 + 9)
     rows = exact.block >= 2  # markers and forces: points jump to another triangle, and the rim is right on average
-    for k in range(1, 30):
+    for k in range(exact.jacobian.shape[1]):
         h = 1e-4 * float(objective.prior_std[k])
         step = torch.zeros_like(raw)
         step[k] = h

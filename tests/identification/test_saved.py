@@ -48,6 +48,9 @@ def test_points_may_have_been_rounded_on_disk(pair, recording, tmp_path):
     path = recordings.write(recording, tmp_path / "episode")
     again = replayed(pair.save(tmp_path), recordings.read(path))
     assert np.allclose(again.frames, pair.frames_after[0], atol=1e-6)
+    assert again.fitted
+    assert again.warning == ""
+    assert float(again.chamfer.mean()) == pytest.approx(pair.fit["chamfer_after"], abs=1e-5)
 
 
 def test_contact_and_step_are_kept(brief, tmp_path):

@@ -137,9 +137,9 @@ def test_coverage_of_readings(fit):
     """White noise of 3 % beside an interval of the mean: the law's part, which holds it, covers nearly all."""
     seen = readings(30, 0.03, np.random.default_rng(5))
     judged = predict_tension(fit.model, seen).judged()["force"]
-    assert judged["covered"] > 0.6
+    assert judged["covered"] > 0.8
     assert judged["rms"] == pytest.approx(0.03, rel=0.4)
-    assert judged["max"] >= judged["rms"]
+    assert judged["max"] == pytest.approx(2.5 * 0.03, rel=0.5)  # of a few tens of readings
 
 
 @pytest.mark.parametrize(

@@ -58,10 +58,11 @@ def test_an_arm_that_holds_nothing_is_drawn_and_not_followed():
     assert not inspect(replace(recording, grippers=both)).lag.std < 2 * alone.lag.std  # where nothing says who holds
 
 
-def test_its_standard_error_is_honest():
+def test_its_standard_error_is_not_too_small_and_not_worlds_too_large():
+    """It allows for errors that last, of which white noise has none."""
     values = [inspect(episode(markers=markers(noise=0.01, seed=seed, **GRID))).lag for seed in range(8)]
     spread, stated = np.std([v.value for v in values]), np.median([v.std for v in values])
-    assert spread / 3 < stated < 6 * spread + 0.003
+    assert 0.7 * spread < stated < 6 * spread + 0.003  # a spread of eight is known to a quarter
 
 
 def test_a_motion_at_constant_speed_tells_no_lag():

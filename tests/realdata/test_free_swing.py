@@ -248,7 +248,6 @@ def test_not_fitted_air_brackets_the_frequency(found, modelled):
     """Densities of the authors' models, depth of the ideal fluid: 0.84 and 1.02 Hz, 8 % below and 12 % above."""
     table = show(found, modelled)
     assert modelled["air of a shirt"].frequency < found.frequency < modelled["air of 0.1 kg"].frequency, table
-    assert SHIRT < AIR * DEPTH / FITTED.mass < HEAVY
     vacuum = modelled["vacuum"].frequency
     for name in ("air of a shirt", "air of 0.1 kg", "fitted"):
         ratio = (1 + MODELS[name].mass) ** -0.5
