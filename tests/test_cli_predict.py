@@ -54,6 +54,9 @@ def test_a_strip_at_any_angle(strips, tmp_path, capsys):
     assert ((low <= truth) & (truth <= high)).all()
     assert content["measured"] == {}
     assert (out / "prediction.png").stat().st_size > 5000
+    assert "replaced" not in printed
+    assert main(["predict", str(strips), "--angle", "45", "--out", str(out)]) == 0
+    assert "prediction.json (the last one is replaced)" in capsys.readouterr().out
 
 
 def test_a_table_is_predicted_and_compared_with(strips, tmp_path, capsys):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._files import write_text
 from .diagnose import progress_line
-from .folders import check_folder, place
+from .folders import check_folder, place, replaces
 
 if TYPE_CHECKING:
     from ..diagnosis import Gain
@@ -50,10 +50,10 @@ def _confirm(options: argparse.Namespace) -> int:
     episodes = [recordings.read(path) for path in options.episodes]
     with progress_line() as progress:
         found = diagnosis.confirm(options.base, options.extended, episodes, progress)
-    replaced = (out / RESULT).exists()
+    note = replaces(out / RESULT)
     path = write_text(out / RESULT, json.dumps(found.as_dict(), indent=1, allow_nan=False) + "\n")
     _print(found)
-    print(f"result: {path}{' (the last one is replaced)' if replaced else ''}")
+    print(f"result: {path}{note}")
     return 0
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
+from .folders import replaces
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -85,8 +86,10 @@ def report(folder: Path, found: FieldFit, cloth: Cloth) -> int:
     from rich.console import Console
     from rich.table import Table
 
+    from ..identification.fields import RESULT
     from ..identification.pictures import field_maps, save_figure
 
+    note = replaces(folder / RESULT)
     path = found.save(folder)
     picture = save_figure(field_maps(found.fields, cloth), folder / "fields.png")
     table = Table(title=f"{len(cloth.mesh.faces)} triangles", title_justify="left", box=box.SIMPLE_HEAD)
@@ -102,5 +105,5 @@ def report(folder: Path, found: FieldFit, cloth: Cloth) -> int:
     console.print(f"Chamfer, one-sided, cloud to surface: {before:.2f} mm with the start values, {after:.2f} mm fitted")
     for warning in found.warnings:
         console.print(f"note: {warning}", style="yellow", markup=False)
-    print(f"result:   {path}\npicture:  {picture}")
+    print(f"result:   {path}{note}\npicture:  {picture}")
     return 0

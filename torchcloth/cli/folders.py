@@ -24,6 +24,11 @@ def how_to_go_on(options: argparse.Namespace) -> str:
     return "; `--resume` goes on from there" if kept else "; nothing was kept yet"
 
 
+def replaces(path: Path) -> str:
+    """What to say beside a result's name, asked before it is written."""
+    return " (the last one is replaced)" if path.exists() else ""
+
+
 def check_folder(path: Path, option: str = "--out") -> None:
     """Refuse, before any work is done, a folder that cannot be made or written to; leaves nothing behind.
 

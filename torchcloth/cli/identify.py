@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from .._files import PROGRESS
 from ..errors import InvalidInput
 from . import fields
-from .folders import check_folder, how_to_go_on, place
+from .folders import check_folder, how_to_go_on, place, replaces
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -273,12 +273,14 @@ def _report(folder: Path, fit: Identification, cloth: Cloth, recordings: list[Re
     from ..identification import episode
     from ..identification.journal import clear
     from ..identification.pictures import draw
+    from ..identification.saved import RESULT
     from ..identification.tables import print_fit
 
+    note = replaces(folder / RESULT)
     path = fit.save(folder)
     pictures = draw(fit, [episode(cloth, r) for r in recordings], cloth.mesh.faces, folder)
     clear(folder / PROGRESS)
     print_fit(fit)
-    print(f"result:   {path}")
+    print(f"result:   {path}{note}")
     print("pictures: " + ", ".join(str(p) for p in pictures))
     return 0

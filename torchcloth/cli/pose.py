@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
-from .folders import check_folder, place
+from .folders import check_folder, place, replaces
 from .identify import assignments, nuisances_of, say_what_is_beside
 
 if TYPE_CHECKING:
@@ -58,13 +58,14 @@ def _pose(options: argparse.Namespace) -> int:
         recording.require("truth", by="--truth")
     cloth, uncertain = _model(options, recording)
     estimate = _estimate(options, cloth, uncertain, recording)
+    note = replaces(options.out / "pose.json")
     files = estimate.save(options.out)
     film = viewing.film_of_pose(recording, estimate, truth=options.truth)
     picture = viewing.picture(film, options.out / "pose.png", size=PICTURE)
     print_pose(estimate)
     if options.fit is not None and _used(options.fit, recording):
         print("note: the fit used this episode: it counts twice, and the errors of the fabric's values are too small")
-    print("result: " + ", ".join(str(path) for path in (*files, picture)))
+    print("result: " + ", ".join(str(path) for path in (*files, picture)) + note)
     return 0
 
 

@@ -10,8 +10,9 @@ from typing import Any
 
 from .._files import write_text
 from ..errors import InvalidInput
-from .folders import check_folder, place
+from .folders import check_folder, place, replaces
 
+RESULT = "prediction.json"
 TABLE = "table.json"  # of a folder with readings of a tension machine
 STRIP = ("angle", "length", "width", "preload", "strain")  # options that no episode has
 
@@ -87,10 +88,11 @@ def _of_strip(fit: Path, out: Path, options: argparse.Namespace) -> int:
     else:
         size = dict(zip(("length", "width", "preload", "strain"), given, strict=True))
         prediction = predict_tension(model, *specimen_like(model, math.radians(options.angle), **size))
+    note = replaces(out / RESULT)
     path = _write(out, prediction.as_dict())
     picture = pictures.save_figure(prediction_report.strip(prediction), out / "prediction.png")
     prediction_report.print_strip(prediction)
-    print(f"result:   {path}\npicture:  {picture}")
+    print(f"result:   {path}{note}\npicture:  {picture}")
     return 0
 
 
@@ -107,6 +109,7 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
     recording = recordings.read(options.seen)
     of_model = fit.suffix == ".tcm"
     found = predicted(fit, recording) if of_model else predict_episode(fit, recording)
+    note = replaces(out / RESULT)
     path = _write(out, found.as_dict())
     with atomically(out / "prediction.npz") as file:
         t, vertices, std = (part.numpy() for part in (found.episode.times, found.frames.x, found.std))
@@ -116,9 +119,9 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
     prediction_report.print_predicted(found)
     if was_fitted(fit, recording) if of_model else is_fitted(fit, recording):
         print("note: this episode was fitted: its distances are residuals, not errors of a prediction")
-    print(f"result:   {path}\nframes:   {out / 'prediction.npz'}\npicture:  {picture}")
+    print(f"result:   {path}{note}\nframes:   {out / 'prediction.npz'}\npicture:  {picture}")
     return 0
 
 
 def _write(out: Path, content: dict[str, Any]) -> Path:
-    return write_text(out / "prediction.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+    return write_text(out / RESULT, json.dumps(content, indent=1, allow_nan=False) + "\n")
