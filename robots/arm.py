@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchcloth._surroundings import full_precision
+from torchcloth._surroundings import undisturbed
 from torchcloth.errors import InvalidInput
 from torchcloth.types import Trajectory
 
@@ -134,7 +134,7 @@ class Arm(nn.Module):
         """Name, frame and joints, for ``print(arm)``."""
         return f"{self.name!r}, frame={self.frame!r}, joints={list(self.joint_names)}"
 
-    @full_precision()
+    @undisturbed()
     def forward(self, q: Tensor) -> Tensor:
         """Pose of ``frame`` in the world.
 
@@ -159,7 +159,7 @@ class Arm(nn.Module):
             bodies.append(bodies[-1] @ joint)
         return torch.stack(bodies, dim=-3)
 
-    @full_precision()
+    @undisturbed()
     def jacobian(self, q: Tensor) -> Tensor:
         """Geometric Jacobian at the origin of ``frame``, in world axes.
 
@@ -178,7 +178,7 @@ class Arm(nn.Module):
         angular = torch.where(slides, 0.0, axis)
         return torch.cat([linear, angular], dim=-1).mT
 
-    @full_precision()
+    @undisturbed()
     def motion(
         self,
         q: Tensor,
@@ -220,7 +220,7 @@ class Arm(nn.Module):
         held = torch.ones_like(t, dtype=torch.bool) if closed is None else closed.to(t.device)
         return Trajectory(sampled.t, self(sampled.q), held[sampled.waypoint])
 
-    @full_precision()
+    @undisturbed()
     def inverse(
         self,
         pose: Tensor,
@@ -259,7 +259,7 @@ class Arm(nn.Module):
         q = inverse.solve(self, poses, start, target, self._limits[2:4], tolerance, iterations)
         return q.reshape(*pose.shape[:-2], -1)
 
-    @full_precision()
+    @undisturbed()
     def geometry(self, q: Tensor) -> list[Primitive]:
         """The boxes, cylinders and spheres of the links from the root to ``frame``.
 
@@ -294,7 +294,7 @@ class Arm(nn.Module):
         if self.base.dtype not in (torch.float32, torch.float64):
             got = str(self.base.dtype).removeprefix("torch.")
             raise InvalidInput("precision of the arm", got=got, expected="float32 or float64", remedy="use arm.float()")
-        return q.to(self.base.dtype)
+        return q.to(self.base)
 
 
 def _checked_base(base: Tensor) -> Tensor:

@@ -11,17 +11,22 @@ DEVICES = ("cpu", "cuda")
 
 
 @contextmanager
-def full_precision() -> Iterator[None]:
-    """Without autocast: eight bits of mantissa are millimetres at a metre's reach."""
+def undisturbed() -> Iterator[None]:
+    """Without autocast, whose eight bits of mantissa are millimetres at a metre's reach, and without a default device.
+
+    What is made on the way is made beside the tensors that are given, or on the CPU.
+    """
     with ExitStack() as stack:
         for device in DEVICES:
             if torch.is_autocast_enabled(device):
                 stack.enter_context(torch.autocast(device, enabled=False))
+        if torch.get_default_device().type != "cpu":
+            stack.enter_context(torch.device("cpu"))
         yield
 
 
 @contextmanager
 def own_gradients() -> Iterator[None]:
-    """With gradients, whatever the caller wants of his own tensors, and without autocast."""
-    with torch.inference_mode(False), torch.enable_grad(), full_precision():
+    """With gradients, whatever the caller wants of his own tensors, and undisturbed."""
+    with torch.inference_mode(False), torch.enable_grad(), undisturbed():
         yield

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from . import functional
-from ._surroundings import full_precision
+from ._surroundings import undisturbed
 from .boundaries import AbstractBoundary
 from .effects import AbstractEffect
 from .engine.choice import Choice, Setting, check_setting, choose, still_drives
@@ -140,16 +140,18 @@ class Cloth(nn.Module):
     @property
     def engine_in_use(self) -> str:
         """What computes the substeps: "fused", "fused, with effects.NAME in torch", or "reference (and why)"."""
-        with torch.no_grad():
+        with torch.no_grad(), undisturbed():
             model, _ = self._stepping()
             return str(self._choice(model, likeness(model, self._vertices)))
 
     # -- states ---------------------------------------------------------------------------------------------------
 
+    @undisturbed()
     def rest_state(self) -> ClothState:
         """The mesh as it was given, at rest."""
         return self.state(self._vertices.clone())  # what a caller does to it is not done to the cloth
 
+    @undisturbed()
     def state(self, x: Tensor, v: Tensor | None = None) -> ClothState:
         """A state from vertex positions [..., V, 3] m and velocities (None: at rest), directors along the normals."""
         x = torch.as_tensor(x, dtype=self._area.dtype, device=self._area.device)
@@ -158,7 +160,7 @@ class Cloth(nn.Module):
 
     # -- simulation -----------------------------------------------------------------------------------------------
 
-    @full_precision()
+    @undisturbed()
     def forward(
         self,
         state: ClothState,
@@ -184,7 +186,7 @@ class Cloth(nn.Module):
         """
         return run(self.plan(state, motion or {}, times, dt), checkpoint)
 
-    @full_precision()
+    @undisturbed()
     def settle(
         self,
         state: ClothState,
@@ -244,6 +246,7 @@ class Cloth(nn.Module):
             if isinstance(part, PhysicalParameter):
                 part.clip_()
 
+    @undisturbed()
     def stable_step(self) -> float:
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
         return self._stepping()[1]
@@ -269,7 +272,7 @@ class Cloth(nn.Module):
             rest=inverse_growth(effect.growth(c) for effect, c in effects.values()),
         )
 
-    @full_precision()
+    @undisturbed()
     def energy(self, state: ClothState) -> dict[str, Tensor]:
         """Energies by name, each [...] J."""
         model = self.model()

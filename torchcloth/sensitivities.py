@@ -9,7 +9,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 
-from ._surroundings import full_precision
+from ._surroundings import undisturbed
 from .boundaries import Drive
 from .engine.tangents import FusedTangents
 from .errors import InvalidInput
@@ -34,7 +34,7 @@ class Directions(NamedTuple):
 
 @torch.inference_mode(False)  # in which tangents are lost
 @torch.no_grad()
-@full_precision()
+@undisturbed()
 def sensitivities(
     cloth: Any,
     state: ClothState,

@@ -189,3 +189,25 @@ def test_another_precision_of_one_parameter_is_named():
     cloth.material.youngs_modulus.float()
     with pytest.raises(InvalidInput, match=r"material\.youngs_modulus; got float32; expected float64"):
         loss_of(cloth, motion)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_what_is_made_on_the_way_is_made_where_the_cloth_is(engine):
+    """Not on a default device: tensors there would be handed to the library as memory that is none."""
+    cloth, motion = held({"gravity": tc.effects.Gravity()}, engine)
+    arm = tc.robots.load("rizon4")
+    faces, q, t = torch.as_tensor(cloth.mesh.faces), torch.stack([arm.home, arm.home + 0.05]), torch.tensor([0.0, 1.0])
+    along = tc.Directions({"areal_density.raw": torch.ones(1)})
+
+    def ask():
+        state = cloth.settle(cloth.rest_state(), motion, duration=0.02)
+        x = cloth(state, motion, times=(0.0, 0.04)).x
+        moved = cloth.sensitivities(state, motion, (0.0, 0.04), along=along)[1].x
+        (slope,) = torch.autograd.grad(x.square().sum(), cloth.areal_density.raw)
+        near = tc.losses.chamfer_to_surface(x[-1].detach(), x[0].detach(), faces)
+        return x.detach(), moved, slope, near, arm.motion(q, t).pose, arm.inverse(arm(q)), cloth.stable_step()
+
+    wanted = ask()
+    with torch.device("meta"):
+        found = ask()
+    torch.testing.assert_close(found, wanted, rtol=0, atol=0)

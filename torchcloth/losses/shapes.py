@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..errors import InvalidInput
+
+
+def taken(given: Tensor | np.ndarray) -> Tensor:
+    """As it is, or an array of recordings and meshes as a tensor."""
+    return given if isinstance(given, Tensor) else torch.as_tensor(given)
 
 
 def check_places(places: Tensor, name: str, least: int = 0) -> None:

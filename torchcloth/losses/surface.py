@@ -9,8 +9,9 @@ from torch import Tensor
 
 from .._math import cross, dot, safe_norm
 from .._remembered import Remembered
+from .._surroundings import undisturbed
 from .nearest import nearest
-from .shapes import check_places, check_triangles
+from .shapes import check_places, check_triangles, taken
 
 
 class Hits(NamedTuple):
@@ -26,6 +27,7 @@ class Hits(NamedTuple):
         return (self.weights.unsqueeze(-1) * picked).sum(-2)
 
 
+@undisturbed()
 def closest(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 4_000_000) -> Hits:
     """Exact closest points on a triangle mesh.
 
@@ -38,7 +40,7 @@ def closest(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 4_000_
     Raises:
         InvalidInput: other shapes, no faces, indices of no vertex, two precisions, or numbers that are not finite.
     """
-    points, vertices, faces = (torch.as_tensor(given) for given in (points, vertices, faces))
+    points, vertices, faces = taken(points), taken(vertices), taken(faces)
     check_places(points, "points")
     check_places(vertices, "vertices")
     check_triangles(faces, len(vertices))
@@ -74,7 +76,7 @@ def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tenso
     Raises:
         InvalidInput: as `closest`, or no points, which have no mean.
     """
-    points = torch.as_tensor(points)
+    points = taken(points)
     check_places(points, "points", least=1)
     return distances(points, vertices, closest(points, vertices, faces)).mean()
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInput
-from .shapes import check_places
+from .shapes import check_places, taken
 
 
 def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
@@ -21,7 +21,7 @@ def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
     Raises:
         InvalidInput: other shapes, or none of either.
     """
-    points, vertices = torch.as_tensor(points), torch.as_tensor(vertices)
+    points, vertices = taken(points), taken(vertices)
     check_places(points, "points", least=1)
     check_places(vertices, "vertices", least=1)
     if points.dtype != vertices.dtype:
