@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import torchcloth as tc
@@ -266,6 +267,8 @@ def bad_recordings(recording):
     yield replace(recording, cloth=replace(recording.cloth, faces=None)), "cloth.faces is missing"
     objects = replace(recording.points, extra={"o": np.array([{}], dtype=object)})
     yield replace(recording, points=objects), "Object arrays"
+    graph = replace(recording.points, xyz=torch.tensor(recording.points.xyz, requires_grad=True))
+    yield replace(recording, points=graph), "requires grad"
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

@@ -35,7 +35,7 @@ def place(target: Path, fill: Callable[[Path, Path], None], *, marker: str, over
         _put(part, target.absolute(), overwrite)
     except RecordingError:
         raise
-    except (OSError, ValueError, TypeError) as error:  # disk, or a value that JSON and NPZ cannot hold
+    except (OSError, ValueError, TypeError, RuntimeError) as error:  # disk, or a value that JSON and NPZ cannot hold
         raise RecordingError(f"{target} cannot be written", got=error, remedy="nothing was changed") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
