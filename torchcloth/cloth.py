@@ -313,7 +313,7 @@ class Cloth(nn.Module):
 
     def _stepping(self, dt: float | None = None) -> tuple[Model, float]:
         """The parts, with the stages that the step needs, and the step [s]: the stable one, or the user's."""
-        check_parameters(self, self._area.dtype)
+        check_parameters(self)
         model = self.model()
         limits = limits_of(model, self._gradient)
         step = check_step(dt, limits.step)

@@ -72,7 +72,7 @@ def limits_of(model: Model, gradient: Tensor) -> Limits:
     if viscous > 0 and yielding * viscous * float(model.mass.detach().max()) > LOOSE:
         viscous = 0.0
     lighter = _lighter(model)
-    stiffness = model.material.stiffness(model.coefficients)
+    stiffness = Stiffness(*(t.to(gradient) for t in model.material.stiffness(model.coefficients)))  # may be float64
     numbers = (*stiffness, model.areal_density, *([] if model.rest is None else [model.rest]))
     beside = (spacing, *((t.dtype, t.detach().tolist()) for t in numbers))
 

@@ -120,8 +120,8 @@ def check_times(times: Tensor | Sequence[float]) -> list[float]:
     return frames
 
 
-def check_parameters(cloth: nn.Module, dtype: torch.dtype) -> None:
-    """What an optimiser's step may have brought, or a part of another precision.
+def check_parameters(cloth: nn.Module) -> None:
+    """What an optimiser's step may have brought.
 
     No NaN: comparisons with one are false, so a threshold of NaN would pass for an effect that is not there. And no
     amplitude below zero, which would drive what it should brake.
@@ -130,14 +130,7 @@ def check_parameters(cloth: nn.Module, dtype: torch.dtype) -> None:
         if bool(parameter.isnan().any()):
             raise InvalidInput(name, got="NaN", expected="a number", remedy="look at the optimiser's last step")
     for name, part in cloth.named_modules():
-        if not isinstance(part, PhysicalParameter):
-            continue
-        if part.raw.dtype != dtype:
-            got, expected = (str(own).removeprefix("torch.") for own in (part.raw.dtype, dtype))
-            raise InvalidInput(
-                name, got=got, expected=f"{expected}, as the cloth's", remedy=f"cloth.to(torch.{expected})"
-            )
-        if part.domain == "nonnegative" and bool((part.raw < 0).any()):
+        if isinstance(part, PhysicalParameter) and part.domain == "nonnegative" and bool((part.raw < 0).any()):
             raise InvalidInput(
                 name,
                 got=f"{float(part.raw.detach().min()):.4g} {part.unit}",

@@ -163,7 +163,7 @@ def test_the_command_says_one_object(tmp_path):
         result["ratios"]
     )
     assert result["cases"][f"startup.gradient.{best}"]["seconds"] > 0
-    assert result["cases"][f"memory.gradient.garment.{best}"]["peak_mebibytes"] > 0
+    assert result["cases"][f"memory.gradient.garment.{best}"]["peak_mebibytes"] >= 0
     assert json.loads((tmp_path / "out" / "bench.json").read_text()) == result
 
 
