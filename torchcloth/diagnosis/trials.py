@@ -122,13 +122,13 @@ def one_step(
     if not fits:
         return None
     common = lambda like, fits: shared(like, [current.evidence, *(f.evidence for _, f in fits)])  # noqa: E731
-    alike = lambda fits, those: _compared(  # noqa: E731
-        current, fits, setting.names, current.noise, common(current.evidence, those)
+    judged = lambda fits, every: _compared(  # noqa: E731
+        current, fits, setting.names, current.noise, common(current.evidence, every)
     )
-    likely = alike(fits, fits)
+    likely = judged(fits, fits)
     settled = _settled(likely, setting, progress)
     first, further = [fits[k] for k in settled], list(settled.values())
-    both = (alike(own, [*fits, *further]) for own in (first, further))
+    both = (judged(own, [*fits, *further]) for own in (first, further))
     for k, before, after in zip(settled, *both, strict=True):
         likely[k] = _better(before, after)
     likeliest = max(likely, key=lambda c: c.gain.density).fitted.evidence

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from contextlib import nullcontext
-from copy import copy
 
 import torch
 from torch import Tensor
@@ -48,9 +47,7 @@ class TorchParts:
 
     def as_they_are(self) -> TorchParts:
         """See ``model.as_it_is``."""
-        own = copy(self)
-        own.model = as_it_is(self.model)
-        return own
+        return TorchParts(as_it_is(self.model), self.parts)
 
     def force(self, state: ClothState, dt: float) -> tuple[Tensor, Memory]:
         """(force on the vertices [..., V, 3] N, internal variables of these parts) at the start of a substep."""
