@@ -109,6 +109,9 @@ def check_rate(rate: float) -> None:
 
 def check_times(times: Tensor | Sequence[float]) -> list[float]:
     """Frame times as a list of increasing seconds."""
+    if isinstance(times, Tensor) and times.requires_grad and torch.is_grad_enabled():
+        remedy = "times.detach(); gradients by when a motion happens are those by its Trajectory.t"
+        raise InvalidInput("times", got="a tensor that wants gradients", expected="frame times, fixed", remedy=remedy)
     try:
         flat = torch.as_tensor(times, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:

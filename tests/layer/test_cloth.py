@@ -76,6 +76,15 @@ def test_refuses_times(times):
         cloth(cloth.rest_state(), times=times)
 
 
+def test_refuses_times_that_want_gradients():
+    """They would stay without, and nobody would be told."""
+    cloth, times = sheet(), torch.tensor([0.0, 0.01], requires_grad=True)
+    with pytest.raises(InvalidInput, match=r"times; got .*gradients.*Trajectory\.t"):
+        cloth(cloth.rest_state(), times=times)
+    with torch.no_grad():
+        cloth(cloth.rest_state(), times=times)
+
+
 @pytest.mark.parametrize("shape", [(15, 3), (16, 2), (16,), (2, 15, 3)])
 def test_refuses_positions_of_the_wrong_shape(shape):
     with pytest.raises(InvalidInput, match=r"x; got shape .*; expected \[\.\.\., 16, 3\]"):
