@@ -65,7 +65,9 @@ def arm_of(recording: Recording, name: str) -> Arm:
             remedy="name the model and its base pose",
         )
     robot = recording.robots[name]
-    return load(robot.model, frame=robot.tool_frame or "flange", base=_tensor(robot.T_world_base))
+    beside = None if recording.path is None else recording.path / robot.model
+    model = robot.model if beside is None or not beside.is_file() else beside
+    return load(model, frame=robot.tool_frame or "flange", base=_tensor(robot.T_world_base))
 
 
 def _tensor(array: np.ndarray) -> Tensor:

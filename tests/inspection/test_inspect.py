@@ -114,10 +114,22 @@ def test_frames_of_another_size_are_rejected_and_no_others(known):
     assert ("unknown" in found.why) == (known == "neither")
 
 
-@pytest.mark.parametrize("grid", [np.array([8, 9]), np.array(64)])
+@pytest.mark.parametrize(
+    "grid", [np.array([8, 9]), np.array(64), np.array([-8, -8]), np.array([1, 64]), np.array(["u", "v"])]
+)
 def test_a_grid_that_does_not_fit_is_refused(grid):
     with pytest.raises(RecordingError, match="grid"):
         inspect(episode(markers=markers(extra={"grid": grid})))
+
+
+def test_material_points_go_before_a_grid():
+    """Markers set in from the edge are no grid over the whole sheet."""
+    stream = markers(noise=0.001, uv=pattern())
+    inner = np.abs(pattern() - pattern().mean(0)).max(1) < 0.8 * np.ptp(pattern(), axis=0).max() / 2
+    side = int(inner.sum() ** 0.5)
+    assert side**2 == inner.sum() < 64
+    few = rec.Markers(stream.t, stream.xyz[:, inner], stream.uv[inner], {"grid": np.array([side, side])})
+    assert not inspect(episode(markers=few)).frames["markers"].rejected.any()
 
 
 @pytest.mark.filterwarnings("error")

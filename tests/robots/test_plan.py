@@ -1,6 +1,7 @@
 """Plans, judged from outside: finite differences of the joints, the forward map, and the layer's own interpolation."""
 
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from torchcloth.boundaries.motion import interpolate
 from torchcloth.errors import InvalidInput
 from torchcloth.robots import Hold, plan
 from torchcloth.robots import primitives as P
+from torchcloth.robots.description import locate
 from torchcloth.robots.inverse import reach
 from torchcloth.robots.primitives.moves import PERIOD
 from torchcloth.robots.spline import Spline
@@ -178,6 +180,22 @@ def test_a_recording_of_it_replays_to_the_same_poses(rig, made, tmp_path):
         assert torch.equal(again[name].t, trajectory.t)
         assert float((again[name].pose - trajectory.pose).abs().max()) < 1e-12
         assert torch.equal(again[name].closed, trajectory.closed)
+
+
+def test_a_urdf_file_beside_the_episode_is_found(tmp_path, monkeypatch):
+    infos = {"left": recordings.RobotInfo("arm.urdf", np.eye(4), "flange")}
+    q = np.zeros((2, 7))
+    recording = recordings.Recording(
+        cloth=recordings.ClothInfo(areal_density=0.2, sheet=(0.4, 0.4)),
+        provenance="synthetic: test",
+        joints={"left": recordings.JointMotion(np.array([0.0, 1.0]), q, closed=np.ones(2, bool))},
+        robots=infos,
+    )
+    episode = recordings.write(recording, tmp_path / "episode")
+    shutil.copy(locate("rizon4"), episode / "arm.urdf")
+    monkeypatch.chdir(tmp_path)
+    pose = robots.replay(recordings.read(episode))["left"].pose[0]
+    assert float((pose - robots.load("rizon4")(pose.new_zeros(7))).abs().max()) < 1e-12
 
 
 def test_the_search_finds_a_way_and_prefers_a_fast_one(rig):

@@ -84,6 +84,14 @@ def test_where_nothing_shows_the_cloth_it_says_so(rich):
     assert any("nothing that was seen" in note for note in film.notes)
 
 
+def test_a_single_knot_of_motion_is_a_picture(example):
+    """Its one time was doubled, and refused."""
+    one = {name: replace(j, t=j.t[:1], q=j.q[:1], closed=None, width=None, force=None, torque=None)
+           for name, j in example.joints.items()}  # fmt: skip
+    still = replace(example, points=None, markers=None, cameras={}, truth=None, joints=one, grippers={})
+    assert film_of(still).times.tolist() == [example.joints["left"].t[0]]
+
+
 def test_arms_stand_where_the_kinematics_say(example):
     film = film_of(example)
     arm, joints = robots.arm_of(example, "left"), example.joints["left"]

@@ -42,12 +42,13 @@ class Frames:
 def of_markers(markers: Markers, cloth: ClothInfo) -> Frames:
     """Frames of markers: their distances must be those of the cloth to 10 %.
 
-    A grid (``extra["grid"]``, [rows, columns] of the markers in order) on a sheet: median arc along its rows and along
-    its columns against the sheet's sides. With ``uv``: median ratio of the distances of neighbours to those in the
-    pattern. With neither: to their own usual ones. A cloth that is folded between most of its markers looks too short.
+    With ``uv``: median ratio of the distances of neighbours to those in the pattern. Else of a grid (``extra["grid"]``,
+    [rows, columns] of the markers in order) on a sheet: median arc along its rows and along its columns against the
+    sheet's sides. With neither: distances to their own usual ones. A cloth that is folded between most of its markers
+    looks too short.
     """
     seen = np.isfinite(markers.xyz[..., 0])
-    if "grid" in markers.extra and cloth.sheet is not None:
+    if markers.uv is None and "grid" in markers.extra and cloth.sheet is not None:
         ratio, why = _arcs(markers, cloth.sheet), "arcs along rows and columns against the sheet's sides"
     else:
         ratio, why = _neighbours(markers)
@@ -59,11 +60,12 @@ def of_markers(markers: Markers, cloth: ClothInfo) -> Frames:
 def _arcs(markers: Markers, sheet: tuple[float, float]) -> np.ndarray:
     """[T, 2] median lengths of rows and columns, each over the side of the sheet that it usually is nearer to."""
     given = np.asarray(markers.extra["grid"])
-    if given.shape != (2,) or given.prod() != markers.xyz.shape[1]:
+    whole = given.shape == (2,) and given.dtype.kind in "iuf" and bool((given == np.round(given)).all())
+    if not whole or given.min() < 2 or given.prod() != markers.xyz.shape[1]:
         raise RecordingError(
             "markers: grid does not fit",
             got=given.tolist(),
-            expected=f"[rows, columns] of {markers.xyz.shape[1]} markers",
+            expected=f"[rows, columns] of {markers.xyz.shape[1]} markers, two at least of each",
         )
     rows, columns = given.astype(int).tolist()
     grid = markers.xyz.reshape(len(markers.t), rows, columns, 3)

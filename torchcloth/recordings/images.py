@@ -174,10 +174,9 @@ def find_streams(folder: Folder, size: tuple[int, int]) -> dict[Kind, ImageStrea
 
 
 def dump_times(streams: dict[Kind, ImageStream]) -> str:
-    """The text of timestamps.csv; a mask on its own is timed in the depth column."""
+    """The text of timestamps.csv; masks without depth images are timed in the depth column."""
     times = {kind: dict(zip(s.frames.tolist(), s.t.tolist(), strict=True)) for kind, s in streams.items()}
-    color, depth = times.get("color", {}), times.get("depth", {})
-    depth = depth | {n: t for n, t in times.get("mask", {}).items() if n not in depth and n not in color}
+    color, depth = times.get("color", {}), times.get("depth", times.get("mask", {}))
     rows = [f"{n},{color.get(n, '')},{depth.get(n, '')}" for n in sorted(color.keys() | depth.keys())]
     return "\n".join([",".join(_COLUMNS), *rows]) + "\n"
 

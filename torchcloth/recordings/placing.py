@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..errors import RecordingError
@@ -29,17 +30,32 @@ def place(target: Path, fill: Callable[[Path, Path], None], *, marker: str, over
     _check(target, marker, overwrite)
     part = target.absolute().with_name(f".{target.absolute().name}.{uuid.uuid4().hex}.partial")
     try:
-        part.mkdir(parents=True)
-        fill(part, target)
-        _sync_all(part)
-        _put(part, target.absolute(), overwrite)
+        with room_for(part):
+            part.mkdir()
+            fill(part, target)
+            _sync_all(part)
+            _put(part, target.absolute(), overwrite)
     except RecordingError:
         raise
     except (OSError, ValueError, TypeError, RuntimeError) as error:  # disk, or a value that JSON and NPZ cannot hold
         raise RecordingError(f"{target} cannot be written", got=error, remedy="nothing was changed") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return target
+
+
+@contextmanager
+def room_for(part: Path) -> Iterator[None]:
+    """Make the folders above; in the end what is left of ``part`` goes, and if all failed what was made for it."""
+    made = [folder for folder in part.parents if not folder.exists()]
+    try:
+        part.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
+        raise
+    shutil.rmtree(part, ignore_errors=True)
 
 
 def _check(target: Path, marker: str, overwrite: bool) -> None:

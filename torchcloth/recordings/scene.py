@@ -90,7 +90,7 @@ def camera(fields: Fields, images_of: Callable[[tuple[int, int]], dict[Kind, Ima
     """Read one camera and list its images, which ``images_of`` finds for (width, height); depth needs its scale."""
     size = fields.whole("width"), fields.whole("height")
     matrix = fields.array("K", 3, 3)
-    if min(matrix[0, 0], matrix[1, 1]) <= 0 or not np.array_equal(matrix[2], [0, 0, 1]):
+    if min(matrix[0, 0], matrix[1, 1]) <= 0 or not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         got = matrix.tolist()
         raise RecordingError(
             f"{fields.at('K')} is no camera matrix", got=got, expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]]"

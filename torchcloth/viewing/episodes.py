@@ -89,7 +89,7 @@ def _times(recording: Recording, truth: bool) -> Array:
     if not motions:
         raise RecordingError(f"{recording.path}: nothing to view", expected="points, markers, images or motion")
     start, end = min(m.t[0] for m in motions), max(m.t[-1] for m in motions)
-    return np.linspace(start, end, max(2, round((end - start) * RATE) + 1))
+    return np.linspace(start, end, max(2, round((end - start) * RATE) + 1)) if end > start else np.array([start])
 
 
 def _seen(stream_times: Array, times: Array) -> Array:

@@ -39,6 +39,26 @@ def test_episode_to_mcap_and_back(episode, tmp_path, assert_same):
     assert back.extra["source"]["checksums"] == "all bytes"
 
 
+def test_keys_and_notes_of_ones_own_come_back(recording, tmp_path):
+    """A slash in a key made it another stream's: raw/xyz took the place of xyz."""
+    points = replace(recording.points, extra={"raw/xyz": np.full((2, 3), 9.0), "raw/t": np.array([0.1, 0.2])})
+    left = replace(recording.grippers["left"], extra={"raw/ft": np.arange(6.0)})
+    grippers, extra = recording.grippers | {"left": left}, recording.extra | {"source": "lab 3"}
+    ours = replace(recording, points=points, grippers=grippers, extra=extra)
+    back = formats.read(formats.write_mcap(ours, tmp_path / "ep.mcap"))
+    np.testing.assert_array_equal(back.points.xyz, points.xyz)
+    np.testing.assert_array_equal(back.points.extra["raw/xyz"], points.extra["raw/xyz"])
+    np.testing.assert_array_equal(back.grippers["left"].extra["raw/ft"], np.arange(6.0))
+    assert back.extra["source"]["origin"] == "lab 3"
+
+
+def test_times_that_no_stamp_holds_are_refused_without_a_trace(recording, tmp_path):
+    late = replace(recording, points=replace(recording.points, t=recording.points.t + 3e9))
+    with pytest.raises(RecordingError, match=r"end in 2038; got a time of 3e\+09 s; .*begin at 0 s"):
+        formats.write_mcap(late, tmp_path / "new" / "deep" / "ep.mcap")
+    assert not (tmp_path / "new").exists()
+
+
 def test_an_imported_bag_keeps_its_absolute_times(tmp_path):
     truth = foreign.ros2(tmp_path)
     imported = formats.read(truth.path, scene=truth.write_scene())

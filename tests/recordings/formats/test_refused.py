@@ -15,9 +15,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import foreign
 
+from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.recordings import formats
 from torchcloth.recordings.formats.bag import Message
+from torchcloth.recordings.formats.imported import nanoseconds
 from torchcloth.recordings.formats.ros2_cameras import BagImages
 
 
@@ -155,6 +157,55 @@ def test_depth_in_other_units(copy):
     truth = copy("redwood")
     truth.scene["cameras"] = {"cam0": {"depth_scale": 0.1}}
     refuse(truth, "units of 0.1 m; got a median depth of 1")
+
+
+def test_tum_depth_in_other_units(copy):
+    truth = copy("tum")
+    camera = truth.scene["cameras"]["cam0"]
+    camera["depth_scale"] = 0.1
+    refuse(truth, "units of 0.1 m; got a median depth of 1")
+    camera["depth_scale"] = 0.001
+    assert formats.read(truth.path, scene=truth.write_scene()).cameras["cam0"].depth_scale == 0.001
+
+
+def test_masks_without_depth_keep_their_times(copy, tmp_path):
+    """Times of the depth images, whose frame numbers colour has, too."""
+    truth = copy("tum")
+    episode = rec.write(formats.read(truth.path, scene=truth.write_scene()), tmp_path / "ep")
+    depth, color = (getattr(rec.read(episode).cameras["cam0"], kind) for kind in ("depth", "color"))
+    (episode / "cam0" / "depth").rename(episode / "cam0" / "mask")
+    for again in ("once", "twice"):
+        camera = rec.read(episode).cameras["cam0"]
+        assert camera.depth is None
+        np.testing.assert_array_equal(camera.mask.t, depth.t)
+        np.testing.assert_array_equal(camera.color.t, color.t)
+        episode = rec.write(rec.read(episode), tmp_path / again)
+
+
+@pytest.mark.parametrize("name", ["run #3", "a?b", "50%25"])
+def test_a_sqlite_bag_whose_path_is_another_in_a_uri(tmp_path, name):
+    truth = foreign.ros2(tmp_path / "plain", "sqlite3")
+    truth.path = truth.path.rename(tmp_path / name)
+    truth.write_scene()
+    before = sorted(tmp_path.iterdir())
+    refuse(truth, "cannot be opened; got a path with .*rename the folder")
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_refused_conversion_leaves_no_folders(copy, tmp_path):
+    truth = copy("tum")
+    last = sorted((truth.path / "depth").iterdir())[-1]
+    last.write_bytes(last.read_bytes()[:100])
+    found = formats.read(truth.path, scene=truth.write_scene())
+    with pytest.raises(RecordingError, match="cannot be decoded"):
+        rec.write(found, tmp_path / "new" / "deep" / "ep")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("time", ["1E9999999", "nan", "yesterday"])
+def test_a_time_that_is_none(time):
+    with pytest.raises(RecordingError, match="is no time"):
+        nanoseconds(time, "rgb.txt")
 
 
 @pytest.mark.parametrize(("name", "file"), [("redwood", "trajectory.log"), ("tum", "groundtruth.txt")])

@@ -29,8 +29,10 @@ WRONG = {
     "collider": ({"colliders": {"table": {"plane": PLANE, "frction": 1}}}, "colliders.table.frction is unknown"),
     "plane": ({"colliders": {"table": {"plane": {"norml": [0, 0, 1]}}}}, "table.plane.norml is unknown"),
     "noise": ({"observation_noise": {"sdt": 1e-3}}, "observation_noise.sdt is unknown; expected one of std"),
+    "split": ({"split": {"motoin": "swing"}}, "split.motoin is unknown; expected one of motion, replicate_of"),
+    "hand": ({"source": {"closed": True}}, "source.closed is unknown; expected one of camera, trajectory"),
     "air": ({"air": {"densty": 1.2}}, "air.densty is unknown; expected one of density"),
-    "source": ({"source": {"camra": "cam0"}}, "source.camra is unknown; expected one of camera, trajectory, closed"),
+    "source": ({"source": {"camra": "cam0"}}, "source.camra is unknown; expected one of camera, trajectory"),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -118,8 +119,12 @@ def _check(file: Path) -> mcap_checksums.Cover:
 def _check_sqlite(file: Path) -> None:
     import sqlite3
 
+    place = str(file.resolve())
+    if re.search("[#?]|%[0-9a-fA-F]{2}", place):  # rosbags, too, would open what is before these
+        got, expected = "a path with #, ? or % in it", "one that stands for itself in a URI"
+        raise RecordingError(f"{file} cannot be opened", got=got, expected=expected, remedy="rename the folder")
     with damaged(file, "sqlite3 file"):
-        connection = sqlite3.connect(f"file:{file.resolve()}?immutable=1", uri=True)
+        connection = sqlite3.connect(f"file:{place}?immutable=1", uri=True)
         try:
             found = connection.execute("PRAGMA integrity_check").fetchone()[0]
         finally:

@@ -40,9 +40,11 @@ def restore(found: Imported, scene: Scene) -> Imported:
     folder = scene.folder
     if EXTRA in folder.held:
         for key, value in folder.npz(EXTRA).items():
-            group, _, rest = key.partition("/")
-            name, _, last = rest.rpartition("/")
-            holder = found.motion.get(name) if group == "motion" else found.points
+            group, _, last = key.partition("/")
+            holder = found.points
+            if group == "motion":
+                name, _, last = last.partition("/")
+                holder = found.motion.get(name)
             if holder is None:
                 raise RecordingError(f"{folder.place(EXTRA)}: {key} belongs to nothing")
             holder[last] = value

@@ -19,6 +19,7 @@ from ..images import ImageSource, ImageStream, Kind, pillow
 
 LONGEST_NAME = 60  # of a value shown in a message
 NANO = 10**9
+LEAST, MOST = 0.05, 30.0  # m; where half of all depths lie
 TOGETHER = 20_000_000  # ns between two images taken as one frame, as TUM's associate.py has it
 
 
@@ -94,6 +95,15 @@ def image_size(path: Path | bytes) -> tuple[int, int]:
         return image.size
 
 
+def plausible(depth: ImageStream, scale: float, path: Path) -> None:
+    """Refuse depths that lie beyond any cloth experiment in the unit that was assumed."""
+    seen = depth.load(0)
+    middle = float(np.median(seen[seen > 0])) * scale if (seen > 0).any() else 1.0
+    if not LEAST < middle < MOST:
+        got, remedy = f"a median depth of {middle:.3g} m", "set cameras.NAME.depth_scale in the scene"
+        raise RecordingError(f"{path} is not in units of {scale:g} m", got=got, expected="0.05 to 30 m", remedy=remedy)
+
+
 def seconds(nanoseconds: Sequence[int] | np.ndarray, start: int) -> np.ndarray:
     """Times [N] s since ``start``, each the float64 nearest to its whole nanoseconds."""
     return (np.asarray(nanoseconds, dtype=np.int64) - start) / NANO
@@ -108,7 +118,7 @@ def nanoseconds(text: str, place: str) -> int:
         if not value.is_finite() or abs(value) > 2**62:
             raise InvalidOperation
         return int(value)
-    except InvalidOperation as error:
+    except ArithmeticError as error:  # it overflows, too
         raise RecordingError(f"{place} is no time", got=repr(text[:LONGEST_NAME]), expected="seconds") from error
 
 

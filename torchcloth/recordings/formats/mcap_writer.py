@@ -13,7 +13,6 @@ from __future__ import annotations
 import io
 import json
 import re
-import shutil
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,6 +32,7 @@ from .side import Scene
 
 Event = tuple[int, Callable[[], None]]  # ns, and what writes the message of that time
 FINGER = "finger_width"
+LATEST = 2**31 * NANO  # ns, the first time that a stamp cannot hold
 
 
 def write(
@@ -53,20 +53,18 @@ def write(
         raise RecordingError(f"{target} exists", expected="a new name", remedy="pass overwrite=True to replace a file")
     part = target.absolute().with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
     try:
-        part.parent.mkdir(parents=True, exist_ok=True)
-        _Bag(part, recording, on_image).write()
-        file = part / f"{part.name}.mcap"
-        mcap_checksums.seal(file)
-        _read_back(file, target)
-        placing.sync(file)
-        file.replace(target.absolute())
-        placing.sync(target.absolute().parent)
+        with placing.room_for(part):
+            _Bag(part, recording, on_image).write()
+            file = part / f"{part.name}.mcap"
+            mcap_checksums.seal(file)
+            _read_back(file, target)
+            placing.sync(file)
+            file.replace(target.absolute())
+            placing.sync(target.absolute().parent)
     except (OSError, ValueError, TypeError) as error:
         if isinstance(error, RecordingError | MissingDependency):
             raise
         raise RecordingError(f"{target} cannot be written", got=error, remedy="nothing was changed") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return target
 
 
@@ -96,7 +94,7 @@ class _Bag:
         self.epoch = _epoch(recording)
         self.events: list[Event] = []
         self.mapping: dict[str, Any] = {"epoch": self.epoch, "motion": {}, "cameras": {}}
-        if isinstance(own := recording.extra.get("source"), dict):
+        if (own := recording.extra.get("source")) is not None:
             self.mapping["origin"] = own  # where the recording is from
 
     def write(self) -> None:
@@ -135,7 +133,11 @@ class _Bag:
         return self._type("std_msgs/msg/Header", time, frame)
 
     def _times(self, t: np.ndarray) -> list[int]:
-        return [self.epoch + round(value * NANO) for value in t.tolist()]
+        times = [self.epoch + round(value * NANO) for value in t.tolist()]
+        if max(times, default=0) >= LATEST:
+            got, expected = f"a time of {float(t.max()):g} s", f"less than {(LATEST - self.epoch) / NANO:g} s"
+            raise RecordingError("stamps of ROS 2 end in 2038", got=got, expected=expected, remedy="begin at 0 s")
+        return times
 
     def _motion(self, name: str) -> None:
         gripper, arm = self.recording.grippers.get(name), self.recording.joints.get(name)

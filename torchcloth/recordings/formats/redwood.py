@@ -32,6 +32,7 @@ from .imported import (
     fixed_pose,
     image_size,
     nothing_left,
+    plausible,
     seconds,
 )
 from .side import Scene
@@ -44,7 +45,6 @@ CAMERA = "cam0"
 UNCHECKED = "intrinsics, pose, and pixels of JPEG images"
 MILLIMETRE = 0.001
 TOGETHER = 50_000_000  # ns between the images of a pair
-LEAST, MOST = 0.05, 30.0  # m; where half of all depths lie
 _STAMPED = re.compile(r"\d+-(\d{6,15})")
 
 
@@ -81,7 +81,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
         camera.streams[kind] = stream
     if image_size(depth[0]) != size:
         raise RecordingError(f"{depth[0]} has the wrong size", got=image_size(depth[0]), expected=f"{size}")
-    _plausible(camera.streams["depth"], camera.known["depth_scale"], depth[0])
+    plausible(camera.streams["depth"], camera.known["depth_scale"], depth[0])
     found = Imported(cameras={name: camera}, notes={"format": NAME, "start_ns": start, "unchecked": UNCHECKED})
     log = next((path / n for n in TRAJECTORY if (path / n).is_file()), None)
     if log is not None:
@@ -141,15 +141,6 @@ def _times(paths: list[Path], fps: float | None) -> np.ndarray:
         expected = 'the scene with "source": {"fps": 30}'
         raise RecordingError(f"{paths[0].parent}: the images carry no times", expected=expected)
     return np.round(np.arange(len(paths)) * (NANO / fps)).astype(np.int64)
-
-
-def _plausible(depth: ImageStream, scale: float, path: Path) -> None:
-    """Refuse depths that lie beyond any cloth experiment in the unit that was assumed."""
-    seen = depth.load(0)
-    middle = float(np.median(seen[seen > 0])) * scale if (seen > 0).any() else 1.0
-    if not LEAST < middle < MOST:
-        got, remedy = f"a median depth of {middle:.3g} m", "set cameras.NAME.depth_scale in the scene"
-        raise RecordingError(f"{path} is not in units of {scale:g} m", got=got, expected="0.05 to 30 m", remedy=remedy)
 
 
 def _poses(log: Path, count: int) -> np.ndarray:

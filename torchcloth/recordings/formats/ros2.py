@@ -57,7 +57,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     epoch = source.maybe(source.take, "epoch")
     if epoch is not None and (isinstance(epoch, bool) or not isinstance(epoch, int) or abs(epoch) > 2**62):
         raise RecordingError(f"{source.at('epoch')} is no time", got=epoch, expected="whole nanoseconds")
-    origin = source.maybe(source.inside, "origin")
+    origin = source.maybe(source.take, "origin")
     motion = {name: MotionTopics(fields, bag, scene) for name, fields in source.each("motion").items()}
     each = source.each("cameras")
     cameras = {name: CameraTopics(fields, bag, scene.depth_scale(name)) for name, fields in each.items()}
@@ -76,7 +76,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
             "start_ns": start,
             "checksums": bag.checksums,
             "unchecked": UNCHECKED[bag.checksums],
-            **({} if origin is None else {"origin": origin.rest}),
+            **({} if origin is None else {"origin": origin}),
         },
     )
     return embedded.restore(found, scene)

@@ -3,10 +3,10 @@
     rgb.txt, depth.txt    timestamp filename
     groundtruth.txt       timestamp tx ty tz qx qy qz qw    (camera to world; scalar last)
 
-Lines with ``#`` are comments. Depth is in 1/5000 m. Colour and depth have clocks ticks of their own; a colour and a
-depth image that are each other's nearest within 20 ms share a frame number, every other image keeps one of its own.
-The layout holds no intrinsics: the scene gives them. ``"source": {"trajectory": "left", "closed": true}`` reads
-groundtruth.txt as the path of the gripper "left" instead, for those who track the hand.
+Lines with ``#`` are comments. Depth is in 1/5000 m, unless the scene says otherwise. Colour and depth have clocks
+ticks of their own; a colour and a depth image that are each other's nearest within 20 ms share a frame number, every
+other image keeps one of its own. The layout holds no intrinsics: the scene gives them. ``"source": {"trajectory":
+"left", "closed": true}`` reads groundtruth.txt as the path of the gripper "left" instead, for those who track the hand.
 
 Text carries no checksum: a changed digit that stays plausible goes unnoticed, and so do changed bytes in the pixels
 of a JPEG; PNG files are verified.
@@ -32,6 +32,7 @@ from .imported import (
     image_size,
     nanoseconds,
     nothing_left,
+    plausible,
     pose_matrix,
     seconds,
 )
@@ -41,7 +42,7 @@ NAME = "tum"
 TITLE = "TUM RGB-D folder"
 CAMERA = "cam0"
 UNCHECKED = "times, poses, and pixels of JPEG images"
-DEPTH_SCALE = 1 / 5000  # m per unit
+DEPTH_SCALE = 1 / 5000  # m per unit, as the layout has it
 LISTS: dict[Kind, str] = {"color": "rgb.txt", "depth": "depth.txt"}
 TRUTH = "groundtruth.txt"
 
@@ -56,7 +57,7 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     source = scene.source
     name = source.maybe(source.text, "camera") or CAMERA
     hand = source.maybe(source.text, "trajectory")
-    closed = source.maybe(source.take, "closed")
+    closed = source.maybe(source.take, "closed") if hand is not None else None
     nothing_left(source)
     lists: dict[Kind, list[tuple[int, Path]]] = {kind: _list(path, file) for kind, file in LISTS.items()}
     stamps: dict[Kind, np.ndarray] = {
@@ -67,10 +68,12 @@ def read(path: Path, scene: Scene, episode: int | None) -> Imported:
     numbers: dict[Kind, np.ndarray] = {}
     numbers["color"], numbers["depth"] = frame_numbers(stamps["color"], stamps["depth"])
     size = image_size(lists["depth"][0][1])
-    camera = ImportedCamera({"width": size[0], "height": size[1], "depth_scale": DEPTH_SCALE})
+    scale = scene.depth_scale(name) or DEPTH_SCALE
+    camera = ImportedCamera({"width": size[0], "height": size[1], "depth_scale": scale})
     for kind, rows in lists.items():
         source_of = FileImages([file for _, file in rows])
         camera.streams[kind] = ImageStream(kind, numbers[kind], seconds(stamps[kind], start), (), size, source_of)
+    plausible(camera.streams["depth"], scale, lists["depth"][0][1])
     found = Imported(cameras={name: camera}, notes={"format": NAME, "start_ns": start, "unchecked": UNCHECKED})
     if truth is not None and hand is None:
         remedy = f'if {TRUTH} tracks a gripper, write "source": {{"trajectory": "left", "closed": true}}'

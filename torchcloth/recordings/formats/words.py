@@ -17,6 +17,7 @@ OBJECTS = {
     "cloth.sheet": ["width", "height"],
     "cloth.nominal": [*NOMINAL, NOTE],
     "observation_noise": ["std"],
+    "split": ["motion", "replicate_of"],
     "air": ["density"],
 }
 GROUPS = {  # of objects with names that the user chooses
