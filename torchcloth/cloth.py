@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Literal, cast
 
@@ -25,7 +25,7 @@ from .parameters import PhysicalParameter
 from .parts import Parts, check_free
 from .sensitivities import Directions, sensitivities
 from .stability import limits_of
-from .strain import inverse_growth
+from .strain import MATERIAL, inverse_growth
 from .transfer import Contact, Grid
 from .types import ClothState, Rollout, Trajectory
 from .validation import (
@@ -288,7 +288,7 @@ class Cloth(nn.Module):
         model, limit = self._stepping(dt)
         check_substeps(frames[-1] - frames[0], limit, dt)
         counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
-        return self._ready(model, state, motion, frames, counts)
+        return self._ready(model, state, motion, frames, counts, dt=dt)
 
     def settling(
         self, state: ClothState, motion: Mapping[str, Trajectory], start: float, duration: float, rate: float
@@ -327,15 +327,26 @@ class Cloth(nn.Module):
         frames: list[float],
         counts: list[int],
         settling: float | None = None,
+        dt: float | None = None,
     ) -> Plan:
         check_state(state, likeness(model, self._vertices))
         if settling is not None:
             model = damped(model, settling)
         state = expand_state(state, model, motion)
         longest = float("inf") if self._grid is None else self._grid.longest
-        plan = Plan(model, motion, frames, counts, state, self._choice(model, state), longest)
+        step_for = self._step_for(model, dt) if MATERIAL in state.memory else None
+        plan = Plan(model, motion, frames, counts, state, self._choice(model, state), longest, step_for)
         plan.check(state)
         return plan
+
+    def _step_for(self, model: Model, dt: float | None) -> Callable[[ClothState], float]:
+        """The longest substep [s] for a state, as what has set shortens it; the user's is held to it."""
+
+        def longest(state: ClothState) -> float:
+            limit = limits_of(model, self._gradient, state.memory[MATERIAL].detach()).longest(model.stages)
+            return check_step(dt, limit)
+
+        return longest
 
     def _choice(self, model: Model, state: ClothState) -> Choice:
         return choose(self.engine, model, state, still_drives(model))

@@ -89,7 +89,7 @@ def constrain(
     for name, boundary in model.boundaries.items():
         drive = drives.get(name)
         if isinstance(boundary, AbstractCollider):
-            after = boundary.constrain(x, v, dt, drive, substep, resistance)
+            after = boundary.constrain(x, v, dt, drive, substep, resistance, model.mass)
         else:
             after = boundary.constrain(x, v, dt, drive, substep)
         if drive is not None:

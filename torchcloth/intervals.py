@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
+from math import ceil
 from typing import NamedTuple
 
 import torch
@@ -77,13 +78,18 @@ class Plan(NamedTuple):
     state: ClothState  # at the first frame, with all batch dimensions
     choice: Choice
     longest: float  # m, extent that the contact grid has room for
+    step_for: Callable[[ClothState], float] | None = None  # [s], longest from a state on; None: it does not matter
 
-    def intervals(self) -> Iterator[Interval]:
-        """One after the other."""
+    def intervals(self, now: Callable[[], ClothState]) -> Iterator[Interval]:
+        """One after the other; ``now``: the state at the start of the next."""
         whole, first = self.drives(), 0
         for interval in self._bare():
             last = first + interval.count
-            yield interval._replace(moves=_parts(whole, first, last))
+            fewest = 0 if self.step_for is None else ceil((interval.end - interval.start) / self.step_for(now()) - 1e-9)
+            if fewest > interval.count:
+                yield interval._replace(count=fewest)
+            else:
+                yield interval._replace(moves=_parts(whole, first, last))
             first = last
 
     def stretches(self) -> Iterator[tuple[list[Interval], dict[str, Drive]]]:
@@ -121,16 +127,18 @@ def run(plan: Plan, checkpoint: bool) -> Rollout:
     Raises:
         SimulationDiverged: the state lost finiteness.
     """
-    fused, state, states, impulses = plan.choice.fused, plan.state, [plan.state], []
-    # a contact grid must be looked after between frames
-    if fused is not None and plan.longest == float("inf") and fused.is_plain(state, plan.motion):
+    fused, state, states, impulses, lost = plan.choice.fused, plan.state, [plan.state], [], None
+    # a contact grid and what sets must be looked after between frames
+    free = plan.longest == float("inf") and plan.step_for is None
+    if fused is not None and free and fused.is_plain(state, plan.motion):
         for some, drives in plan.stretches():
-            for state, given in _together(fused, some, states[-1], drives):
-                states.append(state)
-                impulses.append(given)
+            found = _together(fused, some, states[-1], lost, drives)
+            states += [state for state, _, _ in found]
+            impulses += [given for _, _, given in found]
+            lost = found[-1][1]
         return collect(plan, states, impulses)
-    for interval in plan.intervals():
-        state, given = advance(interval, state, checkpoint)
+    for interval in plan.intervals(lambda: states[-1]):
+        state, lost, given = advance(interval, state, lost, checkpoint)
         plan.check(state)
         states.append(state)
         impulses.append(given)
@@ -138,8 +146,8 @@ def run(plan: Plan, checkpoint: bool) -> Rollout:
 
 
 def _together(
-    fused: Fused, some: Sequence[Interval], state: ClothState, drives: Mapping[str, Drive]
-) -> list[tuple[ClothState, Impulses]]:
+    fused: Fused, some: Sequence[Interval], state: ClothState, lost: Tensor | None, drives: Mapping[str, Drive]
+) -> list[tuple[ClothState, Tensor | None, Impulses]]:
     """Simulate intervals in one call: what ``advance`` gives of each.
 
     Raises:
@@ -147,8 +155,8 @@ def _together(
     """
     counts = torch.tensor([i.count for i in some])
     steps = torch.tensor([i.dt for i in some], dtype=torch.float64).repeat_interleave(counts)
-    found = fused.frames(state, steps, drives, tuple(counts.cumsum(0).tolist()))
-    after = [s for s, _ in found]
+    found = fused.frames(state, lost, steps, drives, tuple(counts.cumsum(0).tolist()))
+    after = [s for s, *_ in found]
     if not bool(torch.isfinite(torch.stack([s.x for s in after])).all()):
         first = 0
         for interval, before, own in zip(some, [state, *after], after, strict=False):
@@ -169,24 +177,27 @@ def collect(plan: Plan, states: Sequence[ClothState], impulses: Sequence[Impulse
     return Rollout(torch.tensor(plan.frames, dtype=torch.float64), x, v, wrench, states[-1])
 
 
-def advance(interval: Interval, state: ClothState, checkpoint: bool) -> tuple[ClothState, Impulses]:
-    """Simulate one interval; impulses are summed over it.
+def advance(
+    interval: Interval, state: ClothState, lost: Tensor | None, checkpoint: bool
+) -> tuple[ClothState, Tensor | None, Impulses]:
+    """Simulate one interval; impulses are summed over it. ``lost``: see ``functional.stretch``.
 
     Raises:
         SimulationDiverged: positions are not finite at its end.
     """
     before, drives = state, interval.drives()
     if interval.fused is None:
-        state, total = _by_reference(interval, state, drives, checkpoint)
+        state, lost, total = _by_reference(interval, state, lost, drives, checkpoint)
     else:
-        state, total = interval.fused.rollout(state, interval.dt, drives, interval.count, checkpoint=checkpoint)
+        run = partial(interval.fused.stretch, checkpoint=checkpoint)
+        state, lost, total = run(state, lost, interval.dt, drives, interval.count)
     check_finite(interval, before, state)
-    return state, total
+    return state, lost, total
 
 
 def _by_reference(
-    interval: Interval, state: ClothState, drives: Mapping[str, Drive], checkpoint: bool
-) -> tuple[ClothState, Impulses]:
+    interval: Interval, state: ClothState, lost: Tensor | None, drives: Mapping[str, Drive], checkpoint: bool
+) -> tuple[ClothState, Tensor | None, Impulses]:
     total: Impulses = {}
     store = checkpoint and recomputes()
     model = interval.model
@@ -194,10 +205,10 @@ def _by_reference(
         model = as_it_is(model)
     for first in range(0, interval.count, CHUNK):
         substeps = min(CHUNK, interval.count - first)
-        run = partial(functional.rollout, model, dt=interval.dt, drives=drives, substeps=substeps, first=first)
-        state, impulses = recompute(run, state, use_reentrant=False) if store else run(state)
+        run = partial(functional.stretch, model, dt=interval.dt, drives=drives, substeps=substeps, first=first)
+        state, lost, impulses = recompute(run, state, lost, use_reentrant=False) if store else run(state, lost)
         total = added(total, impulses)
-    return state, total
+    return state, lost, total
 
 
 def check_finite(interval: Interval, before: ClothState, after: ClothState) -> None:

@@ -75,11 +75,13 @@ class _Walk:
         if fused is None:
             raise ValueError("the reference has no such tangents")
         engine = FusedTangents(fused, self._within, self.count)
-        values, tangents = ([state], []), ([moved], [])
-        for interval in self.plan.intervals():
+        values, tangents, lost = ([state], []), ([moved], []), None
+        for interval in self.plan.intervals(lambda: values[0][-1]):
             before, drives = state, interval.drives()
             driven = poses.tangents(interval, state.x.ndim - 2)
-            state, moved, given, shift = engine.rollout(state, moved, interval.dt, drives, driven, interval.count)
+            state, lost, moved, given, shift = engine.rollout(
+                state, lost, moved, interval.dt, drives, driven, interval.count
+            )
             check_finite(interval, before, state)
             self.plan.check(state)
             for (states, impulses), s, j in ((values, state, given), (tangents, moved, shift)):

@@ -51,9 +51,10 @@ class Limits(NamedTuple):
 
 
 @torch.no_grad()
-def limits_of(model: Model, gradient: Tensor) -> Limits:
+def limits_of(model: Model, gradient: Tensor, inelastic: Tensor | None = None) -> Limits:
     """Those of a cloth with all its parts; ``gradient``: of the shape functions of the pattern.
 
+    ``inelastic``: what has set [..., E, 4], A by rows: triangles that are crushed are small, and their step is short.
     What was found last for a mesh is remembered, with all numbers that it hangs on.
 
     Raises:
@@ -78,13 +79,14 @@ def limits_of(model: Model, gradient: Tensor) -> Limits:
 
     def find() -> float:
         shape = gradient if model.rest is None else grown_gradient(gradient, model.rest)
+        shape = shape if inelastic is None else shape @ inelastic.unflatten(-1, (2, 2))
         try:
             return squared_frequency(shape, model.areal_density, stiffness, spacing)
         except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage] - not finite, or its square
             largest = max(float(t.max()) for t in stiffness)
             raise UnstableStep("stiffness", got=f"{largest:.3g} N/m", expected="a fabric's: the step is 0 s") from error
 
-    squared = _KNOWN.of(gradient, find, beside)
+    squared = _KNOWN.of(gradient, find, beside) if inelastic is None else find()
     return Limits(lighter * squared + elastic, max(0.0, damping - viscous), viscous)
 
 

@@ -11,13 +11,15 @@ from ._math import cross
 from .model import Model
 from .types import ClothState, Memory, Moment, Surface
 
+MATERIAL = "material"  # key of the plastic set among the internal variables
+
 
 def evolve(model: Model, state: ClothState, s: Surface, dt: float) -> Memory:
     """Plastic set, internal friction and creases follow the cloth to where it is now, ``dt`` [s] later."""
     memory = dict(state.memory)
-    if "material" in memory:
+    if MATERIAL in memory:
         trial, _ = elastic(model, s, memory)
-        memory["material"] = model.material.flow(model.coefficients, trial, memory["material"])
+        memory[MATERIAL] = model.material.flow(model.coefficients, trial, memory[MATERIAL])
     for name, (effect, c) in model.effects.items():
         own = memory.get(f"effects.{name}")
         if own is not None:
@@ -31,14 +33,14 @@ def elastic(model: Model, s: Surface, memory: Memory) -> tuple[Surface, Tensor |
     if model.rest is not None:
         s = _seen_from(s, model.rest)
         share = 1 / _determinant(model.rest)
-    return (_seen_from(s, memory["material"]) if "material" in memory else s), share
+    return (_seen_from(s, memory[MATERIAL]) if MATERIAL in memory else s), share
 
 
 def membrane_stress(model: Model, s: Surface, memory: Memory) -> tuple[Tensor, Tensor]:
     """Columns of d(energy)/dF per area of the pattern [..., E, 3] N/m: P = P_E A^T, times the growth of the area."""
     strained, share = elastic(model, s, memory)
     p1, p2 = model.material.membrane_stress(model.coefficients, strained)
-    for inverse in (memory.get("material"), model.rest):
+    for inverse in (memory.get(MATERIAL), model.rest):
         if inverse is not None:
             a11, a12, a21, a22 = inverse.split(1, dim=-1)
             p1, p2 = a11 * p1 + a12 * p2, a21 * p1 + a22 * p2

@@ -20,7 +20,7 @@ from torchcloth.boundaries import (
     Stribeck,
 )
 from torchcloth.boundaries.motion import drive
-from torchcloth.effects import AddedMass, Gravity, GripSlip
+from torchcloth.effects import AddedMass, Gravity, GripSlip, LineMass
 from torchcloth.engine import fused
 from torchcloth.engine.lowering import Unfused
 
@@ -128,6 +128,11 @@ def test_contact_points(solid, moving):
     state = falling(cloth, 5e-4)
     agree(cloth, moves(cloth), state)
     assert float((run(cloth, state).v - run(bare, state).v).norm()) > 1e-3  # the points matter
+
+
+def test_contact_points_of_uneven_mass():
+    cloth = sheet({"body": SMALL["box"](sampling=0.01)}, {"hem": LineMass(5e-3)})
+    agree(cloth, moves(cloth), falling(cloth, 5e-4))
 
 
 def run(cloth, state, substeps=20):

@@ -57,16 +57,36 @@ def test_an_offset_is_a_thicker_body():
 def test_points_share_impulses_without_losing_momentum():
     mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(5, 4))
     points = TrianglePoints(mesh, 0.008)
-    x, mass = torch.as_tensor(mesh.vertices), 1 / points.mobility
     torch.manual_seed(0)
+    x = torch.as_tensor(mesh.vertices)
+    mass = 0.1 + torch.rand(len(x), 1)  # of hems, pockets, wet places
     some = torch.randn_like(points.at(x)) * (torch.rand(len(points.at(x)), 1) < 0.3)
     alone = torch.zeros_like(some)
     alone[37] = some.abs().amax(0) + 1
-    torch.testing.assert_close(points.at(points.share(alone))[37], alone[37])  # one point: exactly as wanted
+    torch.testing.assert_close(points.at(points.share(alone, mass))[37], alone[37])  # one point: exactly as wanted
     same = torch.ones_like(some)
-    torch.testing.assert_close(points.share(same), torch.ones_like(x), rtol=0, atol=0.15)  # all alike: nearly
-    change = points.share(alone)
+    even = torch.as_tensor(mesh.vertex_area)[:, None]
+    torch.testing.assert_close(points.share(same, even), torch.ones_like(x), rtol=0, atol=0.15)  # all alike: nearly
+    change = points.share(alone, mass)
     linear, angular = (mass * change).sum(0), torch.linalg.cross(x, mass * change).sum(0)
     torch.testing.assert_close(angular, torch.linalg.cross(points.at(x)[37], linear))  # it acts at the point
-    batch = points.share(torch.stack([some, alone]))
+    batch = points.share(torch.stack([some, alone]), mass)
     torch.testing.assert_close(batch[1], change)
+
+
+@pytest.mark.parametrize("engine", ["fused", "reference"])
+@pytest.mark.parametrize("hem", [4.5e-3, 2e-2])  # kg/m
+def test_a_heavy_hem_at_rest_is_not_thrown_up(engine, hem):
+    """Cloth beside it lands: what is stopped there takes the hem along by its mass, not as if it were light cloth."""
+    table, effects = tc.boundaries.Plane(friction=0.0, sampling=0.003), {"hem": tc.effects.LineMass(hem)}
+    cloth = sheet({"table": table}, None, n=11, effects=effects, E=1.0, density=0.1)
+    cloth.engine = engine
+    x = cloth.rest_state().x
+    inwards = torch.minimum(x[:, :2], 0.1 - x[:, :2]).amin(-1)
+    x[:, 2] = torch.where(inwards < 0.015, 1e-7, 0.05)
+    v = torch.zeros_like(x)
+    v[:, 2] = torch.where((inwards > 0.005) & (inwards < 0.015), -1.0, 0.0)
+    with torch.no_grad():
+        out, mass = cloth(cloth.state(x, v), times=[0.0, 1e-4]), cloth.model().mass
+    assert float((mass * out.v[-1] ** 2).sum()) < 0.2 * float((mass * v**2).sum())
+    assert float(out.v[-1][inwards < 0.005, 2].max()) < 0.2

@@ -245,3 +245,26 @@ def test_the_usual_scheme_brakes_a_turning_sheet_and_ours_does_not():
         kept[transfer] = float(angular[1] / angular[0])
     assert kept["mesh"] == pytest.approx(1.0, abs=1e-9)
     assert kept["apic"] < 0.99
+
+
+@pytest.mark.parametrize("cell", [0.03, 0.06])
+def test_large_cells_of_an_uneven_mesh_have_no_holes(cell):
+    """Points were laid by the mean edge alone: a small sheet fell through cells of 30 mm beside fine ones."""
+    ys = np.concatenate([np.arange(0.0, 0.021, 0.005), 0.02 + cell * np.arange(1, round(0.06 / cell) + 1)])
+    xs = np.concatenate([np.arange(0.0, 0.061, 0.005), 0.06 + cell * np.arange(1, round(0.09 / cell) + 1)])
+    u, v = np.meshgrid(xs, ys, indexing="ij")
+    first = (np.arange(len(xs) - 1)[:, None] * len(ys) + np.arange(len(ys) - 1)).ravel()
+    a, b, c, d = first, first + len(ys), first + len(ys) + 1, first + 1
+    below = np.stack([u.ravel(), v.ravel(), 0 * u.ravel()], -1)
+    upper, count = tc.meshes.rectangle(0.03, 0.03, resolution=(4, 4)), len(below)
+    mesh = tc.meshes.Mesh.build(
+        np.concatenate([below, upper.vertices + np.array([0.085, 0.035, 0.03])]),
+        np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1), upper.faces + count]),
+        np.concatenate([below[:, :2], upper.uv + np.array([1.0, 0.0])]),
+    )
+    material = tc.materials.AEP(1e5, 0.3, 1e3 * STIFFNESS, 1e3 * STIFFNESS)
+    effects, pin = gravity() | {"damping": tc.effects.MassDamping(8.0)}, {"pin": tc.boundaries.Grasp(range(count))}
+    cloth = tc.Cloth(mesh, material, DENSITY, effects, pin, tc.Contact(spacing=SPACING))
+    with torch.no_grad():
+        end = cloth(cloth.rest_state(), still(), times=[0.0, 0.2]).x[-1, count:, 2]
+    assert float(end.min()) > 0.01

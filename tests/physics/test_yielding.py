@@ -216,3 +216,55 @@ def test_forward_mode_equals_reverse_mode():
     (backward,) = torch.autograd.grad(end(leaf), leaf)
     assert abs(float(backward)) > 1e-6
     torch.testing.assert_close(forward, backward, rtol=1e-10, atol=0)
+
+
+def crushed(cloth, share):
+    """A sheet that has set to a share of its size, and hardly moves."""
+    state = cloth.rest_state()
+    x = state.x * torch.tensor([share, share, 1.0])
+    noise = 1e-3 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0))
+    set_to = torch.tensor([1 / share, 0.0, 0.0, 1 / share]).expand_as(state.memory["material"]).clone()
+    return cloth.state(x, noise)._replace(memory={**state.memory, "material": set_to})
+
+
+@pytest.mark.parametrize("engine", ["fused", "reference"])
+def test_crushed_triangles_get_the_step_of_small_ones(engine):
+    """At the step of the pattern they buzzed for ever: their frequency grows as they shrink."""
+    cloth = sheet()
+    cloth.engine = engine
+    state = crushed(cloth, 0.4)
+    with torch.no_grad():
+        out = cloth(state, times=[0.0, 0.02, 0.04])
+    kinetic = 0.5 * (cloth.model().mass * out.v**2).sum((-2, -1)).detach()
+    assert float(kinetic[1:].max()) < 1.05 * float(kinetic[0])
+    with pytest.raises(tc.errors.UnstableStep, match=r"dt; got .* expected at most"):
+        cloth(state, times=[0.0, 0.02], dt=cloth.stable_step())
+
+
+def test_the_step_follows_the_set_from_frame_to_frame():
+    """A sheet that is crushed on the way, against one that went through it in steps of a tenth."""
+    y = tc.meshes.rectangle(0.1, 0.1, resolution=(4, 4)).vertices[:, 1]
+    sides = {"hand": y < 0.01, "rest": y > 0.09}
+    grips = {name: tc.boundaries.Grasp(side.nonzero()[0].tolist()) for name, side in sides.items()}
+    cloth = sheet(boundaries=grips, effects={"damping": tc.effects.MassDamping(20.0)})
+    t = torch.linspace(0, 0.3, 7)
+    pose = torch.eye(4).repeat(7, 1, 1)
+    still = tc.Trajectory(t, pose.clone(), torch.ones(7, dtype=torch.bool))
+    pose[:, 1, 3] = 0.28 * t  # its second side is 0.1 m away
+    motion = {"hand": tc.Trajectory(t, pose, torch.ones(7, dtype=torch.bool)), "rest": still}
+    with torch.no_grad():
+        ends = [cloth(cloth.rest_state(), motion, times=t, dt=dt) for dt in (None, 0.1 * cloth.stable_step())]
+    kinetic = [0.5 * float((cloth.model().mass * out.v[-1] ** 2).sum().detach()) for out in ends]
+    assert float(ends[0].state.memory["material"].max()) > 2.0
+    assert kinetic[0] == pytest.approx(kinetic[1], rel=0.05)
+
+
+def test_along_directions_the_step_follows_as_well():
+    cloth = sheet()
+    state = crushed(cloth, 0.4)
+    along = tc.Directions({"material.youngs_modulus.raw": torch.tensor([1.0])})
+    with torch.no_grad():
+        expected = cloth(state, times=[0.0, 0.02]).x
+    torch.testing.assert_close(
+        cloth.sensitivities(state, times=[0.0, 0.02], along=along)[0].x, expected, rtol=0, atol=1e-9
+    )

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypedDict, cast
 import torch
 from torch import Tensor
 
-from .._math import dot, times, withheld
+from .._math import displacement, dot, times, withheld
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from .base import AbstractBoundary, Drive
@@ -104,19 +104,28 @@ class AbstractCollider(AbstractBoundary):
         return self
 
     def constrain(
-        self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int, resistance: Tensor | None = None
+        self,
+        x: Tensor,
+        v: Tensor,
+        dt: float,
+        drive: Drive | None,
+        substep: int,
+        resistance: Tensor | None = None,
+        mass: Tensor | None = None,
     ) -> Tensor:
         """Stop what approaches; first the points on edges and triangles, then, exactly, the vertices.
 
         ``resistance`` [..., V, 3, 3] is the mass of the air that moves along, over the vertices' own; None: none does.
+        ``mass`` [..., V, 1] of the vertices, in any unit; None: all have the same.
         """
         motion = (None, None) if drive is None else (d[..., substep, :, :] for d in (drive.increment, drive.pose))
         place = self._placed(*motion)
         if self.points is not None:
             air = None if resistance is None else self.points.at(resistance.flatten(-2)).unflatten(-1, (3, 3))
             contact = self._contact(self.points.at(x), dt, place, air)
+            mass = torch.ones_like(v[..., :1]) if mass is None else mass
             for _ in range(PASSES):
-                v = v + self.points.share(self._change(contact, self.points.at(v)))
+                v = v + self.points.share(self._change(contact, self.points.at(v)), mass)
         return v + self._change(self._contact(x, dt, place, resistance), v)
 
     def _placed(self, increment: Tensor | None, pose: Tensor | None) -> _Place:
@@ -124,11 +133,11 @@ class AbstractCollider(AbstractBoundary):
         return _Place(increment, own if pose is None else pose if own is None else pose @ own)
 
     def _contact(self, x: Tensor, dt: float, place: _Place, resistance: Tensor | None) -> _Contact:
-        carried = place.carried(x)
-        distance, normal = self.distance(place.inside(carried))
+        way = place.way(x)
+        distance, normal = self.distance(place.inside(x if way is None else x + way))
         least = ((self.offset - distance) / dt).clamp(max=self.recovery)
         air = None if resistance is None else _Air.of(place.tensor_inwards(resistance), normal)
-        return _Contact(place, None if carried is x else (carried - x) / dt, normal, least, air)
+        return _Contact(place, None if way is None else way / dt, normal, least, air)
 
     def _change(self, contact: _Contact, v: Tensor) -> Tensor:
         """Change of velocity of points [..., N, 3], exactly 0 for those that are free."""
@@ -156,11 +165,9 @@ class _Place(NamedTuple):
     increment: Tensor | None  # [..., 4, 4] motion of the world points that the body carries along
     pose: Tensor | None  # [..., 4, 4] of the shape
 
-    def carried(self, x: Tensor) -> Tensor:
-        """World points after the body's motion."""
-        if self.increment is None:
-            return x
-        return x @ self.increment[..., :3, :3].mT + self.increment[..., None, :3, 3]
+    def way(self, x: Tensor) -> Tensor | None:
+        """How far the body's motion carries world points; None: it stands still."""
+        return None if self.increment is None else displacement(self.increment, x)
 
     def inside(self, x: Tensor) -> Tensor:
         """World points in the shape's coordinates."""

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from .._math import displacement
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from .base import AbstractBoundary, Drive
@@ -118,10 +119,7 @@ class Grasp(AbstractBoundary):
         """Held vertices arrive exactly where the body carries them."""
         if drive is None or self.held(drive, substep) is None:
             return v
-        motion = drive.increment[..., substep, :, :]
-        held = x.index_select(-2, self.index)
-        target = held @ motion[..., :3, :3].mT + motion[..., None, :3, 3]
-        wanted = (target - held) / dt
+        wanted = displacement(drive.increment[..., substep, :, :], x.index_select(-2, self.index)) / dt
         v = v.expand(*wanted.shape[:-2], *v.shape[-2:])
         return v.index_copy(-2, self.index, wanted)
 

@@ -20,46 +20,46 @@ class TrianglePoints(nn.Module):
 
     Args:
         mesh: the cloth.
-        spacing: distance of neighbouring points, at most, on the mean edge [m].
+        spacing: distance of neighbouring points, at most, on the mean edge, or on two thirds of the longest [m].
     """
 
     def __init__(self, mesh: Mesh, spacing: float) -> None:
         super().__init__()
-        index, weight = _lattice(mesh.faces, int(np.ceil(mesh.mean_edge / spacing - 1e-9)))
-        share = mesh.vertex_area
+        index, weight = _lattice(mesh.faces, int(np.ceil(mesh.coarse_edge / spacing - 1e-9)))
         dtype = torch.get_default_dtype()
         self.register_buffer("index", torch.as_tensor(index.T.ravel().copy()), persistent=False)
         self.register_buffer("weight", torch.as_tensor(weight.T[..., None].copy(), dtype=dtype), persistent=False)
-        self.register_buffer("mobility", torch.as_tensor(share.mean() / share[:, None], dtype=dtype), persistent=False)
         self.index: Tensor  # [3 P], first all first corners, then all second, then all third
         self.weight: Tensor  # [3, P, 1]
-        self.mobility: Tensor  # [V, 1] inverse of the vertices' masses over their mean, for uniform density
 
     def at(self, field: Tensor) -> Tensor:
         """Values [..., P, 3] at the points, of values [..., V, 3] at the vertices."""
         return (self.weight * self._corners(field)).sum(-3)
 
-    def share(self, change: Tensor) -> Tensor:
+    def share(self, change: Tensor, mass: Tensor) -> Tensor:
         """Changes of the vertices' velocities [..., V, 3] that answer the wanted changes [..., P, 3] of the points.
 
-        Each vertex splits its mass among its points that touch the body, by weight (mass splitting: Tonge, Benevolenski
-        and Voroshilov 2012): a point's impulse is the one that changes its own velocity as wanted, and goes to its
-        corners by weight, which keeps linear and angular momentum; no vertex is pushed twice for one cause.
+        Each vertex splits its ``mass`` [..., V, 1] among its points that touch the body, by weight (mass splitting:
+        Tonge, Benevolenski and Voroshilov 2012): a point's impulse is the one that changes its own velocity as wanted,
+        and goes to its corners by weight, which keeps linear and angular momentum; no vertex is pushed twice for one
+        cause.
         """
+        vertices = mass.shape[-2]
         with torch.no_grad():
             touches = (dot(change, change) > TOUCH**2).to(change)
-            load = self._corners(self.mobility * self._gathered(self.weight * touches.unsqueeze(-3)))
-            mobility = (self.weight * load).sum(-3)  # of a point that has its corners' parts of mass m b / sum(b)
+            claims = self._corners(self._gathered(self.weight * touches.unsqueeze(-3), vertices))
+        light = self.weight / self._corners(mass)
+        mobility = (light * claims).sum(-3)  # of a point that has its corners' parts of mass m b / sum(b)
         impulse = torch.where(touches > 0, change / torch.where(touches > 0, mobility, 1.0), 0.0)
-        return self.mobility * self._gathered(self.weight * impulse.unsqueeze(-3))
+        return self._gathered(light * impulse.unsqueeze(-3), vertices)
 
     def _corners(self, field: Tensor) -> Tensor:
         return field.index_select(-2, self.index).unflatten(-2, (3, -1))
 
-    def _gathered(self, shares: Tensor) -> Tensor:
+    def _gathered(self, shares: Tensor, vertices: int) -> Tensor:
         """Sum [..., 3, P, K] on the vertices [..., V, K]."""
         stacked = shares.flatten(-3, -2)
-        total = stacked.new_zeros(*stacked.shape[:-2], len(self.mobility), stacked.shape[-1])
+        total = stacked.new_zeros(*stacked.shape[:-2], vertices, stacked.shape[-1])
         return total.scatter_add(-2, self.index.unsqueeze(-1).expand(stacked.shape), stacked)
 
 

@@ -19,10 +19,13 @@ def named(state: ClothState) -> dict[str, Tensor]:
     return {"x": state.x, "v": state.v, "d3": state.d3, **state.memory}
 
 
-def state_inputs(low: Lowering, state: ClothState) -> dict[Field, Tensor]:
-    """The state's tensors, by field."""
+def state_inputs(low: Lowering, state: ClothState, lost: Tensor | None = None) -> dict[Field, Tensor]:
+    """The state's tensors, by field; ``lost``: see ``functional.stretch``."""
     values = named(state)
-    return {carried.now: values[name] for name, carried in low.carried.items()}
+    found = {carried.now: values[name] for name, carried in low.carried.items()}
+    if low.lost is not None and lost is not None:
+        found[low.lost.now] = lost
+    return found
 
 
 def drive_inputs(low: Lowering, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
@@ -48,13 +51,14 @@ def flat(low: Lowering, found: Mapping[Field, Tensor], batch: torch.Size, behind
 
 def outcome(
     low: Lowering, before: ClothState, results: Mapping[Field, Tensor], batch: torch.Size
-) -> tuple[ClothState, Impulses]:
-    """The state after the substeps, and the impulses, from [scenes, rows, components]."""
+) -> tuple[ClothState, Tensor | None, Impulses]:
+    """The state after the substeps, what is lost, and the impulses, from [scenes, rows, components]."""
     shaped = {f: t.reshape(*batch, *t.shape[1:]) for f, t in results.items()}
     after = {name: shaped[carried.after] for name, carried in low.carried.items()}
     impulses = {name: shaped[f].squeeze(-2) for name, f in low.impulses.items()}
+    lost = None if low.lost is None else shaped[low.lost.after].detach()  # which has no derivative
     x, v, d3 = after.pop("x"), after.pop("v"), after.pop("d3", before.d3)
-    return ClothState(x, v, d3, before.memory | after), impulses
+    return ClothState(x, v, d3, before.memory | after), lost, impulses
 
 
 def _states(low: Lowering) -> set[Field]:

@@ -50,10 +50,24 @@ class Fused:
         checkpoint: bool = True,
     ) -> tuple[ClothState, Impulses]:
         """As ``functional.rollout``. ``checkpoint``: the adjoint keeps to a budget of memory, and recomputes beyond."""
+        state, _, total = self.stretch(state, None, dt, drives, substeps, first, checkpoint)
+        return state, total
+
+    def stretch(
+        self,
+        state: ClothState,
+        lost: Tensor | None,
+        dt: float,
+        drives: Mapping[str, Drive],
+        substeps: int,
+        first: int = 0,
+        checkpoint: bool = True,
+    ) -> tuple[ClothState, Tensor | None, Impulses]:
+        """As ``functional.stretch``."""
         steps = torch.full((first + substeps,), dt, dtype=torch.float64)
         fixed, moves = self.coefficients(_batch(state)), self.moves(state, drives, steps)
         if self.torch_parts is None:
-            return self._call(state, fixed | _cut(moves, first, first + substeps), substeps, checkpoint)
+            return self._call(state, lost, fixed | _cut(moves, first, first + substeps), substeps, checkpoint)
         total: Impulses = {}
         again = checkpoint and recomputes()
         parts = self.torch_parts.as_they_are() if again else self.torch_parts
@@ -61,23 +75,28 @@ class Fused:
         for begin in range(first, last, CHUNK):
             chunk = range(begin, min(begin + CHUNK, last))
             run = partial(self._shared, parts, dt, fixed, moves, chunk)
-            state, impulses = recompute(run, state, use_reentrant=False) if again else run(state)
+            state, lost, impulses = recompute(run, state, lost, use_reentrant=False) if again else run(state, lost)
             total = added(total, impulses)
-        return state, total
+        return state, lost, total
 
     def frames(
-        self, state: ClothState, steps: Tensor, drives: Mapping[str, Drive], ends: tuple[int, ...]
-    ) -> list[tuple[ClothState, Impulses]]:
-        """States after so many substeps each, with the impulses since the one before; ``steps``: [substeps] s.
+        self,
+        state: ClothState,
+        lost: Tensor | None,
+        steps: Tensor,
+        drives: Mapping[str, Drive],
+        ends: tuple[int, ...],
+    ) -> list[tuple[ClothState, Tensor | None, Impulses]]:
+        """As ``stretch``, after so many substeps each, with the impulses since the one before.
 
-        Of what ``is_plain``.
+        Of what ``is_plain``; ``steps``: [substeps] s.
         """
-        results, _ = running.forward(self.job(state, steps, drives)._replace(ends=ends))
+        results, _ = running.forward(self.job(state, steps, drives, lost)._replace(ends=ends))
         found = []
         for row in zip(*(t.unbind(1) for t in results.values()), strict=True):
             found.append(conversion.outcome(self.low, state, dict(zip(results, row, strict=True)), _batch(state)))
-        last, impulses = found[-1]
-        return [*found[:-1], (last.map(torch.clone), impulses)]  # who keeps it keeps no other frames
+        last, lost, impulses = found[-1]  # who keeps it keeps no other frames
+        return [*found[:-1], (last.map(torch.clone), None if lost is None else lost.clone(), impulses)]
 
     def is_plain(self, state: ClothState, motion: Mapping[str, Trajectory]) -> bool:
         """The engine runs by itself on numbers from which nobody wants a derivative."""
@@ -85,11 +104,11 @@ class Fused:
         moves = [part for m in motion.values() for part in (m.t, m.pose)]
         return self.torch_parts is None and _are_numbers([*given, *moves])
 
-    def job(self, state: ClothState, steps: Tensor, drives: Mapping[str, Drive]) -> Job:
+    def job(self, state: ClothState, steps: Tensor, drives: Mapping[str, Drive], lost: Tensor | None = None) -> Job:
         """What the engine is given, as plain numbers; without parts in torch."""
         batch, program = _batch(state), self.low.program
-        found = conversion.flat(self.low, conversion.state_inputs(self.low, state), batch)
-        found |= self.coefficients(batch) | self.moves(state, drives, steps)
+        found = self.coefficients(batch) | self.moves(state, drives, steps)
+        found |= conversion.flat(self.low, conversion.state_inputs(self.low, state, lost), batch)
         return Job(program, {field: found[field] for field in program.inputs}, batch.numel(), len(steps))
 
     def coefficients(self, batch: torch.Size) -> dict[Field, Tensor]:
@@ -111,29 +130,31 @@ class Fused:
         moves: dict[Field, Tensor],
         substeps: range,
         state: ClothState,
-    ) -> tuple[ClothState, Impulses]:
+        lost: Tensor | None,
+    ) -> tuple[ClothState, Tensor | None, Impulses]:
         """Substeps in which torch has a part."""
         total: Impulses = {}
         for k in substeps:
             force, memory = parts.force(state, dt)
-            state, impulses = self._call(state, fixed | _cut(moves, k, k + 1), 1, False, force)
+            state, lost, impulses = self._call(state, lost, fixed | _cut(moves, k, k + 1), 1, False, force)
             state = state._replace(memory=state.memory | memory)
             total = added(total, impulses)
-        return state, total
+        return state, lost, total
 
     def _call(
         self,
         state: ClothState,
+        lost: Tensor | None,
         others: dict[Field, Tensor],
         substeps: int,
         checkpoint: bool,
         force: Tensor | None = None,
-    ) -> tuple[ClothState, Impulses]:
+    ) -> tuple[ClothState, Tensor | None, Impulses]:
         low, program, batch = self.low, self.low.program, _batch(state)
-        begin = conversion.state_inputs(low, state)
+        begin = conversion.state_inputs(low, state, lost)
         if low.torch_force is not None and force is not None:
             begin[low.torch_force] = force
-        by_field = conversion.flat(low, begin, batch) | others
+        by_field = others | conversion.flat(low, begin, batch)
         inputs = [by_field[field] for field in program.inputs]
         if _are_numbers(inputs):
             job = Job(program, dict(zip(program.inputs, inputs, strict=True)), batch.numel(), substeps)

@@ -10,11 +10,13 @@ from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..boundaries import Drive
 from ..effects._bent import BentSheet
 from ..model import Model
+from ..strain import MATERIAL
 from ..types import ClothState
 from .constants import array
 from .fields import Field
@@ -22,7 +24,6 @@ from .loops import Loop
 from .program import Program
 from .shared_loops import Sheet, Triangles, Velocities, scattered
 
-MATERIAL = "material"  # the part's name, and its key among the internal variables
 DIRECTORS = "d3"  # key of the state's directors among the internal variables, where there is contact
 
 
@@ -54,6 +55,7 @@ class Lowering:
         model: the parts.
         program: what is built.
         x, v: positions and velocities.
+        lost: in float32, what was too small to be added to the positions, see ``functional.stretch``; None in float64.
         memory: internal variables by key, as in ``ClothState.memory``.
         force: [V, 3], to be added to.
         pulls: kernels that give each vertex a force of its own, and the fields whose rows they take; see ``pull``.
@@ -76,6 +78,10 @@ class Lowering:
         self.inputs: dict[Field, Tensor] = {}
         self._known: dict[int, Field] = {}
         self.x, self.v = (State(*self.program.state(self.vertices, 3)) for _ in range(2))
+        self.lost: State | None = None
+        if state.x.dtype == torch.float32:
+            self.lost = State(*self.program.state(self.vertices, 3))
+            self.inputs[self.lost.now] = torch.zeros(self.vertices, 3, dtype=torch.float32)
         kept = {key: value for key, value in remembered(model, state).items() if key not in in_torch}
         self.memory = {key: State(*self.program.state(*value.shape[-2:])) for key, value in kept.items()}
         self.dt = self.program.drive(1)
@@ -166,7 +172,7 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive], in_torch
     if model.transfer != "mesh":
         raise Unfused(f"transfer {model.transfer!r}")
     for key in state.memory:
-        if key not in ("material", "contact") and key.removeprefix("effects.") not in model.effects:
+        if key not in (MATERIAL, "contact") and key.removeprefix("effects.") not in model.effects:
             raise Unfused(f"memory {key!r} that no part owns")
     low = Lowering(model, state, drives, in_torch)
     if MATERIAL not in in_torch:

@@ -195,7 +195,13 @@ class Velocities:
 
     def _follow(self, loop: Loop, now: list[int], rows: int | None = None) -> None:
         low = self._low
-        loop.put(loop.call("drift", loop.load(low.dt), loop.load(low.x.now, rows), now), low.x.after, rows)
+        numbers = loop.load(low.dt), loop.load(low.x.now, rows), now
+        if low.lost is None:
+            loop.put(loop.call("drift", *numbers), low.x.after, rows)
+            return
+        both = loop.call("drift_on", *numbers, loop.load(low.lost.now, rows))
+        loop.put(both[:3], low.x.after, rows)
+        loop.put(both[3:], low.lost.after, rows)
 
     def _put(self, regs: list[int]) -> Field:
         field = self._low.program.temporary(self._low.vertices, 3)

@@ -37,30 +37,35 @@ class FusedTangents:
     def rollout(
         self,
         state: ClothState,
+        lost: Tensor | None,
         moved: ClothState,
         dt: float,
         drives: Mapping[str, Drive],
         driven: Mapping[str, Drive],
         substeps: int,
-    ) -> tuple[ClothState, ClothState, Impulses, Impulses]:
-        """(state, its tangents [K, ...], impulses, their tangents) after the substeps; ``driven``: drives' tangents."""
+    ) -> tuple[ClothState, Tensor | None, ClothState, Impulses, Impulses]:
+        """(state, what is lost, tangents of the state [K, ...], impulses, their tangents) after the substeps.
+
+        ``driven``: drives' tangents; ``lost``: see ``functional.stretch``.
+        """
         low, batch = self.fused.low, state.x.shape[:-2]
         program = low.program
-        values = self.fused.job(state, torch.full((substeps,), dt, dtype=torch.float64), drives).inputs
+        given = self.fused.job(state, torch.full((substeps,), dt, dtype=torch.float64), drives, lost).inputs
         dots = conversion.state_inputs(low, moved) | self._inputs(state, drives)
         if driven:
             dots |= {f: t for f, t in conversion.drive_inputs(low, driven).items() if f.comps > 1}  # not the flags
         behind = conversion.flat(low, {f: t.movedim(0, -3) for f, t in dots.items()}, batch, behind=3)
         fields = [f for f in program.inputs if f in behind]
         places = [program.inputs.index(f) for f in fields]
-        inputs, tangents = [values[f] for f in program.inputs], [behind[f] for f in fields]
+        inputs, tangents = [given[f] for f in program.inputs], [behind[f] for f in fields]
         results = ops.rollout_tangent(program.number, substeps, inputs, tangents, places)
         half = len(program.outputs)
-        after, impulses = conversion.outcome(low, state, dict(zip(program.outputs, results[:half], strict=True)), batch)
+        values = dict(zip(program.outputs, results[:half], strict=True))
+        after, lost, impulses = conversion.outcome(low, state, values, batch)
         along = {f: t.movedim(1, 0) for f, t in zip(program.outputs, results[half:], strict=True)}
         shape = torch.Size((self.count, *batch))
-        moved, shift = conversion.outcome(low, moved, {f: t.flatten(0, 1) for f, t in along.items()}, shape)
-        return after, moved, impulses, shift
+        moved, _, shift = conversion.outcome(low, moved, {f: t.flatten(0, 1) for f, t in along.items()}, shape)
+        return after, lost, moved, impulses, shift
 
     def _inputs(self, state: ClothState, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
         """Tangents [K, ..., rows, comps] of the coefficients that have any."""

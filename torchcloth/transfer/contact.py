@@ -60,8 +60,9 @@ class Contact:
     Triangles are neighbours, and do not see each other, up to a way of about 10 spacings plus 3 edges along the cloth:
     ``print(cloth)`` says how far. A coarse cloth needs a finer mesh before its folds can touch.
 
-    Cost: points per triangle grow with (edge / spacing)^2, so a small gap wants small triangles; the stable step falls
-    with spacing sqrt(areal density / (k h)), so a small gap wants k h of 30 to 100 N/m, far below published presets.
+    Cost: points per triangle grow with (edge / spacing)^2, so a small gap wants small triangles, and even ones: all get
+    as many as the longest edges ask for. The stable step falls with spacing sqrt(areal density / (k h)), so a small gap
+    wants k h of 30 to 100 N/m, far below published presets.
 
     Args:
         spacing: grid spacing [m]; None: the mesh's mean edge. See ``with_gap``.
@@ -130,8 +131,8 @@ class Contact:
         Raises:
             InvalidInput: a spacing that is not positive, or points too sparse or many for it.
         """
-        edge = mesh.mean_edge
-        spacing = edge if self.spacing is None else float(self.spacing)
+        edge = mesh.coarse_edge
+        spacing = mesh.mean_edge if self.spacing is None else float(self.spacing)
         if not spacing > 0:
             raise InvalidInput("contact spacing", got=f"{spacing:g} m", expected="a length > 0")
         if not spacing * SPARSEST * MOST >= edge:
@@ -149,7 +150,7 @@ class Contact:
             raise InvalidInput(
                 "contact subdivisions",
                 got=s,
-                expected=f">= {needed} (mean edge {edge:.3g} m, spacing {spacing:.3g} m)",
+                expected=f">= {needed} (edges of some {edge:.3g} m, spacing {spacing:.3g} m)",
                 remedy="sparser points would let layers pass through each other",
             )
         return spacing, _centroids(s)

@@ -80,6 +80,16 @@ struct Pose {  // p -> R p + t
     Vec<T> t;
 };
 
+// Where a rigid motion takes x, less x. A small turn hardly shows beside the ones of its matrix, so it is taken from the
+// other entries: with w = sin(angle) axis, (R - 1) x = w x x + (w (w . x) - |w|^2 x) / (1 + cos(angle)).
+template <class T>
+constexpr Vec<T> displacement(Pose<T> m, Vec<T> x) {
+    const auto& R = m.R;
+    const Vec<T> w = 0.5 * Vec<T>{R.c.y - R.b.z, R.a.z - R.c.x, R.b.x - R.a.y};
+    const T squared = dot(w, w);
+    return cross(w, x) + (1.0 / (1.0 + sqrt(1.0 - squared))) * (dot(w, x) * w - squared * x) + m.t;
+}
+
 template <class T>
 struct Read {
     const T* at;

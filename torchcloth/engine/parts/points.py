@@ -26,7 +26,6 @@ class Points(NamedTuple):
 
     corners: list[int]  # three tables [P]
     weight: Field  # [P, 3]
-    mobile: Field  # [P, 3] weights times the corners' mobilities
     tables: PointTables
     air: Field | None  # [V, 6] that moves along, over the vertices' own mass
 
@@ -60,7 +59,9 @@ def _pass(low: Lowering, points: Points, body: Body, before: Field) -> Field:
     loop.put(loop.load(before), after)
     loop = low.program.among(near)
     load = [reg for corner in points.corners for reg in loop.load(claims, corner)]
-    shares = loop.call("shared", _change(low, loop, points, body, before), loop.load(points.mobile), load)
+    masses = [reg for corner in points.corners for reg in loop.load(low.mass, corner)]
+    light = loop.call("light", loop.load(points.weight), masses)
+    shares = loop.call("shared", _change(low, loop, points, body, before), light, load)
     for k, corner in enumerate(points.corners):
         loop.add(shares[3 * k : 3 * k + 3], after, corner)
     return after
@@ -92,13 +93,11 @@ def _points(low: Lowering, given: TrianglePoints) -> Points:
     owner = _owners(index, weight, faces, low.vertices)
     order = np.argsort(owner, kind="stable")
     index, weight = index[:, order], weight[:, order]
-    mobile = weight * given.mobility[:, 0].cpu().numpy()[index]
     starts = np.searchsorted(owner[order], np.arange(faces.shape[1] + 1))
     table, constant = low.program.table, low.program.constant
     return Points(
         [table(corner) for corner in index],
         constant(weight.T),
-        constant(mobile.T),
         PointTables(table(faces), table(starts), faces.shape[1]),
         _air(low),
     )

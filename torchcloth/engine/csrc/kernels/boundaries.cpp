@@ -18,8 +18,7 @@ struct Grasp {
         r.at += 4;
         const T dt = r.number(), closed = r.number();
         const auto x = r.vec(), v = r.vec();
-        const auto target = motion.R * x + motion.t;
-        Write<T>{out}.vec(select(closed, (target - x) / dt, v));
+        Write<T>{out}.vec(select(closed, displacement(motion, x) / dt, v));
     }
 };
 

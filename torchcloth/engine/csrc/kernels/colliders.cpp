@@ -33,9 +33,9 @@ struct Place {
         r.at += 4;
         const auto pose = r.pose();
         r.at += 4;
-        const auto carried = step.R * x + step.t;
+        const auto way = displacement(step, x);
         Write<T> w{out};
-        w.vec(transposed(pose.R, carried - pose.t)), w.vec((carried - x) / r.number());
+        w.vec(transposed(pose.R, x + way - pose.t)), w.vec(way / r.number());
     }
 };
 

@@ -48,11 +48,22 @@ struct Claim {
     }
 };
 
-// Wanted change, weights times the corners' mobilities, claims on the corners -> changes of the corners.
+// Weights, masses of the corners -> the first over the second.
+struct Light {
+    static constexpr const char* name = "light";
+    static constexpr int inputs = 6, outputs = 3;
+    static constexpr auto fixed = bits(0, 3);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        for (int k = 0; k < 3; k++) out[k] = in[k] / in[3 + k];
+    }
+};
+
+// Wanted change, weights over the corners' masses, claims on the corners -> changes of the corners.
 struct Shared {
     static constexpr const char* name = "shared";
     static constexpr int inputs = 9, outputs = 9;
-    static constexpr auto fixed = bits(3, 6);
+    static constexpr auto fixed = bits(6, 3);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
@@ -66,6 +77,6 @@ struct Shared {
 
 }  // namespace
 
-TC_KERNELS(point_kernels, AtPoint, Reach, Claim, Shared)
+TC_KERNELS(point_kernels, AtPoint, Reach, Claim, Light, Shared)
 
 }  // namespace tc

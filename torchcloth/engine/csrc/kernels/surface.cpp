@@ -108,6 +108,24 @@ struct Drift {
     }
 };
 
+// The same with what was lost of earlier steps, as it was too small to be added to the position -> position, what is lost
+// now (Kahan 1965). Derivatives are those of what is added up.
+struct DriftOn {
+    static constexpr const char* name = "drift_on";
+    static constexpr int inputs = 10, outputs = 6;
+    static constexpr auto fixed = bits(0, 1) | bits(7, 3);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const T dt = r.number();
+        const auto x = r.vec(), v = r.vec();
+        const auto way = dt * v + r.vec();
+        const auto after = x + way;
+        Write<T> w{out};
+        w.vec(after), w.vec(way - (after - x));
+    }
+};
+
 // Numbers go from one place to another, or are added there.
 template <int N>
 struct Copied {
@@ -120,6 +138,6 @@ struct CopyStress : Copied<15> { static constexpr const char* name = "copy15"; }
 
 }  // namespace
 
-TC_KERNELS(surface_kernels, Surface, Assemble, Kick, KickInAir, Stage, StageInAir, Loaded, Scaled, Plus, Drift, Copy, CopyStress)
+TC_KERNELS(surface_kernels, Surface, Assemble, Kick, KickInAir, Stage, StageInAir, Loaded, Scaled, Plus, Drift, DriftOn, Copy, CopyStress)
 
 }  // namespace tc

@@ -1,0 +1,92 @@
+"""In float32 a substep of slow motion is a few units in the last place: what is rounded away must not add up."""
+
+import math
+
+import pytest
+import torch
+
+import torchcloth as tc
+from torchcloth.effects import AbstractEffect
+
+SPEED = 1e-3  # m/s: some two units a substep at half a metre from the origin
+
+
+class Nothing(AbstractEffect):
+    """A user's effect, so that torch has a part in every substep."""
+
+    acts_on = "vertices"
+
+    def coefficients(self):
+        return None
+
+    def force(self, c, now):
+        return torch.zeros_like(now.x)
+
+
+@pytest.fixture(autouse=True)
+def single():
+    torch.set_default_dtype(torch.float32)
+    yield
+    torch.set_default_dtype(torch.float64)
+
+
+def strip(engine: str, effects=None, **boundaries) -> tc.Cloth:
+    mesh = tc.meshes.rectangle(0.06, 0.02, resolution=(4, 2))
+    material = tc.materials.AEP(youngs_modulus=3e5)
+    return tc.Cloth(mesh, material, 0.2, effects or {}, boundaries, contact=None, engine=engine)
+
+
+def way(seconds: float, poses) -> tc.Trajectory:
+    t = torch.linspace(0, seconds, 11)
+    return tc.Trajectory(t, torch.stack([poses(float(s)) for s in t]), torch.ones(11, dtype=torch.bool))
+
+
+def shifted(x: float) -> torch.Tensor:
+    pose = torch.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("engine", "effects"), [("fused", None), ("fused", {"own": Nothing()}), ("reference", None)], ids=str
+)
+def test_slow_grippers_take_the_cloth_along(engine, effects):
+    seconds = 0.06
+    cloth = strip(engine, effects, hand=tc.boundaries.Grasp(vertices=[0, 4]))
+    x = cloth.rest_state().x + torch.tensor([0.61, 0.3, 0.0])
+    out = cloth(cloth.state(x), {"hand": way(seconds, lambda s: shifted(SPEED * s))}, times=[0.0, 0.03, seconds])
+    moved = (out.x[-1].detach().double() - out.x[0].detach().double())[[0, 4]]
+    assert cloth.engine_in_use.startswith(engine)
+    torch.testing.assert_close(moved[:, 0], torch.full((2,), SPEED * seconds).double(), rtol=2e-3, atol=0)
+    assert float(moved[:, 1:].abs().max()) < 1e-9
+
+
+@pytest.mark.parametrize("engine", ["fused", "reference"])
+def test_a_slow_belt_takes_the_cloth_along(engine):
+    seconds = 0.06
+    effects = {"gravity": tc.effects.Gravity()}
+    cloth = strip(engine, effects, belt=tc.boundaries.Plane(friction=2.0, moving=True))
+    state = cloth.state(cloth.rest_state().x + torch.tensor([0.61, 0.3, 0.0]))
+    state = state._replace(v=torch.tensor([SPEED, 0.0, 0.0]).expand_as(state.x).clone())
+    out = cloth(state, {"belt": way(seconds, lambda s: shifted(SPEED * s))}, times=[0.0, 0.03, seconds])
+    moved = (out.x[-1].detach().double() - out.x[0].detach().double())[:, 0]
+    torch.testing.assert_close(moved, torch.full_like(moved, SPEED * seconds), rtol=5e-3, atol=0)
+
+
+@pytest.mark.parametrize("engine", ["fused", "reference"])
+def test_turning_grippers_keep_their_distance(engine):
+    """About an axis 0.6 m away, so slowly that the matrix of a substep has ones on its diagonal."""
+    seconds, rate = 0.1, 0.5
+    cloth = strip(engine, hand=tc.boundaries.Grasp(vertices=list(range(8))))
+
+    def turned(s: float) -> torch.Tensor:
+        pose, angle = torch.eye(4), rate * s
+        pose[0, 0] = pose[1, 1] = math.cos(angle)
+        pose[1, 0], pose[0, 1] = math.sin(angle), -math.sin(angle)
+        return pose
+
+    x = cloth.rest_state().x + torch.tensor([0.6, 0.0, 0.0])
+    with torch.no_grad():
+        end = cloth(cloth.state(x), {"hand": way(seconds, turned)}, times=[0.0, seconds]).x[-1].double()
+    expected = x.double() @ turned(seconds)[:3, :3].double().mT
+    assert float((end - expected).abs().max()) < 5e-7
