@@ -16,7 +16,7 @@ from torchcloth.recordings import JointMotion
 from torchcloth.types import Trajectory
 
 from .arm import Arm
-from .clearance import FAR, Gap
+from .clearance import Gap
 from .crowd import between_arms, within_arm
 from .holds import Hold, candidates, inward
 from .inverse import reach
@@ -126,7 +126,11 @@ def _options(
     if name not in action.motion:
         times = next(iter(action.motion.values())).t[[0, -1]]
         still = Spline.through(times, arm.home.expand(2, -1).to(times))
-        return [(Way(Hold(), still, load(arm, still, limit)), Gap(FAR, "", "", 0.0))]
+        gap, refusal = within_arm(scene, name, arm.home.expand(2, -1), times, clearance)
+        if refusal is not None:
+            what, remedy = f"the idle arm: {refusal.what}", "lower the table, or leave that arm out of the scene"
+            raise InvalidInput(what, got=refusal.got, expected=refusal.expected, remedy=remedy)
+        return [(Way(Hold(), still, load(arm, still, limit)), gap)]
 
     def check(q: Tensor, times: Tensor) -> InvalidInput | None:
         return within_arm(scene, name, q, times, clearance)[1]

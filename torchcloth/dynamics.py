@@ -39,6 +39,8 @@ def vertex_forces(
         if force is None:
             continue
         later = effect.viscous(c, now) if model.stages else None
+        if later is not None and effect.acts_on == "triangles":
+            raise InvalidInput(f"effect {name!r}", got="viscous forces of triangles", expected='acts_on = "vertices"')
         force = force if later is None else force - later
         if effect.acts_on == "triangles":
             part = force / 3

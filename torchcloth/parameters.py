@@ -21,6 +21,12 @@ class _Interval(NamedTuple):
     includes_lower: bool
     text: str
 
+    @classmethod
+    def between(cls, lower: float, upper: float) -> _Interval:
+        """Open at both ends."""
+        limits = [f"above {lower:g}"] * math.isfinite(lower) + [f"below {upper:g}"] * math.isfinite(upper)
+        return cls(lower, upper, False, "a value " + " and ".join(limits))
+
     def contains(self, value: Tensor) -> bool:
         above = value >= self.lower if self.includes_lower else value > self.lower
         return bool((torch.isfinite(value) & above & (value < self.upper)).all())
@@ -47,19 +53,28 @@ class PhysicalParameter(nn.Module):
         domain: "positive", "unit_half" (Poisson's ratio), "nonnegative" or "real".
         name: how messages call it.
         axes: trailing axes of its own, behind those of a batch.
+        within: open interval of a "real" parameter; a step of an optimiser that leaves it is told by the cloth.
 
     Raises:
         InvalidInput: no number or tensor, outside the domain or not finite.
     """
 
     def __init__(
-        self, value: float | Tensor, unit: str, domain: Domain = "positive", *, name: str = "parameter", axes: int = 1
+        self,
+        value: float | Tensor,
+        unit: str,
+        domain: Domain = "positive",
+        *,
+        name: str = "parameter",
+        axes: int = 1,
+        within: tuple[float, float] | None = None,
     ) -> None:
         super().__init__()
         if domain not in _DOMAINS:
             raise InvalidInput("domain", got=repr(domain), expected=f"one of {sorted(_DOMAINS)}")
         self.unit, self.label, self.axes = unit, name, axes
         self.domain: Domain = domain
+        self._interval = _DOMAINS[domain] if within is None else _Interval.between(*within)
         self.raw = nn.Parameter(self._to_raw(value))
 
     @property
@@ -83,6 +98,19 @@ class PhysicalParameter(nn.Module):
                 )
             self.raw.copy_(new)
 
+    def check(self, name: str, remedy: str) -> None:
+        """Refuse what a step of an optimiser may have brought where values are stored as they are.
+
+        Raises:
+            InvalidInput: a value outside the domain.
+        """
+        if self.domain in ("nonnegative", "real") and not self._interval.contains(self.raw.detach()):
+            raise self._outside(name, self.raw.detach(), remedy)
+
+    def _outside(self, name: str, tensor: Tensor, remedy: str = "") -> InvalidInput:
+        shown = f"{tensor.item():g}" if tensor.numel() == 1 else f"a field in [{tensor.min():g}, {tensor.max():g}]"
+        return InvalidInput(name, got=f"{shown} {self.unit}", expected=self._interval.text, remedy=remedy)
+
     @torch.no_grad()
     def clip_(self) -> None:
         """Take an amplitude that a step has made negative back to zero."""
@@ -99,10 +127,8 @@ class PhysicalParameter(nn.Module):
             raise InvalidInput(self.label, got=got, expected="real numbers, one at least")
         if not tensor.is_floating_point():
             tensor = tensor.to(torch.get_default_dtype())
-        interval = _DOMAINS[self.domain]
-        if not interval.contains(tensor):
-            shown = f"{tensor.item():g}" if tensor.numel() == 1 else f"a field in [{tensor.min():g}, {tensor.max():g}]"
-            raise InvalidInput(self.label, got=f"{shown} {self.unit}", expected=interval.text)
+        if not self._interval.contains(tensor):
+            raise self._outside(self.label, tensor)
         if self.domain == "positive":
             tensor = tensor.log()
         elif self.domain == "unit_half":

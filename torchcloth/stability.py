@@ -109,7 +109,8 @@ def squared_frequency(gradient: Tensor, density: Tensor, stiffness: Stiffness, s
 
     The highest frequency of the mesh is bounded by that of its stiffest free element with lumped mass
     (Irons and Treharne 1971). The director adds its own: a contact point alone in its grid cell sees
-    sum_i |dw_i|^2 / w_i <= 4 / spacing^2, and its shear reacts on the triangle's out-of-plane motion.
+    sum_i |dw_i|^2 / w_i, 4 / spacing^2 at a node and 6 between two, of which 4 are counted (contact was met with at
+    most a quarter of them); its shear reacts on the triangle's out-of-plane motion.
 
     Args:
         gradient: [E, 3, 2] 1/m, gradients of the shape functions.

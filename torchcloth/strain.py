@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ._math import cross
+from .errors import InvalidInput
 from .model import Model
 from .types import ClothState, Memory, Moment, Surface
 
@@ -48,12 +49,22 @@ def membrane_stress(model: Model, s: Surface, memory: Memory) -> tuple[Tensor, T
 
 
 def inverse_growth(growths: Iterable[Tensor | None]) -> Tensor | None:
-    """A = (G1 G2 ...)^-1 [..., E or 1, 4] by rows, of growths [..., E or 1, 2, 2]; None without any."""
+    """A = (G1 G2 ...)^-1 [..., E or 1, 4] by rows, of growths [..., E or 1, 2, 2]; None without any.
+
+    Raises:
+        InvalidInput: no area is left.
+    """
     total = None
     for growth in growths:
         if growth is not None:
             total = growth if total is None else total @ growth
-    return None if total is None else torch.linalg.inv(total).flatten(-2)
+    if total is None:
+        return None
+    try:
+        return torch.linalg.inv(total).flatten(-2)
+    except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage]
+        got, expected = "a rest shape without area", "shrinkage below 1 and a skew within a right angle"
+        raise InvalidInput("rest shape", got=got, expected=expected) from error
 
 
 def grown_gradient(gradient: Tensor, rest: Tensor) -> Tensor:

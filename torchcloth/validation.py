@@ -133,13 +133,9 @@ def check_parameters(cloth: nn.Module) -> None:
         if bool(parameter.isnan().any()):
             raise InvalidInput(name, got="NaN", expected="a number", remedy="look at the optimiser's last step")
     for name, part in cloth.named_modules():
-        if isinstance(part, PhysicalParameter) and part.domain == "nonnegative" and bool((part.raw < 0).any()):
-            raise InvalidInput(
-                name,
-                got=f"{float(part.raw.detach().min()):.4g} {part.unit}",
-                expected="a value >= 0",
-                remedy="call the cloth's clip_() after every step of an optimiser",
-            )
+        if isinstance(part, PhysicalParameter):
+            clips = part.domain == "nonnegative"
+            part.check(name, "call the cloth's clip_() after every step of an optimiser" if clips else "")
 
 
 def check_step(dt: float | None, limit: float) -> float:
@@ -279,5 +275,6 @@ def check_extent(x: Tensor, limit: float) -> None:
             "the cloth's extent",
             got=f"{extent:.3g} m",
             expected=f"below {limit:.3g} m",
-            remedy="the sheet is stretched far beyond its rest shape: check initial positions and motion",
+            remedy="the sheet is stretched far beyond its rest shape, or pieces that are not joined have parted: check "
+            "initial positions and motion; simulate such pieces apart",
         )

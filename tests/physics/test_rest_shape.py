@@ -135,3 +135,20 @@ def test_stable_step_knows_the_true_shape(shape):
 def test_refusals(options):
     with pytest.raises(tc.errors.InvalidInput):
         tc.effects.RestShape(**options)
+
+
+@pytest.mark.parametrize(("name", "value"), [("shrink_warp", 1.2), ("shrink_weft", 1.0), ("skew", 1.6)])
+def test_what_a_step_brought_beyond_its_domain_is_refused(name, value):
+    """Of both shrinks at 1.5 a sheet of half the size, turned by 180 degrees, was simulated."""
+    shape, mesh = tc.effects.RestShape(), tc.meshes.rectangle(0.1, 0.1, triangles=8)
+    cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, {"rest": shape}, contact=None)
+    state = cloth.rest_state()
+    with pytest.raises(tc.errors.InvalidInput, match="below"):
+        getattr(shape, name).set(value)
+    with torch.no_grad():
+        getattr(shape, name).raw.fill_(value)
+    with pytest.raises(tc.errors.InvalidInput, match=rf"rest\.{name}; got .*below|without area"):
+        cloth(state, times=[0.0, 0.01])
+    if value == 1.0:
+        with pytest.raises(tc.errors.InvalidInput, match="without area"):
+            cloth.rest_state()

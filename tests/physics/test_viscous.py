@@ -137,3 +137,19 @@ def test_stable_step_is_obeyed(eta):
 def test_negative_viscosity_is_refused():
     with pytest.raises(tc.errors.InvalidInput):
         tc.effects.KelvinVoigt(-1.0)
+
+
+def test_viscous_forces_of_triangles_are_refused():
+    class Sticky(tc.effects.KelvinVoigt):
+        acts_on = "triangles"
+
+        def force(self, c, now):
+            return -c * now.surface.v
+
+        def viscous(self, c, now):
+            return self.force(c, now)
+
+    mesh = tc.meshes.rectangle(0.1, 0.1, triangles=32)
+    cloth = tc.Cloth(mesh, tc.materials.AEP(1e4), 0.15, {"own": Sticky(50.0)}, contact=None)
+    with pytest.raises(tc.errors.InvalidInput, match=r"effect 'own'; got viscous forces of triangles"):
+        cloth(cloth.rest_state(), times=[0.0, 0.01])

@@ -295,3 +295,10 @@ def test_paths_that_do_not_end_together_are_refused():
     motion = {"left": Trajectory(t, still, closed), "right": Trajectory(1.5 * t, still, closed)}
     with pytest.raises(InvalidInput, match="one end"):
         plan(robots.bimanual_rig(), P.Action(motion, 1.5, 1.0))
+
+
+def test_an_idle_arm_in_the_table_is_refused():
+    arms = robots.bimanual_rig()
+    scene = robots.Scene({name: arms[name] for name in ("left", "right")}, robots.Table(height=0.25))
+    with pytest.raises(InvalidInput, match=r"the idle arm: .* of right comes too near to the table.*leave that"):
+        plan(scene, P.hang({"left": (0.55, 0.3, 0.40)}, height=0.5, rest=0.2))

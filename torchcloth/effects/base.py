@@ -79,7 +79,8 @@ class AbstractEffect(nn.Module, ABC):
     def viscous(self, c: Any, now: Moment) -> Tensor | None:
         """[..., V, 3] N: the part of ``force`` that is linear in velocity, if it may be stiff; then it costs no steps.
 
-        At fixed positions it is -C v with C symmetric and not negative. ``viscous_rate`` must be there as well.
+        At fixed positions it is -C v with C symmetric and not negative. ``viscous_rate`` must be there as well, and
+        ``force`` one of the vertices.
         """
         return None
 

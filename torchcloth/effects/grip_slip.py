@@ -25,8 +25,8 @@ class GripSlip(AbstractEffect):
     A Bingham law for the patch as one body, implicit in u, so that any mobility is stable: with the impulse J that
     holding the patch of mass M needs in one step, u = b (|J| / dt - hold) / (1 + b M / dt) against J. Mobility 0 is a
     perfect grip; without bound, the grip becomes dry friction of force ``hold``. The patch stays the same vertices and
-    slides without turning; while ``Cloth.settle`` runs it holds. Air that moves along (``AddedMass``) does not
-    count in the patch's mass.
+    slides without turning; while ``Cloth.settle`` runs it holds. Air that moves along (``AddedMass``) counts in
+    the patch's mass, as far as the pull moves it.
 
     Args:
         grasp: name of the cloth's ``Grasp`` boundary.

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from .base import AbstractEffect, Amplitude
 
@@ -47,14 +47,10 @@ class RestShape(AbstractEffect):
         self, shrink_warp: float | Tensor = 0.0, shrink_weft: float | Tensor = 0.0, skew: float | Tensor = 0.0
     ) -> None:
         super().__init__()
-        for name, value in (("shrink_warp", shrink_warp), ("shrink_weft", shrink_weft)):
-            if not bool((torch.as_tensor(value) < 1).all()):
-                raise InvalidInput(name, got=value, expected="a share below 1 of the length")
-        if not bool((torch.as_tensor(skew).abs() < torch.pi / 2).all()):
-            raise InvalidInput("skew", got=f"{skew} rad", expected="an angle within a right angle")
-        self.shrink_warp = PhysicalParameter(shrink_warp, "-", "real", name="shrinkage along the warp")
-        self.shrink_weft = PhysicalParameter(shrink_weft, "-", "real", name="shrinkage along the weft")
-        self.skew = PhysicalParameter(skew, "rad", "real", name="skew")
+        shorter, turned = (-math.inf, 1.0), (-math.pi / 2, math.pi / 2)
+        self.shrink_warp = PhysicalParameter(shrink_warp, "-", "real", name="shrinkage along the warp", within=shorter)
+        self.shrink_weft = PhysicalParameter(shrink_weft, "-", "real", name="shrinkage along the weft", within=shorter)
+        self.skew = PhysicalParameter(skew, "rad", "real", name="skew", within=turned)
 
     @property
     def has_axes(self) -> bool:

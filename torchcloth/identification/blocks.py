@@ -5,7 +5,7 @@ Rows keep their order and meaning between points of a search.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -118,3 +118,18 @@ def blocks_for(uses: Sequence[str] | None) -> tuple[Block, ...]:
             raise InvalidInput("use", got=repr(use), expected=f"some of {', '.join(USES)}")
     wanted = [name for use in uses or USES for name in USES[use]]
     return tuple(block for block in BLOCKS if block.name in wanted)
+
+
+def floors_of(noise: Mapping[str, float] | None) -> dict[str, float]:
+    """Least standard deviations as a user gives them, by kind.
+
+    Raises:
+        InvalidInput: a kind that is none of ``BLOCKS``, or no positive number.
+    """
+    names = [block.name for block in BLOCKS]
+    for name, std in (noise or {}).items():
+        if name not in names:
+            raise InvalidInput("noise", got=repr(name), expected=f"some of {', '.join(names)}")
+        if not 0 < std < float("inf"):
+            raise InvalidInput(f"noise of {name}", got=std, expected="a finite standard deviation > 0")
+    return dict(noise or {})

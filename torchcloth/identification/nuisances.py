@@ -97,7 +97,8 @@ class Camera(AbstractNuisance):
         eye = torch.eye(3).to(skew)
         rotation = torch.linalg.solve(eye - skew, eye + skew)
         centre = episode.initial.mean(0)
-        return frames._replace(x=(frames.x - centre) @ rotation.mT + centre + values[:3])
+        x = (frames.x - centre) @ rotation.mT + centre + values[:3]
+        return frames._replace(x=x, v=frames.v @ rotation.mT)
 
 
 class Tare(AbstractNuisance):

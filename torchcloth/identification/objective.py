@@ -13,7 +13,7 @@ from ..cloth import Cloth
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from . import gauss_newton
-from .blocks import BLOCKS, USES, Block
+from .blocks import BLOCKS, USES, Block, floors_of
 from .episodes import Episode
 from .identifiability import Reach
 from .journal import Journal, digest, facts_of
@@ -44,7 +44,7 @@ class Objective:
         floors: Mapping[str, float] | None = None,
     ) -> None:
         self.cloth, self.unknowns, self.episodes, self.dt = cloth, list(unknowns), list(episodes), dt
-        self.nuisances, self.blocks, self.floors = list(nuisances), list(blocks), dict(floors or {})
+        self.nuisances, self.blocks, self.floors = list(nuisances), list(blocks), floors_of(floors)
         self.sheet = sheet_for(cloth, self.episodes)
         self.faces = self.sheet.faces
         self.placed = place(self.nuisances, cloth, self.episodes, len(self.unknowns))
@@ -92,11 +92,12 @@ class Objective:
             prior_mean=self.middle,
             prior_std=self.prior_std,
             longest=torch.tensor(longest, dtype=torch.float64),
-            noise=torch.tensor([self._floor(block) for block in self.blocks], dtype=torch.float64),
+            noise=torch.tensor([self.floor(block) for block in self.blocks], dtype=torch.float64),
             gate=torch.tensor([block.gate for block in self.blocks], dtype=torch.float64),
         )
 
-    def _floor(self, block: Block) -> float:
+    def floor(self, block: Block) -> float:
+        """Least standard deviation of a residual of this kind."""
         noises = [e.noise for e in self.episodes if e.noise is not None]
         stated = max(noises) if noises and block.name == "points" else block.floor
         return self.floors.get(block.name, stated)

@@ -57,6 +57,7 @@ def residuals(points: Tensor, vertices: Tensor, hits: Hits) -> tuple[Tensor, Ten
         (along the normal [N], for every point; in the surface's plane [N], for points beyond the sheet's edge and 0
         elsewhere: points beyond pull the edge outwards, missing points do not pull it back, occlusion explains them)
     """
+    points, vertices = taken(points), taken(vertices)
     x0, x1, x2 = vertices.index_select(-2, hits.corners.reshape(-1)).unflatten(-2, (-1, 3)).unbind(-2)
     normal = cross(x1 - x0, x2 - x0)
     normal = normal / dot(normal, normal).sqrt()
@@ -76,14 +77,14 @@ def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tenso
     Raises:
         InvalidInput: as `closest`, or no points, which have no mean.
     """
-    points = taken(points)
+    points, vertices = taken(points), taken(vertices)
     check_places(points, "points", least=1)
     return distances(points, vertices, closest(points, vertices, faces)).mean()
 
 
 def distances(points: Tensor, vertices: Tensor, hits: Hits) -> Tensor:
     """[N] m, of points from the places that they hit; differentiable in ``vertices``."""
-    return safe_norm(points - hits.on(vertices)).squeeze(-1)
+    return safe_norm(taken(points) - hits.on(taken(vertices))).squeeze(-1)
 
 
 def _on_boundary(faces: Tensor, face: Tensor, weights: Tensor) -> Tensor:
@@ -102,6 +103,7 @@ _KNOWN: Remembered[tuple[Tensor, Tensor]] = Remembered()
 
 
 def _find_boundary(faces: Tensor) -> tuple[Tensor, Tensor]:
+    faces = faces.long()  # numbers of edges are beyond 32 bits
     edges = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], dim=1).sort(-1).values
     number = edges[..., 0] * (faces.max() + 1) + edges[..., 1]  # one for each edge: sorts far faster than rows
     _, inverse, count = number.flatten().unique(return_inverse=True, return_counts=True)

@@ -51,17 +51,23 @@ def colors_at(points: Array, color: Array, camera: DepthCamera, depth: Array | N
         color: [H, W, 3] uint8.
         camera: that took it.
         depth: [H, W] m as registered to the colour camera (`reproject`); a point more than 2 cm behind it is hidden.
-            None: nothing hides.
+            Where it has no reading, 0 or NaN, nothing hides; None: nowhere.
+
+    Raises:
+        InvalidInput: images that have not the camera's size.
     """
     if np.shape(color) != (camera.height, camera.width, 3):
         raise InvalidInput("color", got=f"shape {np.shape(color)}", expected=f"{(camera.height, camera.width, 3)}")
+    if depth is not None and np.shape(depth) != (camera.height, camera.width):
+        expected = f"{(camera.height, camera.width)}, registered to the colour camera (reproject)"
+        raise InvalidInput("depth", got=f"shape {np.shape(depth)}", expected=expected)
     pixels, z = camera.project(points)
     with np.errstate(invalid="ignore"):
         inside = (z > 0) & ((pixels > -0.5) & (pixels < [camera.width - 0.5, camera.height - 0.5])).all(-1)
     columns, rows = np.rint(np.where(inside[:, None], pixels, 0)).astype(int).T
     if depth is not None:
         front = np.asarray(depth)[rows, columns]
-        inside &= (front == 0) | (z < front + 0.02)
+        inside &= ~has_reading(front) | (z < front + 0.02)
     return np.where(inside[:, None], np.asarray(color)[rows, columns], 0).astype(np.uint8), inside
 
 

@@ -68,15 +68,19 @@ class Segmentation:
 
     def __post_init__(self) -> None:
         for name in ("edge", "robot", "flat", "radius", "gap", "reach", "spacing", "normals"):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value < np.inf:
-                raise InvalidInput(name, got=value, expected="None or a finite number that is not negative")
+            value, free = getattr(self, name), name not in ("flat", "reach")  # of a stage that is left out by itself
+            if value is None and free:
+                continue
+            if value is None or not 0 <= value < np.inf:
+                raise InvalidInput(name, got=value, expected="None or " * free + "a finite number that is not negative")
         if not 0 < self.deviations < np.inf:  # of 0, half of every cloud would be outliers
             raise InvalidInput("deviations", got=self.deviations, expected="a finite number > 0")
         for name in ("neighbours", "company", "crowd"):
-            value = getattr(self, name)
-            if value is not None and not (value >= 1 and value == int(value)):
-                raise InvalidInput(name, got=value, expected="None or a whole number >= 1")
+            value, free = getattr(self, name), name == "neighbours"
+            if value is None and free:
+                continue
+            if value is None or not (value >= 1 and value == int(value)):
+                raise InvalidInput(name, got=value, expected="None or " * free + "a whole number >= 1")
         if not np.isfinite(self.above):
             raise InvalidInput("above", got=self.above, expected="a finite height in m")
         for name, shape in (("low", (3,)), ("high", (3,)), ("hsv", (2, 3))):

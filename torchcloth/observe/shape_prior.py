@@ -84,6 +84,8 @@ def _hinges(mesh: Mesh, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
             corners.append((a, b, c, d))
             weights.append(((s - 1) / g + (t - 1) / h, -s / g - t / h, 1 / h, 1 / g))
             angle.append(CURVATURE * (h + g) / 3)
+    if not corners:
+        return np.zeros((0, 4), int), np.zeros((0, 4)), np.zeros(0)
     found = np.array(corners), np.array(weights), np.array(angle)
     size = np.linalg.norm((found[1][..., None] * x[found[0]]).sum(1), axis=-1)
     kept = size < 2 * np.sin(SHARPEST / 2)

@@ -57,7 +57,8 @@ def solid_mesh(kind: str, size: tuple[float, ...], pose: Array, segments: int = 
         kind: "box", "cylinder" or "sphere".
         size: m; box: edges x, y, z; cylinder: radius, length along z; sphere: radius.
         pose: [4, 4] of the centre in the world, m, of one moment.
-        segments: corners of a circle; the mesh lies inside the true solid by up to radius * (1 - cos(pi / segments)).
+        segments: corners of a circle; the mesh lies inside the true solid by up to radius * (1 - cos(pi / segments)),
+            of a sphere twice that.
 
     Raises:
         InvalidInput: an unknown kind, sizes that do not fit it, or poses of many moments.
@@ -82,7 +83,7 @@ def _outline(kind: str, size: tuple[float, ...], segments: int) -> tuple[Array, 
     """Radius and height [N] of the curve that turns about z; it starts and ends on the axis."""
     if kind == "cylinder":
         return np.array([0, size[0], size[0], 0]), size[1] * np.array([-0.5, -0.5, 0.5, 0.5])
-    angle = np.linspace(0, np.pi, segments // 2 + 1)
+    angle = np.linspace(0, np.pi, max(2, (segments + 1) // 2) + 1)
     return size[0] * np.sin(angle), -size[0] * np.cos(angle)
 
 

@@ -11,10 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._math import last_knot
 from .._surroundings import own_gradients
 from ..boundaries import Grasp
 from ..cloth import Cloth
-from ..errors import InvalidInput
+from ..errors import InvalidInput, RecordingError
 from ..identification.blocks import blocks_for
 from ..identification.episodes import Episode, episode
 from ..identification.misfit import LEAST_SCALE, figures
@@ -98,13 +99,18 @@ def estimate_pose(
     windows[-1] = (windows[-1][0], len(data.times) - 1)  # what a late clock sees is pushed as the last frame is
     correction = Correction(windows, coarse, torch.full((modes,), FIRST_GUESS))
     objective = Corrected(pushable(cloth), unknowns, data, correction, dt, own, blocks, noise)
+    if not objective.told:
+        kinds = "any" if use is None else ", ".join(use)
+        got = f"no data of {kinds} kind in any frame"
+        raise RecordingError(f"{data.name}: nothing to estimate from", got=got, expected="points, markers or forces")
     gravity = float(torch.as_tensor(recording.gravity).norm()) or 9.81
+    always = _held(cloth, data).all(0)
 
-    def told(stage: str, raw: Tensor) -> None:
+    def tell(stage: str, raw: Tensor) -> None:
         if on_progress is not None:
-            on_progress(stage, float(_shares(objective, raw, gravity).square().mean().sqrt()))
+            on_progress(stage, float(_shares(objective, raw, always, gravity).square().mean().sqrt()))
 
-    found = smooth(objective, told)
+    found = smooth(objective, tell)
     return _concluded(objective, found, fields, gravity, began)
 
 
@@ -116,9 +122,10 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         frames, moved = objective.tangents(raw)
         x, v, along = frames.x[: data.observed], frames.v[: data.observed], moved.x[:, : data.observed]
         alone, null = objective.frames(objective.start)[0][: data.observed], rigid_carry(data)
-        std = _errors(objective, used, found, x, along, fields)
+        held = _held(cloth, data)
+        std = _errors(objective, used, found, x, along, fields, held)
         last = objective.last_state(raw)
-    seen, shares = seen_vertices(x, used, cloth.mesh), _shares(objective, raw, gravity)
+    seen, shares = seen_vertices(x, used, cloth.mesh), _shares(objective, raw, held.all(0), gravity)
     fit = _distances(data, objective.faces, {"after": x, "alone": alone, "null": null})
     fit |= {
         "force_share": float(shares.square().mean().sqrt()),
@@ -147,14 +154,15 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         parameters={u.name: fabric[u.name] for u in objective.unknowns},
         nuisances=next(iter(nuisance_estimates([data], objective.placed, raw, found.covariance).values())),
         fit=fit,
-        warnings=warnings_of(fit, shares, seen, used, ends),
+        warnings=warnings_of(fit, shares, seen, used, ends, _stated(objective, used)),
     )
 
 
 def _used(data: Episode, blocks: Sequence[str]) -> Episode:
     """What the estimate has seen: the rest of the episode tells of its distances only."""
     clouds = data.clouds if "points" in blocks else [cloud[:0] for cloud in data.clouds]
-    return replace(data, clouds=clouds, markers=data.markers if "markers" in blocks else None)
+    markers = data.markers if "markers" in blocks else None
+    return replace(data, clouds=clouds, markers=markers, wrenches=data.wrenches if "force" in blocks else {})
 
 
 def _distances(data: Episode, faces: Tensor, frames: Mapping[str, Tensor]) -> dict[str, Any]:
@@ -168,25 +176,37 @@ def _point_noise(objective: Corrected, used: Episode, found: Smoothed) -> float:
     return float(found.final.scale[names.index("points")]) if any(map(len, used.clouds)) else math.nan
 
 
-def _errors(objective: Corrected, used: Episode, found: Smoothed, x: Tensor, moved: Tensor, fields: Modes) -> Tensor:
+def _stated(objective: Corrected, used: Episode) -> float | None:
+    """m, standard deviation of a point as it was given; None: nobody did."""
+    return objective.floors.get("points", used.noise)
+
+
+def _errors(
+    objective: Corrected, used: Episode, found: Smoothed, x: Tensor, moved: Tensor, fields: Modes, held: Tensor
+) -> Tensor:
     """[T, V, 3] m, of what was estimated, and of what is finer than it."""
     root = found.root.to(moved)
     variance = torch.stack([(root.mT @ frame.flatten(1)).square().sum(0) for frame in moved.unbind(1)])
-    held = _held(objective.cloth)
-    least, usual = used.noise or LEAST_SCALE, used.noise or _point_noise(objective, used, found)
+    stated = _stated(objective, used)
+    least, usual = stated or LEAST_SCALE, stated or _point_noise(objective, used, found)
     coarse = len(objective.correction.modes)
     finer = unexplained(x, used, objective.faces, fields, coarse, held, least, usual)
     return (variance.reshape(x.shape) + finer.square().unsqueeze(-1)).sqrt()
 
 
-def _held(cloth: Cloth) -> Tensor:
-    index = [part.index for part in cloth.boundaries.values() if isinstance(part, Grasp)]
-    return torch.cat(index) if index else torch.zeros(0, dtype=torch.int64)
+def _held(cloth: Cloth, data: Episode) -> Tensor:
+    """[T, V] bool, whether a closed gripper has the vertex at an observed frame."""
+    out = torch.zeros(data.observed, len(cloth.mesh.vertices), dtype=torch.bool)
+    for name, part in cloth.boundaries.items():
+        if isinstance(part, Grasp):
+            motion = data.motion[name]
+            closed = motion.closed[last_knot(motion.t, data.times[: data.observed] + 1e-9).clamp(min=0)]
+            out[:, part.index] |= closed[:, None]
+    return out
 
 
-def _shares(objective: Corrected, raw: Tensor, gravity: float) -> Tensor:
-    """[W] of the force in the weight, rms by mass over the cloth that is not held."""
+def _shares(objective: Corrected, raw: Tensor, held: Tensor, gravity: float) -> Tensor:
+    """[W] of the force in the weight, rms by mass over the cloth that is not ``held`` [V] all the time."""
     squared = objective.correction.field(raw[objective.pushes]).square().sum(-1)
-    mass = objective.cloth.model().mass.detach().squeeze(-1).to(squared).clone()
-    mass[_held(objective.cloth)] = 0.0
+    mass = objective.cloth.model().mass.detach().squeeze(-1).to(squared) * ~held
     return ((squared * mass).sum(-1) / mass.sum()).sqrt() / gravity

@@ -40,15 +40,18 @@ def unexplained(
         faces: [F, 3].
         modes: all of the mesh.
         coarse: how many of them are the forces'.
-        held: [H] vertices that lie where the grippers are.
+        held: [T, V] vertices that lie where the grippers are.
         noise: least standard deviation of a point [m].
         usual: what it is taken for [m] where points are too few to tell it from the field.
     """
-    basis = _basis(modes, coarse, held).to(x)
-    frames = [_rows(cloud, x[t], faces, basis, noise) for t, cloud in enumerate(episode.clouds)]
+    kinds, which = held.unique(dim=0, return_inverse=True)
+    of_kind = [_basis(modes, coarse, kind.nonzero()[:, 0]).to(x) for kind in kinds]
+    bases = [of_kind[k] for k in which.tolist()]
+    frames = [_rows(cloud, x[t], faces, bases[t], noise) for t, cloud in enumerate(episode.clouds)]
     noise = max(noise, _noise(frames) or usual)
     sizes = _smoothed(torch.tensor([_size(frame, noise) for frame in frames]).to(x))
-    return torch.stack([_left(frame, size * basis, size, noise) for frame, size in zip(frames, sizes, strict=True)])
+    each = zip(frames, bases, sizes, strict=True)
+    return torch.stack([_left(frame, size * basis, size, noise) for frame, basis, size in each])
 
 
 def _left(frame: _Frame | None, field: Tensor, size: Tensor, noise: float) -> Tensor:

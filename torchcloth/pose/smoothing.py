@@ -19,7 +19,7 @@ FASTEST = 1e4  # m/s^2, a thousand times gravity: no cloth needs that to be wher
 TRIES = 40  # of expectation and maximisation, on one linearisation
 SMALL = 0.2  # standard errors per unknown, rms, of a step that ends the search
 
-Told = Callable[[str, Tensor], None]  # stage, unknowns
+Tell = Callable[[str, Tensor], None]  # stage, unknowns
 
 
 class Smoothed(NamedTuple):
@@ -36,22 +36,21 @@ class Smoothed(NamedTuple):
         return self.root @ self.root.mT
 
 
-def smooth(objective: Corrected, told: Told) -> Smoothed:
+def smooth(objective: Corrected, tell: Tell) -> Smoothed:
     """The likeliest unknowns and their covariance, the force's size included (restricted maximum likelihood)."""
     raw = objective.start
     for share in PARTS:
         part = objective.part(share)
-        if len(part.episodes[0].times) < len(objective.episodes[0].times):
-            told(f"the first {100 * share:.0f} % of the frames", raw)
+        if part.told and len(part.episodes[0].times) < len(objective.episodes[0].times):
+            tell(f"the first {100 * share:.0f} % of the frames", raw)
             raw = gauss_newton.minimise(part.problem(), raw, 1, lambda _: False).raw
     converged = False
     for number in range(ROUNDS):
-        told(f"all frames, round {number + 1}", raw)
-        before = raw
+        tell(f"all frames, round {number + 1}", raw)
         final = gauss_newton.minimise(objective.problem(), raw, 1, lambda _: False)
         raw = final.raw
-        root, information = _learn(objective, final)
-        step = raw - before
+        root, information, best = _learn(objective, final)
+        step = best - raw  # what a round asks for, not what it came to: one that fails makes no step at all
         prior = (step / objective.prior_std).square().sum()
         converged = float(step @ information @ step + prior) < SMALL**2 * len(raw)
         if converged:
@@ -59,11 +58,12 @@ def smooth(objective: Corrected, told: Told) -> Smoothed:
     return Smoothed(raw, final, root, converged)
 
 
-def _learn(objective: Corrected, at: gauss_newton.Iterate) -> tuple[Tensor, Tensor]:
+def _learn(objective: Corrected, at: gauss_newton.Iterate) -> tuple[Tensor, Tensor, Tensor]:
     """Set the prior's size of every mode to what the numbers and their errors show.
 
     Returns:
-        (root of the covariance with that prior [K, K], information of the data [K, K])
+        (root of the covariance with that prior [K, K], information of the data [K, K], the likeliest unknowns with
+        both [K], of the linearised problem)
 
     Expectation and maximisation (Dempster et al. 1977) on the linearised problem, where both are closed forms.
     """
@@ -71,9 +71,13 @@ def _learn(objective: Corrected, at: gauss_newton.Iterate) -> tuple[Tensor, Tens
     information = (weight * jacobian).mT @ jacobian
     pull = (weight * jacobian).mT @ (jacobian @ at.raw - at.linear.value)
     shape = len(objective.correction.windows), len(objective.correction.modes), 3
-    for _ in range(TRIES):
+
+    def solved() -> tuple[Tensor, Tensor]:
         root = root_of(information, objective.prior_std)
-        mean = root @ (root.mT @ (pull + objective.middle / objective.prior_std**2))
+        return root, root @ (root.mT @ (pull + objective.middle / objective.prior_std**2))
+
+    for _ in range(TRIES):
+        root, mean = solved()
         squared = (mean.square() + root.square().sum(1))[objective.pushes].reshape(shape).mean((0, 2))
         if not bool((squared < FASTEST**2).all()):
             raise SimulationDiverged(
@@ -82,7 +86,8 @@ def _learn(objective: Corrected, at: gauss_newton.Iterate) -> tuple[Tensor, Tens
                 remedy="the motion amplifies small pushes too much: a longer window, fewer frames, or a better fabric",
             )
         objective.expecting(squared.sqrt().clamp(min=LEAST))
-    return root_of(information, objective.prior_std), information
+    root, mean = solved()
+    return root, information, mean
 
 
 def root_of(information: Tensor, prior_std: Tensor) -> Tensor:

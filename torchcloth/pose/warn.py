@@ -12,13 +12,18 @@ from ..identification.episodes import Episode
 
 LARGE = 0.1  # of the weight, from which a corrective force says that the model is wrong
 MISSED = 1.3  # rms over the stated noise
-BLIND = 0.3  # s without anything seen
+BLIND = 0.3  # s without anything seen or felt
 
 
 def warnings_of(
-    fit: Mapping[str, Any], shares: Tensor, seen: Tensor, data: Episode, windows: Sequence[Tensor]
+    fit: Mapping[str, Any],
+    shares: Tensor,
+    seen: Tensor,
+    data: Episode,
+    windows: Sequence[Tensor],
+    noise: float | None,
 ) -> list[str]:
-    """Sentences."""
+    """Sentences; ``noise``: of a point, as it was given [m]."""
     out = []
     if fit["force_share"] > LARGE:
         first, last = windows[int(shares.argmax())].tolist()
@@ -27,9 +32,9 @@ def warnings_of(
             f"{100 * fit['force_share_max']:.0f} % in {first:.2f}-{last:.2f} s) to follow what was seen: identify the "
             "fabric, or state how uncertain its values are; the standard errors are at their least"
         )
-    if data.noise and fit["point_noise"] > MISSED * data.noise:
+    if noise and fit["point_noise"] > MISSED * noise:
         out.append(
-            f"seen points are {1e3 * fit['point_noise']:.1f} mm off the estimate, {1e3 * data.noise:.1f} mm would be "
+            f"seen points are {1e3 * fit['point_noise']:.1f} mm off the estimate, {1e3 * noise:.1f} mm would be "
             "noise: shapes finer than the correction's modes are missed"
         )
     if fit["chamfer_after"] >= fit["chamfer_null"]:
@@ -38,14 +43,17 @@ def warnings_of(
         out.append("the search did not converge: another estimate may fit as well")
     if not any(len(cloud) for cloud in data.clouds):
         out.append("no points were seen: shapes finer than the correction's modes are in no standard error")
-    blind = _longest_gap(data.times, seen.any(1))
+    felt = torch.zeros(len(data.times), dtype=torch.bool)
+    for wrench in data.wrenches.values():
+        felt |= wrench.isfinite().any(-1)
+    blind = _longest_gap(data.times, seen.any(1) | felt)
     if blind > BLIND:
-        out.append(f"nothing was seen for {blind:.2f} s: there the estimate is simulation alone")
+        out.append(f"nothing was seen or felt for {blind:.2f} s: there the estimate is simulation alone")
     return out + data.doubts()
 
 
 def _longest_gap(times: Tensor, any_seen: Tensor) -> float:
-    """[s] between frames in which something was seen."""
+    """[s] between frames in which something was seen, or felt."""
     at = times[any_seen | (torch.arange(len(times)) == 0)]
     ends = torch.cat([at, times[-1:]])
     return float((ends[1:] - ends[:-1]).max())
