@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from torchcloth._files import write_text
 from torchcloth.errors import InvalidInput
 
 from . import footprint, limits, report
@@ -34,8 +35,7 @@ def run(options: argparse.Namespace) -> int:
     plan = (Plan.quick if options.fast else Plan)(tuple(engines()), peers, threads)
     result = measured(plan) | {"absent": missing}
     if options.out is not None:
-        options.out.mkdir(parents=True, exist_ok=True)
-        (options.out / "bench.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        write_text(options.out / "bench.json", json.dumps(result, indent=1) + "\n")
         report.plot(result, options.out)
     if options.json:
         print(json.dumps(result))
@@ -72,7 +72,7 @@ def measured(plan: Plan) -> dict[str, Any]:
 
 def _distances(records: dict[str, Any], plan: Plan, found: limits.Limits) -> dict[str, Any]:
     """Of the standard case, with all triangles on the grid."""
-    case = make("standard-everywhere")
+    case = make("standard-everywhere", plan.fast)
     least = limits.counts(case, case.triangles)
     keys = {name: f"forward.{case.name}.{name}" for name in (*plan.engines, *plan.peers)}
     return {

@@ -79,6 +79,9 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=6, help="at 30 Hz")
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
+    for name in ("frames", "repeats"):
+        if getattr(options, name) < 1:
+            parser.error(f"--{name}: got {getattr(options, name)}, expected 1 or more")
     times = [k / 30 for k in range(options.frames + 1)]
     rows, ends = [], []
     for name, (engine, python) in PATHS.items():

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from torchcloth._files import atomically
+
 COLUMNS = ("", "triangles", "substeps", "batch", "seconds", "ms/substep")
 
 
@@ -69,7 +71,7 @@ def plot(result: dict[str, Any], folder: Path) -> Path | None:
         axes.loglog(sizes, [seconds[0] * size / sizes[0] for size in sizes], "--", color="gray", label="proportional")
         axes.set(xlabel=name, ylabel="seconds of a forward run", title=f"cost by {name}")
         axes.legend(frameon=False)
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / "bench.png"
-    figure.savefig(path, dpi=150)
+    with atomically(path) as part:
+        figure.savefig(part, dpi=150)
     return path

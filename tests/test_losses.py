@@ -10,6 +10,7 @@ from torchcloth.engine.library import library
 from torchcloth.errors import InvalidInput
 from torchcloth.losses import chamfer_to_surface, chamfer_to_vertices, closest, residuals
 from torchcloth.losses import nearest as search
+from torchcloth.losses.surface import _find_boundary
 from torchcloth.testing import check_gradients
 
 MESH = tc.meshes.rectangle(0.3, 0.2, resolution=(5, 4))
@@ -275,6 +276,10 @@ def test_arrays_are_taken_as_recordings_and_meshes_hold_them():
     x, cloud = torch.as_tensor(mesh.vertices), np.add(mesh.vertices, [0.01, 0.0, 0.02])
     wanted = chamfer_to_surface(torch.as_tensor(cloud), x, torch.as_tensor(mesh.faces))
     assert torch.equal(chamfer_to_surface(cloud, x, mesh.faces), wanted)
+    assert torch.equal(chamfer_to_surface(cloud, mesh.vertices, mesh.faces), wanted)
+    hits = closest(cloud, mesh.vertices, mesh.faces)
+    found, expected = residuals(cloud, mesh.vertices, hits), residuals(torch.as_tensor(cloud), x, hits)
+    assert all(map(torch.equal, found, expected))
     assert torch.equal(chamfer_to_vertices(cloud, x), chamfer_to_vertices(torch.as_tensor(cloud), x))
 
 
@@ -284,3 +289,10 @@ def test_gradients_by_torch_func_are_those_of_backward():
     cloud, own = x + torch.tensor([0.01, 0.0, 0.02]), x.clone().requires_grad_()
     (wanted,) = torch.autograd.grad(chamfer_to_surface(cloud, own, faces), own)
     torch.testing.assert_close(torch.func.grad(lambda x: chamfer_to_surface(cloud, x, faces))(x), wanted)
+
+
+def test_edges_of_large_meshes_have_numbers_of_their_own():
+    """In 32 bits two edges got the same, and open ones passed for closed."""
+    faces = torch.tensor([[28_633, 28_634, 150_000], [0, 39_971, 149_999]])  # 28633 * 150001 + 28634 is 39971 + 2^32
+    for each in (faces, faces.int()):
+        assert bool(_find_boundary(each)[0].all())

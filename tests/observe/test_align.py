@@ -115,6 +115,13 @@ def test_a_sheet_without_a_viewpoint():
     assert found.strain < 0.01
 
 
+def test_a_single_triangle_has_no_hinge():
+    mesh = tc.meshes.Mesh.build([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0]], [[0, 1, 2]])
+    rng = np.random.default_rng(0)
+    cloud = rng.dirichlet(np.ones(3), 300) @ mesh.vertices + rng.normal(0, 1e-3, (300, 3))
+    assert align(mesh, cloud, noise=1e-3).coverage > 0.5
+
+
 def nonsense():
     rng = np.random.default_rng(0)
     ball = rng.normal(size=(300, 3))

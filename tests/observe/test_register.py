@@ -86,6 +86,18 @@ def test_images_of_another_size_are_refused(color_camera):
         reproject(np.zeros((4, 4)), KINECT, color_camera)
     with pytest.raises(InvalidInput, match="color"):
         colors_at(np.zeros((4, 3)), np.zeros((4, 4, 3)), color_camera)
+    color = np.zeros((color_camera.height, color_camera.width, 3), np.uint8)
+    with pytest.raises(InvalidInput, match=r"depth; .*registered"):  # that of the depth camera
+        colors_at(np.zeros((4, 3)), color, color_camera, np.zeros((KINECT.height, KINECT.width)))
+
+
+@pytest.mark.parametrize("nothing", [0.0, np.nan])
+def test_pixels_without_a_reading_hide_nothing(color_camera, nothing):
+    color = np.full((color_camera.height, color_camera.width, 3), 7, np.uint8)
+    point = color_camera.at_pixels(np.array([color_camera.height // 2]), np.array([color_camera.width // 2]), [1.0])
+    depth = np.full(color.shape[:2], nothing)
+    assert colors_at(point, color, color_camera, depth)[1].all()
+    assert not colors_at(point, color, color_camera, np.full(color.shape[:2], 0.5))[1].any()
 
 
 def test_steps_in_depth_are_steep_and_gentle_slopes_are_not():

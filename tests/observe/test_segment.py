@@ -43,6 +43,10 @@ def pose(x, y, z):
         {"hsv": (0.1, 0.2)},
         {"hsv": ((100, 0, 0), (140, 255, 255))},
         {"table": (0.0, 0.0, -1.0, 0.0)},
+        {"flat": None, "table": "find"},
+        {"reach": None},
+        {"crowd": None},
+        {"radius": 0.01, "company": None},
     ],
     ids=str,
 )
@@ -58,6 +62,8 @@ def test_colours_from_0_to_1_are_refused():
     with pytest.raises(InvalidInput, match=r"colors; got float64; expected uint8.*multiply by 255"):
         segment(points, how, colors=colors)
     assert len(segment(points, how, colors=(255 * colors).astype(np.uint8)).points) == 3
+    with pytest.raises(InvalidInput, match=r"colors; got .*divide by 257"):
+        segment(points, how, colors=(65535 * colors).astype(np.uint16))
 
 
 def test_pixels_that_are_too_far_were_not_seen():

@@ -36,6 +36,19 @@ def test_volume_and_place(kind, size, expected):
     np.testing.assert_allclose((vertices.min(0) + vertices.max(0)) / 2, [1, 2, 3], atol=1e-3)
 
 
+@pytest.mark.parametrize("segments", [3, 4, 5, 24, 96])
+def test_a_sphere_lies_within_the_true_one_by_no_more_than_stated(segments):
+    vertices, faces = solid_mesh("sphere", (0.1,), np.eye(4), segments=segments)
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = normal[np.linalg.norm(normal, axis=1) > 1e-12]
+    places = np.random.default_rng(0).dirichlet(np.ones(3), 200) @ corners  # [F, 200, 3]
+    depth = 0.1 - np.linalg.norm(places, axis=-1)
+    assert len(normal) >= 2 * segments
+    assert depth.min() > -1e-12
+    assert depth.max() < 2.05 * 0.1 * (1 - np.cos(np.pi / segments))
+
+
 def test_the_cylinder_s_axis_is_z():
     vertices, _ = solid_mesh("cylinder", (0.1, 0.5), np.eye(4))
     np.testing.assert_allclose(np.ptp(vertices, axis=0), [0.2, 0.2, 0.5], atol=1e-3)

@@ -12,10 +12,13 @@ from occluded import WRONG, model
 
 from torchcloth import recordings as rec
 from torchcloth.effects import BodyForce
-from torchcloth.errors import InvalidInput
+from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import episode, nuisances
 from torchcloth.identification.misfit import figures
 from torchcloth.pose import estimate_pose
+from torchcloth.pose.estimate import held_at
+from torchcloth.pose.local import unexplained
+from torchcloth.pose.modes import modes_of
 from torchcloth.types import ClothState
 
 
@@ -126,6 +129,66 @@ def test_markers_alone(scene):
     assert len(mesh.vertices) == found.x.shape[1]
 
 
+def test_nothing_need_be_seen_at_the_beginning(scene):
+    """Early stages without data were refused as if the whole had none."""
+    uv = np.array([[0.1, 0.1], [0.2, 0.05], [0.1, 0.2], [0.2, 0.25]])
+    xyz = np.stack([twins.bilinear(x, twins.FIT, uv) for x in scene.truth.numpy()])
+    xyz[: len(xyz) // 2] = np.nan
+    markers = rec.Markers(scene.recording.points.t, xyz, uv)
+    found = estimate_pose(
+        model(scene, WRONG), replace(scene.recording, points=None, markers=markers), modes=4, window=0.18
+    )
+    late = scene.hidden.clone()
+    late[: len(late) // 2] = False
+    assert rms(found.x, scene, late) < 0.8 * rms(found.alone, scene, late)
+
+
+def test_nothing_seen_at_all_is_said(scene):
+    hands = {name: replace(m, force=None, torque=None) for name, m in scene.recording.grippers.items()}
+    blind = rec.Markers(scene.recording.points.t, np.full((len(scene.truth), 1, 3), np.nan), np.array([[0.1, 0.1]]))
+    recording = replace(scene.recording, points=None, grippers=hands, markers=blind)
+    with pytest.raises(RecordingError, match="nothing to estimate from"):
+        estimate_pose(model(scene, twins.TRUE), recording)
+
+
+def test_a_search_that_can_make_no_step_has_not_converged(scene):
+    """Stiffer cloth has no such step; that no step was made passed for a small one."""
+    cloth = model(scene, replace(twins.TRUE, membrane=0.2 * twins.TRUE.membrane))
+    soft = 0.2 * twins.TRUE.membrane / twins.THICKNESS
+    stuck = {"uncertain": {"youngs_modulus": (soft, 4.0)}, "dt": 0.999 * cloth.stable_step()}
+    found = estimate_pose(cloth, scene.recording, modes=2, window=0.35, **stuck)
+    assert not found.fit["converged"]
+    assert any("did not converge" in warning for warning in found.warnings)
+
+
+def test_stated_noise_is_what_points_are_compared_with(scene):
+    found = estimate_pose(model(scene, twins.TRUE), scene.recording, modes=4, window=0.18, noise={"points": 3e-3})
+    assert found.fit["point_noise"] == 3e-3
+    assert found.warnings == []
+
+
+def test_what_a_gripper_has_let_go_is_as_uncertain_as_the_rest(scene, right):
+    """Its patch was taken for held to the end, and known to the last digit."""
+    hands = scene.recording.grippers
+    left = replace(hands["left"], closed=hands["left"].t < 0.53)  # until the knot at 0.54 s
+    cloth = model(scene, twins.TRUE)
+    data = episode(cloth, replace(scene.recording, grippers={**hands, "left": left}))
+    held, patch = held_at(cloth, data), cloth.boundaries["left"].index
+    assert torch.equal(held[:, patch].all(1), data.times < 0.54)
+    assert bool(held[:, cloth.boundaries["right"].index].all())
+    finer = unexplained(right.x, data, right.faces, modes_of(cloth.mesh), 4, held, 1e-3, 1e-3)
+    assert float(finer[held].max()) < 1e-9
+    assert float(finer[data.times > 0.54][:, patch].min()) > 0.2 * float(finer[~held].median())
+
+
+def test_forces_are_no_blindness(scene):
+    pull = np.random.default_rng(0).normal(0, 0.05, (len(scene.recording.grippers["left"].t), 3))
+    hands = {name: replace(motion, force=pull) for name, motion in scene.recording.grippers.items()}
+    felt = replace(scene.recording, grippers=hands)
+    found = estimate_pose(model(scene, twins.TRUE), felt, modes=4, window=0.18, use=["force"])
+    assert not any("seen or felt" in warning for warning in found.warnings)
+
+
 def few(recording, count):
     """With at most so many points a frame."""
     rng, points = np.random.default_rng(0), recording.points
@@ -174,6 +237,9 @@ def test_what_is_not_used_was_not_seen(scene, use, noise):
         ({"uncertain": {"air.normal": (1.0, -1.0)}}, "air.normal"),
         ({"nuisances": ["weather"]}, "nuisance"),
         ({"use": ["sound"]}, "use"),
+        ({"noise": {"colour": 1.0}}, "noise; got 'colour'; expected some of points"),
+        ({"noise": {"points": -1.0}}, "noise of points"),
+        ({"noise": {"points": math.nan}}, "noise of points"),
     ],
 )
 def test_bad_options(scene, options, match):

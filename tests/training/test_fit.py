@@ -84,6 +84,15 @@ def test_it_learns_the_fabric(config, tmp_path):
     assert float(cloth.material.youngs_modulus.value) == own["value"]
 
 
+def test_what_was_before_is_told_of_all_episodes_or_not_at_all(config, episodes, tmp_path):
+    """The first step of a part of them told of that part, beside the end's of all."""
+    data = {"train": str(episodes / "ep_*")}
+    for per_step, told in ((0, True), (2, False)):
+        out = tmp_path / f"of-{per_step}"
+        assert main(["--config", config(data={**data, "per_step": per_step}), f"out={out}"]) == 0
+        assert ("loss_before" in json.loads((out / "fit.json").read_text())["train"]) == told
+
+
 @pytest.mark.parametrize("step", [1, 2, 3])
 def test_resuming_is_bit_for_bit(config, episodes, tmp_path, monkeypatch, step):
     """Stopped within any step: shuffled episodes, dropout, schedule, a scalar, a field and a network."""

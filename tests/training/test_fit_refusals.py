@@ -151,3 +151,16 @@ def test_more_processes_than_the_config_says_are_refused(config, capsys, monkeyp
     monkeypatch.setenv("WORLD_SIZE", "4")
     assert main(["--config", config()]) == 2
     assert "run.processes x run.nodes; got 1, started as one of 4 processes (WORLD_SIZE)" in capsys.readouterr().err
+
+
+def test_more_processes_than_the_config_says_are_refused_of_srun_too(config, capsys, monkeypatch):
+    for name, value in {"SLURM_NTASKS": "4", "SLURM_PROCID": "3", "SLURM_JOB_NAME": "fit"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    assert main(["--config", config()]) == 2
+    assert "got 1, started as one of 4 processes (SLURM_NTASKS)" in capsys.readouterr().err
+
+
+def test_seeds_have_an_end(config, capsys):
+    assert main(["--config", config(), "run.seed=99999999999999999"]) == 2
+    assert "config: run.seed; got 99999999999999999; expected below 2^32" in capsys.readouterr().err

@@ -213,8 +213,15 @@ def test_a_joint_fit_takes_what_is_held_alike_and_calm(solved, tmp_path, monkeyp
         return {**pretended(solved, 0.9)(setup, whats[0]), "manipulations": [what.facts() for what in whats]}
 
     monkeypatch.setattr(joint, "solve_together", solve_together)
-    assert call("garments", tmp_path, "--joint", "--count", "10", "--garments", "dress") == 0
+    ask = "--joint", "--count", "10", "--garments", "dress"
+    assert call("garments", tmp_path, *ask, "--report") == 2
+    assert "no finished case" in capsys.readouterr().err
+    assert asked == {}
+    assert call("garments", tmp_path, *ask) == 0
     assert asked == {"dress": [0, 5, 9]}, "covers and drags at the corners"
+    asked.clear()
+    assert call("garments", tmp_path, *ask, "--report") == 0
+    assert asked == {}
     printed = capsys.readouterr().out
     assert "0.81 … 0.99" in printed
     assert "3 episodes" in printed

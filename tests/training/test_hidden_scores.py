@@ -66,6 +66,17 @@ def test_one_cause_is_not_both_of_two_effects():
     assert [a["error"] for a in told["amplitudes"]] == pytest.approx([0.0, 0.0])
 
 
+def test_the_order_of_an_answer_does_not_matter():
+    """Damping could stand for both effects, the hem for drag alone: listed first, damping was taken for drag."""
+    two = hidden("double", ("air.drag_n", 1.0), ("air.linear", 1.0))
+    causes = [cause("damp.bend", alike=["air.drag_n", "air.linear"]), cause("mass.hem", alike=["air.drag_n"])]
+    for listed in (causes, causes[::-1]):
+        found = judged(two, answer(*listed))
+        assert (found["found"], found["right"]) == ([True, True], True)
+    named = [cause("air.linear", alike=["air.drag_n"]), cause("air.drag_n", alike=["air.linear"])]
+    assert judged(two, answer(*named))["amplitudes"] == [{"error": 0.0, "inside": True}] * 2
+
+
 def test_an_axis_is_no_other_name_and_counts_once():
     tilt = hidden("single", ("env.gravity_tilt", 0.01))
     found = judged(tilt, answer(cause("env.gravity_tilt[x]", 0.011, alike=["env.gravity_tilt[y]"])))

@@ -18,7 +18,7 @@ ANSWER = {"verdict": "adequate", "causes": [], "unresolvable": [], "undecided": 
 
 @pytest.fixture
 def called(monkeypatch):
-    """Commands instead of processes: making leaves two folders, a diagnosis its file."""
+    """Commands instead of processes: making leaves two folders, and what it was stopped in before."""
     commands = []
 
     def run(command):
@@ -28,8 +28,9 @@ def called(monkeypatch):
             (out / "diagnosis.json").parent.mkdir(parents=True)
             (out / "diagnosis.json").write_text(json.dumps(ANSWER))
         elif out is not None:
-            for name in ("e1", "e2"):
+            for name in ("e1", "e2", ".e2.0123.partial"):
                 (out / name).mkdir(parents=True)
+            return Namespace(returncode=0, stdout=f"{out / 'e1'}: hang\n{out / 'e2'}: turn\n", stderr="")
         elif "shows.py" in commands[-1]:
             sizes = [{"name": "x.jet", "left_moves": 1e-3, "left_pulls": 0.0}]
             return Namespace(returncode=0, stdout=json.dumps(sizes), stderr="")
@@ -152,7 +153,11 @@ def test_experiments_are_made_of_the_same_case_and_answered_with_all_episodes(ca
     )
     monkeypatch.setattr(hidden, "heading_of", lambda template: np.deg2rad(5.0 * len(template)))
     made = []
-    make = lambda *arguments: (made.append(arguments), (Path(arguments[-1]) / "e9").mkdir(parents=True))  # noqa: E731
+
+    def make(*arguments):
+        made.append(arguments)
+        return f"{arguments[-1]}/e9: {arguments[1]}\n"
+
     asked = ANSWER | {"next_experiment": {"motion": "turn", "heading": 90.0, "separates": ["a", "b"]}}
     found = hidden.experiments(tmp_path, "007", make, [tmp_path / "e1"], asked, 19)
     assert made[0] == ("--motion", "turn", "--heading", "95.0", "--out", str(tmp_path / "episodes" / "007-proposed"))

@@ -203,6 +203,9 @@ def segment(
     if how.hsv is not None and np.asarray(colors).dtype.kind not in "iu":
         got, remedy = np.asarray(colors).dtype, "from 0 to 1: multiply by 255 and convert"
         raise InvalidInput("colors", got=got, expected="uint8, 0 to 255", remedy=remedy)
+    if how.hsv is not None and not 0 <= np.min(colors, initial=0) <= np.max(colors, initial=0) <= 255:
+        got = f"{np.min(colors)} to {np.max(colors)}"
+        raise InvalidInput("colors", got=got, expected="uint8, 0 to 255", remedy="divide by 257 what has 16 bits")
     cloud = _Cloud(points)
     if how.low is not None or how.high is not None:
         cloud.keep("crop", lambda p, _: _inside(p, how))

@@ -104,7 +104,7 @@ def estimate_pose(
         got = f"no data of {kinds} kind in any frame"
         raise RecordingError(f"{data.name}: nothing to estimate from", got=got, expected="points, markers or forces")
     gravity = float(torch.as_tensor(recording.gravity).norm()) or 9.81
-    always = _held(cloth, data).all(0)
+    always = held_at(cloth, data).all(0)
 
     def tell(stage: str, raw: Tensor) -> None:
         if on_progress is not None:
@@ -122,7 +122,7 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         frames, moved = objective.tangents(raw)
         x, v, along = frames.x[: data.observed], frames.v[: data.observed], moved.x[:, : data.observed]
         alone, null = objective.frames(objective.start)[0][: data.observed], rigid_carry(data)
-        held = _held(cloth, data)
+        held = held_at(cloth, data)
         std = _errors(objective, used, found, x, along, fields, held)
         last = objective.last_state(raw)
     seen, shares = seen_vertices(x, used, cloth.mesh), _shares(objective, raw, held.all(0), gravity)
@@ -194,7 +194,7 @@ def _errors(
     return (variance.reshape(x.shape) + finer.square().unsqueeze(-1)).sqrt()
 
 
-def _held(cloth: Cloth, data: Episode) -> Tensor:
+def held_at(cloth: Cloth, data: Episode) -> Tensor:
     """[T, V] bool, whether a closed gripper has the vertex at an observed frame."""
     out = torch.zeros(data.observed, len(cloth.mesh.vertices), dtype=torch.bool)
     for name, part in cloth.boundaries.items():

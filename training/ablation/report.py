@@ -78,8 +78,8 @@ def agreement(distance: dict[str, dict[Variant, float]], energy: dict[str, dict[
         action: {"ours": _order(row), "paper": _paper_order(action, row)} for action, row in distance.items()
     }
     cells = {action: [d for v, d in row.items() if v.parameter in PARAMETERS] for action, row in distance.items()}
-    noise = {action: CHAOS * row.get(PERTURBED, 0.0) for action, row in distance.items()}
-    out["beyond_chaos"] = {action: [sum(d >= noise[action] for d in row), len(row)] for action, row in cells.items()}
+    noise = {action: CHAOS * row[PERTURBED] for action, row in distance.items() if PERTURBED in row}
+    out["beyond_chaos"] = {a: [sum(d >= least for d in cells[a]), len(cells[a])] for a, least in noise.items()}
     return out
 
 

@@ -28,9 +28,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (TorchclothError, OSError) as error:
         print(f"fit: {error}", file=sys.stderr)
         return 2
+    except RuntimeError as error:
+        if not _left_alone(error):
+            raise
+        print("fit: another process ended; see its own line", file=sys.stderr)
+        return 2
     except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
         print("fit: stopped; the same command with --resume goes on after the last whole step", file=sys.stderr)
         return 130
+
+
+def _left_alone(error: RuntimeError) -> bool:
+    """By the other processes, one of which has said why."""
+    import torch.distributed as distributed
+
+    running = distributed.is_available() and distributed.is_initialized()
+    return running and any(word in str(error).lower() for word in ("gloo", "connection", "nccl"))
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -124,6 +124,8 @@ def from_dict(content: Mapping[str, Any]) -> Config:
                 raise InvalidInput(f"config: {key}", got=repr(wrong[0]), expected=" or ".join(legal))
         elif not value >= legal:
             raise InvalidInput(f"config: {key}", got=value, expected=f"at least {legal}")
+    if config.run.seed >= 2**32:
+        raise InvalidInput("config: run.seed", got=config.run.seed, expected="below 2^32")
     if not config.optimizer.rate > 0:
         raise InvalidInput("config: optimizer.rate", got=config.optimizer.rate, expected="more than 0")
     return config

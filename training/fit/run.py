@@ -101,8 +101,9 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
         "seconds": time.perf_counter() - began,
         "processes": trainer.world_size,
     }
-    first = module.history[0]
-    figures["train"] |= {"loss_before": first["train/loss"], "chamfer_before": first.get("train/chamfer")}
+    if data.per_step == len(train):  # else the first step told of a part of them
+        first = module.history[0]
+        figures["train"] |= {"loss_before": first["train/loss"], "chamfer_before": first.get("train/chamfer")}
     if trainer.is_global_zero:
         episodes = [str(r.path) for r in train]
         result.show(result.save(folder, config, module, initial, figures, episodes), folder)
@@ -111,11 +112,14 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
 
 def _check_processes(run: Run) -> None:
     """Of a launcher that starts others than the config says, each would take itself for the only one."""
-    started = os.environ.get("WORLD_SIZE", "")
+    variable = "WORLD_SIZE" if "WORLD_SIZE" in os.environ else "SLURM_NTASKS"  # torchrun's goes first, as in Lightning
+    if variable == "SLURM_NTASKS" and os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive"):
+        return
+    started = os.environ.get(variable, "")
     if started.isdigit() and int(started) != run.processes * run.nodes:
         raise InvalidInput(
             "config: run.processes x run.nodes",
-            got=f"{run.processes * run.nodes}, started as one of {started} processes (WORLD_SIZE)",
+            got=f"{run.processes * run.nodes}, started as one of {started} processes ({variable})",
             expected="as many as torchrun or the cluster starts",
         )
 

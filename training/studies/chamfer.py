@@ -47,7 +47,7 @@ def summary(found: dict[str, dict[str, Any]], by: str, names: tuple[str, ...]) -
 
 
 def _table(by: str, rows: dict[str, dict[str, dict[str, Any]]]):
-    title = f"Mean distance [mm] by {by}, over all frames; their second half is predicted"
+    title = f"Mean distance [mm] by {by}, over all frames; those that were not fitted, the late ones, are predicted"
     table = heading_table(title, by, "convention", *STATES.values(), "CoV", "cases", "| paper", "CoV")
     for name, conventions in rows.items():
         mean, cov = paper.CHAMFER[name]

@@ -101,7 +101,7 @@ def others(scale: Scale) -> dict[str, Case]:
 
 
 def seed_of(name: str, index: int) -> int:
-    """Every trial has noise of its own."""
+    """Every trial of a kind has noise of its own; the three places elsewhere in the grid are those of all fabrics."""
     return 100 * list(FABRICS).index(name) + index
 
 

@@ -107,7 +107,7 @@ def _notes(found: dict[str, dict[str, Any]]) -> list[str]:
         "Truth: the fitted engine on another mesh, contact grid and step (same law); Kinect noise; a pole hides "
         f"{100 * hidden:.0f} % of the cloth that the camera would see. E and nu of the truth are the paper's, read as "
         "kPa at 1 mm; k and gamma are those of `torchcloth simulate`. Free beside the four: bending and air drag. "
-        "Fitted is the first half of the frames: later ones are folded and in contact.",
+        "Fitted are the early frames (half of them, unless --share says otherwise): later ones are folded and touch.",
         f"{len(found)} cases, {len(found) - len(fits)} failed; {none} identify none of the four: in {unstable} the "
         f"motion is too unstable for its slopes, {poor} do not beat the rigid-carry null. What is not identified is no "
         "number and in no mean.",

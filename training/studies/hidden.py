@@ -86,6 +86,8 @@ def drawn(options: argparse.Namespace) -> Round:
     for option, number in (("--cases", count), ("--jobs", options.jobs)):
         if number < 1:
             raise InvalidInput(option, got=number, expected="1 or more")
+    if options.seed is not None and options.seed < 0:
+        raise InvalidInput("--seed", got=options.seed, expected="0 or more")
     if fixed:
         settings, seeds = {"study": "hidden", "secret": "fixed", "fast": True}, list(FAST)[:count]
         if count > usual:
@@ -114,8 +116,7 @@ def one(out: Path, name: str, seed: int, fast: bool) -> dict[str, Any]:
     """One case from making to revealing."""
     episodes, answer = out / "episodes" / name, out / "answers" / name
     make = partial(_script, "make.py", "--seed", str(seed), *(["--fast"] if fast else []))
-    make("--out", str(episodes))
-    given = sorted(episodes.iterdir())
+    given = _made(make("--out", str(episodes)))
     begun = time.perf_counter()
     found = answered(given, answer)
     spent = time.perf_counter() - begun
@@ -145,8 +146,8 @@ def experiments(
     for which, plan in (("proposed", turned(proposed, given)), ("random", drawn)):
         folder = out / "episodes" / f"{name}-{which}"
         asked = [part for key in drawn if plan.get(key) is not None for part in (f"--{key}", str(plan[key]))]
-        make(*asked, "--out", str(folder))
-        found[which] = answered([*given, *folder.iterdir()], out / "answers" / f"{name}-{which}")
+        more = _made(make(*asked, "--out", str(folder)))
+        found[which] = answered([*given, *more], out / "answers" / f"{name}-{which}")
     return found
 
 
@@ -162,9 +163,13 @@ def _gain(
     """Of the answer, over the oracle's; 0 of one that is none."""
     if not answer.get("model"):
         return 0.0
-    folder = out / "episodes" / f"{name}-unseen"
-    make("--unseen", "--out", str(folder))
-    return gain(given, out / "answers" / name / str(answer["model"]), next(folder.iterdir()), truth)
+    (unseen,) = _made(make("--unseen", "--out", str(out / "episodes" / f"{name}-unseen")))
+    return gain(given, out / "answers" / name / str(answer["model"]), unseen, truth)
+
+
+def _made(said: str) -> list[Path]:
+    """The episodes that make.py names; what a stopped one has left lies in the same folder."""
+    return sorted(Path(line.rpartition(": ")[0]) for line in said.splitlines())
 
 
 def answered(episodes: list[Path], out: Path) -> dict[str, Any]:

@@ -7,6 +7,7 @@ where the command refused the recordings, or ``{"failed": text}`` where it ended
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import permutations
 from typing import Any, NamedTuple
 
 Truth = Mapping[str, Any]
@@ -115,16 +116,18 @@ def verdict(answer: Answer) -> str:
 
 
 def _matched(causes: Sequence[Named], asked: Sequence[Wanted]) -> list[Named | None]:
-    """The cause that stands for each effect, one for one: by its name, else by its class, else by a rival."""
-    left = list(causes)
-    out: list[Named | None] = [None for _ in asked]
-    for part in (lambda c: {c.best}, lambda c: c.alike, lambda c: c.all):
-        for k, w in enumerate(asked):
-            cause = None if out[k] else next((c for c in left if part(c) & w.names), None)
-            if cause is not None:
-                out[k] = cause
-                left = [c for c in left if c is not cause]
-    return out
+    """The cause that stands for each effect, one for one: as many as can be by their names, then by classes, then by
+    rivals, whatever order they are listed in.
+    """
+
+    def grade(found: Sequence[Named | None]) -> tuple[int, int, int]:
+        pairs = [(c, w.names) for c, w in zip(found, asked, strict=True) if c is not None]
+        sets = (lambda c: {c.best}, lambda c: c.alike, lambda c: c.all)
+        return tuple(sum(bool(part(c) & names) for c, names in pairs) for part in sets)  # type: ignore[return-value]
+
+    possible = permutations([*causes, *[None] * len(asked)], len(asked))
+    best = max(possible, key=grade)
+    return [c if c is not None and c.all & w.names else None for c, w in zip(best, asked, strict=True)]
 
 
 def _invisible(answer: Answer, w: Wanted) -> bool:

@@ -22,6 +22,7 @@ import torchcloth as tc
 from torchcloth import identification, viewing
 from torchcloth._files import write_text
 from torchcloth.effects import AirDrag, Bending, Gravity
+from torchcloth.errors import InvalidInput
 from torchcloth.pose import PoseEstimate, estimate_pose
 from torchcloth.pose.seen import seen_vertices
 from torchcloth.recordings import Recording, read
@@ -91,7 +92,9 @@ def _scene(out: Path, setting: Setting, motion: str) -> Scene:
         effects = [part for effect in HIDDEN for part in ("--effect", effect)]
         sizes = ["--nodes", str(setting.nodes), "--fit-nodes", str(setting.fit)]
         script = [sys.executable, str(folder("independent") / "generate.py"), "--motion", motion, "--seed", "1"]
-        subprocess.run([*script, *sizes, *effects, "--out", str(path)], check=True, stdout=subprocess.DEVNULL)
+        done = subprocess.run([*script, *sizes, *effects, "--out", str(path)], capture_output=True, text=True)
+        if done.returncode:
+            raise InvalidInput("tests/independent/generate.py", got=done.stderr.strip()[-300:])
     recording = read(path, with_truth=True)
     cloth = _cloth(recording)
     data = identification.episode(cloth, recording)

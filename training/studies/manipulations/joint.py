@@ -27,7 +27,7 @@ def run(chosen: argparse.Namespace) -> None:
     setup, wanted = options.chosen(chosen)
     kept = Kept(chosen.out, asdict(setup))
     cases = {f"{garment}-joint": partial(solve_together, setup, own) for garment, own in alike(wanted).items()}
-    found = kept.run(cases)
+    found = options.finished(kept, cases, chosen.out) if chosen.report else kept.run(cases)
     show(_table(found))
     write(chosen.out / "joint.json", found)
 

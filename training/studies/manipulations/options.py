@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from dataclasses import asdict, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from torchcloth.errors import InvalidInput
@@ -41,11 +43,20 @@ def cases(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
     setup, wanted = chosen(options)
     kept = Kept(options.out, asdict(setup))
     if options.report:
-        found = {what.name: case for what in wanted if (case := kept.find(what.name)) is not None}
-        if not found:
-            raise InvalidInput("--report", got=f"no finished case in {options.out}", expected="at least one")
-        return found
+        return finished(kept, [what.name for what in wanted], options.out)
     return kept.run({what.name: partial(solve, setup, what) for what in wanted})
+
+
+def finished(kept: Kept, names: Iterable[str], out: Path) -> dict[str, dict[str, Any]]:
+    """Those of the cases that are there.
+
+    Raises:
+        InvalidInput: none is.
+    """
+    found = {name: case for name in names if (case := kept.find(name)) is not None}
+    if not found:
+        raise InvalidInput("--report", got=f"no finished case in {out}", expected="at least one")
+    return found
 
 
 def chosen(options: argparse.Namespace) -> tuple[Setup, list[Manipulation]]:
