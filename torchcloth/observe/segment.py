@@ -197,15 +197,8 @@ def segment(
     points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InvalidInput("points", got=f"shape {points.shape}", expected="[N, 3], finite, in m")
-    shape = None if colors is None else np.shape(colors)
-    if how.hsv is not None and shape != points.shape:
-        raise InvalidInput("colors", got=f"shape {shape}", expected=f"{points.shape}, since hsv is given")
-    if how.hsv is not None and np.asarray(colors).dtype.kind not in "iu":
-        got, remedy = np.asarray(colors).dtype, "from 0 to 1: multiply by 255 and convert"
-        raise InvalidInput("colors", got=got, expected="uint8, 0 to 255", remedy=remedy)
-    if how.hsv is not None and not 0 <= np.min(colors, initial=0) <= np.max(colors, initial=0) <= 255:
-        got = f"{np.min(colors)} to {np.max(colors)}"
-        raise InvalidInput("colors", got=got, expected="uint8, 0 to 255", remedy="divide by 257 what has 16 bits")
+    if how.hsv is not None:
+        _check_colors(np.asarray(colors), points.shape)
     cloud = _Cloud(points)
     if how.low is not None or how.high is not None:
         cloud.keep("crop", lambda p, _: _inside(p, how))
@@ -226,6 +219,18 @@ def segment(
         cloud.keep("thinned", lambda p, _: np.isin(np.arange(len(p)), spaced(p, spacing)))
     normals = _normals(cloud.points, how.normals, viewpoint) if how.normals else None
     return Segmented(cloud.points, cloud.kept, cloud.removed, len(points), table, normals)
+
+
+def _check_colors(colors: Array, shape: tuple[int, ...]) -> None:
+    if colors.shape != shape:
+        got = "none" if colors.dtype == object else f"shape {colors.shape}"
+        raise InvalidInput("colors", got=got, expected=f"{shape}, since hsv is given")
+    if colors.dtype.kind not in "iu":
+        remedy = "from 0 to 1: multiply by 255 and convert"
+        raise InvalidInput("colors", got=colors.dtype, expected="uint8, 0 to 255", remedy=remedy)
+    if not 0 <= colors.min(initial=0) <= colors.max(initial=0) <= 255:
+        got, remedy = f"{colors.min()} to {colors.max()}", "divide by 257 what has 16 bits"
+        raise InvalidInput("colors", got=got, expected="uint8, 0 to 255", remedy=remedy)
 
 
 class _Cloud:
