@@ -22,11 +22,17 @@ from .types import ClothState, Surface
 
 
 def step(
-    model: Model, state: ClothState, dt: float, drives: Mapping[str, Drive], substep: int, layers: Layers | None = None
+    model: Model,
+    state: ClothState,
+    dt: float,
+    drives: Mapping[str, Drive],
+    substep: int,
+    layers: Layers | None = None,
+    lost: Tensor | None = None,
 ) -> tuple[ClothState, Impulses]:
-    """Advance one substep; ``memory["apic"]`` [..., V + E, 9] 1/s is the particles' affine velocity."""
+    """As ``functional.step``; ``memory["apic"]`` [..., V + E, 9] 1/s is the affine velocity of the particles."""
     grid = cast("Grid", model.grid)  # Cloth refuses to be made without
-    s = surface(model.geometry, state.x, state.v)
+    s = surface(model.geometry, state.x, state.v, lost)
     memory = evolve(model, state, s, dt)
     layers = near_layers(model, grid, state.x) if layers is None else layers
     press = pressure(model, grid, layers, state, s, dt)

@@ -27,10 +27,19 @@ __all__ = ["Geometry", "Impulses", "Model", "energy", "rollout", "step", "surfac
 
 
 def step(
-    model: Model, state: ClothState, dt: float, drives: Mapping[str, Drive], substep: int, layers: Layers | None = None
+    model: Model,
+    state: ClothState,
+    dt: float,
+    drives: Mapping[str, Drive],
+    substep: int,
+    layers: Layers | None = None,
+    lost: Tensor | None = None,
 ) -> tuple[ClothState, Impulses]:
-    """Advance one substep (symplectic Euler); ``layers``: of this state or one nearby, None: to be found."""
-    s = surface(model.geometry, state.x, state.v)
+    """Advance one substep (symplectic Euler).
+
+    ``layers``: of this state or one nearby, None: to be found. ``lost``: see ``stretch``.
+    """
+    s = surface(model.geometry, state.x, state.v, lost)
     memory = evolve(model, state, s, dt)
     columns = membrane_stress(model, s, memory)
     grid, press = model.grid, None
@@ -76,7 +85,7 @@ def stretch(
         if model.grid is not None:
             layers = near_layers(model, model.grid, state.x, layers)
         before = state.x
-        state, impulses = advance(model, state, dt, drives, k, layers)
+        state, impulses = advance(model, state, dt, drives, k, layers, lost)
         if state.x.dtype == torch.float32:
             state, lost = _kept(before, state, lost, dt)
         total = added(total, impulses)

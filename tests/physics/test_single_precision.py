@@ -90,3 +90,36 @@ def test_turning_grippers_keep_their_distance(engine):
         end = cloth(cloth.state(x), {"hand": way(seconds, turned)}, times=[0.0, seconds]).x[-1].double()
     expected = x.double() @ turned(seconds)[:3, :3].double().mT
     assert float((end - expected).abs().max()) < 5e-7
+
+
+@pytest.mark.parametrize(("engine", "seconds"), [("fused", 0.5), ("reference", 0.03)])
+def test_stiff_cloth_does_not_creep_on_a_table_far_from_the_origin(engine, seconds):
+    """Strains by rounded positions, 1e-6 at 1 m, pulled as hard as friction holds: it slid by millimetres a second."""
+    angle = math.atan(0.3 * 0.9)  # nine tenths of what friction holds
+    mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(10, 10))
+    effects = {
+        "gravity": tc.effects.Gravity((9.81 * math.sin(angle), 0.0, -9.81 * math.cos(angle))),
+        "bending": tc.effects.Bending(1e-5),
+    }
+    material = tc.materials.AEP.preset("coated_nylon")
+    table = {"table": tc.boundaries.Plane(friction=0.3)}
+    cloth = tc.Cloth(mesh, material, 0.15, effects, table, contact=None, engine=engine)
+    x = cloth.rest_state().x + torch.tensor([1.0, 0.0, 0.0])
+    with torch.no_grad():
+        out = cloth(cloth.state(x), times=[0.0, 0.5 * seconds, seconds])
+    assert float((out.x[-1].double() - x.double()).mean(0)[0].abs()) < 2e-6
+    assert float(out.v[-1].norm(dim=-1).max()) < 1e-4
+
+
+def test_stiff_cloth_that_hangs_far_from_the_origin_comes_to_rest():
+    """It was heated by what was rounded, at 0.15 m/s, and ever more."""
+    mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(8, 8))
+    effects = {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(1.2), "damping": tc.effects.MassDamping(8.0)}
+    hand = {"hand": tc.boundaries.Grasp.corner("upper-left")}
+    cloth = tc.Cloth(mesh, tc.materials.AEP(2e7), 0.15, effects, hand, contact=None)
+    x = cloth.rest_state().x @ torch.tensor([[1.0, 0, 0], [0, 0, 1.0], [0, 1.0, 0]]) + torch.tensor([1.0, 0, 1.0])
+    t = torch.tensor([0.0, 0.5, 1.0, 1.5])
+    still = tc.Trajectory(t, torch.eye(4).repeat(4, 1, 1), torch.ones(4, dtype=torch.bool))
+    with torch.no_grad():
+        out = cloth(cloth.state(x), {"hand": still}, times=t)
+    assert float(out.v[-1].square().mean().sqrt()) < 0.01

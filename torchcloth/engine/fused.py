@@ -135,7 +135,7 @@ class Fused:
         """Substeps in which torch has a part."""
         total: Impulses = {}
         for k in substeps:
-            force, memory = parts.force(state, dt)
+            force, memory = parts.force(state, lost, dt)
             state, lost, impulses = self._call(state, lost, fixed | _cut(moves, k, k + 1), 1, False, force)
             state = state._replace(memory=state.memory | memory)
             total = added(total, impulses)

@@ -47,8 +47,14 @@ class Triangles:
 
     @property
     def x(self) -> list[list[int]]:
-        """The corners' positions."""
-        return self._corners("x", self._lowering.x.now)
+        """The corners' positions; in float32 from the first one, as ``model.surface`` sees them."""
+        low = self._lowering
+        here = self._corners("x", low.x.now)
+        if low.lost is None:
+            return here
+        lost = self._corners("lost", low.lost.now)
+        both = self._once("edges", lambda: self.loop.call("edges", *here, *lost))
+        return [self.loop.load(low.program.constant(np.zeros((1, 3)))), both[:3], both[3:]]
 
     @property
     def v(self) -> list[list[int]]:

@@ -49,9 +49,9 @@ class TorchParts:
         """See ``model.as_it_is``."""
         return TorchParts(as_it_is(self.model), self.parts)
 
-    def force(self, state: ClothState, dt: float) -> tuple[Tensor, Memory]:
+    def force(self, state: ClothState, lost: Tensor | None, dt: float) -> tuple[Tensor, Memory]:
         """(force on the vertices [..., V, 3] N, internal variables of these parts) at the start of a substep."""
-        s = surface(self.model.geometry, state.x, state.v)
+        s = surface(self.model.geometry, state.x, state.v, lost)
         own = {key: value for key, value in state.memory.items() if key in self.parts}
         memory = evolve(self.model, state._replace(memory=own), s, dt)
         if MATERIAL in self.parts:

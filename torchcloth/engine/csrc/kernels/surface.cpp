@@ -138,6 +138,6 @@ struct CopyStress : Copied<15> { static constexpr const char* name = "copy15"; }
 
 }  // namespace
 
-TC_KERNELS(surface_kernels, Surface, Assemble, Kick, KickInAir, Stage, StageInAir, Loaded, Scaled, Plus, Drift, DriftOn, Copy, CopyStress)
+TC_KERNELS(surface_kernels, Surface, Edges, Assemble, Kick, KickInAir, Stage, StageInAir, Loaded, Scaled, Plus, Drift, DriftOn, Copy, CopyStress)
 
 }  // namespace tc

@@ -25,6 +25,20 @@ struct Surface {
     }
 };
 
+// Corners, what float32 has lost of them -> the second and third from the first. See model.py, ``surface``.
+struct Edges {
+    static constexpr const char* name = "edges";
+    static constexpr int inputs = 18, outputs = 6;
+    static constexpr auto fixed = bits(9, 9);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto x0 = r.vec(), x1 = r.vec(), x2 = r.vec(), l0 = r.vec(), l1 = r.vec(), l2 = r.vec();
+        Write<T> w{out};
+        w.vec((x1 - x0) + (l1 - l0)), w.vec((x2 - x0) + (l2 - l0));
+    }
+};
+
 // Stress columns, warp and weft coefficients, area -> forces on the three corners.
 struct Assemble {
     static constexpr const char* name = "assemble";
