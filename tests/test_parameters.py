@@ -184,3 +184,19 @@ def test_prints_like_a_data_sheet():
         f"stable step: {everything().stable_step():.3g} s",
     ):
         assert line in text
+
+
+def test_values_that_want_gradients_are_refused():
+    """They would be copied, and stay without: a network's answer goes in by functional_call."""
+    given = torch.tensor(1e5, requires_grad=True)
+    vector = torch.tensor([0.0, 0.0, -9.81], requires_grad=True)
+    for make in (
+        lambda: tc.materials.AEP(given),
+        lambda: tc.materials.AEP(1e5).youngs_modulus.set(given),
+        lambda: tc.effects.Gravity(vector),
+        lambda: tc.boundaries.Plane(point=vector),
+    ):
+        with pytest.raises(InvalidInput, match=r"a tensor that wants gradients; .*functional_call"):
+            make()
+        with torch.no_grad():
+            make()

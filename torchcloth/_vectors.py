@@ -30,7 +30,19 @@ def place(what: str, given: Sequence[float]) -> Tensor:
     Raises:
         InvalidInput: not three finite numbers.
     """
+    check_value(what, given)
     vector = torch.as_tensor(given, dtype=torch.get_default_dtype())
     if vector.shape != (3,) or not bool(torch.isfinite(vector).all()):
         raise InvalidInput(what, got=given, expected="three finite numbers")
     return vector
+
+
+def check_value(what: str, given: object) -> None:
+    """Refuse a tensor whose gradients would be lost, as a part keeps a copy.
+
+    Raises:
+        InvalidInput: it wants gradients.
+    """
+    if isinstance(given, Tensor) and given.requires_grad and torch.is_grad_enabled():
+        remedy = "its detach(); what a network gives goes in by torch.func.functional_call, as a parameter of the cloth"
+        raise InvalidInput(what, got="a tensor that wants gradients", expected="a value", remedy=remedy)

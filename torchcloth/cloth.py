@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Literal, cast
@@ -44,6 +45,8 @@ from .validation import (
     check_transfer,
     expand_state,
 )
+
+STILL = 0.1  # m/s, rms: what has settled is slower
 
 
 class Cloth(nn.Module):
@@ -198,7 +201,9 @@ class Cloth(nn.Module):
     ) -> ClothState:
         """Let the cloth come to rest with every driven body held where it is at ``start`` [s].
 
-        Measured initial positions carry noise, which would ring through an undamped simulation: this damps it.
+        Measured initial positions carry noise, which would ring through an undamped simulation: this damps it. Cloth
+        that has far to go is slowed down and stopped on its way, with a warning: simulate it instead, or settle it for
+        seconds at a smaller rate.
 
         Args:
             state: measured or guessed state.
@@ -208,6 +213,10 @@ class Cloth(nn.Module):
             rate: of the mass damping that is added meanwhile [1/s].
         """
         settled = run(self.settling(state, motion or {}, start, duration, rate), checkpoint=True).state
+        speed = float(settled.v.detach().norm(dim=-1).square().mean().sqrt())
+        if speed > STILL:
+            text = f"settle: after {duration:g} s the cloth still moves at {speed:.2g} m/s (rms), and is stopped there"
+            warnings.warn(text, stacklevel=3)
         return settled._replace(v=torch.zeros_like(settled.v))
 
     def sensitivities(
@@ -354,6 +363,8 @@ class Cloth(nn.Module):
     def extra_repr(self) -> str:
         """Data sheet: size, contact, step."""
         size = f"{len(self.mesh.vertices)} vertices, {len(self.mesh.faces)} triangles, {self.mesh.area.sum():.4g} m^2"
+        if (pieces := self.mesh.pieces) > 1:
+            size += f", {pieces} pieces that nothing joins"
         grid = "none" if self._grid is None else self._grid.words
         try:
             step, engine = f"{self.stable_step():.3g} s", self.engine_in_use

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from ._vectors import check_value
 from .errors import InvalidInput
 
 Domain = Literal["positive", "unit_half", "nonnegative", "real"]
@@ -90,6 +91,7 @@ class PhysicalParameter(nn.Module):
 
     def set(self, value: float | Tensor) -> None:
         """Assign a physical value in place; refuses an illegal one and leaves the old value."""
+        check_value(self.label, value)
         with torch.no_grad():
             new = self._to_raw(value).to(self.raw)
             if new.shape != self.raw.shape:
@@ -118,6 +120,7 @@ class PhysicalParameter(nn.Module):
             self.raw.clamp_(min=0.0)
 
     def _to_raw(self, value: float | Tensor) -> Tensor:
+        check_value(self.label, value)
         try:
             tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).detach().clone()
         except (TypeError, ValueError, RuntimeError) as error:

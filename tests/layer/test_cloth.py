@@ -1,6 +1,7 @@
 """The layer: what it refuses, what it promises about steps, time and grasps."""
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -459,3 +460,15 @@ def test_a_cloth_may_be_made_and_run_in_inference_mode(engine):
     with torch.inference_mode():
         inferred = run()
     assert torch.equal(inferred.x, run().x)
+
+
+def test_cloth_that_has_far_to_go_is_not_settled_and_told():
+    mesh = tc.meshes.rectangle(0.4, 0.4, resolution=(6, 6))
+    pins = {"pins": tc.boundaries.Grasp([0, 30])}
+    cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, {"g": tc.effects.Gravity()}, pins, contact=None)
+    still = {"pins": trajectory()}
+    with torch.no_grad(), pytest.warns(UserWarning, match=r"settle: after 0.3 s .* still moves at 0\.\d+ m/s"):
+        cloth.settle(cloth.rest_state(), still)
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cloth.settle(cloth.rest_state(), still, duration=4.0, rate=5.0)

@@ -28,6 +28,9 @@ FACES = np.array([[0, 1, 2], [0, 2, 3]])
         (SQUARE, FACES, SQUARE[:, :2] * np.nan, r"uv; .* expected finite"),
         (SQUARE, [[0, 1, 2], [0, 2, 2], [0, 2, 3]], None, r"1 degenerate or flipped triangles \(first: 1"),
         (SQUARE, FACES, [[0, 0], [1, 0], [1, 1], [2, 0.5]], "degenerate or flipped"),
+        (SQUARE, [[0, 1, 2], [0, 1, 2, 3]], None, "faces; got list .*a rectangular array"),
+        ([[0, 0, 0], [1, 0]], FACES, None, "vertices; got list"),
+        (torch.tensor(SQUARE, requires_grad=True), FACES, None, "vertices; got Tensor"),
     ],
 )
 def test_refusals_name_the_argument(vertices, faces, uv, message):
@@ -256,13 +259,96 @@ def test_load_keeps_an_obj_with_texture_seams_sewn(tmp_path):
     np.testing.assert_array_equal(mesh.rest, laid)
 
 
-@pytest.mark.parametrize(("scale", "area"), [(1 / 0.3, 1.0), (100.0, 900.0), (0.001, 9e-08)])
-def test_load_refuses_texture_coordinates_for_a_pattern(tmp_path, scale, area):
-    """From 0 to 1, as a texture has them, they would be a cloth of 1 m that lies compressed to 0.3 m."""
-    flat = tc.meshes.rectangle(0.3, 0.3, resolution=(5, 5))
-    (tmp_path / "sheet.obj").write_text(obj.dump(flat.vertices, flat.faces, scale * flat.uv))
-    with pytest.raises(InvalidInput, match=rf"sheet.obj: vt; got {area:g} m\^2 .* 0.09 m\^2; .*vt must be in metres"):
-        tc.meshes.load(tmp_path / "sheet.obj")
+def saved(folder, mesh, uv):
+    path = folder / "sheet.obj"
+    path.write_text(obj.dump(mesh.vertices, mesh.faces, uv))
+    return path
+
+
+@pytest.mark.parametrize("scale", [1 / 0.3, 100.0, 0.001])
+def test_load_refuses_texture_coordinates_for_a_pattern(tmp_path, scale):
+    mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(3, 3))
+    path = saved(tmp_path, mesh, scale * mesh.uv)
+    with pytest.raises(InvalidInput, match=rf"sheet.obj: vt; got edges .* {scale:.3g} times .*vt must be in metres"):
+        tc.meshes.load(path)
+
+
+@pytest.mark.parametrize("size", [(1.0, 0.5), (1.5, 1.0), (1.0, 0.7), (0.7, 0.7), (0.9, 0.9), (1.0, 0.8)])
+def test_load_refuses_textures_of_cloth_of_about_a_metre(tmp_path, size):
+    """Areas alone would not tell them: a towel of half its weight sprang to twice its width."""
+    mesh = tc.meshes.rectangle(*size, resolution=(5, 4))
+    with pytest.raises(InvalidInput, match="vt must be in metres"):
+        tc.meshes.load(saved(tmp_path, mesh, mesh.uv / np.array(size)))
+    np.testing.assert_allclose(tc.meshes.load(saved(tmp_path, mesh, mesh.uv)).area.sum(), np.prod(size))
+
+
+def test_load_refuses_millimetres(tmp_path):
+    mesh = tc.meshes.rectangle(300.0, 300.0, resolution=(3, 3))
+    for uv in (mesh.uv, None):
+        with pytest.raises(InvalidInput, match=r"sheet.obj looks like millimetres; got a span of 300"):
+            tc.meshes.load(saved(tmp_path, mesh, uv))
+
+
+def test_load_refuses_a_pattern_with_holes(tmp_path):
+    mesh = tc.meshes.rectangle(0.4, 0.3, resolution=(4, 4))
+    lines = obj.dump(mesh.vertices, mesh.faces, mesh.uv).splitlines()
+    *words, last = lines[-1].split()
+    lines[-1] = " ".join(word.split("/")[0] for word in (*words, last))
+    path = tmp_path / "holes.obj"
+    path.write_text("\n".join(lines))
+    with pytest.raises(InvalidInput, match=r"vt; got 1 of 18 triangles without; .* or nowhere"):
+        tc.meshes.load(path)
+
+
+@pytest.mark.parametrize("ring", ["1 2 3 4", "2 3 4 1"])
+def test_load_refuses_polygons_that_a_fan_does_not_cover_once(tmp_path, ring):
+    """Of four times the area, by where it began."""
+    path = tmp_path / "dart.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0.2 0.2 0\nv 0 1 0\nf " + ring + "\n")
+    if ring == "1 2 3 4":
+        np.testing.assert_allclose(tc.meshes.load(path).area.sum(), 0.2)
+    else:
+        with pytest.raises(InvalidInput, match=r"line 5: a polygon is not convex.*triangulate"):
+            tc.meshes.load(path)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("corners", [3, 4])
+def test_load_keeps_a_ply_with_coordinates_of_corners_sewn(tmp_path, binary, corners):
+    """As MeshLab writes them; trimesh tears such a mesh apart at its seams."""
+    pytest.importorskip("trimesh")
+    if corners == 3:
+        mesh = tc.meshes.shirt(triangles=300)
+        x, rings, laid = mesh.vertices, mesh.faces, mesh.pattern
+    else:
+        x = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0]])
+        rings = np.array([[0, 1, 2, 3], [1, 4, 5, 2]])
+        laid = x[rings][..., :2] + np.array([[[0.0, 0.0]], [[5.0, 0.3]]])
+    head = ["ply", f"format {'binary_little_endian' if binary else 'ascii'} 1.0", f"element vertex {len(x)}"]
+    head += [f"property double {axis}" for axis in "xyz"] + [f"element face {len(rings)}"]
+    head += ["property list uchar int vertex_indices", "property list uchar double texcoord", "end_header\n"]
+    body = x.astype("<f8").tobytes() if binary else "".join(f"{a!r} {b!r} {c!r}\n" for a, b, c in x.tolist()).encode()
+    for ring, place in zip(rings, laid.reshape(len(rings), -1), strict=True):
+        if binary:
+            body += bytes([corners]) + ring.astype("<i4").tobytes() + bytes([2 * corners]) + place.tobytes()
+        else:
+            words = [corners, *ring.tolist(), 2 * corners, *place.tolist()]
+            body += (" ".join(map(repr, words)) + "\n").encode()
+    path = tmp_path / "sewn.ply"
+    path.write_bytes("\n".join(head).encode() + body)
+    loaded = tc.meshes.load(path)
+    np.testing.assert_array_equal(loaded.vertices, x)
+    assert loaded.pieces == 1
+    assert len(loaded.seams) == (len(mesh.seams) if corners == 3 else 1)
+    np.testing.assert_allclose(loaded.area.sum(), mesh.area.sum() if corners == 3 else 2.0)
+
+
+def test_pieces_are_counted_and_told():
+    one = tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3))
+    two = Mesh.build(np.concatenate([one.vertices, one.vertices + 0.1]), np.concatenate([one.faces, one.faces + 9]))
+    assert (one.pieces, two.pieces) == (1, 2)
+    assert "2 pieces that nothing joins" in repr(tc.Cloth(two, tc.materials.AEP(1e5), 0.2))
+    assert "pieces" not in repr(tc.Cloth(one, tc.materials.AEP(1e5), 0.2))
 
 
 def test_load_takes_a_cloth_that_lies_folded_for_what_it_is(tmp_path):

@@ -141,3 +141,14 @@ def test_preset_and_setting_a_value():
     assert float(cotton.membrane_stiffness) == pytest.approx(200.0)
     with pytest.raises(tc.errors.InvalidInput, match="artificial_silk"):
         AEP.preset("velvet")
+
+
+@pytest.mark.parametrize("strain", [1e-2, 1e-3, 1e-4])
+def test_the_energy_of_small_strains_has_its_digits_in_float32(strain):
+    energies = []
+    for dtype in (torch.float64, torch.float32):
+        cloth = tc.Cloth(tc.meshes.rectangle(0.4, 0.4, triangles=72), AEP(5e4), 0.2, contact=None).to(dtype)
+        turn = torch.tensor([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]).to(dtype)
+        x = (cloth.rest_state().x * (1 + strain)) @ turn.mT
+        energies.append(float(cloth.energy(cloth.state(x))["membrane"]))
+    assert energies[1] == pytest.approx(energies[0], rel=0.02 if strain < 1e-3 else 2e-3)

@@ -41,7 +41,7 @@ class Grasp(AbstractBoundary):
         super().__init__()
         if (vertices is None) == (uv is None):
             raise InvalidInput("Grasp", got="both or neither of vertices and uv", expected="exactly one of them")
-        self._uv, self.radius, self._stays = uv, float(radius), False
+        self._uv, self.radius, self._stays = None if uv is None else _centres(uv), float(radius), False
         self._corner: Corner | None = None
         self._place: str | None = None
         self.register_buffer("index", _indices([] if vertices is None else vertices), persistent=False)
@@ -126,6 +126,18 @@ class Grasp(AbstractBoundary):
     def extra_repr(self) -> str:
         """One line of the data sheet."""
         return f"{len(self.index)} vertices"
+
+
+def _centres(uv: ArrayLike) -> np.ndarray:
+    """[G, 2]"""
+    try:
+        found = np.atleast_2d(np.asarray(uv, dtype=float))
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InvalidInput("Grasp uv", got=f"{uv!r}"[:60], expected="pattern points [G, 2] in metres") from error
+    if found.ndim != 2 or found.shape[1] != 2 or not len(found) or not np.isfinite(found).all():
+        got = f"shape {np.shape(uv)}"
+        raise InvalidInput("Grasp uv", got=got, expected="finite pattern points [G, 2] in metres")
+    return found
 
 
 def _indices(vertices: Sequence[int]) -> Tensor:

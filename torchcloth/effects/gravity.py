@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from .._vectors import check_value
 from ..errors import InvalidInput
 from ..types import Moment
 from .base import AbstractEffect, Amplitude
@@ -53,6 +54,7 @@ class Gravity(AbstractEffect):
 
 
 def _vector(name: str, values: Sequence[float], size: int, expected: str) -> nn.Parameter:
+    check_value(name, values)
     vector = torch.as_tensor(values, dtype=torch.get_default_dtype())
     if vector.shape != (size,) or not torch.isfinite(vector).all():
         raise InvalidInput(name, got=values, expected=expected)

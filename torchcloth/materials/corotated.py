@@ -6,12 +6,13 @@ from torch import Tensor
 
 from .._math import dot
 from ..types import Surface
+from .stretch import right_stretch
 
 
 def energy(mu: Tensor, surface: Surface) -> Tensor:
-    """mu (|F|^2 - 2 s + 2) with s = sigma_1 + sigma_2 = sqrt(|F|^2 + 2 J)."""
-    squared, s = _invariants(surface)
-    return mu * (squared - 2 * s + 2)
+    """mu |U - 1|^2, U the right stretch: mu (|F|^2 - 2 (sigma_1 + sigma_2) + 2) would have no digits left at rest."""
+    u = right_stretch(surface)
+    return mu * ((u.warp - 1).square() + (u.weft - 1).square() + 2 * u.shear.square())
 
 
 def stress(mu: Tensor, pressure: Tensor, surface: Surface) -> tuple[Tensor, Tensor]:

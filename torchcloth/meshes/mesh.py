@@ -12,7 +12,9 @@ from ..errors import InvalidInput
 from . import topology
 
 UNEVEN = 1.5  # times the mean edge, beyond which a longest edge is not that of an even mesh: ours have 1.24 to 1.46
-UNLIKE = 4.0  # times the mesh's area, beyond which a pattern is in another unit
+UNLIKE, TEXTURE = 1.2, 1.05  # times an edge that lies there, beyond which a pattern's is in another unit
+FEW = 0.1  # of the edges, that may be longer or shorter: gathered or stretched where the cloth lies
+LARGEST = 20.0  # m, of a cloth; the same number in millimetres is a handkerchief
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +56,9 @@ class Mesh:
             InvalidInput: wrong shapes, indices out of range, unused vertices, degenerate or flipped triangles, more
                 than two at an edge.
         """
-        x = np.array(vertices, dtype=np.float64)
-        f = _indices(np.asarray(faces))
+        x, f = _numbers("vertices", vertices), _indices(_numbers("faces", faces, None))
         _check_triangles(x, f)
-        pattern = None if uv is None else _per_corner(np.array(uv, dtype=np.float64), f, len(x))
+        pattern = None if uv is None else _per_corner(_numbers("uv", uv), f, len(x))
         rest = _flatten(x[f]) if pattern is None else _turned_over(f, pattern)
         area = signed_area(rest)
         bad = np.flatnonzero(~(area > 1e-9 * np.median(np.abs(area))))
@@ -98,6 +99,11 @@ class Mesh:
         return (
             np.zeros(len(self.faces), np.int64) if self.pattern is None else topology.panels(self.faces, self.pattern)
         )
+
+    @property
+    def pieces(self) -> int:
+        """How many parts have no vertex in common."""
+        return topology.pieces(self.faces)
 
     @property
     def area(self) -> np.ndarray:
@@ -204,16 +210,26 @@ def signed_area(rest: np.ndarray) -> np.ndarray:
     return 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def check_metres(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray, place: str) -> None:
-    """Refuse pattern coordinates [F, 3, 2] of a file that are not in metres, as those of textures are not.
+def check_metres(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray | None, place: str) -> None:
+    """Refuse a file's vertices, or its pattern coordinates [F, 3, 2], that are not in metres.
 
-    However the cloth lies, folded or sewn, its triangles are about as large as in its pattern.
+    However the cloth lies, folded or sewn, its edges are about as long as in its pattern; those of a texture are not,
+    unless by chance: a pattern that fills the unit square must fit more closely.
     """
-    pattern, lying = np.abs(signed_area(corners)).sum(), signed_area(_flatten(vertices[faces])).sum()
-    if not lying / UNLIKE < pattern < lying * UNLIKE:
+    span = float(np.ptp(vertices, axis=0).max())
+    if span > LARGEST:
+        got, remedy = f"a span of {span:.4g}", "multiply by 0.001"
+        raise InvalidInput(f"{place} looks like millimetres", got=got, expected="metres", remedy=remedy)
+    if corners is None:
+        return
+    pattern, lying = (np.linalg.norm(c - np.roll(c, 1, axis=1), axis=-1).ravel() for c in (corners, vertices[faces]))
+    low, high = np.quantile(pattern / np.maximum(lying, 1e-9 * span), (FEW, 1 - FEW))
+    square = np.allclose([corners.min((0, 1)), corners.max((0, 1))], [[0, 0], [1, 1]], rtol=0, atol=1e-3)
+    limit = TEXTURE if square else UNLIKE
+    if not 1 / limit < low <= high < limit:
         raise InvalidInput(
             f"{place}: vt",
-            got=f"{pattern:.3g} m^2 in the pattern of a mesh of {lying:.3g} m^2",
+            got=f"edges in the pattern {low:.3g} to {high:.3g} times as long as in the mesh",
             expected="about the same",
             remedy="vt must be in metres: scale it, or export without texture coordinates",
         )
@@ -224,6 +240,15 @@ def per_vertex(faces: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
     values = np.zeros((faces.max() + 1, corners.shape[-1]))
     values[faces] = corners
     return values if np.array_equal(values[faces], corners) else None
+
+
+def _numbers(name: str, given: ArrayLike, dtype: type | None = np.float64) -> np.ndarray:
+    """A copy as an array; tensors that want gradients have none through a mesh."""
+    try:
+        return np.array(given, dtype=dtype)
+    except (TypeError, ValueError, RuntimeError) as error:
+        expected = "a rectangular array of numbers; triangles, of faces"
+        raise InvalidInput(name, got=f"{type(given).__name__} ({error})"[:120], expected=expected) from error
 
 
 def _indices(faces: np.ndarray) -> np.ndarray:

@@ -29,7 +29,11 @@ def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
                 vt.append([float(x) for x in items[:2]])
             elif word == "f":
                 ring = [_corner(item, len(v), len(vt)) for item in items]
+                if len(ring) > 3:
+                    check_convex(np.array([[v[i] for i, _ in ring]]), f"{place}, line {number}")
                 corners += [(ring[0], *pair) for pair in pairwise(ring[1:])]
+        except InvalidInput:
+            raise
         except ValueError as error:
             raise InvalidInput(
                 f"{place} is damaged at line {number}",
@@ -44,9 +48,27 @@ def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
         raise InvalidInput(
             f"{place} has a vertex in no face", got=f"vertex {unused[0] + 1}", remedy="remove loose vertices"
         )
-    if not vt or (patches < 0).any():
+    if (patches < 0).any():
+        if (patches >= 0).any():
+            got = f"{int((patches < 0).any(1).sum())} of {len(faces)} triangles without"
+            remedy = "give it everywhere, or nowhere"
+            raise InvalidInput(f"{place}: vt", got=got, expected="pattern coordinates of all corners", remedy=remedy)
         return vertices, faces, None
     return vertices, faces, _rows(vt, f"{place}: vt", 2)[patches]
+
+
+def check_convex(polygons: np.ndarray, place: str) -> None:
+    """Refuse polygons [N, K, 3] that a fan of triangles does not cover once.
+
+    Raises:
+        InvalidInput: one is not convex, or folded.
+    """
+    edges = polygons[:, 1:] - polygons[:, :1]
+    twice = np.cross(edges[:, :-1], edges[:, 1:])
+    bent = np.linalg.norm(twice, axis=-1).sum(1) > 1.01 * np.linalg.norm(twice.sum(1), axis=-1)
+    if bent.any():
+        got = f"polygon {int(np.flatnonzero(bent)[0]) + 1} of {len(polygons)}"
+        raise InvalidInput(f"{place}: a polygon is not convex", got=got, remedy="triangulate on export")
 
 
 def dump(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None) -> str:

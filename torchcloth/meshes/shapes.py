@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from operator import index
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -82,13 +83,37 @@ def load(path: str | Path) -> Mesh:
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, OSError) as error:
         raise InvalidInput("mesh file", got=f"{path} ({error})", expected="a readable OBJ or PLY file") from error
     uv = getattr(mesh.visual, "uv", None)
-    uv = None if uv is None or len(uv) != len(mesh.vertices) else uv
-    return _in_metres(Mesh.build(mesh.vertices, mesh.faces, uv), path)
+    arrays = mesh.vertices, mesh.faces, None if uv is None or len(uv) != len(mesh.vertices) else uv
+    return _in_metres(Mesh.build(*(_wedges(mesh.metadata.get("_ply_raw"), path) or arrays)), path)
+
+
+def _wedges(raw: Any, path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """(vertices, faces, coordinates of their corners) of a PLY that gives them per corner, as MeshLab does; else None.
+
+    trimesh would tear such a mesh apart at its seams.
+    """
+    face = (raw or {}).get("face") or {}
+    name = next((n for n in ("texcoord", "texcoords") if n in face.get("properties", ())), None)
+    if name is None:
+        return None
+
+    def rows(key: str) -> np.ndarray:
+        found = face["data"][key]
+        return np.asarray(found["f1"] if getattr(found.dtype, "names", None) else found)
+
+    index = next(n for n in face["properties"] if n in ("vertex_indices", "vertex_index"))
+    corners, coordinates, place = rows(index), rows(name), raw["vertex"]["data"]
+    if corners.ndim != 2 or coordinates.shape != (len(corners), 2 * corners.shape[1]):
+        got = f"{path}, polygons of several kinds with coordinates of their corners"
+        raise InvalidInput("mesh file", got=got, expected="triangles", remedy="triangulate on export")
+    vertices = np.stack([np.asarray(place[axis], dtype=float).ravel() for axis in "xyz"], axis=-1)
+    fan = np.array([[0, k, k + 1] for k in range(1, corners.shape[1] - 1)])
+    obj.check_convex(vertices[corners], str(path))
+    return vertices, corners[:, fan].reshape(-1, 3), coordinates.reshape(*corners.shape, 2)[:, fan].reshape(-1, 3, 2)
 
 
 def _in_metres(mesh: Mesh, path: Path) -> Mesh:
-    if mesh.pattern is not None:
-        check_metres(mesh.vertices, mesh.faces, mesh.pattern, str(path))
+    check_metres(mesh.vertices, mesh.faces, mesh.pattern, str(path))
     return mesh
 
 

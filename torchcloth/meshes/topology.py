@@ -26,12 +26,21 @@ def seams(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 def panels(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     """[F] number of the panel of each triangle: those that are joined on the pattern, without crossing a seam."""
     _, side = np.unique(_laid_sides(faces, pattern), axis=0, return_inverse=True)
-    side = side.reshape(-1, 3)
-    label = np.arange(len(faces))
+    return _joined(side.reshape(-1, 3))
+
+
+def pieces(faces: np.ndarray) -> int:
+    """How many parts have no vertex in common."""
+    return int(_joined(faces).max()) + 1
+
+
+def _joined(touched: np.ndarray) -> np.ndarray:
+    """[F] numbers from 0 on of triangles that are joined by what they touch [F, 3]."""
+    label = np.arange(len(touched))
     while True:
-        lowest = np.full(side.max() + 1, len(faces))
-        np.minimum.at(lowest, side.ravel(), np.repeat(label, 3))
-        spread = lowest[side].min(1)
+        lowest = np.full(touched.max() + 1, len(touched))
+        np.minimum.at(lowest, touched.ravel(), np.repeat(label, 3))
+        spread = lowest[touched].min(1)
         spread = spread[spread]  # a label's own label: paths are halved
         if np.array_equal(spread, label):
             return np.unique(label, return_inverse=True)[1]
