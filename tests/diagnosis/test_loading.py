@@ -94,13 +94,14 @@ def test_another_scene_keeps_the_fabric_and_another_fabric_is_refused(made):
 
 def test_a_diagnosis_begins_with_a_models_fabric_in_the_scene_of_its_episodes(made):
     """And writes what it finds beside the data sheet that the numbers are relative to."""
-    folder, seen, _ = made
+    folder, seen, blank = made
     plane = rec.Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.4)
     other = replace(seen.cloth, nominal=seen.cloth.nominal | {"membrane_stiffness": 1.0})
     model, told = dx.begin_with(folder / "extended.tcm", [replace(seen, colliders={"table": plane}, cloth=other)])
     assert "table" in model.world().cloth.boundaries
     assert dict(zip([h.name for h in model.accepted], model.amplitudes, strict=True))["air.drag_n"] == TRUE
     assert told[0].cloth.nominal == seen.cloth.nominal
+    assert model.met == (mark(blank),), "episodes whose data it carries on"
     own, new = (m.world().cloth.material.youngs_modulus.value for m in (dx.load_model(folder / "extended.tcm"), model))
     assert float(own) == pytest.approx(float(new))
 
@@ -206,5 +207,19 @@ def test_the_bases_metres_hardly_depend_on_what_it_is_compared_with(made, tmp_pa
         assert f.whole.before == pytest.approx(found[0].whole.before, rel=0.03)
         assert f.motions["fast"].before == pytest.approx(found[0].motions["fast"].before, rel=0.03)
     assert found[0].whole.after < found[1].whole.after < 0.9 * found[1].whole.before
-    assert [f.confirmed for f in found] == [True, True, False]
+    assert (found[0].confirmed, found[2].confirmed) == (True, False)
+    assert found[1].whole.density > 0, "a third of it: by one short episode not beyond doubt"
     assert all(f.floor < 1e-3 for f in found), "half a millimetre a point, of which a cell has several"
+
+
+def test_friction_stays_above_none_and_a_table_tells_how_high_a_camera_stands(made):
+    _, _, blank = made
+    table = rec.Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.4)
+    for scene, low, kin in ((blank, None, ("robot.base",)), (replace(blank, colliders={"table": table}), -0.399, ())):
+        by = {h.name: h for h in dx.catalogue(dx.base_model(scene), [scene])}
+        assert by["obs.extrinsic[z]"].kin == kin
+        assert by["obs.extrinsic[y]"].kin == ("robot.base",)
+        if low is not None:
+            assert by["contact.mu"].low == pytest.approx(low)
+            world = dx.base_model(scene).plus(by["contact.mu"]).at(torch.tensor([0.0, 0.0, 0.0, 0.0, -0.6])[-5:])
+            assert world.amplitudes[-1] == pytest.approx(low)

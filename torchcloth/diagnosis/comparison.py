@@ -184,9 +184,9 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
         return Gain(np.nan, np.nan, 0.0, (0.0, 0.0), 0.0, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
     owner, density, squares = _blocks(one, two)
     rng = np.random.default_rng(seed)
-    drawn = [_draw(owner, rng) for _ in range(DRAWS)]
-    sums = np.array([density[d].sum() for d in drawn])
-    shares = np.array([_share(squares[d].sum(0), floor) for d in drawn])
+    drawn = _resampled(owner, rng)
+    sums = drawn @ density
+    shares = np.array([_share(row, floor) for row in drawn @ squares])
     before, after, n = squares.sum(0)
     low, high = (float(np.quantile(sums, q)) for q in (0.025, 0.975))
     total, share = float(density.sum()), _share(squares.sum(0), floor)
@@ -239,10 +239,16 @@ def _mended(one: Predicted, two: Predicted, share: Tensor) -> float:
     return max(0.0, *(before**2 - after**2 for before, after in both)) ** 0.5
 
 
-def _draw(owner: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Indices of blocks: each episode's own, with replacement.
+def _resampled(owner: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """[DRAWS, B] how often each block counts: each episode's own are drawn with replacement.
 
+    Sums of m stretches drawn of m vary by (m - 1) / m of what they do, which is made up for; of one nothing is known.
     Episodes themselves are not resampled: they are different motions, of which one may be the only one that tells.
     """
-    own = (np.flatnonzero(owner == e) for e in np.unique(owner))
-    return np.concatenate([rng.choice(blocks, len(blocks)) for blocks in own])
+    out = np.ones((DRAWS, len(owner)))
+    for e in np.unique(owner):
+        m = int((owner == e).sum())
+        if m > 1:
+            times = rng.multinomial(m, np.full(m, 1 / m), DRAWS)
+            out[:, owner == e] += (m / (m - 1)) ** 0.5 * (times - 1)
+    return out

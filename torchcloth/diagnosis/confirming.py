@@ -52,8 +52,12 @@ class Confirmation:
 
     @property
     def confirmed(self) -> bool:
-        """Whether the extended model predicts better beyond doubt, by density and in millimetres."""
-        return min(self.whole.ci95[0], self.whole.explained_ci95[0]) > 0
+        """Whether the extended model predicts better beyond doubt, by density and in millimetres.
+
+        Never by stretches of time that nothing can be compared with: an episode of 0.4 s is one.
+        """
+        known = self.whole.ci95[0] < self.whole.ci95[1]
+        return known and min(self.whole.ci95[0], self.whole.explained_ci95[0]) > 0
 
     def as_dict(self) -> dict[str, Any]:
         """The content of confirmation.json."""

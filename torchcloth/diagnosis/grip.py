@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from ..boundaries import Coulomb, Elliptic, Grasp, Plane, Stribeck
+from ..cloth import Cloth
 from ..effects import Adhesion, GripSlip
 from ..recordings import Recording
 from .regripped import regripped
@@ -50,6 +51,12 @@ def _friction(world: World, more: float = 0.0, along: float = 0.0, excess: float
         return Plane(plane.point.tolist(), plane.normal.tolist(), Stribeck(mu, mu + sticky, SLOW) if sticky else new)
 
     return _planes(world, changed)
+
+
+def least_change(cloth: Cloth) -> float:
+    """Of friction, at which the least of the planes' is none."""
+    every = [part.friction.value.item() for part in cloth.boundaries.values() if isinstance(part, Plane)]
+    return LEAST - min(every, default=0.0)
 
 
 def _axis(plane: Plane) -> list[float]:

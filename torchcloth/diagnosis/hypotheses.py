@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 from ..errors import InvalidInput
 from ..recordings import Recording
@@ -76,7 +77,16 @@ def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]
     """All hypotheses that the recordings could say something about."""
     without = () if "bending" in model.base.cloth.effects else fabric.OF_BENDING
     asked = [h for h in model.others(known()) if h.effect not in without]
-    return [h for h in asked if any(h.needs(r) for r in recordings)]
+    return [_here(h, model, recordings) for h in asked if any(h.needs(r) for r in recordings)]
+
+
+def _here(hypothesis: Hypothesis, model: Model, recordings: Sequence[Recording]) -> Hypothesis:
+    """As these recordings have it: friction stays above none, and a table tells how high a camera stands."""
+    if hypothesis.name == "contact.mu":
+        return replace(hypothesis, low=grip.least_change(model.base.cloth))
+    if hypothesis.name == "obs.extrinsic[z]" and any(r.colliders for r in recordings):
+        return replace(hypothesis, kin=())
+    return hypothesis
 
 
 def registered() -> list[Hypothesis]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -92,7 +93,8 @@ def begin_with(path: str | Path, recordings: Sequence[Recording]) -> tuple[Model
     """
     own = read_model(path).scene
     told = [of_fabric(path, own, r) for r in recordings]
-    return read_model(path, together(told), residual=False).model, told
+    file = read_model(path, together(told), residual=False)
+    return replace(file.model, met=tuple(file.episodes)), told
 
 
 def _parameter(cloth: Cloth, name: str) -> PhysicalParameter:

@@ -1,7 +1,9 @@
 """Would any course over time have done as well? A cause's slopes, exchanged between windows and motions, as placebos.
 
 What a cause does to the cells is kept as it is within a window, but goes to another window of another motion. Such a
-placebo has the cause's size and shape and cannot be what is wrong. What it gains on motions held out is chance.
+placebo has the cause's size and shape and cannot be what is wrong. What it gains on motions held out is chance. Of
+what is alike in all windows and motions, as of a camera that stands elsewhere, an exchange is the cause itself: such
+draws do not count, and where few are left nothing can be asked.
 """
 
 from __future__ import annotations
@@ -21,13 +23,14 @@ from .noise import Whitened
 from .world import Model
 
 DRAWS, LEVEL = 40, 0.95
+ITSELF, FEWEST = 0.9, 10  # cosine with the cause, from which a draw is none; draws that must be left
 
 
 class Placebo(NamedTuple):
     """Log density that is gained on motions held out, where slopes hold all the way."""
 
     gain: float  # by the cause
-    chance: float  # what 95 % of the placebos stay below
+    chance: float  # what 95 % of the placebos stay below; 0 where there are none
 
     @property
     def passed(self) -> bool:
@@ -49,8 +52,11 @@ def placebo(found: Fitted, groups: Sequence[str], halved: Collection[str] = (), 
         white = without._replace(jacobian=torch.cat([slopes, change[:, None]], 1))
         return _held_out(found, white, nothing, groups, halved) - none
 
-    chance = torch.tensor([gain(_exchanged(found, own - 1, rng)) for _ in range(DRAWS)])
-    return Placebo(gain(column), float(chance.quantile(LEVEL)))
+    drawn = [_exchanged(found, own - 1, rng) for _ in range(DRAWS)]
+    others = [change for change in drawn if abs(torch.cosine_similarity(change, column, 0)) < ITSELF]
+    if len(others) < FEWEST:
+        return Placebo(gain(column), 0.0)
+    return Placebo(gain(column), float(torch.tensor([gain(change) for change in others]).quantile(LEVEL)))
 
 
 def _held_out(found: Fitted, white: Whitened, model: Model, groups: Sequence[str], halved: Collection[str]) -> float:

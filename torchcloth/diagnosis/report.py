@@ -81,7 +81,7 @@ COLUMNS = (
 DECISIONS = (
     "Amplitude: what the residuals ask for. Present: surely larger than what matters. Absent: surely smaller than that "
     "(not zero), or of a sign that makes no sense. Unresolvable: even a typical amplitude might not show; an amplitude "
-    "shows, in four of five cases, from the value in its column on. Inconclusive: none of these. Moves: what a typical "
+    "shows, in one of two cases, from the value in its column on. Inconclusive: none of these. Moves: what a typical "
     "amplitude does to the cloth beyond what is fitted anyway."
 )
 

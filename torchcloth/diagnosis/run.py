@@ -144,7 +144,7 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
         for name in (BASE, EXTENDED):  # of an earlier diagnosis
             (folder / name).unlink(missing_ok=True)
     else:
-        said, scene = answer.content["episodes"], together(recordings)
+        said, scene = [*answer.found.start.model.met, *answer.content["episodes"]], together(recordings)
         residual = answer.residual.model if answer.residual is not None and answer.residual.terms else None
         start, end = answer.found.start, answer.found.end
         save_model(folder / BASE, start.model, scene, start.covariance, episodes=said)

@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -189,6 +190,7 @@ class Model:
     values: Tensor  # [P], coordinates
     accepted: tuple[Hypothesis, ...] = ()
     amplitudes: tuple[float, ...] = ()
+    met: tuple[dict[str, Any], ...] = ()  # marks of episodes that its numbers come from
 
     def world(self, extra: Sequence[tuple[Hypothesis, float]] = ()) -> World:
         """The world at these numbers, with further hypotheses at given amplitudes."""
