@@ -7,6 +7,7 @@ import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
 
+import torchcloth as tc
 from torchcloth.forward_mode import real_tangents
 
 OPERATIONS = {
@@ -119,3 +120,45 @@ def test_is_needed():
     if plain < 40e-6 * 60 and plain < 3 * inside:
         pytest.skip(f"torch {torch.__version__} multiplies mixed operands fast by itself: real_tangents can be retired")
     assert plain > 3 * inside
+
+
+@pytest.mark.parametrize("engine", ["fused", "reference"])
+def test_one_direction_in_inference_mode(engine):
+    """Views of what was made there keep no tangent: derivatives were 0."""
+
+    def moved():
+        hand = {"hand": tc.boundaries.Grasp([0])}
+        mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(4, 4))
+        cloth = tc.Cloth(mesh, tc.materials.AEP(3e4), 0.2, {"g": tc.effects.Gravity()}, hand, None, engine=engine)
+        t = torch.tensor([0.0, 0.01])
+        motion = {"hand": tc.Trajectory(t, torch.eye(4).repeat(2, 1, 1), torch.tensor([True, True]))}
+        lift = torch.zeros(1, 2, 4, 4)
+        lift[:, 1, 2, 3] = 1.0
+        one = {"areal_density.raw": torch.ones(1), "material.youngs_modulus.raw": torch.ones(1)}
+        both = (tc.Directions(one), tc.Directions(motion={"hand": lift}))
+        return [cloth.sensitivities(cloth.rest_state(), motion, t, along=along)[1].x for along in both]
+
+    outside = moved()
+    with torch.inference_mode():
+        inside = moved()
+    for one, other in zip(outside, inside, strict=True):
+        assert float(one.norm()) > 0
+        torch.testing.assert_close(other.clone(), one)
+
+
+def test_jvp_of_numbers_in_float32():
+    """torch.func.jvp makes a float64 tangent of a Python number times a scalar: its bits were read as float32."""
+    hand = {"hand": tc.boundaries.Grasp([0])}
+    mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(5, 5))
+    cloth = tc.Cloth(mesh, tc.materials.AEP(3e4, 0.3), 0.2, {"g": tc.effects.Gravity()}, hand, None).float()
+    t = torch.tensor([0.0, 0.05])
+    motion = {"hand": tc.Trajectory(t, torch.eye(4).repeat(2, 1, 1), torch.tensor([True, True]))}
+    state, name = cloth.rest_state(), "material.poisson_ratio.raw"
+
+    def loss(raw):
+        return torch.func.functional_call(cloth, {name: raw}, (state, motion, t)).x[-1].square().sum()
+
+    raw = cloth.material.poisson_ratio.raw.detach()
+    own = raw.clone().requires_grad_()
+    loss(own).backward()
+    assert float(torch.func.jvp(loss, (raw,), (torch.ones_like(raw),))[1]) == pytest.approx(float(own.grad), rel=1e-3)

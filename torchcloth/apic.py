@@ -33,13 +33,15 @@ def step(
     """As ``functional.step``; ``memory["apic"]`` [..., V + E, 9] 1/s is the affine velocity of the particles."""
     grid = cast("Grid", model.grid)  # Cloth refuses to be made without
     s = surface(model.geometry, state.x, state.v, lost)
-    memory = evolve(model, state, s, dt)
+    memory = evolve(model, state, s, dt, lost)
     layers = near_layers(model, grid, state.x) if layers is None else layers
     press = pressure(model, grid, layers, state, s, dt)
     columns = add_columns(layers, membrane_stress(model, s, memory), press)
     nothing = (torch.zeros_like(columns[0]), torch.zeros_like(columns[1]))
-    outer = vertex_forces(model, state, s, memory, nothing)  # weight, air: triangles get their share of it as well
-    force = vertex_forces(model, state, s, memory, columns) - outer
+    outer = vertex_forces(
+        model, state, s, memory, nothing, lost
+    )  # weight, air: triangles get their share of it as well
+    force = vertex_forces(model, state, s, memory, columns, lost) - outer
     v = state.v + dt * outer / model.mass
 
     batch, vertices = state.x.shape[:-2], state.x.shape[-2]

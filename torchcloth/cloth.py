@@ -18,7 +18,7 @@ from .effects import AbstractEffect
 from .engine.choice import Choice, Setting, check_setting, choose, still_drives
 from .errors import TorchclothError
 from .initial import damped, first_state, held, likeness
-from .intervals import Plan, run
+from .intervals import Plan, divided, run
 from .materials import AbstractMaterial
 from .meshes import Mesh
 from .model import Geometry, Model, vertex_mass
@@ -343,8 +343,11 @@ class Cloth(nn.Module):
             model = damped(model, settling)
         state = expand_state(state, model, motion)
         longest = float("inf") if self._grid is None else self._grid.longest
-        step_for = self._step_for(model, dt) if MATERIAL in state.memory else None
-        plan = Plan(model, motion, frames, counts, state, self._choice(model, state), longest, step_for)
+        choice, step_for, asked = self._choice(model, state), None, None
+        if MATERIAL in state.memory:
+            frames, counts, asked = divided(frames, counts)
+            step_for = self._step_for(model, dt)
+        plan = Plan(model, motion, frames, counts, state, choice, longest, step_for, asked)
         plan.check(state)
         return plan
 

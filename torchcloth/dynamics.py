@@ -24,7 +24,12 @@ def added(total: Impulses, more: Impulses) -> Impulses:
 
 
 def vertex_forces(
-    model: Model, state: ClothState, s: Surface, memory: Memory, columns: tuple[Tensor, Tensor]
+    model: Model,
+    state: ClothState,
+    s: Surface,
+    memory: Memory,
+    columns: tuple[Tensor, Tensor],
+    lost: Tensor | None = None,
 ) -> Tensor:
     """Internal forces and effects, assembled on the vertices [..., V, 3] N; without what acts in stages."""
     g = model.geometry
@@ -34,7 +39,7 @@ def vertex_forces(
     first = -(second + third)
     direct = None
     for name, (effect, c) in model.effects.items():
-        now = Moment(state.x, state.v, s, model.mass, memory.get(f"effects.{name}"))
+        now = Moment(state.x, state.v, s, model.mass, memory.get(f"effects.{name}"), lost=lost)
         force = force_of(name, effect, c, now)
         if force is None:
             continue

@@ -40,7 +40,7 @@ def step(
     ``layers``: of this state or one nearby, None: to be found. ``lost``: see ``stretch``.
     """
     s = surface(model.geometry, state.x, state.v, lost)
-    memory = evolve(model, state, s, dt)
+    memory = evolve(model, state, s, dt, lost)
     columns = membrane_stress(model, s, memory)
     grid, press = model.grid, None
     if grid is not None:
@@ -50,7 +50,7 @@ def step(
             columns = add_columns(layers, columns, press)
 
     resistance = resistance_of(model, s, state.x)
-    force = vertex_forces(model, state, s, memory, columns)
+    force = vertex_forces(model, state, s, memory, columns, lost)
     v = relaxed(model, state, s, memory, dt, drives, substep, resistance)
     free = v + dt * resisted(resistance, force / model.mass)
     if grid is not None and layers is not None and press is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import partial, reduce
 from itertools import pairwise
 from math import ceil
 from typing import NamedTuple
@@ -25,6 +25,18 @@ from .validation import check_extent
 
 AT_ONCE = 4_000_000  # vertices times substeps of one call, which nobody can interrupt
 FEW = 250  # vertices, as which fewer count
+PIECE = 64  # substeps after which one looks at what has set
+
+
+def divided(frames: Sequence[float], counts: Sequence[int]) -> tuple[list[float], list[int], tuple[int, ...]]:
+    """(more frames, so that few substeps lie between two, counts between them, which of them were given)."""
+    times, pieces, given = [frames[0]], [], [0]
+    for (start, end), count in zip(pairwise(frames), counts, strict=True):
+        ends = [count * (k + 1) // ceil(count / PIECE) for k in range(ceil(count / PIECE))]
+        pieces += [last - first for first, last in pairwise([0, *ends])]
+        times += [*(start + (end - start) * last / count for last in ends[:-1]), end]
+        given.append(len(times) - 1)
+    return times, pieces, tuple(given)
 
 
 class Interval(NamedTuple):
@@ -79,6 +91,7 @@ class Plan(NamedTuple):
     choice: Choice
     longest: float  # m, extent that the contact grid has room for
     step_for: Callable[[ClothState], float] | None = None  # [s], longest from a state on; None: it does not matter
+    asked: tuple[int, ...] | None = None  # frames that were asked for; None: all
 
     def intervals(self, now: Callable[[], ClothState]) -> Iterator[Interval]:
         """One after the other; ``now``: the state at the start of the next."""
@@ -102,6 +115,20 @@ class Plan(NamedTuple):
                 first, some = last, []
             if interval is not None:
                 last, some = last + interval.count, [*some, interval]
+
+    @property
+    def times(self) -> list[float]:
+        """[T] s, of the frames that were asked for."""
+        return self.frames if self.asked is None else [self.frames[k] for k in self.asked]
+
+    def results(
+        self, states: Sequence[ClothState], impulses: Sequence[Impulses]
+    ) -> tuple[Sequence[ClothState], Sequence[Impulses]]:
+        """States at the frames that were asked for, and impulses between them."""
+        if self.asked is None:
+            return states, impulses
+        between = [reduce(added, impulses[first:last], {}) for first, last in pairwise(self.asked)]
+        return [states[k] for k in self.asked], between
 
     def drives(self) -> dict[str, Drive]:
         """The motion, resolved for all intervals at once, which costs what one of them does."""
@@ -168,13 +195,14 @@ def _together(
 
 def collect(plan: Plan, states: Sequence[ClothState], impulses: Sequence[Impulses]) -> Rollout:
     """States at the frames and impulses between them, as a rollout."""
+    states, impulses = plan.results(states, impulses)
     x, v = (torch.stack(part, dim=-3) for part in ([s.x for s in states], [s.v for s in states]))
     zero, wrench = x.new_zeros(*x.shape[:-3], 6), {}
-    durations = [end - start for start, end in pairwise(plan.frames)]
+    durations = [end - start for start, end in pairwise(plan.times)]
     for name in (name for name, boundary in plan.model.boundaries.items() if boundary.driven):
         found = [-j[name] / d if name in j else zero for j, d in zip(impulses, durations, strict=True)]
         wrench[name] = torch.stack([zero, *(f.expand_as(zero) for f in found)], dim=-2)
-    return Rollout(torch.tensor(plan.frames, dtype=torch.float64), x, v, wrench, states[-1])
+    return Rollout(torch.tensor(plan.times, dtype=torch.float64), x, v, wrench, states[-1])
 
 
 def advance(

@@ -56,17 +56,18 @@ def as_it_is(model: Model) -> Model:
     Those of ``functional_call`` have gone by then.
     """
     return model._replace(
-        material=_kept(model.material),
-        effects={name: (_kept(effect), c) for name, (effect, c) in model.effects.items()},
-        boundaries={name: _kept(boundary) for name, boundary in model.boundaries.items()},
+        material=kept(model.material),
+        effects={name: (kept(effect), c) for name, (effect, c) in model.effects.items()},
+        boundaries={name: kept(boundary) for name, boundary in model.boundaries.items()},
     )
 
 
-def _kept(part: ModuleT) -> ModuleT:
+def kept(part: ModuleT) -> ModuleT:
+    """A part that keeps the parameters of the moment, and shares all else."""
     own = copy(part)
     own.__dict__ = part.__dict__.copy()
     own._parameters = part._parameters.copy()
-    own._modules = {name: None if inner is None else _kept(inner) for name, inner in part._modules.items()}
+    own._modules = {name: None if inner is None else kept(inner) for name, inner in part._modules.items()}
     return own
 
 

@@ -158,5 +158,5 @@ def to_value(raw: Tensor, domain: Domain) -> Tensor:
     if domain == "positive":
         return raw.exp()
     if domain == "unit_half":
-        return 0.5 * torch.sigmoid(raw)
+        return torch.sigmoid(raw) * raw.new_tensor(0.5)  # a Python number would make torch.func.jvp's tangent float64
     return raw

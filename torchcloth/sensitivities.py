@@ -16,7 +16,7 @@ from .errors import InvalidInput
 from .forward_mode import real_tangents
 from .initial import damped, held
 from .intervals import Interval, Plan, check_finite, collect
-from .model import Model
+from .model import Model, kept
 from .parameters import PhysicalParameter, called
 from .types import ClothState, Rollout, Trajectory
 from .validation import check_numbers
@@ -45,6 +45,7 @@ def sensitivities(
     settle: float,
 ) -> tuple[Rollout, Rollout]:  # a cloth is Any here: the layer stands above this file
     """See ``Cloth.sensitivities``."""
+    cloth = kept(cloth)  # parameters are replaced meanwhile, and others may simulate the same cloth
     count = _check(along, cloth, state, motion)
     plan = cloth.plan(state, motion, times, dt)
     fused = plan.choice.fused
@@ -157,11 +158,11 @@ def _by_copies(
     state, batch = plan.state, plan.state.x.ndim - 2
     with forward_ad.dual_level(), real_tangents():
         entries = _dual_copies(cloth, along.parameters, batch)
-        many = state.map(lambda field: field.expand(count, *field.shape).contiguous())
+        many = state.map(lambda field: _own(field.expand(count, *field.shape)))
         if along.state is not None:
             many = _both(many, _tangent_of(state, along, count), forward_ad.make_dual)
         moved = _dual_motion(motion, along, count, batch)
-        out = called(_Replay(cloth), entries, (many, moved, plan.frames, dt, settle))
+        out = called(_Replay(cloth), entries, (many, moved, plan.times, dt, settle))
         primal = _each(out, lambda t: forward_ad.unpack_dual(t).primal[0].clone())
         return primal, _each(out, _tangent)
 
@@ -206,8 +207,9 @@ def _copies(value: Tensor, tangent: Tensor, count: int, batch: int, axes: int) -
     """K copies of a parameter, with so many axes of its own, in front of ``batch`` others, and their tangents."""
     own = value.shape if value.ndim else torch.Size((1,))  # a number would be taken for a field
     ones = (1,) * max(0, batch + axes - len(own))
-    full = value.detach().reshape(1, *ones, *own).expand(count, *ones, *own).contiguous()
-    return full, tangent.to(full).reshape(full.shape).contiguous()
+    full = value.detach().reshape(1, *ones, *own).expand(count, *ones, *own)
+    full = _own(full)
+    return full, _own(tangent.to(full).reshape(full.shape))
 
 
 def _dual_motion(motion: Mapping[str, Trajectory], along: Directions, count: int, batch: int) -> dict[str, Trajectory]:
@@ -216,10 +218,8 @@ def _dual_motion(motion: Mapping[str, Trajectory], along: Directions, count: int
     for name, tangent in along.motion.items():
         pose = motion[name].pose.detach()
         ones = (1,) * max(0, batch + 3 - pose.ndim)
-        many = pose.reshape(1, *ones, *pose.shape).expand(count, *ones, *pose.shape).contiguous()
-        out[name] = motion[name]._replace(
-            pose=forward_ad.make_dual(many, tangent.to(many).reshape(many.shape).contiguous())
-        )
+        many = _own(pose.reshape(1, *ones, *pose.shape).expand(count, *ones, *pose.shape))
+        out[name] = motion[name]._replace(pose=forward_ad.make_dual(many, _own(tangent.to(many).reshape(many.shape))))
     return out
 
 
@@ -233,7 +233,12 @@ def _tangent_of(state: ClothState, along: Directions, count: int) -> ClothState:
 
 def _spread(tangent: Tensor, like: Tensor) -> Tensor:
     ones = (1,) * (like.ndim - tangent.ndim)
-    return tangent.reshape(tangent.shape[0], *ones, *tangent.shape[1:]).expand_as(like).contiguous()
+    return _own(tangent.reshape(tangent.shape[0], *ones, *tangent.shape[1:]).expand_as(like))
+
+
+def _own(tensor: Tensor) -> Tensor:
+    """A contiguous copy: what was made in inference mode keeps no tangent, nor does a view of it."""
+    return tensor.clone(memory_format=torch.contiguous_format)
 
 
 def _both(a: ClothState, b: ClothState, function: Callable[[Tensor, Tensor], Tensor]) -> ClothState:

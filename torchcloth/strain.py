@@ -15,7 +15,7 @@ from .types import ClothState, Memory, Moment, Surface
 MATERIAL = "material"  # key of the plastic set among the internal variables
 
 
-def evolve(model: Model, state: ClothState, s: Surface, dt: float) -> Memory:
+def evolve(model: Model, state: ClothState, s: Surface, dt: float, lost: Tensor | None = None) -> Memory:
     """Plastic set, internal friction and creases follow the cloth to where it is now, ``dt`` [s] later."""
     memory = dict(state.memory)
     if MATERIAL in memory:
@@ -24,7 +24,7 @@ def evolve(model: Model, state: ClothState, s: Surface, dt: float) -> Memory:
     for name, (effect, c) in model.effects.items():
         own = memory.get(f"effects.{name}")
         if own is not None:
-            memory[f"effects.{name}"] = effect.evolve(c, Moment(state.x, state.v, s, model.mass, own, dt))
+            memory[f"effects.{name}"] = effect.evolve(c, Moment(state.x, state.v, s, model.mass, own, dt, lost))
     return memory
 
 

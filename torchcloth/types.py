@@ -52,6 +52,7 @@ class Moment(NamedTuple):
     mass: Tensor  # [..., V, 1] kg
     memory: Tensor | None = None  # [..., N, K], the effect's own internal variables
     dt: float = 0.0  # s, since the internal variables were last evolved
+    lost: Tensor | None = None  # [..., V, 3] m, what was too small to be added to x in float32; the surface knows it
 
 
 class Trajectory(NamedTuple):

@@ -129,11 +129,14 @@ def check_parameters(cloth: nn.Module) -> None:
     No NaN: comparisons with one are false, so a threshold of NaN would pass for an effect that is not there. And no
     amplitude below zero, which would drive what it should brake.
     """
+    check_fields(dict(cloth.effects.items()), len(cloth.mesh.faces))  # type: ignore[arg-type, operator, union-attr]
     for name, parameter in cloth.named_parameters():
         if bool(parameter.isnan().any()):
             raise InvalidInput(name, got="NaN", expected="a number", remedy="look at the optimiser's last step")
     for name, part in cloth.named_modules():
         if isinstance(part, PhysicalParameter):
+            if name.startswith("material.") or name == "areal_density":  # others may have been put in their place
+                check_field(name, part.raw, len(cloth.mesh.faces))  # type: ignore[arg-type]
             clips = part.domain == "nonnegative"
             part.check(name, "call the cloth's clip_() after every step of an optimiser" if clips else "")
 

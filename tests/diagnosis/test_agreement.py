@@ -26,7 +26,7 @@ from torchcloth.diagnosis.world import Model
 
 
 def gain(after):
-    return Gain(1.0, after, 50.0, (10.0, 90.0), 0.5, (0.2, 0.8), (1.0, after), (0.0, 0.0))
+    return Gain(1.0, after, 50.0, (10.0, 90.0), 0.5, (0.2, 0.8), (1.0, after), (0.0, 0.0), 20.0)
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
 )
 def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, shows, low, worth):
     """It mends nothing beside the parameter that has done it."""
-    gain = Gain(1e-3, 1e-3, 5.0, (low, 9.0), 0.0, (0.0, 0.0), (1e-3, 1e-3), (0.0, 0.0))
+    gain = Gain(1e-3, 1e-3, 5.0, (low, 9.0), 0.0, (0.0, 0.0), (1e-3, 1e-3), (0.0, 0.0), low)
     fitted = SimpleNamespace(model=SimpleNamespace(parameters=[toys.parameter("p")]))
     row = SimpleNamespace(shows=shows)
     c = SimpleNamespace(hypothesis=toys.hypothesis("m", twin=twin), fitted=fitted, row=row)

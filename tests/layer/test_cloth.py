@@ -472,3 +472,13 @@ def test_cloth_that_has_far_to_go_is_not_settled_and_told():
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("error")
         cloth.settle(cloth.rest_state(), still, duration=4.0, rate=5.0)
+
+
+@pytest.mark.parametrize("engine", ["fused", "reference"])
+def test_parts_that_were_put_in_a_places_are_looked_at_again(engine):
+    """Of a field of another mesh the engine would read, and write, other memory."""
+    cloth = sheet(contact=tc.Contact())
+    cloth.engine = engine
+    cloth.material.cone = tc.PhysicalParameter(torch.tensor([0.3, 0.6]), "-", "nonnegative")
+    with pytest.raises(InvalidInput, match=r"material\.cone; got shape \(2,\); expected a scalar, \[18\]"):
+        cloth(cloth.rest_state(), times=[0.0, 0.001])

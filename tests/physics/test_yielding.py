@@ -268,3 +268,23 @@ def test_along_directions_the_step_follows_as_well():
     torch.testing.assert_close(
         cloth.sensitivities(state, times=[0.0, 0.02], along=along)[0].x, expected, rtol=0, atol=1e-9
     )
+
+
+def test_what_sets_between_two_frames_is_looked_at_as_well():
+    """Frames are what is asked for: impulses and times are those of one interval."""
+    y = tc.meshes.rectangle(0.1, 0.1, resolution=(4, 4)).vertices[:, 1]
+    grips = {"hand": tc.boundaries.Grasp((y < 0.01).nonzero()[0].tolist())}
+    grips["rest"] = tc.boundaries.Grasp((y > 0.09).nonzero()[0].tolist())
+    cloth = sheet(boundaries=grips, effects={"damping": tc.effects.MassDamping(20.0)})
+    t = torch.linspace(0, 0.3, 7)
+    pose = torch.eye(4).repeat(7, 1, 1)
+    still = tc.Trajectory(t, pose.clone(), torch.ones(7, dtype=torch.bool))
+    pose[:, 1, 3] = 0.28 * t
+    motion = {"hand": tc.Trajectory(t, pose, torch.ones(7, dtype=torch.bool)), "rest": still}
+    with torch.no_grad():
+        few, many = (cloth(cloth.rest_state(), motion, times=times) for times in ([0.0, 0.3], t))
+    assert few.t.tolist() == [0.0, 0.3]
+    assert few.x.shape[0] == few.wrench["hand"].shape[0] == 2
+    assert float(few.v[-1].norm(dim=-1).max()) < 0.3, "the gripper goes at 0.28 m/s"
+    mean = many.wrench["hand"][1:].mean(0)
+    assert float((few.wrench["hand"][1] - mean).norm()) < 0.2 * float(mean.norm())

@@ -107,7 +107,7 @@ def _anew(
     least = 0.0 if lacking else MUCH
     likely = if_possible(lambda: afresh(start, setting, asked, TRIED, progress, least)) or []
     first = one_step(start, setting, [(rows[h.name], model) for h, model in likely], screened, progress)
-    if first is None or not (lacking or first.best.gain.ci95[0] > SURELY):
+    if first is None or not (lacking or first.best.gain.least > SURELY):
         return start, []
     return _chain(start, setting, hypotheses, progress, TRIED, first)
 
@@ -147,7 +147,7 @@ def instead(found: Found, laws: Fitted, tried: int, progress: Progress = lambda 
     alone = alone_in(found.steps)
     law, end = (predict(f, names, alone) for f in weighed_alike(step.best.fitted, found.end))
     over = compare(end, law, 0.0)
-    if over.ci95[0] < 0 or over.density < HALF * gained:
+    if over.least < 0 or over.density < HALF * gained:
         return found
     withdrawn = tuple(s.best.hypothesis.name for s in found.causes)
     none = _found(found.start, found.start, [], found.setting)

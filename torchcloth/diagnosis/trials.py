@@ -221,7 +221,7 @@ def _plausible(c: Candidate) -> bool:
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:
     """What one motion alone tells has predicted no other one: it must surely gain what nulls' causes do not."""
-    sure = not c.alone or c.gain.ci95[0] > SURELY
+    sure = not c.alone or c.gain.least > SURELY
     return sure and worth_naming(c, c.gain) and known(c.fitted, c.hypothesis.name, names, c)
 
 
@@ -245,14 +245,14 @@ def known(found: Fitted, name: str, names: Sequence[str], c: Candidate) -> bool:
 def worth_naming(c: Candidate, gain: Gain) -> bool:
     """As ``worthwhile``; what a parameter does already beside its data sheet must show there, and surely be a gain."""
     twin = bool(c.hypothesis.twin) and c.hypothesis.twin in (p.name for p in c.fitted.model.parameters)
-    return gain.ci95[0] > 0 if twin and c.row.shows else worthwhile(gain)
+    return gain.least > 0 if twin and c.row.shows else worthwhile(gain)
 
 
 def worthwhile(gain: Gain) -> bool:
     """Large enough to be noticed, and surely a gain."""
     seen, felt = gain.mended
     mended = gain.fallen > WORTH_SHARE * gain.calm[0] ** 2 or seen > WORTH_MM or felt > WORTH_PULL
-    return mended and gain.ci95[0] > 0
+    return mended and gain.least > 0
 
 
 def _themselves(useful: Sequence[Candidate]) -> list[Candidate]:
@@ -277,4 +277,4 @@ def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
         return False
     over = compare(predicted, best.predicted, 0.0)
     hardly = over.density < HARDLY * best.gain.density and over.fallen < HARDLY * best.gain.fallen
-    return over.density < CLEAR or over.ci95[0] < 0 or hardly
+    return over.density < CLEAR or over.least < 0 or hardly

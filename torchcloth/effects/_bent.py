@@ -69,9 +69,11 @@ class BentSheet(nn.Module):
         )
         return self
 
-    def see(self, x: Tensor) -> Bent:
-        """Derivatives at positions [..., V, 3] m."""
+    def see(self, x: Tensor, lost: Tensor | None = None) -> Bent:
+        """Derivatives at positions [..., V, 3] m; ``lost``: what of them float32 could not add, see ``Moment``."""
         values = self._derivatives(self.weight, x)
+        if lost is not None:
+            values = values + self._derivatives(self.weight, lost)
         warp, weft = values[..., 3, :, :], values[..., 4, :, :]
         normal = cross(warp, weft)
         stretch = safe_norm(normal).clamp(min=FOLDED)

@@ -176,7 +176,9 @@ class Bending(AbstractEffect):
         force = self._straightened(c, field)
         if c.curl is None or c.plate is None:
             return force
-        return force - self.sheet.force(self.sheet.see(now.x), c.plate.moment(self.rest_curvature(c.curl, now)))
+        return force - self.sheet.force(
+            self.sheet.see(now.x, now.lost), c.plate.moment(self.rest_curvature(c.curl, now))
+        )
 
     def viscous(self, c: Coefficients, now: Moment) -> Tensor | None:
         """-Q damping_time v."""

@@ -66,7 +66,7 @@ class CreasingBending(Bending):
     def evolve(self, c: Coefficients, now: Moment) -> Tensor:
         """The excess of the elastic curvature flows into the crease."""
         crease, curl, mobility = remembered(now), cast("Tensor", c.curl), cast("Tensor", c.mobility)
-        elastic = self.sheet.see(now.x).curvature - curl - crease
+        elastic = self.sheet.see(now.x, now.lost).curvature - curl - crease
         size = safe_norm(elastic)
         bent = size > self.yield_curvature
         excess = torch.where(bent, 1 - self.yield_curvature / torch.where(bent, size, 1.0), 0.0)

@@ -57,13 +57,13 @@ class BendingFriction(AbstractEffect):
     def evolve(self, c: Tensor, now: Moment) -> Tensor:
         """Dahl's law along the change of curvature."""
         before, share = _halves(now)
-        k = self.sheet.see(now.x).curvature
+        k = self.sheet.see(now.x, now.lost).curvature
         return torch.cat([k, dragged(share, k - before, self.threshold)], dim=-1)
 
     def force(self, c: Tensor, now: Moment) -> Tensor:
         """That of the moment z."""
         _, share = _halves(now)
-        return self.sheet.force(self.sheet.see(now.x), c * share)
+        return self.sheet.force(self.sheet.see(now.x, now.lost), c * share)
 
     def rates(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
         """Twice the sticking stiffness, which is what a reversal out of sliding meets, and z's turning."""

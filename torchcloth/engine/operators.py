@@ -91,7 +91,7 @@ def _adjoints(
         every = running.spacing(job)
         records = running.forward(job, every)[1]
     fields = job.program.inputs
-    given = dict(zip(job.program.outputs, (s.contiguous() for s in seeds), strict=True))
+    given = dict(zip(job.program.outputs, (s.to(job.program.dtype).contiguous() for s in seeds), strict=True))
     found = running.reverse(job, records.contiguous(), every, given, {fields[i] for i in wanted})
     grads = [found[fields[i]] for i in wanted]
     return [g.sum(0, keepdim=True) if len(inputs[i]) < len(g) else g for i, g in zip(wanted, grads, strict=True)]
@@ -127,7 +127,8 @@ def _tangents(
     """
     job = _job(program, substeps, inputs)
     fields = job.program.inputs
-    dots = {fields[i]: t.contiguous() for i, t in zip(moved, tangents, strict=True)}
+    dtype = job.program.dtype  # torch.func.jvp makes float64 of a Python number times a scalar
+    dots = {fields[i]: t.to(dtype).contiguous() for i, t in zip(moved, tangents, strict=True)}
     results, moves = running.tangent(job, dots, tangents[0].shape[1])
     return [*results.values(), *moves.values()]
 

@@ -108,6 +108,8 @@ class Sheet:
         seen = program.temporary(lowering.vertices, 15)
         self._answer = program.temporary(lowering.vertices, 15, kept=False)
         program.stencil(near, weight, lowering.x.now, seen)
+        if lowering.lost is not None and any(key.startswith("effects.") for key in lowering.memory):
+            program.stencil(near, weight, lowering.lost.now, seen)  # what remembers a path, adds up what is rounded
         self.loop = lowering.loop(lowering.vertices)
         program.stencil(near, weight, lowering.force, self._answer, Shape.TRANSPOSED)
         self._seen = self.loop.load(seen)

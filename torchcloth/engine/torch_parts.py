@@ -53,12 +53,13 @@ class TorchParts:
         """(force on the vertices [..., V, 3] N, internal variables of these parts) at the start of a substep."""
         s = surface(self.model.geometry, state.x, state.v, lost)
         own = {key: value for key, value in state.memory.items() if key in self.parts}
-        memory = evolve(self.model, state._replace(memory=own), s, dt)
+        memory = evolve(self.model, state._replace(memory=own), s, dt, lost)
         if MATERIAL in self.parts:
-            return vertex_forces(self.model, state, s, memory, membrane_stress(self.model, s, memory)), memory
+            columns = membrane_stress(self.model, s, memory)
+            return vertex_forces(self.model, state, s, memory, columns, lost), memory
         total, shares = torch.zeros_like(state.x), None
         for name, (effect, c) in self.model.effects.items():
-            now = Moment(state.x, state.v, s, self.model.mass, memory.get(f"effects.{name}"))
+            now = Moment(state.x, state.v, s, self.model.mass, memory.get(f"effects.{name}"), lost=lost)
             force = force_of(name, effect, c, now)
             if force is not None and effect.acts_on == "triangles":
                 shares = force / 3 if shares is None else shares + force / 3
