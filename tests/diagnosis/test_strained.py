@@ -108,7 +108,7 @@ def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(
 ):
     """The fit has made up for half an effect, and nulls' causes promise something as well."""
     start, tried = found(0.1), []
-    gain = SimpleNamespace(ci95=(surely, 99.0))
+    gain = SimpleNamespace(least=surely)
     first = Step(Candidate(None, start, None, gain, set(), 0.0), None, [], [], [], start, None)  # type: ignore[arg-type]
     monkeypatch.setattr(stepwise, "is_lacking", lambda *_: lacking)
     monkeypatch.setattr(stepwise, "screen", lambda f: [])
@@ -140,5 +140,5 @@ def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, alone, surely
     """No other motion has predicted it: friction of one fold gained 38 (17 to 68) and was not there."""
     monkeypatch.setattr(trials, "worth_naming", lambda *_: True)
     monkeypatch.setattr(trials, "known", lambda *_: True)
-    gain, row = SimpleNamespace(ci95=(surely, 99.0)), SimpleNamespace(hypothesis=CAUSE)
+    gain, row = SimpleNamespace(least=surely), SimpleNamespace(hypothesis=CAUSE)
     assert trials._useful(Candidate(row, None, None, gain, alone, 2.0), ["fold", "hang"]) == useful  # type: ignore[arg-type]
