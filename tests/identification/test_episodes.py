@@ -296,3 +296,15 @@ def test_a_field_is_not_a_scalar(recording):
     cloth.areal_density = PhysicalParameter(field, "kg/m^2", name="areal_density")
     with pytest.raises(InvalidInput, match="areal_density"):
         identify(cloth, recording, ["areal_density"])
+
+
+def test_force_readings_after_the_last_cloud_are_told():
+    """Frames are those of what is seen: readings of a second were dropped without a word."""
+    whole = twins.twin()
+    t = whole.grippers["left"].t
+    hands = {name: replace(m, force=np.zeros((len(t), 3))) for name, m in whole.grippers.items()}
+    short = replace(twins.first(whole, 4), grippers=hands)
+    data = episode(twins.at(short), short)
+    assert data.unused > 10
+    assert any("force readings come after the last frame that was seen" in doubt for doubt in data.doubts())
+    assert episode(twins.at(whole), replace(whole, grippers=hands)).unused == 0

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,26 +12,31 @@ import torch
 from torch import Tensor
 
 from ..cloth import Cloth
+from ..errors import SimulationDiverged, UnstableStep
 from ..losses import closest
 from ..losses.surface import distances
 from ..recordings import Recording
 from .episodes import Episode, episode
 from .gauss_newton import NORMAL
+from .linearity import NONLINEAR
 from .misfit import figures, forces_rms
 from .null import no_force, rigid_carry
-from .replays import Frames, tangents
+from .replays import Frames, each, simulate, tangents
 from .result import or_none
 from .saved import SavedModel, read_saved, rebuilt, step_of
 from .unknowns import Unknown, collect
 
 CONVENTION = (
     "SI units. std_parameters: standard error [m] of a vertex's place (root mean square over the cloth and time, and "
-    "the largest) by the covariance of the fitted parameters, linearised. std_law: rms distance that the fit left in "
-    "its own episodes: sensor noise and what the law misses. interval: half width [m], along the surface's normal, of "
-    "the 95 % interval of a measured point by both together (root mean square over the cloth and time, and the "
-    "largest), and the share of the measured points inside. rms, chamfer: of the measured points from the simulated "
-    "surface, one-sided; null: the cloth carried rigidly by the grippers. Null (JSON) where nothing was seen."
+    "the largest) by the covariance of the fitted parameters, linearised; where the motion is unstable, by steps of a "
+    "standard error. std_law: rms distance that the fit left in its own episodes: sensor noise and what the law "
+    "misses. interval: half width [m], along the surface's normal, of the 95 % interval of a measured point by both "
+    "together (root mean square over the cloth and time, and the largest), and the share of the measured points "
+    "inside. What differs between episodes (first shape, grasp, camera, clock) is in none of them. rms, chamfer: of "
+    "the measured points from the simulated surface, one-sided; null: the cloth carried rigidly by the grippers. Null "
+    "(JSON) where nothing was seen."
 )
+NOTICED = 1e-4  # m rms, that a standard error must move the cloth by for its tangents to be looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +55,7 @@ class EpisodePrediction:
         inside: share of the measured points that lie in it, NaN without points.
         figures: distances [m] of what was seen, NaN where nothing was.
         per_frame: [T'] m, mean distance in the frames that have points.
+        warnings: what a reader should know of it, in sentences.
     """
 
     cloth: Cloth
@@ -61,6 +68,7 @@ class EpisodePrediction:
     inside: float
     figures: dict[str, float]
     per_frame: Tensor
+    warnings: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """The content of prediction.json."""
@@ -75,6 +83,7 @@ class EpisodePrediction:
                 "inside": or_none(self.inside),
             },
             "measured": {name: or_none(value) for name, value in self.figures.items()},
+            "warnings": list(self.warnings),
             "convention": CONVENTION,
         }
 
@@ -97,7 +106,48 @@ def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction
     raw = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
     with step_of(path):
         frames, moved = tangents(cloth, unknowns, raw, data, model.dt)
-    return with_errors(cloth, data, frames, moved, covariance, model.left)
+        moved, lost = _held_to_steps(cloth, unknowns, raw, data, model.dt, (frames, moved), covariance)
+    found = with_errors(cloth, data, frames, moved, covariance, model.left)
+    if not lost:
+        return found
+    text = (
+        f"the motion is unstable or strongly nonlinear: tangents of {', '.join(lost)} miss what a standard error does, "
+        "and were replaced by it; errors are no better than such a step"
+    )
+    return replace(found, warnings=(text,))
+
+
+@torch.no_grad()
+def _held_to_steps(
+    cloth: Cloth,
+    unknowns: Sequence[Unknown],
+    raw: Tensor,
+    data: Episode,
+    dt: float | None,
+    both: tuple[Frames, Frames],
+    covariance: Tensor,
+) -> tuple[Frames, list[str]]:
+    """(slopes, names of those that tangents miss): of unstable motion they describe what is too small to matter."""
+    frames, moved = both
+    moved, lost = each(moved, torch.clone), []
+    for k, (unknown, std) in enumerate(zip(unknowns, covariance.diagonal().sqrt().tolist(), strict=True)):
+        if not std > 0:
+            continue
+        there = raw.clone()
+        there[k] = unknown.clip(float(raw[k]) + std)
+        try:
+            step = simulate(cloth, unknowns, there, data, dt)
+        except (SimulationDiverged, UnstableStep):  # as far as a longer step of the same cloth tells
+            continue
+        secant = (step.x - frames.x) / std
+        off = float((secant - moved.x[k]).norm() / secant.norm().clamp(min=1e-30))
+        most = max(float(s.square().sum(-1).mean().sqrt()) for s in (secant, moved.x[k]))
+        if std * most > NOTICED and not off < NONLINEAR:
+            lost.append(unknown.name)
+            moved.x[k], moved.v[k] = secant, (step.v - frames.v) / std
+            for name, wrench in moved.wrench.items():
+                wrench[k] = (step.wrench[name] - frames.wrench[name]) / std
+    return moved, lost
 
 
 def with_errors(

@@ -52,6 +52,7 @@ class Episode:
         unseen: frames at the end that are simulated and not observed.
         eye: [3] m, where the camera stands; None where there is none, or more than one.
         dropped: frames after the motion's end, which are not simulated.
+        unused: force readings after the last frame of what was seen, which are not simulated either.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Episode:
     unseen: int = 0
     eye: Tensor | None = None
     dropped: int = 0
+    unused: int = 0
 
     def identity(self) -> list[object]:
         """What simulations of it, and what is seen of them, depend on."""
@@ -91,6 +93,11 @@ class Episode:
             out.append(
                 f"{self.name}: {self.dropped} of {self.observed + self.dropped} frames come after the motion's end and "
                 "were left out: record the motion as long, or check clock_offset"
+            )
+        if self.unused:
+            out.append(
+                f"{self.name}: {self.unused} force readings come after the last frame that was seen and were left out: "
+                "leave points and markers out of the recording to use forces alone"
             )
         if self.motion and not any(bool(m.closed.any()) for m in self.motion.values()):
             out.append(f"{self.name}: no gripper is ever closed: the cloth was simulated as let go")
@@ -221,6 +228,7 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
     initial = first_shape(name, cloth, recording).to(dtype)
     _check_place(name, cloth, motion, initial, times[0])
     markers = streams.markers(recording, times, dtype)
+    felt = streams.felt(recording, needed)
     return Episode(
         name=name,
         motion={key: motion[key] for key in needed},
@@ -234,6 +242,7 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
         wrenches=streams.wrenches(recording, needed, times, dtype),
         eye=_eye(recording, dtype),
         dropped=dropped,
+        unused=int((felt > times[-1] + float(np.diff(times).max())).sum()),
     )
 
 

@@ -100,6 +100,8 @@ def print_predicted(found: EpisodePrediction) -> None:
         print(
             f"together:      95 % of measured points should be within {1e3 * half['rms']:.2g} mm of the surface{inside}"
         )
+    for warning in found.warnings:
+        print(f"warning: {warning}")
     columns = {"rms mm": ("rms", 1e3), "Chamfer mm": ("chamfer", 1e3), "force rms N": ("force_rms", 1.0)}
     known = {heading: own for heading, own in columns.items() if math.isfinite(f.get(own[0], math.nan))}
     if not known:

@@ -89,7 +89,7 @@ def replayed(path: str | Path, recording: Recording) -> Replayed:
     if before and abs(found.chamfer - before[0]) > FAITHFUL * before[0]:
         warning = (
             f"the simulation is {1e3 * found.chamfer:.2f} mm from the points, the fit was {1e3 * before[0]:.2f}: "
-            "the fitted model had parts that the episode does not describe"
+            "the fitted model had parts that the episode does not describe, or nuisances, which a replay leaves out"
         )
     return Replayed(cloth, data, frames, found.per_frame, bool(before), warning)
 
