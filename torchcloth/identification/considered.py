@@ -19,16 +19,17 @@ from .replicates import FEWEST, scatter
 
 def covariance_of(objective: Objective, checked: Checked, strata: Tensor | None = None) -> Tensor:
     """[K, K] of a solution, held places and episodes' scatter included; ``strata`` [E]: ``replicates.strata_of``."""
-    if checked.covariance is not None:
-        return checked.covariance
     final = checked.final
     problem, count = objective.problem(), len(objective.episodes)
-    own = gauss_newton.covariance(problem, final)
+    known = checked.covariance
+    own = gauss_newton.covariance(problem, final) if known is None else known
     if count >= FEWEST:
         strata = torch.zeros(count, dtype=torch.int64) if strata is None else strata
         spread = scatter(problem, final, objective.episode_of(final.linear), strata)
         spread[len(objective.unknowns) :] = 0.0  # an episode's own nuisance is lost without it, and scatters nowhere
         own = gauss_newton.at_least(own, spread)
+    if known is not None:
+        return own
     if checked.withdrawn:  # nothing of it will be used
         return own
     if not final.converged:  # the answer of a search that was cut short is as uncertain as the way that is left

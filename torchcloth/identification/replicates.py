@@ -67,10 +67,10 @@ def scatter(problem: Problem, at: Iterate, episode: Tensor, strata: Tensor) -> T
     Args:
         problem: of all episodes.
         at: its solution.
-        episode: [R] of every row.
+        episode: [R] of every row; E and more: of one that stays.
         strata: [E] numbers of groups of replicates, within which the scatter counts.
     """
-    rows = torch.bincount(episode, minlength=len(strata))
+    rows = torch.bincount(episode, minlength=len(strata))[: len(strata)]
     told = torch.nonzero((rows > 0) & (rows < len(episode)))[:, 0]  # without its only one a fit has no data
     total, strata = torch.zeros_like(at.raw), strata[told]
     if not len(told):
@@ -88,7 +88,7 @@ def scatter(problem: Problem, at: Iterate, episode: Tensor, strata: Tensor) -> T
 
 def _without(problem: Problem, at: Iterate, left_out: Tensor) -> Tensor:
     """[K], by how much the estimate moves without some rows."""
-    linear, kept = at.linear, ~left_out
+    linear, kept = at.linear._replace(wobble=None, blur=None), ~left_out
     parts = ((name, getattr(linear, name)) for name in linear._fields)
     less = linear._replace(**{name: part[kept] for name, part in parts if part is not None})
 

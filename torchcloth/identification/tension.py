@@ -20,6 +20,7 @@ from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from ..recordings import ForceDisplacement
 from . import gauss_newton
+from .replicates import FEWEST, scatter
 from .report import doubts, estimates
 from .result import set_identified
 from .specimens import AbstractSpecimen, Response, Uniaxial, curves
@@ -31,7 +32,8 @@ RESOLUTION = 1e-3  # of a table's largest reading: no kind of reading is taken t
 MISSED = 0.05  # of a table's largest reading, beyond which the law is said to miss it
 CONVENTION = (
     "SI units. errors: force and lateral strain, computed minus measured, as a share of the largest reading of their "
-    "table. std: standard error; it allows for errors that are correlated along a curve, not for a wrong law. "
+    "table. std: standard error; it allows for errors that are correlated along a curve, and by what three tables or "
+    "more at one angle differ, not for a wrong law. "
     "identifiable: std below a quarter of the value (of a typical amplitude, where the amplitude is smaller)."
 )
 
@@ -165,12 +167,14 @@ class _Readings:
         self.contraction, self.lateral_scale = contraction, 1.0
         self.start = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
         frame, patch, lateral, first = [], [], [], 0
+        table = [k for k, t in enumerate(tables) for _ in range(1 + (contraction and t.lateral_strain is not None))]
         for k, (kind, rows) in enumerate(self._misses(self.curves(self.start))):
             frame.append(torch.arange(len(rows)) + first)
             patch.append(torch.full((len(rows),), k))
             lateral.append(torch.full((len(rows),), kind == "lateral"))
             first += len(rows) + gauss_newton.WINDOW  # windows do not reach across curves
         self.frame, self.patch, self.lateral = torch.cat(frame), torch.cat(patch), torch.cat(lateral)
+        self.table = torch.tensor(table)[self.patch]  # of every row
 
     def weigh(self, value: Tensor) -> bool:
         """Let forces and lateral strains count by how well each kind is met at a first fit; whether there are both."""
@@ -227,7 +231,7 @@ def _share(computed: Tensor, measured: Any) -> Tensor:
 
 
 def _statements(readings: _Readings, found: gauss_newton.Iterate, iterations: int) -> TensionFit:
-    covariance = gauss_newton.covariance(readings.problem(), found)
+    covariance = _covariance(readings, found)
     said = estimates(readings.cloth, readings.unknowns, found.raw, covariance)
     with torch.no_grad():
         before, after = readings.curves(readings.start), readings.curves(found.raw)
@@ -245,6 +249,21 @@ def _statements(readings: _Readings, found: gauss_newton.Iterate, iterations: in
     ]
     model = _model(readings, found, covariance)
     return TensionFit(said.parameters, said.correlation, errors, after, warnings, iterations, keys, model)
+
+
+def _covariance(readings: _Readings, found: gauss_newton.Iterate) -> Tensor:
+    """[K, K]; a specimen that is stiffer is so along its whole curve, which shows where several are alike."""
+    problem = readings.problem()
+    own = gauss_newton.covariance(problem, found)
+    angles = [round(table.angle, 6) for table in readings.tables]
+    several = [k for k, angle in enumerate(angles) if angles.count(angle) >= FEWEST]
+    if not several:
+        return own
+    number = torch.full((len(angles),), len(several))
+    number[several] = torch.arange(len(several))
+    kinds = sorted(set(angles))
+    strata = torch.tensor([kinds.index(angles[k]) for k in several])
+    return gauss_newton.at_least(own, scatter(problem, found, number[readings.table], strata))
 
 
 def _model(readings: _Readings, found: gauss_newton.Iterate, covariance: Tensor) -> TensionModel:
