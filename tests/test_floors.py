@@ -16,7 +16,8 @@ COMPANIONS = ("benchmarks", "robots", "training")  # folders of their own, insta
 
 FLOORS = (
     ("errors", "_files", "_math", "_remembered", "_surroundings", "forward_mode"),
-    ("types", "parameters", "_vectors"),
+    ("_vectors",),
+    ("types", "parameters"),
     ("meshes",),
     ("materials", "effects", "boundaries", "transfer"),
     ("model",),
