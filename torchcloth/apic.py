@@ -38,9 +38,8 @@ def step(
     press = pressure(model, grid, layers, state, s, dt)
     columns = add_columns(layers, membrane_stress(model, s, memory), press)
     nothing = (torch.zeros_like(columns[0]), torch.zeros_like(columns[1]))
-    outer = vertex_forces(
-        model, state, s, memory, nothing, lost
-    )  # weight, air: triangles get their share of it as well
+    # Weight, air: triangles get their share of it as well.
+    outer = vertex_forces(model, state, s, memory, nothing, lost)
     force = vertex_forces(model, state, s, memory, columns, lost) - outer
     v = state.v + dt * outer / model.mass
 

@@ -28,9 +28,7 @@ def covariance_of(objective: Objective, checked: Checked, strata: Tensor | None 
         spread = scatter(problem, final, objective.episode_of(final.linear), strata)
         spread[len(objective.unknowns) :] = 0.0  # an episode's own nuisance is lost without it, and scatters nowhere
         own = gauss_newton.at_least(own, spread)
-    if known is not None:
-        return own
-    if checked.withdrawn:  # nothing of it will be used
+    if known is not None or checked.withdrawn:  # of what is withdrawn nothing will be used
         return own
     if not final.converged:  # the answer of a search that was cut short is as uncertain as the way that is left
         gradient, hessian = gauss_newton.normal_equations(problem, final)
