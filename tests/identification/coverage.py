@@ -1,6 +1,6 @@
 """Do the error bars hold the truth? Seeded twins with other mesh, grid, step and values than the model.
 
-    python tests/identification/coverage.py OUT.jsonl [--twins 48] [--first 0]
+    python tests/identification/coverage.py OUT.jsonl [--twins 48] [--first 0] [--refine]
 
 Each twin adds one line; a run that was stopped goes on where it was. The table is printed at the end.
 """
@@ -40,13 +40,13 @@ def truth_of(given: stretches.Fabric) -> dict[str, float]:
     return dict(zip(FITTED, values, strict=True))
 
 
-def twin(seed: int) -> dict:
-    """One line of the study."""
+def twin(seed: int, refine: bool = False) -> dict:
+    """One line of the study; ``refine``: corrected for the mesh."""
     given = fabric(seed)
     recording = stretches.record(given, seed)
     began = time.process_time()
     model = stretches.model(recording, youngs_modulus=8e4, poisson_ratio=0.25)
-    fit = identify(model, recording, FITTED, nuisances={"grasp": 1e-3})
+    fit = identify(model, recording, FITTED, nuisances={"grasp": 1e-3}, refine=refine)
     line = {"seed": seed, "seconds": time.process_time() - began, "iterations": fit.fit["iterations"]}
     for name, truth in truth_of(given).items():
         e = fit.parameters[name]
@@ -80,13 +80,13 @@ def _normalised(e: dict) -> float:
     return (e["value"] - e["truth"]) / max(half, 1e-300)
 
 
-def run(path: Path, twins: int, first: int = 0) -> list[dict]:
+def run(path: Path, twins: int, first: int = 0, refine: bool = False) -> list[dict]:
     """All twins that ``path`` does not hold yet."""
     lines = [json.loads(text) for text in path.read_text().splitlines()] if path.exists() else []
     done = {line["seed"] for line in lines}
     for seed in range(first, first + twins):
         if seed not in done:
-            lines.append(twin(seed))
+            lines.append(twin(seed, refine))
             with path.open("a") as file:
                 file.write(json.dumps(lines[-1]) + "\n")
             print(f"twin {seed}: {lines[-1]['seconds']:.1f} s", file=sys.stderr, flush=True)
@@ -99,10 +99,11 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--twins", type=int, default=48)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--refine", action="store_true", help="correct for the mesh (use another OUT.jsonl)")
     options = parser.parse_args()
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
-    found = table(run(options.out, options.twins, options.first))
+    found = table(run(options.out, options.twins, options.first, options.refine))
     for name, row in found.items():
         print(f"{name:16s} " + "  ".join(f"{k} {v:.3f}" for k, v in row.items() if not math.isnan(v)))
 

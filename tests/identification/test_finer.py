@@ -36,6 +36,29 @@ def test_a_grip_holds_the_new_vertices_between_those_it_held():
     assert (held[:, 0] == 0).all()
 
 
+@pytest.mark.parametrize(
+    "grip",
+    [
+        Grasp(uv=[[0.0, 0.05], [0.0, 0.1], [0.0, 0.15]], radius=0.06),
+        Grasp(uv=[[0.0, 0.1]], radius=0.11),
+        Grasp.corner("lower-left", 0.06),
+        Grasp.at("lower-left", 0.06),
+    ],
+    ids=["bar", "patch", "corner", "place"],
+)
+def test_a_patch_that_ends_between_vertices_holds_no_more_of_a_finer_mesh(grip):
+    """Its next row came within the radius, or was moved there: a bar held 12 of 300 mm more of the cloth, and the drag
+    of 48 twins was corrected from 1.0 to 0."""
+    mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3))
+    mesh = tc.meshes.Mesh.build(mesh.vertices, mesh.faces, mesh.uv, {"lower-left": [0]})
+    sheet = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, boundaries={"grip": grip}, contact=None)
+    fine = finer_cloth(sheet)
+    coarse, now = (np.asarray(c.mesh.uv)[c.boundaries["grip"].index.numpy()] for c in (sheet, fine))
+    assert (now.min(0), now.max(0)) == (pytest.approx(coarse.min(0)), pytest.approx(coarse.max(0)))
+    assert len(now) >= 2 * len(coarse) - 1  # those between
+    assert fine.boundaries["grip"].bind(fine.mesh).index.tolist() == fine.boundaries["grip"].index.tolist()
+
+
 def test_a_residual_force_is_no_parameter_and_no_obstacle(model):
     """As in the extended model of a diagnosis: its strengths are not fitted, and it stays on the finer mesh."""
     law = tc.effects.ResidualForce({"across": 0.1, "mass@edge": 0.01}, held=[0, 1])

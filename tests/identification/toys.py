@@ -26,13 +26,14 @@ class Toy:
     frame: Tensor
     patch: Tensor
     prior_std: float = 5.0
+    unknowns: int = len(TRUE)
     forbidden: Callable[[Tensor], Exception | None] = lambda raw: None
     linearised: list[Tensor] = field(default_factory=list)
     evaluated: list[Tensor] = field(default_factory=list)
 
     def problem(self) -> Problem:
         """The solver's view."""
-        mean = torch.zeros(len(TRUE), dtype=torch.float64)
+        mean = torch.zeros(self.unknowns, dtype=torch.float64)
         std = torch.full_like(mean, self.prior_std)
         return Problem(
             linearise=self._linearise,
@@ -65,10 +66,10 @@ def layout(frames: int = FRAMES) -> tuple[Tensor, Tensor]:
     return frame, patch
 
 
-def sensitivities(generator: torch.Generator, frames: int = FRAMES) -> Tensor:
-    """[R, 3] m: smooth over time and equal within a patch, as those of a fabric are."""
+def sensitivities(generator: torch.Generator, frames: int = FRAMES, unknowns: int = len(TRUE)) -> Tensor:
+    """[R, K] m: smooth over time and equal within a patch, as those of a fabric are."""
     frame, patch = layout(frames)
-    phase, rate = torch.rand(2, PATCHES, len(TRUE), generator=generator, dtype=torch.float64)
+    phase, rate = torch.rand(2, PATCHES, unknowns, generator=generator, dtype=torch.float64)
     t = frame[:, None] / FRAMES
     return 2e-3 * torch.sin(2 * math.pi * (phase[patch] + (0.5 + rate[patch]) * t))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Literal
 
@@ -80,8 +81,12 @@ class Grasp(AbstractBoundary):
         """The same vertices, where a mesh has them ``wider`` [m] farther out and ``along`` [m] further along u."""
         if self.uv is None:
             raise InvalidInput("Grasp.moved", got="a patch without a place", expected="one that was given by uv")
-        grasp = Grasp(uv=self.uv + np.array([along, 0.0]), radius=self.radius + wider)
-        grasp.index, grasp._stays = self.index.clone(), True
+        return Grasp(uv=self.uv + np.array([along, 0.0]), radius=self.radius + wider).holding(self.index)
+
+    def holding(self, vertices: Tensor) -> Grasp:
+        """The same patch or place with these vertices [H] in it, whatever a mesh has there."""
+        grasp = copy.deepcopy(self)
+        grasp.index, grasp._stays = vertices.clone(), True
         return grasp
 
     def bind(self, mesh: Mesh) -> Grasp:

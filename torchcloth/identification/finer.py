@@ -33,7 +33,7 @@ LIMIT, OPEN = 4 / 3, 1 / 3  # of the step between two meshes, whose edges are as
 
 
 def finer_cloth(cloth: Cloth) -> Cloth:
-    """With every triangle divided into four.
+    """With every triangle divided into four; grippers hold what they held.
 
     Raises:
         InvalidInput: a parameter with one value per triangle or vertex.
@@ -47,9 +47,9 @@ def finer_cloth(cloth: Cloth) -> Cloth:
     ends, _ = _divided(mesh.faces)
     fine = _divided_mesh(mesh)
     parts = cast("list[tuple[str, AbstractBoundary]]", list(kept.boundaries.items()))
-    patches = [Patch(p.uv, p.radius) for _, p in parts if isinstance(p, Grasp) and p.uv is not None]
+    patches = [patch for _, part in parts if (patch := _patch(part, mesh)) is not None]
     fine = with_patches(fine, patches)  # rounder than the coarse mesh has them
-    boundaries = {name: _regripped(part, ends, len(mesh.vertices)) for name, part in parts}
+    boundaries = {name: _regripped(part, ends, mesh) for name, part in parts}
     return Cloth(
         fine,
         kept.material,
@@ -101,12 +101,23 @@ def _divided_mesh(mesh: Mesh) -> Mesh:
     return Mesh.build(_between(mesh.vertices, ends), faces, pattern, mesh.places)
 
 
-def _regripped(part: AbstractBoundary, ends: np.ndarray, before: int) -> AbstractBoundary:
-    """A grasp of single vertices holds the new ones between them, too."""
-    if not isinstance(part, Grasp) or part._uv is not None or part._corner is not None or part._place is not None:
+def _patch(part: AbstractBoundary, mesh: Mesh) -> Patch | None:
+    """What it holds, where the mesh has vertices on the edge of that."""
+    if not isinstance(part, Grasp) or part.uv is None or mesh.uv is None:
+        return None
+    patch = Patch(part.uv, part.radius)
+    return patch if patch.ends_on(mesh.uv) else None
+
+
+def _regripped(part: AbstractBoundary, ends: np.ndarray, mesh: Mesh) -> AbstractBoundary:
+    """Holds the new vertices between those that were held, too, unless vertices lie where its patch ends.
+
+    By its radius it would hold more of the cloth than before, or less.
+    """
+    if not isinstance(part, Grasp) or _patch(part, mesh):
         return part
-    held = np.isin(ends, part.index.cpu().numpy()).all(1)
-    return Grasp([*part.index.tolist(), *(before + np.flatnonzero(held)).tolist()])
+    between = len(mesh.vertices) + np.flatnonzero(np.isin(ends, part.index.cpu().numpy()).all(1))
+    return part.holding(torch.cat([part.index, torch.as_tensor(between).to(part.index)]))
 
 
 def _between(field: np.ndarray, ends: np.ndarray) -> np.ndarray:

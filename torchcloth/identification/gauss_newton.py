@@ -176,8 +176,11 @@ def _iterate(problem: Problem, raw: Tensor, linear: Linearised, exact: bool) -> 
     floor = problem.noise if isinstance(problem.noise, Tensor) else torch.full((count,), problem.noise or 0.0)
     scale = torch.tensor([noise_scale(linear.value[kind == b], float(floor[b])) for b in range(count)])
     gate = torch.full((count,), torch.inf) if problem.gate is None else GATE + problem.gate[:count].to(scale) / scale
+    scale, gate = scale.to(linear.value), gate.to(linear.value)
     share = _independent_share(linear, scale, gate)
-    return Iterate(raw, linear, exact, scale.to(linear.value), share.to(linear.value), gate.to(linear.value))
+    at = Iterate(raw, linear, exact, scale, share.clamp(max=1.0), gate)
+    rows, groups = left(problem, at)
+    return at._replace(share=torch.minimum(share * groups, rows))
 
 
 def _independent_share(linear: Linearised, scale: Tensor, gate: Tensor) -> Tensor:
@@ -186,16 +189,39 @@ def _independent_share(linear: Linearised, scale: Tensor, gate: Tensor) -> Tenso
     Residuals of a wrong shape agree over centimetres and frames; counted one by one they would overrule every prior
     and promise errors far too small.
     """
-    kind = linear.kind
-    z = linear.value / scale.to(linear.value)[kind]
-    z = huber(z, gate.to(z)[kind])[1] * z
-    group = (linear.frame // WINDOW) * (int(linear.patch.max()) + 1) + linear.patch
-    out = []
+    kind, group = linear.kind, _groups(linear)
+    z = linear.value / scale[kind]
+    z = huber(z, gate[kind])[1] * z
+    out = torch.ones_like(scale)
     for b in range(len(scale)):
         own = kind == b
         summed = z.new_zeros(int(group.max()) + 1).index_add(0, group[own], z[own])
-        out.append(min(1.0, float((z[own] ** 2).sum() / (summed * summed).sum().clamp(min=1e-12))))
-    return torch.tensor(out)
+        out[b] = (z[own] ** 2).sum() / (summed * summed).sum().clamp(min=1e-12)
+    return out
+
+
+def _groups(linear: Linearised) -> Tensor:
+    """[R], equal for what errs together."""
+    return (linear.frame // WINDOW) * (int(linear.patch.max()) + 1) + linear.patch
+
+
+def left(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
+    """[B] and [B], share of the residuals' squares, and of those of what each group has in common, that fitting left.
+
+    Parameters move whole groups: as many of them as the data determine, rather than the priors, take out that many.
+    """
+    kind, group = at.linear.kind, _groups(at.linear)
+    if not bool(at.linear.jacobian.any()):
+        return torch.ones_like(at.scale), torch.ones_like(at.scale)
+    inverse = torch.linalg.inv(information(problem, at))
+    taken = at.influence()[0] * ((at.linear.jacobian @ inverse) * at.linear.jacobian).sum(1)
+    rows, groups = torch.ones_like(at.scale), torch.ones_like(at.scale)
+    for b in kind.unique().tolist():
+        own = kind == b
+        count, nominal, some = float(taken[own].sum()), int(own.sum()), len(group[own].unique())
+        rows[b] = max(1 - count / nominal, 1 / nominal)
+        groups[b] = max(1 - count / some, float(rows[b]) / some)  # at least what is left within groups
+    return rows, groups
 
 
 def cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
@@ -251,15 +277,20 @@ def _is_near(problem: Problem, at: Iterate, tolerance: float) -> bool:
 def covariance(problem: Problem, at: Iterate) -> Tensor:
     """Covariance of the estimate [K, K]: sandwich with residuals correlated within and between nearby frames.
 
-    Never smaller than what the counted independent observations would give. Model error that lasts is beyond it.
+    Never smaller than what the counted independent observations would give. Model error that lasts is beyond it. What
+    fitting took out of the residuals is put back.
     """
-    gradient, hessian = normal_equations(problem, at)
-    inverse = torch.linalg.inv(hessian)
-    scores = (at.influence()[0] * at.linear.value)[:, None] * at.linear.jacobian
+    rows, weight, (_, groups) = at.linear.kind, at.influence()[0], left(problem, at)
+    counted = float((at.rows[1] * (weight > 0)).sum())
+    wide = student(max(2, round(counted))) / NORMAL
+    at = at._replace(share=at.share / wide**2)
+    inverse = torch.linalg.inv(information(problem, at))
+    weight = at.influence()[0] * wide / groups.sqrt()[rows]
+    scores = (weight * at.linear.value)[:, None] * at.linear.jacobian
     count = int(at.linear.frame.max()) + 1
     summed = torch.zeros(count, scores.shape[1], dtype=scores.dtype).index_add(0, at.linear.frame, scores)
     summed = summed[summed.abs().sum(1) > 0]
-    meat = _long_run(summed) * len(summed) / max(1, len(summed) - len(gradient))
+    meat = _long_run(summed) * len(summed) / max(1, len(summed) - 1)
     robust = inverse @ (meat + torch.diag(problem.prior_std**-2)) @ inverse
     return at_least(robust, inverse.diagonal())
 

@@ -33,6 +33,11 @@ class Patch(NamedTuple):
         away = uv[:, None] - self.centres
         return away[np.arange(len(uv)), np.linalg.norm(away, axis=-1).argmin(1)]
 
+    def ends_on(self, uv: np.ndarray) -> bool:
+        """Whether some of the vertices [V, 2] m are on its edge; else the mesh is too coarse, or not made for it."""
+        far = np.linalg.norm(self.offset(uv), axis=1)
+        return bool((np.abs(far - self.radius) <= 1e-6 * self.radius).any())
+
 
 def fitted_to(mesh: Mesh, patches: Sequence[Patch]) -> np.ndarray:
     """[V, 2] m, pattern coordinates by which no edge of a triangle crosses a patch's; the rim of the cloth stays.
