@@ -118,7 +118,7 @@ def test_nuisances_are_neither_lost_frames_nor_forgotten(shared):
 
 @pytest.mark.parametrize(("rows", "unknowns"), [(4, 2), (5, 1), (6, 2), (8, 3)])
 def test_few_readings_are_as_uncertain_as_few_are(rows, unknowns):
-    """A curve of a tensile test; by the scatter of what is left alone, intervals held 55 to 80 % of truths."""
+    """A curve of a tensile test; by the median of what is left alone, intervals held 50 to 80 % of truths."""
     hits, x = [], torch.linspace(0.1, 1, rows, dtype=torch.float64)
     jacobian = torch.stack([x ** (k + 1) for k in range(unknowns)], 1)
     where = torch.arange(rows), torch.zeros(rows, dtype=torch.int64)
@@ -128,7 +128,7 @@ def test_few_readings_are_as_uncertain_as_few_are(rows, unknowns):
         toy = toys.Toy(lambda raw: jacobian @ raw, jacobian @ true + 0.01 * noise, *where, unknowns=unknowns)
         final = solve(toy, start=torch.zeros(unknowns, dtype=torch.float64))
         hits.append((final.raw - true).abs() < 1.96 * deviations(toy, final))
-    assert share(torch.stack(hits)) > 0.75
+    assert 0.9 < share(torch.stack(hits)) < 0.99
 
 
 def test_shared_noise_counts_as_few_observations():

@@ -128,8 +128,8 @@ def test_replicates_show_what_was_held_otherwise_each_time():
 
 
 def test_error_bars_cover(tmp_path):
-    """44 twins: 95 % intervals of identifiable parameters hold the truth in 88 to 100 %; errors have unit spread.
-    As they are fitted, and corrected for the mesh."""
+    """44 twins, as fitted and corrected for the mesh: 95 % intervals of identifiable parameters hold the truth in 88 to
+    100 %, and errors have unit spread."""
     for refine in (False, True):
         found = coverage.table(coverage.run(tmp_path / f"twins{refine}.jsonl", 44, refine=refine))
         for name, row in found.items():

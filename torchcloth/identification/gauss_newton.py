@@ -17,6 +17,7 @@ TRUSTED = 0.1  # error of the predicted decrease up to which an updated Jacobian
 GATE = 5.0  # standard deviations
 NORMAL = 1.95996  # the 97.5 % quantile
 WINDOW = 5  # frames within which residuals of one patch count as one observation
+FEW = 12  # residuals, of which the median says little of their scatter
 
 
 class Linearised(NamedTuple):
@@ -177,10 +178,8 @@ def _iterate(problem: Problem, raw: Tensor, linear: Linearised, exact: bool) -> 
     scale = torch.tensor([noise_scale(linear.value[kind == b], float(floor[b])) for b in range(count)])
     gate = torch.full((count,), torch.inf) if problem.gate is None else GATE + problem.gate[:count].to(scale) / scale
     scale, gate = scale.to(linear.value), gate.to(linear.value)
-    share = _independent_share(linear, scale, gate)
-    at = Iterate(raw, linear, exact, scale, share.clamp(max=1.0), gate)
-    rows, groups = left(problem, at)
-    return at._replace(share=torch.minimum(share * groups, rows))
+    share = _independent_share(linear, scale, gate).clamp(max=1.0)
+    return Iterate(raw, linear, exact, scale, share, gate)
 
 
 def _independent_share(linear: Linearised, scale: Tensor, gate: Tensor) -> Tensor:
@@ -203,25 +202,6 @@ def _independent_share(linear: Linearised, scale: Tensor, gate: Tensor) -> Tenso
 def _groups(linear: Linearised) -> Tensor:
     """[R], equal for what errs together."""
     return (linear.frame // WINDOW) * (int(linear.patch.max()) + 1) + linear.patch
-
-
-def left(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
-    """[B] and [B], share of the residuals' squares, and of those of what each group has in common, that fitting left.
-
-    Parameters move whole groups: as many of them as the data determine, rather than the priors, take out that many.
-    """
-    kind, group = at.linear.kind, _groups(at.linear)
-    if not bool(at.linear.jacobian.any()):
-        return torch.ones_like(at.scale), torch.ones_like(at.scale)
-    inverse = torch.linalg.inv(information(problem, at))
-    taken = at.influence()[0] * ((at.linear.jacobian @ inverse) * at.linear.jacobian).sum(1)
-    rows, groups = torch.ones_like(at.scale), torch.ones_like(at.scale)
-    for b in kind.unique().tolist():
-        own = kind == b
-        count, nominal, some = float(taken[own].sum()), int(own.sum()), len(group[own].unique())
-        rows[b] = max(1 - count / nominal, 1 / nominal)
-        groups[b] = max(1 - count / some, float(rows[b]) / some)  # at least what is left within groups
-    return rows, groups
 
 
 def cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
@@ -278,14 +258,17 @@ def covariance(problem: Problem, at: Iterate) -> Tensor:
     """Covariance of the estimate [K, K]: sandwich with residuals correlated within and between nearby frames.
 
     Never smaller than what the counted independent observations would give. Model error that lasts is beyond it. What
-    fitting took out of the residuals is put back.
+    fitting took out of the residuals is put back, and few observations widen it as Student's distribution does, so that
+    the interval of 1.96 deviations holds the truth.
     """
-    rows, weight, (_, groups) = at.linear.kind, at.influence()[0], left(problem, at)
-    counted = float((at.rows[1] * (weight > 0)).sum())
-    wide = student(max(2, round(counted))) / NORMAL
+    at = at._replace(scale=_of_few(at))
+    rows, groups = _left(problem, at)
+    share = _independent_share(at.linear, at.scale, at.gate) if problem.scales is None else at.share
+    at = at._replace(share=torch.minimum(share * groups, rows))
+    wide = student(max(2, round(float(at.rows[1][at.influence()[0] > 0].sum())))) / NORMAL
     at = at._replace(share=at.share / wide**2)
     inverse = torch.linalg.inv(information(problem, at))
-    weight = at.influence()[0] * wide / groups.sqrt()[rows]
+    weight = at.influence()[0] * wide / groups.sqrt()[at.linear.kind]
     scores = (weight * at.linear.value)[:, None] * at.linear.jacobian
     count = int(at.linear.frame.max()) + 1
     summed = torch.zeros(count, scores.shape[1], dtype=scores.dtype).index_add(0, at.linear.frame, scores)
@@ -293,6 +276,33 @@ def covariance(problem: Problem, at: Iterate) -> Tensor:
     meat = _long_run(summed) * len(summed) / max(1, len(summed) - 1)
     robust = inverse @ (meat + torch.diag(problem.prior_std**-2)) @ inverse
     return at_least(robust, inverse.diagonal())
+
+
+def _of_few(at: Iterate) -> Tensor:
+    """[B] standard deviations; of few residuals not below the plain one, for a fit may meet half of them exactly."""
+    kind, scale = at.linear.kind, at.scale.clone()
+    for b in kind.unique().tolist():
+        own = at.linear.value[kind == b]
+        if len(own) < FEW:
+            scale[b] = torch.maximum(scale[b], own.square().mean().sqrt())
+    return scale
+
+
+def _left(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
+    """[B] and [B], share of the residuals' squares, and of those of what each group has in common, that fitting left.
+
+    Parameters move whole groups: as many of them as the data determine, rather than the priors, take out that many.
+    """
+    kind, group = at.linear.kind, _groups(at.linear)
+    inverse = torch.linalg.inv(information(problem, at))
+    taken = at.influence()[0] * ((at.linear.jacobian @ inverse) * at.linear.jacobian).sum(1)
+    rows, groups = torch.ones_like(at.scale), torch.ones_like(at.scale)
+    for b in kind.unique().tolist():
+        own = kind == b
+        count, nominal, some = float(taken[own].sum()), int(own.sum()), len(group[own].unique())
+        rows[b] = max(1 - count / nominal, 1 / nominal)
+        groups[b] = max(1 - count / some, float(rows[b]) / some)  # at least what is left within groups
+    return rows, groups
 
 
 def at_least(covariance: Tensor, variances: Tensor) -> Tensor:
