@@ -47,9 +47,9 @@ def finer_cloth(cloth: Cloth) -> Cloth:
     ends, _ = _divided(mesh.faces)
     fine = _divided_mesh(mesh)
     parts = cast("list[tuple[str, AbstractBoundary]]", list(kept.boundaries.items()))
-    patches = [patch for _, part in parts if (patch := _patch(part, mesh)) is not None]
-    fine = with_patches(fine, patches)  # rounder than the coarse mesh has them
-    boundaries = {name: _regripped(part, ends, mesh) for name, part in parts}
+    patches = {name: _patch(part, mesh) for name, part in parts}
+    fine = with_patches(fine, [p for p in patches.values() if p])  # rounder than the coarse mesh has them
+    boundaries = {name: part if patches[name] else _regripped(part, ends, mesh) for name, part in parts}
     return Cloth(
         fine,
         kept.material,
@@ -110,11 +110,8 @@ def _patch(part: AbstractBoundary, mesh: Mesh) -> Patch | None:
 
 
 def _regripped(part: AbstractBoundary, ends: np.ndarray, mesh: Mesh) -> AbstractBoundary:
-    """Holds the new vertices between those that were held, too, unless vertices lie where its patch ends.
-
-    By its radius it would hold more of the cloth than before, or less.
-    """
-    if not isinstance(part, Grasp) or _patch(part, mesh):
+    """A grasp holds the new vertices between those that were held, too: by its radius it would hold more, or less."""
+    if not isinstance(part, Grasp):
         return part
     between = len(mesh.vertices) + np.flatnonzero(np.isin(ends, part.index.cpu().numpy()).all(1))
     return part.holding(torch.cat([part.index, torch.as_tensor(between).to(part.index)]))

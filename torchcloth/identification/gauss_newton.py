@@ -264,9 +264,10 @@ def covariance(problem: Problem, at: Iterate) -> Tensor:
     at = at._replace(scale=_of_few(at))
     rows, groups = _left(problem, at)
     share = _independent_share(at.linear, at.scale, at.gate) if problem.scales is None else at.share
-    at = at._replace(share=torch.minimum(share * groups, rows))
-    wide = student(max(2, round(float(at.rows[1][at.influence()[0] > 0].sum())))) / NORMAL
-    at = at._replace(share=at.share / wide**2)
+    share = torch.minimum(share * groups, rows)
+    counted = float((share[at.linear.kind] * at.linear.factor)[at.influence()[0] > 0].sum())
+    wide = student(max(2, round(counted))) / NORMAL
+    at = at._replace(share=share / wide**2)
     inverse = torch.linalg.inv(information(problem, at))
     weight = at.influence()[0] * wide / groups.sqrt()[at.linear.kind]
     scores = (weight * at.linear.value)[:, None] * at.linear.jacobian
