@@ -24,7 +24,7 @@ FLOORS = (
     ("self_contact", "strain", "dynamics"),
     ("apic", "relaxation"),
     ("functional", "stability", "recordings", "engine"),
-    ("losses",),
+    ("losses", "captured"),
     ("observe", "validation"),
     ("initial", "intervals", "parts"),
     ("sensitivities",),

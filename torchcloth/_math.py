@@ -44,8 +44,11 @@ def resisted(resistance: Tensor | None, change: Tensor) -> Tensor:
 
 
 def withheld(resistance: Tensor, change: Tensor) -> Tensor:
-    """(1 + B)^-1 B y: by how much the air lessens a change."""
-    return torch.linalg.solve(torch.eye(3).to(change) + resistance, times(resistance, change))
+    """(1 + B)^-1 B y: by how much the air lessens a change. By Cramer's rule: CUDA's solver waits for its verdict."""
+    one = torch.eye(3, dtype=change.dtype, device=change.device)
+    (a, b, c), y = (one + resistance).unbind(-1), times(resistance, change)
+    sides = cross(b, c), cross(c, a), cross(a, b)
+    return torch.cat([dot(side, y) for side in sides], -1) / dot(a, sides[0])
 
 
 def displacement(motion: Tensor, x: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from . import functional
 from ._surroundings import undisturbed
 from .boundaries import AbstractBoundary
+from .captured import Graphs
 from .effects import AbstractEffect
 from .engine.choice import Choice, Setting, check_setting, choose, still_drives
 from .errors import TorchclothError
@@ -65,7 +66,8 @@ class Cloth(nn.Module):
             collision damping, no added mass; wrenches leave out what the grid takes up, some per cent of the weight.
         engine: what computes the substeps. "auto": the fused engine (C++, on the CPU, in float32 or float64) where it
             knows the parts, else the torch reference; ``print`` of the cloth tells which and why. "fused": an error
-            where it cannot. "reference": always torch. The attribute of the same name may be set at any time.
+            where it cannot. "reference": always torch. On CUDA "auto" captures the reference's substeps as graphs,
+            "reference" launches them one by one. The attribute of the same name may be set at any time.
 
     Raises:
         InvalidInput: a part that does not fit.
@@ -347,7 +349,8 @@ class Cloth(nn.Module):
         if MATERIAL in state.memory:
             frames, counts, asked = divided(frames, counts)
             step_for = self._step_for(model, dt)
-        plan = Plan(model, motion, frames, counts, state, choice, longest, step_for, asked)
+        graphs = Graphs(model) if choice.captured else None
+        plan = Plan(model, motion, frames, counts, state, choice, longest, step_for, asked, graphs)
         plan.check(state)
         return plan
 

@@ -80,16 +80,30 @@ def stretch(
 ) -> tuple[ClothState, Tensor | None, Impulses]:
     """As ``rollout``; ``lost`` goes from one stretch to the next: see ``_kept``."""
     total: Impulses = {}
-    layers, advance = None, apic.step if model.transfer == "apic" else step
+    layers = None
     for k in range(first, first + substeps):
         if model.grid is not None:
             layers = near_layers(model, model.grid, state.x, layers)
-        before = state.x
-        state, impulses = advance(model, state, dt, drives, k, layers, lost)
-        if state.x.dtype == torch.float32:
-            state, lost = _kept(before, state, lost, dt)
+        state, lost, impulses = substep(model, state, lost, dt, drives, k, layers)
         total = added(total, impulses)
     return state, lost, total
+
+
+def substep(
+    model: Model,
+    state: ClothState,
+    lost: Tensor | None,
+    dt: float,
+    drives: Mapping[str, Drive],
+    k: int,
+    layers: Layers | None,
+) -> tuple[ClothState, Tensor | None, Impulses]:
+    """As ``step`` or ``apic.step``, with what the substep before has ``lost``."""
+    before, advance = state.x, apic.step if model.transfer == "apic" else step
+    state, impulses = advance(model, state, dt, drives, k, layers, lost)
+    if state.x.dtype == torch.float32:
+        state, lost = _kept(before, state, lost, dt)
+    return state, lost, impulses
 
 
 def _kept(before: Tensor, state: ClothState, lost: Tensor | None, dt: float) -> tuple[ClothState, Tensor]:

@@ -14,9 +14,10 @@ from torch.utils.checkpoint import checkpoint as recompute
 
 from . import functional
 from .boundaries import Drive, drive
+from .captured import Graphs, unit_of
 from .dynamics import Impulses, added
 from .engine.choice import Choice
-from .engine.fused import Fused, recomputes
+from .engine.fused import Fused, recomputes, transformed
 from .errors import SimulationDiverged
 from .model import as_it_is
 from .self_contact import CHUNK
@@ -43,6 +44,7 @@ class Interval(NamedTuple):
     """The time between two frames, in ``count`` equal substeps.
 
     ``fused``: the engine that runs them, or None. ``moves``: ``motion`` on the substeps, where it is there already.
+    ``graphs``: of the reference's substeps, where they are captured.
     """
 
     model: functional.Model
@@ -52,6 +54,7 @@ class Interval(NamedTuple):
     count: int
     fused: Fused | None = None
     moves: Mapping[str, Drive] | None = None
+    graphs: Graphs | None = None
 
     @property
     def dt(self) -> float:
@@ -92,6 +95,7 @@ class Plan(NamedTuple):
     longest: float  # m, extent that the contact grid has room for
     step_for: Callable[[ClothState], float] | None = None  # [s], longest from a state on; None: it does not matter
     asked: tuple[int, ...] | None = None  # frames that were asked for; None: all
+    graphs: Graphs | None = None  # of the reference's substeps; None: they are launched one by one
 
     def intervals(self, now: Callable[[], ClothState]) -> Iterator[Interval]:
         """One after the other; ``now``: the state at the start of the next."""
@@ -138,7 +142,7 @@ class Plan(NamedTuple):
     def _bare(self) -> list[Interval]:
         """Without drives."""
         return [
-            Interval(self.model, self.motion, start, end, count, self.choice.fused)
+            Interval(self.model, self.motion, start, end, count, self.choice.fused, None, self.graphs)
             for (start, end), count in zip(pairwise(self.frames), self.counts, strict=True)
         ]
 
@@ -231,10 +235,15 @@ def _by_reference(
     model = interval.model
     if store:
         model = as_it_is(model)
-    for first in range(0, interval.count, CHUNK):
-        substeps = min(CHUNK, interval.count - first)
-        run = partial(functional.stretch, model, dt=interval.dt, drives=drives, substeps=substeps, first=first)
-        state, lost, impulses = recompute(run, state, lost, use_reentrant=False) if store else run(state, lost)
+    graphs = None if transformed() else interval.graphs
+    chunk = CHUNK if graphs is None else unit_of(interval.count)
+    for first in range(0, interval.count, chunk):
+        of = {"dt": interval.dt, "drives": drives, "substeps": min(chunk, interval.count - first), "first": first}
+        found = None if graphs is None else graphs.stretch(state, lost, **of)
+        if found is None:
+            run = partial(functional.stretch, model, **of)
+            found = recompute(run, state, lost, use_reentrant=False) if store else run(state, lost)
+        state, lost, impulses = found
         total = added(total, impulses)
     return state, lost, total
 

@@ -25,10 +25,11 @@ class Choice(NamedTuple):
 
     fused: Fused | None
     reason: str
+    captured: bool = False  # substeps of the reference, as CUDA graphs
 
     def __str__(self) -> str:
         if self.fused is None:
-            return f"reference ({self.reason})"
+            return f"reference{', in CUDA graphs' if self.captured else ''} ({self.reason})"
         parts = () if self.fused.torch_parts is None else sorted(self.fused.torch_parts.parts)
         return f"fused, with {', '.join(parts)} in torch" if parts else "fused"
 
@@ -68,7 +69,7 @@ def choose(setting: Setting, model: Model, state: ClothState, drives: Mapping[st
         raise InvalidInput(
             "engine", got='"fused"', expected=f"a cloth that the engine can run: {reason}", remedy=remedy
         )
-    return Choice(None, reason)
+    return Choice(None, reason, captured=state.x.is_cuda)
 
 
 def still_drives(model: Model) -> dict[str, Drive]:

@@ -1,0 +1,171 @@
+"""Units of substeps that are captured and replayed, with a stand-in for CUDA's graphs that runs anywhere."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchcloth as tc
+from torchcloth import captured
+from torchcloth.captured import Graphs, unit_of
+from torchcloth.intervals import run
+
+FRAMES = [0.0, 0.02, 0.04, 0.08]
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch):
+    """Short simulations are captured, too."""
+    monkeypatch.setattr(captured, "SOON", 0)
+
+
+def again(work: captured.Work) -> tuple[list[Tensor], captured.Replay]:
+    """Computes again what a graph would replay, in the same memory."""
+    found = work()
+
+    def replay() -> None:
+        for slot, now in zip(found, work(), strict=True):
+            slot.copy_(now.detach())
+
+    found = [t.detach() for t in found]
+    return found, replay
+
+
+def refused(work: captured.Work) -> tuple[list[Tensor], captured.Replay]:
+    raise RuntimeError("operation not permitted when stream is capturing\nand more")
+
+
+def scene(contact: bool = True, opens: bool = False, effects: dict[str, tc.effects.AbstractEffect] | None = None, n=5):
+    """A sheet that a corner lifts from a table."""
+    t = torch.linspace(0, 0.08, 9)
+    pose = torch.eye(4).repeat(9, 1, 1)
+    pose[:, 2, 3] = t
+    closed = torch.ones(9, dtype=torch.bool)
+    if opens:
+        closed[4:] = False
+    cloth = tc.Cloth(
+        tc.meshes.rectangle(0.2, 0.2, resolution=(n, n)),
+        tc.materials.AEP(5e3 if contact else 5e4),
+        0.3,
+        {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(), "bending": tc.effects.Bending()}
+        | (effects or {}),
+        {"hand": tc.boundaries.Grasp.corner("upper-left"), "table": tc.boundaries.Plane((0.0, 0.0, -0.1))},
+        contact=tc.Contact() if contact else None,
+        engine="reference",
+    )
+    return cloth, cloth.rest_state(), {"hand": tc.Trajectory(t, pose.requires_grad_(), closed)}
+
+
+def outcome(made, capture: captured.Capture | None = None):
+    """(the rollout, gradients of a function of it, the graphs)."""
+    cloth, state, motion = made
+    x = state.x.clone().requires_grad_()
+    plan = cloth.plan(state._replace(x=x), motion, FRAMES, None)
+    graphs = None if capture is None else Graphs(plan.model, capture)
+    out = run(plan._replace(graphs=graphs), checkpoint=True)
+    weight = torch.randn(out.x.shape, generator=torch.Generator().manual_seed(1), dtype=out.x.dtype)
+    ((weight * out.x).sum() + out.wrench["hand"].square().sum()).backward()
+    named = {"x": x, "pose": motion["hand"].pose, **dict(cloth.named_parameters())}
+    return out, {name: t.grad for name, t in named.items() if t.grad is not None}, graphs
+
+
+def agree(one, other, marks: tuple[float, float]) -> None:
+    (a, before, _), (b, after, _) = one, other
+    for first, second in ((a.x, b.x), (a.v, b.v), (a.wrench["hand"], b.wrench["hand"])):
+        first, second = first.detach(), second.detach()
+        torch.testing.assert_close(second, first, rtol=marks[0], atol=marks[0] * float(first.abs().max()))
+    assert set(before) == set(after)
+    assert len(before) > 6
+    for name, gradient in before.items():
+        torch.testing.assert_close(after[name], gradient, rtol=0, atol=marks[1] * float(gradient.abs().max()), msg=name)
+
+
+@pytest.mark.parametrize(("dtype", "marks"), [(torch.float64, (1e-12, 1e-11)), (torch.float32, (1e-6, 1e-4))])
+@pytest.mark.parametrize("contact", [True, False])
+def test_replays_give_what_substeps_give_one_by_one(dtype, marks, contact):
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        usual, other = (outcome(scene(contact), capture) for capture in (None, again))
+    finally:
+        torch.set_default_dtype(before)
+    assert other[2]._units
+    agree(usual, other, marks)
+
+
+def test_without_gradients_nothing_is_kept():
+    cloth, state, motion = scene()
+    with torch.no_grad():
+        plan = cloth.plan(state, motion, FRAMES, None)
+        graphs = Graphs(plan.model, again)
+        usual, other = run(plan, True), run(plan._replace(graphs=graphs), True)
+    torch.testing.assert_close(other.x, usual.x, rtol=1e-12, atol=1e-13)
+    assert all(unit.backward is None for unit in graphs._units.values())
+    assert graphs._units
+
+
+def test_grippers_that_open_are_another_unit():
+    usual, other = (outcome(scene(opens=True), capture) for capture in (None, again))
+    agree(usual, other, (1e-12, 1e-11))
+    assert {key[1] for key in other[2]._units} == {(("hand", True),), (("hand", False),)}
+
+
+def test_internal_variables_go_along():
+    made = lambda: scene(effects={"friction": tc.effects.BendingFriction(2e-4)})  # noqa: E731
+    usual, other = (outcome(made(), capture) for capture in (None, again))
+    assert usual[0].state.memory.keys() == other[0].state.memory.keys()
+    agree(usual, other, (1e-12, 1e-11))
+
+
+def test_layers_that_meet_are_not_captured(monkeypatch):
+    """A sheet folded onto itself; where a vertex moves farther than was looked at, neither."""
+    cloth, state, motion = scene(n=11)
+    folded = state.x.clone()
+    right = folded[:, 0] > 0.1
+    folded[right, 0], folded[right, 2] = 0.2 - folded[right, 0], folded[right, 2] + 0.004
+    plan = cloth.plan(cloth.state(folded), motion, FRAMES[:2], None)
+    graphs = Graphs(plan.model, again)
+    with torch.no_grad():
+        run(plan._replace(graphs=graphs), True)
+    assert not graphs._units
+    usual = outcome(scene())
+    monkeypatch.setattr(captured.Graphs, "reach", property(lambda self: 1e-9))
+    other = outcome(scene(), again)
+    assert other[2]._units
+    agree(usual, other, (1e-12, 1e-11))
+
+
+def test_few_units_do_not_pay(monkeypatch):
+    monkeypatch.setattr(captured, "SOON", 100)
+    assert not outcome(scene(), again)[2]._units
+
+
+def test_what_cannot_be_captured_is_launched_one_by_one():
+    usual = outcome(scene())
+    with pytest.warns(
+        UserWarning, match="no CUDA graph of the substeps.*: operation not permitted when stream is"
+    ) as told:
+        other = outcome(scene(), refused)
+    assert len(told) == 1
+    agree(usual, other, (1e-12, 1e-11))
+
+
+def test_a_backward_pass_comes_long_after():
+    """Of two simulations of which the second has run before the first is differentiated."""
+    cloth, state, motion = scene()
+    found = []
+    for capture in (None, again):
+        cloth.zero_grad()
+        plan = cloth.plan(state, motion, FRAMES, None)
+        plan = plan._replace(graphs=None if capture is None else Graphs(plan.model, capture))
+        first = run(plan, True)
+        faster = plan._replace(state=plan.state._replace(v=plan.state.v + 0.1))
+        second = run(faster, True)
+        (first.x.square().sum() - second.x.sum()).backward()
+        found.append([p.grad.clone() for p in cloth.parameters() if p.grad is not None])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(b, a, rtol=1e-9, atol=1e-11 * float(a.abs().max()))
+
+
+@pytest.mark.parametrize(("count", "unit"), [(240, 24), (250, 10), (239, 17), (38, 19), (75, 15), (22, 22)])
+def test_units_leave_few_over(count, unit):
+    assert unit_of(count) == unit

@@ -1,0 +1,329 @@
+"""Substeps of the reference as CUDA graphs: hundreds of launches become one.
+
+A unit of some substeps is captured twice, once forward and once forward and back, and replayed with other numbers in
+the same memory. A backward pass computes each unit again from the state where it began, as checkpoints do, so memory
+is that of the frames and the units' states. What is captured must not wait for a number: units in which layers meet,
+or grippers open or close, run as they do elsewhere.
+
+A graph keeps what a part read of itself while it was captured, so it lives no longer than one simulation.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from . import functional
+from .boundaries import Drive
+from .dynamics import Impulses, added
+from .model import Model, kept
+from .self_contact import Layers, near_layers
+from .types import ClothState
+
+UNIT = range(8, 25)  # substeps, of which one count is chosen that fits
+SOON = 2  # units that run as they are before one like them is captured: few do not pay, and libraries are awake then
+
+Replay = Callable[[], None]
+Work = Callable[[], list[Tensor]]
+Capture = Callable[[Work], tuple[list[Tensor], Replay]]
+Stretch = tuple[ClothState, Tensor | None, Impulses]
+
+
+def on_cuda(work: Work) -> tuple[list[Tensor], Replay]:
+    """What ``work`` gives, in memory that each replay overwrites, and the replay."""
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        work()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        found = work()
+    return found, graph.replay
+
+
+def unit_of(count: int) -> int:
+    """Substeps of a unit, of which ``count`` leaves fewest over."""
+    return min(reversed(UNIT), key=lambda unit: count % unit)
+
+
+class Graphs:
+    """The units of one simulation.
+
+    Args:
+        model: of all of them.
+        capture: another way than CUDA's to repeat a calculation in its own memory.
+    """
+
+    def __init__(self, model: Model, capture: Capture = on_cuda) -> None:
+        self.model, self._capture = model, capture
+        self._leaves: list[tuple[Tensor, Tensor]] = []
+        self._own: Model | None = None
+        self._units: dict[tuple[Any, ...], Unit] = {}
+        self._seen: dict[tuple[Any, ...], int] = {}
+        self._able = True
+
+    def stretch(
+        self, state: ClothState, lost: Tensor | None, dt: float, drives: Mapping[str, Drive], substeps: int, first: int
+    ) -> Stretch | None:
+        """As ``functional.stretch``; None where it must run there."""
+        closed = _constant(drives, first, first + substeps)
+        if not self._able or closed is None:
+            return None
+        if self.model.grid is not None and len(near_layers(self.model, self.model.grid, state.x).active):
+            return None
+        moving = Moving.of(state, lost, dt, drives, first, substeps)
+        key = (substeps, tuple(closed.items()), *((tuple(t.shape), t.dtype) for t in moving.tensors))
+        self._seen[key] = self._seen.get(key, 0) + 1
+        if self._seen[key] <= SOON:
+            return None
+        if key not in self._units:
+            self._units[key] = Unit(self.stand_in(), moving, closed, substeps, self._capture)
+        try:
+            found = self._units[key](moving, *self.leaves())
+        except RuntimeError as error:
+            self._able = False
+            line = str(error).partition("\n")[0]
+            warnings.warn(f"no CUDA graph of the substeps, which are launched one by one: {line}", stacklevel=2)
+            return None
+        if self.model.grid is not None and float(found.farthest) >= self.reach:
+            return None
+        return found.state, found.lost, found.impulses
+
+    @property
+    def reach(self) -> float:
+        """[m], that a vertex may move before layers may meet which did not."""
+        return 0.0 if self.model.grid is None else self.model.grid.skin / 2
+
+    def leaves(self) -> tuple[list[Tensor], list[Tensor]]:
+        """(what of the model has a gradient, what stands for it)."""
+        return [given for given, _ in self._leaves], [leaf for _, leaf in self._leaves]
+
+    def stand_in(self) -> Model:
+        """The model with leaves in the place of all that has a gradient."""
+        if self._own is None:
+            leaves: dict[int, Tensor] = {}
+
+            def leaf(given: Tensor) -> Tensor:
+                if not given.requires_grad:
+                    return given
+                if id(given) not in leaves:
+                    leaves[id(given)] = given.detach().requires_grad_()
+                    self._leaves.append((given, leaves[id(given)]))
+                return leaves[id(given)]
+
+            self._own = cast("Model", _mapped(self.model, leaf))
+        return self._own
+
+
+class Moving(NamedTuple):
+    """What differs from unit to unit, in one list of tensors."""
+
+    tensors: list[Tensor]
+    memory: tuple[str, ...]
+    driven: tuple[str, ...]
+    keeps: bool  # whether there is what was lost
+
+    @classmethod
+    def of(
+        cls,
+        state: ClothState,
+        lost: Tensor | None,
+        dt: float,
+        drives: Mapping[str, Drive],
+        first: int,
+        substeps: int,
+    ) -> Moving:
+        """What ``functional.stretch`` is called with."""
+        some = slice(first, first + substeps)
+        fields = [state.x, state.v, state.d3, *state.memory.values()]
+        moves = [t[..., some, :, :] for drive in drives.values() for t in (drive.increment, drive.pose)]
+        last = [state.x.new_full((), dt), *([] if lost is None else [lost])]
+        return cls([*fields, *moves, *last], tuple(state.memory), tuple(drives), lost is not None)
+
+    @property
+    def tracked(self) -> int:
+        """Tensors, the first ones, that have gradients: time and rounding have none."""
+        return len(self.tensors) - 1 - self.keeps
+
+    def read(
+        self, tensors: Sequence[Tensor], closed: Mapping[str, bool], substeps: int
+    ) -> tuple[ClothState, Tensor | None, float, dict[str, Drive]]:
+        """(state, lost, dt, drives) of such tensors."""
+        x, v, d3, *left = tensors
+        memory = {name: left.pop(0) for name in self.memory}
+        drives = {name: Drive(left.pop(0), left.pop(0), (closed[name],) * substeps) for name in self.driven}
+        return ClothState(x, v, d3, memory), left[1] if self.keeps else None, cast("float", left[0]), drives
+
+
+class _Found(NamedTuple):
+    """The end of a unit."""
+
+    state: ClothState
+    lost: Tensor | None
+    impulses: Impulses
+    farthest: Tensor  # [] m, that a vertex was from where the unit began, before its last substep
+
+
+class _Back(NamedTuple):
+    """A backward pass that is captured."""
+
+    asked: list[Tensor]  # where the gradients of what comes out go
+    found: list[Tensor]  # gradients of what went in
+    places: list[int]  # of these among all that moves and the leaves
+    replay: Replay
+
+
+class Unit:
+    """Some substeps, forward and back."""
+
+    def __init__(self, model: Model, like: Moving, closed: Mapping[str, bool], substeps: int, capture: Capture) -> None:
+        self.model, self.closed, self.substeps, self.capture = model, closed, substeps, capture
+        self.read, self.tracked = like._replace(tensors=[]).read, like.tracked
+        self.inputs = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in like.tensors]
+        self.places: tuple[tuple[str, ...], tuple[str, ...], bool] = ((), (), False)  # of what it gives
+        self.forward: tuple[list[Tensor], Replay] | None = None
+        self.backward: _Back | None = None
+
+    def __call__(self, moving: Moving, given: Sequence[Tensor], leaves: Sequence[Tensor]) -> _Found:
+        """The end of the unit; differentiable in all that moves and in what is ``given`` in the place of leaves."""
+        if torch.is_grad_enabled() and any(t.requires_grad for t in (*moving.tensors, *given)):
+            self.get_ready(moving.tensors, leaves)
+            found = cast("Sequence[Tensor]", _Replayed.apply(self, leaves, *moving.tensors, *given))
+        else:
+            found = self.replayed(moving.tensors)
+        x, v, d3, farthest, *left = found
+        memory, driven, keeps = self.places
+        state = ClothState(x, v, d3, {name: left.pop(0) for name in memory})
+        impulses = {name: left.pop(0) for name in driven}
+        return _Found(state, left[0] if keeps else None, impulses, farthest)
+
+    def replayed(self, moving: Sequence[Tensor]) -> list[Tensor]:
+        """Forward."""
+        self._fill(moving)
+        found, replay = self._forward()
+        replay()
+        return [t.clone() for t in found]
+
+    def get_ready(self, moving: Sequence[Tensor], leaves: Sequence[Tensor]) -> None:
+        """For a backward pass, before it: threads of its own run that."""
+        if self.backward is None:
+            self._fill(moving)
+            self.backward = self._captured_back(leaves)
+
+    def pulled_back(
+        self, moving: Sequence[Tensor], grads: Sequence[Tensor | None], leaves: Sequence[Tensor]
+    ) -> list[Tensor | None]:
+        """Gradients of all that moves and of the leaves, from those of what ``replayed`` gives."""
+        self.get_ready(moving, leaves)
+        self._fill(moving)
+        asked, found, places, replay = cast("_Back", self.backward)
+        for slot, grad in zip(asked, grads, strict=True):
+            slot.zero_() if grad is None else slot.copy_(grad)
+        replay()
+        out: list[Tensor | None] = [None] * (len(moving) + len(leaves))
+        for place, grad in zip(places, found, strict=True):
+            out[place] = grad.clone()
+        return out
+
+    def _forward(self) -> tuple[list[Tensor], Replay]:
+        if self.forward is None:
+            with torch.no_grad():
+                self.forward = self.capture(lambda: self._run(self.inputs))
+        return self.forward
+
+    def _captured_back(self, leaves: Sequence[Tensor]) -> _Back:
+        asked, tracked = [torch.zeros_like(t) for t in self._forward()[0]], self.tracked
+        places: list[int] = []
+
+        def work() -> list[Tensor]:
+            with torch.enable_grad():
+                own = [t.detach().requires_grad_(k < tracked) for k, t in enumerate(self.inputs)]
+                told = [(end, grad) for end, grad in zip(self._run(own), asked, strict=True) if end.requires_grad]
+                ends, by = zip(*told, strict=True)
+                found = torch.autograd.grad(ends, [*own[:tracked], *leaves], by, allow_unused=True)
+            at = [*range(tracked), *range(len(own), len(own) + len(leaves))]
+            places[:] = [k for k, grad in zip(at, found, strict=True) if grad is not None]
+            return [grad for grad in found if grad is not None]
+
+        found, replay = self.capture(work)
+        return _Back(asked, found, places, replay)
+
+    def _fill(self, moving: Sequence[Tensor]) -> None:
+        for slot, now in zip(self.inputs, moving, strict=True):
+            slot.copy_(now.detach())
+
+    def _run(self, inputs: Sequence[Tensor]) -> list[Tensor]:
+        state, lost, dt, drives = self.read(inputs, self.closed, self.substeps)
+        total: Impulses = {}
+        start, farthest, layers = state.x.detach(), state.x.new_zeros(()), _none(self.model, state.x)
+        for k in range(self.substeps):
+            farthest = torch.maximum(farthest, (state.x.detach() - start).abs().max())
+            state, lost, impulses = functional.substep(self.model, state, lost, dt, drives, k, layers)
+            total = added(total, impulses)
+        self.places = tuple(state.memory), tuple(total), lost is not None
+        kept_back = [] if lost is None else [lost]
+        return [state.x, state.v, state.d3, farthest, *state.memory.values(), *total.values(), *kept_back]
+
+
+class _Replayed(torch.autograd.Function):
+    """A unit as one operation."""
+
+    @staticmethod
+    def forward(ctx: Any, unit: Unit, leaves: Sequence[Tensor], *inputs: Tensor) -> tuple[Tensor, ...]:
+        """``inputs``: all that moves, and what stands in the model where the leaves do."""
+        ctx.unit, ctx.leaves = unit, leaves
+        moving = inputs[: len(unit.inputs)]
+        ctx.save_for_backward(*moving)
+        found = unit.replayed(moving)
+        ctx.mark_non_differentiable(found[3], *(found[-1:] if unit.places[2] else []))
+        ctx.set_materialize_grads(False)
+        return tuple(found)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Computed again from where the unit began."""
+        return None, None, *ctx.unit.pulled_back(ctx.saved_tensors, grads, ctx.leaves)
+
+
+def _constant(drives: Mapping[str, Drive], first: int, last: int) -> dict[str, bool] | None:
+    """Whether each gripper is closed; None where one changes."""
+    out = {}
+    for name, drive in drives.items():
+        flags = set(drive.closed[first:last])
+        if len(flags) != 1:
+            return None
+        out[name] = flags.pop()
+    return out
+
+
+def _none(model: Model, x: Tensor) -> Layers | None:
+    """No layers near each other."""
+    if model.grid is None:
+        return None
+    empty = torch.empty(0, dtype=torch.int64, device=x.device)
+    return Layers(empty, empty, empty.expand(3, 0), empty.int(), x)
+
+
+def _mapped(tree: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """The same with every tensor and every parameter of a module changed."""
+    if isinstance(tree, Tensor):
+        return change(tree)
+    if isinstance(tree, nn.Module):
+        own = kept(tree)
+        for inner in own.modules():
+            changed = {n: None if p is None else change(p) for n, p in inner._parameters.items()}
+            inner._parameters = cast("dict[str, nn.Parameter | None]", changed)
+        return own
+    if isinstance(tree, Mapping):
+        return {name: _mapped(part, change) for name, part in tree.items()}
+    if isinstance(tree, tuple):
+        parts = [_mapped(part, change) for part in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    return tree
