@@ -45,6 +45,15 @@ def test_what_matters_with_all_its_rivals_is_a_cause():
     assert (found.causes, found.minor) == (found.steps, [])
 
 
+@pytest.mark.parametrize(("scale", "named"), [(0.0034, True), (0.0029, False)])
+def test_of_two_that_cannot_be_told_apart_one_may_be_somewhat_small(scale, named):
+    """Depths off by 5 mm look like 0.34 % at 1.5 m; those off by 0.29 %, which does not matter, like 4.3 mm."""
+    alike = [("obs.depth_scale", 0.015, scale), ("obs.depth_bias", 5e-3, 1.45 * scale)]
+    for order in (alike, alike[::-1]):
+        found = ended(*order)
+        assert (found.causes, found.minor) == ((found.steps, []) if named else ([], found.steps))
+
+
 def test_a_rival_that_joins_the_model_beside_a_cause_is_none_any_more():
     """Neither could be dropped then: they are two."""
     found = ended(SCALE_LARGE, BIAS, EXTRINSIC)
@@ -154,3 +163,18 @@ def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, sho
     c = SimpleNamespace(hypothesis=toys.hypothesis("m", twin=twin), fitted=fitted, row=row)
     assert trials.worth_naming(c, gain) == worth  # type: ignore[arg-type]
     assert not trials.worthwhile(gain)
+
+
+@pytest.mark.parametrize(
+    ("after", "pull", "worth"), [(0.99e-3, 0.0, True), (1.01e-3, 0.0, False), (1.01e-3, 1e-2, True)]
+)
+def test_what_leaves_all_positions_together_further_off_mends_none(after, pull, worth):
+    """Though it does where nothing else goes on, or in one episode; a pull may be mended without them."""
+    gain = Gain(1e-3, after, 18.0, (4.0, 33.0), 0.0, (0.0, 0.0), (0.72e-3, 0.70e-3), (4e-4, pull), 5.0)
+    assert trials.worthwhile(gain) == worth
+
+
+def test_what_was_only_felt_has_no_positions():
+    nowhere = float("nan")
+    gain = Gain(nowhere, nowhere, 18.0, (4.0, 33.0), 0.0, (0.0, 0.0), (0.0, 0.0), (0.0, 1e-2), 5.0)
+    assert trials.worthwhile(gain)

@@ -61,6 +61,22 @@ def test_where_the_data_sheet_is_no_world_nothing_begins_there(monkeypatch):
     assert resettled(found(OFTEN + 1), None, [CAUSE]) is None  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("after", "kept"), [(0.9e-3, True), (1.1e-3, False)])
+def test_causes_that_predict_all_positions_together_worse_are_none(monkeypatch, after, kept):
+    """Though each did better when it was accepted, with the noise of then."""
+    one = found(0.1)
+    row = SimpleNamespace(hypothesis=CAUSE)
+    first = Step(Candidate(row, one, None, None, set(), 0.0), None, [], [], [], one, None)  # type: ignore[arg-type]
+    monkeypatch.setattr(stepwise, "fit", lambda *_, **__: one)
+    monkeypatch.setattr(stepwise, "screen", lambda f: [])
+    monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
+    monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
+    monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
+    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1e-3, after=after, mended=(4e-4, 0.0)))
+    _, steps = stepwise._chain(one, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    assert steps == ([first] if kept else [])
+
+
 @pytest.mark.parametrize("better", [True, False])
 def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypatch, better):
     """The first step ends strained; the second sees the causes of both fits, or those of the new one alone."""
@@ -75,6 +91,7 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     monkeypatch.setattr(stepwise, "one_step", lambda current, setting, begun, *_: looked.append((current, begun)))
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
     monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
+    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5))
     end, _ = stepwise._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     ((current, begun),) = looked
     assert current is end is (anew if better else strained)
@@ -94,6 +111,7 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (doubted.append(current) or current, steps))
     monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
+    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5))
     end, _ = stepwise._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert doubted == ([far, near] if ahead else [far])
     assert end is doubted[-1]

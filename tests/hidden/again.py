@@ -29,9 +29,10 @@ def said(c: Candidate, names: list[str]) -> str:
     place = c.fitted.model.place(c.hypothesis.name)
     middle, motions = (float(v[len(c.fitted.model.parameters) + place]) for v in spread(c.fitted, names, c.alone))
     (calm, after), (seen, felt), (low, high) = c.gain.calm, c.gain.mended, c.gain.ci95
+    whole = f"{1e3 * c.gain.before:.3f} -> {1e3 * c.gain.after:.3f} mm"
     return (
         f"  {c.hypothesis.name:22} {c.amplitude:9.3g} {c.hypothesis.unit:8} density {c.gain.density:8.1f} "
-        f"({low:.0f} to {high:.0f}), {1e3 * calm:.2f} -> {1e3 * after:.2f} mm, mended "
+        f"({low:.0f} to {high:.0f}), {whole}, calm {1e3 * calm:.2f} -> {1e3 * after:.2f} mm, mended "
         f"{1e3 * seen:.2f} mm or {1e3 * felt:.1f} mN, {abs(middle) / max(motions, 1e-30):.1f} standard "
         f"errors between motions ({c.sure:.2f} asked), chi^2 {float(c.fitted.white.value.square().sum()):.0f}"
     )
@@ -78,6 +79,8 @@ def main(arguments: list[str] | None = None) -> int:
             "named:",
             json.dumps({key: cause[key] for key in ("effect", "amplitude", "ci95", "class", "rivals", "placebo")}),
         )
+    if (gain := answer.content["gain"]) is not None:
+        print(f"gain: {1e3 * gain['rms_before']:.3f} -> {1e3 * gain['rms_after']:.3f} mm on motions held out")
     hidden = case(options.seed, SMALL if options.fast else REDUCED)
     print("hidden:", json.dumps([asdict(e) for e in hidden.effects]))
     return 0

@@ -16,7 +16,7 @@ from .noise import floor_of
 from .repeats import Repeats, pairs_of, repeats
 from .screening import MUCH, Row, screen
 from .setting import Progress, Setting, staged
-from .trials import FURTHER, SURELY, TRIED, Candidate, Step, alone_in, begun_with, one_step
+from .trials import FURTHER, SURELY, TRIED, Candidate, Step, alone_in, begun_with, one_step, worsens
 from .world import Hypothesis, Model
 from .worlds import if_possible
 
@@ -45,8 +45,12 @@ class Found:
 
     @property
     def causes(self) -> list[Step]:
-        """Those that are large enough to matter; the others stay in the model, so that nothing stands in for them."""
-        return [s for s in self.steps if all(h.matters(a) for h, a in self.alike(s))]
+        """Those that are large enough to matter; the others stay in the model, so that nothing stands in for them.
+
+        Of what cannot be told apart one must matter, and the others be half as large as is of interest.
+        """
+        large = lambda told: any(h.matters(a) for h, a in told) and all(h.might_matter(a) for h, a in told)  # noqa: E731
+        return [s for s in self.steps if large(self.alike(s))]
 
     @property
     def minor(self) -> list[Step]:
@@ -199,9 +203,16 @@ def _chain(
         current = current if enough(current) else asked(current, now)
         current, steps = pruned(current, steps, setting, hypotheses, progress)
     share = mended(start, current, setting.names, alone_in(steps)) if steps else 1.0
-    if share < LEAST or (share < HALF and unheard(start, current, steps, setting.names)):
+    little = share < LEAST or (share < HALF and unheard(start, current, steps, setting.names))
+    if little or (steps and worsens(_of_all(start, current, steps, setting))):
         return start, []
     return current, steps
+
+
+def _of_all(start: Fitted, current: Fitted, steps: list[Step], setting: Setting, floor: float = 0.0) -> Gain:
+    """What all causes together gain."""
+    before, after = (predict(f, setting.names, alone_in(steps)) for f in weighed_alike(start, current))
+    return compare(before, after, floor)
 
 
 def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> Found:
@@ -210,6 +221,5 @@ def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) 
     last, sensor = predict(current, setting.names, alone), floor_of(current.evidence, current.noise)
     repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
     floor = sensor if repeated is None else repeated.rms
-    before, after = (predict(f, setting.names, alone) for f in weighed_alike(start, current))
-    whole = compare(before, after, floor) if steps else None
+    whole = _of_all(start, current, steps, setting, floor) if steps else None
     return Found(start, current, steps, screened, whole, floor, sensor, repeated, setting)

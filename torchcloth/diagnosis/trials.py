@@ -252,7 +252,12 @@ def worthwhile(gain: Gain) -> bool:
     """Large enough to be noticed, and surely a gain."""
     seen, felt = gain.mended
     mended = gain.fallen > WORTH_SHARE * gain.calm[0] ** 2 or seen > WORTH_MM or felt > WORTH_PULL
-    return mended and gain.least > 0
+    return mended and gain.least > 0 and not worsens(gain)
+
+
+def worsens(gain: Gain) -> bool:
+    """All positions together are predicted worse, whatever else is, and pulls hardly better."""
+    return gain.after > gain.before and gain.mended[1] < WORTH_PULL
 
 
 def _themselves(useful: Sequence[Candidate]) -> list[Candidate]:

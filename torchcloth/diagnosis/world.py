@@ -21,6 +21,7 @@ from ..meshes import Mesh
 from ..recordings import Recording
 
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
+MIGHT_MATTER = 0.5  # the same, beside what matters
 RESIDUAL = "residual"  # and a dot: names of laws that are no causes
 OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
 Motion = Callable[[Episode], Episode]  # what the robot really does, from what it says
@@ -154,6 +155,10 @@ class Hypothesis:
     def matters(self, amplitude: float) -> bool:
         """Large enough to be named."""
         return abs(amplitude) > MATTERS * abs(self.smallest)
+
+    def might_matter(self, amplitude: float) -> bool:
+        """Large enough to be named with what it cannot be told from, and which matters."""
+        return abs(amplitude) > MIGHT_MATTER * abs(self.smallest)
 
 
 @dataclass(frozen=True)
