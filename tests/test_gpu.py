@@ -64,4 +64,5 @@ def test_graphs_pay():
 
 def test_it_says_so():
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3))
-    assert tc.Cloth(mesh, tc.materials.AEP(5e3), 0.3).cuda().engine_in_use == "reference, in CUDA graphs (tensors on cuda)"
+    cloth = tc.Cloth(mesh, tc.materials.AEP(5e3), 0.3).cuda()
+    assert cloth.engine_in_use == "reference, in CUDA graphs (tensors on cuda)"
