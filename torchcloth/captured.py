@@ -246,6 +246,7 @@ class Unit:
                 own = [t.detach().requires_grad_(k < tracked) for k, t in enumerate(self.inputs)]
                 told = [(end, grad) for end, grad in zip(self._run(own), asked, strict=True) if end.requires_grad]
                 ends, by = zip(*told, strict=True)
+                _check_leaves(ends, [*own, *leaves])
                 found = torch.autograd.grad(ends, [*own[:tracked], *leaves], by, allow_unused=True)
             at = [*range(tracked), *range(len(own), len(own) + len(leaves))]
             places[:] = [k for k, grad in zip(at, found, strict=True) if grad is not None]
@@ -290,6 +291,24 @@ class _Replayed(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Computed again from where the unit began."""
         return None, None, *ctx.unit.pulled_back(ctx.saved_tensors, grads, ctx.leaves)
+
+
+def _check_leaves(ends: Sequence[Tensor], known: Sequence[Tensor]) -> None:
+    """Refuse a gradient that would be lost: of what a user's part keeps where nobody looks.
+
+    Raises:
+        RuntimeError: ``ends`` depend on a leaf that is not ``known``.
+    """
+    mine, seen, open_ = {id(t) for t in known}, set(), [end.grad_fn for end in ends]
+    while open_:
+        node = open_.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        leaf = getattr(node, "variable", None)
+        if leaf is not None and id(leaf) not in mine:
+            raise RuntimeError(f"a part has a tensor {tuple(leaf.shape)} with a gradient that is no parameter of it")
+        open_ += [before for before, _ in node.next_functions]
 
 
 def _constant(drives: Mapping[str, Drive], first: int, last: int) -> dict[str, bool] | None:

@@ -149,6 +149,36 @@ def test_what_cannot_be_captured_is_launched_one_by_one():
     agree(usual, other, (1e-12, 1e-11))
 
 
+class Push(tc.effects.AbstractEffect):
+    """A force that knows its size by another name than a parameter's."""
+
+    def __init__(self, size: Tensor) -> None:
+        super().__init__()
+        self.sizes = [size]
+
+    def coefficients(self):
+        return None
+
+    def force(self, c, now):
+        return self.sizes[0] * now.mass * torch.ones_like(now.x)
+
+
+def test_gradients_of_what_is_no_parameter_are_not_lost():
+    size = torch.tensor(2.0, requires_grad=True)
+    found = []
+    for capture in (None, again):
+        size.grad = None
+        made = scene(effects={"push": Push(size)})
+        if capture is None:
+            outcome(made)
+        else:
+            with pytest.warns(UserWarning, match="a part has a tensor .* with a gradient that is no parameter"):
+                outcome(made, capture)
+        found.append(float(size.grad))
+    assert found[0] != 0
+    assert found[1] == pytest.approx(found[0], rel=1e-9)
+
+
 def test_a_backward_pass_comes_long_after():
     """Of two simulations of which the second has run before the first is differentiated."""
     cloth, state, motion = scene()
