@@ -6,8 +6,13 @@ import pytest
 import torch
 
 import torchcloth as tc
+from torchcloth import captured
 
-pytestmark = pytest.mark.gpu
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.filterwarnings("error:no CUDA graph"),
+    pytest.mark.filterwarnings("error:The CUDA Graph is empty"),
+]
 CONTACT = {"contact": tc.Contact(), "none": None}
 
 
@@ -44,16 +49,43 @@ def lifted(device: str, engine: str, dtype: torch.dtype, contact: str, duration:
 
 @pytest.mark.parametrize("contact", CONTACT)
 @pytest.mark.parametrize(("dtype", "mark"), [(torch.float64, 1e-9), (torch.float32, 1e-4)])
-def test_cuda_equals_cpu(dtype, mark, contact):
+def test_cuda_equals_cpu(monkeypatch, dtype, mark, contact):
     """Captured, and launched one by one."""
-    known, gradient, _ = lifted("cpu", "reference", dtype, contact, 0.1)
+    units = []
+    usual = captured.Unit.__init__
+    monkeypatch.setattr(captured.Unit, "__init__", lambda self, *how: (units.append(self), usual(self, *how))[1])
+    known, gradient, _ = lifted("cpu", "reference", dtype, contact, 0.2)
     for engine in ("auto", "reference"):
-        x, grad, _ = lifted("cuda", engine, dtype, contact, 0.1)
+        x, grad, _ = lifted("cuda", engine, dtype, contact, 0.2)
         torch.testing.assert_close(x, known, rtol=mark, atol=mark)
         torch.testing.assert_close(grad, gradient, rtol=10 * mark, atol=10 * mark * float(gradient.abs()))
+        assert units, "nothing was captured"
 
 
-@pytest.mark.filterwarnings("error:no CUDA graph")
+class Waits(tc.effects.AbstractEffect):
+    """It brings a number from the processor in every substep."""
+
+    def coefficients(self):
+        return None
+
+    def force(self, c, now):
+        return torch.tensor([0.0, 0.0, 1e-3]).to(now.x).expand_as(now.x)
+
+
+@pytest.mark.filterwarnings("default:no CUDA graph")
+def test_a_part_that_waits_is_launched_one_by_one_and_spoils_nothing():
+    mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(6, 6))
+    stream = torch.cuda.current_stream()
+    cloth = tc.Cloth(mesh, tc.materials.AEP(5e4), 0.3, {"waits": Waits()}, contact=None).cuda()
+    with pytest.warns(UserWarning, match="no CUDA graph of the substeps"):
+        cloth(cloth.rest_state(), times=[0.0, 0.2])
+    assert torch.cuda.current_stream() == stream
+    torch.cuda.empty_cache()
+    assert not captured.Graphs.broken
+    plain = tc.Cloth(mesh, tc.materials.AEP(5e4), 0.3, {"gravity": tc.effects.Gravity()}, contact=None).cuda()
+    assert torch.isfinite(plain(plain.rest_state(), times=[0.0, 0.2]).x).all()
+
+
 def test_graphs_pay():
     """Prints by how much, forward and back together."""
     *_, launched = lifted("cuda", "reference", torch.float32, "contact", 0.5)

@@ -12,38 +12,65 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from functools import cache
+from typing import Any, ClassVar, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from . import functional
 from .boundaries import Drive
 from .dynamics import Impulses, added
+from .errors import InvalidInput
 from .model import Model, kept
 from .self_contact import Layers, near_layers
 from .types import ClothState
 
 UNIT = range(8, 25)  # substeps, of which one count is chosen that fits
-SOON = 2  # units that run as they are before one like them is captured: few do not pay, and libraries are awake then
+SOON = 2  # units that run as they are before one like them is captured: libraries are awake then
+PAYS = 8  # units that must be left: a capture takes as long as some six of them
 
 Replay = Callable[[], None]
 Work = Callable[[], list[Tensor]]
-Capture = Callable[[Work], tuple[list[Tensor], Replay]]
+Capture = Callable[[Work, torch.device], tuple[list[Tensor], Replay]]
 Stretch = tuple[ClothState, Tensor | None, Impulses]
 
 
-def on_cuda(work: Work) -> tuple[list[Tensor], Replay]:
-    """What ``work`` gives, in memory that each replay overwrites, and the replay."""
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        work()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        found = work()
+class _Broken(RuntimeError):
+    """A capture failed half way, after which no other should be tried in this process."""
+
+
+@cache
+def _stream(device: torch.device) -> torch.cuda.Stream:
+    """One for all captures: libraries keep a workspace for each."""
+    return torch.cuda.Stream(device)
+
+
+def on_cuda(work: Work, device: torch.device) -> tuple[list[Tensor], Replay]:
+    """What ``work`` gives, in memory that each replay overwrites, and the replay.
+
+    Raises:
+        RuntimeError: ``work`` waits for the device.
+    """
+    with torch.cuda.device(device):
+        side, now, mode = _stream(device), torch.cuda.current_stream(), torch.cuda.get_sync_debug_mode()
+        side.wait_stream(now)
+        torch.cuda.set_sync_debug_mode("error")  # before anything is captured, which could not be taken back
+        try:
+            with torch.cuda.stream(side):
+                work()
+        finally:
+            torch.cuda.set_sync_debug_mode(mode)
+        now.wait_stream(side)
+        graph = torch.cuda.CUDAGraph()
+        try:
+            with (
+                torch.cuda.stream(now),  # a capture that fails leaves its own
+                torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"),
+            ):
+                found = work()
+        except Exception as error:
+            raise _Broken(str(error)) from error
     return found, graph.replay
 
 
@@ -57,11 +84,14 @@ class Graphs:
 
     Args:
         model: of all of them.
+        substeps: of all of it.
         capture: another way than CUDA's to repeat a calculation in its own memory.
     """
 
-    def __init__(self, model: Model, capture: Capture = on_cuda) -> None:
-        self.model, self._capture = model, capture
+    broken: ClassVar[bool] = False
+
+    def __init__(self, model: Model, substeps: int, capture: Capture = on_cuda) -> None:
+        self.model, self._left, self._capture = model, substeps, capture
         self._leaves: list[tuple[Tensor, Tensor]] = []
         self._own: Model | None = None
         self._units: dict[tuple[Any, ...], Unit] = {}
@@ -73,27 +103,35 @@ class Graphs:
     ) -> Stretch | None:
         """As ``functional.stretch``; None where it must run there."""
         closed = _constant(drives, first, first + substeps)
-        if not self._able or closed is None:
+        self._left -= substeps
+        if not self.able or closed is None:
             return None
         if self.model.grid is not None and len(near_layers(self.model, self.model.grid, state.x).active):
             return None
         moving = Moving.of(state, lost, dt, drives, first, substeps)
         key = (substeps, tuple(closed.items()), *((tuple(t.shape), t.dtype) for t in moving.tensors))
         self._seen[key] = self._seen.get(key, 0) + 1
-        if self._seen[key] <= SOON:
-            return None
         if key not in self._units:
+            if self._seen[key] <= SOON or self._left < PAYS * substeps:
+                return None
             self._units[key] = Unit(self.stand_in(), moving, closed, substeps, self._capture)
+        unit = self._units[key]
         try:
-            found = self._units[key](moving, *self.leaves())
-        except RuntimeError as error:
-            self._able = False
+            unit.get_ready(moving, *self.leaves())
+        except Exception as error:  # whatever a user's part says to a number that is not there yet
+            self._able, Graphs.broken = False, isinstance(error, _Broken)
             line = str(error).partition("\n")[0]
             warnings.warn(f"no CUDA graph of the substeps, which are launched one by one: {line}", stacklevel=2)
             return None
+        found = unit(moving, self.leaves()[0])
         if self.model.grid is not None and float(found.farthest) >= self.reach:
             return None
         return found.state, found.lost, found.impulses
+
+    @property
+    def able(self) -> bool:
+        """Until a capture fails; nor where torch looks at every number."""
+        return self._able and not Graphs.broken and not torch.is_anomaly_enabled()
 
     @property
     def reach(self) -> float:
@@ -111,7 +149,7 @@ class Graphs:
 
             def leaf(given: Tensor) -> Tensor:
                 if not given.requires_grad:
-                    return given
+                    return given.detach()  # whoever changes the cloth later leaves this to the graphs
                 if id(given) not in leaves:
                     leaves[id(given)] = given.detach().requires_grad_()
                     self._leaves.append((given, leaves[id(given)]))
@@ -190,11 +228,10 @@ class Unit:
         self.forward: tuple[list[Tensor], Replay] | None = None
         self.backward: _Back | None = None
 
-    def __call__(self, moving: Moving, given: Sequence[Tensor], leaves: Sequence[Tensor]) -> _Found:
+    def __call__(self, moving: Moving, given: Sequence[Tensor]) -> _Found:
         """The end of the unit; differentiable in all that moves and in what is ``given`` in the place of leaves."""
-        if torch.is_grad_enabled() and any(t.requires_grad for t in (*moving.tensors, *given)):
-            self.get_ready(moving.tensors, leaves)
-            found = cast("Sequence[Tensor]", _Replayed.apply(self, leaves, *moving.tensors, *given))
+        if _watched(moving, given):
+            found = cast("Sequence[Tensor]", _Replayed.apply(self, *moving.tensors, *given))
         else:
             found = self.replayed(moving.tensors)
         x, v, d3, farthest, *left = found
@@ -206,43 +243,38 @@ class Unit:
     def replayed(self, moving: Sequence[Tensor]) -> list[Tensor]:
         """Forward."""
         self._fill(moving)
-        found, replay = self._forward()
+        found, replay = cast("tuple[list[Tensor], Replay]", self.forward)
         replay()
         return [t.clone() for t in found]
 
-    def get_ready(self, moving: Sequence[Tensor], leaves: Sequence[Tensor]) -> None:
-        """For a backward pass, before it: threads of its own run that."""
-        if self.backward is None:
-            self._fill(moving)
-            self.backward = self._captured_back(leaves)
+    def get_ready(self, moving: Moving, given: Sequence[Tensor], leaves: Sequence[Tensor]) -> None:
+        """Capture what is not captured yet; for a backward pass before it, for threads of its own run that."""
+        if self.forward is None:
+            self._fill(moving.tensors)
+            with torch.no_grad():
+                self.forward = self.capture(lambda: self._run(self.inputs), self.inputs[0].device)
+        if self.backward is None and _watched(moving, given):
+            self.backward = self._captured_back(self.forward[0], leaves)
 
-    def pulled_back(
-        self, moving: Sequence[Tensor], grads: Sequence[Tensor | None], leaves: Sequence[Tensor]
-    ) -> list[Tensor | None]:
-        """Gradients of all that moves and of the leaves, from those of what ``replayed`` gives."""
-        self.get_ready(moving, leaves)
+    def pulled_back(self, moving: Sequence[Tensor], grads: Sequence[Tensor | None], leaves: int) -> list[Tensor | None]:
+        """Gradients of all that moves and of so many leaves, from those of what ``replayed`` gives."""
         self._fill(moving)
         asked, found, places, replay = cast("_Back", self.backward)
         for slot, grad in zip(asked, grads, strict=True):
             slot.zero_() if grad is None else slot.copy_(grad)
         replay()
-        out: list[Tensor | None] = [None] * (len(moving) + len(leaves))
+        out: list[Tensor | None] = [None] * (len(moving) + leaves)
         for place, grad in zip(places, found, strict=True):
             out[place] = grad.clone()
         return out
 
-    def _forward(self) -> tuple[list[Tensor], Replay]:
-        if self.forward is None:
-            with torch.no_grad():
-                self.forward = self.capture(lambda: self._run(self.inputs))
-        return self.forward
-
-    def _captured_back(self, leaves: Sequence[Tensor]) -> _Back:
-        asked, tracked = [torch.zeros_like(t) for t in self._forward()[0]], self.tracked
+    def _captured_back(self, ends: Sequence[Tensor], leaves: Sequence[Tensor]) -> _Back:
+        asked, tracked = [torch.zeros_like(t) for t in ends], self.tracked
         places: list[int] = []
 
         def work() -> list[Tensor]:
-            with torch.enable_grad():
+            # what a caller's checkpoint or offloading does with saved tensors is none of this
+            with torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(lambda t: t, lambda t: t):
                 own = [t.detach().requires_grad_(k < tracked) for k, t in enumerate(self.inputs)]
                 told = [(end, grad) for end, grad in zip(self._run(own), asked, strict=True) if end.requires_grad]
                 ends, by = zip(*told, strict=True)
@@ -252,7 +284,7 @@ class Unit:
             places[:] = [k for k, grad in zip(at, found, strict=True) if grad is not None]
             return [grad for grad in found if grad is not None]
 
-        found, replay = self.capture(work)
+        found, replay = self.capture(work, self.inputs[0].device)
         return _Back(asked, found, places, replay)
 
     def _fill(self, moving: Sequence[Tensor]) -> None:
@@ -276,21 +308,28 @@ class _Replayed(torch.autograd.Function):
     """A unit as one operation."""
 
     @staticmethod
-    def forward(ctx: Any, unit: Unit, leaves: Sequence[Tensor], *inputs: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, unit: Unit, *inputs: Tensor) -> tuple[Tensor, ...]:
         """``inputs``: all that moves, and what stands in the model where the leaves do."""
-        ctx.unit, ctx.leaves = unit, leaves
-        moving = inputs[: len(unit.inputs)]
-        ctx.save_for_backward(*moving)
-        found = unit.replayed(moving)
+        ctx.unit = unit
+        ctx.save_for_backward(*inputs)  # all of it: torch refuses what has been changed since
+        found = unit.replayed(inputs[: len(unit.inputs)])
         ctx.mark_non_differentiable(found[3], *(found[-1:] if unit.places[2] else []))
         ctx.set_materialize_grads(False)
         return tuple(found)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Computed again from where the unit began."""
-        return None, None, *ctx.unit.pulled_back(ctx.saved_tensors, grads, ctx.leaves)
+        if torch.is_grad_enabled():
+            got, remedy = "create_graph=True", 'engine="reference"'
+            raise InvalidInput("gradient of a gradient through CUDA graphs", got=got, expected="one", remedy=remedy)
+        count, inputs = len(ctx.unit.inputs), ctx.saved_tensors
+        return None, *ctx.unit.pulled_back(inputs[:count], grads, len(inputs) - count)
+
+
+def _watched(moving: Moving, given: Sequence[Tensor]) -> bool:
+    """Whether a backward pass may come."""
+    return torch.is_grad_enabled() and any(t.requires_grad for t in (*moving.tensors, *given))
 
 
 def _check_leaves(ends: Sequence[Tensor], known: Sequence[Tensor]) -> None:
@@ -339,6 +378,7 @@ def _mapped(tree: Any, change: Callable[[Tensor], Tensor]) -> Any:
         for inner in own.modules():
             changed = {n: None if p is None else change(p) for n, p in inner._parameters.items()}
             inner._parameters = cast("dict[str, nn.Parameter | None]", changed)
+            inner._buffers = {n: None if b is None else change(b) for n, b in inner._buffers.items()}
         return own
     if isinstance(tree, Mapping):
         return {name: _mapped(part, change) for name, part in tree.items()}

@@ -349,7 +349,7 @@ class Cloth(nn.Module):
         if MATERIAL in state.memory:
             frames, counts, asked = divided(frames, counts)
             step_for = self._step_for(model, dt)
-        graphs = Graphs(model) if choice.captured else None
+        graphs = Graphs(model, sum(counts)) if choice.captured else None
         plan = Plan(model, motion, frames, counts, state, choice, longest, step_for, asked, graphs)
         plan.check(state)
         return plan

@@ -236,7 +236,7 @@ def _by_reference(
     if store:
         model = as_it_is(model)
     graphs = None if transformed() else interval.graphs
-    chunk = CHUNK if graphs is None else unit_of(interval.count)
+    chunk = unit_of(interval.count) if graphs is not None and graphs.able else CHUNK
     for first in range(0, interval.count, chunk):
         of = {"dt": interval.dt, "drives": drives, "substeps": min(chunk, interval.count - first), "first": first}
         found = None if graphs is None else graphs.stretch(state, lost, **of)

@@ -83,17 +83,18 @@ def runs_on_any_device(
     leaf = state.map(lambda t: t.to("meta").requires_grad_())
     lost = torch.zeros_like(leaf.x, requires_grad=False) if state.x.dtype == torch.float32 else None
     moving = captured.Moving.of(leaf, lost, dt, drives, 0, 2)
-    graphs = captured.Graphs(model, watched)
+    graphs = captured.Graphs(model, 2, watched)
     unit = captured.Unit(graphs.stand_in(), moving, closed, 2, watched)
-    end = unit(moving, *graphs.leaves())
+    unit.get_ready(moving, *graphs.leaves())
+    end = unit(moving, graphs.leaves()[0])
     (end.state.x.sum() + sum(value.sum() for value in end.impulses.values())).backward()
     assert leaf.x.grad is not None
     assert leaf.x.grad.is_meta
 
 
-def watched(work: captured.Work) -> tuple[list[Tensor], captured.Replay]:
+def watched(work: captured.Work, device: torch.device) -> tuple[list[Tensor], captured.Replay]:
     """As a graph that is captured from tensors without numbers, which refuses what others it would have to wait for."""
-    with OnOneDevice("meta"):
+    with OnOneDevice(device.type):
         return work(), lambda: None
 
 

@@ -3,10 +3,12 @@
 import pytest
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 import torchcloth as tc
 from torchcloth import captured
 from torchcloth.captured import Graphs, unit_of
+from torchcloth.errors import InvalidInput
 from torchcloth.intervals import run
 
 FRAMES = [0.0, 0.02, 0.04, 0.08]
@@ -16,9 +18,10 @@ FRAMES = [0.0, 0.02, 0.04, 0.08]
 def soon(monkeypatch):
     """Short simulations are captured, too."""
     monkeypatch.setattr(captured, "SOON", 0)
+    monkeypatch.setattr(captured, "PAYS", 0)
 
 
-def again(work: captured.Work) -> tuple[list[Tensor], captured.Replay]:
+def again(work: captured.Work, device: torch.device | None = None) -> tuple[list[Tensor], captured.Replay]:
     """Computes again what a graph would replay, in the same memory."""
     found = work()
 
@@ -30,7 +33,7 @@ def again(work: captured.Work) -> tuple[list[Tensor], captured.Replay]:
     return found, replay
 
 
-def refused(work: captured.Work) -> tuple[list[Tensor], captured.Replay]:
+def refused(work: captured.Work, device: torch.device) -> tuple[list[Tensor], captured.Replay]:
     raise RuntimeError("operation not permitted when stream is capturing\nand more")
 
 
@@ -60,7 +63,7 @@ def outcome(made, capture: captured.Capture | None = None):
     cloth, state, motion = made
     x = state.x.clone().requires_grad_()
     plan = cloth.plan(state._replace(x=x), motion, FRAMES, None)
-    graphs = None if capture is None else Graphs(plan.model, capture)
+    graphs = None if capture is None else Graphs(plan.model, sum(plan.counts), capture)
     out = run(plan._replace(graphs=graphs), checkpoint=True)
     weight = torch.randn(out.x.shape, generator=torch.Generator().manual_seed(1), dtype=out.x.dtype)
     ((weight * out.x).sum() + out.wrench["hand"].square().sum()).backward()
@@ -96,7 +99,7 @@ def test_without_gradients_nothing_is_kept():
     cloth, state, motion = scene()
     with torch.no_grad():
         plan = cloth.plan(state, motion, FRAMES, None)
-        graphs = Graphs(plan.model, again)
+        graphs = Graphs(plan.model, sum(plan.counts), again)
         usual, other = run(plan, True), run(plan._replace(graphs=graphs), True)
     torch.testing.assert_close(other.x, usual.x, rtol=1e-12, atol=1e-13)
     assert all(unit.backward is None for unit in graphs._units.values())
@@ -123,7 +126,7 @@ def test_layers_that_meet_are_not_captured(monkeypatch):
     right = folded[:, 0] > 0.1
     folded[right, 0], folded[right, 2] = 0.2 - folded[right, 0], folded[right, 2] + 0.004
     plan = cloth.plan(cloth.state(folded), motion, FRAMES[:2], None)
-    graphs = Graphs(plan.model, again)
+    graphs = Graphs(plan.model, sum(plan.counts), again)
     with torch.no_grad():
         run(plan._replace(graphs=graphs), True)
     assert not graphs._units
@@ -135,7 +138,10 @@ def test_layers_that_meet_are_not_captured(monkeypatch):
 
 
 def test_few_units_do_not_pay(monkeypatch):
-    monkeypatch.setattr(captured, "SOON", 100)
+    with monkeypatch.context() as patch:
+        patch.setattr(captured, "SOON", 100)
+        assert not outcome(scene(), again)[2]._units
+    monkeypatch.setattr(captured, "PAYS", 100)
     assert not outcome(scene(), again)[2]._units
 
 
@@ -179,6 +185,48 @@ def test_gradients_of_what_is_no_parameter_are_not_lost():
     assert found[1] == pytest.approx(found[0], rel=1e-9)
 
 
+def test_gradients_of_gradients_are_refused():
+    cloth, state, motion = scene()
+    x = state.x.clone().requires_grad_()
+    plan = cloth.plan(state._replace(x=x), motion, FRAMES, None)
+    out = run(plan._replace(graphs=Graphs(plan.model, sum(plan.counts), again)), checkpoint=True)
+    with pytest.raises(InvalidInput, match=r'create_graph=True; expected one; .*engine="reference"'):
+        torch.autograd.grad(out.x.square().sum(), x, create_graph=True)
+
+
+def test_a_callers_checkpoint_is_not_captured():
+    """It would compute the caller's work again in the midst of a capture."""
+    times, found = [], []
+    for capture in (None, again):
+        cloth, state, motion = scene()
+
+        def work(x, cloth=cloth, state=state, motion=motion, capture=capture):
+            times.append(capture)
+            plan = cloth.plan(state._replace(x=x), motion, FRAMES, None)
+            graphs = None if capture is None else Graphs(plan.model, sum(plan.counts), capture)
+            return run(plan._replace(graphs=graphs), checkpoint=True).x
+
+        x = state.x.clone().requires_grad_()
+        checkpoint(work, x, use_reentrant=False).square().sum().backward()
+        found.append(x.grad)
+    assert times.count(None) == times.count(again) == 2
+    torch.testing.assert_close(found[1], found[0], rtol=1e-10, atol=1e-12)
+
+
+def test_what_is_done_to_a_cloth_later_does_not_reach_its_graphs():
+    """Graphs know addresses: what lies there is theirs."""
+    cloth, state, motion = scene()
+    for p in cloth.parameters():
+        p.requires_grad_(False)
+    plan = cloth.plan(state, motion, FRAMES, None)
+    own = Graphs(plan.model, 1, again).stand_in()
+    for name, part in own.boundaries.items():
+        for key, buffer in part.named_buffers():
+            theirs = cloth.boundaries[name].get_buffer(key)
+            assert buffer is not theirs
+            assert buffer.data_ptr() == theirs.data_ptr()
+
+
 def test_a_backward_pass_comes_long_after():
     """Of two simulations of which the second has run before the first is differentiated."""
     cloth, state, motion = scene()
@@ -186,7 +234,7 @@ def test_a_backward_pass_comes_long_after():
     for capture in (None, again):
         cloth.zero_grad()
         plan = cloth.plan(state, motion, FRAMES, None)
-        plan = plan._replace(graphs=None if capture is None else Graphs(plan.model, capture))
+        plan = plan._replace(graphs=None if capture is None else Graphs(plan.model, sum(plan.counts), capture))
         first = run(plan, True)
         faster = plan._replace(state=plan.state._replace(v=plan.state.v + 0.1))
         second = run(faster, True)

@@ -35,12 +35,13 @@ class AbstractEffect(nn.Module, ABC):
             def __init__(self, strength=1e-3):
                 super().__init__()
                 self.strength = PhysicalParameter(strength, "N", "nonnegative", name="pull")  # 0 must be allowed
+                self.register_buffer("along", torch.tensor([1.0, 0.0, 0.0]))  # goes where the cloth goes
 
             def coefficients(self):
                 return self.strength.field  # [..., 1, 1]: numbers, fields and batches alike
 
             def force(self, c, now):
-                return c * torch.tensor([1.0, 0.0, 0.0]).to(now.x).expand_as(now.x)
+                return c * self.along.expand_as(now.x)
 
         class TestPull(torchcloth.testing.EffectContract):
             def make(self, amplitude):
