@@ -1,0 +1,35 @@
+"""The table for a device: refused in one line where there is none, and made by what a CPU has of its ways."""
+
+import sys
+
+import pytest
+import torch
+
+from torchcloth.benchmarks import graphs
+
+
+def asked(monkeypatch, *words: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["graphs", *words])
+    graphs.main()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a device")
+def test_without_a_device_it_says_so(monkeypatch, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        asked(monkeypatch)
+    assert "got no CUDA device, expected one" in capsys.readouterr().err
+
+
+def test_scenes_are_some(monkeypatch, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        asked(monkeypatch, "--scenes", "4", "0")
+    assert "--scenes: got 0, expected 1 or more" in capsys.readouterr().err
+
+
+def test_ways_agree_and_are_told(monkeypatch, capsys):
+    monkeypatch.setattr(graphs, "WAYS", {"fused, CPU": ("cpu", "fused"), "one by one": ("cpu", "reference")})
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "none")
+    asked(monkeypatch, "--scenes", "2", "--frames", "1", "--repeats", "1")
+    rows = [line.split("|")[1:3] for line in capsys.readouterr().out.splitlines() if line.startswith("| 2")]
+    assert [[cell.strip() for cell in row] for row in rows] == [["2", "fused, CPU"], ["2", "one by one"]]
