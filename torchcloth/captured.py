@@ -92,8 +92,9 @@ class Graphs:
 
     def __init__(self, model: Model, substeps: int, capture: Capture = on_cuda) -> None:
         self.model, self._left, self._capture = model, substeps, capture
-        self._leaves: list[tuple[Tensor, Tensor]] = []
-        self._own: Model | None = None
+        self.given: list[Tensor] = []  # what of the model has a gradient
+        self.leaves: list[Tensor] = []  # what stands for it in the graphs' own model
+        self.own = cast("Model", _mapped(model, self._kept))
         self._units: dict[tuple[Any, ...], Unit] = {}
         self._seen: dict[tuple[Any, ...], int] = {}
         self._able = True
@@ -114,16 +115,16 @@ class Graphs:
         if key not in self._units:
             if self._seen[key] <= SOON or self._left < PAYS * substeps:
                 return None
-            self._units[key] = Unit(self.stand_in(), moving, closed, substeps, self._capture)
+            self._units[key] = Unit(self.own, moving, closed, substeps, self._capture)
         unit = self._units[key]
         try:
-            unit.get_ready(moving, *self.leaves())
+            unit.get_ready(moving, self.given, self.leaves)
         except Exception as error:  # whatever a user's part says to a number that is not there yet
             self._able, Graphs.broken = False, isinstance(error, _Broken)
             line = str(error).partition("\n")[0]
             warnings.warn(f"no CUDA graph of the substeps, which are launched one by one: {line}", stacklevel=2)
             return None
-        found = unit(moving, self.leaves()[0])
+        found = unit(moving, self.given)
         if self.model.grid is not None and float(found.farthest) >= self.reach:
             return None
         return found.state, found.lost, found.impulses
@@ -138,25 +139,16 @@ class Graphs:
         """[m], that a vertex may move before layers may meet which did not."""
         return 0.0 if self.model.grid is None else self.model.grid.skin / 2
 
-    def leaves(self) -> tuple[list[Tensor], list[Tensor]]:
-        """(what of the model has a gradient, what stands for it)."""
-        return [given for given, _ in self._leaves], [leaf for _, leaf in self._leaves]
-
-    def stand_in(self) -> Model:
-        """The model with leaves in the place of all that has a gradient."""
-        if self._own is None:
-            leaves: dict[int, Tensor] = {}
-
-            def leaf(given: Tensor) -> Tensor:
-                if not given.requires_grad:
-                    return given.detach()  # whoever changes the cloth later leaves this to the graphs
-                if id(given) not in leaves:
-                    leaves[id(given)] = given.detach().requires_grad_()
-                    self._leaves.append((given, leaves[id(given)]))
-                return leaves[id(given)]
-
-            self._own = cast("Model", _mapped(self.model, leaf))
-        return self._own
+    def _kept(self, tensor: Tensor) -> Tensor:
+        """What stands for a tensor of the model; whoever changes the cloth later leaves its memory to the graphs."""
+        if not tensor.requires_grad:
+            return tensor.detach()
+        for given, leaf in zip(self.given, self.leaves, strict=True):
+            if given is tensor:
+                return leaf
+        self.given.append(tensor)
+        self.leaves.append(tensor.detach().requires_grad_())
+        return self.leaves[-1]
 
 
 class Moving(NamedTuple):

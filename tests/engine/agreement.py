@@ -84,9 +84,9 @@ def runs_on_any_device(
     lost = torch.zeros_like(leaf.x, requires_grad=False) if state.x.dtype == torch.float32 else None
     moving = captured.Moving.of(leaf, lost, dt, drives, 0, 2)
     graphs = captured.Graphs(model, 2, watched)
-    unit = captured.Unit(graphs.stand_in(), moving, closed, 2, watched)
-    unit.get_ready(moving, *graphs.leaves())
-    end = unit(moving, graphs.leaves()[0])
+    unit = captured.Unit(graphs.own, moving, closed, 2, watched)
+    unit.get_ready(moving, graphs.given, graphs.leaves)
+    end = unit(moving, graphs.given)
     (end.state.x.sum() + sum(value.sum() for value in end.impulses.values())).backward()
     assert leaf.x.grad is not None
     assert leaf.x.grad.is_meta

@@ -219,7 +219,7 @@ def test_what_is_done_to_a_cloth_later_does_not_reach_its_graphs():
     for p in cloth.parameters():
         p.requires_grad_(False)
     plan = cloth.plan(state, motion, FRAMES, None)
-    own = Graphs(plan.model, 1, again).stand_in()
+    own = Graphs(plan.model, 1, again).own
     for name, part in own.boundaries.items():
         for key, buffer in part.named_buffers():
             theirs = cloth.boundaries[name].get_buffer(key)
