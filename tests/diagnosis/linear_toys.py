@@ -30,7 +30,8 @@ def grid() -> Cells:
     one = torch.ones(size).double()
     return Cells(
         torch.zeros(size).double(), torch.zeros(size, 0).double(), 25 * one, 5 * WHITE * one,
-        torch.zeros(size).long(), 3 * patch, window, place, 0.2 * window.double(), torch.zeros(size).double(),
+        torch.zeros(size).long(), 3 * patch, window, place, 0.2 * window.double(),
+        torch.zeros(size).double(), torch.zeros(size).double(),
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from torchcloth.diagnosis.comparison import Predicted, _resampled, as_it_is, com
 from torchcloth.diagnosis.confirming import Confirmation
 from torchcloth.diagnosis.evidence import as_rough
 from torchcloth.diagnosis.fitting import renoised, step_of, weighed_alike
-from torchcloth.diagnosis.noise import ROUGH, Noise, fit_noise, floor_of, whitened
+from torchcloth.diagnosis.noise import MEMORY, ROUGH, Noise, fit_noise, floor_of, whitened
 from torchcloth.diagnosis.screening import Row, _decided, screen
 from torchcloth.diagnosis.trials import CLEAR
 from torchcloth.diagnosis.wording import _is_too_large, _too_large
@@ -104,6 +104,24 @@ def test_the_level_of_slow_errors_is_found_also_beside_a_strong_effect():
     for truth in ([0.0] * 5, [0.0, 0.0, 0.0, 3.0, 0.0]):
         noise = fit_noise(toys.evidence(SLOPES, 2, NAMES, torch.tensor(truth).double(), 7))
         assert float(noise.level[0]) == pytest.approx(toys.SLOW, rel=0.35)
+
+
+def test_the_slow_error_of_depths_is_found_and_is_no_error_of_places():
+    """Images 1.5 mm too far or too near, for a while each, of cloth that faces the camera here and not there."""
+    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 7)
+    rng, size, cells = torch.Generator().manual_seed(3), 1.5e-3, []
+    for c in ev.cells:
+        times = c.time.unique()
+        memory = torch.linalg.cholesky(torch.exp(-(times[:, None] - times).abs() / MEMORY))
+        off = size * (memory @ torch.randn(len(times), generator=rng).double())[c.window]
+        ray = torch.cos(10 * c.place[:, 0])
+        cells.append(c._replace(ray=ray, value=c.value + ray * off))
+    noise = fit_noise(replace(ev, cells=cells))
+    assert noise.depth == pytest.approx(size, rel=0.4)
+    assert float(noise.level[0]) == pytest.approx(toys.SLOW, rel=0.35)
+    unaware = fit_noise(replace(ev, cells=[c._replace(ray=torch.zeros_like(c.ray)) for c in cells]))
+    assert unaware.depth == 0, "nothing is known of a camera"
+    assert float(unaware.level[0]) > 1.3 * float(noise.level[0])
 
 
 def test_whitened_noise_is_white():

@@ -9,7 +9,7 @@ import torch
 
 from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import base_model
-from torchcloth.diagnosis.cells import _places
+from torchcloth.diagnosis.cells import SEEN, _places, cells_of
 from torchcloth.diagnosis.evidence import asked_about, gather
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
@@ -69,6 +69,21 @@ def test_air_and_hem_do_what_their_names_say(made):
     depth = lambda x: (x - torch.as_tensor(sheets.EYE)).norm(dim=-1)  # noqa: E731
     torch.testing.assert_close(depth(last("obs.depth_scale", 0.015)), 1.015 * depth(base))
     torch.testing.assert_close(depth(last("obs.depth_bias", 5e-3)), depth(base) + 5e-3)
+
+
+def test_cells_know_what_a_longer_depth_does_to_them(made):
+    model, setting = made
+    e, by = setting.episodes[0], {h.name: h for h in catalogue(model, [RECORDING])}
+    cells = lambda world: cells_of(world.frames(e), None, e, setting.sheet, setting.rest)  # noqa: E731
+    base, off = cells(model.world()), cells(model.world([(by["obs.depth_bias"], 1e-4)]))
+    seen = base.block < SEEN
+    assert torch.equal(base.key, off.key)
+    assert float(base.ray[seen].abs().max()) > 0.5
+    assert not base.ray[~seen].any()
+    change = (off.value - base.value) / 1e-4
+    assert float((change - base.ray).square().mean().sqrt()) < 0.05 * float(base.ray.square().mean().sqrt())
+    unplaced = cells_of(model.world().frames(e), None, replace(e, eye=None), setting.sheet, setting.rest)
+    assert not unplaced.ray.any(), "no camera, or several"
 
 
 @pytest.mark.parametrize("first", ["elas.ortho", "plast.crease", "air.drag_n", "rest.skew", "grip.width"])

@@ -38,6 +38,7 @@ class Cells(NamedTuple):
     place: Tensor  # [C, 3] m, where on the fabric at rest; zero where that makes no sense
     time: Tensor  # [C] s
     rough: Tensor  # [C] in the value's unit, see ``evidence.gather``; zero where nobody asked
+    ray: Tensor  # [C] -, d residual / d depth of the one camera; zero of what it does not see
 
     @property
     def key(self) -> Tensor:
@@ -83,7 +84,8 @@ def mean_over(stretch: Tensor, values: Tensor) -> Tensor:
 
 def cells_of(frames: Frames, moved: Frames | None, episode: Episode, sheet: Sheet, rest: Tensor) -> Cells:
     """Of one simulated episode; ``moved`` holds derivatives of the frames, ``rest`` [V, 3] m the pattern."""
-    scene = scene_of(frames, moved, episode, sheet)
+    farther = _farther(frames, episode)
+    scene = scene_of(frames, farther if moved is None else joined(moved, farther), episode, sheet)
     parts = []
     for b, block in enumerate(BLOCKS):
         rows = block.rows(scene)
@@ -101,6 +103,21 @@ def directions(base: Frames, shifted: Sequence[Frames], steps: Sequence[float]) 
 
     wrench = {name: slope(lambda f, name=name: f.wrench[name]) for name in base.wrench}
     return Frames(slope(lambda f: f.x), slope(lambda f: f.v), wrench, slope(lambda f: f.edge))
+
+
+def joined(a: Frames, b: Frames) -> Frames:
+    """Directions of both."""
+    wrench = {name: torch.cat([a.wrench[name], b.wrench[name]]) for name in a.wrench}
+    return Frames(torch.cat([a.x, b.x]), torch.cat([a.v, b.v]), wrench, torch.cat([a.edge, b.edge]))
+
+
+def _farther(frames: Frames, episode: Episode) -> Frames:
+    """The direction [1, ...] away from the one camera that an episode has."""
+    x = torch.zeros_like(frames.x)
+    if episode.eye is not None:
+        x = torch.nn.functional.normalize(frames.x - episode.eye, dim=-1)
+    still = {name: torch.zeros_like(w)[None] for name, w in frames.wrench.items()}
+    return Frames(x[None], torch.zeros_like(frames.v)[None], still, torch.zeros_like(frames.edge)[None])
 
 
 def _shown(name: str, rows: Rows) -> Rows:
@@ -135,10 +152,11 @@ def _averaged(rows: Rows, block: int, episode: Episode, sheet: Sheet, rest: Tens
     share = kept / count.clamp(min=1.0)[index]
     mean = add(share * rows.value)
     spread = add(share * (rows.value - mean[index]) ** 2).sqrt()
-    jacobian = torch.zeros(len(rows.value), 0).to(mean) if rows.jacobian is None else rows.jacobian
+    slopes = add(share[:, None] * rows.jacobian)  # type: ignore[operator]
+    ray = torch.zeros_like(mean) if NAMES[block] == "markers" else slopes[:, -1]  # these may have cameras of their own
     found = Cells(
         mean,
-        add(share[:, None] * jacobian),
+        slopes[:, :-1],
         count,
         spread,
         torch.full((size,), block),
@@ -147,6 +165,7 @@ def _averaged(rows: Rows, block: int, episode: Episode, sheet: Sheet, rest: Tens
         add(share[:, None] * place),
         add(share * times[rows.frame]),
         torch.zeros_like(mean),
+        ray,
     )
     return found.rows(count >= min(FEWEST, float(count.max())))
 

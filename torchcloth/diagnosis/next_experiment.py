@@ -25,13 +25,13 @@ from ..errors import InvalidInput, TorchclothError
 from ..identification.episodes import Episode, episode
 from ..identification.replays import Frames
 from ..recordings import Recording
-from .cells import cells_of, directions
+from .cells import cells_of, directions, joined
 from .evidence import central
 from .experiments import Experiment, planned, possible
 from .fitting import Fitted, prior_precision
 from .lacking import reference
 from .noise import Noise
-from .pieces import joined, nuisances, runs, side_by_side
+from .pieces import nuisances, runs, side_by_side
 from .setting import Progress, Setting, foreseen, surely_seen
 from .steps import both_ways
 from .stepwise import Found
@@ -174,7 +174,7 @@ def whitened_slopes(question: Question, recording: Recording, setting: Setting) 
     cells = central(cells, shifts, len(model.parameters))
     count = len(model.point) + len(hypotheses)
     level, _ = reference(cells, torch.zeros_like(cells.value))
-    noise = Noise(torch.maximum(level.level, found.noise.level))
+    noise = Noise(torch.maximum(level.level, found.noise.level), found.noise.depth)
     root = torch.linalg.cholesky(noise.covariance(cells, cells.jacobian[:, count:], std))
     return torch.linalg.solve_triangular(root, cells.jacobian[:, :count], upper=False)
 

@@ -1,12 +1,14 @@
 """How residuals of a true model err together: sensor, slow errors, and what differs from episode to episode.
 
-    K = diag(spread^2 / n + r^2 / 2) + (level^2 + r^2 / 2) R + N P N',  r = ROUGH rough
+    K = diag(spread^2 / n + r^2 / 2) + (level^2 + r^2 / 2) R + depth^2 d d' o S + N P N',  r = ROUGH rough
 
-R falls with distance on the fabric and with time; N are the slopes along clock, camera, grasp, rim, tare and mesh (the
-difference between two, of which the truth may have more or less), and P their variances, so that these are neither
-fixed nor free. The levels, one for each kind of data, come from restricted maximum likelihood after everything that is
-asked about is projected out: an effect must not pass as noise. How rough a stretch of time is (``evidence.gather``) is
-known beforehand; ripples neither agree with their neighbours nor do they not.
+R falls with distance on the fabric and with time, and so does S, over wider parts of an image: a camera's depths err
+slowly and together, and what that does to a cell depends on how the cloth faces the ray (d). N are the slopes along
+clock, camera, grasp, rim, tare and mesh (the difference between two, of which the truth may have more or less), and P
+their variances, so that these are neither fixed nor free. The levels, one for each kind of data, and the depths' come
+from restricted maximum likelihood after everything that is asked about is projected out: an effect must not pass as
+noise. How rough a stretch of time is (``evidence.gather``) is known beforehand; ripples neither agree with their
+neighbours nor do they not.
 """
 
 from __future__ import annotations
@@ -21,23 +23,28 @@ from .cells import NAMES, SEEN, Cells, mean_over, stretches
 from .evidence import NUMERICS, Evidence
 
 REACH, MEMORY = 0.1, 0.3  # m, s, over which slow errors agree
+ACROSS = 0.3  # m, over which those of a camera's depths do
 FLOOR = {"points": 1e-4, "edges": 3e-4, "markers": 1e-4, "force": 5e-3, "torque": 5e-4}  # m, N, N m: of one cell
+DEPTH = 1e-4  # m, least slow error of depths
 UNFITTED = 5.0  # slow errors over their least size, to fit by: those of a model that is wrong yet say nothing
 ROUGH = 3.0  # steps along every parameter by which two engines' cloths may differ in effect
 RANK = 1e-9  # relative, of directions that count in the likelihood
 
 
 class Noise(NamedTuple):
-    """Levels of slow errors by kind of data."""
+    """Levels of slow errors by kind of data, and of a camera's depths."""
 
     level: Tensor  # [blocks], in the data's units
+    depth: float = 0.0  # m
 
     def covariance(self, cells: Cells, nuisance: Tensor, std: Tensor) -> Tensor:
         """[C, C] of one episode; ``nuisance`` [C, N] slopes, ``std`` [N]."""
         moved = nuisance * std
         rough = 0.5 * _rough(cells)
         slow = (self.level[cells.block] ** 2 + rough).sqrt()
-        return torch.diag(_white(cells) + rough) + slow[:, None] * _together(cells) * slow + moved @ moved.mT
+        deep = self.depth * cells.ray
+        agreed = slow[:, None] * _together(cells) * slow + deep[:, None] * _in_depth(cells) * deep
+        return torch.diag(_white(cells) + rough) + agreed + moved @ moved.mT
 
     def smooth(self, cells: Cells) -> Tensor:
         """[C] share of the variance that is no roughness."""
@@ -46,22 +53,24 @@ class Noise(NamedTuple):
 
     def plain(self, cells: Cells) -> Tensor:
         """[C] the other variance, but for what differs from episode to episode."""
-        return _white(cells) + self.level[cells.block] ** 2
+        return _white(cells) + self.level[cells.block] ** 2 + (self.depth * cells.ray) ** 2
 
 
 def least() -> Noise:
     """The sensor's and hardly more."""
-    return Noise(torch.tensor([FLOOR[name] for name in NAMES], dtype=torch.float64))
+    return Noise(torch.tensor([FLOOR[name] for name in NAMES], dtype=torch.float64), DEPTH)
 
 
 def unfitted() -> Noise:
     """To fit by, where residuals are mostly the model's."""
-    return Noise(UNFITTED * least().level)
+    level, depth = least()
+    return Noise(UNFITTED * level, UNFITTED * depth)
 
 
 def to_fit_by(noise: Noise) -> Noise:
     """The smaller levels of these and of ``unfitted``: what a model leaves that may be wrong is not all noise."""
-    return Noise(torch.minimum(noise.level, unfitted().level))
+    most = unfitted()
+    return Noise(torch.minimum(noise.level, most.level), min(noise.depth, most.depth))
 
 
 class Whitened(NamedTuple):
@@ -96,26 +105,33 @@ def whitened(evidence: Evidence, noise: Noise) -> Whitened:
 
 def fit_noise(evidence: Evidence, sweeps: int = 2) -> Noise:
     """Levels by restricted maximum likelihood, one kind of data after the other on a grid of factors."""
-    level = torch.tensor([FLOOR[name] for name in NAMES], dtype=torch.float64)
+    found = least()
     present = torch.cat([c.block for c in evidence.cells]).unique().tolist()
+    if any(bool(c.ray.any()) for c in evidence.cells):
+        present.append(None)
+    else:
+        found = found._replace(depth=0.0)
     factors = 10 ** torch.linspace(-0.5, 1.75, 10, dtype=torch.float64)
     for sweep in range(sweeps):
         for b in present:
-            tried = [*(FLOOR[NAMES[b]] * factors)] if sweep == 0 else level[b] * factors[:5] ** 0.3
-            best = max(tried, key=lambda v: _likelihood(evidence, _with(level, b, v)))
-            level = _with(level, b, best)
-    return Noise(level)
+            own = float(found.depth if b is None else found.level[b])
+            tried = (own * (factors if sweep == 0 else factors[:5] ** 0.3)).tolist()
+            found = max((_with(found, b, v) for v in tried), key=lambda n: _likelihood(evidence, n))
+    return found
 
 
-def _with(level: Tensor, block: int, value: Tensor) -> Tensor:
-    out = level.clone()
-    out[block] = value
-    return out
+def _with(noise: Noise, block: int | None, value: float) -> Noise:
+    """With another level of one kind of data; None: of depths."""
+    if block is None:
+        return noise._replace(depth=value)
+    level = noise.level.clone()
+    level[block] = value
+    return noise._replace(level=level)
 
 
-def _likelihood(evidence: Evidence, level: Tensor) -> float:
+def _likelihood(evidence: Evidence, noise: Noise) -> float:
     """Restricted log-likelihood, all that is asked about projected out."""
-    found = whitened(evidence, Noise(level))
+    found = whitened(evidence, noise)
     scale = found.jacobian.norm(dim=0).clamp(min=1e-12)
     u, s, _ = torch.linalg.svd(found.jacobian / scale, full_matrices=False)
     u, s = u[:, s > RANK * s[0]], s[s > RANK * s[0]]
@@ -147,6 +163,12 @@ def _together(cells: Cells) -> Tensor:
     alike = there | (cells.patch[:, None] == cells.patch)
     apart = (cells.time[:, None] - cells.time).abs() / MEMORY
     return torch.where(same & alike, torch.exp(-where - apart), 0.0)
+
+
+def _in_depth(cells: Cells) -> Tensor:
+    """[C, C] correlation of a camera's slow errors."""
+    where = torch.cdist(cells.place, cells.place).square() / (2 * ACROSS**2)
+    return torch.exp(-where - (cells.time[:, None] - cells.time).abs() / MEMORY)
 
 
 def floor_of(evidence: Evidence, noise: Noise) -> float:

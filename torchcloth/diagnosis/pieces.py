@@ -15,7 +15,7 @@ from torch import Tensor
 from ..identification.episodes import Episode
 from ..identification.nuisances import Camera, Clock, Held, Rim, Tare
 from ..identification.replays import Frames
-from .cells import Cells, Piece, aligned, cells_of, directions
+from .cells import Cells, Piece, aligned, cells_of, directions, joined
 from .setting import Setting
 from .steps import taken
 from .world import Hypothesis, World
@@ -208,9 +208,3 @@ def nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) ->
             stds.append(own)
     every = [GRASP] * len(held)
     return directions(base, [*moved, *held], [*steps, *every]), torch.tensor([*stds, *every], dtype=torch.float64)
-
-
-def joined(a: Frames, b: Frames) -> Frames:
-    """Directions of both."""
-    wrench = {name: torch.cat([a.wrench[name], b.wrench[name]]) for name in a.wrench}
-    return Frames(torch.cat([a.x, b.x]), torch.cat([a.v, b.v]), wrench, torch.cat([a.edge, b.edge]))
