@@ -32,7 +32,7 @@ class Size:
     Attributes:
         nodes: vertices along the truth's sides; fit: along those of the recordings' mesh.
         free, table: motions in the air, and with one on a table.
-        pad: m, within which the truth holds vertices: three of its edges and beside them one, the roundest of patches.
+        pad: m, within which the truth holds vertices, a round patch on its mesh.
         pads: m, between which grippers hold; lines of the truth's vertices are moved to where that ends.
     """
 
@@ -51,7 +51,7 @@ _COMMON: tuple[Plan, ...] = (
     ("turn", 0.0, 2.0),
     ("hang", 90.0, 2.0),
 )
-REDUCED = Size(19, 13, (*_COMMON, ("shake", 0.0, 1.5)), (*_COMMON, ("drag-fast", 0.0, 1.0)))
+REDUCED = Size(29, 13, (*_COMMON, ("shake", 0.0, 1.5)), (*_COMMON, ("drag-fast", 0.0, 1.0)))
 _FAST: Plan = ("swing-fast", 0.0, 1.3)
 SMALL = Size(13, 9, (_FAST, ("turn", 0.0, 3.0)), (_FAST, ("drag-fast", 0.0, 1.3)), 0.0795, (0.075, 0.075))
 UNSEEN: Plan = ("swing", 45.0, 1.4)  # of no case

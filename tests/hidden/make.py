@@ -2,6 +2,7 @@
 
 python tests/hidden/make.py --seed 12 --out cases/12            # e1, e2, ... in that folder
 python tests/hidden/make.py --seed 12 --motion lift --heading 90 --out cases/12-next   # one more
+python tests/hidden/make.py --seed 12 --nodes 19 --out cases/12-coarse                 # the truth on another mesh
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from scene import Scene, simulate
 from torchcloth import recordings
 from torchcloth.errors import TorchclothError
 
+FEWEST = 9
 SAID_BY = "synthetic: an engine of its own"
 
 
@@ -79,6 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--fast", action="store_true", help="fewer and shorter episodes, coarser meshes")
+    parser.add_argument("--nodes", type=int, help="vertices along the truth's sides, of which all cases have the same")
     parser.add_argument("--motion", help="one more episode of the case, with this motion, instead of all")
     parser.add_argument("--heading", type=float, default=0.0, metavar="DEGREES")
     parser.add_argument("--speed", type=float, default=1.0, metavar="FACTOR")
@@ -86,6 +89,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         found = case(options.seed, SMALL if options.fast else REDUCED)
+        if options.nodes is not None:
+            found = replace(found, nodes=_enough(options.nodes))
         for number, take in _asked(found, options):
             made = episode(found, take, number)
             recordings.write(made, options.out / f"e{number}", overwrite=True)
@@ -94,6 +99,12 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     return 0
+
+
+def _enough(nodes: int) -> int:
+    if nodes < FEWEST:
+        raise ValueError(f"--nodes: got {nodes}; expected {FEWEST} or more, so that grippers hold a few")
+    return nodes
 
 
 def _asked(found: Case, options: argparse.Namespace) -> list[tuple[int, Take]]:

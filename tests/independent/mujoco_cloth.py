@@ -109,7 +109,9 @@ class _Held:
     def gather(self, step: int, pull: Array) -> None:
         """Add the forces [N, 3] N of one step."""
         arm = self.place(step) - self.origin[step]
-        self.sum += np.concatenate([pull.sum(0), np.cross(arm, pull).sum(0)])
+        m = arm.T @ pull
+        turning = m[1, 2] - m[2, 1], m[2, 0] - m[0, 2], m[0, 1] - m[1, 0]  # sum of arm x pull
+        self.sum += np.concatenate([pull.sum(0), turning])
         self.count += 1
 
     def close(self, frame: int) -> None:
