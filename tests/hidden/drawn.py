@@ -32,7 +32,7 @@ class Size:
     Attributes:
         nodes: vertices along the truth's sides; fit: along those of the recordings' mesh.
         free, table: motions in the air, and with one on a table.
-        pad: m, within which the truth holds vertices, a round patch on its mesh.
+        pad: m, within which the truth holds vertices: five of its edges and beside them one, the roundest of patches.
         pads: m, between which grippers hold; lines of the truth's vertices are moved to where that ends.
     """
 
@@ -40,7 +40,7 @@ class Size:
     fit: int
     free: tuple[Plan, ...]
     table: tuple[Plan, ...]
-    pad: float = 0.053
+    pad: float
     pads: tuple[float, float] = (0.042, 0.058)
 
 
@@ -51,9 +51,9 @@ _COMMON: tuple[Plan, ...] = (
     ("turn", 0.0, 2.0),
     ("hang", 90.0, 2.0),
 )
-REDUCED = Size(29, 13, (*_COMMON, ("shake", 0.0, 1.5)), (*_COMMON, ("drag-fast", 0.0, 1.0)))
+REDUCED = Size(29, 13, (*_COMMON, ("shake", 0.0, 1.5)), (*_COMMON, ("drag-fast", 0.0, 1.0)), 0.0557)
 _FAST: Plan = ("swing-fast", 0.0, 1.3)
-SMALL = Size(13, 9, (_FAST, ("turn", 0.0, 3.0)), (_FAST, ("drag-fast", 0.0, 1.3)), 0.0795, (0.075, 0.075))
+SMALL = Size(21, 9, (_FAST, ("turn", 0.0, 3.0)), (_FAST, ("drag-fast", 0.0, 1.3)), 0.0785, (0.075, 0.075))
 UNSEEN: Plan = ("swing", 45.0, 1.4)  # of no case
 
 
