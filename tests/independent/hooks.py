@@ -20,10 +20,13 @@ class Hook:
     Attributes:
         settles: acts while the cloth is brought to rest, too; what remembers or slips does not.
         reacts: has a ``reaction``.
+        viscous: [V, V] kg/s, minus which times the velocities acts besides; taken at the end of a step, so that no step
+            is too long for it. Where some hook reacts, who has one adds it to ``force`` instead.
     """
 
     settles = True
     reacts = False
+    viscous: csr_matrix | None = None
 
     def start(self, cloth: MujocoCloth, x: Array) -> None:
         """Prepare for a run of this cloth from positions x [V, 3] m; forget what was."""

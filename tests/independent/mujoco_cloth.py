@@ -8,8 +8,8 @@ version is refused.
 
 Integration is MuJoCo's semi-implicit Euler: symplectic, so without numerical damping, and with a step limited by the
 membrane wave. MuJoCo's implicit "discrete" integrator would allow larger steps at the price of numerical damping. Air
-drag is computed here, in numpy, and so is everything that `Hook`s add. Vertices inside a grasp are prescribed at every
-step; what it takes to do so is the gripper's force.
+drag is computed here, in numpy, and so is everything that `Hook`s add; what they damp linearly is implicit. Vertices
+inside a grasp are prescribed at every step; what it takes to do so is the gripper's force.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ import numpy as np
 from flex_sheet import Air, SheetSpec, flex_xml, grid, largest_step, rest_points, vertex_masses
 from hooks import Hook
 from scipy.interpolate import CubicSpline
+from scipy.sparse import csc_matrix, diags
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from torchcloth.errors import InvalidInput, MissingDependency, SimulationDiverged
@@ -120,6 +122,24 @@ class _Held:
         self.sum, self.count = np.zeros(6), 0
 
 
+class _Viscous:
+    """Damping forces -C v with the velocities v at the end of a step, of which those of the held vertices are given."""
+
+    def __init__(self, matrix: csc_matrix, mass: Array, held: Array, dt: float) -> None:
+        self.matrix, self.mass, self.dt = matrix, mass.copy(), dt
+        self.free = np.setdiff1d(np.arange(len(mass)), held)
+        inner = diags([self.mass], [0]) + dt * matrix
+        self.solve = splu(csc_matrix(inner)[self.free][:, self.free]).solve
+        self.from_held = (dt * matrix).tocsr()[self.free][:, held]
+        self.held = held
+
+    def damped(self, v: Array) -> Array:
+        """Velocities [V, 3] of the free vertices after what acts besides, with the damping; of the others as given."""
+        out = v.copy()
+        out[self.free] = self.solve(self.mass[self.free, None] * v[self.free] - self.from_held @ v[self.held])
+        return out
+
+
 class MujocoCloth:
     """A sheet in MuJoCo whose grasped vertices follow grippers.
 
@@ -152,6 +172,7 @@ class MujocoCloth:
         mujoco.mj_setConst(self.model, self.data)
         self._rest = np.column_stack([rest_points(spec), np.zeros(len(self.uv))])
         self.hooks = list(hooks)
+        self.implicit = not any(hook.reacts for hook in hooks)  # to damping; inertia besides the vertices' is not known
         self._air = Air(spec, self.faces, len(self.uv)) if spec.drag_normal > 0 else None
 
     def run(
@@ -186,6 +207,9 @@ class MujocoCloth:
         v[:] = 0.0 if v0 is None else v0
         for hook in self.hooks:
             hook.start(self, x0)
+        matrices = [hook.viscous for hook in self.hooks if hook.viscous is not None]
+        every = np.concatenate([np.zeros(0, int), *(grip.vertices for grip in grips.values())])
+        self._viscous = _Viscous(sum(matrices), self.mass, every, self.dt) if matrices else None
         xs, vs, error, frame = [x0], [v.copy()], 0.0, 1
         for step in range(frames[-1]):
             error = max(error, self._step(q, v, held, step, clock[step], brake, load))
@@ -220,13 +244,21 @@ class MujocoCloth:
         self._advance(x, applied)
         push = data.qfrc_passive.reshape(-1, 3) + applied
         weight = np.array([0.0, 0.0, self.spec.gravity])
+        viscous = self._viscous
+        pull = push if viscous is None else push - viscous.matrix @ before
         for grip in held.values():
             i = grip.index
             error = max(error, float(np.linalg.norm(data.flexvert_xpos[i] - grip.place(step), axis=1).max()))
-            grip.creep(step, push[i] + self.mass[i, None] * weight, self.dt)
+            grip.creep(step, pull[i] + self.mass[i, None] * weight, self.dt)
             target = grip.place(step + 1)
             q[i] = target - self._rest[i]
             v[i] = (target - x[i]) / self.dt  # what semi-implicit Euler would have needed to get there
+        if viscous is not None:
+            v[:] = viscous.damped(v)
+            q[viscous.free] = (x + self.dt * v - self._rest)[viscous.free]
+            push = push - viscous.matrix @ v
+        for grip in held.values():
+            i = grip.index
             gained = (v[i] - before[i]) / self.dt - weight
             grip.gather(step, push[i] - self.mass[i, None] * gained)
         return error

@@ -111,9 +111,12 @@ class Plate(Hook):
         stencils = Stencils(cloth.spec)
         weight = stencils.area * _moduli(self.spec, stencils) * _layers(self.spec, cloth, stencils)
         self.matrix = csr_matrix(stencils.rows.T @ diags([weight], [0]) @ stencils.rows)
+        tau = self.spec.damping_time
+        self.viscous = tau * self.matrix if tau and cloth.implicit else None
+        self.explicit = tau if self.viscous is None else 0.0
 
     def force(self, t: float, x: Array, v: Array) -> Array:
-        return -(self.matrix @ (x + self.spec.damping_time * v))
+        return -(self.matrix @ (x + self.explicit * v))
 
 
 class Moments(Hook):

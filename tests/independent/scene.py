@@ -120,7 +120,10 @@ def hooks(scene: Scene, table: bool) -> list[Hook]:
 
 
 def stable_step(scene: Scene) -> float:
-    """A safe step in s: 0.8 of the limit of the stiffest membrane and plate waves together, damping included."""
+    """A safe step in s: 0.8 of the limit of the stiffest membrane and plate waves together.
+
+    Damping included, but for the plate's where that is implicit (``Hook.viscous``).
+    """
     sheet, plate, membrane = scene.sheet, scene.plate, scene.membrane
     h = sheet.shortest
     stiffer = 1 + max(membrane.shear, 0.0) + 0.2 * membrane.stiffening  # up to a strain of 10 %
@@ -129,7 +132,8 @@ def stable_step(scene: Scene) -> float:
     stretch = 8 * young / (1 - sheet.poisson_ratio**2) / (light * sheet.areal_density * h**2)
     bent = (plate.stiffness * (1 + max(plate.weft, 0.0)) * (1 + plate.layer)) + plate.friction / plate.threshold
     bend = 64 * bent / (light * sheet.areal_density * h**4)
-    damping = (sheet.damping_time + membrane.viscosity) * stretch + plate.damping_time * bend
+    explicit = plate.damping_time * bend if scene.air.added else 0.0
+    damping = (sheet.damping_time + membrane.viscosity) * stretch + explicit
     omega = np.sqrt(stretch + bend)
     zeta = 0.5 * damping / omega
     return 0.8 * 2 / omega * (np.sqrt(1 + zeta**2) - zeta)

@@ -10,7 +10,7 @@ pytest.importorskip("mujoco", minversion="4.0")
 from air import AddedMass, AirSpec, Drag, LinearDrag
 from flex_sheet import Air, SheetSpec, grid
 from membrane import Membrane, MembraneSpec
-from mujoco_cloth import Slip
+from mujoco_cloth import MujocoCloth, Slip
 from plate import Moments, Plate, PlateSpec
 from small_sheets import FREE, SMALL, G, crumpled, lying, run, standing, started, top
 from table import Table, TableSpec
@@ -71,7 +71,33 @@ def test_dissipation_takes_power_whatever_the_motion(name):
         x, v = crumpled(SMALL, seed)
         hook, _ = started(DISSIPATIVE[name])
         power = ((hook.force(0.0, x, v) - hook.force(0.0, x, 0 * v)) * v).sum()
+        power -= 0.0 if hook.viscous is None else (v * (hook.viscous @ v)).sum()
         assert power < 0
+
+
+def test_implicit_damping_is_the_explicit_one_of_short_steps():
+    """A strip that swings from a gripper that starts to move, and bends: places, and what the gripper feels."""
+    spec, plate = SheetSpec(0.04, 0.2, nodes=(3, 11)), PlateSpec(stiffness=1e-4, damping_time=0.02)
+    x0, t = standing(spec), np.linspace(0.0, 0.3, 31)
+    pose = np.tile(np.eye(4), (31, 1, 1))
+    pose[:, 0, 3] = 0.05 * (1 - np.cos(10 * t))
+    grips = {name: replace(grip, t=t, pose=pose) for name, grip in top(spec, x0).items()}
+    found = []
+    for implicit in (True, False):
+        cloth = MujocoCloth(spec, 2e-5, [Plate(plate)])
+        cloth.implicit &= implicit
+        found.append(cloth.run(x0, t, grips))
+        assert (cloth.hooks[0].viscous is not None) == implicit
+    first, second = found
+    moved = np.abs(second.x - x0).max()
+    np.testing.assert_allclose(first.x, second.x, atol=1e-3 * moved)
+    for name, force in second.force.items():
+        np.testing.assert_allclose(first.force[name], force, atol=2e-3 * np.abs(force).max())
+        np.testing.assert_allclose(
+            first.torque[name], second.torque[name], atol=2e-3 * np.abs(second.torque[name]).max()
+        )
+    undamped = MujocoCloth(spec, 2e-5, [Plate(replace(plate, damping_time=0.0))]).run(x0, t, grips)
+    assert np.abs(undamped.x - second.x).max() > 0.02 * moved, "it matters here"
 
 
 def test_drag_is_that_of_the_example():
