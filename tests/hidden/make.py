@@ -25,7 +25,7 @@ from scene import Scene, simulate
 from torchcloth import recordings
 from torchcloth.errors import TorchclothError
 
-FEWEST = 9
+FEWEST = 9  # vertices along a side
 SAID_BY = "synthetic: an engine of its own"
 
 

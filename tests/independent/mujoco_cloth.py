@@ -22,7 +22,7 @@ import numpy as np
 from flex_sheet import Air, SheetSpec, flex_xml, grid, largest_step, rest_points, vertex_masses
 from hooks import Hook
 from scipy.interpolate import CubicSpline
-from scipy.sparse import csc_matrix, diags
+from scipy.sparse import csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -123,15 +123,17 @@ class _Held:
 
 
 class _Viscous:
-    """Damping forces -C v with the velocities v at the end of a step, of which those of the held vertices are given."""
+    """Damping forces -C v with the velocities v at the end of a step, of which those of the held vertices are given.
 
-    def __init__(self, matrix: csc_matrix, mass: Array, held: Array, dt: float) -> None:
-        self.matrix, self.mass, self.dt = matrix, mass.copy(), dt
+    Masses are those of the first step: where they change by a share, so does the damping.
+    """
+
+    def __init__(self, matrix: csr_matrix, mass: Array, held: Array, dt: float) -> None:
+        self.matrix, self.mass, self.held = matrix, mass.copy(), held
         self.free = np.setdiff1d(np.arange(len(mass)), held)
-        inner = diags([self.mass], [0]) + dt * matrix
-        self.solve = splu(csc_matrix(inner)[self.free][:, self.free]).solve
-        self.from_held = (dt * matrix).tocsr()[self.free][:, held]
-        self.held = held
+        rows = (dt * matrix)[self.free]
+        self.solve = splu(csc_matrix(diags([mass[self.free]], [0]) + rows[:, self.free])).solve
+        self.from_held = rows[:, held]
 
     def damped(self, v: Array) -> Array:
         """Velocities [V, 3] of the free vertices after what acts besides, with the damping; of the others as given."""
@@ -245,7 +247,8 @@ class MujocoCloth:
         push = data.qfrc_passive.reshape(-1, 3) + applied
         weight = np.array([0.0, 0.0, self.spec.gravity])
         viscous = self._viscous
-        pull = push if viscous is None else push - viscous.matrix @ before
+        slips = any(grip.slip for grip in held.values())
+        pull = push - viscous.matrix @ before if viscous is not None and slips else push
         for grip in held.values():
             i = grip.index
             error = max(error, float(np.linalg.norm(data.flexvert_xpos[i] - grip.place(step), axis=1).max()))

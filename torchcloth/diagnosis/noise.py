@@ -43,7 +43,7 @@ class Noise(NamedTuple):
         rough = 0.5 * _rough(cells)
         slow = (self.level[cells.block] ** 2 + rough).sqrt()
         deep = self.depth * cells.ray
-        agreed = slow[:, None] * _together(cells) * slow + deep[:, None] * _in_depth(cells) * deep
+        agreed = slow[:, None] * _together(cells) * slow + deep[:, None] * _fading(cells, ACROSS) * deep
         return torch.diag(_white(cells) + rough) + agreed + moved @ moved.mT
 
     def smooth(self, cells: Cells) -> Tensor:
@@ -155,19 +155,16 @@ def _rough(cells: Cells) -> Tensor:
 
 
 def _together(cells: Cells) -> Tensor:
-    """[C, C] correlation of slow errors."""
+    """[C, C] correlation of slow errors: of one kind and axis, all that is seen or what one gripper feels."""
     same = (cells.block[:, None] == cells.block) & (cells.patch[:, None] % 3 == cells.patch % 3)
     seen = cells.block < SEEN
-    there = seen[:, None] & seen
-    where = torch.where(there, torch.cdist(cells.place, cells.place).square() / (2 * REACH**2), 0.0)
-    alike = there | (cells.patch[:, None] == cells.patch)
-    apart = (cells.time[:, None] - cells.time).abs() / MEMORY
-    return torch.where(same & alike, torch.exp(-where - apart), 0.0)
+    alike = (seen[:, None] & seen) | (cells.patch[:, None] == cells.patch)
+    return torch.where(same & alike, _fading(cells, REACH), 0.0)
 
 
-def _in_depth(cells: Cells) -> Tensor:
-    """[C, C] correlation of a camera's slow errors."""
-    where = torch.cdist(cells.place, cells.place).square() / (2 * ACROSS**2)
+def _fading(cells: Cells, reach: float) -> Tensor:
+    """[C, C] from 1 towards 0 with distance on the fabric, of which what is felt has none, and with time."""
+    where = torch.cdist(cells.place, cells.place).square() / (2 * reach**2)
     return torch.exp(-where - (cells.time[:, None] - cells.time).abs() / MEMORY)
 
 
