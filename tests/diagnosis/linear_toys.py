@@ -19,7 +19,7 @@ def hypothesis(name: str, typical: float = 1.0, **options) -> Hypothesis:
 
 
 def parameter(name: str, std: float = 0.5) -> Parameter:
-    return Parameter(name, "-", 0.1, std, lambda *_: None, lambda x: x)
+    return Parameter(name, "-", 0.1, std, lambda world, _: world, lambda x: x)
 
 
 def grid() -> Cells:

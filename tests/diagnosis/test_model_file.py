@@ -27,7 +27,7 @@ def sound(tmp_path_factory):
     base = base_model(RECORDING)
     by = {h.name: h for h in catalogue(base, [RECORDING])}
     model = base.plus(by["air.drag_n"], 1.5)
-    covariance = torch.eye(5, dtype=torch.float64)
+    covariance = torch.eye(6, dtype=torch.float64)
     path = tmp_path_factory.mktemp("model") / "sound.tcm"
     yield save_model(path, model, RECORDING, covariance, model.plus(by["obs.clock"], 0.01), [mark(RECORDING)])
     torch.set_default_dtype(before)
@@ -60,7 +60,8 @@ def put(*path, value):
 
 
 DAMAGE = {
-    "another format": (put("format", value=9), r"format; got 9; expected 1; update torchcloth$"),
+    "another format": (put("format", value=9), r"format; got 9; expected 2; update torchcloth$"),
+    "an old format": (put("format", value=1), r"format; got 1; expected 2; run `torchcloth diagnose` again"),
     "no format": (put("format", value=None), "format is missing"),
     "deep": (lambda content: "[" * 200_000, "not valid JSON"),
     "a list": (lambda content: "[]", "not an object of named values"),
@@ -76,7 +77,7 @@ DAMAGE = {
     "cause without amplitude": (put("causes", 0, "amplitude", value=None), r"causes\[0\].amplitude is missing"),
     "amplitude of no world": (put("residual", "causes", 0, "amplitude", value=-1.0), "got -1"),
     "covariance ragged": (put("covariance", value=[[1, 2], [3]]), "covariance is not a rectangular array"),
-    "covariance small": (put("covariance", value=[[1.0]]), r"covariance has the wrong shape; got \[1, 1\]; .*\[5, 5\]"),
+    "covariance small": (put("covariance", value=[[1.0]]), r"covariance has the wrong shape; got \[1, 1\]; .*\[6, 6\]"),
     "variance negative": (put("covariance", 0, 0, value=-1.0), "covariance has a negative variance"),
     "gravity a word": (put("cloth", "gravity", value="down"), "cloth.gravity has the wrong dtype"),
     "density negative": (put("cloth", "areal_density", value=-1.0), "cloth.areal_density is too small"),
@@ -119,7 +120,7 @@ def test_what_is_sound_is_read(sound, tmp_path):
     whole, part = read_model(sound), read_model(sound, residual=False)
     assert [h.name for h in whole.model.accepted] == ["air.drag_n", "obs.clock"]
     assert [h.name for h in part.model.accepted] == ["air.drag_n"]
-    assert whole.covariance.shape == (5, 5)
+    assert whole.covariance.shape == (6, 6)
     assert whole.episodes == [mark(RECORDING)]
     assert whole.scene.grasps["left"].radius == RECORDING.grasps["left"].radius
     assert read_model(spoiled(sound, tmp_path / "old.tcm", put("episodes", value=None))).episodes == []

@@ -275,6 +275,7 @@ def test_slopes_along_parameters_are_central_and_their_disagreement_is_rough(mad
     """At the end of a coordinate one side is all there is, and says nothing of roughness."""
     model, setting = made
     steps, last = [p.step for p in model.parameters], len(model.parameters) - 1
+    model = model.at(model.point + 2 * steps[last] * torch.eye(last + 1)[last])  # stiffening, off its end
     shifts = [(k, sign * step) for k, step in enumerate(steps) for sign in (1.0, -1.0)]
     raw, found = gather(model, setting, shifts=shifts), gather(model, setting)
     (one,), (cells,) = raw.cells, found.cells
@@ -285,7 +286,9 @@ def test_slopes_along_parameters_are_central_and_their_disagreement_is_rough(mad
     assert (shrunk >= 0.9 * central).all(), "this sheet hardly ripples"
     torch.testing.assert_close(cells.rough, (0.5 * torch.tensor(steps) * (up - down)).norm(dim=1))
     assert not one.rough.any()
-    ended = replace(model, parameters=(*model.parameters[:-1], replace(model.parameters[-1], low=0.0)))
+    ended = replace(
+        model, parameters=(*model.parameters[:-1], replace(model.parameters[-1], low=float(model.values[-1])))
+    )
     (sided,) = gather(ended, setting).cells
     torch.testing.assert_close(sided.jacobian[:, last], up[:, last])
     assert (sided.rough <= cells.rough + 1e-15).all()

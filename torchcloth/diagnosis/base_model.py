@@ -12,11 +12,13 @@ from ..cloth import Cloth
 from ..identification.episodes import cloth_from
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
+from .fabric import moduli
 from .world import Model, Parameter, World
 
 LEAST = 1e-3  # -, of Poisson's ratio
 WRONG_BY = 2.5  # factor that a data sheet may be wrong by: two standard deviations
 POISSON, SPREAD, MOST = 0.05, 0.1, 0.45  # step, standard deviation and largest value of Poisson's ratio
+LAW, STIFFER = 1.5, 1.0  # standard deviation and step of stiffening in tension: laws of one modulus differ by as much
 
 
 def base_model(recording: Recording) -> Model:
@@ -36,6 +38,9 @@ def _parameters(cloth: Cloth, recording: Recording) -> list[Parameter]:
     std = recording.cloth.areal_density_std
     if std:
         found.append(_log(cloth, "areal_density", 0.04, std / recording.cloth.areal_density))
+    if cloth.mesh.pattern is not None:
+        stiffer = lambda world, c: moduli(world, stiffening=c) if c else world  # noqa: E731
+        found.append(Parameter("stiffening", "-", STIFFER, LAW, stiffer, lambda c: c, low=0.0))
     return found
 
 
@@ -47,7 +52,12 @@ def _log(cloth: Cloth, path: str, step: float, std: float) -> Parameter:
 def _of(cloth: Cloth, path: str, step: float, std: float, value: Callable[[float], float]) -> Parameter:
     head, _, tail = path.partition(".")
     name = tail if head in ("material", "effects") else path
-    return Parameter(name, _part(cloth, path).unit, step, std, lambda c, x: _part(c, path).set(value(x)), value)
+
+    def apply(world: World, coordinate: float) -> World:
+        _part(world.cloth, path).set(value(coordinate))
+        return world
+
+    return Parameter(name, _part(cloth, path).unit, step, std, apply, value)
 
 
 def _part(cloth: Cloth, path: str) -> PhysicalParameter:

@@ -114,17 +114,17 @@ def _with_twins(evidence: Evidence, model: Model, hypotheses: Sequence[Hypothesi
     names, cells, after = [p.name for p in model.parameters], [], evidence.own + len(evidence.hypotheses)
     rest = [h for h in hypotheses if h.twin in names]
     places = [names.index(h.twin) for h in rest]
-    shares = torch.tensor([_by_share(model.parameters[k], float(model.values[k])) for k in places])
+    shares = torch.tensor([_by_twin(model.parameters[k], float(model.values[k])) for k in places])
     for own in evidence.cells:
         first, last = own.jacobian[:, :after], own.jacobian[:, after:]
         cells.append(own._replace(jacobian=torch.cat([first, first[:, places] * shares.to(first), last], 1)))
     return replace(evidence, cells=cells, hypotheses=[*evidence.hypotheses, *rest])
 
 
-def _by_share(parameter: Parameter, coordinate: float) -> float:
-    """Derivative of the coordinate by the share of its value."""
-    up, down = (parameter.value(coordinate + sign * parameter.step) for sign in (1.0, -1.0))
-    return 2 * parameter.step * parameter.value(coordinate) / (up - down)
+def _by_twin(parameter: Parameter, coordinate: float) -> float:
+    """Derivative of the coordinate by its twin's amplitude."""
+    up, down = (parameter.more(coordinate + sign * parameter.step, coordinate) for sign in (1.0, -1.0))
+    return 2 * parameter.step / (up - down)
 
 
 def _pieces(

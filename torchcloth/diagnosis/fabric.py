@@ -11,7 +11,7 @@ MOST = 0.9  # share by which one stiffness may fall short of another
 YIELD = 30.0  # 1/m, beyond which bent cloth keeps a crease
 
 
-def _moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffening: float = 0.0) -> World:
+def moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffening: float = 0.0) -> World:
     """Shares by which the weft falls short of the warp, and shear exceeds the isotropic value; c of stiffening."""
     own = world.cloth.material
     nu, warp = float(own.poisson_ratio.value), float(own.youngs_modulus.value)  # type: ignore[union-attr,arg-type]
@@ -87,9 +87,9 @@ HYPOTHESES = (
     Hypothesis("damp.bend", "s", 0.05, lambda w, a: _bending(w, damping_time=a)),
     Hypothesis("plast.crease", "1/s", 5.0, lambda w, a: _bending(w, mobility=a), finer=True),
     Hypothesis("bend.aniso", "-", -0.6, lambda w, a: _bending(w, weft=a), signed=True, low=-MOST),
-    Hypothesis("elas.ortho", "-", 0.5, lambda w, a: _moduli(w, weft=a), signed=True, high=MOST),
-    Hypothesis("elas.shear", "-", -0.6, lambda w, a: _moduli(w, shear=a), signed=True, low=-MOST),
-    Hypothesis("elas.stiffen", "-", 10.0, lambda w, a: _moduli(w, stiffening=a)),
+    Hypothesis("elas.ortho", "-", 0.5, lambda w, a: moduli(w, weft=a), signed=True, high=MOST),
+    Hypothesis("elas.shear", "-", -0.6, lambda w, a: moduli(w, shear=a), signed=True, low=-MOST),
+    Hypothesis("elas.stiffen", "-", 10.0, lambda w, a: moduli(w, stiffening=a), twin="stiffening"),
     Hypothesis("rest.curl[warp]", "1/m", 3.0, lambda w, a: _bending(w, curl_warp=a), signed=True),
     Hypothesis("rest.curl[weft]", "1/m", 3.0, lambda w, a: _bending(w, curl_weft=a), signed=True),
     Hypothesis("rest.shrink[warp]", "-", 0.03, lambda w, a: _rest(w, "shrink_warp", a), signed=True),

@@ -110,8 +110,7 @@ def with_cause(found: Fitted, hypothesis: Hypothesis) -> Model:
     names = [p.name for p in model.parameters]
     if hypothesis.twin in names:
         place, point = names.index(hypothesis.twin), model.point
-        value = model.parameters[place].value
-        point[-1], point[place] = value(float(point[place])) / value(0.0) - 1, 0.0
+        point[-1], point[place] = model.parameters[place].more(float(point[place])), 0.0
         model = model.at(point)
     step, _ = leap_with(whitened(found.evidence, unfitted()), model, found.evidence.own + index)
     return model.at(model.point + step)

@@ -13,7 +13,6 @@ from ..cloth import Cloth
 from ..identification.episode_prediction import EpisodePrediction, with_errors
 from ..identification.episodes import Episode, episode
 from ..identification.replays import Frames, each
-from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from ..recordings.marks import alike, mark
 from ..recordings.together import together
@@ -66,14 +65,17 @@ def beside_the_cloth(model: Model) -> dict[str, float]:
 
 
 def uncertain(file: ModelFile) -> dict[str, tuple[float, float]]:
-    """By name of the base parameters that data determine: (value, spread), as the priors of ``identify``."""
+    """By name of the cloth's own parameters that data determine: (value, spread), as the priors of ``identify``."""
+    from ..identification.unknowns import available
+
     out = {}
     if file.covariance is None:
         return out
     stds, cloth = file.covariance.diagonal().sqrt().tolist(), file.model.base.cloth
+    own = available(cloth)
     for p, c, std in zip(file.model.parameters, file.model.values.tolist(), stds, strict=False):
-        if std < TOLD * p.std:
-            positive = _parameter(cloth, p.name).domain == "positive"
+        if std < TOLD * p.std and p.name in own:
+            positive = cloth.get_submodule(own[p.name]).domain == "positive"
             up, value, down = p.value(c + std), p.value(c), p.value(c - std)
             out[p.name] = (value, math.sqrt(up / down) if positive else abs(up - down) / 2)
     return out
@@ -95,12 +97,6 @@ def begin_with(path: str | Path, recordings: Sequence[Recording]) -> tuple[Model
     told = [of_fabric(path, own, r) for r in recordings]
     file = read_model(path, together(told), residual=False)
     return replace(file.model, met=tuple(file.episodes)), told
-
-
-def _parameter(cloth: Cloth, name: str) -> PhysicalParameter:
-    from ..identification.unknowns import available
-
-    return cloth.get_submodule(available(cloth)[name])  # type: ignore[return-value]
 
 
 def watched(world: World, data: Episode) -> Frames:

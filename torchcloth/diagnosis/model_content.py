@@ -20,7 +20,7 @@ from ..recordings.checks import Fields
 from ..recordings.files import Folder
 from .world import Parameter
 
-FORMAT = 1
+FORMAT = 2  # 1: of base models without stiffening
 CONTENT, ARRAYS = "model.json", "mesh.npz"
 EXPECTED, AGAIN = "a .tcm file of `torchcloth diagnose`", "run `torchcloth diagnose` again, or restore the file"
 FARTHEST = 14.0  # coordinates are logarithms or small shares: no fabric is a million times what its data sheet says
@@ -93,9 +93,8 @@ def read_content(path: Path) -> Content:
         fields = folder.json(CONTENT)
         found = fields.take("format")
     if found != FORMAT:
-        raise RecordingError(
-            f"{path}: format", got=reprlib.repr(found), expected=f"{FORMAT}", remedy="update torchcloth"
-        )
+        remedy = AGAIN if found == 1 else "update torchcloth"
+        raise RecordingError(f"{path}: format", got=reprlib.repr(found), expected=f"{FORMAT}", remedy=remedy)
     with damage(path):
         own = _scene(fields.inside("cloth"), Fields(folder.npz(ARRAYS), folder.place(ARRAYS), ": "))
         for part in (mesh_of, material_of, effects_of):  # they refuse what is none, also where another takes its place

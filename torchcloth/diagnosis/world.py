@@ -119,8 +119,8 @@ class Hypothesis:
         step: of slopes beside an amplitude, as a share of the typical one.
         needs: what a recording must have for it to mean anything.
         kin: names that no experiment of this kind can tell from it, by structure.
-        twin: base parameter that is the same number, by which share it is off; where that is fitted, its prior alone
-            tells of the hypothesis.
+        twin: base parameter that is the same number (``Parameter.more``); where that is fitted, its prior alone tells
+            of the hypothesis.
         low, high: amplitudes that a world can have.
         brings: another hypothesis, which comes along at its typical amplitude where the world has none of it.
         finer: its slopes are taken on the finer mesh where it does something on the given one: it acts in folds, for
@@ -171,7 +171,7 @@ class Parameter:
         name: public name of the parameter.
         step: finite step for derivatives, in the coordinate.
         std: of the prior, in the coordinate.
-        set: (cloth, coordinate) -> None; 0 is the data sheet's value.
+        apply: (world, coordinate) -> world, which may be the given one, changed; 0 is the data sheet's value.
         value: coordinate -> physical value.
         low, high: least and largest coordinate.
     """
@@ -180,10 +180,15 @@ class Parameter:
     unit: str
     step: float
     std: float
-    set: Callable[[Cloth, float], None]
+    apply: Callable[[World, float], World]
     value: Callable[[float], float]
     low: float = -math.inf
     high: float = math.inf
+
+    def more(self, coordinate: float, than: float = 0.0) -> float:
+        """By how much a value is larger than at another coordinate: a share, but of what the sheet says 0 of."""
+        before = self.value(than)
+        return (self.value(coordinate) - before) / (before if self.value(0.0) else 1.0)
 
 
 @dataclass(frozen=True)
@@ -199,10 +204,9 @@ class Model:
 
     def world(self, extra: Sequence[tuple[Hypothesis, float]] = ()) -> World:
         """The world at these numbers, with further hypotheses at given amplitudes."""
-        cloth = copied(self.base.cloth)
+        world = replace(self.base, cloth=copied(self.base.cloth))
         for parameter, coordinate in zip(self.parameters, self.values.tolist(), strict=True):
-            parameter.set(cloth, coordinate)
-        world = replace(self.base, cloth=cloth)
+            world = parameter.apply(world, coordinate)
         own = zip(self.accepted, self.amplitudes, strict=True)
         for hypothesis, amplitude in (*own, *extra):
             if amplitude:
