@@ -18,7 +18,7 @@ from .world import Model, Parameter, World
 LEAST = 1e-3  # -, of Poisson's ratio
 WRONG_BY = 2.5  # factor that a data sheet may be wrong by: two standard deviations
 POISSON, SPREAD, MOST = 0.05, 0.1, 0.45  # step, standard deviation and largest value of Poisson's ratio
-LAW, STIFFER = 1.5, 1.0  # standard deviation and step of stiffening in tension: laws of one modulus differ by as much
+LAW, STIFFER = 1.5, 2.0  # standard deviation and step of stiffening in tension: laws of one modulus differ by as much
 
 
 def base_model(recording: Recording) -> Model:
