@@ -91,6 +91,16 @@ def test_less_is_asked_of_a_rival_than_of_a_cause():
     assert not _agreed(replace(tried, row=tried.row._replace(bias=5.0)), list("abcd"))
 
 
+@pytest.mark.parametrize(("amplitude", "named", "rival"), [(4.9, True, True), (5.1, False, True), (10.1, False, False)])
+def test_a_rival_may_be_larger_than_a_cause(amplitude, named, rival):
+    """A lean of 0.0501 rad, a hair more than is believed, left a wind alone that it cannot be told from."""
+    tried = candidate(0.1, 0.0)
+    model = replace(tried.fitted.model, amplitudes=(amplitude,))
+    tried = replace(tried, fitted=replace(tried.fitted, model=model))
+    assert known(tried.fitted, "cause", list("abcd"), tried) == named
+    assert _agreed(tried, list("abcd")) == rival
+
+
 def candidate(asked, numerics):
     """A cause in the model of four motions that ask for so much of it, of which numerics alone would ask for a part."""
     ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.tensor([0.0, asked]).double(), 0)

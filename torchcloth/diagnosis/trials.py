@@ -23,6 +23,7 @@ VERY_MUCH = 25.0  # log density; nulls' causes that ask for too little to show r
 SURELY = 12.0  # log density held out, beyond which no null's cause surely gains: of what no other motion predicts
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
+POSSIBLE = 10.0  # the same, of what predicts as well as something plausible
 MUCH_OF_ALL = 1 / 3  # that is wrong, of which predictions say that it is there
 # standard errors between motions, from which they agree that there is something: 97.5 % of Student's t by one less than
 # there are motions; of the best of TRIED causes, with a fourth of that chance
@@ -229,15 +230,19 @@ def _agreed(c: Candidate, names: Sequence[str]) -> bool:
     """Of what predicts as well as a cause, less is asked than of a cause: it need not be there, it cannot be told.
 
     Halves of the one motion that tells of it need not agree: a law that is not quite right differs from early to late.
+    And what stands alone because the other is a hair too large is not known for that.
     """
-    return known(c.fitted, c.hypothesis.name, names, replace(c, sure=0.0 if c.alone else NORMAL))
+    return known(c.fitted, c.hypothesis.name, names, replace(c, sure=0.0 if c.alone else NORMAL), POSSIBLE)
 
 
-def known(found: Fitted, name: str, names: Sequence[str], c: Candidate) -> bool:
-    """Of a size that makes sense and that numerics do not ask for, and motions agree so far that there is something."""
+def known(found: Fitted, name: str, names: Sequence[str], c: Candidate, most: float = PLAUSIBLE) -> bool:
+    """Of a size that makes sense and that numerics do not ask for, and motions agree so far that there is something.
+
+    It makes sense up to ``most`` times the typical amplitude.
+    """
     place = found.model.place(name)
     middle, std = (float(v[len(found.model.parameters) + place]) for v in spread(found, names, c.alone))
-    largest = PLAUSIBLE * abs(found.model.accepted[place].typical)
+    largest = most * abs(found.model.accepted[place].typical)
     least = max(c.sure * std, NORMAL * abs(c.row.bias))
     return least < abs(middle) and abs(found.model.amplitudes[place]) < largest
 
