@@ -7,6 +7,7 @@ import pytest
 import sheets
 import torch
 
+from torchcloth import materials
 from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import base_model
 from torchcloth.diagnosis.cells import SEEN, _places, cells_of
@@ -233,6 +234,18 @@ def test_two_effects_in_one_part_keep_both(made):
     woven = model.world([(by["elas.ortho"], 0.5), (by["elas.shear"], -0.4)]).cloth.material
     assert float(woven.weft_modulus.value / woven.youngs_modulus.value) == pytest.approx(0.5)
     assert float(woven.shear_modulus.value * 2 * 1.3 / woven.youngs_modulus.value) == pytest.approx(0.6)
+
+
+def test_stiffening_of_the_base_leaves_one_modulus_and_adds_to_what_exceeds_it(made):
+    model, _ = made
+    by = {h.name: h for h in catalogue(model, [RECORDING])}
+    stiff = model.at(model.point + 1.2 * torch.eye(len(model.point)).double()[-1])
+    assert type(model.world().cloth.material) is materials.AEP
+    cloth = stiff.world([(by["elas.stiffen"], 8.0)]).cloth.material
+    assert type(cloth) is materials.StiffeningAEP
+    assert float(cloth.stiffening.value) == pytest.approx(9.2)
+    woven = stiff.world([(by["elas.shear"], -0.4)]).cloth.material
+    assert [float(c.value) for c in (woven.warp_stiffening, woven.weft_stiffening)] == pytest.approx([1.2, 1.2])
 
 
 def test_the_base_is_in_vacuum_and_left_alone(made):

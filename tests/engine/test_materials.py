@@ -42,6 +42,11 @@ def test_isotropic(convention):
     agree(cloth, {}, moving(cloth))
 
 
+def test_stiffening():
+    cloth = sheet(tc.materials.StiffeningAEP(field(5e4, 7e4), field(0.2, 0.4), field(0, 30), stiffening_reach=REACH))
+    agree(cloth, {}, moving(cloth, strain=0.03))
+
+
 def test_orthotropic_in_all_its_branches():
     cloth = sheet(orthotropic())
     state = moving(cloth, strain=0.03)

@@ -6,7 +6,7 @@ from strips import Strip
 
 import torchcloth as tc
 from torchcloth import functional
-from torchcloth.materials import OrthotropicAEP, stiffening
+from torchcloth.materials import OrthotropicAEP, StiffeningAEP, stiffening
 from torchcloth.testing import finite_difference_sweep, samples
 from torchcloth.testing.contract import call_with
 
@@ -28,6 +28,15 @@ def test_tension_along_a_yarn(angle, stiffness, c):
     inside = strain.clamp(max=REACH)
     tension = stiffness * (inside * (1 + c * inside) + (1 + 2 * c * REACH) * (strain - inside))
     torch.testing.assert_close(force / 0.02, tension, rtol=1e-6, atol=0)
+
+
+def test_one_modulus_is_both_yarns():
+    even, both = (
+        StiffeningAEP(60 / H, 0.3, 2.0),
+        OrthotropicAEP(60 / H, 60 / H, 60 / 2.6 / H, 0.3, 1e6, 2.5e5, 0.3, 2.0, 2.0),
+    )
+    for one, other in zip(even.coefficients(), both.coefficients(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
 
 def test_uniaxial_tension_with_lateral_contraction():

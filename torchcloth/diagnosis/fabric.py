@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ..effects import Bending, CreasingBending, Gravity, LineMass, RestShape
 from ..errors import InvalidInput
-from ..materials import OrthotropicAEP
+from ..materials import OrthotropicAEP, StiffeningAEP
 from .world import Hypothesis, World
 
 MOST = 0.9  # share by which one stiffness may fall short of another
@@ -19,7 +19,10 @@ def moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffening: floa
         e2, g = float(own.weft_modulus.value), float(own.shear_modulus.value)
         c = float(own.warp_stiffening.value)
     else:
-        e2, g, c = warp, warp / (2 * (1 + nu)), 0.0
+        e2, g = warp, warp / (2 * (1 + nu))
+        c = float(own.stiffening.value) if isinstance(own, StiffeningAEP) else 0.0
+        if not (weft or shear):  # one modulus, to be fitted on
+            return world.with_cloth(material=StiffeningAEP(warp, nu, c + stiffening, thickness=own.thickness))  # type: ignore[union-attr,arg-type]
     e2, g, c = e2 * (1 - weft), g * (1 + shear), c + stiffening
     new = OrthotropicAEP(
         warp,

@@ -71,7 +71,7 @@ def uncertain(file: ModelFile) -> dict[str, tuple[float, float]]:
     out = {}
     if file.covariance is None:
         return out
-    stds, cloth = file.covariance.diagonal().sqrt().tolist(), file.model.base.cloth
+    stds, cloth = file.covariance.diagonal().sqrt().tolist(), file.model.world().cloth
     own = available(cloth)
     for p, c, std in zip(file.model.parameters, file.model.values.tolist(), stds, strict=False):
         if std < TOLD * p.std and p.name in own:

@@ -4,7 +4,16 @@ from . import presets
 from .aep import AEP
 from .base import AbstractMaterial, Stiffness
 from .director import DirectorMaterial
-from .orthotropic import OrthotropicAEP
+from .orthotropic import OrthotropicAEP, StiffeningAEP
 from .yielding import NormYield
 
-__all__ = ["AEP", "AbstractMaterial", "DirectorMaterial", "NormYield", "OrthotropicAEP", "Stiffness", "presets"]
+__all__ = [
+    "AEP",
+    "AbstractMaterial",
+    "DirectorMaterial",
+    "NormYield",
+    "OrthotropicAEP",
+    "StiffeningAEP",
+    "Stiffness",
+    "presets",
+]

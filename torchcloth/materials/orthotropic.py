@@ -14,8 +14,10 @@ At small strain this is the orthotropic plane-stress law, and for E_warp = E_wef
 
 from __future__ import annotations
 
+from abc import ABC
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from .._math import safe_norm
@@ -44,7 +46,56 @@ class Coefficients(NamedTuple):
     limit: Tensor  # of the elastic stretch, infinite without plasticity
 
 
-class OrthotropicAEP(DirectorMaterial):
+class WovenMaterial(DirectorMaterial, ABC):
+    """The law of this module; a subclass says what its coefficients are.
+
+    Attributes:
+        stiffening_reach: strain up to which tension stiffens.
+    """
+
+    def __init__(self, thickness: float, stiffening_reach: float) -> None:
+        super().__init__(thickness)
+        if not 0 < stiffening_reach < float("inf"):
+            raise InvalidInput("stiffening_reach", got=stiffening_reach, expected="a strain > 0")
+        self.stiffening_reach = float(stiffening_reach)
+
+    @property
+    def has_axes(self) -> bool:
+        """Yarns have directions, also where both are alike."""
+        return True
+
+    def membrane_energy(self, c: Coefficients, surface: Surface) -> Tensor:
+        """Density of the module's docstring, and what stiffening adds."""
+        warp, weft = safe_norm(surface.f1) - 1, safe_norm(surface.f2) - 1
+        squares = c.warp * warp * warp + c.weft * weft * weft + c.lam * _dilation(c, surface, warp, weft) ** 2
+        stiffer = stiffening.energy(c.warp_toe, warp, self.stiffening_reach)
+        stiffer = stiffer + stiffening.energy(c.weft_toe, weft, self.stiffening_reach)
+        return corotated.energy(c.mu, surface) + 0.5 * squares + stiffer
+
+    def membrane_stress(self, c: Coefficients, surface: Surface) -> tuple[Tensor, Tensor]:
+        """Its exact derivative: that of the sheet, and tensions along the yarns."""
+        length1, length2 = safe_norm(surface.f1), safe_norm(surface.f2)
+        warp, weft = length1 - 1, length2 - 1
+        pressure = c.lam * _dilation(c, surface, warp, weft)
+        tension1 = c.warp * warp + (c.balance - 1) * pressure
+        tension2 = c.weft * weft + (1 / c.balance - 1) * pressure
+        tension1 = tension1 + stiffening.stress(c.warp_toe, warp, self.stiffening_reach)
+        tension2 = tension2 + stiffening.stress(c.weft_toe, weft, self.stiffening_reach)
+        p1, p2 = corotated.stress(c.mu, pressure, surface)
+        return p1 + tension1 / length1 * surface.f1, p2 + tension2 / length2 * surface.f2
+
+    def stiffness(self, c: Coefficients) -> Stiffness:
+        """In the plane at ``stiffening_reach``; the director's normal tangent 2 k (1 - R33) at half compression."""
+        warp = c.warp + 2 * c.mu + c.lam * c.balance**2 + stiffening.tangent(c.warp_toe, self.stiffening_reach)
+        weft = c.weft + 2 * c.mu + c.lam / c.balance**2 + stiffening.tangent(c.weft_toe, self.stiffening_reach)
+        return Stiffness(warp, weft, c.lam, c.mu, c.contact, c.shear)
+
+    def extra_repr(self) -> str:
+        """Constants of the data sheet."""
+        return f"{super().extra_repr()}, stiffening_reach={self.stiffening_reach:g}"
+
+
+class OrthotropicAEP(WovenMaterial):
     """Orthotropic membrane in the axes of the mesh's (u, v) = (warp, weft), with the director law of ``AEP``.
 
     Pulled along the warp, T = E_warp e (1 + c e) at small strain, and the sheet contracts along the weft by
@@ -85,9 +136,7 @@ class OrthotropicAEP(DirectorMaterial):
         thickness: float = 1e-3,
         plastic: NormYield | None = None,
     ) -> None:
-        super().__init__(thickness)
-        if not 0 < stiffening_reach < float("inf"):
-            raise InvalidInput("stiffening_reach", got=stiffening_reach, expected="a strain > 0")
+        super().__init__(thickness, stiffening_reach)
         self.youngs_modulus = PhysicalParameter(youngs_modulus, "Pa", name="youngs_modulus")
         self.weft_modulus = PhysicalParameter(weft_modulus, "Pa", name="weft_modulus")
         self.shear_modulus = PhysicalParameter(shear_modulus, "Pa", name="shear_modulus")
@@ -95,7 +144,6 @@ class OrthotropicAEP(DirectorMaterial):
         self.warp_stiffening = PhysicalParameter(warp_stiffening, "-", "nonnegative", name="warp_stiffening")
         self.weft_stiffening = PhysicalParameter(weft_stiffening, "-", "nonnegative", name="weft_stiffening")
         self._complete(contact_stiffness, shear_stiffness, cone, plastic)
-        self.stiffening_reach = float(stiffening_reach)
 
     @classmethod
     def preset(cls, name: str, **changes) -> OrthotropicAEP:
@@ -107,11 +155,6 @@ class OrthotropicAEP(DirectorMaterial):
         from .presets import find
 
         return cls(**find(name).orthotropic(**changes))
-
-    @property
-    def has_axes(self) -> bool:
-        """Also where both are alike: they are learnable."""
-        return True
 
     def coefficients(self) -> Coefficients:
         """Stiffnesses times thickness."""
@@ -129,35 +172,52 @@ class OrthotropicAEP(DirectorMaterial):
             **self._director(),
         )
 
-    def membrane_energy(self, c: Coefficients, surface: Surface) -> Tensor:
-        """Density of the module's docstring, and what stiffening adds."""
-        warp, weft = safe_norm(surface.f1) - 1, safe_norm(surface.f2) - 1
-        squares = c.warp * warp * warp + c.weft * weft * weft + c.lam * _dilation(c, surface, warp, weft) ** 2
-        stiffer = stiffening.energy(c.warp_toe, warp, self.stiffening_reach)
-        stiffer = stiffer + stiffening.energy(c.weft_toe, weft, self.stiffening_reach)
-        return corotated.energy(c.mu, surface) + 0.5 * squares + stiffer
 
-    def membrane_stress(self, c: Coefficients, surface: Surface) -> tuple[Tensor, Tensor]:
-        """Its exact derivative: that of the sheet, and tensions along the yarns."""
-        length1, length2 = safe_norm(surface.f1), safe_norm(surface.f2)
-        warp, weft = length1 - 1, length2 - 1
-        pressure = c.lam * _dilation(c, surface, warp, weft)
-        tension1 = c.warp * warp + (c.balance - 1) * pressure
-        tension2 = c.weft * weft + (1 / c.balance - 1) * pressure
-        tension1 = tension1 + stiffening.stress(c.warp_toe, warp, self.stiffening_reach)
-        tension2 = tension2 + stiffening.stress(c.weft_toe, weft, self.stiffening_reach)
-        p1, p2 = corotated.stress(c.mu, pressure, surface)
-        return p1 + tension1 / length1 * surface.f1, p2 + tension2 / length2 * surface.f2
+class StiffeningAEP(WovenMaterial):
+    """``AEP`` whose yarns stiffen in tension: one modulus along warp and weft, T = E e (1 + c e) at small strain.
 
-    def stiffness(self, c: Coefficients) -> Stiffness:
-        """In the plane at ``stiffening_reach``; the director's normal tangent 2 k (1 - R33) at half compression."""
-        warp = c.warp + 2 * c.mu + c.lam * c.balance**2 + stiffening.tangent(c.warp_toe, self.stiffening_reach)
-        weft = c.weft + 2 * c.mu + c.lam / c.balance**2 + stiffening.tangent(c.weft_toe, self.stiffening_reach)
-        return Stiffness(warp, weft, c.lam, c.mu, c.contact, c.shear)
+    Args:
+        youngs_modulus: E [Pa]. Scalar or one value per triangle, like every parameter here.
+        poisson_ratio: nu, in (0, 0.5).
+        stiffening: c [-] >= 0; Saint Venant and Kirchhoff's membrane has 1.5, fabrics have 5 to 50.
+        contact_stiffness: as of ``OrthotropicAEP``, and so are those that follow.
 
-    def extra_repr(self) -> str:
-        """Constants of the data sheet."""
-        return f"{super().extra_repr()}, stiffening_reach={self.stiffening_reach:g}"
+    Raises:
+        InvalidInput: a parameter outside its domain.
+    """
+
+    def __init__(
+        self,
+        youngs_modulus: float | Tensor,
+        poisson_ratio: float | Tensor = 0.3,
+        stiffening: float | Tensor = 0.0,
+        contact_stiffness: float | Tensor = 1e6,
+        shear_stiffness: float | Tensor = 2.5e5,
+        cone: float | Tensor = 0.3,
+        stiffening_reach: float = 0.05,
+        thickness: float = 1e-3,
+        plastic: NormYield | None = None,
+    ) -> None:
+        super().__init__(thickness, stiffening_reach)
+        self.youngs_modulus = PhysicalParameter(youngs_modulus, "Pa", name="youngs_modulus")
+        self.poisson_ratio = PhysicalParameter(poisson_ratio, "-", "unit_half", name="poisson_ratio")
+        self.stiffening = PhysicalParameter(stiffening, "-", "nonnegative", name="stiffening")
+        self._complete(contact_stiffness, shear_stiffness, cone, plastic)
+
+    def coefficients(self) -> Coefficients:
+        """Stiffnesses times thickness."""
+        modulus, nu = self.youngs_modulus.field * self.thickness, self.poisson_ratio.field
+        one, none, toe = torch.ones_like(modulus), torch.zeros_like(modulus), modulus * self.stiffening.field
+        return Coefficients(
+            mu=modulus / (2 * (1 + nu)),
+            lam=nu * modulus / (1 - nu * nu),
+            balance=one,
+            warp=none,
+            weft=none,
+            warp_toe=toe,
+            weft_toe=toe,
+            **self._director(),
+        )
 
 
 def _dilation(c: Coefficients, surface: Surface, warp: Tensor, weft: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
-from ...materials import AEP, OrthotropicAEP
+from ...materials import AEP, OrthotropicAEP, StiffeningAEP
 from ...self_contact import CHUNK
 from ...transfer import FADING, Grid
 from ..fields import Field
@@ -21,7 +21,7 @@ from ..lowering import DIRECTORS, Lowering, Unfused
 from ..stages import Layers
 from .patches import patches
 
-_LAWS = (AEP, OrthotropicAEP)  # whose law across the sheet is that of DirectorMaterial
+_LAWS = (AEP, OrthotropicAEP, StiffeningAEP)  # whose law across the sheet is that of DirectorMaterial
 
 
 class Rows(IntEnum):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import cast
 
-from ...materials import AEP, NormYield, OrthotropicAEP
+from ...materials import AEP, NormYield, OrthotropicAEP, StiffeningAEP
 from ..lowering import Lowering, Unfused
 
 
@@ -57,4 +57,8 @@ def _orthotropic(low: Lowering) -> tuple[str, list[list[int]]]:
     return "orthotropic", [*numbers, t.loop.load(low.number(reach))]
 
 
-_LAWS: dict[type, Callable[[Lowering], tuple[str, list[list[int]]]]] = {AEP: _isotropic, OrthotropicAEP: _orthotropic}
+_LAWS: dict[type, Callable[[Lowering], tuple[str, list[list[int]]]]] = {
+    AEP: _isotropic,
+    OrthotropicAEP: _orthotropic,
+    StiffeningAEP: _orthotropic,
+}
