@@ -230,7 +230,7 @@ def _agreed(c: Candidate, names: Sequence[str]) -> bool:
     """Of what predicts as well as a cause, less is asked than of a cause: it need not be there, it cannot be told.
 
     Halves of the one motion that tells of it need not agree: a law that is not quite right differs from early to late.
-    And what stands alone because the other is a hair too large is not known for that.
+    Nor does a cause stand alone because its rival is a hair larger than is believed.
     """
     return known(c.fitted, c.hypothesis.name, names, replace(c, sure=0.0 if c.alone else NORMAL), POSSIBLE)
 

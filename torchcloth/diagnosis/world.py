@@ -186,7 +186,7 @@ class Parameter:
     high: float = math.inf
 
     def more(self, coordinate: float, than: float = 0.0) -> float:
-        """By how much a value is larger than at another coordinate: a share, but of what the sheet says 0 of."""
+        """By how much a value exceeds that of another coordinate: as a share, or plainly where the sheet has 0."""
         before = self.value(than)
         return (self.value(coordinate) - before) / (before if self.value(0.0) else 1.0)
 
