@@ -159,4 +159,4 @@ def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, alone, surely
     monkeypatch.setattr(trials, "worth_naming", lambda *_: True)
     monkeypatch.setattr(trials, "known", lambda *_: True)
     gain, row = SimpleNamespace(least=surely), SimpleNamespace(hypothesis=CAUSE)
-    assert trials._useful(Candidate(row, None, None, gain, alone, 2.0), ["fold", "hang"]) == useful  # type: ignore[arg-type]
+    assert trials._useful(Candidate(row, None, None, gain, alone, 2.0), ["fold", "hang", "swing"]) == useful  # type: ignore[arg-type]
