@@ -222,7 +222,7 @@ def _plausible(c: Candidate) -> bool:
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:
     """What one motion alone tells has predicted no other one: it must surely gain what nulls' causes do not."""
-    least = SURELY if len(set(names)) > 2 else VERY_MUCH  # of two motions the other tells little of what is usual
+    least = (1.0 if len(set(names)) > 2 else 1.5) * SURELY  # of two motions the other tells little of what is usual
     sure = not c.alone or c.gain.least > least
     return sure and worth_naming(c, c.gain) and known(c.fitted, c.hypothesis.name, names, c)
 
