@@ -36,6 +36,11 @@ class TestOrthotropicAEP(MaterialContract):
         return tc.materials.OrthotropicAEP(1e5, 3e4, 2e3, 0.3, 4e5, 7e4, cone=0.4)
 
 
+class TestStiffeningAEP(MaterialContract):
+    def make(self):
+        return tc.materials.StiffeningAEP(1e5, 0.3, 8.0, 4e5, 7e4, cone=0.4)
+
+
 class TestStiffeningOrthotropicAEPWithFields(MaterialContract):
     def make(self):
         field = torch.linspace(0.8, 1.2, self.triangles)

@@ -16,13 +16,12 @@ from .noise import floor_of
 from .repeats import Repeats, pairs_of, repeats
 from .screening import MUCH, Row, screen
 from .setting import Progress, Setting, staged
-from .trials import FURTHER, SURELY, TRIED, Candidate, Step, alone_in, begun_with, one_step, worsens
+from .trials import FEWEST, FURTHER, SURELY, TRIED, Candidate, Step, alone_in, begun_with, one_step, worsens
 from .world import Hypothesis, Model
 from .worlds import if_possible
 
 MOST = 4  # causes
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
-FEWEST = 3  # motions, of which one is held out: two name only what is overwhelming, and that is lacking
 LEAST = 1 / 3  # of what is wrong, that all causes explain beside something else
 HALF = 0.5  # the same of a further cause, and of what only motions tell that do not fit; of what is gained, a law more
 

@@ -21,6 +21,8 @@ FURTHER = 3  # steps of the likelier ones among them
 HARDLY = 0.2  # of what the better of two models gains, in density and squares, that two engines may differ by
 VERY_MUCH = 25.0  # log density; nulls' causes that ask for too little to show reach 16, and 27 once
 SURELY = 12.0  # log density held out, beyond which no null's cause surely gains: of what no other motion predicts
+SURELY_OF_FEW = 18.0  # the same of fewer motions than FEWEST, set between two cases of the tests' own round
+FEWEST = 3  # motions, of which one is held out: two name only what is overwhelming, and that is lacking
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 POSSIBLE = 10.0  # the same, of what predicts as well as something plausible
@@ -196,7 +198,7 @@ def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bo
     """
     # Of what mends that much of all that is wrong in motions it was not fitted to, predictions have said that it is
     # there; real motions may then differ about its size. Two motions differ once, which tells nothing.
-    if first and len(set(names)) > 2 and gain.before**2 - gain.after**2 > MUCH_OF_ALL * gain.before**2:
+    if first and len(set(names)) >= FEWEST and gain.before**2 - gain.after**2 > MUCH_OF_ALL * gain.before**2:
         return NORMAL
     return between_motions(names, alone, SURE if first else SURE_OF_BEST)
 
@@ -222,8 +224,7 @@ def _plausible(c: Candidate) -> bool:
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:
     """What one motion alone tells has predicted no other one: it must surely gain what nulls' causes do not."""
-    least = (1.0 if len(set(names)) > 2 else 1.5) * SURELY  # of two motions the other tells little of what is usual
-    sure = not c.alone or c.gain.least > least
+    sure = not c.alone or c.gain.least > (SURELY if len(set(names)) >= FEWEST else SURELY_OF_FEW)
     return sure and worth_naming(c, c.gain) and known(c.fitted, c.hypothesis.name, names, c)
 
 

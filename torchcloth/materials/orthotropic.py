@@ -17,7 +17,6 @@ from __future__ import annotations
 from abc import ABC
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from .._math import safe_norm
@@ -63,6 +62,19 @@ class WovenMaterial(DirectorMaterial, ABC):
     def has_axes(self) -> bool:
         """Yarns have directions, also where both are alike."""
         return True
+
+    def _woven(self, warp: Tensor, weft: Tensor, mu: Tensor, nu: Tensor, c1: Tensor, c2: Tensor) -> Coefficients:
+        """Of moduli times thickness [N/m], and the stiffening of warp and weft [-]."""
+        return Coefficients(
+            mu=mu,
+            lam=nu * (warp * weft).sqrt() / (1 - nu * nu),
+            balance=(warp / weft) ** 0.25,
+            warp=warp / (1 + nu) - 2 * mu,
+            weft=weft / (1 + nu) - 2 * mu,
+            warp_toe=warp * c1,
+            weft_toe=weft * c2,
+            **self._director(),
+        )
 
     def membrane_energy(self, c: Coefficients, surface: Surface) -> Tensor:
         """Density of the module's docstring, and what stiffening adds."""
@@ -159,18 +171,8 @@ class OrthotropicAEP(WovenMaterial):
     def coefficients(self) -> Coefficients:
         """Stiffnesses times thickness."""
         warp, weft = self.youngs_modulus.field * self.thickness, self.weft_modulus.field * self.thickness
-        nu = self.poisson_ratio.field
-        mu = self.shear_modulus.field * self.thickness
-        return Coefficients(
-            mu=mu,
-            lam=nu * (warp * weft).sqrt() / (1 - nu * nu),
-            balance=(warp / weft) ** 0.25,
-            warp=warp / (1 + nu) - 2 * mu,
-            weft=weft / (1 + nu) - 2 * mu,
-            warp_toe=warp * self.warp_stiffening.field,
-            weft_toe=weft * self.weft_stiffening.field,
-            **self._director(),
-        )
+        mu, nu = self.shear_modulus.field * self.thickness, self.poisson_ratio.field
+        return self._woven(warp, weft, mu, nu, self.warp_stiffening.field, self.weft_stiffening.field)
 
 
 class StiffeningAEP(WovenMaterial):
@@ -207,17 +209,8 @@ class StiffeningAEP(WovenMaterial):
     def coefficients(self) -> Coefficients:
         """Stiffnesses times thickness."""
         modulus, nu = self.youngs_modulus.field * self.thickness, self.poisson_ratio.field
-        one, none, toe = torch.ones_like(modulus), torch.zeros_like(modulus), modulus * self.stiffening.field
-        return Coefficients(
-            mu=modulus / (2 * (1 + nu)),
-            lam=nu * modulus / (1 - nu * nu),
-            balance=one,
-            warp=none,
-            weft=none,
-            warp_toe=toe,
-            weft_toe=toe,
-            **self._director(),
-        )
+        c = self.stiffening.field
+        return self._woven(modulus, modulus, modulus / (2 * (1 + nu)), nu, c, c)
 
 
 def _dilation(c: Coefficients, surface: Surface, warp: Tensor, weft: Tensor) -> Tensor:
