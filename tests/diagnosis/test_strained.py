@@ -160,3 +160,16 @@ def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, alone, surely
     monkeypatch.setattr(trials, "known", lambda *_: True)
     gain, row = SimpleNamespace(least=surely), SimpleNamespace(hypothesis=CAUSE)
     assert trials._useful(Candidate(row, None, None, gain, alone, 2.0), ["fold", "hang", "swing"]) == useful  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "predicts", "kept"),
+    [(1.0, 2.0, 30.0, "first"), (1.0, 2.0, 45.0, "then"), (0.0, 2.0, 30.0, "then"), (0.0, 0.0, 30.0, "first")],
+)
+def test_further_steps_are_kept_unless_they_predict_worse_than_a_cause(first, then, predicts, kept):
+    """A loose grip that ended at nothing predicted by its slopes alone, 48 against 36."""
+    fits = {
+        name: SimpleNamespace(name=name, amplitude=amplitude, gain=SimpleNamespace(density=density))
+        for name, amplitude, density in (("first", first, 50.0), ("then", then, predicts))
+    }
+    assert trials._better(*fits.values()).name == kept  # type: ignore[arg-type]

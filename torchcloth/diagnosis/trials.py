@@ -172,8 +172,9 @@ def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> di
 
 
 def _better(before: Candidate, after: Candidate) -> Candidate:
-    """Further steps, unless they predict clearly worse."""
-    return before if after.gain.density < before.gain.density - HARDLY * abs(before.gain.density) else after
+    """Further steps, unless they predict clearly worse; what has ended at nothing was no fit of the cause."""
+    worse = after.gain.density < before.gain.density - HARDLY * abs(before.gain.density)
+    return before if worse and (before.amplitude or not after.amplitude) else after
 
 
 def _compared(
