@@ -1,6 +1,6 @@
 """A number that has left its data sheet: the fit begins there again, with the causes that are known by now."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import linear_toys as toys
@@ -72,8 +72,9 @@ def test_causes_that_predict_all_positions_together_worse_are_none(monkeypatch, 
     monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
     monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
+    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: False)
     monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1e-3, after=after, mended=(4e-4, 0.0)))
-    _, steps = stepwise._chain(one, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    _, steps, _ = stepwise._chain(one, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert steps == ([first] if kept else [])
 
 
@@ -91,8 +92,9 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     monkeypatch.setattr(stepwise, "one_step", lambda current, setting, begun, *_: looked.append((current, begun)))
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
     monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
+    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: False)
     monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5))
-    end, _ = stepwise._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    end, _, _ = stepwise._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     ((current, begun),) = looked
     assert current is end is (anew if better else strained)
     assert [model for _, model in begun] == ([anew.model] if better else [strained.model, anew.model])
@@ -111,8 +113,9 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (doubted.append(current) or current, steps))
     monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
+    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: False)
     monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5))
-    end, _ = stepwise._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    end, _, _ = stepwise._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert doubted == ([far, near] if ahead else [far])
     assert end is doubted[-1]
 
@@ -132,8 +135,8 @@ def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(
     monkeypatch.setattr(stepwise, "screen", lambda f: [])
     monkeypatch.setattr(stepwise, "afresh", lambda *a: tried.append(a[-1]) or [])
     monkeypatch.setattr(stepwise, "one_step", lambda *_: first)
-    monkeypatch.setattr(stepwise, "_chain", lambda *a: (start, [a[-1]]))
-    _, steps = stepwise._anew(start, SimpleNamespace(names=[*motions]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
+    monkeypatch.setattr(stepwise, "_chain", lambda *a: (start, [a[-1]], None))
+    _, steps, _ = stepwise._anew(start, SimpleNamespace(names=[*motions]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
     assert steps == ([first] if named else [])
     assert tried == ([] if motions == "aab" else [0.0 if lacking else stepwise.MUCH])
 
@@ -173,3 +176,37 @@ def test_further_steps_are_kept_unless_they_predict_worse_than_a_cause(first, th
         for name, amplitude, density in (("first", first, 50.0), ("then", then, predicts))
     }
     assert trials._better(*fits.values()).name == kept  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Of a setting, what a chain of causes needs."""
+
+    names: list[str]
+    unstable: tuple[torch.Tensor, ...]
+
+
+@pytest.mark.parametrize(("lacking", "kept", "left_out"), [(True, True, 2), (True, False, 1), (False, True, 1)])
+def test_where_something_is_lacking_cells_that_jump_with_the_cause_are_left_out(monkeypatch, lacking, kept, left_out):
+    """A loose grip leaves slack that buckles to either side, where vacuum has none."""
+    whole = toys.fitted(toys.evidence(toys.smooth(4, 2), 1, [], torch.tensor([0.4]).double(), 0))
+    first, second = (tuple(c.key[k : k + 1] for c in whole.evidence.cells) for k in (0, 1))
+    start = stepwise.without(whole, first)
+    best = Candidate(SimpleNamespace(hypothesis=CAUSE), start, None, None, set(), 0.0)  # type: ignore[arg-type]
+    step = Step(best, None, [], [], [], start, None)  # type: ignore[arg-type]
+    monkeypatch.setattr(stepwise, "fit", lambda model, setting, *_, **__: stepwise.without(whole, setting.unstable))
+    monkeypatch.setattr(stepwise, "unstable", lambda *_: second)
+    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: lacking)
+    monkeypatch.setattr(stepwise, "screen", lambda f: [])
+    monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
+    monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
+    monkeypatch.setattr(stepwise, "mended", lambda *_: float(kept))
+    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5))
+    asked = Asked(["a"] * toys.EPISODES, first)
+    found = stepwise._chain(start, asked, [], lambda _: None, 4, step)  # type: ignore[arg-type]
+    assert found.steps == ([step] if kept else [])
+    for cells, keys, before in zip(
+        found.current.evidence.cells, found.setting.unstable, whole.evidence.cells, strict=True
+    ):
+        assert len(keys) == left_out
+        assert torch.equal(cells.key, before.key[left_out:])

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
 
 from .afresh import afresh, resettled
 from .approach import approach
@@ -24,6 +27,14 @@ MOST = 4  # causes
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
 LEAST = 1 / 3  # of what is wrong, that all causes explain beside something else
 HALF = 0.5  # the same of a further cause, and of what only motions tell that do not fit; of what is gained, a law more
+
+
+class Chain(NamedTuple):
+    """Causes one after the other."""
+
+    current: Fitted  # with all of them
+    steps: list[Step]
+    setting: Setting  # without the cells that jump with them
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,24 +97,22 @@ def search(
     jumping = unstable(start, setting, staged(progress, "folds that turn over"))
     if any(map(len, jumping)):
         setting, start = replace(setting, unstable=jumping), without(start, jumping)
-    current, steps = _chain(start, setting, hypotheses, progress, TRIED)
+    current, steps, left = _chain(start, setting, hypotheses, progress, TRIED)
     if not steps:
-        current, steps = _anew(start, setting, hypotheses, progress)
+        current, steps, left = _anew(start, setting, hypotheses, progress)
     able = {h.name for h in start.evidence.hypotheses}
     impossible = tuple(h.name for h in model.others(hypotheses) if h.name not in able)
-    return replace(_found(start, current, steps, setting), impossible=impossible)
+    return replace(_found(start, current, steps, left), impossible=impossible)
 
 
-def _anew(
-    start: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress
-) -> tuple[Fitted, list[Step]]:
+def _anew(start: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress) -> Chain:
     """As ``_chain``, with a first cause that is begun at the data sheet.
 
     Where nothing is lacking any more, it must surely gain what nulls' causes do not.
     """
     lacking = is_lacking(start, setting.names)
     if not lacking and len(set(setting.names)) < FEWEST:
-        return start, []
+        return Chain(start, [], setting)
     screened = screen(start)
     rows = {row.hypothesis.name: row for row in screened}
     asked = [row.hypothesis for row in screened if row.sight]
@@ -111,7 +120,7 @@ def _anew(
     likely = if_possible(lambda: afresh(start, setting, asked, TRIED, progress, least)) or []
     first = one_step(start, setting, [(rows[h.name], model) for h, model in likely], screened, progress)
     if first is None or not (lacking or first.best.gain.least > SURELY):
-        return start, []
+        return Chain(start, [], setting)
     return _chain(start, setting, hypotheses, progress, TRIED, first)
 
 
@@ -127,8 +136,7 @@ def extend(
     Each step fits the ``tried`` likeliest anew.
     """
     sound = lambda found: not is_lacking(found, setting.names)  # noqa: E731
-    current, steps = _chain(start, setting, hypotheses, progress, tried, enough=sound)
-    return _found(start, current, steps, setting)
+    return _found(start, *_chain(start, setting, hypotheses, progress, tried, enough=sound))
 
 
 def instead(found: Found, laws: Fitted, tried: int, progress: Progress = lambda _: None) -> Found:
@@ -165,8 +173,9 @@ def _chain(
     tried: int,
     first: Step | None = None,
     enough: Callable[[Fitted], bool] = lambda _: False,
-) -> tuple[Fitted, list[Step]]:
-    """(the model with all causes, the steps that led to it), after ``first`` if known, until it is ``enough``."""
+) -> Chain:
+    """The model with all causes, after ``first`` if known, until it is ``enough``."""
+    nothing = Chain(start, [], setting)
 
     def asked(found: Fitted, progress: Progress) -> Fitted:
         left = found.model.others(hypotheses)
@@ -184,11 +193,13 @@ def _chain(
             step = one_step(current, setting, begun, screened, progress)
         if step is None:
             break
-        best, before = step.best.fitted, current
+        best, before = step.best.fitted, (current, start, setting)
         now = staged(progress, f"with {step.best.hypothesis.name}")
         current = fit(best.model, setting, (), FURTHER, now, before=start.evidence, here=best.evidence)
-        if steps and mended(before, current, setting.names, alone_in([*steps, step])) < HALF:
-            current = before
+        if is_lacking(current, setting.names):
+            start, current, setting = _still(start, current, setting, now)
+        if steps and mended(before[0], current, setting.names, alone_in([*steps, step])) < HALF:
+            current, start, setting = before
             break
         steps, step = [*steps, step], None
         if enough(current):
@@ -204,8 +215,18 @@ def _chain(
     share = mended(start, current, setting.names, alone_in(steps)) if steps else 1.0
     little = share < LEAST or (share < HALF and unheard(start, current, steps, setting.names))
     if little or (steps and worsens(_of_all(start, current, steps, setting))):
-        return start, []
-    return current, steps
+        return nothing
+    return Chain(current, steps, setting)
+
+
+def _still(start: Fitted, current: Fitted, setting: Setting, progress: Progress) -> tuple[Fitted, Fitted, Setting]:
+    """Less the cells that jump with the causes in the model: slack that a loose grip leaves buckles to either side."""
+    more = unstable(current, setting, staged(progress, "folds that turn over"))
+    if not any(map(len, more)):
+        return start, current, setting
+    known = setting.unstable or [keys[:0] for keys in more]
+    setting = replace(setting, unstable=tuple(map(torch.cat, zip(known, more, strict=True))))
+    return without(start, more), without(current, more), setting
 
 
 def _of_all(start: Fitted, current: Fitted, steps: list[Step], setting: Setting, floor: float = 0.0) -> Gain:
