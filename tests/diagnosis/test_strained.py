@@ -186,8 +186,11 @@ class Asked:
     unstable: tuple[torch.Tensor, ...]
 
 
-@pytest.mark.parametrize(("lacking", "kept", "left_out"), [(True, True, 2), (True, False, 1), (False, True, 1)])
-def test_where_something_is_lacking_cells_that_jump_with_the_cause_are_left_out(monkeypatch, lacking, kept, left_out):
+@pytest.mark.parametrize(
+    ("lacking", "kept", "left_out"),
+    [({1}, True, 2), ({1}, False, 1), ({1, 2}, True, 1), (set(), True, 1)],  # lacking with so many cells left out
+)
+def test_cells_that_jump_with_a_cause_are_left_out_where_nothing_else_is_lacking(monkeypatch, lacking, kept, left_out):
     """A loose grip leaves slack that buckles to either side, where vacuum has none."""
     whole = toys.fitted(toys.evidence(toys.smooth(4, 2), 1, [], torch.tensor([0.4]).double(), 0))
     first, second = (tuple(c.key[k : k + 1] for c in whole.evidence.cells) for k in (0, 1))
@@ -196,7 +199,8 @@ def test_where_something_is_lacking_cells_that_jump_with_the_cause_are_left_out(
     step = Step(best, None, [], [], [], start, None)  # type: ignore[arg-type]
     monkeypatch.setattr(stepwise, "fit", lambda model, setting, *_, **__: stepwise.without(whole, setting.unstable))
     monkeypatch.setattr(stepwise, "unstable", lambda *_: second)
-    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: lacking)
+    less = lambda f: len(whole.evidence.cells[0].key) - len(f.evidence.cells[0].key)  # noqa: E731
+    monkeypatch.setattr(stepwise, "is_lacking", lambda f, _: less(f) in lacking)
     monkeypatch.setattr(stepwise, "screen", lambda f: [])
     monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))

@@ -220,13 +220,16 @@ def _chain(
 
 
 def _still(start: Fitted, current: Fitted, setting: Setting, progress: Progress) -> tuple[Fitted, Fitted, Setting]:
-    """Less the cells that jump with the causes in the model: slack that a loose grip leaves buckles to either side."""
+    """Less the cells that jump with the causes in the model, where they are all that is lacking.
+
+    Slack that a loose grip leaves buckles to either side.
+    """
     more = unstable(current, setting, staged(progress, "folds that turn over"))
-    if not any(map(len, more)):
+    if not any(map(len, more)) or is_lacking(still := without(current, more), setting.names):
         return start, current, setting
     known = setting.unstable or [keys[:0] for keys in more]
     setting = replace(setting, unstable=tuple(map(torch.cat, zip(known, more, strict=True))))
-    return without(start, more), without(current, more), setting
+    return without(start, more), still, setting
 
 
 def _of_all(start: Fitted, current: Fitted, steps: list[Step], setting: Setting, floor: float = 0.0) -> Gain:
