@@ -9,6 +9,7 @@ import torch
 
 from torchcloth.diagnosis import afresh, stepwise, trials
 from torchcloth.diagnosis.afresh import resettled
+from torchcloth.diagnosis.setting import Setting
 from torchcloth.diagnosis.trials import Candidate, Step
 from torchcloth.diagnosis.world import OFTEN
 from torchcloth.errors import SimulationDiverged
@@ -184,6 +185,7 @@ class Asked:
 
     names: list[str]
     unstable: tuple[torch.Tensor, ...]
+    less = Setting.less
 
 
 @pytest.mark.parametrize(

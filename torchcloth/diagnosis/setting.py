@@ -61,6 +61,11 @@ class Setting:
         """Of the motions."""
         return motions_of(self.recordings)
 
+    def less(self, jumping: Sequence[Tensor]) -> Setting:
+        """Without these cells as well, by their keys, one tensor per episode."""
+        known = self.unstable or [keys[:0] for keys in jumping]
+        return replace(self, unstable=tuple(map(torch.cat, zip(known, jumping, strict=True))))
+
 
 def setting_of(model: Model, recordings: Sequence[Recording]) -> Setting:
     """Checks the recordings against the model, and prepares the same on a mesh twice as fine."""

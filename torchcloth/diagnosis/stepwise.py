@@ -6,8 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import torch
-
 from .afresh import afresh, resettled
 from .approach import approach
 from .branches import unstable, without
@@ -96,7 +94,7 @@ def search(
     start = fit(near, setting, hypotheses, progress=staged(progress, "base model"), before=before)
     jumping = unstable(start, setting, staged(progress, "folds that turn over"))
     if any(map(len, jumping)):
-        setting, start = replace(setting, unstable=jumping), without(start, jumping)
+        setting, start = setting.less(jumping), without(start, jumping)
     current, steps, left = _chain(start, setting, hypotheses, progress, TRIED)
     if not steps:
         current, steps, left = _anew(start, setting, hypotheses, progress)
@@ -193,13 +191,13 @@ def _chain(
             step = one_step(current, setting, begun, screened, progress)
         if step is None:
             break
-        best, before = step.best.fitted, (current, start, setting)
+        best, before, cells = step.best.fitted, current, (start, setting)
         now = staged(progress, f"with {step.best.hypothesis.name}")
         current = fit(best.model, setting, (), FURTHER, now, before=start.evidence, here=best.evidence)
         if is_lacking(current, setting.names):
             start, current, setting = _still(start, current, setting, now)
-        if steps and mended(before[0], current, setting.names, alone_in([*steps, step])) < HALF:
-            current, start, setting = before
+        if steps and mended(before, current, setting.names, alone_in([*steps, step])) < HALF:
+            current, (start, setting) = before, cells
             break
         steps, step = [*steps, step], None
         if enough(current):
@@ -227,9 +225,7 @@ def _still(start: Fitted, current: Fitted, setting: Setting, progress: Progress)
     more = unstable(current, setting, staged(progress, "folds that turn over"))
     if not any(map(len, more)) or is_lacking(still := without(current, more), setting.names):
         return start, current, setting
-    known = setting.unstable or [keys[:0] for keys in more]
-    setting = replace(setting, unstable=tuple(map(torch.cat, zip(known, more, strict=True))))
-    return without(start, more), still, setting
+    return without(start, more), still, setting.less(more)
 
 
 def _of_all(start: Fitted, current: Fitted, steps: list[Step], setting: Setting, floor: float = 0.0) -> Gain:
