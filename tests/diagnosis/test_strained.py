@@ -156,14 +156,21 @@ def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
 
 
 @pytest.mark.parametrize(
-    ("alone", "surely", "useful"), [(set(), 1.0, True), ({"fold"}, 11.0, False), ({"fold"}, 13.0, True)]
+    ("motions", "alone", "surely", "useful"),
+    [
+        (["fold", "hang", "swing"], set(), 1.0, True),
+        (["fold", "hang", "swing"], {"fold"}, 11.0, False),
+        (["fold", "hang", "swing"], {"fold"}, 13.0, True),
+        (["fold", "hang"], {"fold"}, 24.0, False),
+        (["fold", "hang"], {"fold"}, 26.0, True),
+    ],
 )
-def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, alone, surely, useful):
-    """No other motion has predicted it."""
+def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, motions, alone, surely, useful):
+    """No other motion has predicted it; of two, the other one tells little of what is usual."""
     monkeypatch.setattr(trials, "worth_naming", lambda *_: True)
     monkeypatch.setattr(trials, "known", lambda *_: True)
     gain, row = SimpleNamespace(least=surely), SimpleNamespace(hypothesis=CAUSE)
-    assert trials._useful(Candidate(row, None, None, gain, alone, 2.0), ["fold", "hang", "swing"]) == useful  # type: ignore[arg-type]
+    assert trials._useful(Candidate(row, None, None, gain, alone, 2.0), motions) == useful  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
