@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import sheets
 import torch
@@ -10,6 +11,7 @@ import torch
 from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, run, search, setting_of, write_diagnosis
+from torchcloth.diagnosis.cloud_pictures import over_cloud
 from torchcloth.diagnosis.pictures import residual_maps
 from torchcloth.diagnosis.verdict import judge
 from torchcloth.errors import InvalidInput
@@ -44,7 +46,38 @@ def test_hidden_drag_is_named(with_drag):
     gain = answer.content["gain"]
     assert gain["rms_after"] < 0.5 * gain["rms_before"]
     assert gain["explained_fraction"] > 0.9
+    assert [row["motion"] for row in gain["per_motion"]] == list(sheets.MOTIONS)
+    assert all(row["rms_after"] < row["rms_before"] for row in gain["per_motion"])
+    squares = [[row[key] ** 2 for row in gain["per_motion"]] for key in ("rms_before", "rms_after")]
+    assert min(squares[0]) < gain["rms_before"] ** 2 < max(squares[0])
+    assert min(squares[1]) < gain["rms_after"] ** 2 < max(squares[1])
     assert "Cause: air.drag_n" in answer.summary()
+    assert "of what could be explained" in answer.summary()
+
+
+def test_a_cause_says_where_and_when_it_shows(with_drag):
+    """Drag holds back what is free to move: the lower end of the sheet, and not in the first moment."""
+    _, answer = with_drag
+    (cause,) = answer.content["causes"]
+    assert cause["where"]["at"][1] < 0.5 * sheets.SIDE
+    assert cause["when"]["motion"] in sheets.MOTIONS
+    assert 0.0 < cause["when"]["from"] < cause["when"]["to"] <= 0.2 + sheets.FRAMES / sheets.RATE
+    assert 1e-3 < cause["moves"]["value"] < 0.1
+
+
+def test_the_cloud_is_shown_over_both_models_where_the_first_is_farthest_off(with_drag):
+    recordings, answer = with_drag
+    assert [o.motion for o in answer.overlays] == list(sheets.MOTIONS)
+    for o, recording in zip(answer.overlays, recordings, strict=True):
+        frame = int(np.abs(recording.points.t - recording.points.t[0] - o.time).argmin())
+        first = recording.points.counts[:frame].sum()
+        own = recording.points.xyz[first : first + recording.points.counts[frame]]
+        assert np.array_equal(o.points.numpy(), own)
+        before, after = (float(d.mean()) for d in o.distances)
+        assert after < (1.0 if o.motion == "lift" else 0.25) * before  # lifted, drag hardly shows
+    figure = over_cloud(answer.overlays, answer.found.setting.sheet.faces.numpy())
+    assert len(figure.axes) == 2 * len(answer.overlays) + 1
+    assert "with causes" in figure.axes[-2].get_title()
 
 
 def test_an_amplitude_that_no_world_can_have_ends_a_fit_and_not_the_diagnosis(with_drag):
@@ -89,7 +122,8 @@ def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
     )
     assert content["plan_hash"]
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 5
+    assert "<th>motion held out</th>" in page
     assert "http" not in page  # self-contained
     assert "<th>matters from</th><th>shows from</th>" in page
     assert "(not zero)" in page

@@ -27,7 +27,7 @@ def ended(best, *rivals):
     best, *rivals = (candidate(*one) for one in (best, *rivals))
     step = Step(best, None, [best, *rivals], rivals, [], None, None)  # type: ignore[arg-type]
     model = Model(None, (), toys.torch.zeros(0), (best.hypothesis,), (best.amplitude,))  # type: ignore[arg-type]
-    return Found(None, SimpleNamespace(model=model), [step], [], None, 0.0, 0.0, None, None)  # type: ignore[arg-type]
+    return Found(None, SimpleNamespace(model=model), [step], [], None, None, 0.0, 0.0, None, None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("order", [(SCALE, BIAS, HEM), (BIAS, SCALE, HEM)])

@@ -51,7 +51,14 @@ def test_what_lacks_in_one_stretch_of_time_only_is_said_to():
 
 def test_numbers_without_a_unit_have_none():
     cause = {"effect": "air.drag_n", "amplitude": 1.19, "unit": "-", "ci95": [1.05, 1.32], "class": [], "rivals": []}
-    assert "Cause: air.drag_n = 1.19 (95 %: 1.05 to 1.32)." in summary("identified", causes=[cause])
+    cause |= {"when": {"motion": "swing", "from": 0.4, "to": 0.6}, "moves": {"value": 0.0123, "unit": "m"}}
+    cause |= {"where": {"at": [0.1, 0.25]}}
+    said = summary("identified", causes=[cause])
+    assert "Cause: air.drag_n = 1.19 (95 %: 1.05 to 1.32)." in said
+    assert "  Shows most in swing from 0.4 to 0.6 s, at (100, 250) mm of the pattern: 12.3 mm." in said
+    felt = cause | {"where": {"gripper": "left"}, "moves": {"value": 0.035, "unit": "N"}}
+    said = summary("identified", causes=[felt])
+    assert "  Shows most in swing from 0.4 to 0.6 s, at gripper left: 35 mN." in said
 
 
 def test_a_missing_force_is_a_pressure_at_a_place():

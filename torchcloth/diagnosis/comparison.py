@@ -202,6 +202,13 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     return Gain(rms[0], rms[1], total, (low, high), share, (left, right), calm, mended, float(np.quantile(sums, 0.05)))
 
 
+def by_motion(first: Predicted, second: Predicted, floor: float, names: Sequence[str]) -> dict[str, Gain]:
+    """``compare`` for each motion; ``names`` are those of the episodes."""
+    motions = {name: [k for k, own in enumerate(names) if own == name] for name in dict.fromkeys(names)}
+    both = lambda own: (of_episodes(first, own), of_episodes(second, own))  # noqa: E731
+    return {name: compare(*both(own), floor) for name, own in motions.items()}
+
+
 def _share(squares: np.ndarray, floor: float) -> float:
     before, after, n = squares
     gone = before - after

@@ -17,7 +17,7 @@ from ..recordings import Recording
 from ..recordings.marks import alike, each_once, mark
 from ..recordings.together import listed, same_cloth, together
 from .cells import aligned
-from .comparison import Gain, Predicted, as_it_is, compare, of_episodes
+from .comparison import Gain, Predicted, as_it_is, by_motion, compare
 from .evidence import Evidence, as_held, as_rough, gather, shared
 from .fitting import Fitted
 from .gate import check
@@ -123,10 +123,8 @@ def confirm(
     floor, source = min(floor_of(e, least()) for e in found), "sensor only"  # slow errors may be the models' own
     if (repeated := repeats(whole[1], pairs_of(recordings, settings[1].episodes))) is not None:
         floor, source = repeated.rms, "repetitions"
-    names = settings[0].names
-    motions = {name: [k for k, own in enumerate(names) if own == name] for name in dict.fromkeys(names)}
-    of = {name: compare(of_episodes(before, own), of_episodes(after, own), floor) for name, own in motions.items()}
-    return Confirmation(compare(before, after, floor), of, floor, source)
+    motions = by_motion(before, after, floor, settings[0].names)
+    return Confirmation(compare(before, after, floor), motions, floor, source)
 
 
 def _refuse_no_extension(base: Model, extended: Model) -> None:

@@ -11,11 +11,9 @@ from typing import Any
 
 from .._files import write_text
 from . import pictures
-from .comparison import predict
-from .fitting import weighed_alike
+from .cloud_pictures import over_cloud
 from .glossary import GLOSSARY
 from .screening import Row, screen
-from .trials import alone_in
 from .verdict import Diagnosis
 
 STYLE = """
@@ -40,14 +38,15 @@ def write_report(answer: Diagnosis, folder: Path) -> Path:
 
 def _evidence(answer: Diagnosis) -> list[str]:
     """Pictures and tables of a search."""
-    found, motions = answer.found, answer.content["motions"]
-    alike, alone = weighed_alike(found.start, found.end), alone_in(found.steps)
-    before, after = (predict(fitted, motions, alone) for fitted in alike)
+    found = answer.found
+    before, after = found.held_out
     return [
+        *_over_cloud(answer),
         "<h2>Where and when</h2>",
         _image(pictures.residual_maps(answer), "Neither points nor markers were seen."),
         "<h2>Motions held out</h2>",
         _image(pictures.courses(answer, before, after if found.steps else None)),
+        _gained(answer.content["gain"]),
         "<h2>What the residuals of the base model ask for</h2>",
         _image(pictures.screening(screen(found.start))),
         "<h2>What is left</h2>" if found.steps else "<h2>All hypotheses</h2>",
@@ -64,6 +63,34 @@ def _evidence(answer: Diagnosis) -> list[str]:
         "<h2>What the names mean</h2>",
         *(f"<p><b>{name}</b>: {html.escape(said)}</p>" for name, said in GLOSSARY.items()),
     ]
+
+
+def _over_cloud(answer: Diagnosis) -> list[str]:
+    """The moments that were kept, if any."""
+    if not answer.overlays:
+        return []
+    faces = answer.found.setting.sheet.faces.numpy()
+    told = (
+        "Of each episode the moment in which the base model is farthest off; the title has the points' mean distance."
+    )
+    return [
+        "<h2>Measured points over the simulation</h2>",
+        f"<p>{told}</p>",
+        _image(over_cloud(answer.overlays, faces)),
+    ]
+
+
+def _gained(gain: dict[str, Any] | None) -> str:
+    """What all causes gain, motion by motion."""
+    if gain is None:
+        return ""
+
+    def told(row: dict[str, Any]) -> list[str]:
+        rms = (row[key] for key in ("rms_before", "rms_after"))
+        return [row["motion"], *("–" if r is None else f"{1e3 * r:.2f}" for r in rms), f"{row['log_density']:.1f}"]
+
+    head = ("motion held out", "RMS before, mm", "after, mm", "log density gained")
+    return _ruled(head, ((told(row), False) for row in gain["per_motion"]))
 
 
 def _image(figure: Any, otherwise: str = "") -> str:

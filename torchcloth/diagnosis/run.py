@@ -25,6 +25,7 @@ from .lacking import lack_of_fit
 from .missing import missing_force
 from .model_file import save_model
 from .next_experiment import propose
+from .overlays import overlays
 from .report import write_report
 from .residual import doubted, is_residual, learn_residual
 from .setting import Progress, motions_of, setting_of, somewhere_seen, staged
@@ -104,9 +105,11 @@ def diagnose(
         following = None
         if answer.verdict in OPEN:
             following = propose(found, answer.content, setting, staged(progress, "next experiment"))
+        over = overlays(answer.found, progress)
     warnings = [*answer.content["warnings"], *([NONE_TELLS] if answer.verdict == "ambiguous" and not following else [])]
     files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
-    return replace(answer, content=answer.content | files | {"next_experiment": following, "warnings": warnings})
+    said = answer.content | files | {"next_experiment": following, "warnings": warnings}
+    return replace(answer, content=said, overlays=over)
 
 
 @contextmanager

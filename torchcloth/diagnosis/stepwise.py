@@ -9,7 +9,7 @@ from typing import NamedTuple
 from .afresh import afresh, resettled
 from .approach import approach
 from .branches import unstable, without
-from .comparison import Gain, compare, predict
+from .comparison import Gain, Predicted, compare, predict
 from .doubts import mended, plainer, predicts_better, pruned, unheard
 from .fitting import Fitted, fit, weighed_alike
 from .lacking import is_lacking
@@ -43,6 +43,7 @@ class Found:
     end: Fitted
     steps: list[Step]
     screened: list[Row]  # at the end
+    held_out: tuple[Predicted, Predicted]  # by the model at the start and at the end
     whole: Gain | None  # of all causes together
     floor: float  # m, of a cell: what repetitions differ by, else what the sensor does
     sensor: float  # m, of a cell: noise and slow errors
@@ -228,10 +229,16 @@ def _still(start: Fitted, current: Fitted, setting: Setting, progress: Progress)
     return without(start, more), still, setting.less(more)
 
 
-def _of_all(start: Fitted, current: Fitted, steps: list[Step], setting: Setting, floor: float = 0.0) -> Gain:
+def _of_all(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> Gain:
     """What all causes together gain."""
-    before, after = (predict(f, setting.names, alone_in(steps)) for f in weighed_alike(start, current))
-    return compare(before, after, floor)
+    return compare(*_held_out(start, current, steps, setting), 0.0)
+
+
+def _held_out(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> tuple[Predicted, Predicted]:
+    """By the model without its causes and with them."""
+    first, last = weighed_alike(start, current)
+    held_out = lambda found: predict(found, setting.names, alone_in(steps))  # noqa: E731
+    return held_out(first), held_out(last)
 
 
 def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> Found:
@@ -240,5 +247,6 @@ def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) 
     last, sensor = predict(current, setting.names, alone), floor_of(current.evidence, current.noise)
     repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
     floor = sensor if repeated is None else repeated.rms
-    whole = _of_all(start, current, steps, setting, floor) if steps else None
-    return Found(start, current, steps, screened, whole, floor, sensor, repeated, setting)
+    held_out = _held_out(start, current, steps, setting)
+    whole = compare(*held_out, floor) if steps else None
+    return Found(start, current, steps, screened, held_out, whole, floor, sensor, repeated, setting)

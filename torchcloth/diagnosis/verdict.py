@@ -10,13 +10,16 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInput
+from ..identification.result import or_none
 from .classes import alike, fitted_alike
-from .comparison import Gain, spread
+from .comparison import Gain, by_motion, spread
 from .drifting import drifts
 from .gate import Fault
 from .lacking import lack_of_fit
 from .missing import MissingForce
+from .overlays import Overlay
 from .residual import Residual
+from .showing import shown
 from .stepwise import Found
 from .trials import NORMAL, Step, between_motions
 from .wording import sentences, warnings_of
@@ -38,6 +41,7 @@ class Diagnosis:
         searched: the search; None of invalid data.
         missing: the force that is missing, where the fit is lacking.
         residual: laws of a force that were learned, where the fit is lacking or no cause is named.
+        overlays: a moment of each episode, for pictures; none, where nobody simulated them.
     """
 
     verdict: Verdict
@@ -45,6 +49,7 @@ class Diagnosis:
     searched: Found | None
     missing: MissingForce | None = None
     residual: Residual | None = None
+    overlays: Sequence[Overlay] = ()
 
     @property
     def found(self) -> Found:
@@ -94,7 +99,7 @@ def judge(
             for r in rows
             if r.decision == "unresolvable"
         ],
-        "gain": _gain(found) if causes else None,
+        "gain": _gain(found, names) if causes else None,
         "also_unexplained": bool(causes) and lacking,
         "floor": _floor(found),
         "lack_of_fit": [row.as_dict() for row in left],
@@ -172,6 +177,7 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
         "gain_mm": 1e3 * (best.gain.before - best.gain.after),
         "placebo": {"log_density": step.placebo.gain, "chance": step.placebo.chance},
         "share_of_explainable": _share(found, best.gain),
+        **shown(found.end, h.name, names, found.setting.episodes),
     }
 
 
@@ -190,10 +196,10 @@ def _share(found: Found, gain: Gain) -> float | None:
     return None if found.whole is None else max(0.0, found.whole.explained) * gain.density / every
 
 
-def _gain(found: Found) -> dict[str, Any] | None:
+def _gain(found: Found, names: Sequence[str]) -> dict[str, Any] | None:
     if found.whole is None:
         return None
-    g = found.whole
+    g, motions = found.whole, by_motion(*found.held_out, found.floor, names)
     return {
         "rms_before": g.before,
         "rms_after": g.after,
@@ -203,6 +209,10 @@ def _gain(found: Found) -> dict[str, Any] | None:
         "ci95": list(g.explained_ci95),
         "log_density": g.density,
         "log_density_ci95": list(g.ci95),
+        "per_motion": [
+            {"motion": name, "rms_before": or_none(m.before), "rms_after": or_none(m.after), "log_density": m.density}
+            for name, m in motions.items()
+        ],
     }
 
 

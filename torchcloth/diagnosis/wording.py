@@ -24,11 +24,15 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
             f"{1e3 * gain['rms_after']:.2f} mm with the causes below; {1e3 * gain['floor']:.2f} mm would be expected "
             f"({content['floor']['source']})."
         )
+        low, high = (100 * end for end in gain["ci95"])
+        share = 100 * gain["explained_fraction"]
+        out.append(f"That is {share:.0f} % (95 %: {low:.0f} to {high:.0f} %) of what could be explained.")
     out += [f"Came with the model, fitted anew: {_sized(c)}." for c in content["given"]]
     for c in content["causes"]:
         out.append(f"Cause: {_sized(c)}.")
         others = [name for name in c["class"] if name != c["effect"]] + [r["effect"] for r in c["rivals"]]
         out += [f"  {said}" for said in (GLOSSARY.get(c["effect"].partition("[")[0]),) if said]
+        out.append(f"  {_shown(c)}")
         if others:
             out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
     if content["causes"]:
@@ -69,6 +73,15 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
 def _sized(row: dict[str, Any]) -> str:
     low, high = row["ci95"]
     return f"{_size(row)} (95 %: {low:.4g} to {high:.4g})"
+
+
+def _shown(c: dict[str, Any]) -> str:
+    """Where and when a cause stands out most."""
+    when, where, moves = c["when"], c["where"], c["moves"]
+    u, v = (1e3 * s for s in where.get("at", (0.0, 0.0)))
+    place = f"gripper {where['gripper']}" if "gripper" in where else f"({u:.0f}, {v:.0f}) mm of the pattern"
+    size = f"{1e3 * moves['value']:.3g} m{moves['unit']}"
+    return f"Shows most in {when['motion']} from {when['from']:.1f} to {when['to']:.1f} s, at {place}: {size}."
 
 
 def _size(row: dict[str, Any]) -> str:

@@ -1,0 +1,50 @@
+"""A cause shows where it does what nothing else that is fitted could do."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import linear_toys as toys
+import pytest
+import torch
+
+from torchcloth.diagnosis.cells import NAMES
+from torchcloth.diagnosis.showing import shown
+
+PART, WINDOW, EPISODE, BUMP, AMPLITUDE = 5, 3, 2, 2e-3, 1.5
+PLACE = torch.tensor([(PART // 4) * 0.075, (PART % 4) * 0.075], dtype=torch.float64)
+EPISODES = [SimpleNamespace(wrenches={f"hand {k}": None for k in range(toys.PATCHES)})] * toys.EPISODES
+
+
+def with_cause(change=lambda cells: cells):
+    """A fit in which a cause does what the first parameter does, ten times as much as that, and one bump."""
+    cells = toys.grid()
+    here = (cells.patch == 3 * PART) & (cells.window == WINDOW)
+    slopes = toys.smooth(0, 2)
+    slopes = torch.stack([slopes[..., 0], 10 * slopes[..., 0], slopes[..., 1]], -1)
+    slopes[EPISODE, here, 1] += BUMP
+    found = toys.fitted(toys.evidence(slopes, 2, [], torch.zeros(2).double(), 0), std=100.0)
+    evidence = replace(found.evidence, cells=[change(c) for c in found.evidence.cells])
+    model = replace(found.model, parameters=found.model.parameters[:1], values=found.model.values[:1])
+    model = model.plus(toys.hypothesis("cause", 1.0), AMPLITUDE)
+    return replace(found, evidence=evidence, model=model)
+
+
+def told(found):
+    return shown(found, "cause", ["a", "b", "c", "d"], EPISODES)
+
+
+def test_it_shows_where_and_when_it_does_what_parameters_do_not():
+    answer = told(with_cause())
+    assert answer["where"]["at"] == pytest.approx(PLACE.tolist())
+    assert answer["when"] == {"motion": "c", "from": pytest.approx(0.6), "to": pytest.approx(0.8)}
+    assert answer["moves"] == {"value": pytest.approx(AMPLITUDE * BUMP, rel=0.1), "unit": "m"}
+
+
+def test_what_forces_alone_tell_shows_at_a_gripper():
+    def felt(cells):
+        return cells._replace(block=torch.full_like(cells.block, NAMES.index("force")))
+
+    answer = told(with_cause(felt))
+    assert answer["where"] == {"gripper": f"hand {PART}"}
+    assert answer["moves"]["unit"] == "N"
+    assert answer["when"]["motion"] == "c"
