@@ -50,15 +50,37 @@ def test_what_lacks_in_one_stretch_of_time_only_is_said_to():
 
 
 def test_numbers_without_a_unit_have_none():
-    cause = {"effect": "air.drag_n", "amplitude": 1.19, "unit": "-", "ci95": [1.05, 1.32], "class": [], "rivals": []}
+    cause = {"effect": "air.drag_n", "amplitude": 1.19, "unit": "-", "ci95": [1.05, 1.32], "typical": 1.2}
+    cause |= {"class": [], "rivals": []}
     cause |= {"when": {"motion": "swing", "from": 0.4, "to": 0.6}, "moves": {"value": 0.0123, "unit": "m"}}
     cause |= {"where": {"at": [0.1, 0.25]}}
     said = summary("identified", causes=[cause])
-    assert "Cause: air.drag_n = 1.19 (95 %: 1.05 to 1.32)." in said
-    assert "  Shows most in swing from 0.4 to 0.6 s, at (100, 250) mm of the pattern: 12.3 mm." in said
+    assert "Cause: air.drag_n = 1.19 (95 %: 1.05 to 1.32); 1.2 is typical." in said
+    beyond = "beyond what fitted numbers could do instead"
+    assert f"  Surest in swing from 0.4 to 0.6 s, at (100, 250) mm of the pattern: 12.3 mm {beyond}." in said
     felt = cause | {"where": {"gripper": "left"}, "moves": {"value": 0.035, "unit": "N"}}
     said = summary("identified", causes=[felt])
-    assert "  Shows most in swing from 0.4 to 0.6 s, at gripper left: 35 mN." in said
+    assert f"  Surest in swing from 0.4 to 0.6 s, in what gripper left feels: 35 mN {beyond}." in said
+
+
+def test_what_cannot_be_seen_is_told_from_what_a_fitted_number_does():
+    rows = [
+        {"effect": name, "smallest_detectable": least, "unit": "-"}
+        for name, least in (("air.drag_t", 0.05), ("mass.density", None))
+    ]
+    said = summary("adequate", unresolvable=rows)
+    assert "Cannot be seen in these data: air.drag_t." in said
+    assert "Does nothing that a fitted number does not: mass.density." in said
+
+
+def test_the_gain_is_told_with_its_intervals():
+    gain = {"rms_before": 5e-3, "rms_after": 1e-3, "floor": 5e-4, "explained_fraction": 0.97, "ci95": [0.9, 1.0]}
+    gain |= {"log_density": 316.0, "log_density_ci95": [113.0, 493.0]}
+    first, second, *_ = summary("identified", gain=gain, floor={"source": "repetitions"})
+    assert first.endswith("1.00 mm with the causes below; 0.50 mm is what repetitions of a command differ by.")
+    assert second == (
+        "That is 97 % of what could be explained (95 %: 90 to 100 %), and 316 in log density (113 to 493)."
+    )
 
 
 def test_a_missing_force_is_a_pressure_at_a_place():

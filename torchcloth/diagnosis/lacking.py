@@ -71,8 +71,8 @@ class Left(NamedTuple):
         window = max(self.stretches, key=lambda w: self.stretches[w][0] - self.stretches[w][1])
         left, expected = (sum(share[i] for w, share in self.stretches.items() if w != window) for i in (0, 1))
         return {
-            "from": window * STRETCH,
-            "to": (window + 1) * STRETCH,
+            "from": round(window * STRETCH, 9),
+            "to": round((window + 1) * STRETCH, 9),
             "ratio_elsewhere": (left / expected) ** 0.5,
         }
 

@@ -23,10 +23,11 @@ MAPPED: dict[str, Own] = {  # what lies on the fabric, by what is shown of it
     "upwards": lambda c: (c.block == NAMES.index("markers")) & (c.patch % 3 == 2),
 }
 FARTHEST = 2.2  # typical amplitudes that are shown
+UNSEEN = "#c4c4c4"
 
 
 def residual_maps(answer: Diagnosis) -> Any:
-    """Mean misfit by part of the fabric (rows, from the pattern's top down) and time of every episode; mm.
+    """Mean misfit by part of the fabric (rows, from the pattern's top down) and time of every episode; mm, or grey.
 
     Of the points, along the normal; upwards of markers where there are none, and None where there are neither.
     """
@@ -50,6 +51,7 @@ def residual_maps(answer: Diagnosis) -> Any:
         for k, (axis, field) in enumerate(zip(axes[row], maps, strict=True)):
             extent = (0, field.shape[1] * STRETCH, field.shape[0], 0)
             image = axis.imshow(field, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto", extent=extent)
+            axis.set_facecolor(UNSEEN)
             axis.set_yticks(np.arange(len(told)) + 0.5, told, fontsize=6)
             axis.set_title(names[k] if row == 0 else "", fontsize=9, parse_math=False)
             if row == rows - 1:
@@ -122,7 +124,7 @@ def courses(answer: Diagnosis, before: Predicted, after: Predicted | None) -> An
             if p is not None:
                 time, rms = _course(p, k)
                 axis.plot(time, 1e3 * rms, color=colour, label=label)
-        axis.axhline(1e3 * answer.found.floor, color="#888888", ls=":", label="expected")
+        axis.axhline(1e3 * answer.found.floor, color="#888888", ls=":", label=answer.content["floor"]["source"])
         axis.set_title(names[k], fontsize=9, parse_math=False)
         axis.set_xlabel("time, s")
     axes[0].set_ylim(bottom=0)

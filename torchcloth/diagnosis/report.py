@@ -43,15 +43,18 @@ def _evidence(answer: Diagnosis) -> list[str]:
     return [
         *_over_cloud(answer),
         "<h2>Where and when</h2>",
+        "<p>Grey: not seen, or left out because it jumps between shapes of the cloth.</p>",
         _image(pictures.residual_maps(answer), "Neither points nor markers were seen."),
         "<h2>Motions held out</h2>",
         _image(pictures.courses(answer, before, after if found.steps else None)),
         _gained(answer.content["gain"]),
         "<h2>What the residuals of the base model ask for</h2>",
+        "<p>A first guess by slopes, which decides what is fitted. The causes above are what fits ended with.</p>",
         _image(pictures.screening(screen(found.start))),
         "<h2>What is left</h2>" if found.steps else "<h2>All hypotheses</h2>",
         _table(found.screened),
         "<h2>Lack of fit</h2>",
+        f"<p>{LACK}</p>",
         _left(answer.content["lack_of_fit"]),
         _drifts(answer.content["drifts"]),
         *_missing(answer),
@@ -71,7 +74,8 @@ def _over_cloud(answer: Diagnosis) -> list[str]:
         return []
     faces = answer.found.setting.sheet.faces.numpy()
     told = (
-        "Of each episode the moment in which the base model is farthest off; the title has the points' mean distance."
+        "Of each episode the moment in which the base model is farthest off, with the mean distance of all its points, "
+        "also of those that count for nothing elsewhere because the cloth jumps."
     )
     return [
         "<h2>Measured points over the simulation</h2>",
@@ -105,6 +109,10 @@ COLUMNS = (
     "hypothesis", "unit", "amplitude", "std. error", "of numerics", "matters from", "shows from", "typical",
     "moves, mm", "decision",
 )  # fmt: skip
+LACK = (
+    "What a right model leaves: the sensor's slow errors, what another mesh changes, and ripples, which another cloth "
+    "has elsewhere. Where these are large, little can be called lacking."
+)
 DECISIONS = (
     "Amplitude: what the residuals ask for. Present: surely larger than what matters. Absent: surely smaller than that "
     "(not zero), or of a sign that makes no sense. Unresolvable: even a typical amplitude might not show; an amplitude "

@@ -172,6 +172,7 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     return {
         **_told(h, amplitude),
         "ci95": [amplitude - NORMAL * std, amplitude + NORMAL * std],
+        "typical": h.typical,
         "class": sorted({h.name, *kin, *h.kin}),
         "rivals": [_told(c.hypothesis, c.amplitude) for c in rivals],
         "gain_mm": 1e3 * (best.gain.before - best.gain.after),
@@ -229,7 +230,7 @@ def _parameters(found: Found, names: Sequence[str]) -> dict[str, Any]:
     return {
         p.name: {
             "value": p.value(c),
-            "ci95": sorted([p.value(c - NORMAL * s), p.value(c + NORMAL * s)]),
+            "ci95": sorted(p.value(min(max(end, p.low), p.high)) for end in (c - NORMAL * s, c + NORMAL * s)),
             "unit": p.unit,
         }
         for p, c, s in zip(model.parameters, model.values.tolist(), std, strict=False)

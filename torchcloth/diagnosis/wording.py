@@ -13,6 +13,8 @@ from .trials import PLAUSIBLE
 from .world import Model
 
 NEARLY = 0.9  # of the largest amplitude that is believed: fits end a little beyond what slopes ask for
+RIPPLED = 0.01  # m, that a right model may leave of positions: more says nothing of what is lacking
+FLOORS = {"sensor only": "the sensor alone would leave", "repetitions": "repetitions of a command differ by"}
 
 
 def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
@@ -21,15 +23,18 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
     if gain:
         out.append(
             f"On motions held out the simulation is {1e3 * gain['rms_before']:.2f} mm RMS off, "
-            f"{1e3 * gain['rms_after']:.2f} mm with the causes below; {1e3 * gain['floor']:.2f} mm would be expected "
-            f"({content['floor']['source']})."
+            f"{1e3 * gain['rms_after']:.2f} mm with the causes below; {1e3 * gain['floor']:.2f} mm is what "
+            f"{FLOORS[content['floor']['source']]}."
         )
         low, high = (100 * end for end in gain["ci95"])
-        share = 100 * gain["explained_fraction"]
-        out.append(f"That is {share:.0f} % (95 %: {low:.0f} to {high:.0f} %) of what could be explained.")
+        least, most = gain["log_density_ci95"]
+        out.append(
+            f"That is {100 * gain['explained_fraction']:.0f} % of what could be explained (95 %: {low:.0f} to "
+            f"{high:.0f} %), and {gain['log_density']:.0f} in log density ({least:.0f} to {most:.0f})."
+        )
     out += [f"Came with the model, fitted anew: {_sized(c)}." for c in content["given"]]
     for c in content["causes"]:
-        out.append(f"Cause: {_sized(c)}.")
+        out.append(f"Cause: {_sized(c)}; {abs(c['typical']):.4g} is typical.")
         others = [name for name in c["class"] if name != c["effect"]] + [r["effect"] for r in c["rivals"]]
         out += [f"  {said}" for said in (GLOSSARY.get(c["effect"].partition("[")[0]),) if said]
         out.append(f"  {_shown(c)}")
@@ -63,8 +68,9 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
     for m in content["minor"]:
         if m["rivals"]:
             out.append(f"  These data cannot tell it from {', '.join(map(_size, m['rivals']))}, which would matter.")
-    if content["unresolvable"]:
-        out.append(f"Cannot be seen in these data: {', '.join(r['effect'] for r in content['unresolvable'])}.")
+    for label, known in (("Cannot be seen in these data", True), ("Does nothing that a fitted number does not", False)):
+        names = [r["effect"] for r in content["unresolvable"] if (r["smallest_detectable"] is not None) == known]
+        out += [f"{label}: {', '.join(names)}."] if names else []
     if content["next_experiment"]:
         out.append(f"Next experiment: {content['next_experiment']['why']}")
     return [*out, *(f"Warning: {text}." for text in content["warnings"])]
@@ -79,9 +85,10 @@ def _shown(c: dict[str, Any]) -> str:
     """Where and when a cause stands out most."""
     when, where, moves = c["when"], c["where"], c["moves"]
     u, v = (1e3 * s for s in where.get("at", (0.0, 0.0)))
-    place = f"gripper {where['gripper']}" if "gripper" in where else f"({u:.0f}, {v:.0f}) mm of the pattern"
-    size = f"{1e3 * moves['value']:.3g} m{moves['unit']}"
-    return f"Shows most in {when['motion']} from {when['from']:.1f} to {when['to']:.1f} s, at {place}: {size}."
+    place = f"at ({u:.0f}, {v:.0f}) mm of the pattern" if "at" in where else f"in what gripper {where['gripper']} feels"
+    time = f"{when['from']:.1f} to {when['to']:.1f} s"
+    beyond = "beyond what fitted numbers could do instead"
+    return f"Surest in {when['motion']} from {time}, {place}: {1e3 * moves['value']:.3g} m{moves['unit']} {beyond}."
 
 
 def _size(row: dict[str, Any]) -> str:
@@ -157,6 +164,12 @@ def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> lis
     folded = sorted({row.motion for row in left if not row.stable})
     if folded:
         out.append(f"the cloth folds in another way on another mesh in {', '.join(folded)}: no judgement there")
+    rippled = [row for row in left if row.seen and row.stable and row.expected > RIPPLED]
+    out += [
+        f"the cloth ripples so much in {row.motion} that a right model might leave {1e3 * row.expected:.0f} mm of "
+        f"{row.kind}: little there can be called lacking"
+        for row in rippled
+    ]
     if not found.causes and any(row.lacking for row in left):
         out += [_too_large(row) for row in found.screened if _is_too_large(row)][:1]
     if len(set(names)) < 3:
