@@ -53,6 +53,7 @@ def test_hidden_drag_is_named(with_drag):
     assert min(squares[1]) < gain["rms_after"] ** 2 < max(squares[1])
     assert "Cause: air.drag_n" in answer.summary()
     assert "of what could be explained" in answer.summary()
+    assert answer.content["parameters"]["stiffening"]["ci95"][0] >= 0  # a number's interval ends where the number does
 
 
 def test_a_cause_says_where_and_when_it_shows(with_drag):

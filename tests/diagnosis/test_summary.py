@@ -1,6 +1,8 @@
 """What a diagnosis says in words."""
 
-from torchcloth.diagnosis.wording import sentences
+from types import SimpleNamespace
+
+from torchcloth.diagnosis.wording import RIPPLED, sentences, warnings_of
 
 LISTS = ("causes", "given", "minor", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "drifts", "warnings")
 NONE = ("gain", "missing_force", "residual", "next_experiment")
@@ -94,3 +96,20 @@ def test_a_missing_force_is_a_pressure_at_a_place():
     assert (
         "  What force is missing there cannot be asked: small pushes grow without end in hang from 0.6 s on." in until
     )
+
+
+def test_ripples_that_would_hide_a_lack_of_fit_are_warned_of():
+    model = SimpleNamespace(strained=[], accepted=(), amplitudes=(), base=SimpleNamespace())
+    model.base.cloth = SimpleNamespace(effects={"bending": None})
+    fitted = SimpleNamespace(model=model)
+    found = SimpleNamespace(start=fitted, end=fitted, setting=SimpleNamespace(episodes=[]), repeats=1, left_out=0.0)
+    found.impossible = found.withdrawn = found.causes = found.screened = ()
+
+    def warned(expected, stable=True):
+        row = SimpleNamespace(motion="turn", kind="points", seen=True, stable=stable, lacking=False, expected=expected)
+        return [text for text in warnings_of(found, ["turn"] * 8, [row]) if "ripples" in text]  # type: ignore[arg-type]
+
+    (text,) = warned(1.5 * RIPPLED)
+    assert "in turn that a right model might leave 15 mm of points" in text
+    assert warned(0.5 * RIPPLED) == []
+    assert warned(1.5 * RIPPLED, stable=False) == []  # said of the meshes already
