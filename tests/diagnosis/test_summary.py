@@ -72,7 +72,7 @@ def test_what_cannot_be_seen_is_told_from_what_a_fitted_number_does():
     ]
     said = summary("adequate", unresolvable=rows)
     assert "Cannot be seen in these data: air.drag_t." in said
-    assert "Does nothing that a fitted number does not: mass.density." in said
+    assert "Does nothing here, or what a fitted number does as well: mass.density." in said
 
 
 def test_the_gain_is_told_with_its_intervals():

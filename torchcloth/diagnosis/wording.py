@@ -68,7 +68,10 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
     for m in content["minor"]:
         if m["rivals"]:
             out.append(f"  These data cannot tell it from {', '.join(map(_size, m['rivals']))}, which would matter.")
-    for label, known in (("Cannot be seen in these data", True), ("Does nothing that a fitted number does not", False)):
+    for label, known in (
+        ("Cannot be seen in these data", True),
+        ("Does nothing here, or what a fitted number does as well", False),
+    ):
         names = [r["effect"] for r in content["unresolvable"] if (r["smallest_detectable"] is not None) == known]
         out += [f"{label}: {', '.join(names)}."] if names else []
     if content["next_experiment"]:
