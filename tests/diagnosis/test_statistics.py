@@ -340,6 +340,15 @@ def test_what_a_leap_makes_large_is_not_ruled_out_by_slopes(reached, worth, said
     assert _decided(asks) == said
 
 
+@pytest.mark.parametrize(
+    ("amplitude", "signed", "decision", "wrong"),
+    [(-0.5, False, "absent", True), (-0.5, True, "present", False), (-0.3, False, "absent", False)],
+)
+def test_what_would_matter_but_for_its_sign_is_no_trifle(amplitude, signed, decision, wrong):
+    h = replace(toys.hypothesis("a"), signed=signed)
+    assert Row(h, amplitude, 0.01, 0.0, 400.0, 1e-2, 0.0, amplitude, 20.0, decision).wrong_sign == wrong
+
+
 def test_two_that_were_fitted_are_alike_where_what_lies_between_them_is_within_three_standard_deviations():
     found = asked([0.0] * 5)
     unit = float(found.white.jacobian[:, 3].norm())

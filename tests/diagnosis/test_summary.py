@@ -4,7 +4,8 @@ from types import SimpleNamespace
 
 from torchcloth.diagnosis.wording import RIPPLED, sentences, warnings_of
 
-LISTS = ("causes", "given", "minor", "ruled_out", "undecided", "unresolvable", "lack_of_fit", "drifts", "warnings")
+LISTS = ("causes", "given", "minor", "ruled_out", "wrong_sign", "undecided", "unresolvable", "lack_of_fit", "drifts")
+LISTS = (*LISTS, "warnings")
 NONE = ("gain", "missing_force", "residual", "next_experiment")
 
 
@@ -63,6 +64,12 @@ def test_numbers_without_a_unit_have_none():
     felt = cause | {"where": {"gripper": "left"}, "moves": {"value": 0.035, "unit": "N"}}
     said = summary("identified", causes=[felt])
     assert f"  Surest in swing from 0.4 to 0.6 s, in what gripper left feels: 35 mN {beyond}." in said
+
+
+def test_what_would_have_the_wrong_sign_is_told_from_what_is_small():
+    said = summary("adequate", ruled_out=["mass.hem", "air.drag_n"], wrong_sign=["air.drag_n"])
+    assert "Too small to matter: mass.hem." in said
+    assert "Would have to be of a sign that makes no sense: air.drag_n." in said
 
 
 def test_what_cannot_be_seen_is_told_from_what_a_fitted_number_does():

@@ -107,7 +107,7 @@ def _image(figure: Any, otherwise: str = "") -> str:
 
 COLUMNS = (
     "hypothesis", "unit", "amplitude", "std. error", "of numerics", "matters from", "shows from", "typical",
-    "moves, mm", "decision",
+    "typical moves, mm", "decision",
 )  # fmt: skip
 LACK = (
     "What a right model leaves: the sensor's slow errors, what another mesh changes, and ripples, which another cloth "
@@ -116,8 +116,8 @@ LACK = (
 DECISIONS = (
     "Amplitude: what the residuals ask for. Present: surely larger than what matters. Absent: surely smaller than that "
     "(not zero), or of a sign that makes no sense. Unresolvable: even a typical amplitude might not show; an amplitude "
-    "shows, in one of two cases, from the value in its column on. Inconclusive: none of these. Moves: what a typical "
-    "amplitude does to the cloth beyond what is fitted anyway."
+    "shows, in one of two cases, from the value in its column on. Inconclusive: none of these. Typical moves: what a "
+    "typical amplitude does to the cloth beyond what is fitted anyway."
 )
 
 

@@ -74,6 +74,11 @@ class Row(NamedTuple):
         return max(self.size / LEAST, self.pull / LEAST_PULL)
 
     @property
+    def wrong_sign(self) -> bool:
+        """Absent because what is asked for would matter, but for its sign, which makes no sense."""
+        return self.decision == "absent" and self.forward < -abs(self.hypothesis.smallest)
+
+    @property
     def forward(self) -> float:
         """The amplitude; negative where it would need a sign that makes no sense."""
         return self._forward(self.amplitude)

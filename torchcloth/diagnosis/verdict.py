@@ -93,6 +93,7 @@ def judge(
         "given": _given(found, names),
         "minor": minor,
         "ruled_out": [r.hypothesis.name for r in rows if r.decision == "absent"],
+        "wrong_sign": [r.hypothesis.name for r in rows if r.wrong_sign],
         "undecided": [*doubtful, *(r.hypothesis.name for r in rows if r.decision in ("inconclusive", "present"))],
         "unresolvable": [
             {"effect": r.hypothesis.name, "smallest_detectable": _finite(r.detectable), "unit": r.hypothesis.unit}
@@ -116,7 +117,7 @@ def judge(
 
 def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
     """The answer where episodes cannot be believed: what is wrong with them."""
-    keys = "causes given minor ruled_out undecided unresolvable lack_of_fit drifts warnings"
+    keys = "causes given minor ruled_out wrong_sign undecided unresolvable lack_of_fit drifts warnings"
     lists: dict[str, Any] = {key: [] for key in keys.split()}
     none = dict.fromkeys(("gain", "missing_force", "residual", "next_experiment", "model"))
     said = [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults]

@@ -57,12 +57,13 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
     if content["also_unexplained"]:
         out.append("Something beyond these causes remains unexplained.")
     out += _lacking(content)
-    for label, key in (
-        ("Too small to matter, or of a sign that makes no sense", "ruled_out"),
-        ("Undecided", "undecided"),
+    small = [name for name in content["ruled_out"] if name not in content["wrong_sign"]]
+    for label, names in (
+        ("Too small to matter", small),
+        ("Would have to be of a sign that makes no sense", content["wrong_sign"]),
+        ("Undecided", content["undecided"]),
     ):
-        if content[key]:
-            out.append(f"{label}: {', '.join(content[key])}.")
+        out += [f"{label}: {', '.join(names)}."] if names else []
     if content["minor"]:
         out.append(f"There, but too small to matter: {', '.join(map(_size, content['minor']))}.")
     for m in content["minor"]:
