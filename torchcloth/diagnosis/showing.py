@@ -11,7 +11,7 @@ from torch import Tensor
 from ..identification.blocks import BLOCKS
 from ..identification.episodes import Episode
 from .cells import SEEN, STRETCH
-from .fitting import Fitted, prior_precision
+from .fitting import Fitted, curvature
 
 SEEN_ENOUGH = 0.1  # of what all cells tell: from there on the place is one on the fabric
 
@@ -53,13 +53,10 @@ def shown(found: Fitted, name: str, names: Sequence[str], episodes: Sequence[Epi
 
 def _alone(found: Fitted, name: str) -> list[Tensor]:
     """Per episode [C], in the cells' units: the cause at its amplitude, less what else is fitted could do instead."""
-    model, white = found.model, found.white
+    model, square = found.model, curvature(found.white, found.model)
     place = len(model.parameters) + model.place(name)
     others = [k for k in range(found.evidence.own) if k != place]
-    prior = prior_precision(model).sqrt()
-    slopes = torch.cat([white.jacobian[:, others], torch.diag(prior[others])])
-    asked = torch.cat([white.jacobian[:, place], prior.new_zeros(len(others))])
-    instead = torch.linalg.lstsq(slopes, asked[:, None]).solution[:, 0]
+    instead = torch.linalg.solve(square[others][:, others], square[others, place])
     amplitude = model.amplitudes[model.place(name)]
     return [amplitude * (c.jacobian[:, place] - c.jacobian[:, others] @ instead) for c in found.evidence.cells]
 
