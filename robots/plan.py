@@ -96,7 +96,7 @@ def plan(
         if not (math.isfinite(value) and value > 0):
             raise InvalidInput(name, got=value, expected="a finite value > 0")
     plain = {id(part): part.detach().clone() for part in scene.buffers()}  # a base may be of a graph
-    scene = deepcopy(scene, plain).double()  # float32 has no digits for solutions as exact as these
+    scene = deepcopy(scene, plain).cpu().double()  # float32 has no digits for solutions as exact as these
     spans = {name: path.t[[0, -1]].tolist() for name, path in action.motion.items()}
     if any(max(ends) - min(ends) > SAME for ends in zip(*spans.values(), strict=True)):
         told = ", ".join(f"{name} {first:g} to {last:g} s" for name, (first, last) in spans.items())

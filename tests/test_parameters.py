@@ -194,7 +194,9 @@ def test_values_that_want_gradients_are_refused():
         lambda: tc.materials.AEP(given),
         lambda: tc.materials.AEP(1e5).youngs_modulus.set(given),
         lambda: tc.effects.Gravity(vector),
+        lambda: tc.effects.AirDrag(wind=vector),
         lambda: tc.boundaries.Plane(point=vector),
+        lambda: tc.boundaries.Box((0.1, 0.1, 0.1), pose=torch.eye(4) + 0 * given),
     ):
         with pytest.raises(InvalidInput, match=r"a tensor that wants gradients; .*functional_call"):
             make()

@@ -11,7 +11,7 @@ from twins import THICKNESS, TRUE, at, first, twin
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import cloth_from, identify
+from torchcloth.identification import cloth_from, fit_fields, identify
 
 PAIR = ["youngs_modulus", "air.normal"]
 STATED = 0.005  # kg/m^2, the recording's error of its areal density
@@ -282,3 +282,15 @@ def test_a_path_is_no_recording(model, tmp_path):
     for given in ("episodes/one", tmp_path, ["episodes/one"]):
         with pytest.raises(InvalidInput, match=r"recording; got '.*'; expected a Recording; read it: "):
             identify(model, given)
+
+
+def test_a_cloth_on_another_device_is_refused(recording):
+    """Tensors without numbers stand for a GPU's."""
+    cloth = at(recording).to("meta")
+    for ask in (
+        lambda: identify(cloth, recording, ["youngs_modulus"]),
+        lambda: fit_fields(cloth, recording, ["youngs_modulus"]),
+        lambda: tc.estimate_pose(cloth, recording),
+    ):
+        with pytest.raises(InvalidInput, match=r"cloth; got on meta; expected a cloth on the CPU; cloth.cpu\(\)"):
+            ask()

@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -82,8 +83,40 @@ def test_other_files_are_not_removed(tmp_path):
     assert (tmp_path / "thesis.tex").exists()
 
 
+@pytest.mark.parametrize("half", ["folder", "stamp"])
+def test_a_folder_that_was_begun_when_all_ended_is_begun_again(tmp_path, half):
+    (tmp_path / "j").mkdir()
+    if half == "stamp":
+        (tmp_path / "j" / ".problem.0a1b").write_text("0")
+    assert float(Journal(tmp_path / "j", ["a"], resume=None).ask("rows", POINT, answer(1.0))[0]) == 1.0
+    assert float(Journal(tmp_path / "j", ["a"], resume=True).ask("rows", POINT, answer(2.0))[0]) == 1.0
+    assert sorted(path.suffix for path in (tmp_path / "j").iterdir()) in (["", ".pt"], ["", "", ".pt"])
+
+
+def test_a_folder_whose_removal_was_interrupted_is_a_journal_still(tmp_path, monkeypatch):
+    kept = Journal(tmp_path / "j", ["a"], resume=False)
+    for number in range(3):
+        kept.ask("rows", POINT + number, answer(1.0))
+    unlink, removed = Path.unlink, []
+
+    def interrupted(path, **options):
+        removed.append(path)
+        if len(removed) > 2:
+            raise KeyboardInterrupt
+        unlink(path, **options)
+
+    monkeypatch.setattr(Path, "unlink", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        journal.clear(tmp_path / "j")
+    monkeypatch.undo()
+    Journal(tmp_path / "j", ["a"], resume=True)
+    journal.clear(tmp_path / "j")
+    assert not (tmp_path / "j").exists()
+
+
 def test_an_interrupt_while_writing_leaves_no_answer(tmp_path, monkeypatch):
     kept = Journal(tmp_path / "j", ["a"], resume=False)
+    kept.ask("other rows", POINT, answer(0.0))
     monkeypatch.setattr(os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         kept.ask("rows", POINT, answer(1.0))

@@ -1,6 +1,7 @@
 """A fit on disk is the model that was fitted: its simulation repeats."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,8 +9,10 @@ import torch
 import twins
 
 from torchcloth import recordings
+from torchcloth.effects import AirDrag, Gravity
 from torchcloth.errors import InvalidInput, RecordingError, UnstableStep
 from torchcloth.identification import cloth_from, fitted, identify, predict_episode, replayed
+from torchcloth.identification.described import beyond
 from torchcloth.identification.saved import read_saved
 from torchcloth.transfer import Contact
 
@@ -74,6 +77,38 @@ def test_the_right_one_of_several_episodes_is_found(recording, brief, tmp_path):
     again = replayed(tmp_path, twins.first(recording, 5))
     assert not again.fitted
     assert again.warning == ""
+
+
+def leaning(cloth):
+    return Gravity(cloth.effects["gravity"].acceleration.tolist(), [0.03, 0.0])
+
+
+def blown(cloth):
+    return AirDrag(1.2, cloth.effects["air"].density, wind=(0.3, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("key", "part", "said"), [("gravity", leaning, "effects.gravity.tilt"), ("air", blown, "effects.air.wind")]
+)
+def test_what_no_episode_describes_is_not_left_out_silently(brief, tmp_path, key, part, said):
+    """A diagnosis has found a tilt or a wind, and the fabric is fitted anew beside it."""
+    cloth = twins.at(brief)
+    cloth.effects[key] = part(cloth)
+    identify(cloth, brief, ["youngs_modulus"], iterations=1).save(tmp_path)
+    for read in (fitted, predict_episode, replayed):
+        with pytest.raises(InvalidInput, match=f"a fit of another model; got {said} not alike in both"):
+            read(tmp_path, brief)
+
+
+def test_precision_and_mesh_are_no_other_model(brief):
+    assert beyond(twins.at(brief).double(), brief) == []
+    assert beyond(cloth_from(brief, contact=Contact(0.05)), brief) == []
+    finer = replace(brief, cloth=replace(brief.cloth, vertices=None, faces=None, sheet=(0.3, 0.3)))
+    assert beyond(twins.at(brief), finer) == []
+    thin = cloth_from(replace(brief, cloth=replace(brief.cloth, thickness=5e-4)))
+    assert beyond(thin, brief) == ["material.thickness"]
+    nothing = replace(brief, cloth=replace(brief.cloth, vertices=None, faces=None, sheet=None))
+    assert beyond(thin, nothing) == []
 
 
 @pytest.mark.parametrize("damage", ["a word", None, float("nan"), -1.0])

@@ -4,6 +4,7 @@ import pytest
 import torch
 from twins import at
 
+from torchcloth.errors import UnstableStep
 from torchcloth.identification import episode
 from torchcloth.identification.blocks import point_rows
 from torchcloth.identification.objective import Objective
@@ -133,6 +134,26 @@ def test_secants_of_small_steps_are_tangents(short):
     moved = tangents(model, unknowns, problem.start, seen, 0.5 * model.stable_step())[1].x
     torch.testing.assert_close(reach.position, moved.square().sum(-1).mean((1, 2)).sqrt(), rtol=0.02, atol=1e-9)
     assert float(missed.max()) < 1e-2
+
+
+@pytest.mark.parametrize("open_to", ["back", "neither"])
+def test_where_nothing_can_be_simulated_ahead_secants_go_back(short, monkeypatch, open_to):
+    """A solution just below the stiffness that a given step allows: the search is not lost at its end."""
+    model, unknowns, seen = short
+    problem = Objective(model, unknowns, [seen], 0.5 * model.stable_step())
+    simulated, steps = problem.seen, 1e-4 * torch.tensor([min(1.0, abs(u.value(u.start))) for u in unknowns])
+
+    def within(raw):
+        if not bool((raw <= problem.start).all()) or (open_to == "neither" and not torch.equal(raw, problem.start)):
+            raise UnstableStep("dt", got="0.5 s", expected="less")
+        return simulated(raw)
+
+    monkeypatch.setattr(problem, "seen", within)
+    exact, (finite, reach) = problem.linearise(problem.start), problem.secants(problem.start, steps)
+    missed = (exact.jacobian - finite.jacobian).norm(dim=0) / exact.jacobian.norm(dim=0)
+    assert float(missed.max()) < 1e-2
+    assert torch.equal(finite.jacobian, exact.jacobian) is (open_to == "neither")
+    assert bool((reach.position > 0).all())
 
 
 def test_frames_are_remembered_and_simulations_counted(short):

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .._math import displacement, dot, times, withheld
+from .._vectors import check_value
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from .base import AbstractBoundary, Drive
@@ -222,6 +223,7 @@ class _Air(NamedTuple):
 
 
 def _rigid(pose: Tensor) -> Tensor:
+    check_value("pose", pose)
     matrix = torch.as_tensor(pose).detach().to(torch.get_default_dtype())
     if matrix.shape == (4, 4) and bool(torch.isfinite(matrix).all()):
         rotation, last = matrix[:3, :3], matrix[3]

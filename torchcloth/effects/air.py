@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from .._math import dot, safe_norm
+from .._vectors import check_value
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
@@ -60,6 +61,7 @@ class AirDrag(AbstractEffect):
         super().__init__()
         if not density > 0:
             raise InvalidInput("air density", got=f"{density} kg/m^3", expected="a value > 0")
+        check_value("wind", wind)
         vector = torch.as_tensor(wind, dtype=torch.get_default_dtype())
         if vector.shape != (3,) or not torch.isfinite(vector).all():
             raise InvalidInput("wind", got=wind, expected="three finite numbers in m/s")

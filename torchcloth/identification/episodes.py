@@ -209,6 +209,16 @@ def _mesh_as_said(recording: Recording) -> Mesh:
     )
 
 
+def on_cpu(cloth: Cloth) -> None:
+    """Episodes are read into memory that the fused engine works on.
+
+    Raises:
+        InvalidInput: the cloth is on another device.
+    """
+    if (device := cloth.areal_density.raw.device).type != "cpu":
+        raise InvalidInput("cloth", got=f"on {device}", expected="a cloth on the CPU", remedy="cloth.cpu()")
+
+
 def episode(cloth: Cloth, recording: Recording) -> Episode:
     """Check a recording against a cloth and turn it into tensors of the cloth's dtype.
 

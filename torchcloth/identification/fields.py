@@ -24,7 +24,7 @@ from ..parameters import PhysicalParameter, called, to_value
 from ..recordings import Recording
 from .blocks import blocks_for
 from .descent import quasi_newton
-from .episodes import Episode, episode
+from .episodes import Episode, episode, on_cpu
 from .given import given
 from .journal import Journal
 from .misfit import figures
@@ -108,6 +108,7 @@ def fit_fields(
         RecordingError: a recording without motion, with nothing seen or felt, or seen in another unit than metres.
     """
     began = time.perf_counter()
+    on_cpu(cloth)
     if not (math.isfinite(contrast) and contrast > 0):
         raise InvalidInput("contrast", got=contrast, expected="a number > 0")
     if iterations < 1:

@@ -20,7 +20,7 @@ from ..recordings import Recording
 from . import gauss_newton
 from .blocks import blocks_for
 from .considered import covariance_of
-from .episodes import Episode, episode
+from .episodes import Episode, episode, on_cpu
 from .finer import LIMIT, OPEN, finer_cloth, mesh_step
 from .given import given
 from .identifiability import combinations, influences
@@ -117,6 +117,7 @@ def identify(
     _check(method, stop, iterations, starts)
     _check_priors(method, priors, nuisances)
     began = time.perf_counter()
+    on_cpu(cloth)
     episodes_in = given(recordings)
     if refine and profile:
         raise InvalidInput("profile", got="refine as well", expected="one of them: a profile is that of the given mesh")

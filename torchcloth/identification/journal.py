@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-import shutil
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -17,11 +16,12 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from .._files import atomically
+from .._files import atomically, write_text
 from ..cloth import Cloth
 from ..errors import InvalidInput
 
 FORMAT = 1
+STAMP = "problem"  # file that makes a folder a journal
 DAMAGED = (RuntimeError, KeyError, ValueError, EOFError, OSError, pickle.UnpicklingError)  # torch's, of half a file
 T = TypeVar("T", bound=Sequence)
 
@@ -42,7 +42,7 @@ class Journal:
     def __init__(self, folder: str | Path, problem: Sequence[object], resume: bool | None) -> None:
         self.folder, self.key = Path(folder), digest([FORMAT, torch.__version__, program(), *problem])
         self.recalled = 0
-        stamp = self.folder / "problem"
+        stamp = self.folder / STAMP
         if not resume:
             if resume is None and stamp.exists():
                 same = stamp.read_text() == self.key
@@ -82,9 +82,10 @@ class Journal:
         return answer
 
     def _write(self, path: Path, answer: tuple) -> None:
-        if not self.folder.exists():
+        stamp = self.folder / STAMP
+        if not stamp.exists():
             self.folder.mkdir(parents=True, exist_ok=True)  # several answers may come at once
-            (self.folder / "problem").write_text(self.key)
+            write_text(stamp, self.key)
         with atomically(path) as part:
             torch.save(answer, part)
 
@@ -98,15 +99,21 @@ def program() -> str:
 
 
 def clear(folder: Path) -> None:
-    """Remove a journal, if there is one.
+    """Remove a journal, if there is one: its stamp last, so that what is left by an interruption is a journal still.
 
     Raises:
         InvalidInput: a folder of other things.
     """
-    if folder.exists():
-        if not (folder / "problem").exists():
-            raise InvalidInput("journal", got=f"{folder} with other content", expected="a new folder, or a journal")
-        shutil.rmtree(folder)
+    if not folder.exists():
+        return
+    stamp = folder / STAMP
+    inside = [path for path in folder.iterdir() if path != stamp]
+    if not stamp.exists() and any(not path.name.startswith(f".{STAMP}.") for path in inside):  # these are half a stamp
+        raise InvalidInput("journal", got=f"{folder} with other content", expected="a new folder, or a journal")
+    for path in inside:
+        path.unlink()
+    stamp.unlink(missing_ok=True)
+    folder.rmdir()
 
 
 def digest(parts: Sequence[object]) -> str:

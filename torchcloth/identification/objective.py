@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..cloth import Cloth
-from ..errors import InvalidInput
+from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..parameters import PhysicalParameter
 from . import gauss_newton
 from .blocks import BLOCKS, USES, Block, floors_of
@@ -275,10 +276,9 @@ class Objective:
         They are what survives where the motion is unstable.
         """
         both = [self._tangents(raw, i) for i in range(len(self.episodes))]
-        for k, step in enumerate(steps[: len(self.unknowns)]):
-            shifted = raw.clone()
-            shifted[k] += step
-            for (frames, moved), ahead in zip(both, self.seen(shifted), strict=True):
+        for k in range(len(self.unknowns)):
+            step, seen = self._beside(raw, k, float(steps[k]))
+            for (frames, moved), ahead in zip(both, seen, strict=bool(step)):
                 moved.x[k] = (ahead.x - frames.x) / step
                 for name in moved.wrench:
                     moved.wrench[name][k] = (ahead.wrench[name] - frames.wrench[name]) / step
@@ -287,6 +287,17 @@ class Objective:
         wrenches = [w[:count, 1:, :3].square().sum(-1).mean(1) for _, m in both for w in m.wrench.values()]
         force = torch.stack(wrenches).mean(0) if wrenches else torch.zeros(count)
         return self._rows(both), Reach(position.mean(0).sqrt(), force.sqrt())
+
+    def _beside(self, raw: Tensor, k: int, step: float) -> tuple[float, list[Frames]]:
+        """(step along an unknown, what is seen there), back where nothing can be simulated ahead; (0, []): nowhere."""
+        here, clip = float(raw[k]), self.unknowns[k].clip
+        for way in (clip(here + step) - here, clip(here - step) - here):
+            shifted = raw.clone()
+            shifted[k] += way
+            with suppress(SimulationDiverged, UnstableStep):
+                if way:
+                    return way, self.seen(shifted)
+        return 0.0, []
 
     def _rows(self, both: Sequence[tuple[Frames, Frames | None]]) -> gauss_newton.Linearised:
         parts: list[tuple[int, int, Rows]] = []

@@ -19,6 +19,7 @@ from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from ..recordings.marks import alike, mark
 from ..transfer import Contact
+from .described import beyond
 from .episodes import Episode, cloth_from, episode
 from .files import number, read_result
 from .misfit import figures
@@ -63,7 +64,13 @@ def model_of(cloth: Cloth, fit: Identification, recordings: Sequence[Recording],
         chamfer = figures([frames], [episode(cloth, recording)], faces).chamfer
         episodes.append({**mark(recording), "chamfer": or_none(chamfer)})
     contact = None if cloth.contact is None else asdict(cloth.contact)
-    return {"values": values, "contact": contact, "dt": dt, "episodes": episodes}
+    return {
+        "values": values,
+        "contact": contact,
+        "dt": dt,
+        "beyond": beyond(cloth, recordings[0]),
+        "episodes": episodes,
+    }
 
 
 def replayed(path: str | Path, recording: Recording) -> Replayed:
@@ -127,12 +134,14 @@ class SavedModel:
     Attributes:
         values: by name, fitted or not.
         stds: standard errors of the fitted parameters, by name.
+        beyond: names of what the fitted cloth has and its first episode does not describe.
         correlation: [K, K] of the fitted parameters, in the order of ``stds``.
         left: m, rms distance that the fit left in its own episodes; NaN where nothing was seen.
     """
 
     values: dict[str, float]
     stds: dict[str, float]
+    beyond: list[str]
     correlation: np.ndarray
     left: float
     contact: Contact | None
@@ -177,6 +186,7 @@ def _model(content: dict[str, Any]) -> SavedModel:
     return SavedModel(
         {str(name): _value(name, value) for name, value in model["values"].items()},
         {name: number(said[name]["std"], 0.0, f"{name}'s std") for name in correlation},
+        [str(name) for name in model.get("beyond", ())],  # files of before do not say
         matrix,
         math.nan if left is None else number(left, 0.0),
         None if model["contact"] is None else _contact(**model["contact"]),
@@ -202,15 +212,15 @@ def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:
     """The cloth that an episode describes, at the fitted values.
 
     Raises:
-        InvalidInput: it has other parameters than the fitted one.
+        InvalidInput: it has other parameters than the fitted one, or that has more than its own episode describes.
         RecordingError: a value that no such parameter can have.
     """
     cloth = cloth_from(recording, contact=model.contact)
     names = available(cloth)
-    if other := model.values.keys() ^ names.keys():
+    if other := (model.values.keys() ^ names.keys()) | set(model.beyond):
         raise InvalidInput(
             f"{path}: a fit of another model",
-            got=f"{', '.join(sorted(other))} in only one of them",
+            got=f"{', '.join(sorted(other))} not alike in both",
             expected="the model that the episode describes",
             remedy="fit this episode, or show a cloth of your own with viewing.with_cloth",
         )

@@ -17,7 +17,7 @@ from ..boundaries import Grasp
 from ..cloth import Cloth
 from ..errors import InvalidInput, RecordingError
 from ..identification.blocks import blocks_for
-from ..identification.episodes import Episode, episode
+from ..identification.episodes import Episode, episode, on_cpu
 from ..identification.misfit import LEAST_SCALE, figures
 from ..identification.nuisances import chosen, foreseen, implied
 from ..identification.null import rigid_carry
@@ -87,6 +87,7 @@ def estimate_pose(
     began = time.perf_counter()
     if not (math.isfinite(window) and window > 0):
         raise InvalidInput("window", got=window, expected="a time > 0 in s")
+    on_cpu(cloth)
     check_recording(recording)
     check_size(recording)
     data, fields = episode(cloth, recording), modes_of(cloth.mesh)
