@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.stats import t
 
-from torchcloth.diagnosis.comparison import Gain, spread
+from torchcloth.diagnosis.comparison import Gain, heard, spread
 from torchcloth.diagnosis.screening import Row
 from torchcloth.diagnosis.trials import (
     NORMAL,
@@ -45,6 +45,24 @@ def test_what_mends_much_of_all_that_is_wrong_may_differ_from_motion_to_motion(a
 
 def test_a_motion_that_alone_tells_counts_twice_and_does_not_make_three():
     assert standard_errors(gain(0.7), ["a", "b"], {"a"}, True) == pytest.approx(4.30, abs=0.01)
+
+
+def test_motions_without_cells_neither_count_nor_are_left_out():
+    """All of them jump: three motions of which one is silent are two."""
+    slopes = toys.smooth(2, 3)
+    ev = toys.evidence(slopes, 2, [], torch.tensor([0.3, -0.2]).double(), 0)
+    silent = replace(
+        ev, cells=[*ev.cells[:3], ev.cells[3].rows(slice(0))], numerics=[*ev.numerics[:3], ev.numerics[3][:0]]
+    )
+    three = replace(ev, cells=ev.cells[:3], stds=ev.stds[:3], numerics=ev.numerics[:3])
+    mean, std = spread(toys.fitted(silent), ["a", "b", "c", "d"])
+    for one, other in zip((mean, std), spread(toys.fitted(three), ["a", "b", "c"]), strict=True):
+        torch.testing.assert_close(one, other)
+    assert heard(toys.fitted(silent).white.episode, ["a", "b", "c", "d"]) == ["a", "b", "c"]
+
+
+def test_one_motion_agrees_with_nothing():
+    assert standard_errors(gain(0.7), ["a"], set(), True) == float("inf")
 
 
 def test_the_numbers_are_those_of_students_distribution():

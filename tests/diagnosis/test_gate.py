@@ -15,6 +15,7 @@ import torch
 from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, check, diagnose, setting_of
+from torchcloth.diagnosis.gate import _stamps
 from torchcloth.diagnosis.setting import somewhere_seen
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings.images import ImageStream
@@ -54,7 +55,16 @@ def thinned(recording, every):
     return replace(recording, points=rec.PointClouds(points.t[kept], xyz, points.counts[kept]))
 
 
+def paused(recording):
+    """The robot's clock stands still for a while that is not seen."""
+    t = recording.grippers["left"].t
+    late = np.where(np.arange(len(t)) > len(t) // 3, t + 0.7, t)
+    own = {name: replace(g, t=late) for name, g in recording.grippers.items()}
+    return replace(recording, grippers=own)
+
+
 FAULTS = {
+    "the stamps of left jump by 0.7": paused,
     "the stamps of points does not increase": lambda r: stamped(r, lambda t: np.where(np.arange(len(t)) == 9, t[8], t)),
     "the stamps of points jump by 0.4": lambda r: stamped(r, lambda t: t + 0.4 * (np.arange(len(t)) > 30)),
     "the stamps of points jump by 0.18": lambda r: stamped(r, lambda t: t + 0.15 * (np.arange(len(t)) > 30)),
@@ -140,7 +150,20 @@ def with_images(recording):
     return replace(recording, cameras={name: camera})
 
 
+def with_rests(recording):
+    """Grippers of whose first rest, a second, there is one knot, and a path at 100 Hz."""
+    moved = {}
+    for name, g in recording.grippers.items():
+        t = np.concatenate([g.t[:1], g.t[1:] + 1.0])
+        position = np.concatenate([g.position[1:2], g.position[1:] + 1e-9 * np.arange(1, len(t))[:, None]])
+        position[1] = position[0]
+        quat = np.concatenate([g.quat_wxyz[1:2], g.quat_wxyz[1:]])
+        moved[name] = replace(g, t=t, position=position, quat_wxyz=quat)
+    return stamped(replace(recording, grippers=moved), lambda t: t + 1.0)
+
+
 GOOD |= {
+    "grippers that rest first": with_rests,
     "a gripper that lets go": letting_go,
     "pictures with a gap": with_images,
     "one marker": lambda r: with_markers(r, 1),
@@ -152,6 +175,16 @@ GOOD |= {
 @pytest.mark.parametrize("what", GOOD)
 def test_what_a_diagnosis_looks_for_passes(turned, what):
     assert check([GOOD[what](turned)]) == []
+
+
+def test_two_knots_are_enough_of_a_gripper_that_rests(turned):
+    still = {
+        name: rec.GripperMotion(
+            g.t[0] + np.array([0.0, 9.0]), *(v[[0, 0]] for v in (g.position, g.quat_wxyz, g.closed))
+        )
+        for name, g in turned.grippers.items()
+    }
+    assert list(_stamps(replace(turned, grippers=still))) == []
 
 
 def test_episodes_of_two_cloths_are_refused(turned):

@@ -4,6 +4,7 @@ import io
 import json
 import re
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -87,6 +88,15 @@ DAMAGE = {
     "nominal a word": (put("cloth", "nominal", value={"membrane_stiffness": "soft"}), "membrane_stiffness.*'soft'"),
     "mark of nothing": (put("episodes", value=[{"x": 1}]), r"episodes\[0\].frames is missing"),
 }
+
+
+def test_friction_ends_where_there_is_none_also_when_it_comes_from_a_file(tmp_path):
+    table = {"table": rec.Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.3)}
+    base = base_model(on := replace(RECORDING, colliders=table))
+    (cause,) = (h for h in catalogue(base, [on]) if h.name == "contact.mu")
+    path = save_model(tmp_path / "m.tcm", base.plus(cause, 0.2), on)
+    (again,) = read_model(path, on).model.accepted
+    assert again.low == cause.low == pytest.approx(-0.299)
 
 
 @pytest.mark.parametrize("case", DAMAGE)

@@ -43,6 +43,15 @@ def test_a_planted_amplitude_is_found_within_its_error():
     assert 0.75 < float(z.std()) < 1.25
 
 
+def test_single_stretches_are_surely_no_gain():
+    """Of episodes of less than 0.8 s nothing is known of how their stretches scatter."""
+    found = asked([0.3, 0.0, 0.0, 0.0, 0.0])
+    short = [p._replace(window=0 * p.window) for p in (as_it_is(found), predict(found, list("abcd")))]
+    assert compare(*short, 0.0).density > 0
+    assert compare(*short, 0.0).least == -math.inf
+    assert -math.inf < compare(as_it_is(found), predict(found, list("abcd")), 0.0).least < math.inf
+
+
 def test_without_noise_it_is_exact_and_parameters_do_not_matter():
     """r = -J_j a asks for a; what fitted parameters of any size do is not mistaken for a hypothesis."""
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 0)

@@ -170,7 +170,10 @@ def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, motions, alon
     monkeypatch.setattr(trials, "worth_naming", lambda *_: True)
     monkeypatch.setattr(trials, "known", lambda *_: True)
     gain, row = SimpleNamespace(least=surely), SimpleNamespace(hypothesis=CAUSE)
-    assert trials._useful(Candidate(row, None, None, gain, alone, 2.0), motions) == useful  # type: ignore[arg-type]
+    predicted = SimpleNamespace(episode=torch.arange(len(motions)))
+    found = Candidate(row, None, predicted, gain, alone, 2.0)  # type: ignore[arg-type]
+    assert trials._useful(found, motions) == useful
+    assert trials._useful(found, [*motions, "one whose cells all jump"]) == useful
 
 
 @pytest.mark.parametrize(
@@ -184,6 +187,26 @@ def test_further_steps_are_kept_unless_they_predict_worse_than_a_cause(first, th
         for name, amplitude, density in (("first", first, 50.0), ("then", then, predicts))
     }
     assert trials._better(*fits.values()).name == kept  # type: ignore[arg-type]
+
+
+def test_what_a_model_has_is_not_asked_about_again(monkeypatch):
+    """Also where somebody names what is to be asked about."""
+    asked = []
+
+    class Enough(Exception):
+        pass
+
+    def base_fit(model, setting, hypotheses, **_):
+        asked.extend(h.name for h in hypotheses)
+        raise Enough
+
+    monkeypatch.setattr(stepwise, "approach", lambda model, *_: (model, None))
+    monkeypatch.setattr(stepwise, "fit", base_fit)
+    model = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], torch.tensor([0.4]).double(), 0)).model
+    other = toys.hypothesis("another")
+    with pytest.raises(Enough):
+        stepwise.search(model.plus(CAUSE, 1.0), None, [CAUSE, other])  # type: ignore[arg-type]
+    assert asked == ["another"]
 
 
 @dataclass(frozen=True)

@@ -69,6 +69,12 @@ class Gain(NamedTuple):
         return self.calm[0] ** 2 - self.calm[1] ** 2
 
 
+def heard(episode: Tensor, names: Sequence[str]) -> list[str]:
+    """The motions of which there are cells, which are of the numbered ``episode`` [C]: others say nothing."""
+    there = set(episode.tolist())
+    return [name for k, name in enumerate(names) if k in there]
+
+
 def predict(found: Fitted, groups: Sequence[str], halved: Collection[str] = ()) -> Predicted:
     """Residuals of every episode when its group of motions is left out of the fit.
 
@@ -144,14 +150,14 @@ def _told(found: Fitted, likely: Tensor, white: Tensor, scale: Tensor) -> Predic
 
 
 def _folds(found: Fitted, groups: Sequence[str], halved: Collection[str]) -> list[Tensor]:
-    """[C] bool each: what is left out together."""
+    """[C] bool each: what is left out together, of groups that have cells."""
     member = _member(found, groups)
     odd = torch.cat([c.window for c in found.evidence.cells]) // BLOCK % 2 == 1
     out = []
     for k, group in enumerate(sorted(set(groups))):
         inside = member == k
         out += [inside & odd, inside & ~odd] if group in halved else [inside]
-    return out
+    return [inside for inside in out if bool(inside.any())]
 
 
 def _member(found: Fitted, groups: Sequence[str]) -> Tensor:
@@ -197,9 +203,10 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     counts = one.smooth * torch.maximum(*(weights(p.white, p.stretch) for p in (one, two)))
     seen, felt = counts * one.seen, counts * (one.kind == SEEN)
     calm = _calm(one, two, seen)
+    least = float(np.quantile(sums, 0.05)) if (drawn != 1).any() else -np.inf  # single stretches have no spread
     mended = (_mended(one, two, seen), 3**0.5 * _mended(one, two, felt))  # a force has three cells
     rms = [(square / n) ** 0.5 if n else np.nan for square in (before, after)]  # nothing was seen, only felt
-    return Gain(rms[0], rms[1], total, (low, high), share, (left, right), calm, mended, float(np.quantile(sums, 0.05)))
+    return Gain(rms[0], rms[1], total, (low, high), share, (left, right), calm, mended, least)
 
 
 def by_motion(first: Predicted, second: Predicted, floor: float, names: Sequence[str]) -> dict[str, Gain]:

@@ -90,10 +90,11 @@ def _faults(recording: Recording) -> Iterator[tuple[str, str]]:
 
 
 def _stamps(recording: Recording) -> Iterator[tuple[str, str]]:
-    for name, (kind, t) in times(recording).items():
+    for name, (kind, stamps) in times(recording).items():
         if kind in IMAGES:
             continue
-        checks.increasing(t, f"the stamps of {name}")
+        checks.increasing(stamps, f"the stamps of {name}")
+        t = _without_rests(recording, name, stamps)
         between = np.diff(t)
         if not len(between):
             continue
@@ -108,7 +109,7 @@ def _stamps(recording: Recording) -> Iterator[tuple[str, str]]:
         worst = int(between.argmax()) if jump is None else jump
         if jump is not None or between[worst] > max(JUMP * usual, LEAST_JUMP):
             yield (
-                f"the stamps of {name} jump by {between[worst]:.3g} s at {t[worst]:.3g} s ({usual:.3g} s is usual)",
+                f"the stamps of {name} jump by {between[worst]:.3g} s at {stamps[worst]:.3g} s, {usual:.3g} s is usual",
                 "the clock was set or frames are missing: cut the episode there, or repair the stamps",
             )
         missing = 1 - len(t) / (1 + (t[-1] - t[0]) / usual)
@@ -117,6 +118,21 @@ def _stamps(recording: Recording) -> Iterator[tuple[str, str]]:
                 f"{name}: {100 * missing:.0f} % of the frames are missing",
                 "record again, or state a rate that was kept",
             )
+
+
+def _without_rests(recording: Recording, name: str, t: np.ndarray) -> np.ndarray:
+    """Stamps of a stream; between two knots of a gripper that rests there may be any time, which is taken out."""
+    if (arm := recording.joints.get(name)) is not None:
+        path = arm.q
+    elif (gripper := recording.grippers.get(name)) is not None:
+        path = np.concatenate([gripper.position, gripper.quat_wxyz], axis=1)
+    else:
+        return t
+    between, rests = np.diff(t), (np.diff(path, axis=0) == 0).all(axis=1)
+    if rests.all():
+        return t[:1]
+    between = np.where(rests, np.minimum(between, np.median(between[~rests])), between)
+    return t[0] + np.concatenate([[0.0], between.cumsum()])
 
 
 def _set_clock(t: np.ndarray, usual: float) -> int | None:

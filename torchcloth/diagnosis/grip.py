@@ -35,7 +35,7 @@ def _planes(world: World, change) -> World:
 
 
 def _friction(world: World, more: float = 0.0, along: float = 0.0, excess: float = 0.0) -> World:
-    """Everywhere by so much; for slip along one axis of the table by a share; before it slips by an excess.
+    """By so much (across, times the ratio that the table has); along one axis by a share; before it slips by an excess.
 
     No law has both a direction and an excess: with the one, the other changes nothing.
     """

@@ -77,10 +77,10 @@ def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]
     """All hypotheses that the recordings could say something about."""
     without = () if "bending" in model.base.cloth.effects else fabric.OF_BENDING
     asked = [h for h in model.others(known()) if h.effect not in without]
-    return [_here(h, model, recordings) for h in asked if any(h.needs(r) for r in recordings)]
+    return [here(h, model, recordings) for h in asked if any(h.needs(r) for r in recordings)]
 
 
-def _here(hypothesis: Hypothesis, model: Model, recordings: Sequence[Recording]) -> Hypothesis:
+def here(hypothesis: Hypothesis, model: Model, recordings: Sequence[Recording] = ()) -> Hypothesis:
     """As these recordings have it: friction stays above none, and a table tells how high a camera stands."""
     if hypothesis.name == "contact.mu":
         return replace(hypothesis, low=grip.least_change(model.base.cloth))

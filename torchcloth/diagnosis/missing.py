@@ -88,9 +88,9 @@ class MissingForce:
         w, v = m.strongest
         alike = (m.force[w] @ m.force[w, v] / m.force[w, v].norm().clamp(min=1e-30)).clamp(min=0.0)
         weight = alike.square() * self.area  # what pushes the other way has its middle elsewhere
-        middle = (weight[:, None] * self.uv).sum(0) / weight.sum()
-        pressure = (weight[:, None] * m.force[w]).sum(0) / weight.sum()
-        if alike[(self.uv - middle).norm(dim=1).argmin()] < 0.5 * alike[v]:  # it lies between two places
+        share = weight / weight.sum().clamp(min=1e-30)  # of a motion without cells there is no force
+        middle, pressure = ((share[:, None] * of).sum(0) for of in (self.uv, m.force[w]))
+        if alike[(self.uv - middle).norm(dim=1).argmin()] <= 0.5 * alike[v]:  # it lies between two places
             middle = self.uv[v]
         certain = float(m.certainty[w].max())
         return {

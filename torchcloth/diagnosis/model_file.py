@@ -22,7 +22,7 @@ from .._files import atomically
 from ..errors import InvalidInput
 from ..recordings import GraspInfo, Recording
 from .base_model import base_model
-from .hypotheses import known
+from .hypotheses import here, known
 from .model_content import ARRAYS, CONTENT, EXPECTED, FORMAT, damage, read_content
 from .residual import TERMS
 from .world import Model
@@ -154,7 +154,7 @@ def _extended(path: Path, model: Model, causes: Sequence[tuple[str, float]]) -> 
                 got="not in the catalogue",
                 remedy="name the file that registers it (--causes FILE.py, diagnosis.register_file)",
             )
-        model = model.plus(by_name[name], amplitude)
+        model = model.plus(here(by_name[name], model), amplitude)
     return model
 
 

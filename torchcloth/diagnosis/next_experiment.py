@@ -98,7 +98,7 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
         "shows": [] if question.pairs else names,
         "expected_d": _weakest(told[best]),
         "d_now": _weakest(now),
-        "random": {"experiment": str(tried[middle][0]), "expected_d": _weakest(told[middle])},
+        "median": {"experiment": str(tried[middle][0]), "expected_d": _weakest(told[middle])},
         "repeats": repeats,
         "why": _why(experiment, question, now, told[best], _weakest(told[middle]), repeats),
     }
@@ -227,7 +227,7 @@ def _why(
     question: Question,
     now: Mapping[tuple[str, ...], float],
     told: Mapping[tuple[str, ...], float],
-    random: float,
+    median: float,
     repeats: int | None,
 ) -> str:
     hardest = min(told, key=lambda key: told[key])
@@ -240,5 +240,5 @@ def _why(
     )
     return (
         f"{experiment}: {about}, by chi^2 = {now[hardest]:.2g} now and {told[hardest]:.2g} with it "
-        f"({NEEDED:.1f} is needed; {times}). A choice at random gives {random:.2g}."
+        f"({NEEDED:.1f} is needed; {times}). The middle one of all that can be asked gives {median:.2g}."
     )

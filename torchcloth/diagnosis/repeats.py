@@ -1,7 +1,7 @@
 """What repetitions of a command differ by: no model can be better than that.
 
 The error of a model is the same in both; what is left of the difference is regrasping, several equilibria and the
-sensor. Its standard deviation over the square root of two is the floor of a cell (pure error).
+sensor. Its RMS over the square root of two is the floor of a cell (pure error).
 """
 
 from __future__ import annotations
@@ -28,12 +28,10 @@ class Repeats(NamedTuple):
 
     pairs: int  # of episodes
     rms: float  # m, of a position cell of one episode
-    key: Tensor  # [C] cells
-    sd: Tensor  # [C] standard deviation of one episode, in the cell's unit; pooled over all pairs that have the cell
 
 
 def pairs_of(recordings: Sequence[Recording], episodes: Sequence[Episode]) -> list[tuple[int, int]]:
-    """Episodes that repeat each other: they say so, or have one motion and the same path of the grippers."""
+    """Episodes that repeat each other: they say so or have one motion, and grippers go the same way, if any do."""
     keys = keys_of(recordings)
     every = combinations(range(len(keys)), 2)
     return [(i, k) for i, k in every if keys[i] == keys[k] and _alike(episodes[i], episodes[k])]
@@ -41,8 +39,8 @@ def pairs_of(recordings: Sequence[Recording], episodes: Sequence[Episode]) -> li
 
 def _alike(a: Episode, b: Episode) -> bool:
     """Whether the grippers go the same way from the first frame on, wherever that is, and face the same way."""
-    if a.motion.keys() != b.motion.keys():
-        return False
+    if not a.motion or a.motion.keys() != b.motion.keys():
+        return a.motion.keys() == b.motion.keys()
     span = min(float(e.times[-1] - e.times[0]) for e in (a, b))
     since = torch.linspace(0.0, span, 50, dtype=a.times.dtype)
 
@@ -57,17 +55,11 @@ def _alike(a: Episode, b: Episode) -> bool:
 
 def repeats(predicted: Predicted, pairs: Sequence[tuple[int, int]]) -> Repeats | None:
     """The floor from residuals of one model; None without pairs that share cells."""
-    keys, squares, seen = [], [], []
+    squares = []
     for i, k in pairs:
         one, two = predicted.episode == i, predicted.episode == k
-        both = torch.isin(predicted.key[one], predicted.key[two])
+        both = torch.isin(predicted.key[one], predicted.key[two]) & predicted.seen[one]
         key, value = predicted.key[one][both], predicted.value[one][both]
-        keys.append(key)
         squares.append((value - aligned(key, predicted.key[two], predicted.value[two])).square() / 2)
-        seen.append(predicted.seen[one][both])
-    if not keys or not torch.cat(seen).any():
-        return None
-    key, square, where = torch.cat(keys), torch.cat(squares), torch.cat(seen)
-    cell, index = key.unique(return_inverse=True)
-    total = torch.zeros(len(cell), dtype=square.dtype).index_add(0, index, square)
-    return Repeats(len(pairs), float(square[where].mean().sqrt()), cell, (total / torch.bincount(index)).sqrt())
+    square = torch.cat(squares) if squares else predicted.value[:0]
+    return Repeats(len(pairs), float(square.mean().sqrt())) if len(square) else None

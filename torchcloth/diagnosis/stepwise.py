@@ -9,7 +9,7 @@ from typing import NamedTuple
 from .afresh import afresh, resettled
 from .approach import approach
 from .branches import unstable, without
-from .comparison import Gain, Predicted, compare, predict
+from .comparison import Gain, Predicted, compare, heard, predict
 from .doubts import mended, plainer, predicts_better, pruned, unheard
 from .fitting import Fitted, fit, weighed_alike
 from .lacking import is_lacking
@@ -91,6 +91,7 @@ def search(
     model: Model, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
 ) -> Found:
     """Causes one after the other, until none is both present and useful on motions held out."""
+    hypotheses = model.others(hypotheses)
     near, before = approach(model, setting, staged(progress, "from the data sheet"))
     start = fit(near, setting, hypotheses, progress=staged(progress, "base model"), before=before)
     jumping = unstable(start, setting, staged(progress, "folds that turn over"))
@@ -100,7 +101,7 @@ def search(
     if not steps:
         current, steps, left = _anew(start, setting, hypotheses, progress)
     able = {h.name for h in start.evidence.hypotheses}
-    impossible = tuple(h.name for h in model.others(hypotheses) if h.name not in able)
+    impossible = tuple(h.name for h in hypotheses if h.name not in able)
     return replace(_found(start, current, steps, left), impossible=impossible)
 
 
@@ -110,7 +111,7 @@ def _anew(start: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], pro
     Where nothing is lacking any more, it must surely gain what nulls' causes do not.
     """
     lacking = is_lacking(start, setting.names)
-    if not lacking and len(set(setting.names)) < FEWEST:
+    if not lacking and len(set(heard(start.white.episode, setting.names))) < FEWEST:
         return Chain(start, [], setting)
     screened = screen(start)
     rows = {row.hypothesis.name: row for row in screened}

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from .comparison import Gain, Predicted, compare, predict, spread, telling
+from .comparison import Gain, Predicted, compare, heard, predict, spread, telling
 from .evidence import Evidence, shared
 from .fitting import Fitted, fit, renoised, with_cause
 from .noise import Noise, fit_noise, to_fit_by
@@ -187,7 +188,7 @@ def _compared(
         alone = telling(after, names)
         predicted = predict(after, names, alone)
         gain = compare(predict(before, names, alone), predicted, 0.0)
-        sure = standard_errors(gain, names, alone, not current.model.accepted)
+        sure = standard_errors(gain, heard(predicted.episode, names), alone, not current.model.accepted)
         out.append(Candidate(row, found, predicted, gain, alone, sure))
     return out
 
@@ -205,8 +206,12 @@ def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bo
 
 
 def between_motions(names: Sequence[str], alone: Collection[str] = (), table: Sequence[float] = SURE) -> float:
-    """Standard errors by which a mean over so few motions may be off; one that is ``alone`` counts as two."""
-    return table[min(len(set(names)) + len(alone) - 2, len(table) - 1)]
+    """Standard errors by which a mean over so few motions may be off; one that is ``alone`` counts as two.
+
+    One motion agrees with nothing.
+    """
+    count = len(set(names)) + len(alone)
+    return table[min(count - 2, len(table) - 1)] if count > 1 else math.inf
 
 
 def _open(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
@@ -225,7 +230,8 @@ def _plausible(c: Candidate) -> bool:
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:
     """What one motion alone tells has predicted no other one: it must surely gain what nulls' causes do not."""
-    sure = not c.alone or c.gain.least > (SURELY if len(set(names)) >= FEWEST else SURELY_OF_FEW)
+    few = len(set(heard(c.predicted.episode, names))) < FEWEST
+    sure = not c.alone or c.gain.least > (SURELY_OF_FEW if few else SURELY)
     return sure and worth_naming(c, c.gain) and known(c.fitted, c.hypothesis.name, names, c)
 
 
@@ -247,7 +253,7 @@ def known(found: Fitted, name: str, names: Sequence[str], c: Candidate, most: fl
     middle, std = (float(v[len(found.model.parameters) + place]) for v in spread(found, names, c.alone))
     largest = most * abs(found.model.accepted[place].typical)
     least = max(c.sure * std, NORMAL * abs(c.row.bias))
-    return least < abs(middle) and abs(found.model.amplitudes[place]) < largest
+    return c.sure < math.inf and least < abs(middle) and abs(found.model.amplitudes[place]) < largest
 
 
 def worth_naming(c: Candidate, gain: Gain) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -12,7 +13,7 @@ from torch import Tensor
 from ..errors import InvalidInput
 from ..identification.result import or_none
 from .classes import alike, fitted_alike
-from .comparison import Gain, by_motion, spread
+from .comparison import Gain, by_motion, heard, spread
 from .drifting import drifts
 from .gate import Fault
 from .lacking import lack_of_fit
@@ -188,8 +189,9 @@ def _errors(found: Found, names: Sequence[str], alone: Collection[str] = ()) -> 
 
     Few motions know little of what they disagree by: NORMAL of these errors is as wide as Student's interval.
     """
-    widened = between_motions(names, alone) / NORMAL * spread(found.end, names, alone)[1]
-    return torch.maximum(found.end.covariance.diagonal().sqrt(), widened)
+    own = found.end.covariance.diagonal().sqrt()
+    wider = between_motions(heard(found.end.white.episode, names), alone) / NORMAL
+    return torch.maximum(own, wider * spread(found.end, names, alone)[1]) if wider < math.inf else own
 
 
 def _share(found: Found, gain: Gain) -> float | None:
