@@ -20,7 +20,7 @@ def replay(recording: Recording, dtype: torch.dtype = torch.float64) -> dict[str
     """The world poses of every gripper of an episode, by name.
 
     Joint trajectories go through the arm's own kinematics; where an episode has joints and poses, the joints win:
-    they are what was measured, and what can be optimised.
+    they are what was measured, and what can be optimised, unless no arm is named.
 
     Args:
         recording: an episode.
@@ -36,6 +36,8 @@ def replay(recording: Recording, dtype: torch.dtype = torch.float64) -> dict[str
         pose = _poses(motion.position, motion.quat_wxyz)
         out[name] = Trajectory(_tensor(motion.t), pose.to(dtype), torch.as_tensor(motion.closed, dtype=torch.bool))
     for name, joints in recording.joints.items():
+        if name in out and name not in recording.robots:
+            continue
         pose = arm_of(recording, name)(_tensor(joints.q))
         out[name] = Trajectory(_tensor(joints.t), pose.to(dtype), _closed(joints))
     if not out:

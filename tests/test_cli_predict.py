@@ -117,6 +117,8 @@ def test_wrong_input_is_one_line(strips, swing, tmp_path, capsys):
         (model, other, "--angle", "30"): "got m.tcm with a strip to predict; expected tension.json",
         (fit,): "SEEN; got none; expected an episode",
         (fit, tmp_path / "no"): "no",
+        (fit / "run1.json", other): "FIT; got .*run1.json; expected tension.json, identification.json or the folder",
+        (fit / "deep", other): "FIT; got .*deep; expected",
     }
     for k, (arguments, said) in enumerate(wrong.items()):
         out = tmp_path / f"out{k}"

@@ -11,7 +11,7 @@ from twins import at, shifted
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import cloth_from, episode, identify
+from torchcloth.identification import cloth_from, episode, identify, streams
 from torchcloth.identification.episodes import first_shape, mesh_of
 from torchcloth.identification.finer import finer_cloth, finer_recording
 from torchcloth.identification.objective import Objective
@@ -308,3 +308,12 @@ def test_force_readings_after_the_last_cloud_are_told():
     assert data.unused > 10
     assert any("force readings come after the last frame that was seen" in doubt for doubt in data.doubts())
     assert episode(twins.at(whole), replace(whole, grippers=hands)).unused == 0
+
+
+def test_the_frame_of_a_time_is_the_nearest_one_that_is_the_same():
+    frames = np.array([0.0, 0.1, 0.25, 0.4])
+    times = np.array([0.4, 0.1 + 1e-9, -1.0, 0.0, 0.17, 9.0, 0.25 - 1e-9])
+    assert streams.places(times, frames).tolist() == [3, 1, -1, 0, -1, -1, 2]
+    assert streams.places(times[:2], frames[3:]).tolist() == [0, -1]
+    many = np.arange(200_000) / 30  # two hours: a table of all pairs would have 320 GB
+    assert np.array_equal(streams.places(many, many), np.arange(200_000))

@@ -262,6 +262,20 @@ def test_streams(episode, file, key, change, message):
     refused(episode, message)
 
 
+def test_an_episode_all_in_milliseconds(episode):
+    """Nothing is longer than anything else, but no camera is so slow."""
+    with np.load(episode / M) as stored:
+        slow = {key: 1e3 * value if key.endswith("/t") else value for key, value in stored.items()}
+    np.savez(episode / M, **slow)
+    for file in (K, T):
+        edit_npz(episode, file, "t", lambda t: 1e3 * t)
+    with np.load(episode / P) as stored:
+        np.savez(
+            episode / P, t=33.3 * np.arange(6), counts=np.full(6, 8), xyz=stored["xyz"][:48], scale=stored["scale"]
+        )
+    refused(episode, "points.npz: t looks like milliseconds; got steps of 33.3; expected seconds")
+
+
 def test_points_in_float_millimetres(episode):
     with np.load(episode / P) as stored:
         np.savez(episode / P, t=stored["t"], counts=stored["counts"], xyz=stored["xyz"] * np.float32(0.1))

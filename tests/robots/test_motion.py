@@ -1,6 +1,7 @@
 """Joint waypoints to pose trajectories."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 import torchcloth.robots as robots
 from torchcloth import recordings as rec
-from torchcloth.errors import InvalidInput
+from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.types import Trajectory
 
 
@@ -159,3 +160,16 @@ def test_a_path_is_recorded_and_replayed(random_q, tmp_path):
     torch.testing.assert_close(again.pose, pose, atol=1e-12, rtol=0)
     assert torch.equal(again.closed, path.closed)
     assert ((motion.quat_wxyz[1:] * motion.quat_wxyz[:-1]).sum(-1) >= 0).all()
+
+
+def test_a_pose_is_enough_where_no_arm_is_named(random_q):
+    """Joints are kept beside it, of an arm that nobody describes."""
+    q = random_q(robots.load("rizon4"), 6, seed=1)
+    t = np.linspace(0.0, 1.0, 6)
+    pose = rec.GripperMotion(t, np.outer(t, [0.1, 0.0, 0.0]), np.tile([1.0, 0, 0, 0], (6, 1)), np.ones(6, bool))
+    sheet = rec.ClothInfo(areal_density=0.2, sheet=(0.1, 0.1))
+    joints = {"hand": rec.JointMotion(t, q.numpy())}
+    episode = rec.Recording(cloth=sheet, provenance="test", grippers={"hand": pose}, joints=joints)
+    assert robots.replay(episode)["hand"].pose[-1, :3, 3].tolist() == [0.1, 0.0, 0.0]
+    with pytest.raises(RecordingError, match="no robot"):
+        robots.replay(replace(episode, grippers={}))

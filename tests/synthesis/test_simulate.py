@@ -1,6 +1,7 @@
 """``torchcloth simulate``: one small episode from command to recording, and what it refuses."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from torchcloth.identification import cloth_from, episode
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.observe import DepthCamera, decode, to_points
 from torchcloth.parameters import PhysicalParameter
+from torchcloth.synthesis import episodes
 
 SMALL = ["--triangles", "98", "--rate", "6"]
 EPISODE = "sheet_stretch"
@@ -31,6 +33,13 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def recording(folder):
     return recordings.read(folder / EPISODE, with_truth=True)
+
+
+def test_what_is_missing_is_said_before_anything_is_simulated(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    monkeypatch.setattr(episodes, "perform", lambda *_: pytest.fail("simulated"))
+    assert simulate(tmp_path / "out") == 2
+    assert "depth cameras and clouds need open3d" in capsys.readouterr().err
 
 
 def test_leaves_episode_and_pictures_and_nothing_else(folder):

@@ -57,7 +57,7 @@ def test_a_solid_is_placed(film):
 
 
 def test_the_box_is_about_cloth_points_and_grippers(film):
-    low, high = film.box()
+    low, high = film.box
     assert low == pytest.approx([-0.2, -0.2, 0.0])
     assert high == pytest.approx([0.2, 0.2, 0.3])
 

@@ -37,7 +37,7 @@ def at(stage, point, frame=0):
 @pytest.mark.parametrize("look", [(0.0, 20.0), (130.0, 35.0), (0.0, 90.0), (70.0, -90.0), ABOVE, None])
 def test_the_camera_sees_everything(film, look):
     camera = camera_for(film, (400, 300), look)
-    low, high = film.box()
+    low, high = film.box
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
     pixels, depth = camera.project(corners)
     assert (depth > 0.1).all()
@@ -66,7 +66,7 @@ def test_what_has_no_size_can_be_looked_at(film, part, tmp_path):
     np.testing.assert_allclose(camera.project(trace.points[0])[0], [199.5, 149.5], atol=30)
     assert picture(one, tmp_path / "a.png").is_file()
     if part == "gripper":
-        assert np.ptp(one.box(), axis=0) == pytest.approx(0.3)
+        assert np.ptp(one.box, axis=0) == pytest.approx(0.3)
 
 
 def test_lengths_are_equal_in_all_directions(film):

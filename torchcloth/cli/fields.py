@@ -74,7 +74,7 @@ def fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording], jo
         dt=options.dt,
         use=options.use,
         journal=journal,
-        resume=options.resume or options.unsaid,
+        resume=options.resume or None,
         on_progress=advance,
         **contrast,
     )

@@ -30,11 +30,11 @@ def add(verbs: Any) -> None:
     identify = verbs.add_parser("identify", help="fit fabric parameters to recorded episodes")
     identify.add_argument("episodes", nargs="+", metavar="EPISODE", help="folder of a recording")
     identify.add_argument("--out", type=place, required=True, metavar="DIR", help="folder for the result and pictures")
-    identify.set_defaults(run=_identify, stopped=how_to_go_on, unsaid=None)  # work is not thrown away unasked
+    identify.set_defaults(run=_identify, stopped=how_to_go_on)
     _add_options(identify)
     demo = verbs.add_parser("demo", help="identify the shipped example")
     demo.add_argument("--out", type=place, default=Path("out/demo"), metavar="DIR", help="default out/demo")
-    demo.set_defaults(run=_demo, stopped=how_to_go_on, unsaid=False)
+    demo.set_defaults(run=_demo, stopped=how_to_go_on)
     _add_options(demo)
 
 
@@ -252,7 +252,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             starts=options.starts,
             profile=options.profile,
             journal=options.out / PROGRESS,
-            resume=options.resume or options.unsaid,
+            resume=options.resume or None,  # work is not thrown away unasked
             dt=options.dt,
             use=options.use,
             nuisances=nuisances_of(options.nuisance),

@@ -59,8 +59,9 @@ def _predict(options: argparse.Namespace) -> int:
     if options.fit.suffix == ".tcm" and not of_strip:
         return _of_episode(options.fit, out, options)
     known = [name for name in (TENSION, RESULT) if (folder / name).is_file()]
-    if options.fit.name in (TENSION, RESULT) or options.fit.suffix == ".tcm":
-        known = [options.fit.name] if options.fit.is_file() else []
+    if not options.fit.is_dir():
+        readable = options.fit.is_file() and (options.fit.suffix == ".tcm" or options.fit.name in known)
+        known = [options.fit.name] if readable else []
     if not known:
         raise InvalidInput(
             "FIT", got=options.fit, expected=f"{TENSION}, {RESULT} or the folder that holds it, or a .tcm file"

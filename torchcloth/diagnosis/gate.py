@@ -16,14 +16,13 @@ import numpy as np
 from ..errors import RecordingError
 from ..recordings import Recording, checks, read
 from ..recordings.reading import EPISODE
-from ..recordings.ticks import times
+from ..recordings.ticks import SLOWEST, times
 from ..recordings.together import name_of, same_cloth
 from .gate_clouds import Seen, handed, places, units
 
 JUMP, LEAST_JUMP = 8.0, 0.2  # usual intervals and s: a longer one is no dropped frame any more
 TICKS, EVEN, BEAT = 8, 0.05, 0.15  # frames to either side that tick evenly; usual intervals, of a tick and of a jump
 DROPPED = 0.5  # share of the frames
-SLOWEST = 3.0  # s between frames: 240 Hz in milliseconds are 4
 COVERED = 0.5  # share of the frames that the motion must cover
 IMAGES = ("depth", "color", "mask")  # streams of a camera, which nothing here is compared with
 

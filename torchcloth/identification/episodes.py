@@ -358,9 +358,10 @@ def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[s
     end = min((float(motion[key].t[-1]) for key in needed), default=np.inf)
     inside = np.flatnonzero((times >= start - 1e-6) & (times <= end + 1e-6))
     if len(inside) < 2 or inside[0] != 0:
+        seen = f"frames in [{times[0]:g}, {times[-1]:g}] s" if len(times) else "no frames"
         raise RecordingError(
             "points and motion",
-            got=f"frames in [{times[0]:g}, {times[-1]:g}] s, motion in [{start:g}, {end:g}] s",
+            got=f"{seen}, motion in [{start:g}, {end:g}] s",
             expected="motion that covers the first frame",
             remedy="check clock_offset",
         )

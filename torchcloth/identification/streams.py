@@ -36,8 +36,10 @@ def felt(recording: Recording, names: Sequence[str]) -> np.ndarray:
 
 
 def places(times: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """[N] the frame of each time; -1 where there is none."""
-    near = np.abs(frames[:, None] - times).argmin(0)
+    """[N] the frame of each time; -1 where there is none. Frames are in order."""
+    after = np.searchsorted(frames, times).clip(max=len(frames) - 1)
+    before = (after - 1).clip(min=0)
+    near = np.where(np.abs(frames[before] - times) <= np.abs(frames[after] - times), before, after)
     return np.where(np.abs(frames[near] - times) <= SAME, near, -1)
 
 

@@ -12,6 +12,7 @@ from ..errors import RecordingError
 from . import images, scene, streams
 from .checks import Fields
 from .files import Folder
+from .ticks import SLOWEST
 from .types import Camera, GraspInfo, Recording
 
 EPISODE = "episode.json"
@@ -277,12 +278,20 @@ def _check_overlap(recording: Recording, folder: Folder) -> None:
 
 
 def _check_seconds(recording: Recording, folder: Folder) -> None:
-    """Streams of one motion last about as long: one that ticks more slowly than another lasts is in another unit."""
+    """Streams of one motion last about as long: one that ticks more slowly than another lasts is in another unit.
+
+    So are all of them where the cloth was seen more slowly than any camera sees.
+    """
     motions = {**recording.grippers, **recording.joints}
     times = {f"{folder.place(streams.MOTION)}: {name}/t": motion.t for name, motion in motions.items()}
     seen = {streams.POINTS: recording.points, streams.MARKERS: recording.markers}
     times |= {f"{folder.place(file)}: t": stream.t for file, stream in seen.items() if stream is not None}
     spans = {place: float(t[-1] - t[0]) for place, t in times.items() if len(t) > 1}
+    for file, stream in seen.items():
+        step = 0.0 if stream is None or len(stream.t) < FEW_TICKS else float(np.median(np.diff(stream.t)))
+        if step > SLOWEST:
+            place, got = f"{folder.place(file)}: t", f"steps of {step:.4g}"
+            raise RecordingError(f"{place} looks like milliseconds", got=got, expected="seconds", remedy="rescale it")
     brief = min(spans, key=spans.__getitem__, default="")
     for place, span in spans.items():
         step = float(np.median(np.diff(times[place])))

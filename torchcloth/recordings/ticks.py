@@ -8,6 +8,7 @@ import numpy as np
 
 from .types import Recording
 
+SLOWEST = 3.0  # s between frames of what moves: 240 Hz in milliseconds are 4
 GAP = 1.5  # an interval longer than so many usual ones is a gap
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..errors import MissingDependency, SimulationDiverged
 from ..observe import capture, encode, solid_meshes
+from ..observe.render import open3d_or_refuse
 from ..parameters import PhysicalParameter
 from ..recordings import (
     Camera,
@@ -69,6 +70,7 @@ def make(order: Order, images: Path, on_progress: Progress = lambda stage, done,
         SimulationDiverged: the cloth ran away.
         MissingDependency: open3d or Pillow is not installed.
     """
+    open3d_or_refuse()  # before the simulation, and not after it
     start, seen = (np.random.default_rng([order.seed, k]) for k in range(2))
     staged = stage(order, start)
     on_progress("planning", 0, 1)

@@ -69,7 +69,7 @@ def film_of(recording: Recording, *, truth: bool = False, times: Array | None = 
         curves=_curves(recording),
         notes=tuple(notes),
     )
-    planes = {f"colliders/{name}": _plane(c, film.box()) for name, c in recording.colliders.items()}
+    planes = {f"colliders/{name}": _plane(c, film.box) for name, c in recording.colliders.items()}
     return replace(film, planes=planes)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sized
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -147,6 +148,7 @@ class Film:
         """Whether a sheet carries values, so that a colour bar is needed."""
         return any(sheet.values is not None for sheet in self.sheets.values())
 
+    @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lower and upper corner, each [3] m, of all that the film is about: cloth, points and grippers; else all."""
         about = [sheet.vertices.reshape(-1, 3) for sheet in self.sheets.values()]
@@ -210,7 +212,7 @@ def ground_of(film: Film) -> list[Plane]:
     """The film's planes; without any, a level floor under everything, for orientation."""
     if film.planes:
         return list(film.planes.values())
-    low, high = film.box()
+    low, high = film.box
     lowest = [low[2], *(placed(solid, 0)[:, 2].min() for solid in film.solids.values())]
     height, half = min(lowest), float(np.linalg.norm(high - low))
     middle = np.round((low + high)[:2] / 2 / CELL) * CELL

@@ -51,7 +51,7 @@ def camera_for(film: Film, size: tuple[int, int], look: tuple[float, float] | No
             camera, else facing the arms.
     """
     width, height = size
-    low, high = film.box()
+    low, high = film.box
     arms = any(name.startswith("arms/") for name in film.solids)
     high = high + np.array([0, 0, ABOVE if arms else 0])
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
@@ -86,7 +86,7 @@ def _direction(film: Film, centre: Array) -> tuple[float, float]:
 
 def polygons(film: Film, frame: int, camera: DepthCamera) -> Polygons:
     """Everything in a frame but planes and lines."""
-    low, high = film.box()
+    low, high = film.box
     reach = IN_FRONT * float(np.linalg.norm(high - low))
     parts = [
         _net(sheet, frame, reach, camera) if sheet.net else _sheet(sheet, frame, film.worst, camera)

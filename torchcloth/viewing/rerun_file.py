@@ -170,7 +170,7 @@ def _layout(film: Film) -> Any:
     """
     import rerun.blueprint as rrb
 
-    low, high = film.box()
+    low, high = film.box
     target = (low + high) / 2
     position = target + NEARER * (camera_for(film, WINDOW).T_world_camera[:3, 3] - target)
     deep = [name for name, view in film.views.items() if (view.index >= 0).any()]

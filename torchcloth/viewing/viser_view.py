@@ -201,7 +201,7 @@ def _stop(server: Any) -> None:
 def _aim(server: Any, film: Film) -> None:
     """Put the eye where pictures are taken from."""
     camera = camera_for(film, WINDOW)
-    low, high = film.box()
+    low, high = film.box
     server.initial_camera.position = tuple(camera.T_world_camera[:3, 3])
     server.initial_camera.look_at = tuple((low + high) / 2)
     server.initial_camera.up = (0.0, 0.0, 1.0)

@@ -52,6 +52,21 @@ def test_keys_and_notes_of_ones_own_come_back(recording, tmp_path):
     assert back.extra["source"]["origin"] == "lab 3"
 
 
+def test_what_is_wrong_with_a_whole_stream_of_images_is_said(episode, tmp_path):
+    """At its end, behind the last image that has a time: as `write` says it of a folder."""
+    recording = rec.read(episode)
+    (name, camera), *_ = recording.cameras.items()
+    more = replace(camera.depth, paths=(*camera.depth.paths, camera.depth.paths[0]))
+    longer = replace(recording, cameras=recording.cameras | {name: replace(camera, depth=more)})
+    for write in (
+        lambda: rec.write(longer, tmp_path / "folder"),
+        lambda: formats.write_mcap(longer, tmp_path / "ep.mcap"),
+    ):
+        with pytest.raises(RecordingError, match="depth images are too many"):
+            write()
+    assert list(tmp_path.glob("*.mcap")) == []
+
+
 def test_times_that_no_stamp_holds_are_refused_without_a_trace(recording, tmp_path):
     late = replace(recording, points=replace(recording.points, t=recording.points.t + 3e9))
     with pytest.raises(RecordingError, match=r"end in 2038; got a time of 3e\+09 s; .*begin at 0 s"):

@@ -18,6 +18,7 @@ import foreign
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.recordings import formats
+from torchcloth.recordings.formats import lerobot
 from torchcloth.recordings.formats.bag import Message
 from torchcloth.recordings.formats.imported import nanoseconds
 from torchcloth.recordings.formats.ros2_cameras import BagImages
@@ -333,6 +334,20 @@ def test_lerobot_values_are_held_against_their_statistics(copy):
     column = pyarrow.array(rows, type=table.schema.field("observation.state").type)
     parquet.write_table(table.set_column(0, "observation.state", column), file)
     refuse(truth, "observation.state contradicts its statistics; got a mean of .* in entry 2")
+
+
+def test_lerobot_means_of_what_stands_still_are_as_wrong_as_float32_makes_them():
+    """100 s of a joint at rest: every row of the sum is rounded alike."""
+    values = np.full((3000, 2), [1.23, 0.1], np.float32)
+    values[:, 1] += np.linspace(0, 1, 3000, dtype=np.float32)
+    kept = {f"stats/state/{name}": getattr(values, name)(axis=0).astype(float) for name in ("min", "max", "mean")}
+    off = np.abs(kept["stats/state/mean"] - values.astype(float).mean(axis=0)).max()
+    assert off > lerobot.AGREE * np.abs(values).max()
+    lerobot._agree(values.astype(float), {"file": "meta", **kept}, "state")
+    changed = values.astype(float)
+    changed[1000, 0] += 3.0
+    with pytest.raises(RecordingError, match="contradicts its statistics"):
+        lerobot._agree(changed, {"file": "meta", **kept}, "state")
 
 
 def test_another_lerobot_version(copy):

@@ -14,6 +14,7 @@ import io
 import json
 import re
 import uuid
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -93,6 +94,7 @@ class _Bag:
         self.recording, self.on_image = recording, on_image
         self.epoch = _epoch(recording)
         self.events: list[Event] = []
+        self.images: list[Iterator[Any]] = []
         self.mapping: dict[str, Any] = {"epoch": self.epoch, "motion": {}, "cameras": {}}
         if (own := recording.extra.get("source")) is not None:
             self.mapping["origin"] = own  # where the recording is from
@@ -111,6 +113,8 @@ class _Bag:
             self._rest(first)
             for _, put in sorted(self.events, key=lambda event: event[0]):  # stable: as they came where times agree
                 put()
+            for files in self.images:
+                deque(files, 0)  # to their ends: what is wrong with a whole file is said there
 
     def _topic(self, name: str, kind: str, message: Callable[[int], Any], times: Any, *, first: bool = False) -> str:
         """Add a topic with the message ``message(i)`` at each of ``times`` [ns]."""
@@ -232,6 +236,7 @@ class _Bag:
 
     def _images(self, topic: str, stream: images.ImageStream) -> str:
         kind, times, files = "sensor_msgs/msg/CompressedImage", self._times(stream.t), stream.files()
+        self.images.append(files)
 
         def message(i: int) -> Any:
             _, suffix, data = next(files)  # called in the order of time, which is theirs
