@@ -16,13 +16,13 @@ from functools import cache
 from typing import Any, ClassVar, NamedTuple, cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from . import functional
 from .boundaries import Drive
 from .dynamics import Impulses, added
 from .errors import InvalidInput
-from .model import Model, kept
+from .model import Model, mapped
 from .self_contact import Layers, near_layers
 from .types import ClothState
 
@@ -94,7 +94,9 @@ class Graphs:
         self.model, self._left, self._capture = model, substeps, capture
         self.given: list[Tensor] = []  # what of the model has a gradient
         self.leaves: list[Tensor] = []  # what stands for it in the graphs' own model
-        self.own = cast("Model", _mapped(model, self._kept))
+        parts = model._replace(geometry=(), grid=None)  # nobody writes to these
+        own = cast("Model", mapped(parts, self._kept, buffers=True))
+        self.own = own._replace(geometry=model.geometry, grid=model.grid)
         self._units: dict[tuple[Any, ...], Unit] = {}
         self._seen: dict[tuple[Any, ...], int] = {}
         self._able = True
@@ -140,9 +142,9 @@ class Graphs:
         return 0.0 if self.model.grid is None else self.model.grid.skin / 2
 
     def _kept(self, tensor: Tensor) -> Tensor:
-        """What stands for a tensor of the model; whoever changes the cloth later leaves its memory to the graphs."""
+        """What stands for a tensor of the model, in memory of its own: the cloth may be changed later."""
         if not tensor.requires_grad:
-            return tensor.detach()
+            return tensor.detach().clone()
         for given, leaf in zip(self.given, self.leaves, strict=True):
             if given is tensor:
                 return leaf
@@ -359,22 +361,3 @@ def _none(model: Model, x: Tensor) -> Layers | None:
         return None
     empty = torch.empty(0, dtype=torch.int64, device=x.device)
     return Layers(empty, empty, empty.expand(3, 0), empty.int(), x)
-
-
-def _mapped(tree: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    """The same with every tensor and every parameter of a module changed."""
-    if isinstance(tree, Tensor):
-        return change(tree)
-    if isinstance(tree, nn.Module):
-        own = kept(tree)
-        for inner in own.modules():
-            changed = {n: None if p is None else change(p) for n, p in inner._parameters.items()}
-            inner._parameters = cast("dict[str, nn.Parameter | None]", changed)
-            inner._buffers = {n: None if b is None else change(b) for n, b in inner._buffers.items()}
-        return own
-    if isinstance(tree, Mapping):
-        return {name: _mapped(part, change) for name, part in tree.items()}
-    if isinstance(tree, tuple):
-        parts = [_mapped(part, change) for part in tree]
-        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
-    return tree

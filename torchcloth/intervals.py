@@ -255,19 +255,21 @@ def check_finite(interval: Interval, before: ClothState, after: ClothState) -> N
         SimulationDiverged: positions are not finite at its end.
     """
     if not bool(torch.isfinite(after.x.detach()).all()):
-        raise _divergence(interval, before)
+        raise _divergence(interval, before, after)
 
 
 @torch.no_grad()
-def _divergence(interval: Interval, state: ClothState) -> SimulationDiverged:
-    drives, k, vertex = interval.drives(), 0, 0
-    run = partial(functional.rollout, interval.model) if interval.fused is None else interval.fused.rollout
+def _divergence(interval: Interval, state: ClothState, after: ClothState) -> SimulationDiverged:
+    drives, k, low = interval.drives(), 0, None
+    run = partial(functional.stretch, interval.model) if interval.fused is None else interval.fused.stretch
     for k in range(interval.count):
-        state, _ = run(state, interval.dt, drives, 1, k)
-        lost = ~torch.isfinite(state.x).all(-1)
-        if bool(lost.any()):
-            vertex = int(lost.reshape(-1, lost.shape[-1]).any(0).nonzero()[0])
+        state, low, _ = run(state, low, interval.dt, _parts(drives, k, k + 1), 1)
+        if not bool(torch.isfinite(state.x).all()):
             break
+    else:  # searched at every substep, layers may have passed each other otherwise
+        state = after
+    gone = ~torch.isfinite(state.x).all(-1)
+    vertex = int(gone.reshape(-1, gone.shape[-1]).any(0).nonzero()[0])
     return SimulationDiverged(
         f"simulation diverged at t = {float(interval.times()[k + 1]):.6g} s",
         got=f"vertex {vertex} not finite after substep {k + 1} of {interval.count}",

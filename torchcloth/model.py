@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -51,22 +51,39 @@ class Model(NamedTuple):
 
 
 def as_it_is(model: Model) -> Model:
-    """With parts that keep the parameters of the moment, for a backward pass that computes again.
+    """With parts that keep the values of the moment, for a backward pass that computes again.
 
-    Those of ``functional_call`` have gone by then.
+    Parameters of ``functional_call`` have gone by then, and an optimiser may have written to others.
     """
-    return model._replace(
-        material=kept(model.material),
-        effects={name: (kept(effect), c) for name, (effect, c) in model.effects.items()},
-        boundaries={name: kept(boundary) for name, boundary in model.boundaries.items()},
-    )
+    names = ("material", "coefficients", "effects", "boundaries", "mass", "areal_density", "rest")
+    return model._replace(**{name: mapped(getattr(model, name), torch.clone) for name in names})
+
+
+def mapped(tree: Any, change: Callable[[Tensor], Tensor], buffers: bool = False) -> Any:
+    """The same with every tensor changed, and every parameter of a module; buffers, too, or the same ones."""
+    if isinstance(tree, Tensor):
+        return change(tree)
+    if isinstance(tree, nn.Module):
+        own = kept(tree)
+        for inner in own.modules():
+            changed = {n: None if p is None else change(p) for n, p in inner._parameters.items()}
+            inner._parameters = cast("dict[str, nn.Parameter | None]", changed)
+            if buffers:
+                inner._buffers = {n: None if b is None else change(b) for n, b in inner._buffers.items()}
+        return own
+    if isinstance(tree, Mapping):
+        return {name: mapped(part, change, buffers) for name, part in tree.items()}
+    if isinstance(tree, tuple):
+        parts = [mapped(part, change, buffers) for part in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    return tree
 
 
 def kept(part: ModuleT) -> ModuleT:
-    """A part that keeps the parameters of the moment, and shares all else."""
+    """A part that keeps the parameters and buffers of the moment, and shares all else."""
     own = copy(part)
     own.__dict__ = part.__dict__.copy()
-    own._parameters = part._parameters.copy()
+    own._parameters, own._buffers = part._parameters.copy(), part._buffers.copy()
     own._modules = {name: None if inner is None else kept(inner) for name, inner in part._modules.items()}
     return own
 

@@ -18,6 +18,7 @@ from .types import ClothState, Surface
 # Substeps between checkpoints of a long interval: memory ~ frames + CHUNK, one extra forward pass. Near layers are
 # searched again at each, as substeps that are computed anew start there.
 CHUNK = 48
+EXACT = "donot_use_mm_for_euclid_dist"  # by differences: squares of 30 m have no digits for millimetres in float32
 
 
 class Layers(NamedTuple):
@@ -54,7 +55,9 @@ def near_layers(model: Model, grid: Grid, x: Tensor, before: Layers | None = Non
     if grid.apart is None:
         near = torch.ones(centre.shape[:2], dtype=torch.bool, device=x.device)
     else:
-        near = torch.stack([((torch.cdist(p, p) < grid.reach) & grid.apart).any(-1) for p in centre])
+        near = torch.stack(
+            [((torch.cdist(p, p, compute_mode=EXACT) < grid.reach) & grid.apart).any(-1) for p in centre]
+        )
     scene, triangle = near.nonzero(as_tuple=True)
     scenes, triangles = near.shape
     own = model.geometry.corners.view(3, -1).index_select(1, triangle) + scene * x.shape[-2]
@@ -79,7 +82,7 @@ def _unpressed(grid: Grid, apart: Tensor, centre: Tensor, n: Tensor) -> Tensor:
     farthest = TOUCH * grid.spacing + side  # pairs beyond do not press, whatever their direction
     found = []
     for points, normals in zip(centre.reshape(-1, *n.shape[-2:]), n.reshape(-1, *n.shape[-2:]), strict=True):
-        over, under = ((torch.cdist(points, points) <= farthest) & apart).nonzero(as_tuple=True)
+        over, under = ((torch.cdist(points, points, compute_mode=EXACT) <= farthest) & apart).nonzero(as_tuple=True)
         between = points[over] - points[under]
         height = dot(between, normals[under]).abs()
         beside = (dot(between, between) - height**2).clamp(min=0).sqrt() > side

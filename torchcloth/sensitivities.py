@@ -56,7 +56,7 @@ def sensitivities(
         start = plan.frames[0]
         rest = cloth.settling(state, motion, start, settle, RATE)
         walk = _Walk(cloth, rest, lambda: damped(cloth.model(), RATE), along, count)
-        poses = _Poses(motion, along, count, lambda m: held(m, *rest.frames))
+        poses = _Poses(motion, along, count, lambda m: held(m, rest.frames[0], rest.frames[-1]))
         (states, _), (shifts, _) = walk.run(state, moved, poses)
         state, moved = (s[-1]._replace(v=torch.zeros_like(s[-1].v)) for s in (states, shifts))
     found = _Walk(cloth, plan, cloth.model, along, count).run(state, moved, _Poses(motion, along, count))

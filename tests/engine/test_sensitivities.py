@@ -55,6 +55,21 @@ def test_equal_the_reference(case):
     assert moved.x.shape == (count, *value.x.shape)
 
 
+def test_cloth_that_sets_while_it_settles_and_hands_are_moved():
+    """It settles in pieces, as what has set shortens the step."""
+    found = []
+    for engine in ("fused", "reference"):
+        material = tc.materials.AEP(1e5, 0.3, plastic=tc.materials.NormYield(1e-3))
+        cloth = sheet(engine, material=material)
+        state, motion = start(cloth), opening(END)
+        moves = directions(cloth, state, motion).motion
+        found.append(cloth.sensitivities(state, motion, (0.0, END), along=Directions(motion=moves), settle=0.2))
+    (value, moved), (expected, slopes) = found
+    for name in parts(value):
+        close(parts(value)[name], parts(expected)[name], 1e-10, name)
+        close(parts(moved)[name], parts(slopes)[name], 1e-7, f"tangent of {name}")
+
+
 def test_equal_reverse_mode():
     """Every direction against the same projection of a gradient."""
     cloth = sheet("fused")

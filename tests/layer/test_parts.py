@@ -96,6 +96,61 @@ def test_gradients_of_a_bodys_numbers_under_functional_call():
     torch.testing.assert_close(slopes[0], slopes[1])
 
 
+class Pull(tc.effects.AbstractEffect):
+    """A user's."""
+
+    def __init__(self):
+        super().__init__()
+        self.strength = tc.PhysicalParameter(0.05, "N", "nonnegative", name="pull")
+
+    def coefficients(self):
+        return self.strength.field
+
+    def force(self, c, now):
+        return c * torch.stack([now.v[..., 1], torch.sin(now.x[..., 2]), -now.v[..., 0]], dim=-1)
+
+
+@pytest.mark.parametrize("engine", ["reference", "fused"])
+def test_gradients_are_those_of_the_values_that_were_simulated(engine):
+    """A sweep, and one backward pass at its end: what is computed again must not take the last values for the first."""
+    ball = tc.boundaries.Sphere(0.5, (0.1, 0.1, -0.5005), friction=0.3)
+    cloth = sheet(7, effects={"damping": tc.effects.MassDamping(0.5), "pull": Pull()}, boundaries={"ball": ball}, Y=1.0)
+    cloth.engine = engine
+    raw = [n.raw for n in (cloth.effects["pull"].strength, cloth.effects["damping"].rate, ball.friction, ball.radius)]
+    state = cloth.state(cloth.rest_state().x, torch.tensor([0.3, 0.1, -0.1]).expand(49, 3))
+
+    def loss(scale):
+        with torch.no_grad():
+            for parameter, value in zip(raw, first, strict=True):
+                parameter.copy_(scale * value)
+        return cloth(state, {}, (0.0, 0.05)).x[-1].square().sum()
+
+    first = [parameter.detach().clone() for parameter in raw]
+    each = [torch.autograd.grad(loss(scale), raw) for scale in (1.0, 1.2)]
+    together = torch.autograd.grad(sum(loss(scale) for scale in (1.0, 1.2)), raw)
+    for sum_of, (one, two) in zip(together, zip(*each, strict=True), strict=True):
+        assert float(one.norm()) > 0
+        assert not torch.allclose(one, two, rtol=1e-3)
+        torch.testing.assert_close(sum_of, one + two, rtol=1e-9, atol=0)
+
+
+def test_a_body_that_is_held_elsewhere_later_is_computed_again_where_it_was():
+    hand = tc.boundaries.Grasp([0])
+    cloth = sheet(boundaries={"hand": hand})
+    cloth.engine = "reference"
+    path = torch.eye(4).repeat(2, 1, 1)
+    path[1, 2, 3] = 0.01
+    motion = {"hand": tc.Trajectory(torch.tensor([0.0, 0.01]), path, torch.ones(2, dtype=torch.bool))}
+    stiffness, slopes = cloth.material.youngs_modulus.raw, []
+    for later in (False, True):
+        hand.index = torch.tensor([0])
+        x = cloth(cloth.rest_state(), motion, (0.0, 0.01)).x[-1]
+        if later:
+            hand.index = torch.tensor([5])
+        slopes.append(torch.autograd.grad(x.square().sum(), stiffness)[0])
+    torch.testing.assert_close(*slopes, rtol=1e-9, atol=0)
+
+
 @pytest.mark.parametrize(
     "part",
     [

@@ -80,6 +80,24 @@ def test_only_triangles_near_another_layer_take_part():
 
 
 @torch.no_grad()
+def test_layers_are_found_as_well_far_from_the_origin():
+    """Float32 at 60 m has 4 micrometres between numbers; squares of 60 m have none for a gap of millimetres."""
+    mesh = tc.meshes.rectangle(0.4, 0.1, resolution=(41, 11))
+    cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), DENSITY, contact=tc.Contact(spacing=0.005)).float()
+    x, model = torch.as_tensor(mesh.vertices).float(), cloth.model()
+    x[x[:, 0] > 0.2, 0] = 0.4 - x[x[:, 0] > 0.2, 0]
+    x[torch.arange(len(x)) % 41 > 20, 2] = 0.006
+    found = []
+    for away in (0.0, 60.0):
+        there = x + torch.tensor([away, -away, 0.5 * away]).float()
+        layers = self_contact.near_layers(model, model.grid, there)
+        found.append((len(layers.active), self_contact.first_directors(model, model.grid, there)))
+    assert found[0][0] == pytest.approx(found[1][0], abs=4)
+    assert found[0][0] > 300
+    torch.testing.assert_close(found[0][1], found[1][1], rtol=0, atol=0.01)
+
+
+@torch.no_grad()
 @pytest.mark.parametrize(
     ("speed", "stiffness"),
     [(2.0, 100.0), pytest.param(0.3, 20.0, marks=pytest.mark.slow), pytest.param(2.0, 1000.0, marks=pytest.mark.slow)],

@@ -115,6 +115,8 @@ class Fused:
         """Inputs that stay the same over the substeps of a call."""
         if not self._coefficients:
             self._coefficients = conversion.flat(self.low, self.low.inputs, batch)
+            if self.torch_parts is not None and recomputes():  # then parameters may have other values
+                self._coefficients = {field: t.clone() for field, t in self._coefficients.items()}
         return self._coefficients
 
     def moves(self, state: ClothState, drives: Mapping[str, Drive], steps: Tensor) -> dict[Field, Tensor]:

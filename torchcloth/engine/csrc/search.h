@@ -54,7 +54,7 @@ struct Search {
         std::iota(sorted.begin(), sorted.end(), 0);
         std::vector<R> low[3], high[3];
         std::vector<R> first(patches);
-        for (int p = 0; p < patches; p++) first[p] = *std::min_element(&centre[0][starts[p]], &centre[0][starts[p + 1]]);
+        for (int p = 0; p < patches; p++) first[p] = *std::min_element(centre[0].data() + starts[p], centre[0].data() + starts[p + 1]);
         std::sort(sorted.begin(), sorted.end(), [&](int a, int b) { return first[a] < first[b]; });
         boxes(centre, sorted, low, high);
         const std::vector<Together> together = side_by_side(centre);
@@ -127,7 +127,7 @@ struct Search {
     void boxes(const std::vector<R>* centre, const std::vector<int>& sorted, std::vector<R>* low, std::vector<R>* high) const {
         for (int d = 0; d < 3; d++)
             for (int p : sorted) {
-                const auto [least, most] = std::minmax_element(&centre[d][starts[p]], &centre[d][starts[p + 1]]);
+                const auto [least, most] = std::minmax_element(centre[d].data() + starts[p], centre[d].data() + starts[p + 1]);
                 low[d].push_back(*least), high[d].push_back(*most);
             }
     }
