@@ -13,6 +13,7 @@ from torchcloth.diagnosis.hypotheses import catalogue
 from torchcloth.diagnosis.pieces import runs
 from torchcloth.diagnosis.refined import refined
 from torchcloth.diagnosis.worlds import Worlds
+from torchcloth.identification.nuisances import Held
 
 RECORDING = sheets.episode()
 
@@ -87,3 +88,19 @@ def test_what_does_nothing_on_the_given_mesh_is_not_simulated_on_the_finer(made,
     assert (none.fine, none.refined) == (None, set())
     assert some.fine is not None
     assert some.refined == {0}
+
+
+def test_cells_that_are_seen_for_the_first_time_have_slopes_along_nuisances(made):
+    """All but those of grasps, which would take simulations: else they would seem surer than all others."""
+    model, setting = made
+    whole = gather(model, setting)
+    first = whole.cells[0]
+    places = torch.arange(len(first.key)) % 5 == 0
+    less = replace(whole, cells=[c.rows(~places) if k == 0 else c for k, c in enumerate(whole.cells)])
+    again = gather(model, setting, before=less).cells[0]
+    grasps = len(Held().modes(model.base.cloth, setting.episodes[0]))
+    assert torch.equal(again.key, first.key)
+    count = again.jacobian.shape[1] - grasps
+    assert torch.equal(again.jacobian[:, :count], first.jacobian[:, :count])
+    assert not again.jacobian[places, count:].any()
+    assert torch.equal(again.jacobian[~places, count:], first.jacobian[~places, count:])

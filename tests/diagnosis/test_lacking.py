@@ -129,6 +129,23 @@ def test_what_only_forces_tell_is_counted_where_positions_lack_nothing():
     assert explained(rows(5.0, 5.0), rows(5.0, 1.0)) == 0.0
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "share"),
+    [
+        ((2.2, 2.0), (2.3, 1.0), 1.0),  # a hair more than is tolerated, where it was a hair less, and less in all
+        ((2.2, 2.0), (3.0, 2.0), -0.6),  # it did harm
+        ((2.3, 2.0), (2.4, 1.0), 0.35),  # something was wrong, and most of it still is
+    ],
+)
+def test_a_cause_is_not_doubted_for_what_was_hardly_less_before(monkeypatch, before, after, share):
+    """Case 029 of b3f2eda: a late clock, gaining 135 in log density, left a stretched sheet lacking a little."""
+    toy = toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.0]).double(), 0))
+    told = iter([[row(m, 1e-3 * r) for m, r in zip(("stretch", "swing"), own, strict=True)] for own in (before, after)])
+    monkeypatch.setattr(doubts, "is_lacking", lambda *_: True)
+    monkeypatch.setattr(doubts, "lack_of_fit", lambda *_: next(told))
+    assert doubts.mended(toy, toy, MOTIONS) == pytest.approx(share, abs=0.05)
+
+
 def snapped(found, at, stretches=8):
     """A row of which one stretch is 20 mm off."""
     (left, expected), off = found.stretches[at], 4e-4 / stretches

@@ -23,6 +23,7 @@ from torchcloth import diagnosis, recordings
 from torchcloth.diagnosis import trials
 from torchcloth.diagnosis.comparison import spread
 from torchcloth.diagnosis.trials import Candidate
+from torchcloth.identification import journal as kept
 
 NUMBERS = {
     "youngs_modulus": "membrane_stiffness",
@@ -71,6 +72,7 @@ def main(arguments: list[str] | None = None) -> int:
         return found
 
     trials._compared = compared
+    kept.program = lambda: "whatever decides"  # else every change of the library would begin anew
     answer = diagnosis.diagnose(episodes, journal=journal, resume=journal.exists())
     model, std = answer.model, answer.found.end.covariance.diagonal().sqrt()
     for p, c, s in zip(model.parameters, model.values.tolist(), std.tolist(), strict=False):

@@ -5,7 +5,7 @@ point anywhere. So residuals are first described by a parabola along every coord
 
     r(u) = r + J u + Q u^2,
 
-whose minimum is looked for within that width. Then the same with half the width.
+whose minimum is looked for within that width and the ends of every coordinate. Then the same with half the width.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..identification.bounds import bounded
 from .bursts import calmed
 from .evidence import Evidence, gather
 from .fitting import prior_precision
@@ -40,8 +41,10 @@ def approach(model: Model, setting: Setting, progress: Progress = lambda _: None
         before = before or evidence
         white = calmed(whitened(evidence, unfitted()))
         up, down = white.jacobian.chunk(2, dim=1)
-        slope, bend = 0.5 * (up + down) * width, 0.5 * (up - down) * width
-        u = _lowest(white.value, slope, bend, model.point * prior, width * prior)
+        low, high = ((end - model.point) / width for end in model.ends)
+        slope, bend = _parabola(up * width, down * width, high.clamp(max=1.0), -low.clamp(min=-1.0))
+        reach = low.clamp(min=-FARTHEST), high.clamp(max=FARTHEST)
+        u = _lowest(white.value, slope, bend, model.point * prior, width * prior, reach)
         model = model.at(model.point + u * width)
         if float(u.abs().max()) < THERE:
             break
@@ -58,8 +61,22 @@ def _possible(model: Model, coordinate: int, width: float) -> float:
     return width
 
 
-def _lowest(value: Tensor, slope: Tensor, bend: Tensor, start: Tensor, pull: Tensor, iterations: int = 50) -> Tensor:
-    """[P] minimum of |value + slope u + bend u^2|^2 + |start + pull u|^2 in reach, by damped Gauss-Newton."""
+def _parabola(up: Tensor, down: Tensor, ahead: Tensor, back: Tensor) -> tuple[Tensor, Tensor]:
+    """(J, Q) [C, P] from difference quotients over steps [P] of ``ahead`` and ``back``; straight, where one is none."""
+    bend = torch.where((ahead > 0) & (back > 0), (up - down) / (ahead + back), 0.0)
+    return torch.where(ahead > 0, up - bend * ahead, down), bend
+
+
+def _lowest(
+    value: Tensor,
+    slope: Tensor,
+    bend: Tensor,
+    start: Tensor,
+    pull: Tensor,
+    reach: tuple[Tensor, Tensor],
+    iterations: int = 50,
+) -> Tensor:
+    """[P] minimum of |value + slope u + bend u^2|^2 + |start + pull u|^2 within reach, by damped Gauss-Newton."""
     count = slope.shape[1]
     triangle = torch.linalg.qr(torch.cat([value[:, None], slope, bend], 1)).R
     value, slope, bend = triangle[:, 0], triangle[:, 1 : count + 1], triangle[:, count + 1 :]
@@ -68,8 +85,8 @@ def _lowest(value: Tensor, slope: Tensor, bend: Tensor, start: Tensor, pull: Ten
     for _ in range(iterations):
         r, j = rest(u), torch.cat([slope + 2 * bend * u, torch.diag(pull)])
         square = j.mT @ j
-        step = -torch.linalg.solve(square + damping * torch.diag(square.diagonal()), j.mT @ r)
-        tried = (u + step).clamp(-FARTHEST, FARTHEST)
+        damped = square + damping * torch.diag(square.diagonal())
+        tried = u + bounded(damped, -(j.mT @ r), *(end - u for end in reach))
         better = float(rest(tried).norm()) < float(r.norm())
         u, damping = (tried, 0.3 * damping) if better else (u, 10 * damping)
         if damping > 1e6:

@@ -64,7 +64,7 @@ def plainer(
 
 
 def mended(start: Fitted, end: Fitted, names: Sequence[str], alone: Collection[str] = ()) -> float:
-    """Share of what is wrong that is gone; 1 where nothing is lacking any more.
+    """Share of what is wrong that is gone; 1 where nothing is lacking any more, or was before and less is wrong now.
 
     Of less than half, more is still there: whatever makes it may well do what passed for the causes, too. Where both
     meshes agree about less than half of the motions, the share held out, of all. Of cells that both fits have: points
@@ -76,7 +76,8 @@ def mended(start: Fitted, end: Fitted, names: Sequence[str], alone: Collection[s
     first, left = (lack_of_fit(found, names) for found in alike)
     folded = {row.episode for row in (*first, *left) if not row.stable}
     if 2 * len(folded) <= len(names):
-        return explained(first, left)
+        share = explained(first, left)
+        return share if share < 0 or any(row.lacking for row in first) else 1.0
     before, after = (predict(f, names, alone) for f in weighed_alike(start, end))
     return compare(before, after, floor_of(end.evidence, end.noise)).explained
 

@@ -50,11 +50,11 @@ def gather(
 ) -> Evidence:
     """Simulate every episode at the model's point, beside it, and with each hypothesis at its typical amplitude.
 
-    The nuisances' slopes, which hardly depend on the point, are taken from ``before`` where that is given. Hypotheses
-    that cannot be simulated in one of the episodes are left out. ``shifts`` are (coordinate, step) of the points
-    beside, with a column each; None: central differences along each coordinate. What these miss, a second difference,
-    makes cells ``rough``: another engine's cloth is a few per cent off in effect, and where ripples turn over within
-    that, nothing says how.
+    The nuisances' slopes, which hardly depend on the point, are taken from ``before`` where that has the cell.
+    Hypotheses that cannot be simulated in one of the episodes are left out. ``shifts`` are (coordinate, step) of the
+    points beside, with a column each; None: central differences along each coordinate. What these miss, a second
+    difference, makes cells ``rough``: another engine's cloth is a few per cent off in effect, and where ripples turn
+    over within that, nothing says how.
     """
     raw, shifts = shifts is not None, both_ways(model) if shifts is None else list(shifts)
     own = len(shifts)

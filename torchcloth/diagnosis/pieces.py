@@ -47,7 +47,11 @@ def piece_of(
     else:
         key, slopes, std = known
         coarse = cells_of(base, moved, e, setting.sheet, setting.rest)
-        coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, aligned(coarse.key, key, slopes)], 1))
+        others, new = aligned(coarse.key, key, slopes), ~torch.isin(coarse.key, key)
+        if bool(new.any()):  # seen there for the first time; how grasps move it would take simulations
+            anew = cells_of(base, nuisances(world, base, [], e)[0], e, setting.sheet, setting.rest)
+            others[new, : anew.jacobian.shape[1]] = aligned(coarse.key, anew.key, anew.jacobian)[new]
+        coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, others], 1))
     finer_cells = cells_of(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest)  # type: ignore[arg-type]
     kept, difference = _replaced(_woven(coarse, finer_cells, sides), finer_cells)
     return Piece(kept, std, difference, torch.tensor(able, dtype=torch.bool))
