@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+EXACT = "donot_use_mm_for_euclid_dist"  # of cdist: squares of 30 m have no digits for millimetres in float32
 AT_ONCE = 200  # torch's SEARCHSORTED_GRAIN_SIZE: a search for more wakes its threads, which then keep processors busy
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ._math import cross, dot
+from ._math import EXACT, cross, dot
 from .model import Model, centroids, corners, surface
 from .transfer import FADING, RANGE, SKIN, TOUCH, Grid, Stencil, push, stencil, velocity_gradient
 from .types import ClothState, Surface
@@ -18,7 +18,6 @@ from .types import ClothState, Surface
 # Substeps between checkpoints of a long interval: memory ~ frames + CHUNK, one extra forward pass. Near layers are
 # searched again at each, as substeps that are computed anew start there.
 CHUNK = 48
-EXACT = "donot_use_mm_for_euclid_dist"  # by differences: squares of 30 m have no digits for millimetres in float32
 
 
 class Layers(NamedTuple):

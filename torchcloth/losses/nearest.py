@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._math import cross
+from .._math import EXACT, cross
 from ..engine.library import at_hand
 from ..errors import InvalidInput
 
@@ -61,7 +61,7 @@ def _near(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
     """Pairs (point [M], triangle [M]), by points, that leave out only triangles beyond another's farthest place."""
     centre = corners.mean(1)
     radius = (corners - centre[:, None]).norm(dim=-1).amax(1)
-    distance = torch.cdist(points, centre, compute_mode="donot_use_mm_for_euclid_dist")
+    distance = torch.cdist(points, centre, compute_mode=EXACT)
     slack = 1 + 16 * torch.finfo(points.dtype).eps
     reach = slack * (distance + radius).amin(1, keepdim=True)
     point, triangle = (distance - radius <= reach).nonzero(as_tuple=True)

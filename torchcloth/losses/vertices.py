@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .._math import EXACT
 from ..errors import InvalidInput
 from .shapes import check_places, taken
 
@@ -28,5 +29,5 @@ def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
         raise InvalidInput("points", got=points.dtype, expected=f"the vertices' precision, {vertices.dtype}")
     with torch.no_grad():
         # by products of the coordinates, distances would lose their digits far from the origin
-        nearest = torch.cdist(points, vertices, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
+        nearest = torch.cdist(points, vertices, compute_mode=EXACT).argmin(-1)
     return (points - vertices[nearest]).norm(dim=-1).mean()
