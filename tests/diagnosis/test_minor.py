@@ -151,16 +151,48 @@ def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
     assert doubts.plainer(current, steps, None, [], print) == (current, steps)  # type: ignore[arg-type]
 
 
+def row_of(shows: bool, decision: str = "present", worth: float = 10.0) -> SimpleNamespace:
+    """What screening said of a cause."""
+    return SimpleNamespace(shows=shows, decision=decision, worth=worth)
+
+
 @pytest.mark.parametrize(
-    ("twin", "shows", "low", "worth"),
-    [("p", True, 1.0, True), ("p", True, -1.0, False), ("p", False, 1.0, False), ("", True, 1.0, False)],
+    ("twin", "row", "low", "worth"),
+    [
+        ("p", row_of(True), 1.0, True),
+        ("p", row_of(True), -1.0, False),
+        ("p", row_of(False), 1.0, False),
+        ("", row_of(True), 1.0, False),
+        ("p", row_of(True, worth=60.0), -1.0, True),
+        ("p", row_of(True, "inconclusive", 60.0), -1.0, False),
+        ("p", row_of(False, worth=60.0), -1.0, False),
+        ("", row_of(True, worth=60.0), -1.0, False),
+    ],
 )
-def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, shows, low, worth):
-    """It mends nothing beside the parameter that has done it."""
+def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, row, low, worth):
+    """It mends nothing beside the parameter that has done it, and hardly predicts better where the sheet is far off."""
     gain = Gain(1e-3, 1e-3, 5.0, (low, 9.0), 0.0, (0.0, 0.0), (1e-3, 1e-3), (0.0, 0.0), low)
     fitted = SimpleNamespace(model=SimpleNamespace(parameters=[toys.parameter("p")]))
-    row = SimpleNamespace(shows=shows)
-    c = SimpleNamespace(hypothesis=toys.hypothesis("m", twin=twin), fitted=fitted, row=row)
+    c = SimpleNamespace(hypothesis=toys.hypothesis("m", twin=twin), fitted=fitted, row=row, relieves=False)
+    assert trials.worth_naming(c, gain) == worth  # type: ignore[arg-type]
+    assert not trials.worthwhile(gain)
+    assert not trials.worth_naming(c, gain._replace(density=3.0, least=-2.0))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("relieves", "low", "after", "worth"),
+    [
+        (True, 13.0, 0.999e-3, True),
+        (True, 11.0, 0.999e-3, False),
+        (False, 13.0, 0.999e-3, False),
+        (True, 13.0, 1.001e-3, False),
+    ],
+)
+def test_what_a_bent_number_did_of_a_cause_is_not_asked_to_be_mended(relieves, low, after, worth):
+    """Orthotropy of half its size (050 of b3f2eda) gained 44: most of its millimetres had gone into stiffening."""
+    gain = Gain(1e-3, after, 20.0, (low, 30.0), 0.0, (0.0, 0.0), (1e-3, 0.995e-3), (2e-4, 3e-3), low)
+    fitted = SimpleNamespace(model=SimpleNamespace(parameters=[toys.parameter("p")]))
+    c = SimpleNamespace(hypothesis=toys.hypothesis("m"), fitted=fitted, row=row_of(False), relieves=relieves)
     assert trials.worth_naming(c, gain) == worth  # type: ignore[arg-type]
     assert not trials.worthwhile(gain)
 

@@ -17,7 +17,19 @@ from .noise import floor_of
 from .repeats import Repeats, pairs_of, repeats
 from .screening import MUCH, Row, screen
 from .setting import Progress, Setting, staged
-from .trials import FEWEST, FURTHER, SURELY, TRIED, Candidate, Step, alone_in, begun_with, one_step, worsens
+from .trials import (
+    FEWEST,
+    FURTHER,
+    SURELY,
+    TRIED,
+    Candidate,
+    Step,
+    alone_in,
+    begun_with,
+    one_step,
+    twin_of_fitted,
+    worsens,
+)
 from .world import Hypothesis, Model
 from .worlds import if_possible
 
@@ -214,7 +226,8 @@ def _chain(
         current, steps = pruned(current, steps, setting, hypotheses, progress)
     share = mended(start, current, setting.names, alone_in(steps)) if steps else 1.0
     little = share < LEAST or (share < HALF and unheard(start, current, steps, setting.names))
-    if little or (steps and worsens(_of_all(start, current, steps, setting))):
+    number = any(twin_of_fitted(step.best) for step in steps)
+    if little or (steps and not number and worsens(_of_all(start, current, steps, setting))):
         return nothing
     return Chain(current, steps, setting)
 

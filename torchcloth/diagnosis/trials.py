@@ -47,6 +47,7 @@ class Candidate:
     gain: Gain  # over the model without it
     alone: set[str]  # the motion that alone tells of it, if any
     sure: float  # standard errors between motions that it must be away from zero
+    relieves: bool = False  # a fitted number that had left its data sheet is back with it
 
     @property
     def hypothesis(self) -> Hypothesis:
@@ -183,13 +184,15 @@ def _compared(
 ) -> list[Candidate]:
     """Each fit beside the model without it, on motions held out; all by one noise, on the cells of ``like``."""
     before, out = renoised(current, noise, like), []
+    strained = {p.name for p, _ in current.model.strained}
     for row, found in fits:
         after = renoised(found, noise, like)
         alone = telling(after, names)
         predicted = predict(after, names, alone)
         gain = compare(predict(before, names, alone), predicted, 0.0)
         sure = standard_errors(gain, heard(predicted.episode, names), alone, not current.model.accepted)
-        out.append(Candidate(row, found, predicted, gain, alone, sure))
+        relieves = bool(strained - {p.name for p, _ in found.model.strained})
+        out.append(Candidate(row, found, predicted, gain, alone, sure, relieves))
     return out
 
 
@@ -257,9 +260,20 @@ def known(found: Fitted, name: str, names: Sequence[str], c: Candidate, most: fl
 
 
 def worth_naming(c: Candidate, gain: Gain) -> bool:
-    """As ``worthwhile``; what a parameter does already beside its data sheet must show there, and surely be a gain."""
-    twin = bool(c.hypothesis.twin) and c.hypothesis.twin in (p.name for p in c.fitted.model.parameters)
-    return gain.least > 0 if twin and c.row.shows else worthwhile(gain)
+    """As ``worthwhile``, or what a number of the fabric did until then, far from its data sheet, and surely a gain.
+
+    Beside such a number little is left to mend. What is the same as one that is fitted (a twin) must show beside the
+    sheet; it can hardly predict better, so that the sheet is surely wrong by much may stand for its gain.
+    """
+    if twin_of_fitted(c) and c.row.shows:
+        much = c.row.decision == "present" and c.row.worth > VERY_MUCH and gain.density > CLEAR
+        return much or gain.least > 0
+    return worthwhile(gain) or (c.relieves and gain.least > SURELY and not worsens(gain))
+
+
+def twin_of_fitted(c: Candidate) -> bool:
+    """A number that is fitted anyway is the same."""
+    return bool(c.hypothesis.twin) and c.hypothesis.twin in (p.name for p in c.fitted.model.parameters)
 
 
 def worthwhile(gain: Gain) -> bool:
