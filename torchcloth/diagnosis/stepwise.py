@@ -26,8 +26,8 @@ from .trials import (
     Step,
     alone_in,
     begun_with,
+    far_from_sheet,
     one_step,
-    twin_of_fitted,
     worsens,
 )
 from .world import Hypothesis, Model
@@ -226,8 +226,8 @@ def _chain(
         current, steps = pruned(current, steps, setting, hypotheses, progress)
     share = mended(start, current, setting.names, alone_in(steps)) if steps else 1.0
     little = share < LEAST or (share < HALF and unheard(start, current, steps, setting.names))
-    number = any(twin_of_fitted(step.best) for step in steps)
-    if little or (steps and not number and worsens(_of_all(start, current, steps, setting))):
+    far = any(far_from_sheet(step.best, step.best.gain) for step in steps)
+    if little or (steps and not far and worsens(_of_all(start, current, steps, setting))):
         return nothing
     return Chain(current, steps, setting)
 

@@ -263,17 +263,21 @@ def worth_naming(c: Candidate, gain: Gain) -> bool:
     """As ``worthwhile``, or what a number of the fabric did until then, far from its data sheet, and surely a gain.
 
     Beside such a number little is left to mend. What is the same as one that is fitted (a twin) must show beside the
-    sheet; it can hardly predict better, so that the sheet is surely wrong by much may stand for its gain.
+    sheet instead.
     """
-    if twin_of_fitted(c) and c.row.shows:
-        much = c.row.decision == "present" and c.row.worth > VERY_MUCH and gain.density > CLEAR
-        return much or gain.least > 0
+    if _twin(c):
+        return gain.least > 0 or far_from_sheet(c, gain)
     return worthwhile(gain) or (c.relieves and gain.least > SURELY and not worsens(gain))
 
 
-def twin_of_fitted(c: Candidate) -> bool:
-    """A number that is fitted anyway is the same."""
-    return bool(c.hypothesis.twin) and c.hypothesis.twin in (p.name for p in c.fitted.model.parameters)
+def far_from_sheet(c: Candidate, gain: Gain) -> bool:
+    """A twin of a number that is surely far off: with that number bent it predicts as well, and need not gain more."""
+    return _twin(c) and c.row.decision == "present" and c.row.worth > VERY_MUCH and gain.density > CLEAR
+
+
+def _twin(c: Candidate) -> bool:
+    """The same as a number that is fitted anyway, and shows beside its data sheet."""
+    return bool(c.hypothesis.twin) and c.hypothesis.twin in (p.name for p in c.fitted.model.parameters) and c.row.shows
 
 
 def worthwhile(gain: Gain) -> bool:
