@@ -83,7 +83,7 @@ def _start(engine: str, quantity: Any, plan: Plan) -> Record:
     environment = {**os.environ, "OMP_NUM_THREADS": str(plan.threads)}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
     if done.returncode:
-        raise Failed(f"start-up of {engine}: {done.stderr.strip().splitlines()[-1]}")
+        raise Failed(f"start-up of {engine}: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
     answer = json.loads(done.stdout.splitlines()[-1])
     wrong = guards.problems(task.scene(), task.substeps, np.array(answer.pop("x")))
     if wrong:

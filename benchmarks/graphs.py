@@ -10,7 +10,7 @@ import argparse
 
 import torch
 
-from .paths import motion, seconds, sheet
+from .paths import LIKE, motion, seconds, sheet
 
 WAYS = {"fused, CPU": ("cpu", "fused"), "one by one": ("cuda", "reference"), "graphs": ("cuda", "auto")}
 AGREE = 1e-4  # m, in float32
@@ -31,7 +31,7 @@ def main() -> None:
     times = [k / 30 for k in range(options.frames + 1)]
     rows = []
     for scenes in options.scenes:
-        ends = []
+        ends, slopes = [], []
         for name, (device, engine) in WAYS.items():
             cloth = sheet(engine, python=False).to(device)
             state = cloth.rest_state().map(lambda t, n=scenes: t.expand(n, *t.shape).clone())
@@ -48,10 +48,13 @@ def main() -> None:
 
             value, end = seconds(forward, options.repeats)
             ends.append(end)
-            rows.append((scenes, name, value, seconds(gradient, options.repeats)[0]))
+            slope, along = seconds(gradient, options.repeats)
+            slopes.append(along)
+            rows.append((scenes, name, value, slope))
             substeps = sum(cloth.plan(state, driven, times, None).counts)
-        for end in ends[1:]:
+        for end, along in zip(ends[1:], slopes[1:], strict=True):
             torch.testing.assert_close(end, ends[0], rtol=0, atol=AGREE)
+            torch.testing.assert_close(along, slopes[0], rtol=LIKE, atol=0)
     print(f"{substeps} substeps of 800 triangles, {torch.get_default_dtype()}, {torch.cuda.get_device_name()}\n")
     print("| scenes | path | forward | gradient | a substep and scene |\n|---|---|---|---|---|")
     for scenes, name, value, slope in rows:

@@ -18,6 +18,7 @@ from torchcloth.effects import AbstractEffect, Amplitude
 from torchcloth.engine.choice import Setting
 from torchcloth.sensitivities import Directions
 
+LIKE = 1e-2  # relative, of slopes in float32
 T = TypeVar("T")
 PATHS: dict[str, tuple[Setting, bool]] = {
     "fused": ("fused", False),
@@ -96,16 +97,21 @@ def main() -> None:
         def gradient(cloth=cloth, state=state, driven=driven):
             cloth.zero_grad()
             cloth(state, driven, times).x.pow(2).sum().backward()
+            return torch.stack([cloth.get_parameter(name).grad for name in FABRIC])
 
         def tangents(cloth=cloth, state=state, driven=driven, along=along):
             return cloth.sensitivities(state, driven, times, along=along)
 
         best, out = seconds(forward, options.repeats)
-        ends.append(out.x)
-        rows.append((name, best, seconds(gradient, options.repeats)[0], seconds(tangents, options.repeats)[0]))
+        slope, slopes = seconds(gradient, options.repeats)
+        moves, (_, moved) = seconds(tangents, options.repeats)
+        ends.append((out.x, slopes, moved.x))
+        rows.append((name, best, slope, moves))
         substeps = sum(cloth.plan(state, driven, times, None).counts)
-    for x in ends[1:]:
-        torch.testing.assert_close(x, ends[0], rtol=0, atol=1e-4)
+    for x, slopes, moved in ends[1:]:
+        torch.testing.assert_close(x, ends[0][0], rtol=0, atol=1e-4)
+        torch.testing.assert_close(slopes, ends[0][1], rtol=LIKE, atol=LIKE * float(ends[0][1].abs().max()))
+        torch.testing.assert_close(moved, ends[0][2], rtol=LIKE, atol=LIKE * float(ends[0][2].abs().max()))
     print(f"{substeps} substeps of 800 triangles, {torch.get_num_threads()} thread(s), {torch.get_default_dtype()}\n")
     print(f"| path | forward | gradient | {len(FABRIC)} tangents | per substep |\n|---|---|---|---|---|")
     for name, value, slope, moves in rows:

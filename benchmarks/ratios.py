@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from .suite import Record
 
 CONVENTIONS = {
-    "seconds": "median over samples of one whole run; contestants took turns within this one call",
+    "seconds": "median over samples of one whole run; contestants of one case and quantity took turns, others ran a "
+    "while before or after in this one call: ratios *_default_*, *_vs_forward* and batch* are of different moments",
     "substeps": "of 1.6e-4 s; ms_per_substep is seconds by substeps, of all scenes of a batch together",
     "ratios *_vs_taichi, *_vs_warp, *_vs_newton, *_vs_mujoco, *_vs_eager": "time of the other over torchcloth's: above "
     "1, torchcloth is faster",

@@ -14,6 +14,7 @@ import torch
 
 from torchcloth._files import as_json, write_text
 from torchcloth.errors import InvalidInput, RecordingError, TorchclothError
+from torchcloth.identification.journal import program
 
 Case = Callable[[], dict[str, Any]]
 
@@ -23,14 +24,14 @@ class Kept:
 
     Args:
         folder: new, or one that holds a study of the same settings.
-        settings: what all cases depend on; plain JSON.
+        settings: what all cases depend on, besides the library's code; plain JSON.
 
     Raises:
-        InvalidInput: the folder holds a study of other settings, or is a file.
+        InvalidInput: the folder holds a study of other settings or by other code, or is a file.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
-        self.folder, self.settings = folder, dict(settings)
+        self.folder, self.settings = folder, of_this_code(settings)
         check_settings(folder, self.settings)
 
     def begin(self) -> None:
@@ -120,6 +121,11 @@ def guarded(name: str, what: str, work: Callable[[], object]) -> int:
         return 130
 
 
+def of_this_code(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with a fingerprint of the library: results of two versions are no study."""
+    return {**settings, "code": program()}
+
+
 def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
     """Raises InvalidInput where the folder cannot hold a study of these settings."""
     if folder.exists() and not folder.is_dir():
@@ -130,6 +136,8 @@ def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
         return
     except ValueError:
         raise unreadable(folder / "study.json") from None
+    if not isinstance(found, dict):
+        raise unreadable(folder / "study.json")
     other = {key: found.get(key) for key in settings if found.get(key) != settings[key]}
     if not other:
         return

@@ -6,12 +6,15 @@ from a secret. Twenty numbers in a row hold every family at its share.
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import beside  # noqa: F401
 import numpy as np
 from effects import CATALOGUE
-from partners import OUTSIDE, PAIRS, SINGLES, Partner
+from partners import DRAGGED, FOLDED, OUTSIDE, PAIRS, SINGLES, Partner
+from sensor import EYE, TARGET
 
 DEVELOPMENT, SEALED = 1000, 100_000
 HALF, FULL, MORE = 0.5, 1.0, 1.5  # of typical
@@ -55,6 +58,9 @@ REDUCED = Size(29, 13, (*_COMMON, ("shake", 0.0, 1.5)), (*_COMMON, ("drag-fast",
 _FAST: Plan = ("swing-fast", 0.0, 1.3)
 SMALL = Size(21, 9, (_FAST, ("turn", 0.0, 3.0)), (_FAST, ("drag-fast", 0.0, 1.3)), 0.0785, (0.075, 0.075))
 UNSEEN: Plan = ("swing", 45.0, 1.4)  # of no case
+LIKE_OTHERS = 0.4  # share of cases on a table with one of the motions that some effects need: those tell nothing, then
+START = 0.02  # m, within which nobody puts a sheet down more exactly
+CAMERA, ROLL = 0.05, 0.03  # m and rad, standard deviations of where a rig's camera stands and looks, and how level
 
 
 @dataclass(frozen=True)
@@ -75,6 +81,7 @@ class Take:
     heading: float  # degrees
     speed: float
     own: tuple[Hidden, ...] = ()  # differs from episode to episode
+    start: tuple[float, float] = (0.0, 0.0)  # m, by which the sheet and the grippers are beside the usual place
 
 
 @dataclass(frozen=True)
@@ -90,6 +97,7 @@ class Case:
         bias, occlusion: of the sensor; diagonals: of the truth's mesh.
         pad: m, that grippers hold.
         forces: measured.
+        camera: where it is, of the sensor.
         fault: of the recording, or "".
     """
 
@@ -108,6 +116,7 @@ class Case:
     pad: float = 0.05
     forces: bool = True
     fault: str = ""
+    camera: dict[str, Any] = field(default_factory=dict)
 
     @property
     def sealed(self) -> bool:
@@ -116,7 +125,7 @@ class Case:
 
     def take(self, plan: Plan) -> Take:
         """A further episode of this case with another motion."""
-        return Take(*plan)
+        return Take(*plan, start=_start(self.seed, plan))
 
 
 def case(seed: int, size: Size = REDUCED) -> Case:
@@ -141,12 +150,14 @@ def case(seed: int, size: Size = REDUCED) -> Case:
         "next experiment": _next,
     }[family]
     parts = {"kind": "", "effects": (), "plans": _plans(size, rng)} | draw(rng, turn, slot, size)
-    regrasp = parts.pop("regrasp", 0.0)
-    takes = _balanced(tuple(_take(plan, regrasp, rng) for plan in parts.pop("plans")), regrasp)
+    regrasp, plans = parts.pop("regrasp", 0.0), _like_others(parts.pop("plans"), seed, size)
+    takes = _balanced(tuple(_take(plan, regrasp, rng) for plan in plans), regrasp)
+    takes = [replace(take, start=_start(seed, (take.motion, take.heading, take.speed))) for take in takes]
     order = rng.permutation(len(takes))
     given = {"nodes": size.nodes, "fabric": _fabric(rng), "said": _sheet(rng, 0.15)} | parts
     pad = float(np.random.default_rng([seed, 17]).uniform(*size.pads))
-    return Case(seed, family, size=size, takes=tuple(takes[k] for k in order), pad=pad, **given)
+    ordered = tuple(takes[k] for k in order)
+    return Case(seed, family, size=size, takes=ordered, pad=pad, camera=_camera(seed), **given)
 
 
 def sealed(secret: int, count: int) -> list[int]:
@@ -161,6 +172,28 @@ def sealed(secret: int, count: int) -> list[int]:
 
 def _plans(size: Size, rng: np.random.Generator) -> tuple[Plan, ...]:
     return size.table if rng.random() < 0.5 else size.free
+
+
+def _like_others(plans: tuple[Plan, ...], seed: int, size: Size) -> tuple[Plan, ...]:
+    """Of the usual motions on a table some for others, which would else tell of friction or creases."""
+    rng = np.random.default_rng([seed, 23])
+    if size != REDUCED or plans != size.table or rng.random() > LIKE_OTHERS:
+        return plans
+    others = (DRAGGED, FOLDED)[int(rng.integers(2))]
+    return (*plans[: len(plans) - len(others)], *others)
+
+
+def _start(seed: int, plan: Plan) -> tuple[float, float]:
+    """Where a sheet is put down: equal places in all episodes would show whatever is off by a millimetre."""
+    x, y = np.random.default_rng([seed, 21, zlib.crc32(repr(plan).encode())]).uniform(-START, START, 2)
+    return float(x), float(y)
+
+
+def _camera(seed: int) -> dict[str, Any]:
+    """A case's rig: where all cameras stand alike, a false pose can be read off."""
+    rng = np.random.default_rng([seed, 19])
+    eye, target = (tuple((np.array(p) + CAMERA * rng.standard_normal(3)).tolist()) for p in (EYE, TARGET))
+    return {"eye": eye, "target": target, "roll": float(ROLL * rng.standard_normal())}
 
 
 def _where(size: Size, rng: np.random.Generator, *names: str) -> tuple[Plan, ...]:

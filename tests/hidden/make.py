@@ -26,6 +26,7 @@ from torchcloth import recordings
 from torchcloth.errors import TorchclothError
 
 FEWEST = 9  # vertices along a side
+LAST = 0.05  # s, longer than any clock is early
 SAID_BY = "synthetic: an engine of its own"
 
 
@@ -40,7 +41,7 @@ def scenes(found: Case, take: Take) -> tuple[Scene, Scene]:
         membrane_stiffness=fabric["membrane_stiffness"],
     )
     plate = replace(plain.plate, stiffness=fabric["bending_stiffness"])
-    sensor = replace(plain.sensor, bias=found.bias, occlusion=found.occlusion)
+    sensor = replace(plain.sensor, bias=found.bias, occlusion=found.occlusion, **found.camera)
     true = replace(plain, sheet=sheet, plate=plate, sensor=sensor, grip=replace(plain.grip, radius=found.size.pad))
     said = replace(
         true,
@@ -66,9 +67,11 @@ def _hidden(scene: Scene, effect: Hidden) -> Scene:
 def episode(found: Case, take: Take, number: int) -> recordings.Recording:
     """One episode; ``number`` keeps its noise apart from the others'."""
     true, said = scenes(found, take)
-    moved = motion(take.motion, true.sheet, take.heading, take.speed)
+    moved = motion(take.motion, true.sheet, take.heading, take.speed, take.start)
     result = simulate(true, moved)
     made = record(true, moved, result, take.motion, [found.seed, number], found.size.fit, said=said)
+    if made.points is not None:  # an early clock sees nothing of the end: nobody may count its frames
+        made = replace(made, points=made.points.only(made.points.t <= moved.t[-1] - LAST))
     if not found.forces:
         made = replace(made, grippers={k: replace(g, force=None, torque=None) for k, g in made.grippers.items()})
     wrong = np.random.default_rng([found.seed, 13])  # the same in all episodes
@@ -110,10 +113,10 @@ def _enough(nodes: int) -> int:
 def _asked(found: Case, options: argparse.Namespace) -> list[tuple[int, Take]]:
     count = len(found.takes)
     if options.unseen:
-        return [(count + 1, Take(*UNSEEN))]
+        return [(count + 1, found.take(UNSEEN))]
     if options.motion:
         key = zlib.crc32(f"{options.motion} {options.heading} {options.speed}".encode())
-        return [(count + 2 + key % 1000, Take(options.motion, options.heading, options.speed))]
+        return [(count + 2 + key % 1000, found.take((options.motion, options.heading, options.speed)))]
     return list(enumerate(found.takes, 1))
 
 

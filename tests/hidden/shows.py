@@ -68,7 +68,7 @@ def means(found: Case, name: str = "", change: float = 0.0) -> Array:
     places, forces = [], []
     for take in found.takes:
         scene, _ = scenes(found, take)
-        moved = motion(take.motion, scene.sheet, take.heading, take.speed)
+        moved = motion(take.motion, scene.sheet, take.heading, take.speed, take.start)
         result = simulate(scene, moved)
         x = evenly(scene, result.x)
         uv = grid(scene.sheet)[0] / [scene.sheet.width, scene.sheet.height]

@@ -10,13 +10,15 @@ import again
 import drawn
 import numpy as np
 import pytest
-from drawn import DEVELOPMENT, ROUND, SEALED, SMALL, case, sealed
+from drawn import DEVELOPMENT, ROUND, SEALED, SMALL, Hidden, case, sealed
 from effects import CATALOGUE
 from faults import FAULTS
 from make import episode, main, scenes
-from motions import LYING
+from motions import LYING, motion
 from partners import LEFT_OUT, OUTSIDE, PAIRS, SINGLES
 from reveal import truth
+from scene import believed
+from sensor import pinhole
 from shows import rms, shown
 from test_independence import forbidden
 
@@ -121,6 +123,48 @@ def test_an_episode_says_nothing_of_what_it_holds(tiny, tmp_path):
     assert one.truth is None
     assert one.split["motion"] == "drag-fast"
     assert 1e-5 < np.abs(one.points.xyz[-250:] - two.points.xyz[-250:]).max() < 0.05  # but the cloth moved otherwise
+
+
+def places(found, take):
+    """What a recording says of where its camera and its grippers are, to a micrometre."""
+    true, _ = scenes(found, take)
+    pose = believed(true.grip, motion(take.motion, true.sheet, take.heading, take.speed, take.start).pose["left"])
+    return [*pinhole(true.sensor)["T_world_camera"].ravel(), *pose[0, :3, 3]]
+
+
+@pytest.mark.parametrize("name", ["obs.extrinsic", "obs.rotation", "robot.base"])
+def test_a_false_pose_cannot_be_told_from_the_true_ones_of_others(name):
+    """Where all true ones are alike, false ones can be read off."""
+    nulls = [c for c in map(case, range(300)) if c.family == "null"]
+    effects = drawn._hide(name, 1.0, np.random.default_rng(7), SINGLES)
+    usual, wrong = (
+        np.array([places(c, take) for c in cases for take in c.takes])
+        for cases in (nulls, [replace(c, effects=effects) for c in nulls])
+    )
+    moved = wrong.mean(0) - usual.mean(0)
+    assert np.abs(moved).max() > 1e-3
+    assert (np.abs(moved) <= usual.std(0)).all()
+    assert len(np.unique(usual[:, 3].round(6))) == len(nulls)  # each has its own camera
+    assert len(np.unique(usual[:, -3].round(6))) == len(usual)  # and each episode its own start
+
+
+@pytest.mark.parametrize("name", ["obs.clock", "air.drag_n"])
+def test_frames_are_as_many_whatever_is_hidden(tiny, name):
+    found = drawn.case(0, tiny)
+    counts = set()
+    for amplitude in (-0.045, 0.0, 0.045) if name == "obs.clock" else (0.0, 2.0):
+        recording = episode(replace(found, effects=(Hidden(name, amplitude),)), found.takes[0], 1)
+        counts.add((len(recording.points.t), len(recording.points.xyz)))
+    assert len(counts) == 1
+
+
+def test_motions_that_some_effects_need_are_made_for_others_as_well():
+    """By cases on a table that hide nothing that creases or rubs."""
+    tables = [c for c in map(case, range(1000)) if not {"drag-fast", "fold"}.isdisjoint(t.motion for t in c.takes)]
+    plain = [c for c in tables if not {h.name for h in c.effects} & {"plast.crease", "contact.mu", "contact.aniso"}]
+    with_one = lambda motion: sum(any(t.motion == motion for t in c.takes) for c in plain) / len(plain)  # noqa: E731
+    assert 0.1 < with_one("fold") < 0.35
+    assert 0.1 < with_one("drag") < 0.35
 
 
 def test_the_data_sheet_is_off_and_the_fabric_is_not(tiny):

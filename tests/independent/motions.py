@@ -90,7 +90,9 @@ NAMES = (*HANGING, *LYING)
 GRIPPERS = {"left": 1.0, "right": -1.0}  # side along y
 
 
-def motion(name: str, sheet: SheetSpec, heading: float = 0.0, speed: float = 1.0) -> Motion:
+def motion(
+    name: str, sheet: SheetSpec, heading: float = 0.0, speed: float = 1.0, start: tuple[float, float] = (0.0, 0.0)
+) -> Motion:
     """A motion by name.
 
     Args:
@@ -98,6 +100,7 @@ def motion(name: str, sheet: SheetSpec, heading: float = 0.0, speed: float = 1.0
         sheet: its corners are held.
         heading: degrees about the vertical.
         speed: 2 takes half the time.
+        start: m, x and y by which all of it lies beside the usual place.
 
     Raises:
         InvalidInput: no such motion, or a speed that is not positive.
@@ -115,7 +118,7 @@ def motion(name: str, sheet: SheetSpec, heading: float = 0.0, speed: float = 1.0
     apart = (1.0 if lying else TAUT) * sheet.width + _along(t, knots, plan.apart)
     yaw = np.deg2rad(heading) + _along(t, knots, plan.yaw)
     turn = _about_z(np.full_like(t, np.deg2rad(heading)))
-    centre = PIVOT + np.einsum("kab,kb->ka", turn, home + offset)
+    centre = PIVOT + np.array([*start, 0.0]) + np.einsum("kab,kb->ka", turn, home + offset)
     pose, held = {}, {}
     for gripper, side in GRIPPERS.items():
         pose[gripper] = np.tile(np.eye(4), (len(t), 1, 1))

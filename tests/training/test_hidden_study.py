@@ -9,6 +9,7 @@ import pytest
 
 from torchcloth.diagnosis.experiments import Experiment
 from torchcloth.errors import InvalidInput
+from torchcloth.training import kept
 from torchcloth.training.studies import hidden
 from torchcloth.training.studies.checkout import module
 from torchcloth.training.studies.command import main
@@ -117,7 +118,7 @@ def test_secrets_are_kept_fresh_ones_differ_and_development_is_no_secret(tmp_pat
 
 
 def test_an_answer_that_is_none_says_how_it_ended(monkeypatch, tmp_path):
-    for code, word in ((2, "refused"), (-9, "failed")):
+    for code, word in ((2, "refused"), (1, "failed")):
         ended = Namespace(returncode=code, stdout="", stderr="progress\npoints.npz: t does not increase")
         monkeypatch.setattr(hidden, "_run", lambda command, ended=ended: ended)
         found = hidden.answered([tmp_path / "e1"], tmp_path / word)
@@ -126,6 +127,27 @@ def test_an_answer_that_is_none_says_how_it_ended(monkeypatch, tmp_path):
             "stderr": ["progress", "points.npz: t does not increase"],
         }
         assert json.loads((tmp_path / word / "diagnosis.json").read_text()) == found
+
+
+def test_an_answer_stays_once_its_truth_may_be_open(monkeypatch, tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "diagnosis.json").write_text(json.dumps(ANSWER))
+    monkeypatch.delattr(hidden, "_run")
+    assert hidden.answered([tmp_path / "e1"], tmp_path / "a") == ANSWER
+
+
+def test_what_the_system_kills_is_no_answer(monkeypatch, tmp_path):
+    monkeypatch.setattr(hidden, "_run", lambda _: Namespace(returncode=-9, stdout="", stderr=""))
+    with pytest.raises(KeyboardInterrupt):
+        hidden.answered([tmp_path / "e1"], tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+def test_one_round_is_of_one_code(called, tmp_path, monkeypatch):
+    hidden.run(options(tmp_path, seed=9, cases=1))
+    monkeypatch.setattr(kept, "program", lambda: "another")
+    with pytest.raises(InvalidInput, match="holds a study with code"):
+        hidden.run(options(tmp_path, cases=2))
 
 
 def test_a_diagnosis_that_was_stopped_is_no_answer_and_goes_on(monkeypatch, tmp_path):
@@ -176,6 +198,12 @@ def test_a_case_that_needs_no_experiment_tells_nothing_of_experiments():
     none = {"proposed": None, "random": None}
     resolved = lambda answer, later: hidden.scored("1", {"truth": truth, "answer": answer, "next": later})["resolved"]  # noqa: E731
     assert resolved(sure, none) is None
+    assert (
+        resolved(
+            ANSWER | {"causes": [cause, cause | {"rivals": [{"effect": "my.own"}]}]}, {"proposed": sure, "random": sure}
+        )
+        is None
+    )
     assert resolved(unsure, none) is False
     assert resolved(unsure, {"proposed": sure, "random": unsure}) is True
     assert resolved(unsure, {"proposed": unsure, "random": unsure}) is False

@@ -202,7 +202,8 @@ def _chain(
             screened = screen(current)
             begun = begun_with(current, screened, tried)
             begun += [] if other is None else begun_with(other, screen(other), tried)
-            step = one_step(current, setting, begun, screened, progress)
+            more = begun_with(current, screened, tried, after=tried)
+            step = one_step(current, setting, begun, screened, progress, more)
         if step is None:
             break
         best, before, cells = step.best.fitted, current, (start, setting)

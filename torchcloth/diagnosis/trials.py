@@ -97,9 +97,9 @@ def _likely(screened: Sequence[Row]) -> list[Row]:
     return sorted(likely, key=lambda r: -r.worth)
 
 
-def begun_with(found: Fitted, screened: Sequence[Row], tried: int) -> list[tuple[Row, Model]]:
-    """The likeliest causes, each with the model to which one leap leads."""
-    return [(row, with_cause(found, row.hypothesis)) for row in _likely(screened)[:tried]]
+def begun_with(found: Fitted, screened: Sequence[Row], tried: int, after: int = 0) -> list[tuple[Row, Model]]:
+    """The likeliest causes ``after`` so many, each with the model to which one leap leads."""
+    return [(row, with_cause(found, row.hypothesis)) for row in _likely(screened)[after : after + tried]]
 
 
 def one_step(
@@ -108,8 +108,11 @@ def one_step(
     begun: Sequence[tuple[Row, Model]],
     screened: list[Row],
     progress: Progress,
+    more: Sequence[tuple[Row, Model]] = (),
 ) -> Step | None:
     """The best of what was ``begun`` that is worth its name, with what cannot be told from it; None: nothing is.
+
+    Where what predicts best is larger than is believed, what looks like it may be among the next likely ones.
 
     Args:
         current: the model so far, asked about what was begun.
@@ -117,29 +120,17 @@ def one_step(
         begun: (row as screened, model to fit) of each.
         screened: all rows, for the record.
         progress: called with one line for each episode that is simulated.
+        more: as ``begun``, tried where that leads to nothing that can be believed.
     """
-    fits: list[tuple[Row, Fitted]] = []
-    by = to_fit_by(current.noise)
-    for row, model in begun:
-        trial = staged(progress, f"trying {row.hypothesis.name}")
-        with suppress(*IMPOSSIBLE):
-            fits.append((row, fit(model, setting, (), 0, trial, by, current.evidence)))
-    if not fits:
+    likely = _tried(current, setting, begun, progress)
+    if not likely:
         return None
-    common = lambda like, fits: shared(like, [current.evidence, *(f.evidence for _, f in fits)])  # noqa: E731
-    judged = lambda fits, every: _compared(  # noqa: E731
-        current, fits, setting.names, current.noise, common(current.evidence, every)
-    )
-    likely = judged(fits, fits)
-    settled = _settled(likely, setting, progress)
-    first, further = [fits[k] for k in settled], list(settled.values())
-    both = (judged(own, [*fits, *further]) for own in (first, further))
-    for k, before, after in zip(settled, *both, strict=True):
-        likely[k] = _better(before, after)
+    if more and not _plausible(max(likely, key=lambda c: c.gain.density)):
+        likely += _tried(current, setting, more, progress)
     likeliest = max(likely, key=lambda c: c.gain.density).fitted.evidence
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
     fits = [(c.row, c.fitted) for c in likely]
-    noise, like = fit_noise(likeliest), common(likeliest, fits)
+    noise, like = fit_noise(likeliest), _common(likeliest, current, fits)
     tried = _compared(current, fits, setting.names, noise, like)
     useful = _ranked(_themselves([c for c in tried if _useful(c, setting.names)]))
     others = [c for c in tried if c not in useful]
@@ -155,6 +146,33 @@ def one_step(
     rivals = {c.hypothesis.name: c for c in reversed(possible) if c is not best and _rival(c, alike(c), best)}
     rivals |= {c.hypothesis.name: c for c in others if _open(c, alike(c), best)}
     return Step(best, chance, tried, [*reversed(rivals.values())], screened, current, noise)
+
+
+def _tried(
+    current: Fitted, setting: Setting, begun: Sequence[tuple[Row, Model]], progress: Progress
+) -> list[Candidate]:
+    """What was begun, fitted as far as that leads, beside the model without it; less what cannot be simulated."""
+    fits: list[tuple[Row, Fitted]] = []
+    by = to_fit_by(current.noise)
+    for row, model in begun:
+        trial = staged(progress, f"trying {row.hypothesis.name}")
+        with suppress(*IMPOSSIBLE):
+            fits.append((row, fit(model, setting, (), 0, trial, by, current.evidence)))
+    judged = lambda fits, every: _compared(  # noqa: E731
+        current, fits, setting.names, current.noise, _common(current.evidence, current, every)
+    )
+    likely = judged(fits, fits)
+    settled = _settled(likely, setting, progress)
+    first, further = [fits[k] for k in settled], list(settled.values())
+    both = (judged(own, [*fits, *further]) for own in (first, further))
+    for k, before, after in zip(settled, *both, strict=True):
+        likely[k] = _better(before, after)
+    return likely
+
+
+def _common(like: Evidence, current: Fitted, fits: Sequence[tuple[Row, Fitted]]) -> Evidence:
+    """On the cells that all of these have."""
+    return shared(like, [current.evidence, *(f.evidence for _, f in fits)])
 
 
 def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> dict[int, tuple[Row, Fitted]]:
@@ -221,14 +239,14 @@ def _open(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
     """Predicts clearly better, though motions do not agree how large it is: the best of the others is not the cause."""
     h = c.hypothesis
     stands_in = bool(h.brings) and not h.matters(c.amplitude)
-    if h.effect == best.hypothesis.effect or stands_in or not (worth_naming(c, c.gain) and _plausible(c)):
+    if h.effect == best.hypothesis.effect or stands_in or not (worth_naming(c, c.gain) and _plausible(c, POSSIBLE)):
         return False
     over = compare(predicted, best.predicted, 0.0)
     return over.density < -CLEAR and over.ci95[1] < 0
 
 
-def _plausible(c: Candidate) -> bool:
-    return abs(c.amplitude) < PLAUSIBLE * abs(c.hypothesis.typical)
+def _plausible(c: Candidate, most: float = PLAUSIBLE) -> bool:
+    return abs(c.amplitude) < most * abs(c.hypothesis.typical)
 
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:

@@ -6,17 +6,18 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
+from pathlib import Path
 
 from torchcloth.errors import MissingDependency, TorchclothError
 
-from .config import load
+from .config import CHECKPOINT, load
 
 NAME = "torchcloth.training.fit"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
-    options = _parser().parse_args(arguments)
+    options, config = _parser().parse_args(arguments), None
     try:
         config = load(options.config, options.overrides)
         if find_spec("lightning") is None:
@@ -34,7 +35,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("fit: another process ended; see its own line", file=sys.stderr)
         return 2
     except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
-        print("fit: stopped; the same command with --resume goes on after the last whole step", file=sys.stderr)
+        kept = config is not None and (Path(config.out) / CHECKPOINT).is_file()
+        print(
+            "fit: stopped" + ("; the same command with --resume goes on after the last whole step" * kept),
+            file=sys.stderr,
+        )
         return 130
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from importlib import resources
@@ -9,6 +10,8 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from torchcloth.errors import InvalidInput
+
+CHECKPOINT = "last.ckpt"  # in a run's folder
 
 
 @dataclass(frozen=True)
@@ -122,12 +125,12 @@ def from_dict(content: Mapping[str, Any]) -> Config:
             wrong = [v for v in (value if isinstance(value, list) else [value]) if v not in legal]
             if wrong:
                 raise InvalidInput(f"config: {key}", got=repr(wrong[0]), expected=" or ".join(legal))
-        elif not value >= legal:
-            raise InvalidInput(f"config: {key}", got=value, expected=f"at least {legal}")
+        elif not (value >= legal and math.isfinite(value)):
+            raise InvalidInput(f"config: {key}", got=value, expected=f"at least {legal}, and finite")
     if config.run.seed >= 2**32:
         raise InvalidInput("config: run.seed", got=config.run.seed, expected="below 2^32")
-    if not config.optimizer.rate > 0:
-        raise InvalidInput("config: optimizer.rate", got=config.optimizer.rate, expected="more than 0")
+    if not 0 < config.optimizer.rate < math.inf:
+        raise InvalidInput("config: optimizer.rate", got=config.optimizer.rate, expected="more than 0, and finite")
     return config
 
 

@@ -71,9 +71,10 @@ class Learned(nn.Module):
         if self.network is None or self.what.network is None:
             return own
         out, names = self._given(self.network, self.what.network.module), self.what.network.gives
-        if out.shape != (len(self._places), len(names)):
+        if not isinstance(out, Tensor) or out.shape != (len(self._places), len(names)):
+            got = list(out.shape) if isinstance(out, Tensor) else type(out).__name__
             expected = f"[{len(self._places)}, {len(names)}], a column for each of {', '.join(names)}"
-            raise InvalidInput(f"{self.what.network.module}: output", got=list(out.shape), expected=expected)
+            raise InvalidInput(f"{self.what.network.module}: output", got=got, expected=expected)
         given = {name: self.parameter(name).raw + self.units[name] * out[:, i] for i, name in enumerate(names)}
         amplitudes = {
             name: raw.clamp(min=0.0) for name, raw in given.items() if self.parameter(name).domain == "nonnegative"
@@ -146,7 +147,7 @@ def _made(network: Network) -> nn.Module:
     where, _, name = network.module.rpartition(".")
     try:
         made = getattr(import_module(where), name)(**network.arguments)
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
+    except Exception as error:  # of somebody's code, whatever it raises
         expected = "package.module.Class that can be imported and made with the arguments"
         raise InvalidInput("config: learn.network", got=f"{network.module} ({error})", expected=expected) from None
     if not isinstance(made, nn.Module):

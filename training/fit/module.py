@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcloth import Cloth
-from torchcloth.errors import InvalidInput
+from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.identification import Episode
 from torchcloth.identification.objective import Objective
 from torchcloth.identification.replays import Replay, frames_of
@@ -100,8 +100,20 @@ class FitModule(pl.LightningModule):
                 loss = loss + self.config.learn.roughness * self.learned.roughness()
             parts = torch.autograd.grad(loss * (world / data.per_step), learned, allow_unused=True)
             summed = [s if g is None else s + g for s, g in zip(summed, parts, strict=True)]
+        self._finite(summed)
         self._log(figures)
         return torch.stack([(p * g).sum() for p, g in zip(learned, summed, strict=True)]).sum()
+
+    def _finite(self, gradients: list[Tensor]) -> None:
+        """Of all processes: a step along what is not would leave a checkpoint that nobody can go on from."""
+        wrong = torch.stack([(~g.isfinite()).sum() for g in gradients]).sum().double()
+        if self.trainer.strategy.reduce(wrong, reduce_op="sum") > 0:
+            raise SimulationDiverged(
+                f"gradient of step {self.global_step + 1}",
+                got="numbers that are not finite",
+                expected="finite ones",
+                remedy="the checkpoint is from the step before; fewer frames, or a smaller optimizer.rate",
+            )
 
     def validation_step(self, episodes: list[Episode], index: int) -> None:
         """Losses and distances of episodes that are only looked at."""

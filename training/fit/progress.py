@@ -33,11 +33,10 @@ class Told(pl.Callback):
         if self.task is None or "train/loss" not in metrics:
             return
         parts = [f"loss {float(metrics['train/loss']):.4g}"]
-        parts += [
-            f"{kind} {1e3 * float(metrics[key]):.2f} mm"
-            for kind in ("train", "val")
-            if (key := f"{kind}/chamfer") in metrics
-        ]
+        fresh = trainer.global_step % (trainer.check_val_every_n_epoch or 1) == 0
+        for kind, when in (("train", ""), *([("val", " after it")] if fresh else [])):
+            if (key := f"{kind}/chamfer") in metrics:
+                parts.append(f"{kind}{when} {1e3 * float(metrics[key]):.2f} mm")
         values = pl_module.begun if isinstance(pl_module, FitModule) else {}
         parts += [f"{name} {value:.4g}" for name, value in list(values.items())[:3]]
         text = ", ".join(parts)

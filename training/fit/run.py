@@ -17,17 +17,16 @@ from lightning.pytorch.strategies import DDPStrategy
 
 from torchcloth import Cloth
 from torchcloth.errors import InvalidInput, MissingDependency
-from torchcloth.identification.journal import DAMAGED, digest
+from torchcloth.identification.journal import DAMAGED, digest, program
 from torchcloth.identification.objective import Objective
 
 from . import result
-from .config import Config, Optimizer, Run
+from .config import CHECKPOINT, Config, Optimizer, Run
 from .data import Episodes, found
 from .described import built, described, precision
 from .module import FitModule
 from .progress import Told
 
-CHECKPOINT = "last.ckpt"
 QUIET = (
     "does not have many workers",
     "irectory .* exists and is not empty",
@@ -47,7 +46,8 @@ def fit(config: Config, resume: bool = False) -> FitModule:
     Raises:
         InvalidInput: a config or data that make no run; nothing to resume, or more steps done than asked for.
         RecordingError: an episode that cannot be trusted.
-        SimulationDiverged: a step led where nothing can be simulated, and the checkpoint is from there.
+        SimulationDiverged: a step led where nothing can be simulated, and the checkpoint is from there; or a gradient
+            that is not finite, before it is followed: the checkpoint is from the step before.
     """
     torch.set_num_threads(1)  # meshes of a thousand triangles: processes pay, threads do not
     folder = Path(config.out)
@@ -167,7 +167,7 @@ def _after(trainer: pl.Trainer, module: FitModule, data: Episodes, episodes: lis
 
 
 def _problem(config: Config, cloth: Cloth, data: Episodes) -> str:
-    """Fingerprint of data, model and options; of what may change while a run rests, nothing."""
+    """Fingerprint of data, model, options and the library's code; of what may change while a run rests, nothing."""
     fixed = replace(config, out="", run=Run(seed=config.run.seed), data=replace(config.data, train=[], val=[]))
     fixed = replace(fixed, optimizer=replace(config.optimizer, steps=Optimizer.steps))
-    return digest([fixed, len(data.train), *Objective(cloth, [], [*data.train, *data.val]).identity()])
+    return digest([program(), fixed, len(data.train), *Objective(cloth, [], [*data.train, *data.val]).identity()])

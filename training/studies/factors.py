@@ -92,17 +92,19 @@ def _parameter_table(values: dict[str, dict[str, Pooled]]):
 def _notes(cases: int) -> list[str]:
     """What the numbers are worth."""
     levels = "; ".join(f"{factor}: {' / '.join(names)}" for factor, names in FACTORS.items())
-    chance = f"{200 / (cases - 1):.0f} %" if cases > 1 else "all"
     return [
         f"Levels: {levels}. vertices: cloud to the nearest vertex (the paper's); surface: cloud to surface (ours).",
         "The paper's pooled variance adds the variances within and between the levels, which gives that of all values: "
         "of the same cases it is the same for every factor. What a factor does is the share between its levels; "
-        f"without any effect that is {chance} on average, with these {cases} cases.",
+        f"without any effect that is on average what stands in brackets; {cases} cases were asked for.",
     ]
 
 
 def _share(p: Pooled) -> str:
-    return f"{100 * p.between / p.pooled:.0f} %" if p.pooled > 0 else "–"
+    """With what it would be on average without any effect, of so many values at so many levels."""
+    count = sum(own.count for own in p.levels.values())
+    chance = f" ({100 * (len(p.levels) - 1) / (count - 1):.0f})" if count > 1 else ""
+    return f"{100 * p.between / p.pooled:.0f} %{chance}" if p.pooled > 0 else "–"
 
 
 def _plain(values: dict[str, dict[str, Pooled]]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ hidden, at its true amplitude.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -47,12 +47,15 @@ def knowing(model: Model, truth: Mapping[str, Any]) -> Oracle | None:
     return Oracle(model.base, model.parameters, model.values, hidden=tuple(hidden)) if hidden else None
 
 
-def gain(episodes: Sequence[Path], extended: Path, unseen: Path, truth: Mapping[str, Any]) -> float | None:
+def gain(
+    episodes: Sequence[Path], extended: Path, named: Collection[str], unseen: Path, truth: Mapping[str, Any]
+) -> float | None:
     """The share of the oracle's gain; None where nothing is to be gained, or where nobody can know all.
 
     Args:
         episodes: those that were diagnosed.
         extended: the model that the diagnosis wrote.
+        named: its causes; what else it has, the answer does not say.
         unseen: an episode of another motion.
         truth: what was hidden.
     """
@@ -61,10 +64,17 @@ def gain(episodes: Sequence[Path], extended: Path, unseen: Path, truth: Mapping[
     oracle = knowing(base, truth)
     if oracle is None:
         return None
-    setting, found = setting_of(base, recordings), load_model(extended)
+    setting, found = setting_of(base, recordings), _saying(load_model(extended, residual=False), named)
     fitted = _fitted(base, setting) if found.accepted else found  # without causes it is the fitted base
     before, best = rms(fitted, last), rms(_fitted(oracle, setting), last)
     return None if before - best < LEAST else (before - rms(found, last)) / (before - best)
+
+
+def _saying(model: Model, named: Collection[str]) -> Model:
+    """Less the causes that have no name."""
+    for h in model.accepted:
+        model = model if h.name in named else model.without(h.name)
+    return model
 
 
 def _fitted(model: Model, setting: Setting) -> Model:

@@ -79,13 +79,15 @@ def rate(cases: Sequence[Judged], hit: Callable[[Judged], Any]) -> Rate:
 
 def marks(cases: Sequence[Judged]) -> list[Mark]:
     """What must show, of judged cases."""
-    singles, effects = of(cases, "single"), of(cases, *WITH_EFFECT)
+    singles, effects = of(cases, "single"), [c for c in of(cases, *WITH_EFFECT) if not c["no_answer"]]
     sets = [c for c in singles if c["named"]]
     sizes = [size for c in sets for size in c["sizes"]]
     errors = amplitude_errors(cases)
     gains = [c["gain"] for c in cases if c.get("gain") is not None]
     return [
-        Mark("nulls with a named cause", rate(of(cases, *NULLS), lambda c: c["named"]), 0.05, 0.02, False),
+        Mark(
+            "nulls with a named cause, or refused", rate(of(cases, *NULLS), lambda c: not c["right"]), 0.05, 0.02, False
+        ),
         Mark("class identified, singles at typical size", rate(at(singles, "1"), _found), 0.85, 0.95),
         Mark("class identified, singles at half", rate(at(singles, "0.5"), _found), 0.60, 0.80),
         Mark("confident and wrong", rate(effects, lambda c: c["wrong"]), 0.05, 0.02, False),

@@ -157,7 +157,7 @@ def _right(truth: Truth, answer: Answer, causes: Sequence[Named], asked: Sequenc
     if family == "outside":
         return unexplained(answer)
     if family == "fault":
-        return verdict(answer) in ("refused", "invalid_data") or _only(causes, truth["right_for_fault"])
+        return verdict(answer) == "invalid_data" or _only(causes, truth["right_for_fault"])
     return said_alike(truth, answer, causes)
 
 

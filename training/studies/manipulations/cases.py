@@ -73,9 +73,12 @@ def solve(setup: Setup, what: Manipulation) -> dict[str, Any]:
     start, early = model.cloth(true.start()), data.until(setup.share)
     try:
         fit = identify(start, early.recording, [*SOUGHT, *FREE], iterations=setup.iterations, warm_start=True)
-        return case | stated(fit) | {"distance": _distances(setup, model, data, fit)}
     except (SimulationDiverged, UnstableStep) as error:
         return case | {"failed": str(error)}
+    try:
+        return case | stated(fit) | {"distance": _distances(setup, model, data, fit)}
+    except (SimulationDiverged, UnstableStep) as error:  # later frames only: what was found stands
+        return case | stated(fit) | {"unpredicted": str(error)}
 
 
 def solve_together(setup: Setup, whats: Sequence[Manipulation]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -26,10 +27,15 @@ def run(chosen: argparse.Namespace) -> None:
     """Fits, table and result."""
     setup, wanted = options.chosen(chosen)
     kept = Kept(chosen.out, asdict(setup))
-    cases = {f"{garment}-joint": partial(solve_together, setup, own) for garment, own in alike(wanted).items()}
+    cases = {_name(garment, own): partial(solve_together, setup, own) for garment, own in alike(wanted).items()}
     found = options.finished(kept, cases, chosen.out) if chosen.report else kept.run(cases)
     show(_table(found))
     write(chosen.out / "joint.json", found)
+
+
+def _name(garment: str, own: Sequence[Manipulation]) -> str:
+    """Of a fit to these: others are another fit."""
+    return f"{garment}-joint-" + "-".join(f"{what.number:02d}" for what in own)
 
 
 def alike(wanted: list[Manipulation]) -> dict[str, list[Manipulation]]:
