@@ -95,7 +95,8 @@ def test_wind_that_does_not_matter_is_not_named_for_the_drag_that_it_brings(ampl
         ("air.drag_n", 1.4, -80.0, (-120.0, -40.0), True),
         ("air.drag_n", 1.4, -80.0, (-170.0, 10.0), False),  # not surely
         ("air.drag_n", 1.4, -3.0, (-3.5, -2.5), False),  # hardly
-        ("air.drag_n", 6.1, -80.0, (-120.0, -40.0), False),  # of no size that makes sense
+        ("air.drag_n", 6.1, -80.0, (-120.0, -40.0), True),  # larger than a cause may be, not than a rival
+        ("air.drag_n", 12.1, -80.0, (-120.0, -40.0), False),  # of no size that makes sense
         ("air.linear[x]", 1.4, -80.0, (-120.0, -40.0), False),  # the same along another axis
         ("air.wind[y]", 0.01, -80.0, (-120.0, -40.0), False),  # it stands for what it brought along
     ],

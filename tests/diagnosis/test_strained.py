@@ -89,7 +89,7 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     monkeypatch.setattr(stepwise, "fit", lambda *_, **__: strained)
     monkeypatch.setattr(stepwise, "predicts_better", lambda *_: 1.0 if better else -1.0)
     monkeypatch.setattr(stepwise, "screen", lambda f: [f])
-    monkeypatch.setattr(stepwise, "begun_with", lambda f, screened, tried: [(row, f.model)])
+    monkeypatch.setattr(stepwise, "begun_with", lambda f, screened, tried, after=0: [(row, f.model)])
     monkeypatch.setattr(stepwise, "one_step", lambda current, setting, begun, *_: looked.append((current, begun)))
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
     monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
@@ -110,7 +110,7 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     doubted, fits = [], iter([far, far, near, near])  # fitted, then asked about the other causes
     monkeypatch.setattr(stepwise, "fit", lambda *_, **__: next(fits))
     monkeypatch.setattr(stepwise, "screen", lambda f: [])
-    monkeypatch.setattr(stepwise, "begun_with", lambda *_: [])
+    monkeypatch.setattr(stepwise, "begun_with", lambda *_, **__: [])
     monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (doubted.append(current) or current, steps))
     monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
@@ -174,6 +174,29 @@ def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, motions, alon
     found = Candidate(row, None, predicted, gain, alone, 2.0)  # type: ignore[arg-type]
     assert trials._useful(found, motions) == useful
     assert trials._useful(found, [*motions, "one whose cells all jump"]) == useful
+
+
+@pytest.mark.parametrize(("amplitude", "tries"), [(1.0, ["first"]), (11.0, ["first", "more"])])
+def test_where_what_predicts_best_is_too_large_to_be_believed_more_are_tried(monkeypatch, amplitude, tries):
+    """Gravity that leans by 70 mrad stood for wind, which was not among the four."""
+    tried = []
+
+    class Enough(Exception):
+        pass
+
+    def likely(current, setting, begun, progress):
+        tried.append(begun)
+        gain = SimpleNamespace(density=50.0)
+        return [SimpleNamespace(hypothesis=CAUSE, amplitude=amplitude, gain=gain, row=None, fitted=found(0.1))]
+
+    def enough(_):
+        raise Enough
+
+    monkeypatch.setattr(trials, "_tried", likely)
+    monkeypatch.setattr(trials, "fit_noise", enough)
+    with pytest.raises(Enough):
+        trials.one_step(found(0.1), None, "first", [], print, "more")  # type: ignore[arg-type]
+    assert tried == tries
 
 
 @pytest.mark.parametrize(

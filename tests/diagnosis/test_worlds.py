@@ -190,6 +190,25 @@ def test_who_asks_later_is_told_the_same(made):
         assert torch.equal(a, b)
 
 
+def test_slopes_along_wind_know_nothing_of_the_drag_that_it_brings(made):
+    """It brakes whichever way the wind blows: of one sign it would be in the slope, of the other against it."""
+    model, setting = made
+    (wind,) = (h for h in catalogue(model, [RECORDING]) if h.name == "air.wind[x]")
+    alone, known = replace(wind, brings=""), gather(model, setting)
+
+    def slope(h):
+        found = gather(model, setting, [h])
+        assert found.hypotheses == [h]
+        later = asked_about(known, model, setting, [h])
+        torch.testing.assert_close(later.cells[0].jacobian, found.cells[0].jacobian, rtol=1e-9, atol=1e-12)
+        return found.cells[0].jacobian[:, found.own]
+
+    there, back = slope(alone), slope(alone.opposite)
+    torch.testing.assert_close(slope(wind), 0.5 * (there + back), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(slope(wind.opposite), slope(wind), rtol=1e-9, atol=1e-12)
+    assert (there - back).norm() > 0.1 * (there + back).norm()
+
+
 def test_steps_end_at_bounds_and_slopes_know_it(made):
     """Poisson's ratio at its largest value: a step on from there is none, one back tells."""
     model, setting = made

@@ -65,7 +65,8 @@ def gather(
         question = [k, [h.name for h in model.accepted], _told(asked), shifts, *(slopes or ())]
         return setting.kept(question, model.point, partial(piece_of, worlds, setting, k, asked, slopes))
 
-    pieces, possible = _pieces(setting, _of_their_own(model, hypotheses), progress, ask)
+    asked = _of_their_own(model, hypotheses)
+    pieces, possible = _pieces(setting, _with_opposites(asked), progress, ask)
     cells, stds, numerics = [], [], []
     for k, (piece, simulated) in enumerate(pieces):
         use = [*range(own), *(own + i for i, h in enumerate(simulated) if h in possible)]
@@ -76,7 +77,8 @@ def gather(
         cells.append(found if raw else central(found, shifts, len(model.parameters)))
         numerics.append(piece.numerics[stable])
         stds.append(piece.std)
-    return _with_twins(Evidence(cells, own if raw else len(model.point), possible, stds, numerics), model, hypotheses)
+    found = Evidence(cells, own if raw else len(model.point), possible, stds, numerics)
+    return _with_twins(_odd(found, asked), model, hypotheses)
 
 
 def asked_about(
@@ -93,20 +95,39 @@ def asked_about(
         question = [k, "asked", [h.name for h in model.accepted], _told(asked)]
         return setting.kept(question, model.point, partial(asked_piece, worlds, setting, k, asked))
 
-    pieces, possible = _pieces(setting, _of_their_own(model, hypotheses), progress, ask)
+    asked = _of_their_own(model, hypotheses)
+    pieces, possible = _pieces(setting, _with_opposites(asked), progress, ask)
     cells = []
     for own, std, (piece, simulated) in zip(here.cells, here.stds, pieces, strict=True):
         use = [i for i, h in enumerate(simulated) if h in possible]
         slopes = aligned(own.key, piece.cells.key, piece.cells.jacobian[:, use])
         parts = [own.jacobian[:, : here.own], slopes, own.jacobian[:, own.jacobian.shape[1] - len(std) :]]
         cells.append(own._replace(jacobian=torch.cat(parts, 1)))
-    return _with_twins(replace(here, cells=cells, hypotheses=possible), model, hypotheses)
+    return _with_twins(_odd(replace(here, cells=cells, hypotheses=possible), asked), model, hypotheses)
 
 
 def _of_their_own(model: Model, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Those that no parameter of the model does already."""
     fitted = {p.name for p in model.parameters}
     return [h for h in hypotheses if h.twin not in fitted]
+
+
+def _with_opposites(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Asked about both ways where a cause brings another one along, which is the same either way."""
+    return [*hypotheses, *(h.opposite for h in hypotheses if h.brings and h.opposite not in hypotheses)]
+
+
+def _odd(evidence: Evidence, asked: Sequence[Hypothesis]) -> Evidence:
+    """Slopes of these alone, less what is the same both ways: drag, in those along wind, would brake one way only."""
+    every, own = evidence.hypotheses, evidence.own
+    kept = [k for k, h in enumerate(every) if h in asked]
+    pairs = [[k, *(j for j, h in enumerate(every) if every[k].brings and h == every[k].opposite)] for k in kept]
+    cells = []
+    for c in evidence.cells:
+        slopes, rest = c.jacobian[:, own : own + len(every)], c.jacobian[:, own + len(every) :]
+        columns = [slopes[:, pair].mean(1, keepdim=True) for pair in pairs]
+        cells.append(c._replace(jacobian=torch.cat([c.jacobian[:, :own], *columns, rest], 1)))
+    return replace(evidence, cells=cells, hypotheses=[every[k] for k in kept])
 
 
 def _with_twins(evidence: Evidence, model: Model, hypotheses: Sequence[Hypothesis]) -> Evidence:

@@ -157,9 +157,13 @@ def distances(question: Question, left: Tensor) -> dict[tuple[str, ...], float]:
 
 
 def whitened_slopes(question: Question, recording: Recording, setting: Setting) -> Tensor:
-    """[C, own + causes] of an experiment that has not been done, by the present model on the coarser mesh."""
+    """[C, own + causes] of an experiment that has not been done, by the present model on the coarser mesh.
+
+    Along causes as large as they were found: what wind brings along brakes whichever way that blows.
+    """
     found, model = question.fitted, question.fitted.model
-    hypotheses = [found.evidence.hypotheses[k] for k in _columns(question)]
+    asked = [found.evidence.hypotheses[k] for k in _columns(question)]
+    hypotheses = [replace(h, typical=question.amplitudes[h.name] or h.typical) for h in asked]
     world, shifts = question.worlds.plain, question.worlds.shifts
     blank = foreseen(episode(model.base.cloth, recording))
     done = runs(question.worlds, blank, setting.dt, hypotheses, with_held=True)

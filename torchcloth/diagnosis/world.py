@@ -152,6 +152,11 @@ class Hypothesis:
         """Of interest."""
         return self.share * self.typical
 
+    @property
+    def opposite(self) -> Hypothesis:
+        """The same, asked about the other way."""
+        return replace(self, typical=-self.typical)
+
     def matters(self, amplitude: float) -> bool:
         """Large enough to be named."""
         return abs(amplitude) > MATTERS * abs(self.smallest)
