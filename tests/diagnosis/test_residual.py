@@ -96,6 +96,17 @@ def test_it_is_kept_with_the_model_and_can_be_left_out(tmp_path):
     assert torch.equal(left_out.values, plain.values)
 
 
+def test_a_force_that_is_missing_is_learned():
+    """Air, of which the model has none, and nothing else; with an answer around it: the slow tests."""
+    recordings = recorded(lambda world: world.with_cloth({"air": AirDrag(HIDDEN)}), 0)
+    model = base_model(recordings[0])
+    setting = setting_of(model, recordings)
+    residual = learn_residual(fit(model, setting), setting)
+    assert residual.terms
+    assert all(name.startswith("across") for name in residual.terms)
+    assert residual.gain.after < 0.5 * residual.gain.before
+
+
 def test_where_nothing_is_missing_nothing_is_learned():
     recordings = recorded(lambda world: world, 20)
     model = base_model(recordings[0])

@@ -25,41 +25,47 @@ def cloth():
     )
 
 
-@pytest.fixture(params=[1, 2])
-def threads(request):
+@pytest.fixture
+def threads():
+    """Sets their number; as before in the end."""
     before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
+    yield torch.set_num_threads
     torch.set_num_threads(before)
 
 
-FOUND: dict[str, list[torch.Tensor]] = {}
+def all_alike(threads, results):
+    """Twice with one thread and twice with two."""
+    found = []
+    for count in (1, 1, 2, 2):
+        threads(count)
+        found.append(results())
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
-def same(name: str, results: list[torch.Tensor]) -> None:
-    """Whatever came first is what all later runs must give."""
-    first = FOUND.setdefault(name, results)
-    assert all(torch.equal(a, b) for a, b in zip(first, results, strict=True))
-
-
-@pytest.mark.usefixtures("threads")
-@pytest.mark.parametrize("run", [1, 2])
-def test_values_and_gradients(cloth, run):
+def test_values_and_gradients(cloth, threads):
     noise = torch.randn(SCENES, len(cloth.mesh.vertices), 3, generator=torch.Generator().manual_seed(0))
-    x = (cloth.rest_state().x + 1e-3 * noise.to(cloth.rest_state().x)).requires_grad_()
-    end = cloth(cloth.state(x), times=TIMES).x[:, -1]
     parameters = [p for p in cloth.parameters() if p.requires_grad]
-    grads = torch.autograd.grad((end**2).sum(), [x, *parameters], allow_unused=True)
-    same("reverse", [end.detach(), *(g for g in grads if g is not None)])
+
+    def results():
+        x = (cloth.rest_state().x + 1e-3 * noise.to(cloth.rest_state().x)).requires_grad_()
+        end = cloth(cloth.state(x), times=TIMES).x[:, -1]
+        grads = torch.autograd.grad((end**2).sum(), [x, *parameters], allow_unused=True)
+        return [end.detach(), *(g for g in grads if g is not None)]
+
+    all_alike(threads, results)
 
 
-@pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("count", [12, 16])  # eight at a time, and four for what is left: each thread has some
-def test_tangents(cloth, count):
+def test_tangents(cloth, threads, count):
     eye = torch.eye(count, 2, dtype=cloth.rest_state().x.dtype)
     along = tc.Directions({"material.youngs_modulus.raw": eye[:, 0].clone(), "areal_density.raw": eye[:, 1].clone()})
-    rollout, moved = cloth.sensitivities(cloth.rest_state(), times=TIMES, along=along)
-    same(f"forward {count}", [rollout.x, moved.x])
+
+    def results():
+        rollout, moved = cloth.sensitivities(cloth.rest_state(), times=TIMES, along=along)
+        return [rollout.x, moved.x]
+
+    all_alike(threads, results)
 
 
 @pytest.mark.usefixtures("team")
