@@ -110,6 +110,33 @@ def test_resuming_is_bit_for_bit(config, episodes, tmp_path, monkeypatch, step):
     assert not torch.equal(whole.learned.values()["areal_density"], torch.full((32,), 0.3))
 
 
+def test_a_gradient_that_is_no_number_is_not_followed(config, tmp_path, capsys):
+    """The checkpoint is from the step before, and can be gone on from."""
+    path = config(learn={"network": {"module": "nets.Spoilt", "gives": ["youngs_modulus"]}}, optimizer={"steps": 4})
+    for again in ([], ["--resume"]):
+        assert main(["--config", path, *again]) == 2
+        assert "gradient of step 2; got numbers that are not finite" in capsys.readouterr().err
+        weights, _, _, history = state(tmp_path / "out")
+        assert len(history) == 1
+        assert all(bool(value.isfinite().all()) for value in weights.values())
+
+
+def test_a_checkpoint_is_there_whole_or_as_before(config, tmp_path, monkeypatch):
+    path = config(optimizer={"steps": 1})
+    assert main(["--config", path]) == 0
+    before, usual = state(tmp_path / "out"), torch.save
+
+    def fails(content, file, *more):
+        usual(content, file, *more)
+        Path(file).write_bytes(Path(file).read_bytes()[:200])
+        raise OSError("the disk is full")
+
+    monkeypatch.setattr(torch, "save", fails)
+    assert main(["--config", path, "--resume", "optimizer.steps=2"]) == 2
+    assert same(state(tmp_path / "out"), before)
+    assert not [f for f in (tmp_path / "out").iterdir() if f.name.startswith(".")]
+
+
 def test_more_steps_after_the_end(config, tmp_path):
     """A finished run goes on with more steps as if it had been asked for them at once."""
     path = config()

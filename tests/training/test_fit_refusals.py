@@ -15,7 +15,8 @@ from torchcloth.training.fit.data import Deal
 
 sys.path.insert(0, str(Path(__file__).parent))  # nets.py
 
-SEVEN = "{in_features: 7, out_features: 1}"
+SEVEN, TWO = "{in_features: 7, out_features: 1}", "{input_size: 2, hidden_size: 1}"
+LESS = "{in_features: -2, out_features: 1}"
 
 
 @pytest.mark.parametrize(
@@ -26,6 +27,8 @@ SEVEN = "{in_features: 7, out_features: 1}"
         (["optimizer.steps=many"], "config: optimizer.steps; got 'many'; expected a whole number"),
         (["optimizer.steps=0"], "config: optimizer.steps; got 0; expected at least 1"),
         (["optimizer.rate=-1"], "config: optimizer.rate; got -1.0"),
+        (["optimizer.rate=.inf"], "config: optimizer.rate; got inf; expected more than 0, and finite"),
+        (["learn.roughness=.inf"], "config: learn.roughness; got inf; expected at least 0, and finite"),
         (["steps"], "override; got 'steps'; expected KEY=VALUE"),
         (["data.train.0=mine"], "override; got data.train.0; expected nothing inside of 'train'"),
         (["out.x=1"], "override; got out.x"),
@@ -53,6 +56,16 @@ SEVEN = "{in_features: 7, out_features: 1}"
         (
             [f"learn.network={{module: torch.nn.Linear, arguments: {SEVEN}, gives: [poisson_ratio]}}"],
             "torch.nn.Linear: input; got mat1 and mat2 shapes cannot be multiplied",
+        ),
+        (
+            [
+                "learn.network={module: torch.nn.Linear, arguments: {in_features: -2, out_features: 1}, gives: [poisson_ratio]}"
+            ],
+            "config: learn.network; got torch.nn.Linear (",
+        ),
+        (
+            [f"learn.network={{module: torch.nn.LSTM, arguments: {TWO}, gives: [poisson_ratio]}}"],
+            "output; got tuple; exp",
         ),
         (["run.loggers=[wandb]"], "config: run.loggers; got 'wandb'; expected csv or tensorboard"),
         (["run.processes=4"], "config: run.processes; got 4; expected at most 3, the episodes at a step"),

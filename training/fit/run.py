@@ -21,6 +21,7 @@ from torchcloth.identification.journal import DAMAGED, digest, program
 from torchcloth.identification.objective import Objective
 
 from . import result
+from .checkpoints import Whole
 from .config import CHECKPOINT, Config, Optimizer, Run
 from .data import Episodes, found
 from .described import built, described, precision
@@ -144,6 +145,7 @@ def _trainer(config: Config, folder: Path) -> pl.Trainer:
             ModelCheckpoint(folder, Path(CHECKPOINT).stem, save_on_train_epoch_end=True, enable_version_counter=False),
             Told(),
         ],
+        plugins=[Whole()],
         default_root_dir=folder,
         enable_progress_bar=False,
         enable_model_summary=False,

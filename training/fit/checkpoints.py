@@ -1,0 +1,24 @@
+"""Checkpoints that are there whole or not at all.
+
+Lightning writes one to the system's folder for temporary files and moves it; between two file systems that is a copy
+over the only one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+from torchcloth._files import atomically
+
+
+class Whole(TorchCheckpointIO):
+    """Written beside its place, then put there."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """As torch.save has it; ``storage_options`` are not used."""
+        with atomically(Path(path)) as part:
+            torch.save(checkpoint, part)
