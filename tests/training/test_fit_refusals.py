@@ -58,9 +58,7 @@ LESS = "{in_features: -2, out_features: 1}"
             "torch.nn.Linear: input; got mat1 and mat2 shapes cannot be multiplied",
         ),
         (
-            [
-                "learn.network={module: torch.nn.Linear, arguments: {in_features: -2, out_features: 1}, gives: [poisson_ratio]}"
-            ],
+            [f"learn.network={{module: torch.nn.Linear, arguments: {LESS}, gives: [poisson_ratio]}}"],
             "config: learn.network; got torch.nn.Linear (",
         ),
         (
