@@ -1,11 +1,14 @@
 """The ablation's scenes, and that a study is kept, continued and refused as promised."""
 
 import json
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 
 import numpy as np
 import pytest
 import torch
 
+from torchcloth.errors import InvalidInput
 from torchcloth.materials import AEP
 from torchcloth.training.ablation import command
 from torchcloth.training.ablation import study as studies
@@ -221,3 +224,24 @@ def test_the_fast_study(tmp_path):
     calm = result["scenes"]["trousers drag"]["chamfer_cm"]
     assert calm["E-025"] > 100 * calm["perturbed"]
     assert result["agreement"]["chamfer"]["all"] > 0.4
+
+
+def test_a_process_that_the_system_ends_is_one_line(monkeypatch, tmp_path):
+    """Out of memory, as a rule."""
+
+    class Pool:
+        def __init__(self, *_, **__):
+            pass
+
+        def submit(self, *_):
+            ended = Future()
+            ended.set_exception(BrokenProcessPool("a process was terminated abruptly"))
+            return ended
+
+        def shutdown(self, **_):
+            pass
+
+    monkeypatch.setattr(studies, "ProcessPoolExecutor", Pool)
+    kept = studies.Study(tmp_path / "s", Setup())
+    with pytest.raises(InvalidInput, match="--jobs; got 2, and the system ended one of them"):
+        studies.simulate(kept, [studies.Task(("shirt", "drag"), [])], 2, lambda *_: None)

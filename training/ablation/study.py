@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 
 from torchcloth._files import atomically
-from torchcloth.errors import TorchclothError
+from torchcloth.errors import InvalidInput, TorchclothError
 
 from ..kept import check_settings, of_this_code, unreadable, write_settings
 from .measures import WITHOUT
@@ -111,7 +112,12 @@ def simulate(study: Study, tasks: list[Task], jobs: int, report: Callable[[float
     try:
         pending = {pool.submit(_work, study, task): task for task in tasks}
         for done, future in enumerate(as_completed(pending)):
-            future.result()
+            try:
+                future.result()
+            except BrokenProcessPool:
+                raise InvalidInput(
+                    "--jobs", got=f"{jobs}, and the system ended one of them", expected="as many as there is memory for"
+                ) from None
             report(done + 1.0, pending[future])
     finally:
         pool.shutdown(cancel_futures=True)
