@@ -31,7 +31,7 @@ class Kept:
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
-        self.folder, self.settings = folder, of_this_code(settings)
+        self.folder, self.settings = folder, dict(settings)
         check_settings(folder, self.settings)
 
     def begin(self) -> None:
@@ -121,13 +121,8 @@ def guarded(name: str, what: str, work: Callable[[], object]) -> int:
         return 130
 
 
-def of_this_code(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with a fingerprint of the library: results of two versions are no study."""
-    return {**settings, "code": program()}
-
-
 def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Raises InvalidInput where the folder cannot hold a study of these settings."""
+    """Raises InvalidInput where the folder cannot hold a study of these settings, or has one by other code."""
     if folder.exists() and not folder.is_dir():
         raise InvalidInput("--out", got=f"{folder}, a file", expected="a folder, new or existing")
     try:
@@ -138,21 +133,27 @@ def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
         raise unreadable(folder / "study.json") from None
     if not isinstance(found, dict):
         raise unreadable(folder / "study.json")
-    other = {key: found.get(key) for key in settings if found.get(key) != settings[key]}
-    if not other:
-        return
     remedy = "use the same settings, or another folder"
     if not found.keys() & settings.keys():
         raise InvalidInput("--out", got=f"{folder}, which holds another study", expected="a folder", remedy=remedy)
+    wanted = _of_this_code(settings)
+    other = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
+    if not other:
+        return
     holds = ", ".join(f"{key} {value}" if key in found else f"no {key}" for key, value in other.items())
-    expected = ", ".join(f"{key} {settings[key]}" for key in other)
+    expected = ", ".join(f"{key} {wanted[key]}" for key in other)
     raise InvalidInput("--out", got=f"{folder}, which holds a study with {holds}", expected=expected, remedy=remedy)
 
 
 def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
     """Make the folder and note the settings."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / "study.json", json.dumps(dict(settings), indent=1) + "\n")
+    write_text(folder / "study.json", json.dumps(_of_this_code(settings), indent=1) + "\n")
+
+
+def _of_this_code(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with a fingerprint of the library: results of two versions are no study."""
+    return {**settings, "code": program()}
 
 
 def unreadable(path: Path) -> RecordingError:

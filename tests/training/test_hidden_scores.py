@@ -150,7 +150,6 @@ def test_outside_the_catalogue_and_faults():
     assert (partly["right"], partly["wrong"]) == (True, True)
     assert not judged(jet, answer(verdict="adequate"))["right"]
     jump = hidden("fault", fault="clock jump", right_for_fault=["obs.clock"])
-    assert judged(jump, answer(verdict="invalid_data"))["right"]
     assert not judged(jump, {"refused": "No space left on device"})["right"]
     assert judged(jump, answer(verdict="invalid_data"))["right"]
     assert judged(jump, answer(cause("obs.clock")))["right"]

@@ -17,7 +17,7 @@ import torch
 from torchcloth._files import atomically
 from torchcloth.errors import InvalidInput, TorchclothError
 
-from ..kept import check_settings, of_this_code, unreadable, write_settings
+from ..kept import check_settings, unreadable, write_settings
 from .measures import WITHOUT
 from .scenes import Run, Scene, Setup, Variant
 
@@ -33,11 +33,11 @@ class Study(NamedTuple):
 
     def check(self) -> None:
         """Raises InvalidInput where the folder cannot hold this study's runs."""
-        check_settings(self.folder, of_this_code(asdict(self.setup)))
+        check_settings(self.folder, asdict(self.setup))
 
     def begin(self) -> None:
         """Make the folder and note the settings."""
-        write_settings(self.folder, of_this_code(asdict(self.setup)))
+        write_settings(self.folder, asdict(self.setup))
         (self.folder / "runs").mkdir(exist_ok=True)
 
     def path(self, scene: Name, variant: Variant) -> Path:

@@ -36,10 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
         kept = config is not None and (Path(config.out) / CHECKPOINT).is_file()
-        print(
-            "fit: stopped" + ("; the same command with --resume goes on after the last whole step" * kept),
-            file=sys.stderr,
-        )
+        further = "; the same command with --resume goes on after the last whole step" if kept else ""
+        print(f"fit: stopped{further}", file=sys.stderr)
         return 130
 
 

@@ -11,6 +11,7 @@ import json
 import os
 import secrets
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -38,7 +39,8 @@ CASES = 60
 FAST = tuple(10_089_647_160 + k for k in (0, 4, 5, 11, 68, 15, 18, 38, 58, 78))
 REFUSED = 2  # exit code
 ANSWER = "diagnosis.json"
-STOPPED = 130  # exit code
+# exit codes of who was stopped, or ended by others; a crash of its own is an answer that failed
+STOPPED = (130, *(-s for s in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)))
 LINES = 20  # of an error that are kept
 HEADINGS = (0.0, 90.0, 180.0, 270.0)  # degrees, of random experiments
 
@@ -108,14 +110,8 @@ def _secret(options: argparse.Namespace) -> int:
         return options.seed
     try:
         found = json.loads((options.out / "study.json").read_text())["secret"]
-    except (
-        FileNotFoundError,
-        NotADirectoryError,
-        ValueError,
-        KeyError,
-        TypeError,
-    ):  # a damaged one is refused by who reads it next
-        found = None
+    except (FileNotFoundError, NotADirectoryError, ValueError, LookupError, TypeError):
+        found = None  # a damaged one is refused by who reads it next
     return found if isinstance(found, int) else secrets.randbits(48)
 
 
@@ -190,7 +186,7 @@ def answered(episodes: list[Path], out: Path) -> dict[str, Any]:
     if begun and done.returncode == REFUSED:  # another version of the program left it
         shutil.rmtree(out / PROGRESS)
         done = _run(command)
-    if done.returncode == STOPPED or done.returncode < 0:  # by who stops the study, or the system: that is no answer
+    if done.returncode in STOPPED:  # by who stops the study, or the system for want of memory: that is no answer
         raise KeyboardInterrupt
     if done.returncode == 0:
         return json.loads((out / ANSWER).read_text())

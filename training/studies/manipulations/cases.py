@@ -65,7 +65,8 @@ def solve(setup: Setup, what: Manipulation) -> dict[str, Any]:
     """A finished case, plain JSON.
 
     "manipulation", "truth", "hidden", "found" (estimates), "moves_mm" (how far 10 % of each moves the cloth), "fit",
-    "warnings", and "distance" for the rigid-carry null, the start values and the fitted ones; or "failed": why.
+    "warnings", and "distance" for the rigid-carry null, the start values and the fitted ones, or "unpredicted":
+    why there is none; or "failed": why.
     """
     model, data = seen(setup, what)
     true = Fabric.true(what.garment)
@@ -75,10 +76,11 @@ def solve(setup: Setup, what: Manipulation) -> dict[str, Any]:
         fit = identify(start, early.recording, [*SOUGHT, *FREE], iterations=setup.iterations, warm_start=True)
     except (SimulationDiverged, UnstableStep) as error:
         return case | {"failed": str(error)}
+    case |= stated(fit)
     try:
-        return case | stated(fit) | {"distance": _distances(setup, model, data, fit)}
+        return case | {"distance": _distances(setup, model, data, fit)}
     except (SimulationDiverged, UnstableStep) as error:  # later frames only: what was found stands
-        return case | stated(fit) | {"unpredicted": str(error)}
+        return case | {"unpredicted": str(error)}
 
 
 def solve_together(setup: Setup, whats: Sequence[Manipulation]) -> dict[str, Any]:
