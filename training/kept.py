@@ -134,7 +134,7 @@ def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
     if not isinstance(found, dict):
         raise unreadable(folder / "study.json")
     remedy = "use the same settings, or another folder"
-    if not found.keys() & settings.keys():
+    if settings and not found.keys() & settings.keys():
         raise InvalidInput("--out", got=f"{folder}, which holds another study", expected="a folder", remedy=remedy)
     wanted = _of_this_code(settings)
     other = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
