@@ -55,9 +55,10 @@ def peak(task: Task, name: str, threads: int) -> Record:
     """
     with Worker(name, threads) as worker:
         worker.prepare(replace(task, substeps=WARM_UP))
+        worker.forget()
         base = worker.build(task)
-        seconds = worker.sample(0.0)
-        outcome, highest = worker.result()
+        seconds = worker.sample(task, 0.0)
+        outcome, highest = worker.result(task)
     case = task.scene()
     wrong = guards.problems(case, task.substeps, outcome.x)
     if wrong:

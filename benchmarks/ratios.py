@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from .suite import Record
 
 CONVENTIONS = {
-    "seconds": "median over samples of one whole run; contestants of one case and quantity took turns, others ran a "
-    "while before or after in this one call: ratios *_default_*, *_vs_forward* and batch* are of different moments",
+    "seconds": "median over samples of one whole run; what a ratio compares took turns in one round",
     "substeps": "of 1.6e-4 s; ms_per_substep is seconds by substeps, of all scenes of a batch together",
     "ratios *_vs_taichi, *_vs_warp, *_vs_newton, *_vs_mujoco, *_vs_eager": "time of the other over torchcloth's: above "
     "1, torchcloth is faster",
@@ -36,40 +35,40 @@ CONVENTIONS = {
 def ratios(records: Mapping[str, Record], engine: str) -> dict[str, float]:
     """All ratios that the records allow; ``engine`` is torchcloth's best."""
     found = {}
-    for name, (above, below, scale) in _pairs(engine).items():
+    for name, (above, below) in pairs(engine).items():
         if above in records and below in records:
-            found[name] = scale * records[above]["seconds"] / records[below]["seconds"]
+            found[name] = records[above]["seconds"] / records[below]["seconds"]
     growth = _growth(records, engine)
     return {name: float(f"{value:.4g}") for name, value in (found | growth).items()}
 
 
-def _pairs(engine: str) -> dict[str, tuple[str, str, float]]:
-    """Name -> (key above, key below, factor)."""
+def pairs(engine: str) -> dict[str, tuple[str, str]]:
+    """Name -> (key above, key below)."""
     equal, default, lone = "standard-everywhere", "standard", "sheet-800"
-    pairs = {}
+    found = {}
     for quantity in ("forward", "gradient"):
         for peer in ("taichi", "warp"):
-            pairs[f"{quantity}_vs_{peer}"] = (f"{quantity}.{equal}.{peer}", f"{quantity}.{equal}.{engine}")
-            pairs[f"{quantity}_default_vs_{peer}"] = (f"{quantity}.{equal}.{peer}", f"{quantity}.{default}.{engine}")
+            found[f"{quantity}_vs_{peer}"] = (f"{quantity}.{equal}.{peer}", f"{quantity}.{equal}.{engine}")
+            found[f"{quantity}_default_vs_{peer}"] = (f"{quantity}.{equal}.{peer}", f"{quantity}.{default}.{engine}")
         for peer in ("newton", "mujoco"):
-            pairs[f"{quantity}_vs_{peer}"] = (f"{quantity}.{lone}.{peer}", f"{quantity}.{lone}.{engine}")
+            found[f"{quantity}_vs_{peer}"] = (f"{quantity}.{lone}.{peer}", f"{quantity}.{lone}.{engine}")
     for peer in ("taichi", "warp"):
-        pairs[f"forward_1s_vs_{peer}"] = (f"forward.{equal}.1s.{peer}", f"forward.{equal}.1s.{engine}")
-        pairs[f"forward_default_1s_vs_{peer}"] = (f"forward.{equal}.1s.{peer}", f"forward.{default}.1s.{engine}")
-    pairs["forward_1s_vs_eager"] = (f"forward.{default}.1s.reference", f"forward.{default}.1s.{engine}")
-    pairs["gradient_vs_forward_1s"] = (f"gradient.{default}.1s.{engine}", f"forward.{default}.1s.{engine}")
-    pairs["forward_default_vs_newton"] = (f"forward.{default}.newton", f"forward.{default}.{engine}")
+        found[f"forward_1s_vs_{peer}"] = (f"forward.{equal}.1s.{peer}", f"forward.{equal}.1s.{engine}")
+        found[f"forward_default_1s_vs_{peer}"] = (f"forward.{equal}.1s.{peer}", f"forward.{default}.1s.{engine}")
+    found["forward_1s_vs_eager"] = (f"forward.{default}.1s.reference", f"forward.{default}.1s.{engine}")
+    found["gradient_vs_forward_1s"] = (f"gradient.{default}.1s.{engine}", f"forward.{default}.1s.{engine}")
+    found["forward_default_vs_newton"] = (f"forward.{default}.newton", f"forward.{default}.{engine}")
     for quantity in ("forward", "gradient", "tangents8"):
         name = "forward_vs_eager" if quantity == "forward" else f"{quantity}_vs_eager"
-        pairs[name] = (f"{quantity}.{equal}.reference", f"{quantity}.{equal}.{engine}")
-        pairs[f"{quantity}_garment_vs_eager"] = (f"{quantity}.garment.reference", f"{quantity}.garment.{engine}")
+        found[name] = (f"{quantity}.{equal}.reference", f"{quantity}.{equal}.{engine}")
+        found[f"{quantity}_garment_vs_eager"] = (f"{quantity}.garment.reference", f"{quantity}.garment.{engine}")
     for case, suffix in ((equal, "_everywhere"), (default, ""), ("standard-usual", "_usual"), ("garment", "_garment")):
         for quantity in ("tangents8", "gradient"):
-            pairs[f"{quantity}_vs_forward{suffix}"] = (f"{quantity}.{case}.{engine}", f"forward.{case}.{engine}")
+            found[f"{quantity}_vs_forward{suffix}"] = (f"{quantity}.{case}.{engine}", f"forward.{case}.{engine}")
     one = f"forward.{default}.batch-1.{engine}"
     for size in (8, 32):
-        pairs[f"batch{size}_vs_batch1"] = (f"forward.{default}.batch-{size}.{engine}", one)
-    return {name: (*pair, 1.0) for name, pair in pairs.items()}
+        found[f"batch{size}_vs_batch1"] = (f"forward.{default}.batch-{size}.{engine}", one)
+    return found
 
 
 def _growth(records: Mapping[str, Record], engine: str) -> dict[str, float]:

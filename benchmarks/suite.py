@@ -1,8 +1,8 @@
-"""The list of measurements, and running them: contestants take turns, so that a busy moment hits all of them."""
+"""The list of measurements, and running them: what is compared takes turns, so that a busy moment hits all of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ COMPARED = 250  # substeps at most for which float32 lets contestants be compare
 ENOUGH = 5.0  # s, of samples of one contestant
 MPM, MESH = ("taichi", "warp"), ("newton", "mujoco")
 SIZES = (200, 800, 3200, 10_000, 20_000)
+QUANTITIES: tuple[Quantity, ...] = ("forward", "gradient", "tangents8")
 
 
 @dataclass(frozen=True)
@@ -53,34 +54,32 @@ class Entry:
         return ".".join(part for part in parts if part)
 
 
-def entries(plan: Plan) -> list[Entry]:
-    """What is timed."""
+def rounds(plan: Plan) -> list[list[Entry]]:
+    """What is timed; the entries of a round take turns, for ratios between them."""
     best, all_engines = plan.engines[:1], plan.engines
     mpm, mesh = (tuple(name for name in group if name in plan.peers) for group in (MPM, MESH))
+    newton = tuple(name for name in mesh if name == "newton")
     found = [
-        Entry(Task("standard-everywhere", "forward", 250), all_engines + mpm),
-        Entry(Task("standard-everywhere", "gradient", 250), all_engines + mpm),
-        Entry(Task("sheet-800", "forward", 250), all_engines + mesh),
-        Entry(Task("sheet-800", "gradient", 250), all_engines + mesh),
-        Entry(Task("standard", "forward", 250), all_engines + tuple(n for n in mesh if n == "newton")),
-        *(Entry(Task(case, q, 250), all_engines) for case, q in _EACH),
-        *(Entry(Task("standard", "forward", 250, batch), best) for batch in (1, 8, 32)),
-        *(Entry(Task(f"sheet-{size}", "forward", 250), best, "size") for size in SIZES),
-        *(Entry(Task("sheet-800", "forward", count), best, f"steps-{count}") for count in (250, 2500)),
-        Entry(Task("standard", "forward", SECOND), all_engines, "1s"),
-        Entry(Task("standard", "gradient", SECOND), best, "1s"),
-        Entry(Task("standard-everywhere", "forward", SECOND), best + mpm, "1s"),
+        [
+            Entry(Task("standard-everywhere", "forward", 250), all_engines + mpm),
+            Entry(Task("standard", "forward", 250), all_engines + newton),
+            Entry(Task("standard-everywhere", "gradient", 250), all_engines + mpm),
+            Entry(Task("standard", "gradient", 250), all_engines),
+            Entry(Task("standard-everywhere", "tangents8", 250), all_engines),
+            Entry(Task("standard", "tangents8", 250), all_engines),
+        ],
+        *([Entry(Task(case, q, 250), all_engines) for q in QUANTITIES] for case in ("standard-usual", "garment")),
+        [Entry(Task("sheet-800", quantity, 250), all_engines + mesh) for quantity in QUANTITIES[:2]],
+        [Entry(Task("standard", "forward", 250, batch), best) for batch in (1, 8, 32)],
+        [Entry(Task(f"sheet-{size}", "forward", 250), best, "size") for size in SIZES],
+        [Entry(Task("sheet-800", "forward", count), best, f"steps-{count}") for count in (250, 2500)],
+        [
+            Entry(Task("standard", "forward", SECOND), all_engines, "1s"),
+            Entry(Task("standard", "gradient", SECOND), best, "1s"),
+            Entry(Task("standard-everywhere", "forward", SECOND), best + mpm, "1s"),
+        ],
     ]
-    return [_small(entry) for entry in found] if plan.fast else found
-
-
-_QUANTITIES: tuple[Quantity, ...] = ("forward", "gradient", "tangents8")
-_EACH: list[tuple[str, Quantity]] = [
-    ("standard-everywhere", "tangents8"),
-    ("standard", "gradient"),
-    ("standard", "tangents8"),
-    *((case, quantity) for case in ("standard-usual", "garment") for quantity in _QUANTITIES),
-]
+    return [[_small(entry) for entry in entries] for entries in found] if plan.fast else found
 
 
 def _small(entry: Entry) -> Entry:
@@ -91,6 +90,15 @@ def _small(entry: Entry) -> Entry:
     fewest = 100 if entry.task.quantity == "gradient" else 4  # dE of a sheet that hardly moved is rounding
     substeps = max(fewest, entry.task.substeps // 60)
     return replace(entry, task=replace(entry.task, small=True, substeps=substeps), names=names)
+
+
+@dataclass
+class Turn:
+    """A contestant that is ready for an entry."""
+
+    worker: Worker
+    prepare_seconds: float  # of building, compiling and a first run
+    samples: list[float] = field(default_factory=list)  # s, of one run
 
 
 @dataclass
@@ -112,30 +120,40 @@ class Bench:
             worker.close()
 
     def run(self) -> None:
-        """All entries."""
-        for entry in entries(self.plan):
-            self.tell(f"{entry.task.quantity}, {entry.task.case}, {entry.task.substeps} substeps")
-            self.measure(entry)
+        """All rounds."""
+        for entries in rounds(self.plan):
+            self.measure(entries)
 
-    def measure(self, entry: Entry) -> None:
-        """Time one entry: every contestant in turn, as often as asked."""
-        prepared = {name: seconds for name in entry.names if (seconds := self._prepared(entry, name)) is not None}
-        samples: dict[str, list[float]] = {name: [] for name in prepared}
+    def measure(self, entries: Sequence[Entry]) -> None:
+        """Time one round: every contestant of every entry in turn, as often as asked."""
+        turns: dict[tuple[Entry, str], Turn] = {}
+        for entry in entries:
+            self.tell(f"{entry.task.quantity}, {entry.task.case}, {entry.task.substeps} substeps")
+            for name in entry.names:
+                if (turn := self._prepared(entry, name)) is not None:
+                    turns[entry, name] = turn
         for _ in range(self.plan.samples):
-            for name, taken in samples.items():
-                if name in self._workers and sum(taken) < ENOUGH:
+            for (entry, name), turn in turns.items():
+                if self._workers.get(name) is turn.worker and sum(turn.samples) < ENOUGH:
                     try:
-                        taken.append(self._workers[name].sample(self.plan.shortest))
+                        turn.samples.append(turn.worker.sample(entry.task, self.plan.shortest))
                     except Failed as error:
                         self._lose(entry, name, error)
-        self._judge(entry, prepared, {name: taken for name, taken in samples.items() if name in self._workers})
+        for (entry, name), turn in turns.items():
+            if self._workers.get(name) is not turn.worker:
+                self.notes.setdefault(entry.key(name), f"{name} ended in another task of this round")
+        for entry in entries:
+            self._judge(entry, {n: turns[entry, n] for n in entry.names if entry.key(n) not in self.notes})
+        for worker in self._workers.values():
+            worker.forget()
 
-    def _prepared(self, entry: Entry, name: str) -> float | None:
-        """Seconds of building, compiling and a first run; None if the contestant cannot do it."""
+    def _prepared(self, entry: Entry, name: str) -> Turn | None:
+        """Built, compiled and run once; None if the contestant cannot do it."""
         try:
             if name not in self._workers:
                 self._workers[name] = Worker(name, self.plan.threads)
-            return self._workers[name].prepare(entry.task)
+            worker = self._workers[name]
+            return Turn(worker, worker.prepare(entry.task))
         except Unsupported as error:
             self.notes[entry.key(name)] = str(error)
         except Failed as error:
@@ -148,18 +166,18 @@ class Bench:
         if name in self._workers:
             self._workers.pop(name).close()
 
-    def _judge(self, entry: Entry, prepared: dict[str, float], samples: dict[str, list[float]]) -> None:
+    def _judge(self, entry: Entry, turns: Mapping[str, Turn]) -> None:
         """Keep the timings whose physics holds."""
         case = entry.task.scene()
-        outcomes = {name: self._workers[name].result()[0] for name in samples}
+        outcomes = {name: turn.worker.result(entry.task)[0] for name, turn in turns.items()}
         faults = {
             name: guards.problems(case, entry.task.substeps, found.x) + _derivatives(entry.task, found)
             for name, found in outcomes.items()
         }
         sound = [name for name, wrong in faults.items() if not wrong]
         first = outcomes.get("reference" if "reference" in sound else next(iter(sound), ""))
-        for name, taken in samples.items():
-            worker, key, outcome, wrong = self._workers[name], entry.key(name), outcomes[name], faults[name]
+        for name, turn in turns.items():
+            key, outcome, wrong = entry.key(name), outcomes[name], faults[name]
             if entry.task.substeps <= COMPARED and not wrong and first is not None:
                 truth, limit = self._truth(entry.task, name, first)
                 derivative = guards.ROUNDED if entry.task.small else guards.DERIVATIVE
@@ -167,9 +185,9 @@ class Bench:
             if wrong:
                 self.notes[key] = "not counted: " + "; ".join(wrong)
                 continue
-            self.records[key] = record(entry.task, case.triangles, Timing.of(taken)) | {
-                "threads": worker.threads,
-                "prepare_seconds": prepared[name],
+            self.records[key] = record(entry.task, case.triangles, Timing.of(turn.samples)) | {
+                "threads": turn.worker.threads,
+                "prepare_seconds": turn.prepare_seconds,
                 "apart_m": guards.apart(outcome.x if first is None else first.x, outcome.x),
             }
 

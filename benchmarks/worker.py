@@ -1,7 +1,8 @@
 """A contestant in a process of its own: compiled code, thread pools and memory do not meet.
 
-One JSON object a line each way: {"prepare": task, "run": flag}, {"sample": shortest seconds} and {"result": {}} are
-answered in turn. Who is not asked is stopped: thread pools watch for work long after their last, at others' expense.
+One JSON object a line each way: {"prepare": task, "run": flag}, {"sample": task, "shortest": seconds},
+{"result": task} and {"forget": {}} are answered in turn. Who is not asked is stopped: thread pools watch for work long
+after their last, at others' expense.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import IO, Any
 
@@ -61,15 +63,19 @@ class Worker:
         """Without the run; memory of the process after it [MiB]."""
         return self._ask({"prepare": asdict(task), "run": False})["mebibytes"]
 
-    def sample(self, shortest: float = measure.SHORTEST) -> float:
-        """Seconds per run."""
-        return self._ask({"sample": shortest})["seconds"]
+    def sample(self, task: Task, shortest: float = measure.SHORTEST) -> float:
+        """Seconds per run of a task that was prepared."""
+        return self._ask({"sample": asdict(task), "shortest": shortest})["seconds"]
 
-    def result(self) -> tuple[Outcome, float]:
-        """What the last run computed, and this process's peak memory [MiB]."""
-        answer = self._ask({"result": {}})
+    def result(self, task: Task) -> tuple[Outcome, float]:
+        """What its last run computed, and this process's peak memory [MiB]."""
+        answer = self._ask({"result": asdict(task)})
         fields = {name: _array(value) for name, value in answer["outcome"].items()}
         return Outcome(**fields), answer["mebibytes"]
+
+    def forget(self) -> None:
+        """All tasks that were prepared, and their memory."""
+        self._ask({"forget": {}})
 
     def close(self) -> None:
         """End the process."""
@@ -121,21 +127,29 @@ def _serve(name: str, threads: int) -> None:
 
     contestant = build(name, threads)
     _say(answers, {"threads": contestant.threads})
-    run, outcome = None, None
+    runs: dict[Task, Callable[[], Outcome]] = {}
+    outcomes: dict[Task, Outcome] = {}
     for line in sys.stdin:
         request = json.loads(line)
         try:
             if "prepare" in request:
-                start = time.perf_counter()
-                run = contestant.prepare(Task(**request["prepare"]))
-                outcome = run() if request["run"] else None
+                start, task = time.perf_counter(), Task(**request["prepare"])
+                runs[task] = contestant.prepare(task)
+                if request["run"]:
+                    outcomes[task] = runs[task]()
                 _say(answers, {"seconds": time.perf_counter() - start, "mebibytes": measure.resident()})
-            elif "sample" in request and run is not None:
-                seconds, outcome = measure.sample(run, request["sample"])
+            elif "sample" in request:
+                task = Task(**request["sample"])
+                seconds, outcomes[task] = measure.sample(runs[task], request["shortest"])
                 _say(answers, {"seconds": seconds})
-            elif outcome is not None:
+            elif "result" in request:
+                outcome = outcomes[Task(**request["result"])]
                 fields = {key: _plain(value) for key, value in outcome._asdict().items()}
                 _say(answers, {"outcome": fields, "mebibytes": measure.peak()})
+            else:
+                runs.clear()
+                outcomes.clear()
+                _say(answers, {})
         except Unsupported as error:
             _say(answers, {"unsupported": str(error)})
         except Exception as error:

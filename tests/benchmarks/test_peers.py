@@ -23,7 +23,7 @@ def compare(name, task, truth_case, limit):
     truth = Ours("reference", 1).prepare(replace(task, case=truth_case))()  # float64
     with worker(name) as far:
         far.prepare(task)
-        found = far.result()[0]
+        found = far.result(task)[0]
     case = task.scene()
     assert guards.problems(case, task.substeps, found.x) == []
     assert guards.disagreement(case, truth, found, limit) == []

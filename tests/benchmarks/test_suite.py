@@ -1,10 +1,10 @@
 """Ratios, counts and the command."""
 
+import itertools
 import json
 import mmap
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,8 +13,9 @@ from torchcloth.benchmarks import contestants, limits, report
 from torchcloth.benchmarks.cases import engines, make
 from torchcloth.benchmarks.contestant import Outcome, Task
 from torchcloth.benchmarks.measure import Timing, peak, resident, sample
-from torchcloth.benchmarks.ratios import CONVENTIONS, ratios
-from torchcloth.benchmarks.suite import Bench, Entry, Plan, entries
+from torchcloth.benchmarks.ratios import CONVENTIONS, pairs, ratios
+from torchcloth.benchmarks.suite import Bench, Entry, Plan, Turn, rounds
+from torchcloth.benchmarks.worker import Failed
 
 ISSUE = (
     "forward_vs_taichi",
@@ -33,7 +34,7 @@ def made_up():
     """A record for every entry of the full plan: so many seconds as the contestant's name has letters."""
     plan = Plan(("fused", "reference"), tuple(contestants.PEERS))
     found = {}
-    for entry in entries(plan):
+    for entry in itertools.chain(*rounds(plan)):
         for name in entry.names:
             task = entry.task
             size = {"substeps": task.substeps, "triangles": task.scene().triangles, "batch": task.batch}
@@ -71,8 +72,49 @@ def test_conventions_speak_of_ratios_that_exist(made_up):
 def test_entries_have_keys_of_their_own():
     for fast in (False, True):
         plan = Plan(("fused", "reference"), tuple(contestants.PEERS), fast=fast)
-        keys = [entry.key(name) for entry in entries(plan) for name in entry.names]
+        keys = [entry.key(name) for entry in itertools.chain(*rounds(plan)) for name in entry.names]
         assert len(keys) == len(set(keys))
+
+
+def test_a_ratio_is_of_one_round():
+    plan = Plan(("fused", "reference"), tuple(contestants.PEERS))
+    of = {e.key(name): k for k, entries in enumerate(rounds(plan)) for e in entries for name in e.names}
+    for name, (above, below) in pairs("fused").items():
+        assert of[above] == of[below], name
+
+
+class Ready:
+    """A worker that has computed something."""
+
+    threads = 1
+    prepare = lambda self, task: 0.1  # noqa: E731
+    forget = close = lambda self: None
+
+    def __init__(self, outcome, ends_in=None):
+        self.outcome, self.ends_in = outcome, ends_in
+
+    def sample(self, task, shortest):
+        if task.quantity == self.ends_in:
+            raise Failed("killed")
+        return 1.0
+
+    def result(self, task):
+        return (self.outcome,)
+
+
+def test_who_ends_leaves_the_round_and_nobody_else_does():
+    x = Task("standard", "forward", 20, small=True).scene().mesh.vertices + np.array([0.0, 0.0, -1e-4])
+    right = Outcome(x, 1.0, np.ones_like(x), 1.0)
+    bench = Bench(Plan(("fused", "reference"), samples=2))
+    bench._workers.update(fused=Ready(right, ends_in="gradient"), reference=Ready(right))
+    entries = [Entry(Task("standard", q, 20, small=True), ("fused", "reference")) for q in ("forward", "gradient")]
+    bench.measure(entries)
+    assert set(bench.records) == {entry.key("reference") for entry in entries}
+    assert bench.notes == {
+        entries[0].key("fused"): "fused ended in another task of this round",
+        entries[1].key("fused"): "killed",
+    }
+    assert set(bench._workers) == {"reference"}
 
 
 @pytest.mark.parametrize(
@@ -84,11 +126,8 @@ def test_who_is_wrong_is_not_counted_and_condemns_nobody(broken, counted):
     x = task.scene().mesh.vertices + np.array([0.0, 0.0, -1e-4])
     right = Outcome(x, 1.0, np.ones_like(x), 1.0)
     wrong = Outcome(np.full_like(x, np.nan), 1.0, np.ones_like(x), 1.0)
-    stub = lambda name: SimpleNamespace(result=lambda: (wrong if name == broken else right,), threads=1)  # noqa: E731
-    bench = Bench(Plan(("fused", "reference")))
-    bench._workers.update({name: stub(name) for name in ("fused", "reference")})
-    entry = Entry(task, ("fused", "reference"))
-    bench._judge(entry, {"fused": 0.0, "reference": 0.0}, {"fused": [1.0], "reference": [2.0]})
+    bench, entry = Bench(Plan(("fused", "reference"))), Entry(task, ("fused", "reference"))
+    bench._judge(entry, {n: Turn(Ready(wrong if n == broken else right), 0.0, [1.0]) for n in entry.names})
     assert set(bench.records) == {entry.key(name) for name in counted}
     assert len(bench.notes) == 2 - len(counted)
 
@@ -98,9 +137,7 @@ def test_the_fused_engine_is_held_against_the_reference():
     x = task.scene().mesh.vertices + np.array([0.0, 0.0, -1e-4])
     right, other = Outcome(x, 1.0, np.ones_like(x), 1.0), Outcome(x, 1.0, -7 * np.ones_like(x), 1.0)
     bench, entry = Bench(Plan(("fused", "reference"))), Entry(task, ("fused", "reference"))
-    for name, found in (("fused", other), ("reference", right)):
-        bench._workers[name] = SimpleNamespace(result=lambda found=found: (found,), threads=1)
-    bench._judge(entry, {"fused": 0.0, "reference": 0.0}, {"fused": [1.0], "reference": [2.0]})
+    bench._judge(entry, {"fused": Turn(Ready(other), 0.0, [1.0]), "reference": Turn(Ready(right), 0.0, [1.0])})
     assert set(bench.records) == {entry.key("reference")}
     assert "derivative by positions" in bench.notes[entry.key("fused")]
 
