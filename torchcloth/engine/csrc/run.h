@@ -5,6 +5,8 @@
 #include <exception>
 #include <mutex>
 
+#include <sys/mman.h>
+
 #include "program.h"
 
 namespace tc {
@@ -43,6 +45,15 @@ size_t records_size(const Program<R>& p, int64_t substeps, int64_t every) {
     return (rows + masks + LANES<R> - 1) / LANES<R> * LANES<R>;  // the next scene's begin on a cache line
 }
 
+// Memory that will be written from end to end: of small pages each one would be a fault.
+inline void in_large_pages([[maybe_unused]] void* data, [[maybe_unused]] size_t bytes) {
+#ifdef MADV_HUGEPAGE
+    constexpr uintptr_t page = 2 << 20;
+    const uintptr_t first = (uintptr_t(data) + page - 1) / page, last = (uintptr_t(data) + bytes) / page;
+    if (last > first) madvise(reinterpret_cast<void*>(first * page), (last - first) * page, MADV_HUGEPAGE);
+#endif
+}
+
 template <class R>
 class Run {
     static constexpr int64_t LONG = 4;  // substeps that are worth the start of a second thread
@@ -64,13 +75,15 @@ class Run {
         each(call.scenes, [&](int64_t scene) {
             Memory m = memory(scene, Mode::value, call.scenes);
             R* first = call.every ? record(scene, 0) : nullptr;
-            if (call.every) clear_records(scene);
+            if (call.every) in_large_pages(first, records_size(program, call.substeps, call.every) * sizeof(R));
+            if (call.every) clear_record(scene, call.every == 1 ? 0 : (call.substeps + call.every - 1) / call.every);
             m.rows.reset(2 * program.record_size);
             R *row = call.every == 1 ? first : m.rows.data, *after = nullptr;
             start(m, scene, row);
             int64_t frame = 0;
             for (int64_t k = 0; k < call.substeps; k++) {
                 if (call.every > 1 && k % call.every == 0) save(record(scene, k / call.every), row);
+                if (call.every == 1) clear_record(scene, k + 1);
                 after = call.every == 1 ? record(scene, k + 1) : other(m, row);
                 substep(m, scene, k, row, after);
                 row = after;
@@ -160,13 +173,10 @@ class Run {
         const size_t size = call.every == 1 ? program.record_size : program.state_size;
         return static_cast<R*>(call.records) + scene * records_size(program, call.substeps, call.every) + k * size;
     }
-    // What no substep writes: lanes beyond the last row, and the end of the last record. Results are then reproducible.
-    void clear_records(int64_t scene) const {
-        const int64_t last = (call.substeps + call.every - 1) / call.every;
-        for (int64_t k = 0; k <= last; k++) {
-            const size_t size = k == last && call.every == 1 ? program.record_size : program.state_size;
-            std::memset(static_cast<void*>(record(scene, k)), 0, size * sizeof(R));
-        }
+    // What no substep writes: lanes beyond the last row, and the last record or its end. Results are then reproducible.
+    void clear_record(int64_t scene, int64_t k) const {
+        const size_t size = k == call.substeps && call.every == 1 ? program.record_size : program.state_size;
+        std::memset(static_cast<void*>(record(scene, k)), 0, size * sizeof(R));
     }
     R* other(const Memory& m, const R* row) const {
         return row == m.rows.data ? m.rows.data + program.record_size : m.rows.data;
