@@ -10,7 +10,7 @@ from .verdicts import OPEN, Line
 
 HEAD = """# Verification
 
-`make verify` measures what stands here and writes this page; it exits with 1 when a figure misses its mark. Truth comes
+`make verify` measures what stands here and writes this page; it fails when a figure misses its mark. Truth comes
 from outside the simulator: closed forms, symmetry, conservation, finite differences, and for convergence the same scene
 computed finer. Figures are in float64 on one CPU core unless the case says otherwise; below a thousandth of the mark
 only that is said, and where a sheet crumples the last digits may differ between machines.

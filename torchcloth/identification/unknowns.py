@@ -118,7 +118,7 @@ def collect(
                 "parameter to fit",
                 got=repr(name),
                 expected="a parameter of the model",
-                remedy="it needs contact (--contact)",
+                remedy="it needs contact between layers (--contact; in a config model.contact)",
             )
         out.append(_unknown(cloth, name, known[name]))
     if weighed and "areal_density" in known and "areal_density" not in names:
