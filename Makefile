@@ -44,7 +44,7 @@ format: .venv/.installed-dev  ## put files into shape
 	$(BIN)/ruff format .
 
 types: .venv/.installed-dev  ## type check, by path
-	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright torchcloth robots training
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright torchcloth robots training benchmarks
 
 clean:  ## remove what tools leave behind
 	rm -rf build dist ./*.egg-info .pytest_cache .ruff_cache

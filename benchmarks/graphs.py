@@ -10,9 +10,15 @@ import argparse
 
 import torch
 
+from torchcloth.engine.choice import Setting
+
 from .paths import LIKE, motion, seconds, sheet
 
-WAYS = {"fused, CPU": ("cpu", "fused"), "one by one": ("cuda", "reference"), "graphs": ("cuda", "auto")}
+WAYS: dict[str, tuple[str, Setting]] = {
+    "fused, CPU": ("cpu", "fused"),
+    "one by one": ("cuda", "reference"),
+    "graphs": ("cuda", "auto"),
+}
 AGREE = 1e-4  # m, in float32
 
 
@@ -44,7 +50,7 @@ def main() -> None:
             def gradient(cloth=cloth, state=state, driven=driven):
                 cloth.zero_grad()
                 cloth(state, driven, times).x.square().mean().backward()
-                return cloth.areal_density.raw.grad.cpu()
+                return cloth.get_parameter("areal_density.raw").grad.cpu()  # type: ignore[union-attr]
 
             value, end = seconds(forward, options.repeats)
             ends.append(end)

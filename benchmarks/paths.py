@@ -97,7 +97,7 @@ def main() -> None:
         def gradient(cloth=cloth, state=state, driven=driven):
             cloth.zero_grad()
             cloth(state, driven, times).x.pow(2).sum().backward()
-            return torch.stack([cloth.get_parameter(name).grad for name in FABRIC])
+            return torch.stack([cloth.get_parameter(name).grad for name in FABRIC])  # type: ignore[arg-type]
 
         def tangents(cloth=cloth, state=state, driven=driven, along=along):
             return cloth.sensitivities(state, driven, times, along=along)

@@ -1,6 +1,7 @@
 """Shared settings: one thread (the meshes are small), float64 physics."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -34,8 +35,21 @@ def _float64():
 
 @pytest.fixture
 def realdata() -> Path:
-    """Folder of measured data; skips where it is absent."""
+    """Folder of measured data; skips where none is named."""
     folder = os.environ.get("TORCHCLOTH_REALDATA")
-    if not folder or not Path(folder).is_dir():
+    if not folder:
         pytest.skip("TORCHCLOTH_REALDATA does not name a folder of measured data")
+    assert Path(folder).is_dir(), f"TORCHCLOTH_REALDATA: {folder} is no folder"
     return Path(folder)
+
+
+@pytest.fixture
+def measured_in(realdata: Path) -> Callable[[str], Path]:
+    """The folder of a source by name; skips where it is absent."""
+
+    def find(name: str) -> Path:
+        if not (realdata / name).is_dir():
+            pytest.skip(f"{realdata / name} is absent")
+        return realdata / name
+
+    return find

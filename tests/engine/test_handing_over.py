@@ -46,17 +46,19 @@ def cloth(n):
     mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(n, n))
     effects = {"g": tc.effects.Gravity(), "b": tc.effects.Bending(1e-5)}
     return tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), 0.2, effects, contact=None, engine="fused")
-small, large = cloth(4), cloth(30)
+few, many = cloth(4), cloth(60)
 with torch.no_grad():
-    small(small.rest_state(), times=[0.0, 0.001])
+    scenes = [c.state(c.rest_state().x.expand(16, -1, -1).contiguous()) for c in (few, many)]
+    known = [c(c.rest_state(), times=[0.0, 0.001]).x for c in (few, many)]
     used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + int(sys.argv[1]) * 2**20, resource.RLIM_INFINITY))
-    try:
-        large(large.rest_state(), times=[0.0, 0.001])
-        many = small.state(small.rest_state().x.expand(16, -1, -1).contiguous())
-        small(many, times=[0.0, 0.01])
-    except (MemoryError, RuntimeError):
-        pass
+    for limit in (used + int(sys.argv[1]) * 2**20, resource.RLIM_INFINITY):
+        resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
+        for c, state, alone in zip((few, many), scenes, known):
+            try:
+                torch.testing.assert_close(c(state, times=[0.0, 0.001]).x[7], alone, rtol=0, atol=1e-6)
+                print("done")
+            except (MemoryError, RuntimeError) as error:
+                print(type(error).__name__, error)
 """
 
 
@@ -65,3 +67,7 @@ with torch.no_grad():
 def test_too_little_memory_is_an_error(megabytes):
     done = subprocess.run([sys.executable, "-c", SHORT, str(megabytes)], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr[-2000:]
+    few, many, *after = done.stdout.splitlines()
+    assert after == ["done", "done"]
+    assert few == "done" or megabytes < 12
+    assert many != "done"

@@ -201,15 +201,14 @@ def test_sweep_over_a_rollout():
         return run(state.x + 1e-3 * dx, **{name.replace("_", "."): value for name, value in parameters.items()})
 
     inputs = {"dx": torch.zeros_like(state.x)}
-    check_gradients(moved, inputs, 1e-6, tuple(10.0 ** (-1 - k / 2) for k in range(9)))
+    steps = tuple(10.0 ** (-1 - k / 2) for k in range(9))
+    check_gradients(moved, inputs, 1e-6, steps, acts=True)
     sizes = {"young": 1.0, "drag": 1.0}
 
     def fabric(young, drag):
         return run(**{"material.youngs_modulus.raw": young, "effects.air.normal.raw": drag})
 
-    check_gradients(
-        fabric, {"young": young, "drag": drag}, 1e-6, tuple(10.0 ** (-1 - k / 2) for k in range(9)), sizes=sizes
-    )
+    check_gradients(fabric, {"young": young, "drag": drag}, 1e-6, steps, sizes=sizes, acts=True)
 
 
 @pytest.mark.parametrize("way", ["forward_ad", "torch.func.jvp"])

@@ -61,7 +61,6 @@ def test_another_seed_gives_other_noise(small):
     assert not np.array_equal(small[0].points.xyz, other.points.xyz)
 
 
-@pytest.mark.skipif(not PACKAGED.exists(), reason="run make_example.py first")
 def test_the_packaged_episode_is_sound_and_small():
     recording = recordings.read(PACKAGED, with_truth=True)
     check(recording)

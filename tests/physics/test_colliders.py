@@ -210,4 +210,4 @@ def test_gradients_of_a_rollout():
         "radius": ball.radius.raw.detach(),
     }
     steps = [10.0 ** (-3 - k / 2) for k in range(9)]
-    check_gradients(final, inputs, 1e-6, steps)
+    check_gradients(final, inputs, 1e-6, steps, acts=True)

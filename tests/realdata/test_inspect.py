@@ -33,19 +33,13 @@ def lift(source: Path, trial: str) -> rec.Recording:
 
 
 @pytest.fixture
-def swings(realdata: Path) -> Path:
-    return _folder(realdata / "iri_cloth_swings")
+def swings(measured_in) -> Path:
+    return measured_in("iri_cloth_swings")
 
 
 @pytest.fixture
-def lifts(realdata: Path) -> Path:
-    return _folder(realdata / "lifted_cloth_clouds")
-
-
-def _folder(folder: Path) -> Path:
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
-    return folder
+def lifts(measured_in) -> Path:
+    return measured_in("lifted_cloth_clouds")
 
 
 def test_the_swings_lag_by_0_32_s(swings):

@@ -21,6 +21,7 @@ def source(measured_in) -> Path:
 
 def test_all_lifts_agree_on_the_camera(source):
     """Seven lifts, each on its own: within a degree and 4 mm of the constants, highest points 4 mm beside the path."""
+    assert len(lifts.trials(source)) == 7
     for trial in lifts.trials(source):
         yaw, shift, rms = lifts.register(source, trial)
         assert np.degrees(yaw - lifts.YAW) == pytest.approx(0, abs=1.0), trial
@@ -37,6 +38,7 @@ def test_side(source):
 
 def test_crop_and_outliers(source):
     """What is dropped: 0.03 to 0.1 % below the crop, up to 1 % outliers; kept flagged on demand."""
+    assert len(lifts.trials(source)) == 7
     for trial in lifts.trials(source):
         clean, whole = lifts.episode(source, trial), lifts.episode(source, trial, crop=False)
         assert clean.points is not None

@@ -115,8 +115,9 @@ def test_links_that_the_makers_never_check_cannot_meet(random_q):
     arm = robots.load("rizon4")
     q = random_q(arm, 150)
     solids = [Named(p.link, p) for p in arm.geometry(q)]
-    for i, j in combinations(range(len(solids)), 2):
-        if (arm.bodies[i], arm.bodies[j]) in NEVER:
-            assert nearest(solids, [(i, j)], torch.arange(150)).distance > 0.005, (solids[i].name, solids[j].name)
+    never = [(i, j) for i, j in combinations(range(len(solids)), 2) if (arm.bodies[i], arm.bodies[j]) in NEVER]
+    assert {(arm.bodies[i], arm.bodies[j]) for i, j in never} == NEVER
+    for i, j in never:
+        assert nearest(solids, [(i, j)], torch.arange(150)).distance > 0.005, (solids[i].name, solids[j].name)
     met = [(i, j) for i, j in combinations(range(len(solids)), 2) if arm.bodies[j] - arm.bodies[i] > 4]
     assert nearest(solids, met, torch.arange(150)).distance <= 0, "others can"

@@ -85,6 +85,14 @@ def test_refusals():
         finite_difference_sweep(lambda x: x, POINT, ALONG, SLOPE)
 
 
+def test_check_gradients_may_demand_that_inputs_act():
+    apart = {"a": POINT, "b": ALONG}
+    check_gradients(lambda a, b: a.sin() + 0 * b, apart)
+    with pytest.raises(AssertionError, match=r"'b': it does not move the result"):
+        check_gradients(lambda a, b: a.sin() + 0 * b, apart, acts=True)
+    check_gradients(lambda a, b: a.sin() + b, apart, acts=True)
+
+
 def test_check_gradients_names_the_input():
     best = check_gradients(lambda a, b: a.sin() * b, {"a": POINT, "b": ALONG})
     assert max(best.values()) < 1e-7

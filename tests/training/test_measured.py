@@ -13,14 +13,7 @@ from torchcloth.identification import read_model
 from torchcloth.recordings import ForceDisplacement
 from torchcloth.training.studies.checkout import module
 from torchcloth.training.studies.command import main
-from torchcloth.training.studies.measured import find, swing_predictions, swings, tension
-
-
-def _source(realdata, name):
-    """The folder of a source; skips where it is absent."""
-    if not (realdata / name).is_dir():
-        pytest.skip(f"{realdata / name} is absent")
-    return realdata / name
+from torchcloth.training.studies.measured import SOURCES, find, swing_predictions, swings, tension
 
 
 @pytest.mark.slow
@@ -37,6 +30,8 @@ def test_fast_study(realdata, tmp_path):
     assert "about 0.0 min left" in first.stdout
     assert "min left" not in again.stdout, "nothing is computed twice"
     result = json.loads((out / "measured.json").read_text())
+    names = dict(zip(("nylon", "knits", "swings", "sample"), SOURCES, strict=True))
+    assert set(result) == {name for name, folder in names.items() if (realdata / folder).is_dir()}
     if "nylon" in result:
         _check_nylon(result["nylon"], first.stdout, out)
     if "knits" in result:
@@ -66,9 +61,9 @@ def _check_nylon(found, printed, out):
 
 
 @pytest.mark.realdata
-def test_runs_are_split_and_thinned(realdata):
+def test_runs_are_split_and_thinned(measured_in):
     """Twenty fitted, ten others predicted; the first frame, where the cloth hangs still, is always there."""
-    source = _source(realdata, "iri_cloth_swings")
+    source = measured_in("iri_cloth_swings")
     fitted, held = swings.split(source, fast=False)
     assert (len(fitted), len(held)) == (20, 10)
     assert not set(fitted) & set(held)
@@ -80,9 +75,9 @@ def test_runs_are_split_and_thinned(realdata):
 
 
 @pytest.mark.realdata
-def test_a_knits_third_pull(realdata, tmp_path):
+def test_a_knits_third_pull(measured_in, tmp_path):
     """Near the floor in force; the fit on disk predicts any angle."""
-    found = tension.knit(_source(realdata, "knit_tension"), tmp_path, "Pearlized_Cotton_Seed")
+    found = tension.knit(measured_in("knit_tension"), tmp_path, "Pearlized_Cotton_Seed")
     for one in found["directions"].values():
         force = one["prediction"]["measured"]["force"]
         assert one["floor"]["force"] / 2 < force["rms"] < one["floor"]["force"] + 0.06

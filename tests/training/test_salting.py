@@ -1,8 +1,6 @@
 """Errors that are put into recordings are what they are called; of real swings the diagnosis says which (slow)."""
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,10 +49,9 @@ def test_without_data_it_says_so(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_in_real_swings_they_are_found(tmp_path, capsys):
-    folder = Path(os.environ.get("TORCHCLOTH_REALDATA", "nowhere"))
-    if not (folder / "iri_cloth_swings").is_dir():
-        pytest.skip("TORCHCLOTH_REALDATA names no folder with iri_cloth_swings")
+@pytest.mark.realdata
+def test_in_real_swings_they_are_found(measured_in, tmp_path, capsys):
+    measured_in("iri_cloth_swings")
     assert main(["salting", "--out", str(tmp_path / "s")]) == 0
     found = json.loads((tmp_path / "s" / "salting.json").read_text())
     for case in found.values():

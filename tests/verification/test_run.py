@@ -150,6 +150,5 @@ def test_every_line_of_the_design_has_a_case():
 
 @pytest.mark.slow
 def test_the_coarse_subset(tmp_path):
-    """Runs through; which marks hold is for the page to say."""
-    assert execute(tmp_path, None, "--fast") in (0, 1)
-    assert "**failed**" not in (tmp_path / "out/verification.md").read_text()
+    """All marks hold there, too."""
+    assert execute(tmp_path, None, "--fast") == 0

@@ -134,6 +134,7 @@ def check_gradients(
     steps: Sequence[float] = STEPS,
     seed: int = 0,
     sizes: Mapping[str, float] | None = None,
+    acts: bool = False,
 ) -> dict[str, float]:
     """Sweep a function's reverse-mode gradient in each of its inputs, along random directions of the input's size.
 
@@ -144,6 +145,7 @@ def check_gradients(
         steps: of the sweep.
         seed: of directions and weights.
         sizes: of a coarse change of an input, where its own mean size is not it (logarithms).
+        acts: an input that does not move the result is an error, too: a sweep of nothing proves nothing.
 
     Returns:
         the smallest relative error of each input.
@@ -166,7 +168,10 @@ def check_gradients(
             return (weight * function(**{**inputs, name: moved})).sum()
 
         try:
-            best[name] = finite_difference_sweep(along, value, direction, claim, steps).check(tolerance)
+            sweep = finite_difference_sweep(along, value, direction, claim, steps)
+            best[name] = sweep.check(tolerance)
+            if acts and abs(claim) * float(sweep.steps.max()) <= 10 * sweep.noise:
+                raise AssertionError(f"it does not move the result\n{sweep}")
         except AssertionError as error:
             raise AssertionError(f"gradient in {name!r}: {error}") from None
     return best
