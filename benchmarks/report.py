@@ -55,6 +55,7 @@ def plot(result: dict[str, Any], folder: Path) -> Path | None:
     """Cost against triangles and against substeps as ``folder``/bench.png; None without such records."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     records = result["cases"]
     series = {
@@ -70,6 +71,8 @@ def plot(result: dict[str, Any], folder: Path) -> Path | None:
         axes.loglog(sizes, seconds, "o-", label="measured")
         axes.loglog(sizes, [seconds[0] * size / sizes[0] for size in sizes], "--", color="gray", label="proportional")
         axes.set(xlabel=name, ylabel="seconds of a forward run", title=f"cost by {name}")
+        axes.set_xticks(sizes, [f"{size}" for size in sizes])
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.legend(frameon=False)
     path = folder / "bench.png"
     with atomically(path) as part:
