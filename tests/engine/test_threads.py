@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -104,6 +106,27 @@ def test_helpers_stay_for_the_next_call_and_a_fork_does_without_them():
         signal.alarm(30)  # ends what waits for a thread that only the parent has
         os._exit(0 if torch.equal(run(), first) else 1)
     assert os.waitpid(child, 0)[1] == 0
+
+
+HIRING = """
+import os, torch, torchcloth as tc
+from torchcloth.engine import running
+torch.set_num_threads(3)
+running.WORTH = 1e-9
+mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(9, 9))
+cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, {"gravity": tc.effects.Gravity()}, contact=None, engine="fused")
+for end, dt in ((2e-5, 1e-5), (0.01, 1e-4)):  # too short for a second thread, and not
+    with torch.no_grad():
+        cloth(cloth.rest_state(), times=[0.0, end], dt=dt)
+    print(len(os.listdir("/proc/self/task")))
+"""
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="needs Linux to count threads")
+def test_who_is_wanted_is_hired_where_there_are_cores():
+    """Without helpers the tests of a team would hold, too."""
+    before, after = subprocess.run([sys.executable, "-c", HIRING], capture_output=True, text=True).stdout.split()
+    assert int(after) - int(before) == min(2, len(os.sched_getaffinity(0)) - 1)
 
 
 def thread_count() -> int:
