@@ -11,7 +11,8 @@ from twins import THICKNESS, TRUE, at, first, twin
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import cloth_from, fit_fields, identify
+from torchcloth.identification import cloth_from, episode, fit_fields, identify, search
+from torchcloth.identification.descent import to_vertices
 
 PAIR = ["youngs_modulus", "air.normal"]
 STATED = 0.005  # kg/m^2, the recording's error of its areal density
@@ -192,19 +193,25 @@ def test_adam_lowers_the_chamfer_in_three_iterations(model, brief):
 
 
 @pytest.mark.parametrize("method", ["gauss-newton", "adam"])
-def test_the_papers_stop_rule_ends_a_fit_that_is_good_enough(model, brief, method):
-    """The start is at 8 mm, the rule asks for 15: nothing is left to do."""
+def test_the_papers_stop_rule_ends_a_fit_that_is_good_enough(model, brief, monkeypatch, method):
+    """By the distance that the paper minimises, to vertices: it holds half an edge even where the fit is perfect."""
+    seen = episode(model, brief)
+    with torch.no_grad():
+        start = float(to_vertices(model(model.state(seen.initial), seen.motion, seen.times).x, seen))
+    monkeypatch.setattr(search, "PAPER_CHAMFER", 1.05 * start)
     fit = identify(model, brief, PAIR, method=method, stop="paper")
-    assert fit.fit["chamfer_before"] < 0.015
     assert fit.fit["iterations"] == 0
     assert not fit.fit["converged"]
     assert fit.parameters["youngs_modulus"].value == pytest.approx(8e4)
     assert fit.fit["chamfer_after"] == pytest.approx(fit.fit["chamfer_before"], rel=1e-12)
+    monkeypatch.setattr(search, "PAPER_CHAMFER", 0.95 * start)
+    assert identify(model, brief, PAIR, method=method, stop="paper", iterations=3).fit["iterations"] > 0
 
 
 @pytest.mark.parametrize("options", [{"stop": "paper"}, {"method": "adam", "stop": "paper"}])
-def test_no_search_that_never_moved_presents_its_start_as_the_answer(model, brief, options):
+def test_no_search_that_never_moved_presents_its_start_as_the_answer(model, brief, monkeypatch, options):
     """DiffCloth, issue 24: the start value came back as the result. Here the way that is left is in the error."""
+    monkeypatch.setattr(search, "PAPER_CHAMFER", 1.0)
     fit = identify(model, brief, ["youngs_modulus"], **options)
     found = fit.parameters["youngs_modulus"]
     assert found.value == pytest.approx(found.initial)  # twice the truth

@@ -10,6 +10,7 @@ from torch import Tensor
 from ..errors import SimulationDiverged, UnstableStep
 from ..losses import chamfer_to_vertices
 from . import gauss_newton
+from .episodes import Episode
 from .objective import Objective
 
 OnIterate = Callable[[Tensor, Objective], bool]
@@ -47,9 +48,13 @@ def descend(
 
 def chamfer(objective: Objective, raw: Tensor, i: int) -> Tensor:
     """The paper's loss [m] of episode ``i``, as a part of the mean over all."""
-    pairs = ((objective.episodes[i].positions(t), x) for t, x in enumerate(objective.simulate(raw, i).x))
-    loss = torch.stack([chamfer_to_vertices(cloud, x) for cloud, x in pairs if len(cloud)]).mean()
-    return loss / len(objective.episodes)
+    return to_vertices(objective.simulate(raw, i).x, objective.episodes[i]) / len(objective.episodes)
+
+
+def to_vertices(frames: Tensor, episode: Episode) -> Tensor:
+    """One-sided Chamfer distance [m], cloud to nearest vertex, mean over the frames [T, V, 3] m that have points."""
+    pairs = ((episode.positions(t), x) for t, x in enumerate(frames))
+    return torch.stack([chamfer_to_vertices(cloud, x) for cloud, x in pairs if len(cloud)]).mean()
 
 
 def quasi_newton(objective: Objective, start: Tensor, iterations: int, on_iterate: OnIterate) -> tuple[Tensor, bool]:

@@ -78,7 +78,7 @@ def identify(
         method: "gauss-newton" (robust residuals, forward-mode sensitivities) or "lbfgs" (the same, reverse mode);
             "adam" or "gradient-descent" (the paper's Chamfer distance to vertices, reverse mode), for comparison: a
             distance knows of no errors, so these take neither priors nor nuisances, and the density as exact.
-        stop: "converged", or "paper": as soon as Chamfer (one-sided, cloud to surface) is below 1.5 cm.
+        stop: "converged", or "paper": as soon as the paper's Chamfer distance (one-sided, to vertices) is below 1.5 cm.
         iterations: at most this many with all frames, and at most 10 with the early ones before: the beginning of the
             same motion, so that neither velocity nor rest shape is ever set anew.
         rate: of "adam" and "gradient-descent": 0.1 is about 10 % a step, of an amplitude's typical size.

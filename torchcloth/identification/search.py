@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..errors import SimulationDiverged, UnstableStep
 from . import ensemble, gauss_newton, horizon, linearity, starts
-from .descent import descend, quasi_newton
+from .descent import descend, quasi_newton, to_vertices
 from .objective import Objective
 from .report import undecided
 from .unfinished import astray
@@ -44,6 +44,7 @@ class Search:
         self.objective, self.stop, self.on_progress, self.strata = objective, stop, on_progress, strata
         self.history: list[dict[str, Any]] = []
         self.elsewhere = 0  # simulations of parts of the episodes
+        self.near = False  # stopped by the paper's rule
 
     @property
     def simulations(self) -> int:
@@ -111,7 +112,11 @@ class Search:
         self.history.append({**entry, **values})
         if self.on_progress is not None:
             self.on_progress(len(self.history) - 1, now.chamfer, values, share)
-        return self.stop == "paper" and objective is self.objective and now.chamfer < PAPER_CHAMFER
+        if self.stop == "paper" and objective is self.objective:
+            pairs = zip(objective.frames(raw), objective.episodes, strict=True)
+            losses = [float(to_vertices(frames, episode)) for frames, episode in pairs]
+            self.near = sum(losses) / len(losses) < PAPER_CHAMFER
+        return self.near
 
     def tell(self, at: gauss_newton.Iterate) -> bool:
         """Of what is done after the search: progress, and no part of the history."""
@@ -138,12 +143,12 @@ class Search:
         return starts.best(part.problem(), found)
 
     def _why(self) -> str:
-        if self.stop == "paper" and self.history[-1]["chamfer"] < PAPER_CHAMFER:
+        if self.near:
             return "stopped by the paper's rule, Chamfer below 1.5 cm: the values still depend on the start"
         done = len(self.history) - 1
         return f"stopped after {done} iterations before converging: the search is unfinished, so are its errors"
 
     def _undecided(self) -> str:
-        if self.stop == "paper" and self.history[-1]["chamfer"] < PAPER_CHAMFER:
+        if self.near:
             return self._why()
         return "gradient descent has no test of convergence: values and errors may be those of an unfinished search"

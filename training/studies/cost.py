@@ -192,7 +192,7 @@ def _table(found: dict[str, dict[str, Any]]):
 
 
 NOTE = (
-    "descent: plain gradient descent; paper: Adam with the paper's stop, a Chamfer distance below 15 mm. Both follow "
+    "descent: plain gradient descent; paper: Adam with the paper's stop, that loss below 15 mm. Both follow "
     "the paper's loss (cloud to nearest vertex), in logarithms, without markers and forces, which Gauss-Newton uses, "
     "and have no test of convergence. *: stopped there, not converged. "
     "?: called not identifiable. Iterations: of all stages. CPU: of the fit alone; clock: with what "
