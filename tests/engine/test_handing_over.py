@@ -1,8 +1,12 @@
 """A program reaches the library whole or not at all, and memory that runs out ends a call, not Python."""
 
+import os
+import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 
+import numpy as np
 import pytest
 import torch
 
@@ -37,6 +41,43 @@ def test_an_interrupted_program_is_made_anew(monkeypatch, at):
         with pytest.raises(KeyboardInterrupt):
             falling(0.2)
     torch.testing.assert_close(falling(0.2), torch.full((12,), -0.5 * 9.81 * 1e-4), rtol=0.1, atol=0)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing forks here")
+def test_a_fork_does_not_wait_for_a_thread_that_it_has_not():
+    """Another thread of the parent was just handing a program over."""
+    with program._KEEPING:
+        child = os.fork()
+        if child == 0:
+            signal.alarm(30)
+            os._exit(0 if falling(0.31).isfinite().all() else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_records_may_come_back_from_elsewhere():
+    """A hook keeps what a backward pass needs where it likes: not where vectors may be read from."""
+
+    def away(tensor):
+        if not tensor.is_floating_point() or tensor.requires_grad:
+            return tensor
+        memory = np.empty(tensor.numel() + 16)
+        shift = (-memory.ctypes.data) % 64 // 8 + 2
+        place = memory[shift : shift + tensor.numel()].reshape(tensor.shape)
+        place[...] = tensor.numpy()
+        return place
+
+    def back(kept):
+        return torch.from_numpy(kept) if isinstance(kept, np.ndarray) else kept
+
+    mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(5, 5))
+    cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, {"g": tc.effects.Gravity()}, contact=None, engine="fused")
+    found = []
+    for hooks in (nullcontext(), torch.autograd.graph.saved_tensors_hooks(away, back)):
+        x = cloth.rest_state().x.clone().requires_grad_()
+        with hooks:
+            out = cloth(cloth.state(x), times=[0.0, 0.005]).x[-1]
+        found.append(torch.autograd.grad(out.square().sum(), x)[0])
+    assert torch.equal(*found)
 
 
 SHORT = """

@@ -160,6 +160,15 @@ def test_vmap_equals_a_loop(mapped):
             close(part, torch.stack(own), 1e-10, function.__name__)
 
 
+def test_what_is_too_short_is_not_read_beyond():
+    known, inputs = program(torch.float64)
+    with pytest.raises(ValueError, match=rf"expected \[1 or 1, {STEPS + 5}, 1\]"):
+        torch.ops.torchcloth.rollout(known.number, STEPS + 5, 0, inputs)
+    two, three = (inputs[0].expand(n, -1, -1).contiguous() for n in (2, 3))
+    with pytest.raises(ValueError, match=r"got shape \[2, .*expected \[1 or 3"):
+        torch.ops.torchcloth.rollout(known.number, STEPS, 0, [two, three, *inputs[2:]])
+
+
 def test_vmap_over_scenes_that_share_a_parameter():
     """Each entry of the batch is itself a batch: adjoints of what its scenes share are summed within it."""
     known, inputs = program(torch.float64, batch=(2,))

@@ -140,6 +140,7 @@ def test_a_stiffness_changed_later_moves_the_limit():
         (lambda: tc.boundaries.Grasp([[0, 1]]), r"Grasp vertices; got int64 of shape \(1, 2\)"),
         (lambda: tc.boundaries.Grasp("ab"), "Grasp vertices"),
         (lambda: tc.boundaries.Grasp(uv=[[5.0, 5.0]]), "no vertex within"),
+        (lambda: tc.boundaries.Grasp([0]).holding(torch.tensor([3, -1])), r"Grasp vertices; got \[-1, 3\]"),
         (lambda: tc.boundaries.Grasp.corner("middle"), "lower-left"),
         (lambda: tc.boundaries.Plane(normal=(0.0, 0.0, 0.0)), "not all zero"),
         (lambda: tc.boundaries.Plane(friction=-0.1), "friction"),

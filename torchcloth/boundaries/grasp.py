@@ -91,8 +91,18 @@ class Grasp(AbstractBoundary):
 
     def bind(self, mesh: Mesh) -> Grasp:
         """Find the held vertices in the mesh's pattern coordinates, or among its places."""
-        if self._stays:
-            return self
+        if not self._stays:
+            self._find(mesh)
+        self.index = self.index.unique()  # a vertex named twice would count twice in the wrench
+        if len(self.index) == 0 or int(self.index.min()) < 0 or int(self.index.max()) >= len(mesh.vertices):
+            raise InvalidInput(
+                "Grasp vertices",
+                got=np.asarray(self.index.cpu()).tolist(),
+                expected=f"indices in 0..{len(mesh.vertices) - 1}",
+            )
+        return self
+
+    def _find(self, mesh: Mesh) -> None:
         if self._place is not None:
             self.index = torch.as_tensor(mesh.around(self._place, self.radius), device=self.index.device)
         if self._corner is not None:
@@ -107,14 +117,6 @@ class Grasp(AbstractBoundary):
             self._uv = [[(low if horizontal == "left" else high)[0], (low if vertical == "lower" else high)[1]]]
         if self._uv is not None:
             self.index = torch.as_tensor(mesh.nearest_vertices(self._uv, self.radius), device=self.index.device)
-        self.index = self.index.unique()  # a vertex named twice would count twice in the wrench
-        if len(self.index) == 0 or int(self.index.min()) < 0 or int(self.index.max()) >= len(mesh.vertices):
-            raise InvalidInput(
-                "Grasp vertices",
-                got=np.asarray(self.index.cpu()).tolist(),
-                expected=f"indices in 0..{len(mesh.vertices) - 1}",
-            )
-        return self
 
     def held(self, drive: Drive | None, substep: int) -> Tensor | None:
         """All while it is closed."""

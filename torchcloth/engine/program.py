@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import marshal
+import os
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import cached_property
@@ -94,6 +95,8 @@ class Program:
         """Rows to gather from or scatter to, one per item."""
         data = np.ascontiguousarray(array(index), dtype=np.int32).ravel()
         key = data.tobytes()
+        if data.min(initial=0) < 0:
+            raise ValueError(f"rows {data.min()}: negative")
         if key not in self._tables:
             self._tables[key] = len(self._tables)
             self._reach.append(int(data.max(initial=-1)) + 1)
@@ -230,6 +233,16 @@ _KEPT: OrderedDict[bytes, Program] = OrderedDict()
 _KNOWN: WeakValueDictionary[int, Program] = WeakValueDictionary()
 _NUMBERS = count()
 _KEEPING = Lock()
+
+
+def _after_fork() -> None:
+    """Another thread of the parent may have held it, and is not here to let go."""
+    global _KEEPING
+    _KEEPING = Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def _for_c(value: Any) -> Any:

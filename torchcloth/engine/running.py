@@ -9,12 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .fields import Field
+from .fields import Field, Kind
 from .library import Call, Port
 from .program import Program
 
 BUDGET = 192 * 2**20  # bytes of records that a simulation keeps for its adjoint
 ANEW = 96 * 2**20  # bytes of records that the adjoint makes at a time, of substeps that it goes through again
+ALIGNED = 64  # bytes
 WORTH = 8e5  # operations of a substep for which another thread is worth while: some 20 us
 
 
@@ -49,6 +50,8 @@ def reverse(
     job: Job, records: Tensor, every: int, seeds: Mapping[Field, Tensor], wanted: set[Field]
 ) -> dict[Field, Tensor]:
     """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums."""
+    if records.data_ptr() % ALIGNED:  # a hook kept them, and gives them back from elsewhere
+        records = records.clone()
     like = next(iter(job.inputs.values()))
     grads = {f: like.new_zeros(job.scenes, *job.inputs[f].shape[1:]) for f in wanted}
     ports = _ports(job)
@@ -95,8 +98,11 @@ def record_size(program: Program, substeps: int, every: int) -> int:
 def _ports(job: Job):
     ports = (Port * len(job.program.fields))()
     for f, tensor in job.inputs.items():
+        shape = (job.substeps if f.kind == Kind.DRIVE else f.rows, f.comps)
         if not tensor.is_contiguous() or tensor.dtype != job.program.dtype:
             raise ValueError(f"{f}: not contiguous or of another precision")
+        if tensor.shape[1:] != shape or len(tensor) not in (1, job.scenes):
+            raise ValueError(f"{f}: got shape {list(tensor.shape)}, expected [1 or {job.scenes}, {shape[0]}, {shape[1]}]")
         ports[f.id].value, ports[f.id].stride = tensor.data_ptr(), tensor[0].numel() if len(tensor) > 1 else 0
     return ports
 

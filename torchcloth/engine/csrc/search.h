@@ -58,8 +58,7 @@ struct Search {
         std::sort(sorted.begin(), sorted.end(), [&](int a, int b) { return first[a] < first[b]; });
         boxes(centre, sorted, low, high);
         const std::vector<Together> together = side_by_side(centre);
-        auto search = [&](int part, Mask& found) {
-            std::vector<R> gap(patches);
+        auto search = [&](int part, Mask& found, std::vector<R>& gap) {
             for (int i = part; i < patches; i += parts) {
                 const int end = int(std::upper_bound(low[0].begin() + i, low[0].end(), high[0][i] + reach) - low[0].begin());
                 std::fill(gap.begin() + i, gap.begin() + end, R(0));
@@ -77,9 +76,10 @@ struct Search {
                     }
             }
         };
-        if (parts == 1) return search(0, mask);
+        std::vector<std::vector<R>> gaps(parts, first);  // made here: what throws in a team ends the process
+        if (parts == 1) return search(0, mask, gaps[0]);
         std::vector<Mask> found(parts, mask);
-        team->run(parts, [&](int m) { search(m, found[m]); });
+        team->run(parts, [&](int m) { search(m, found[m], gaps[m]); });
         for (const Mask& own : found)
             for (size_t w = 0; w < mask.size(); w++) mask[w] |= own[w];
     }

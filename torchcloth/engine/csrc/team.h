@@ -39,6 +39,9 @@ struct Habit {
 class Seats {
     static std::atomic<int>& taken() {
         static std::atomic<int> count{0};
+        static std::atomic<pid_t> process{getpid()};  // one that was forked off has its parent's count, not its threads
+        pid_t last = process, now = getpid();
+        if (last != now && process.compare_exchange_strong(last, now)) count = 0;
         return count;
     }
 
@@ -113,6 +116,7 @@ class Member {
 class Pool {
     std::mutex guard;
     std::vector<Member*> free;
+    size_t all = 0;
     const pid_t process = getpid();
 
   public:
@@ -128,7 +132,12 @@ class Pool {
     }
     Member* hire() {
         std::lock_guard<std::mutex> lock(guard);
-        if (free.empty()) return new Member;
+        if (free.empty()) {
+            free.reserve(all + 1);  // to leave must not fail
+            Member* one = new Member;
+            all++;
+            return one;
+        }
         Member* one = free.back();
         free.pop_back();
         return one;
