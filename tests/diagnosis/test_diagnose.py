@@ -75,7 +75,7 @@ def test_the_cloud_is_shown_over_both_models_where_the_first_is_farthest_off(wit
         own = recording.points.xyz[first : first + recording.points.counts[frame]]
         assert np.array_equal(o.points.numpy(), own)
         before, after = (float(d.mean()) for d in o.distances)
-        assert after < (1.0 if o.motion == "lift" else 0.25) * before  # lifted, drag hardly shows
+        assert after < (1.05 if o.motion == "lift" else 0.25) * before  # lifted, drag hardly shows
     figure = over_cloud(answer.overlays, answer.found.setting.sheet.faces.numpy())
     assert len(figure.axes) == 2 * len(answer.overlays) + 1
     assert "with causes" in figure.axes[-2].get_title()

@@ -16,10 +16,12 @@ from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, check, diagnose, setting_of
 from torchcloth.diagnosis.gate import _stamps
+from torchcloth.diagnosis.gate_clouds import Seen
 from torchcloth.diagnosis.setting import somewhere_seen
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings.images import ImageStream
 
+EXAMPLE = Path(__file__).parents[2] / "torchcloth" / "examples" / "bimanual_swing"
 GENERATE = Path(__file__).parents[1] / "independent" / "generate.py"
 AHEAD, DEEP = np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.0, 0.6])
 SMALL = ("--nodes", "9", "--fit-nodes", "7")
@@ -185,6 +187,17 @@ def test_two_knots_are_enough_of_a_gripper_that_rests(turned):
         for name, g in turned.grippers.items()
     }
     assert list(_stamps(replace(turned, grippers=still))) == []
+
+
+def test_an_arm_that_was_recorded_with_its_fingers_width_holds_while_they_are_near():
+    """Width instead of closed: as ``replay`` reads it."""
+    whole = rec.read(EXAMPLE)
+    width = np.where(np.arange(len(whole.joints["left"].t)) < 5, 0.08, 0.0)
+    joints = {"left": replace(whole.joints["left"], closed=None, width=width), "right": whole.joints["right"]}
+    seen = Seen(replace(whole, joints=joints))
+    free = seen.t < whole.joints["left"].t[5]
+    assert np.isnan(seen.holding[free, list(seen.paths).index("left")]).all()
+    assert np.isfinite(seen.holding[~free]).all()
 
 
 def test_episodes_of_two_cloths_are_refused(turned):

@@ -12,6 +12,7 @@ from torchcloth.diagnosis.stepwise import Found
 from torchcloth.diagnosis.trials import Step, _open, _rival, _themselves
 from torchcloth.diagnosis.verdict import _minor, _verdict
 from torchcloth.diagnosis.world import MATTERS, Model
+from torchcloth.errors import SimulationDiverged
 
 SCALE, BIAS = ("obs.depth_scale", 0.015, -0.002), ("obs.depth_bias", 5e-3, -2.5e-3)
 SCALE_LARGE, EXTRINSIC = ("obs.depth_scale", 0.015, 0.01), ("obs.extrinsic[x]", 4e-3, 2.5e-3)
@@ -150,6 +151,24 @@ def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
     monkeypatch.delattr(doubts, "fit")
     current = SimpleNamespace(model=model)
     assert doubts.plainer(current, steps, None, [], print) == (current, steps)  # type: ignore[arg-type]
+
+
+def test_what_cannot_be_simulated_without_a_cause_leaves_it_in(monkeypatch):
+    """All work up to there would be lost, and a diagnosis that goes on would end there again."""
+    drag, law = candidate("air.drag_n", 1.2, 1.4), candidate("b", 1.0, 1.0)
+    drag.alone = law.alone = set()
+    model = Model(None, (), toys.torch.zeros(0), (drag.hypothesis, law.hypothesis), (1.4, 1.0))  # type: ignore[arg-type]
+    steps = [Step(c, None, [c], [], [], None, None) for c in (drag, law)]  # type: ignore[arg-type]
+    current = SimpleNamespace(model=model, noise=None, evidence=None)
+
+    def diverges(*_):
+        raise SimulationDiverged("no such world")
+
+    monkeypatch.setattr(doubts, "without_cause", lambda found, name: found.model.without(name))
+    monkeypatch.setattr(doubts, "known", lambda *_: False)
+    monkeypatch.setattr(doubts, "fit", diverges)
+    asked = (SimpleNamespace(names=[]), [], lambda _: None)
+    assert doubts.pruned(current, steps, *asked) == (current, steps)  # type: ignore[arg-type]
 
 
 def row_of(shows: bool, decision: str = "present", worth: float = 10.0) -> SimpleNamespace:

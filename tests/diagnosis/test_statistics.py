@@ -241,6 +241,18 @@ def test_twins_form_a_class_and_strangers_do_not():
     assert [r.hypothesis.name for r in alike(found, rows["a"], 1.0, [rows["b"], rows["c"]])] == ["b"]
 
 
+def test_what_would_need_a_sign_that_it_cannot_have_is_no_twin():
+    """Less friction and more adhesion do the opposite: adhesion cannot have been taken away."""
+    against = SLOPES.clone()
+    against[..., 3] = -1.5 * against[..., 2] + 1e-4 * against[..., 4]
+    found = asked([0.0, 0.0, 1.0, 0.0, 0.0], slopes=against)
+    rows = {r.hypothesis.name: r for r in screen(found)}
+    other = rows["b"]._replace(hypothesis=replace(rows["b"].hypothesis, signed=False))
+    assert alike(found, rows["a"], 1.0, [other]) == []
+    assert alike(found, rows["a"], -1.0, [other]) == [other]
+    assert alike(found, rows["a"], 1.0, [rows["b"]]) == [rows["b"]]
+
+
 def test_what_a_fit_finds_tells_it_from_strangers_though_a_score_found_little():
     """A cause that slopes where it was asked about hardly showed is not alike everything."""
     found = asked([0.0, 0.0, 1.0, 0.0, 0.0])

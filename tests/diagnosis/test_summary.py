@@ -106,11 +106,12 @@ def test_a_missing_force_is_a_pressure_at_a_place():
 
 
 def test_ripples_that_would_hide_a_lack_of_fit_are_warned_of():
-    model = SimpleNamespace(strained=[], accepted=(), amplitudes=(), base=SimpleNamespace())
+    model = SimpleNamespace(strained=[], accepted=(), amplitudes=(), base=SimpleNamespace(), parameters=())
     model.base.cloth = SimpleNamespace(effects={"bending": None})
     fitted = SimpleNamespace(model=model)
     found = SimpleNamespace(start=fitted, end=fitted, setting=SimpleNamespace(episodes=[]), repeats=1, left_out=0.0)
     found.impossible = found.withdrawn = found.causes = found.screened = ()
+    found.whole = None
 
     def warned(expected, stable=True):
         row = SimpleNamespace(motion="turn", kind="points", seen=True, stable=stable, lacking=False, expected=expected)

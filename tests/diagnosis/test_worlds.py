@@ -1,6 +1,7 @@
 """Hypotheses as changes of a world: nothing at zero, continuous from there, and of the stated sign and size."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,17 +10,20 @@ import torch
 
 from torchcloth import materials
 from torchcloth.diagnosis import air, fabric, grip, observer
-from torchcloth.diagnosis.base_model import base_model
-from torchcloth.diagnosis.cells import SEEN, _places, cells_of
+from torchcloth.diagnosis.base_model import SILENT, base_model
+from torchcloth.diagnosis.cells import NAMES as NAMES_OF_DATA
+from torchcloth.diagnosis.cells import SEEN, _averaged, _places, cells_of
 from torchcloth.diagnosis.evidence import asked_about, gather
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
-from torchcloth.diagnosis.setting import LATE, motions_of, setting_of
+from torchcloth.diagnosis.setting import LATE, MOST, motions_of, setting_of
 from torchcloth.diagnosis.steps import one_way, step_sizes
 from torchcloth.diagnosis.wording import on_top
 from torchcloth.diagnosis.world import Hypothesis
+from torchcloth.effects import AirDrag
 from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.identification.rows import Rows
 from torchcloth.identification.sheet import sheet_of
 from torchcloth.meshes import rectangle
 from torchcloth.recordings import Collider
@@ -234,6 +238,67 @@ def test_a_data_sheet_without_bending_is_asked_nothing_about_it():
     assert {h.effect for h in EVERY} - {h.effect for h in asked} >= set(fabric.OF_BENDING)
     for h in asked:
         model.world([(h, h.typical)])
+
+
+def test_a_data_sheet_without_stiffness_is_believed_nothing(made):
+    sheet = {k: v for k, v in RECORDING.cloth.nominal.items() if k != "membrane_stiffness"}
+    bare = replace(RECORDING, cloth=replace(RECORDING.cloth, nominal=sheet))
+    told, silent = (base_model(r).parameters[0] for r in (RECORDING, bare))
+    assert (told.name, silent.name) == ("youngs_modulus", "youngs_modulus")
+    assert told.value(2 * told.std) == pytest.approx(2.5 * told.value(0.0))
+    assert silent.value(2 * silent.std) == pytest.approx(10 * silent.value(0.0))
+    assert silent.std > SILENT > told.std
+
+
+def test_an_own_effect_does_not_take_the_name_of_one_of_the_catalogue(made):
+    """Beside drag that was found, it would silently be all the air there is."""
+    model, _ = made
+
+    class Gust(AirDrag):
+        pass
+
+    own = lambda name: Hypothesis("my.gust", "-", 1.0, lambda w, a: w.with_cloth({name: Gust(a)}))  # noqa: E731
+    try:
+        register(own("air"))
+        with pytest.raises(InvalidInput, match=r"my\.gust.*Gust named 'air'.*another name"):
+            catalogue(model, [RECORDING])
+        register(own("gust"))
+        assert "my.gust" in {h.name for h in catalogue(model, [RECORDING])}
+    finally:
+        forget("my.gust")
+
+
+@pytest.mark.parametrize("rate", [5.0, 10.0, 12.5, 15.0, 30.0])
+def test_slow_sensors_are_heard_in_every_window(rate):
+    """Of two readings in a window none was kept, as if they were strays, but where rounding made it three."""
+    times = torch.arange(int(3 * rate)) / rate
+    rows = Rows(
+        torch.randn(len(times)), torch.zeros(len(times), 1), torch.arange(len(times)), torch.zeros(len(times)).long()
+    )
+    cells = _averaged(rows, NAMES_OF_DATA.index("force"), SimpleNamespace(times=times), None, torch.zeros(1, 3))
+    windows = len(set((times / 0.2 + 1e-6).floor().tolist()))
+    assert len(cells.value) >= windows - 1
+    assert cells.count.sum() >= 0.9 * len(times)
+
+
+def test_windows_do_not_run_into_the_next_part_of_the_fabric():
+    times = torch.tensor([0.0, 100.0, 250.0])
+    rows = Rows(torch.ones(3), torch.zeros(3, 1), torch.arange(3), torch.zeros(3).long())
+    with pytest.raises(InvalidInput, match="got 250 s; expected less than 200 s"):
+        _averaged(rows, NAMES_OF_DATA.index("force"), SimpleNamespace(times=times), None, torch.zeros(1, 3))
+
+
+def test_dense_clouds_are_thinned_alike_on_both_meshes(made):
+    model, _ = made
+    points = RECORDING.points
+    xyz = np.concatenate([np.repeat(points.frame(0), 250, axis=0), *(points.frame(k) for k in range(1, len(points)))])
+    counts = np.array([250 * points.counts[0], *points.counts[1:]])
+    dense = replace(RECORDING, points=replace(points, xyz=xyz, counts=counts))
+    setting = setting_of(model, [dense])
+    (coarse,), (fine,) = setting.episodes, setting.finer.episodes
+    assert len(coarse.clouds[0]) == MOST
+    assert torch.equal(coarse.clouds[0], fine.clouds[0])
+    assert torch.equal(coarse.clouds[1], torch.as_tensor(points.frame(1)))
 
 
 def test_two_effects_in_one_part_keep_both(made):

@@ -13,6 +13,8 @@ from .._files import PROGRESS
 from ..errors import InvalidInput
 from .folders import check_folder, how_to_go_on, place
 
+LONG = 10.0  # s, of an episode
+
 
 def add(verbs: Any) -> None:
     """The verb and its options."""
@@ -53,6 +55,9 @@ def _diagnose(options: argparse.Namespace) -> int:
             "core, up to four times as many where causes are found",
             flush=True,
         )
+        longest = max((float(e.points.t[-1] - e.points.t[0]) for e in episodes if e.points is not None), default=0.0)
+        if longest > LONG:
+            print(f"one lasts {longest:.0f} s: time and memory grow with the cube of that", flush=True)
         with progress_line() as progress:
             answer = diagnosis.diagnose(
                 episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume or None

@@ -21,7 +21,7 @@ from .noise import unfitted, whitened
 from .setting import Progress, Setting
 from .steps import shifted
 from .world import Model
-from .worlds import if_possible
+from .worlds import IMPOSSIBLE, if_possible
 
 SWEEPS = 2
 FARTHEST = 1.2  # widths, of one sweep
@@ -36,8 +36,7 @@ def approach(model: Model, setting: Setting, progress: Progress = lambda _: None
     width, before = torch.tensor(wide, dtype=torch.float64), None
     prior = prior_precision(model).sqrt()
     for _ in range(SWEEPS):
-        shifts = [(k, sign * w) for sign in (1.0, -1.0) for k, w in enumerate(width.tolist())]
-        evidence = gather(model, setting, (), progress, before, shifts)
+        evidence, width = _on_either_side(model, setting, progress, before, width)
         before = before or evidence
         white = calmed(whitened(evidence, unfitted()))
         up, down = white.jacobian.chunk(2, dim=1)
@@ -50,6 +49,21 @@ def approach(model: Model, setting: Setting, progress: Progress = lambda _: None
             break
         width = torch.where(u.abs() > 0.8, width, 0.5 * width)
     return model, before  # type: ignore[return-value]
+
+
+def _on_either_side(
+    model: Model, setting: Setting, progress: Progress, before: Evidence | None, width: Tensor
+) -> tuple[Evidence, Tensor]:
+    """Evidence a width on either side of every coordinate, or as much of it as can be simulated; (it, the width)."""
+    for left in reversed(range(HALVINGS + 1)):
+        shifts = [(k, sign * w) for sign in (1.0, -1.0) for k, w in enumerate(width.tolist())]
+        try:
+            return gather(model, setting, (), progress, before, shifts), width
+        except IMPOSSIBLE:
+            if left == 0:
+                raise
+            width = 0.5 * width
+    raise AssertionError
 
 
 def _possible(model: Model, coordinate: int, width: float) -> float:

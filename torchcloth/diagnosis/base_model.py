@@ -17,6 +17,7 @@ from .world import Model, Parameter, World
 
 LEAST = 1e-3  # -, of Poisson's ratio
 WRONG_BY = 2.5  # factor that a data sheet may be wrong by: two standard deviations
+ANY, SILENT = 10.0, 1.0  # likewise, of what it does not say, and the standard deviation from which it has not
 POISSON, SPREAD, MOST = 0.05, 0.1, 0.45  # step, standard deviation and largest value of Poisson's ratio
 LAW, STIFFER = 1.5, 2.0  # standard deviation and step of stiffening in tension: laws of one modulus differ by as much
 
@@ -29,7 +30,8 @@ def base_model(recording: Recording) -> Model:
 
 def _parameters(cloth: Cloth, recording: Recording) -> list[Parameter]:
     spread = 0.5 * math.log(WRONG_BY)
-    found = [_log(cloth, "material.youngs_modulus", 0.1, spread)]
+    told = {"membrane_stiffness", "youngs_modulus"} & set(recording.cloth.nominal)
+    found = [_log(cloth, "material.youngs_modulus", 0.1, spread if told else 0.5 * math.log(ANY))]
     nu = float(cloth.material.poisson_ratio.value)  # type: ignore[attr-defined,union-attr]
     ratio = _of(cloth, "material.poisson_ratio", POISSON, SPREAD, lambda c: min(max(nu + c, LEAST), MOST + POISSON))
     found.append(replace(ratio, low=LEAST - nu, high=max(MOST - nu, 0.0)))

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..errors import InvalidInput
 from ..identification.blocks import BLOCKS
 from ..identification.episodes import Episode
 from ..identification.replays import Frames
@@ -19,6 +20,7 @@ from ..identification.rows import Rows, scene_of
 from ..identification.sheet import ACROSS, Sheet
 
 STRETCH = 0.2  # s
+WINDOWS = 1000  # of an episode, at most
 OUTLIER = 5.0  # robust standard deviations within a cell
 FEWEST = 3  # rows, of a cell of many
 NAMES = tuple(block.name for block in BLOCKS)
@@ -43,7 +45,7 @@ class Cells(NamedTuple):
     @property
     def key(self) -> Tensor:
         """[C] the same for the same cell of another model."""
-        return (self.block * 10_000 + self.patch) * 1000 + self.window
+        return (self.block * 10_000 + self.patch) * WINDOWS + self.window
 
     def rows(self, index: Tensor | slice) -> Cells:
         """Those cells alone, by a mask, numbers or a slice."""
@@ -143,12 +145,18 @@ def _grouped(name: str, rows: Rows, episode: Episode, sheet: Sheet) -> Rows:
 def _averaged(rows: Rows, block: int, episode: Episode, sheet: Sheet, rest: Tensor) -> Cells:
     place = _places(NAMES[block], sheet, rest)[rows.patch // 3]
     times = episode.times.to(rows.value)
-    window = ((times - times[0]) / STRETCH).floor().long()[rows.frame]
-    group, index = torch.unique(rows.patch * 1000 + window, return_inverse=True)
+    window = ((times - times[0]) / STRETCH + 1e-6).floor().long()[rows.frame]  # stamps are rounded
+    if int(window.max()) >= WINDOWS:
+        raise InvalidInput(
+            "episode", got=f"{float(times[-1] - times[0]):.0f} s", expected=f"less than {WINDOWS * STRETCH:.0f} s"
+        )
+    group, index = torch.unique(rows.patch * WINDOWS + window, return_inverse=True)
     size = len(group)
     add = lambda v: torch.zeros(size, *v.shape[1:], dtype=v.dtype).index_add(0, index, v)  # noqa: E731
     kept = _inliers(rows.value, index, size).to(rows.value)
     count = add(kept)
+    usual = int(add(torch.ones_like(kept)).median())  # slow streams have few rows in a window, and no strays to spot
+    least = FEWEST if usual > FEWEST else max(1, min(usual, FEWEST - 1))
     share = kept / count.clamp(min=1.0)[index]
     mean = add(share * rows.value)
     spread = add(share * (rows.value - mean[index]) ** 2).sqrt()
@@ -160,14 +168,14 @@ def _averaged(rows: Rows, block: int, episode: Episode, sheet: Sheet, rest: Tens
         count,
         spread,
         torch.full((size,), block),
-        group // 1000,
-        group % 1000,
+        group // WINDOWS,
+        group % WINDOWS,
         add(share[:, None] * place),
         add(share * times[rows.frame]),
         torch.zeros_like(mean),
         ray,
     )
-    return found.rows(count >= min(FEWEST, float(count.max())))
+    return found.rows(count >= least)
 
 
 def _inliers(value: Tensor, index: Tensor, size: int) -> Tensor:

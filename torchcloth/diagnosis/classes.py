@@ -30,7 +30,7 @@ def correlations(found: Fitted) -> Tensor:
 def alike(found: Fitted, row: Row, amplitude: float, others: Sequence[Row]) -> list[Row]:
     """Those of ``others`` that cannot be told from ``row`` at this amplitude or the one that was asked for.
 
-    Directions of the same effect are none.
+    Directions of the same effect are none, nor is what would have to have a sign that it cannot have.
     """
     index = {h.name: k for k, h in enumerate(found.evidence.hypotheses)}
     if row.hypothesis.name not in index:  # no world could have it there
@@ -40,6 +40,8 @@ def alike(found: Fitted, row: Row, amplitude: float, others: Sequence[Row]) -> l
     out = []
     for other in others:
         r = float(rho[index[other.hypothesis.name]])
+        if not other.hypothesis.signed and r * amplitude < 0:
+            r = 0.0
         told = square * (1 - r * r)
         if other.hypothesis.effect != row.hypothesis.effect and (abs(r) > ALIKE or told < TOLD):
             out.append(other)

@@ -62,6 +62,7 @@ class Gain(NamedTuple):
     calm: tuple[float, float]  # m RMS before and after, where what neither describes, or ripples, counts for less
     mended: tuple[float, float]  # m and N RMS, so weighed, that are gone from the episode where most is
     least: float  # that the density surely gains: more, in 95 of 100 cases
+    few: int = 0  # episodes, where they show too little of their own spread and the share's interval is doubled
 
     @property
     def fallen(self) -> float:
@@ -197,8 +198,9 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     before, after, n = squares.sum(0)
     low, high = (float(np.quantile(sums, q)) for q in (0.025, 0.975))
     total, share = float(density.sum()), _share(squares.sum(0), floor)
-    few = 2.0 if len(set(owner.tolist())) < FEW else 1.0
-    ends = (share + few * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
+    episodes = len(set(owner.tolist()))
+    few = episodes if episodes < FEW else 0
+    ends = (share + (2.0 if few else 1.0) * (float(np.quantile(shares, q)) - share) for q in (0.025, 0.975))
     left, right = (min(max(end, -1.0), 1.0) for end in ends)
     counts = one.smooth * torch.maximum(*(weights(p.white, p.stretch) for p in (one, two)))
     seen, felt = counts * one.seen, counts * (one.kind == SEEN)
@@ -206,7 +208,7 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     least = float(np.quantile(sums, 0.05)) if (drawn != 1).any() else -np.inf  # single stretches have no spread
     mended = (_mended(one, two, seen), 3**0.5 * _mended(one, two, felt))  # a force has three cells
     rms = [(square / n) ** 0.5 if n else np.nan for square in (before, after)]  # nothing was seen, only felt
-    return Gain(rms[0], rms[1], total, (low, high), share, (left, right), calm, mended, least)
+    return Gain(rms[0], rms[1], total, (low, high), share, (left, right), calm, mended, least, few)
 
 
 def by_motion(first: Predicted, second: Predicted, floor: float, names: Sequence[str]) -> dict[str, Gain]:

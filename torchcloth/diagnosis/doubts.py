@@ -9,11 +9,12 @@ from .comparison import compare, of_episodes, predict
 from .evidence import shared
 from .fitting import Fitted, fit, renoised, weighed_alike, without_cause
 from .lacking import explained, is_lacking, lack_of_fit
-from .noise import floor_of
+from .noise import floor_of, least
 from .placebo import placebo
 from .setting import Progress, Setting, staged
 from .trials import CLEAR, FURTHER, Step, alone_in, known, worth_naming, worthwhile
 from .world import Hypothesis
+from .worlds import IMPOSSIBLE
 
 
 def pruned(
@@ -25,8 +26,11 @@ def pruned(
         sure = known(current, name, setting.names, step.best)
         if sure and last:  # it has just been tried
             continue
-        less = without_cause(current, name)
-        less = fit(less, setting, (), 0, staged(progress, f"without {name}"), current.noise, current.evidence)
+        less, now = without_cause(current, name), staged(progress, f"without {name}")
+        try:
+            less = fit(less, setting, (), 0, now, current.noise, current.evidence)
+        except IMPOSSIBLE:  # what it does keeps the others from what no cloth does
+            continue
         without, there = (predict(f, setting.names, step.best.alone) for f in weighed_alike(less, current))
         gain = compare(without, there, 0.0)
         if sure and worth_naming(step.best, gain):
@@ -56,7 +60,10 @@ def plainer(
         brought, alone = other.best.hypothesis, other.best.alone
         plain = without_cause(current, h.name).plus(brought, brought.typical)  # what is there when h has gone
         left, now = plain.others(hypotheses), staged(progress, f"{h.brings} instead of {h.name}")
-        found = fit(plain, setting, left, FURTHER, now, before=current.evidence)
+        try:
+            found = fit(plain, setting, left, FURTHER, now, before=current.evidence)
+        except IMPOSSIBLE:
+            continue
         chance = placebo(renoised(other.best.fitted, found.noise, found.evidence), setting.names, alone)
         if chance.passed and predicts_better(current, found, setting.names) < CLEAR:
             current, steps = found, [*steps[:k], replace(other, placebo=chance), *steps[k + 1 :]]
@@ -79,7 +86,7 @@ def mended(start: Fitted, end: Fitted, names: Sequence[str], alone: Collection[s
         share = explained(first, left)
         return share if share < 0 or any(row.lacking for row in first) else 1.0
     before, after = (predict(f, names, alone) for f in weighed_alike(start, end))
-    return compare(before, after, floor_of(end.evidence, end.noise)).explained
+    return compare(before, after, floor_of(end.evidence, least())).explained
 
 
 def unheard(start: Fitted, end: Fitted, steps: Sequence[Step], names: Sequence[str]) -> bool:

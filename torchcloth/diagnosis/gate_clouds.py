@@ -15,7 +15,9 @@ from ..cloth import Cloth
 from ..identification.episodes import cloth_from, first_shape
 from ..losses import closest
 from ..recordings import Recording, extents
-from ..robots.paths import Path, holding  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..robots.paths import Path, holding  # pyright: ignore[reportMissingImports]
+from ..types import Trajectory
 
 FAR = 0.1  # m, of the first points from the first shape, half of them
 STRAY, REACH = 0.1, 1.1  # share of points, and lengths of the cloth from a gripper that holds it
@@ -73,13 +75,18 @@ class Seen:
         return np.stack([path.at(self.t)[0] for path in self.paths.values()], 1)
 
     @cached_property
+    def moved(self) -> dict[str, Trajectory]:
+        """How, by name."""
+        return replay(self.recording)
+
+    @cached_property
     def holding(self) -> np.ndarray:
         """The same while they hold; NaN once they have let go."""
         out = self.held.copy()
         for k, name in enumerate(self.paths):
-            motion = self.recording.joints.get(name) or self.recording.grippers[name]
-            knot = np.searchsorted(motion.t, self.t + 1e-9, side="right").clip(min=1) - 1
-            out[~np.asarray(motion.closed, dtype=bool)[knot], k] = np.nan
+            motion = self.moved[name]
+            knot = np.searchsorted(motion.t.numpy(), self.t + 1e-9, side="right").clip(min=1) - 1
+            out[~motion.closed.numpy()[knot], k] = np.nan
         return out
 
 

@@ -11,11 +11,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
-from ..errors import InvalidInput
+from ..errors import InvalidInput, TorchclothError
 from ..recordings import Recording
 from . import air, fabric, grip, observer
 from .world import RESIDUAL, Hypothesis, Model
 
+TAKEN = frozenset({air.DRAG, "linear", "added_mass", "viscosity", "hem", "seam", "rest_shape", "gravity", "bending"})
 _registered: list[Hypothesis] = []
 _notes: list[list[Hypothesis]] = []
 
@@ -77,7 +78,21 @@ def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]
     """All hypotheses that the recordings could say something about."""
     without = () if "bending" in model.base.cloth.effects else fabric.OF_BENDING
     asked = [h for h in model.others(known()) if h.effect not in without]
+    for own in _registered:
+        _refuse_taken(own, model)
     return [here(h, model, recordings) for h in asked if any(h.needs(r) for r in recordings)]
+
+
+def _refuse_taken(own: Hypothesis, model: Model) -> None:
+    """Of two effects of one name the later would silently take the place of the earlier."""
+    try:
+        effects = own.apply(model.base, own.typical).cloth.effects
+    except TorchclothError:
+        return  # the search says so
+    for name, effect in effects.items():
+        if name in TAKEN and not type(effect).__module__.startswith("torchcloth."):
+            got = f"an effect {type(effect).__name__} named {name!r}, as the catalogue calls one of its own"
+            raise InvalidInput(f"hypothesis {own.name!r}", got=got, expected="another name")
 
 
 def here(hypothesis: Hypothesis, model: Model, recordings: Sequence[Recording] = ()) -> Hypothesis:

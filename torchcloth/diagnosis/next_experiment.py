@@ -114,7 +114,7 @@ def question_of(found: Found, content: Mapping[str, Any]) -> Question | None:
         known = {h.name for h in step.before.evidence.hypotheses}
         open_to = known & {cause["effect"], *(r["effect"] for r in cause["rivals"])}
         amplitudes = {h.name: a for h, a in found.alike(step) if h.name in open_to}
-        rows = {r.hypothesis.name: r.amplitude for r in step.screened}
+        rows = {r.hypothesis.name: r.amplitude for r in step.screened if not r.wrong_sign}
         amplitudes |= {name: rows[name] for name in cause.get("class", ()) if name in rows and name not in amplitudes}
         best = step.best.hypothesis.name
         pairs = tuple((best, other) for other in amplitudes if other != best)

@@ -86,7 +86,13 @@ class Whitened(NamedTuple):
 
 
 def whitened(evidence: Evidence, noise: Noise) -> Whitened:
-    """Cells and slopes by the inverse Cholesky factor of every episode's covariance."""
+    """Cells and slopes by the inverse Cholesky factor of every episode's covariance.
+
+    Raises:
+        InvalidInput: no cell is left.
+    """
+    if not any(len(cells.value) for cells in evidence.cells):
+        raise _nothing_left()
     values, slopes, index, logs, roots = [], [], [], [], []
     count = evidence.own + len(evidence.hypotheses)
     for k, (cells, std) in enumerate(zip(evidence.cells, evidence.stds, strict=True)):
@@ -176,10 +182,14 @@ def floor_of(evidence: Evidence, noise: Noise) -> float:
         variance = noise.plain(cells)[own]
         total, count = total + float(variance.sum()), count + int(own.sum())
     if not count:
-        raise InvalidInput(
-            "episodes",
-            got="no place on the cloth that finer and coarser meshes and neighbouring values find alike",
-            expected="some",
-            remedy="shorter or slower motions, with more of the cloth in view",
-        )
+        raise _nothing_left()
     return (total / count) ** 0.5
+
+
+def _nothing_left() -> InvalidInput:
+    return InvalidInput(
+        "episodes",
+        got="no place on the cloth that finer and coarser meshes and neighbouring values find alike",
+        expected="some",
+        remedy="shorter or slower motions, with more of the cloth in view",
+    )

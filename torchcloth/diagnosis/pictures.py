@@ -178,7 +178,8 @@ def _local(found: MissingForce, m: Missing) -> tuple[np.ndarray, np.ndarray]:
     x, uv = m.x[window].numpy(), found.uv.numpy()
     corners, place = x[found.faces.numpy()], uv[found.faces.numpy()]
     sides = np.stack([place[:, 1] - place[:, 0], place[:, 2] - place[:, 0]], -1)  # columns in the pattern
-    gradient = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], -1) @ np.linalg.inv(sides)
+    along = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], -1)
+    gradient = along @ np.linalg.pinv(sides)  # a triangle that is seen edge-on spans nothing
     tangent = np.zeros((len(x), 3, 2))
     np.add.at(tangent, found.faces.numpy().ravel(), np.repeat(gradient, 3, axis=0))
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)

@@ -17,6 +17,7 @@ from .cells import Piece
 from .refined import refined
 from .world import Model, World
 
+MOST = 8000  # points of a frame
 LATE = 0.05  # s, by which a clock may be late and its last frames still be simulated
 MEANWHILE = f"after its first frame and before its last {LATE:g} s"
 Progress = Callable[[str], None]
@@ -74,7 +75,7 @@ def setting_of(model: Model, recordings: Sequence[Recording]) -> Setting:
 
 def _setting(model: Model, recordings: Sequence[Recording]) -> Setting:
     cloth = model.base.cloth
-    episodes = tuple(_telling(foreseen(episode(cloth, r))) for r in recordings)
+    episodes = tuple(_telling(foreseen(_thinned(episode(cloth, r)))) for r in recordings)
     mesh = cloth.mesh
     pattern = torch.as_tensor(mesh.vertices).double()
     if mesh.uv is not None:
@@ -83,6 +84,13 @@ def _setting(model: Model, recordings: Sequence[Recording]) -> Setting:
         thin = int((pattern.amax(0) - pattern.amin(0)).argmin())
         pattern = pattern[:, [*(k for k in range(3) if k != thin), thin]]
     return Setting(model.base, tuple(recordings), episodes, sheet_for(cloth, episodes), pattern)
+
+
+def _thinned(e: Episode) -> Episode:
+    """With MOST points of a frame at most, drawn alike every time: more only take memory, means over parts are sure."""
+    draw = torch.Generator().manual_seed(0)
+    kept = lambda c: torch.randperm(len(c), generator=draw)[:MOST].sort().values  # noqa: E731
+    return replace(e, clouds=[c[kept(c)] if len(c) > MOST else c for c in e.clouds])
 
 
 def foreseen(e: Episode) -> Episode:

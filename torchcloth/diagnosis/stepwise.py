@@ -13,7 +13,7 @@ from .comparison import Gain, Predicted, compare, heard, predict
 from .doubts import mended, plainer, predicts_better, pruned, unheard
 from .fitting import Fitted, fit, weighed_alike
 from .lacking import is_lacking
-from .noise import floor_of
+from .noise import floor_of, least
 from .repeats import Repeats, pairs_of, repeats
 from .screening import MUCH, Row, screen
 from .setting import Progress, Setting, staged
@@ -259,7 +259,8 @@ def _held_out(start: Fitted, current: Fitted, steps: list[Step], setting: Settin
 def _found(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> Found:
     screened = screen(current)
     alone = alone_in(steps)
-    last, sensor = predict(current, setting.names, alone), floor_of(current.evidence, current.noise)
+    last = predict(current, setting.names, alone)
+    sensor = floor_of(current.evidence, least())  # slow errors that were fitted may be the model's own
     repeated = repeats(last, pairs_of(setting.recordings, setting.episodes))
     floor = sensor if repeated is None else repeated.rms
     held_out = _held_out(start, current, steps, setting)

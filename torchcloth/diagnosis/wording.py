@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from .base_model import SILENT
 from .glossary import GLOSSARY
 from .lacking import TOLERATED, Left
 from .screening import MUCH, Row
@@ -155,6 +156,8 @@ def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> lis
     out += on_top(found.end.model)
     if found.repeats is None:
         out.append("floor: sensor only; no episode repeats another, so what repetitions differ by is not known")
+    if any(p.name == "youngs_modulus" and p.std > SILENT for p in found.start.model.parameters):
+        out.append("the data sheet says no stiffness in tension: it is sought over two decades")
     if "bending" not in found.start.model.base.cloth.effects:
         out.append(
             "the data sheet says no bending stiffness: the model's cloth has none, and nothing is asked about it"
@@ -178,8 +181,10 @@ def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> lis
         out += [_too_large(row) for row in found.screened if _is_too_large(row)][:1]
     if len(set(names)) < 3:
         out.append(f"{len(set(names))} kind(s) of motion: many causes look alike in them")
-    if len(names) < 8:
-        out.append(f"{len(names)} episodes show little of their own spread: the explained share's interval is doubled")
+    if found.whole is not None and found.whole.few:
+        out.append(
+            f"{found.whole.few} episodes show little of their own spread: the explained share's interval is doubled"
+        )
     return out
 
 

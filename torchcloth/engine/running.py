@@ -102,7 +102,9 @@ def _ports(job: Job):
         if not tensor.is_contiguous() or tensor.dtype != job.program.dtype:
             raise ValueError(f"{f}: not contiguous or of another precision")
         if tensor.shape[1:] != shape or len(tensor) not in (1, job.scenes):
-            raise ValueError(f"{f}: got shape {list(tensor.shape)}, expected [1 or {job.scenes}, {shape[0]}, {shape[1]}]")
+            raise ValueError(
+                f"{f}: got shape {list(tensor.shape)}, expected [1 or {job.scenes}, {shape[0]}, {shape[1]}]"
+            )
         ports[f.id].value, ports[f.id].stride = tensor.data_ptr(), tensor[0].numel() if len(tensor) > 1 else 0
     return ports
 
