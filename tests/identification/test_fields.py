@@ -96,6 +96,27 @@ def test_the_prior_of_a_slope_does_not_depend_on_the_mesh(resolution):
     assert float(rise @ matrix @ rise) == pytest.approx(1.0, rel=0.2)
 
 
+@pytest.mark.parametrize("gap", [0.0, 0.02])
+def test_panels_that_lie_on_each_other_are_neighbours_as_any_others(gap):
+    """Across a side seam of a shirt that lies flat the centres of two triangles are next to each other in space."""
+    mesh = tc.meshes.shirt(triangles=300, gap=gap)
+    matrix = laplacian(mesh)
+    pairs = -matrix[matrix < 0]
+    assert bool(matrix.isfinite().all())
+    assert float(pairs.max()) < 6 * float(pairs.median())
+    assert float((matrix @ torch.ones(len(matrix), dtype=torch.float64)).abs().max()) < 1e-9
+
+
+def test_distances_of_centres_are_those_of_triangles_side_by_side():
+    mesh = tc.meshes.rectangle(0.3, 0.2, resolution=(5, 4))
+    flat, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    centres, matrix = flat[faces].mean(1), laplacian(mesh)
+    for a, b in zip(*np.nonzero(np.triu(matrix.numpy(), 1)), strict=True):
+        i, j = set(faces[a]) & set(faces[b])
+        weight = np.linalg.norm(flat[i] - flat[j]) / np.linalg.norm(centres[a] - centres[b])
+        assert -float(matrix[a, b]) == pytest.approx(weight, rel=1e-9)
+
+
 @pytest.mark.parametrize("name", ["poisson_ratio", "cone", "nothing"])
 def test_what_is_no_field_is_refused(striped, name):
     recording = striped(frames=4, points=50)

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ import twins
 
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import cloth_from, draw, episode, identify, print_fit, replayed, streams
-from torchcloth.identification.report import worthless
+from torchcloth.identification.blocks import USES
+from torchcloth.identification.null import CARRIED, UNFELT, no_better_than
+from torchcloth.identification.replays import Frames
 
 STIFFNESS = ["youngs_modulus"]
 
@@ -81,9 +84,32 @@ def test_its_pictures_show_forces(fit, felt, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["forces.png", "parameters.png"]
 
 
-def test_a_fit_of_forces_that_is_worthless_is_called_so(fit):
-    assert not worthless(fit.fit)
-    assert worthless({**fit.fit, "force_rms_after": fit.fit["force_rms_null"]})
+def test_a_fit_is_held_against_the_null_of_the_data_that_tell(felt):
+    """Cloth that hangs still lies where it lay, whatever it is: only force tells of it, and only where it is in use."""
+    model = cloth_from(felt)
+    own = episode(model, felt)
+    here = [own.initial + 1e-4 * torch.randn(400, *own.initial.shape)[0] for _ in own.times]
+    still = replace(
+        own,
+        motion={n: m._replace(pose=m.pose[:1].expand_as(m.pose)) for n, m in own.motion.items()},
+        clouds=here,
+    )
+    moved = replace(own, clouds=[x + torch.tensor([0.0, 0.0, 0.1]) for x in here])
+
+    def told(data, *kinds, force=1.0, shift=0.0):
+        names = [name for kind in kinds for name in USES[kind]]
+        blocks = [SimpleNamespace(name=name) for name in names]
+        scene = SimpleNamespace(blocks=blocks, episodes=[data], faces=torch.as_tensor(model.mesh.faces))
+        x = torch.stack(list(data.clouds)) + shift
+        wrench = {n: force * w.nan_to_num() for n, w in data.wrenches.items()}
+        return no_better_than(scene, [Frames(x, 0 * x, wrench, torch.zeros(len(x), 0))])
+
+    assert told(still, "points", "force") == ""
+    assert told(still, "points", "force", force=-1.0) == UNFELT
+    assert told(still, "points") == ""
+    assert told(moved, "points", "force", force=-1.0) == ""
+    assert told(moved, "points", "force", shift=0.5) == CARRIED
+    assert told(moved, "force", shift=0.5) == ""
 
 
 @pytest.mark.parametrize("options", [{"method": "adam"}, {"stop": "paper"}])

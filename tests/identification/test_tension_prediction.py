@@ -85,6 +85,16 @@ def test_a_wrong_law_widens_the_interval_until_it_covers(tables):
     assert missed == pytest.approx(share, rel=0.2), "the 45 degrees are missed by what was put in"
 
 
+def test_a_direction_is_left_out_with_all_its_tables(tables):
+    """Of two strips at 45 degrees either tells what the other reads, and nothing of the law between directions."""
+    twice = [*tables, readings(45, 0.03, np.random.default_rng(5), count=20)]
+    *parts, whole = cross_validated(fit_tension(cloth(), twice, NAMES), cloth(), twice)
+    assert [len(part.model.tables) for part in parts] == [3, 2, 3]
+    assert whole.model.tables[1].left_out["force"] == pytest.approx(whole.model.tables[3].left_out["force"], abs=0.05)
+    with pytest.raises(InvalidInput, match="got 2 directions"):
+        next(cross_validated(whole, cloth(), [twice[0], twice[1], twice[3]]))
+
+
 def test_a_table_whose_miss_the_numbers_errors_explain_says_nothing_of_the_law():
     """Of three angles, the two at the ends leave the shear modulus open, whatever the third one reads."""
     draw = np.random.default_rng(2)
@@ -106,7 +116,7 @@ def test_where_the_laws_part_comes_from_is_said(fit, tables):
     assert outside.force.law[-1] == pytest.approx((0.13**0.5) * outside.force.value[-1], rel=0.01)
     beyond = predict_tension(fit.model, replace(strip(30), displacement=np.linspace(0, 2e-4, 11)))
     assert any("beyond the strains" in w for w in beyond.warnings)
-    with pytest.raises(InvalidInput, match="tables; got 2; expected three or more"):
+    with pytest.raises(InvalidInput, match="tables; got 2 directions; expected three or more"):
         next(cross_validated(fit, cloth(), tables[:2]))
 
 

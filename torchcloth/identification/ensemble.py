@@ -184,11 +184,12 @@ class Around:
         self.objective, self.mask = objective, mask
         self.wider, self.drawn = with_held_places(objective)
         self.samples: list[Sample] = []
+        self.fresh = 0  # number of the first one of this round
         self.rows: Linearised  # what rows mean, from the first simulation on
 
     def add(self, raw: Tensor, spread: Tensor) -> None:
         """Pairs on both sides of ``raw`` [K]; ``spread`` [K]: their standard deviations."""
-        count = len(raw)
+        count, self.fresh = len(raw), len(self.samples)
         for offset in _offsets(count, int(self.drawn.sum()), len(self.samples)):
             near = self.objective.clip(raw + spread * offset[:count])
             point = self.wider.start.clone()
@@ -208,7 +209,8 @@ class Around:
         Raises:
             SimulationDiverged: too few.
         """
-        found = [s for s in self.samples if bool(((s.raw - raw).abs() <= NEAR * spread).all())]
+        earlier = [s for s in self.samples[: self.fresh] if bool(((s.raw - raw).abs() <= NEAR * spread).all())]
+        found = [*earlier, *self.samples[self.fresh :]]  # of many unknowns some always lie far out in one
         if len(found) < len(raw) + SPARE:
             raise SimulationDiverged(
                 f"only {len(found)} simulations around the solution went well",

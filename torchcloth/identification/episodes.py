@@ -333,6 +333,9 @@ def _check_place(name: str, cloth: Cloth, motion: Mapping[str, Trajectory], x: T
     """Refuse a cloth that is not where its grippers are: only their increments move it, so nothing else would show."""
     for key, boundary in cloth.boundaries.items():
         if isinstance(boundary, Grasp):
+            knot = int(torch.searchsorted(motion[key].t.double(), start + 1e-9, right=True)) - 1
+            if not motion[key].closed[max(knot, 0)]:  # it comes for the cloth later
+                continue
             pose = interpolate(motion[key], torch.tensor([start], dtype=torch.float64))
             gap = float((x[boundary.index].mean(0) - pose[0, :3, 3]).norm())
             if gap > FARTHEST:

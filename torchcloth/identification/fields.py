@@ -200,18 +200,32 @@ class _Fields(Objective):
         return frames_of(called(Replay(self.cloth), entries, (data, self.dt)))
 
 
+def _centres(sides: np.ndarray, length: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[F, 3] m each: where a triangle's centre lies beside each of its sides, along it and off it."""
+    reach = sides / 3 - np.roll(sides, 1, axis=1) / 3  # from each corner: a third of the way to both others
+    along = (reach * sides).sum(-1) / length
+    off = np.abs(sides[..., 0] * reach[..., 1] - sides[..., 1] * reach[..., 0]) / length
+    return along, off
+
+
 def laplacian(mesh: Mesh) -> Tensor:
-    """[F, F], of triangles across inner edges: edge length over distance of the centres, at rest."""
+    """[F, F], of triangles across inner edges: edge length over distance of the centres, at rest and laid side by side.
+
+    Panels that lie on each other are as far apart at a seam as anywhere else.
+    """
     faces = np.asarray(mesh.faces)
-    flat = np.asarray(mesh.vertices)
+    sides = np.roll(mesh.rest, -1, axis=1) - mesh.rest  # [F, 3, 2], from each corner to the next
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     order = np.lexsort(edges.T)
     same = (edges[order][1:] == edges[order][:-1]).all(1)
     first, second = order[:-1][same], order[1:][same]
-    centres = flat[faces].mean(1)
     a, b = first // 3, second // 3
-    length = np.linalg.norm(flat[edges[first, 0]] - flat[edges[first, 1]], axis=1)
-    weight = torch.as_tensor(length / np.linalg.norm(centres[a] - centres[b], axis=1), dtype=torch.float64)
+    length = np.linalg.norm(sides, axis=-1)
+    along, above = _centres(sides, length)
+    flipped = faces[a, first % 3] != faces[b, second % 3]  # neighbours go through their edge in opposite ways
+    other = np.where(flipped, length[b, second % 3] - along[b, second % 3], along[b, second % 3])
+    apart = np.hypot(above[a, first % 3] + above[b, second % 3], along[a, first % 3] - other)
+    weight = torch.as_tensor(length[a, first % 3] / apart, dtype=torch.float64)
     out = torch.zeros(len(faces), len(faces), dtype=torch.float64)
     for i, j, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
         out.index_put_((torch.as_tensor(i), torch.as_tensor(j)), sign * weight, accumulate=True)

@@ -27,12 +27,12 @@ from .identifiability import combinations, influences
 from .journal import Journal
 from .misfit import figures, forces_rms
 from .nuisances import chosen, foreseen, implied
-from .null import constant_force, no_force, rigid_carry
+from .null import constant_force, no_better_than, no_force, rigid_carry
 from .objective import Objective
 from .profile import profiles
 from .replays import Frames
 from .replicates import strata_of
-from .report import estimates, nuisance_estimates, skewed, warnings_of, with_profiles, withdraw, worthless
+from .report import estimates, nuisance_estimates, skewed, warnings_of, with_profiles, withdraw
 from .result import Identification
 from .saved import model_of
 from .search import CHAMFER, METHODS, Method, Outcome, Progress, Search
@@ -244,14 +244,15 @@ def _concluded(
         fit["replicates"] = int((search.strata > 0).sum())
     if outcome.reached is not None:
         fit |= {"starts": outcome.reached.tried, "starts_agreeing": outcome.reached.agree}
-    withdrawn = checked.withdrawn or worthless(fit)
+    null_of = no_better_than(full, end)
+    withdrawn = checked.withdrawn or bool(null_of)
     if withdrawn:  # slopes of chaos, or of elsewhere, promise tiny errors
         found = withdraw(found, full.unknowns, final.raw)
     warnings += [outcome.unfinished] if outcome.unfinished else []
     warnings += skewed(found, [name for name in checked.curved if name not in profiled])
     used = [x[: len(e.times)] for x, e in zip(after, told.episodes, strict=True)]
     rms = figures(used, told.episodes, full.faces).rms
-    warnings += warnings_of(full.cloth, full.episodes, found, {**fit, "rms_after": rms}, after, full.faces)
+    warnings += warnings_of(full.cloth, full.episodes, found, {**fit, "rms_after": rms}, after, full.faces, null_of)
     keys = {u.name: u.key.removesuffix(".raw") for u in full.unknowns}
     nuisances = nuisance_estimates(full.episodes, full.placed, final.raw, covariance, withdrawn)
     return Identification(

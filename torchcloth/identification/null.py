@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from ..boundaries.motion import interpolate
+from .blocks import USES
 from .episodes import Episode
+from .misfit import figures, forces_rms
+from .objective import Objective
+from .replays import Frames
 
+STILL = 1e-3  # m, that cloth moves with grippers that stand
+CARRIED, UNFELT = "cloth carried rigidly by the grippers", "no force at all"
 ARM = 0.05  # m, length of the axes that carry a gripper's orientation into the alignment
 
 
@@ -29,6 +38,26 @@ def no_force(episode: Episode) -> dict[str, Tensor]:
 def constant_force(episode: Episode) -> dict[str, Tensor]:
     """Each gripper's mean reading, which a weight alone would give."""
     return {name: wrench.nanmean(0).expand_as(wrench) for name, wrench in episode.wrenches.items()}
+
+
+def no_better_than(objective: Objective, frames: Sequence[Frames]) -> str:
+    """The null that ``frames`` of the objective's episodes do not beat, in words; empty where they do or none exists.
+
+    By distance to what was seen while grippers moved, else by force: cloth that hangs still lies where it lay at first,
+    whatever it is made of.
+    """
+    used = {block.name for block in objective.blocks}
+    if used & {*USES["points"], *USES["markers"]}:
+        rigid = [rigid_carry(e) for e in objective.episodes]
+        moved = [k for k, x in enumerate(rigid) if float((x - x[:1]).abs().max()) > STILL]
+        seen = [objective.episodes[k] for k in moved]
+        own, null = (figures([x[k] for k in moved], seen, objective.faces) for x in ([f.x for f in frames], rigid))
+        if not math.isnan(own.chamfer):
+            return CARRIED if own.chamfer >= null.chamfer else ""
+    if used & {*USES["force"]} and any(e.wrenches for e in objective.episodes):
+        felt = forces_rms([f.wrench for f in frames], objective.episodes)
+        return UNFELT if felt >= forces_rms([no_force(e) for e in objective.episodes], objective.episodes) else ""
+    return ""
 
 
 def _marks(pose: Tensor) -> Tensor:

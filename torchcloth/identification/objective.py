@@ -19,7 +19,7 @@ from .episodes import Episode
 from .identifiability import Reach
 from .journal import Journal, digest, facts_of
 from .misfit import Figures, figures, huber
-from .nuisances import AbstractNuisance, Placed, place
+from .nuisances import AbstractNuisance, Placed, foreseen, place
 from .replays import Frames, each, simulate, tangents
 from .rows import Rows, scene_of
 from .sheet import sheet_for
@@ -61,14 +61,14 @@ class Objective:
 
     def part(self, share: float) -> Objective:
         """The same for the first ``share`` of the frames."""
-        return self._like([e.until(share).beyond(e.lookahead) for e in self.episodes], self.nuisances)
+        return self._like(foreseen([e.until(share) for e in self.episodes], self.nuisances), self.nuisances)
 
     @property
     def told(self) -> bool:
         """Whether there are any data of the kinds in use."""
         of = {
-            "points": lambda e: any(len(cloud) for cloud in e.clouds),
-            "markers": lambda e: e.markers is not None and bool(e.markers.isfinite().any()),
+            "points": lambda e: any(len(cloud) for cloud in e.clouds[1:]),
+            "markers": lambda e: e.markers is not None and bool(e.markers[1:].isfinite().any()),
             "force": lambda e: any(bool(w[1:].isfinite().any()) for w in e.wrenches.values()),
         }
         names = {block.name for block in self.blocks}
@@ -313,11 +313,15 @@ class Objective:
             asked = ", ".join(block.name for block in self.blocks)
             raise InvalidInput("use", got=f"{asked}, which no episode has", expected="kinds of data that one has")
         double, count = torch.float64, len(self.start)
-        jacobians = [r.value.new_zeros(len(r.value), count) if r.jacobian is None else r.jacobian for *_, r in parts]
         value = torch.cat([r.value for *_, r in parts]).to(double)
+        if any(r.jacobian is not None for *_, r in parts):
+            zeros = lambda r: r.value.new_zeros(len(r.value), count)  # noqa: E731
+            jacobian = torch.cat([zeros(r) if r.jacobian is None else r.jacobian for *_, r in parts]).to(double)
+        else:  # one zero for all: with many rows and unknowns they would fill memory and journal
+            jacobian = value.new_zeros(1, 1).expand(len(value), count)
         return gauss_newton.Linearised(
             value=value,
-            jacobian=torch.cat(jacobians).to(double),
+            jacobian=jacobian,
             factor=torch.ones_like(value),
             frame=torch.cat([r.frame + offset for _, offset, r in parts]),
             patch=torch.cat([r.patch for *_, r in parts]),

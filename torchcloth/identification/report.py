@@ -149,12 +149,6 @@ def doubts(found: Found) -> list[str]:
     return out
 
 
-def worthless(fit: Mapping[str, float]) -> bool:
-    """Whether the fit is no better than its null: by distance, or by force where nothing was seen."""
-    by = "force_rms" if math.isnan(fit["chamfer_after"]) else "chamfer"
-    return fit[f"{by}_after"] >= fit[f"{by}_null"]
-
-
 def warnings_of(
     cloth: Cloth,
     episodes: Sequence[Episode],
@@ -162,11 +156,11 @@ def warnings_of(
     fit: dict[str, float],
     frames: Sequence[Tensor],
     faces: Tensor,
+    null: str = "",
 ) -> list[str]:
-    """What a reader must know before he uses the numbers."""
+    """What a reader must know before he uses the numbers; ``null``: ``no_better_than``."""
     out = []
-    if worthless(fit):
-        null = "no force at all" if math.isnan(fit["chamfer_after"]) else "cloth carried rigidly by the grippers"
+    if null:
         out.append(f"the fit is no better than {null}: these data say nothing about it")
     elif math.isnan(fit["chamfer_after"]) and fit["force_rms_after"] >= STEADY * fit["force_rms_constant"]:
         out.append("constant forces would do as well: these data weigh the cloth and say little else")

@@ -75,7 +75,7 @@ class Identification:
         return {
             "parameters": {name: asdict(estimate) for name, estimate in self.parameters.items()},
             "fit": {name: or_none(value) for name, value in self.fit.items()},
-            "correlation": self.correlation,
+            "correlation": {a: {b: or_none(r) for b, r in row.items()} for a, row in self.correlation.items()},
             "identifiability": {name: asdict(influence) for name, influence in self.influences.items()},
             "combinations": [{"of": c.text, **asdict(c)} for c in self.combinations],
             "nuisances": {

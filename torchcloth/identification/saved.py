@@ -18,6 +18,7 @@ from ..errors import InvalidInput, RecordingError, UnstableStep
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from ..recordings.marks import alike, mark
+from ..recordings.together import together
 from ..transfer import Contact
 from .described import beyond
 from .episodes import Episode, cloth_from, episode
@@ -68,7 +69,7 @@ def model_of(cloth: Cloth, fit: Identification, recordings: Sequence[Recording],
         "values": values,
         "contact": contact,
         "dt": dt,
-        "beyond": beyond(cloth, recordings[0]),
+        "beyond": beyond(cloth, together(recordings)),
         "episodes": episodes,
     }
 

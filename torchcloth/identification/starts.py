@@ -49,6 +49,6 @@ def best(problem: gauss_newton.Problem, found: Sequence[gauss_newton.Iterate]) -
     judge = min(found, key=lambda at: float(at.scale.log().sum()))  # explains most: its noise is the smallest
     costs = [gauss_newton.cost(problem, judge, at.raw, at.linear.value) for at in found]
     winner = found[costs.index(min(costs))]
-    hessian = torch.linalg.inv(gauss_newton.covariance(problem, winner))
-    away = [float((at.raw - winner.raw) @ hessian @ (at.raw - winner.raw)) ** 0.5 for at in found]
+    hessian = torch.linalg.pinv(gauss_newton.covariance(problem, winner), hermitian=True)  # chaos leaves it singular
+    away = [max(float((at.raw - winner.raw) @ hessian @ (at.raw - winner.raw)), 0.0) ** 0.5 for at in found]
     return Reached(winner.raw, sum(d <= SAME for d in away), len(found))

@@ -204,24 +204,32 @@ def specimen_like(
 def cross_validated(
     fit: TensionFit, cloth: Cloth, tables: Sequence[ForceDisplacement], **options: Any
 ) -> Iterator[TensionFit]:
-    """Fit again with one table after the other left out; yields each of these fits, then ``fit`` knowing their errors.
+    """Fit again with one direction after the other left out; yields these fits, then ``fit`` knowing their errors.
 
     The last one says how far the law is from directions that were not fitted. The others are its parts, for those who
     want to see them, and for progress.
 
     Args:
         fit: of all tables.
-        cloth, tables, options: as given to ``fit_tension``; three tables or more.
+        cloth, tables, options: as given to ``fit_tension``; three directions or more.
 
     Raises:
-        InvalidInput: fewer than three tables.
+        InvalidInput: fewer than three directions.
     """
-    if len(tables) < 3:
-        raise InvalidInput("tables", got=f"{len(tables)}", expected="three or more, to leave one out")
-    left_out = []
-    for k, table in enumerate(tables):
-        part = fit_tension(cloth, [t for i, t in enumerate(tables) if i != k], list(fit.keys), **options)
-        left_out.append(excess(part.model, table))
+    angles: list[float] = []
+    for table in tables:
+        if all(abs(_folded(table.angle) - a) >= SAME for a in angles):
+            angles.append(_folded(table.angle))
+    if len(angles) < 3:
+        raise InvalidInput("tables", got=f"{len(angles)} directions", expected="three or more, to leave one out")
+    left_out: list[dict[str, float | None]] = [{} for _ in tables]
+    for angle in angles:
+        own = [abs(_folded(t.angle) - angle) < SAME for t in tables]
+        others = [t for t, is_own in zip(tables, own, strict=True) if not is_own]
+        part = fit_tension(cloth, others, list(fit.keys), **options)
+        for k, table in enumerate(tables):
+            if own[k]:
+                left_out[k] = excess(part.model, table)
         yield part
     yield replace(fit, model=with_left_out(fit.model, left_out))
 
