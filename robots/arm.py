@@ -103,11 +103,11 @@ class Arm(nn.Module):
         super().__init__()
         self.name, self.model, self.frame = description.name, model or description.name, frame
         self.joint_names, self.joint_types = description.joint_names, description.joint_types
-        self._shapes = description.shapes
+        self._shapes, self._unshaped = description.shapes, description.unshaped
         prismatic = torch.tensor([kind == "prismatic" for kind in self.joint_types])
         posture = torch.tensor(home or [0.0] * len(self.joint_names), dtype=torch.float64)
         buffers = {
-            "base": torch.eye(4, dtype=torch.float64) if base is None else _checked_base(base),
+            "base": torch.eye(4, dtype=torch.float64) if base is None else _checked_base(base, dtype),
             "home": posture.clamp(description.limits[2], description.limits[3]),
             "_modes": joint_modes(description.origin, description.axis, prismatic),
             "_axis": description.axis,
@@ -124,6 +124,11 @@ class Arm(nn.Module):
     def bodies(self) -> tuple[int, ...]:
         """Which joint moves each solid of ``geometry``, counted from 1; 0 for those of the root."""
         return tuple(shape.body for shape in self._shapes)
+
+    @property
+    def unshaped(self) -> tuple[str, ...]:
+        """Links whose solids are meshes alone, which ``geometry`` leaves out."""
+        return self._unshaped
 
     @property
     def limits(self) -> Limits:
@@ -297,8 +302,11 @@ class Arm(nn.Module):
         return q.to(self.base)
 
 
-def _checked_base(base: Tensor) -> Tensor:
+def _checked_base(base: Tensor, dtype: torch.dtype) -> Tensor:
     base = torch.as_tensor(base)
+    if base.requires_grad and base.is_leaf and base.dtype != dtype:  # a copy follows no optimiser
+        remedy = "make both alike: load(..., dtype=base.dtype), or base.double()"
+        raise InvalidInput("base that is learned", got=base.dtype, expected=f"the arm's {dtype}", remedy=remedy)
     if base.shape != (4, 4) or not base.is_floating_point():
         got = f"{base.dtype} {tuple(base.shape)}"
         raise InvalidInput("base has the wrong shape or type", got=got, expected="floating (4, 4)")

@@ -46,6 +46,7 @@ class Description(NamedTuple):
     tip: Tensor  # [4, 4] m, the frame in the last body
     limits: Tensor  # [6, J] lower, upper, soft lower, soft upper, velocity, effort
     shapes: tuple[Shape, ...]
+    unshaped: tuple[str, ...]  # links of the chain whose solids are meshes alone
 
 
 def models() -> list[str]:
@@ -111,6 +112,7 @@ def describe(path: Path, frame: str) -> Description:
         tip=pending,
         limits=torch.tensor([_limits(joint) for joint in moving], dtype=torch.float64).T.contiguous(),
         shapes=tuple(shapes),
+        unshaped=_unshaped([robot.link_map[chain[0].parent], *(robot.link_map[joint.child] for joint in chain)]),
     )
 
 
@@ -178,6 +180,11 @@ def _shapes(link: Any, body: int, placed: Tensor) -> list[Shape]:
         ]
 
     return read(link.collisions) or read(link.visuals)
+
+
+def _unshaped(links: list) -> tuple[str, ...]:
+    solids = [(link.name, [*link.collisions, *link.visuals]) for link in links]
+    return tuple(name for name, own in solids if own and all(_primitive(e.geometry) is None for e in own))
 
 
 def _primitive(geometry: Any) -> tuple[str, tuple[float, ...]] | None:

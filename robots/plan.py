@@ -90,6 +90,14 @@ def plan(
     Raises:
         InvalidInput: names the joint or the pair of solids in the way, value, limit and time.
     """
+    for name in scene.arms:
+        if unshaped := scene[name].unshaped:
+            raise InvalidInput(
+                f"solids of {name!r}",
+                got=f"meshes alone at {', '.join(unshaped)}",
+                expected="boxes, cylinders or spheres, which can be kept apart",
+                remedy="describe these links by some in the URDF's collisions",
+            )
     if unknown := action.motion.keys() - scene.arms.keys():
         raise InvalidInput("action moves unknown arms", got=sorted(unknown), expected=f"among {list(scene.arms)}")
     for name, value in {"acceleration": acceleration, "clearance": clearance, "period": period}.items():
@@ -97,6 +105,8 @@ def plan(
             raise InvalidInput(name, got=value, expected="a finite value > 0")
     plain = {id(part): part.detach().clone() for part in scene.buffers()}  # a base may be of a graph
     scene = deepcopy(scene, plain).cpu().double()  # float32 has no digits for solutions as exact as these
+    exact = {n: Trajectory(path.t.double(), path.pose.double(), path.closed) for n, path in action.motion.items()}
+    action = action._replace(motion=exact)
     spans = {name: path.t[[0, -1]].tolist() for name, path in action.motion.items()}
     if any(max(ends) - min(ends) > SAME for ends in zip(*spans.values(), strict=True)):
         told = ", ".join(f"{name} {first:g} to {last:g} s" for name, (first, last) in spans.items())

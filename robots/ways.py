@@ -84,7 +84,10 @@ def ways(task: Task, holds: Sequence[Hold]) -> Iterator[Hold]:
     if not judged:
         raise max(failures, key=lambda failure: failure[0])[1]
     postures = [hold._replace(elbow=elbow) for hold in judged[:BEST] for elbow in ELBOWS]
-    yield from _judge(task, LOOK, postures)[0]
+    looked, missed = _judge(task, LOOK, postures)
+    if not looked and not judged[BEST:]:
+        raise max(missed, key=lambda failure: failure[0])[1]
+    yield from looked
     yield from judged[BEST:]
 
 

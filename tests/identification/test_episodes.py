@@ -12,7 +12,7 @@ import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import cloth_from, episode, identify, streams
-from torchcloth.identification.episodes import first_shape, mesh_of
+from torchcloth.identification.episodes import eye_of, first_shape, mesh_of
 from torchcloth.identification.finer import finer_cloth, finer_recording
 from torchcloth.identification.objective import Objective
 from torchcloth.identification.unknowns import available, collect
@@ -184,6 +184,28 @@ def test_a_sheet_needs_no_mesh_and_something_is_needed(recording):
         mesh_of(nothing)
     sheet = with_cloth(nothing, sheet=(0.3, 0.2))
     np.testing.assert_allclose(np.ptp(mesh_of(sheet).vertices, axis=0)[:2], [0.3, 0.2])
+
+
+def test_of_several_cameras_the_one_with_depth_sees_how_far_things_are(recording):
+    """A Kinect is two: colour has no say in depth."""
+    camera = rec.Camera(width=640, height=480, K=np.eye(3), T_world_camera=np.eye(4))
+    deep = replace(camera, depth_scale=1e-3)
+    seen = lambda **cameras: eye_of(replace(recording, cameras=cameras))  # noqa: E731
+    assert seen(depth=deep, color=camera) is deep
+    assert seen(only=camera) is camera
+    assert seen(one=camera, two=camera) is None
+    assert seen(one=deep, two=deep, color=camera) is None
+
+
+def test_a_gripper_that_comes_for_the_cloth_later_may_be_far_away(recording):
+    model = cloth_from(recording)
+    away = {
+        name: replace(g, position=g.position + np.array([0.0, 0.0, 0.5]), closed=np.arange(len(g.t)) > 2)
+        for name, g in recording.grippers.items()
+    }
+    episode(model, replace(recording, grippers=away))
+    with pytest.raises(InvalidInput, match=r"the held patch 0\.5\d m from its gripper"):
+        episode(model, replace(recording, grippers={n: replace(g, closed=g.closed | True) for n, g in away.items()}))
 
 
 def test_a_collider_becomes_a_plane(recording):

@@ -198,7 +198,7 @@ NPZ = [
         M,
         "left/t",
         lambda t: t * 1e3,
-        r"left/t looks like milliseconds; got steps of 200, while .*spans 0.2; expected s",
+        r"left/t looks like milliseconds; got steps of 200, while .*spans 1; expected s",
     ),
     (M, "left/t", lambda t: t[:-1], r"left/closed has the wrong shape; got \[6\]; expected \[5\]"),
     (M, "left/t", lambda t: t[:, None], r"left/t has the wrong shape; got \[6, 1\]; expected \[T\]"),

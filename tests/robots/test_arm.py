@@ -70,6 +70,13 @@ def test_base_moves_the_world_and_takes_gradients():
     assert torch.autograd.grad(placed[0, 3], base)[0].abs().sum() > 0
 
 
+def test_a_base_that_an_optimiser_would_change_is_no_copy():
+    base = torch.eye(4, dtype=torch.float32, requires_grad=True)
+    with pytest.raises(InvalidInput, match=r"base that is learned; got torch\.float32; .*torch\.float64"):
+        robots.load("rizon4", base=base)
+    assert robots.load("rizon4", base=base, dtype=torch.float32).base is base
+
+
 @pytest.mark.parametrize("own", [False, True], ids=["rizon4", "own"])
 def test_derivatives(own, crane, random_q):
     arm = robots.load(crane, frame="hook") if own else robots.load("rizon4")

@@ -40,6 +40,7 @@ CASES = {
     "shake": (P.shake(HIGH), (1.2, -1, False, -0.7), (1.2, -1, False, 0.7)),
     "stretch": (P.stretch(HIGH), (0.6, -0.5, True, -0.7), (0.6, 0.5, False, -0.7)),
 }
+MESH = '<collision><geometry><mesh filename="forearm.stl"/></geometry></collision>'
 SLOWED = [name for name in CASES if name != "stretch"]
 
 
@@ -65,11 +66,33 @@ def finely(found, name, count=8000):
 
 
 def test_an_arm_whose_base_is_learned_is_planned(rig, made):
-    base = rig["left"].base.float().requires_grad_()
+    base = rig["left"].base.clone().requires_grad_()
     arms = {"left": robots.load(rig["left"].model, frame=rig["left"].frame, base=base), "right": rig["right"]}
     action, left, right = CASES["hang"]
     found = plan(robots.Scene(arms, rig.table), action, holds={"left": Hold(*left), "right": Hold(*right)})
     torch.testing.assert_close(found.q["left"], made["hang"][1].q["left"], rtol=0, atol=1e-4)
+
+
+def test_paths_in_single_precision_are_planned(rig, made):
+    """torch's own default."""
+    action, left, right = CASES["hang"]
+    short = {name: Trajectory(p.t.float(), p.pose.float(), p.closed) for name, p in action.motion.items()}
+    found = plan(rig, action._replace(motion=short), holds={"left": Hold(*left), "right": Hold(*right)})
+    torch.testing.assert_close(found.q["left"], made["hang"][1].q["left"], rtol=0, atol=1e-4)
+
+
+def test_an_arm_of_meshes_alone_is_not_called_clear(rig, tmp_path):
+    """Nothing would be known of what it meets."""
+    path = tmp_path / "meshes.urdf"
+    text = locate("rizon4").read_text()
+    start = text.index("<visual>", text.index('<link name="link3"'))
+    end = text.index("</link>", start)
+    path.write_text(text[:start] + MESH + text[end:])
+    arm = robots.load(path, frame=rig["left"].frame)
+    assert arm.unshaped == ("link3",)
+    action, _, right = CASES["hang"]
+    with pytest.raises(InvalidInput, match=r"solids of 'left'; got meshes alone at link3"):
+        plan(robots.Scene({"left": arm, "right": rig["right"]}, rig.table), action, holds={"right": Hold(*right)})
 
 
 def test_single_precision_arms_are_planned_in_double(made):

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ import torch
 from torchcloth import recordings
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.losses import chamfer_to_surface
+from torchcloth.recordings import PointClouds
 from torchcloth.viewing import Cloud, film_of_fit, with_cloth
-from torchcloth.viewing.distances import _worst
+from torchcloth.viewing.distances import _when, _worst
 
 
 @pytest.fixture
@@ -51,6 +53,25 @@ def test_near_and_far_points_colour_their_own_places(bare):
     x = cloth.vertices[0]
     assert np.nanmedian(values[:, x[:, 0] > 0.08]) == pytest.approx(5.0, abs=0.3)
     assert np.nanmedian(values[:, x[:, 0] < -0.08]) == pytest.approx(1.0, abs=0.3)
+
+
+def test_points_of_another_time_are_shown_and_not_measured(bare):
+    """Markers at 120 Hz, points at 30: between them the cloth has gone on."""
+    film, cloth = bare
+    told = np.arange(len(film.times)) % 2 == 0
+    shown = with_cloth(film, cloth.vertices, cloth.faces, told=told)
+    assert np.array_equal(np.isfinite(shown.curves["distance"].values), told)
+    assert np.isnan(shown.sheets["cloth"].values[~told]).all()
+    assert shown.clouds["points"] is film.clouds["points"]
+
+
+def test_which_frames_have_points_of_their_own():
+    points = PointClouds(np.array([0.0, 0.1, 0.2]), np.zeros((3, 3)), np.ones(3, dtype=int))
+    recording = SimpleNamespace(points=points, clock_offset=0.05)
+    times = points.t + 0.05
+    between = np.sort(np.concatenate([times, times[:-1] + 0.3 * np.diff(times)]))
+    assert np.array_equal(_when(recording, between), np.isin(between, times))
+    assert not _when(SimpleNamespace(points=None), between).any()
 
 
 def test_a_frame_without_points_has_no_distance(bare):

@@ -6,7 +6,7 @@ from functools import partial
 
 import torch
 
-from ..identification.episodes import Episode
+from ..identification.episodes import Episode, eye_of
 from ..identification.nuisances import Camera, Clock, Rim
 from ..identification.replays import Frames
 from ..recordings import Recording
@@ -38,7 +38,7 @@ def _depth(world: World, share: float = 0.0, offset: float = 0.0) -> World:
 
 
 def _one_camera(recording: Recording) -> bool:
-    return len(recording.cameras) == 1
+    return eye_of(recording) is not None
 
 
 _CAMERA, _CLOCK, _RIM = Camera(), Clock(), Rim()

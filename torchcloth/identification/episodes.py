@@ -19,7 +19,7 @@ from ..losses import Hits
 from ..materials import AEP, AbstractMaterial
 from ..meshes import Mesh, rectangle
 from ..meshes.patches import Patch
-from ..recordings import Recording
+from ..recordings import Camera, Recording
 from ..robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..transfer import Contact
 from ..types import Trajectory
@@ -257,10 +257,16 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
 
 
 def _eye(recording: Recording, dtype: torch.dtype) -> Tensor | None:
-    if len(recording.cameras) != 1:
-        return None
-    (camera,) = recording.cameras.values()
-    return torch.as_tensor(camera.T_world_camera[:3, 3], dtype=dtype)
+    camera = eye_of(recording)
+    return None if camera is None else torch.as_tensor(camera.T_world_camera[:3, 3], dtype=dtype)
+
+
+def eye_of(recording: Recording) -> Camera | None:
+    """The camera that sees how far away things are, where there is one: of several, the one with depth."""
+    cameras = list(recording.cameras.values())
+    deep = [c for c in cameras if c.depth is not None or c.depth_scale is not None]
+    found = deep or cameras
+    return found[0] if len(found) == 1 else None
 
 
 def _frame_times(

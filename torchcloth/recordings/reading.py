@@ -292,7 +292,8 @@ def _check_seconds(recording: Recording, folder: Folder) -> None:
         if step > SLOWEST:
             place, got = f"{folder.place(file)}: t", f"steps of {step:.4g}"
             raise RecordingError(f"{place} looks like milliseconds", got=got, expected="seconds", remedy="rescale it")
-    brief = min(spans, key=spans.__getitem__, default="")
+    lasting = {place: span for place, span in spans.items() if len(times[place]) >= FEW_TICKS}
+    brief = min(lasting, key=lasting.__getitem__, default="")
     for place, span in spans.items():
         step = float(np.median(np.diff(times[place])))
         if len(times[place]) >= FEW_TICKS and span > FAR_LONGER * spans[brief] and step > spans[brief]:

@@ -12,6 +12,7 @@ from ..diagnosis import read_model
 from ..diagnosis.loading import watched
 from ..identification import replayed
 from ..identification.episodes import episode
+from ..identification.streams import SAME
 from ..losses import closest
 from ..recordings import Recording
 from .episodes import film_of
@@ -42,7 +43,10 @@ def film_of_fit(recording: Recording, fit: str | Path, *, truth: bool = False) -
         return _film_of_model(recording, fit, truth)
     again = replayed(fit, recording)
     film = film_of(recording, truth=truth, times=again.episode.times.numpy())
-    film = with_cloth(film, again.frames.numpy(), again.cloth.mesh.faces, noise=recording.observation_noise_std)
+    told = _when(recording, film.times)
+    film = with_cloth(
+        film, again.frames.numpy(), again.cloth.mesh.faces, noise=recording.observation_noise_std, told=told
+    )
     distance = f", {1e3 * float(again.chamfer.mean()):.2f} mm from the points" if len(again.chamfer) else ""
     title = f"{film.title}: {'fitted' if again.fitted else 'predicted'}{distance}"
     return replace(film, title=title, notes=film.notes + ((again.warning,) if again.warning else ()))
@@ -54,13 +58,23 @@ def _film_of_model(recording: Recording, path: str | Path, truth: bool) -> Film:
     world, data = model.world(), episode(model.base.cloth, recording)
     film = film_of(recording, truth=truth, times=data.times.numpy())
     x = watched(world, data).x.numpy()
-    film = with_cloth(film, x, world.cloth.mesh.faces, noise=recording.observation_noise_std)
+    told = _when(recording, film.times)
+    film = with_cloth(film, x, world.cloth.mesh.faces, noise=recording.observation_noise_std, told=told)
     far = film.curves[DISTANCE].values if DISTANCE in film.curves else np.array([np.nan])
     distance = f", {np.nanmean(far):.2f} mm from the points" if np.isfinite(far).any() else ""
     return replace(film, title=f"{film.title}: {Path(path).stem} model{distance}")
 
 
-def with_cloth(film: Film, vertices: Array, faces: Array, *, noise: float | None = None) -> Film:
+def _when(recording: Recording, times: Array) -> Array:
+    """[T] whether points were seen then, and not only a little before or after."""
+    if recording.points is None:
+        return np.zeros(len(times), dtype=bool)
+    return np.abs(times[:, None] - recording.points.t - recording.clock_offset).min(1) <= SAME
+
+
+def with_cloth(
+    film: Film, vertices: Array, faces: Array, *, noise: float | None = None, told: Array | None = None
+) -> Film:
     """The film with a simulated cloth, coloured by the distance of the film's points where there are some near.
 
     The distance of each point from the surface is spread over the fabric around the place that is nearest to it, as
@@ -72,13 +86,15 @@ def with_cloth(film: Film, vertices: Array, faces: Array, *, noise: float | None
         vertices: [T, V, 3] m at the film's times.
         faces: [F, 3].
         noise: of one point, standard deviation [m]: the colour bar does not dramatise it.
+        told: [T] whether the points of a frame are of its time; None: all are. Others are shown and not measured.
     """
     sheets = {name: replace(sheet, net=True) for name, sheet in film.sheets.items()}
     if "points" not in film.clouds:
         return replace(film, sheets={**sheets, "cloth": Sheet(vertices.astype(np.float32), faces)})
     values, means = [], []
-    for x, cloud in zip(vertices, film.clouds["points"].frames, strict=True):
-        distance, mean = _distances(cloud, x, faces)
+    told = np.ones(len(vertices), dtype=bool) if told is None else told
+    for x, cloud, counts in zip(vertices, film.clouds["points"].frames, told, strict=True):
+        distance, mean = _distances(cloud if counts else cloud[:0], x, faces)
         values.append(1e3 * distance)
         means.append(1e3 * mean)
     cloth = Sheet(vertices.astype(np.float32), faces, np.stack(values).astype(np.float32))

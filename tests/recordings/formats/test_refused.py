@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sqlite3
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +19,7 @@ import foreign
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.recordings import formats
-from torchcloth.recordings.formats import lerobot
+from torchcloth.recordings.formats import bag, lerobot
 from torchcloth.recordings.formats.bag import Message
 from torchcloth.recordings.formats.imported import nanoseconds
 from torchcloth.recordings.formats.ros2_cameras import BagImages
@@ -103,6 +104,23 @@ def test_an_mcap_file_with_another_suffix(copy):
     (truth.path / f"{truth.path.name}.mcap").rename(file)
     truth.path = file
     refuse(truth, "mislabelled; got content of a .mcap file; expected .db3 content")
+
+
+@pytest.mark.parametrize("suffix", ["-wal", "-journal"])
+def test_messages_that_are_not_in_the_bag_yet_are_not_lost(tmp_path, suffix):
+    """Of a recorder that was killed: the end of the recording is beside the file, which is sound by itself."""
+    file = tmp_path / "take_0.db3"
+    connection = sqlite3.connect(file)
+    connection.execute("CREATE TABLE topics(id INTEGER)")
+    connection.commit()
+    connection.close()
+    bag._check_sqlite(file)
+    beside = tmp_path / f"take_0.db3{suffix}"
+    beside.write_bytes(b"")
+    bag._check_sqlite(file)
+    beside.write_bytes(b"more")
+    with pytest.raises(RecordingError, match=rf"unfinished; got messages in take_0\.db3{suffix}; .*sqlite3"):
+        bag._check_sqlite(file)
 
 
 def test_a_camera_that_contradicts_the_file(copy):

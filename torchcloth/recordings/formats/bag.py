@@ -123,6 +123,11 @@ def _check_sqlite(file: Path) -> None:
     if re.search("[#?]|%[0-9a-fA-F]{2}", place):  # rosbags, too, would open what is before these
         got, expected = "a path with #, ? or % in it", "one that stands for itself in a URI"
         raise RecordingError(f"{file} cannot be opened", got=got, expected=expected, remedy="rename the folder")
+    for suffix in ("-wal", "-journal"):  # which are not looked at: the file is read as it is
+        beside = file.with_name(file.name + suffix)
+        if beside.is_file() and beside.stat().st_size:
+            remedy = f"open and close it once with sqlite3, which takes in {beside.name}, or reindex the bag"
+            raise RecordingError(f"{file} is unfinished", got=f"messages in {beside.name}", remedy=remedy)
     with damaged(file, "sqlite3 file"):
         connection = sqlite3.connect(f"file:{place}?immutable=1", uri=True)
         try:
