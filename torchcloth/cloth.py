@@ -215,11 +215,12 @@ class Cloth(nn.Module):
             rate: of the mass damping that is added meanwhile [1/s].
         """
         settled = run(self.settling(state, motion or {}, start, duration, rate), checkpoint=True).state
-        speed = float(settled.v.detach().norm(dim=-1).square().mean().sqrt())
+        speed = float(settled.v.detach().square().sum(-1).mean(-1).sqrt().max())  # of the scene that moves most
         if speed > STILL:
             text = f"settle: after {duration:g} s the cloth still moves at {speed:.2g} m/s (rms), and is stopped there"
             warnings.warn(text, stacklevel=3)
-        return settled._replace(v=torch.zeros_like(settled.v))
+        memory = {name: torch.zeros_like(own) if name == "apic" else own for name, own in settled.memory.items()}
+        return settled._replace(v=torch.zeros_like(settled.v), memory=memory)
 
     def sensitivities(
         self,
@@ -308,8 +309,8 @@ class Cloth(nn.Module):
         frames = [start, start + duration]
         motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
         model, step = self._stepping()
-        check_substeps(duration, step)
         check_rate(rate)
+        check_substeps(duration, 1 / (1 / step + rate))
         count = int(np.ceil(duration * (1 / step + rate)))
         return self._ready(model, state, motion, frames, [count], rate)
 

@@ -22,7 +22,7 @@ from .errors import SimulationDiverged
 from .model import as_it_is
 from .self_contact import CHUNK
 from .types import ClothState, Rollout, Trajectory
-from .validation import check_extent
+from .validation import check_extent, check_substeps
 
 AT_ONCE = 4_000_000  # vertices times substeps of one call, which nobody can interrupt
 FEW = 250  # vertices, as which fewer count
@@ -102,7 +102,11 @@ class Plan(NamedTuple):
         whole, first = self.drives(), 0
         for interval in self._bare():
             last = first + interval.count
-            fewest = 0 if self.step_for is None else ceil((interval.end - interval.start) / self.step_for(now()) - 1e-9)
+            fewest, span = 0, interval.end - interval.start
+            if self.step_for is not None:
+                longest = self.step_for(now())
+                check_substeps(span, longest)
+                fewest = ceil(span / longest - 1e-9)
             if fewest > interval.count:
                 yield interval._replace(count=fewest)
             else:

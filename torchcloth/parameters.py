@@ -93,7 +93,7 @@ class PhysicalParameter(nn.Module):
         """Assign a physical value in place; refuses an illegal one and leaves the old value."""
         check_value(self.label, value)
         with torch.no_grad():
-            new = self._to_raw(value).to(self.raw)
+            new = self._to_raw(value, self.raw.dtype).to(self.raw)
             if new.shape != self.raw.shape:
                 raise InvalidInput(
                     self.label, got=f"shape {tuple(new.shape)}", expected=f"shape {tuple(self.raw.shape)}"
@@ -119,7 +119,7 @@ class PhysicalParameter(nn.Module):
         if self.domain == "nonnegative":
             self.raw.clamp_(min=0.0)
 
-    def _to_raw(self, value: float | Tensor) -> Tensor:
+    def _to_raw(self, value: float | Tensor, dtype: torch.dtype | None = None) -> Tensor:
         check_value(self.label, value)
         try:
             tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).detach().clone()
@@ -136,7 +136,7 @@ class PhysicalParameter(nn.Module):
             tensor = tensor.log()
         elif self.domain == "unit_half":
             tensor = torch.logit(2.0 * tensor)
-        return tensor if isinstance(value, Tensor) else tensor.to(torch.get_default_dtype())
+        return tensor if isinstance(value, Tensor) else tensor.to(dtype or torch.get_default_dtype())
 
     def extra_repr(self) -> str:
         """One line of a data sheet."""

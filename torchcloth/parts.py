@@ -35,6 +35,12 @@ class Parts(nn.ModuleDict):
         super().__setitem__(key, module.bind(self._mesh).to(self._like))
         _OWNERS[module] = ref(self)
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A copy owns its parts, too."""
+        super().__setstate__(state)
+        for part in self.values():
+            _OWNERS[part] = ref(self)
+
 
 def check_free(mesh: Mesh, parts: Iterable[tuple[str, AbstractEffect | AbstractBoundary]]) -> None:
     """Refuse what is bound to another cloth's mesh: it would be bound anew under that one's feet."""

@@ -124,12 +124,15 @@ def check_times(times: Tensor | Sequence[float]) -> list[float]:
 
 
 def check_parameters(cloth: nn.Module) -> None:
-    """What an optimiser's step may have brought.
+    """What an optimiser's step may have brought, or parts that were put in later.
 
     No NaN: comparisons with one are false, so a threshold of NaN would pass for an effect that is not there. And no
     amplitude below zero, which would drive what it should brake.
     """
-    check_fields(dict(cloth.effects.items()), len(cloth.mesh.faces))  # type: ignore[arg-type, operator, union-attr]
+    effects: dict[str, AbstractEffect] = dict(cloth.effects.items())  # type: ignore[arg-type, operator, union-attr]
+    check_fields(effects, len(cloth.mesh.faces))  # type: ignore[arg-type, union-attr]
+    check_axes(cloth.mesh, {"material": cloth.material, **effects})  # type: ignore[arg-type, dict-item]
+    check_grasps(effects, cloth.boundaries)  # type: ignore[arg-type]
     for name, parameter in cloth.named_parameters():
         if bool(parameter.isnan().any()):
             raise InvalidInput(name, got="NaN", expected="a number", remedy="look at the optimiser's last step")

@@ -73,9 +73,16 @@ class Mesh:
         return Mesh(x, f, rest, pattern, named)
 
     def same(self, other: Mesh) -> bool:
-        """Whether vertices, triangles and rest shapes are the same."""
-        pairs = ((self.vertices, other.vertices), (self.faces, other.faces), (self.rest, other.rest))
-        return self is other or all(np.array_equal(a, b) for a, b in pairs)
+        """Whether vertices, triangles, rest shapes, patterns and places are the same."""
+        if self is other:
+            return True
+        if self.places.keys() != other.places.keys() or (self.pattern is None) is not (other.pattern is None):
+            return False
+        pairs = [(self.vertices, other.vertices), (self.faces, other.faces), (self.rest, other.rest)]
+        pairs += [(index, other.places[name]) for name, index in self.places.items()]
+        if self.pattern is not None and other.pattern is not None:
+            pairs.append((self.pattern, other.pattern))
+        return all(np.array_equal(a, b) for a, b in pairs)
 
     @property
     def uv(self) -> np.ndarray | None:
@@ -135,11 +142,13 @@ class Mesh:
 
     @property
     def extent(self) -> float:
-        """Longest way [m] along the edges of the rest shape, from the vertex farthest from the first: how far the cloth
-        can extend in any state without strain, up to the zigzag of the edges.
+        """Longest way [m] along the edges of the rest shape, of any piece from the vertex farthest from its first.
+
+        So far the cloth can extend in any state without strain, up to the zigzag of the edges.
         """
-        start, _ = topology.farthest(self.faces, self.rest, 0)
-        return topology.farthest(self.faces, self.rest, start)[1]
+        firsts = topology.firsts(self.faces)
+        starts = (topology.farthest(self.faces, self.rest, int(first))[0] for first in firsts)
+        return max(topology.farthest(self.faces, self.rest, start)[1] for start in starts)
 
     def in_order(self) -> Mesh:
         """The same cloth with vertices and triangles numbered along its longest side.

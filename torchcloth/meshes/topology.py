@@ -34,6 +34,11 @@ def pieces(faces: np.ndarray) -> int:
     return int(_joined(faces).max()) + 1
 
 
+def firsts(faces: np.ndarray) -> np.ndarray:
+    """[pieces] a vertex of each."""
+    return faces[np.unique(_joined(faces), return_index=True)[1], 0]
+
+
 def _joined(touched: np.ndarray) -> np.ndarray:
     """[F] numbers from 0 on of triangles that are joined by what they touch [F, 3]."""
     label = np.arange(len(touched))

@@ -167,12 +167,13 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
                 bag.write(connection, ns + 1_500_000, store.serialize_cdr(message, kind))  # logged 1.5 ms later
 
         put("/closed", std + "Bool", [(stamps[0], make(std + "Bool", True)), (stamps[3], make(std + "Bool", False))])
-        poses, joints, wrenches, sensed = [], [], [], []
+        poses, based, joints, wrenches, sensed = [], [], [], [], []
         for i, ns in enumerate(stamps):
             w, x, y, z = quat[i].tolist()
             orientation = make(geometry + "Quaternion", x, y, z, w)
             pose = make(geometry + "Pose", make(geometry + "Point", *position[i].tolist()), orientation)
             poses.append((ns, make(geometry + "PoseStamped", header(ns), pose)))
+            based.append((ns, make(geometry + "PoseStamped", header(ns, "base"), pose)))
             names = [*(f"j{k}" for k in range(7)), "finger"]
             values, none = np.append(q[i], width[i]), np.zeros(0)
             order = np.roll(np.arange(8), i)  # drivers do not promise an order
@@ -183,6 +184,7 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
             wrenches.append((ns, make(geometry + "WrenchStamped", header(ns), wrench)))
             sensed.append((ns, make(geometry + "WrenchStamped", header(ns, "sensor"), wrench)))
         put("/left/pose", geometry + "PoseStamped", poses)
+        put("/left/pose_in_base", geometry + "PoseStamped", based)
         put("/joint_states", sensor + "JointState", joints)
         put("/left/ft", geometry + "WrenchStamped", wrenches)
         put("/left/ft_sensor", geometry + "WrenchStamped", sensed)

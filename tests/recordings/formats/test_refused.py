@@ -290,12 +290,26 @@ def test_a_depth_behind_the_lens_is_refused():
         BagImages(None, "/depth", "depth")._pixels(Message("/depth", 0, body, "take: /depth"))
 
 
-@pytest.mark.parametrize("topic", ["/left/ft", "/left/ft_sensor"])
+@pytest.mark.parametrize("what", ["pose", "wrench", "points"])
+def test_what_is_in_the_world_is_not_placed_there_again(copy, what):
+    """A mapping that names another frame contradicts the message: it would be moved twice."""
+    truth = copy("ros2")
+    source = truth.scene["source"]
+    if what == "points":
+        source["points"] = {"topic": "/cloth", "frame": "cam0"}
+    else:
+        truth.scene["robots"]["arm"]["T_world_base"] = BASE.tolist()
+        pose = "/left/pose" if what == "pose" else "/left/pose_in_base"
+        source["motion"]["left"] |= {"frame": "arm", "pose": pose}
+    refuse(truth, "is in the world already; got 'world'; expected another frame; .*leave out frame")
+
+
+@pytest.mark.parametrize("topic", ["/left/ft_sensor"])
 def test_a_wrench_turns_with_the_frame_that_places_it(copy, topic):
     """Given in the axes of a robot's base, as its gripper's pose is."""
     truth = copy("ros2")
     truth.scene["robots"]["arm"]["T_world_base"] = BASE.tolist()
-    truth.scene["source"]["motion"]["left"] |= {"frame": "arm", "wrench": topic}
+    truth.scene["source"]["motion"]["left"] |= {"frame": "arm", "wrench": topic, "pose": "/left/pose_in_base"}
     left = formats.read(truth.path, scene=truth.write_scene()).grippers["left"]
     np.testing.assert_allclose(left.force, truth.arrays["left/force"] @ BASE[:3, :3].T, atol=1e-15)
     np.testing.assert_allclose(left.torque, truth.arrays["left/torque"] @ BASE[:3, :3].T, atol=1e-15)
@@ -306,7 +320,8 @@ def test_frames_are_placed_in_the_world(copy, topic):
     """A pose given in the frame of a robot's base, a wrench given in the gripper's, whatever its own is called."""
     truth = copy("ros2")
     truth.scene["robots"]["arm"]["T_world_base"] = BASE.tolist()
-    truth.scene["source"]["motion"]["left"] |= {"frame": "arm", "wrench": topic, "wrench_frame": "gripper"}
+    truth.scene["source"]["motion"]["left"] |= {"frame": "arm", "wrench": topic, "pose": "/left/pose_in_base"}
+    truth.scene["source"]["motion"]["left"]["wrench_frame"] = "gripper"
     left = formats.read(truth.path, scene=truth.write_scene()).grippers["left"]
     there = truth.arrays["left/position"]
     np.testing.assert_allclose(left.position, there @ BASE[:3, :3].T + BASE[:3, 3], atol=1e-15)

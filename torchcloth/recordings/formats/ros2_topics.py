@@ -35,8 +35,15 @@ def in_world(fields: Fields, scene: Scene) -> np.ndarray | None:
 
 
 def must_be_world(message: Message, frame: np.ndarray | None, remedy: str) -> None:
-    """Refuse a message of another frame than the world's, unless the mapping placed it."""
+    """Refuse a message of another frame than the world's, unless the mapping placed it, and then one of the world's."""
     found = message.body.header.frame_id
+    if frame is not None and not np.array_equal(frame, np.eye(4)) and found.strip("/") in WORLD:
+        raise RecordingError(
+            f"{message.place} is in the world already",
+            got=repr(found),
+            expected="another frame",
+            remedy="leave out frame, or let the driver say which frame it means",
+        )
     if frame is None and found.strip("/") not in WORLD:
         raise RecordingError(
             f"{message.place} is in another frame", got=repr(found), expected="world or map", remedy=remedy
