@@ -9,7 +9,7 @@ from .comparison import compare, of_episodes, predict
 from .evidence import shared
 from .fitting import Fitted, fit, renoised, weighed_alike, without_cause
 from .lacking import explained, is_lacking, lack_of_fit
-from .noise import floor_of, least
+from .noise import floor_of
 from .placebo import placebo
 from .setting import Progress, Setting, staged
 from .trials import CLEAR, FURTHER, Step, alone_in, known, worth_naming, worthwhile
@@ -86,7 +86,7 @@ def mended(start: Fitted, end: Fitted, names: Sequence[str], alone: Collection[s
         share = explained(first, left)
         return share if share < 0 or any(row.lacking for row in first) else 1.0
     before, after = (predict(f, names, alone) for f in weighed_alike(start, end))
-    return compare(before, after, floor_of(end.evidence, least())).explained
+    return compare(before, after, floor_of(end.evidence, end.noise)).explained
 
 
 def unheard(start: Fitted, end: Fitted, steps: Sequence[Step], names: Sequence[str]) -> bool:
