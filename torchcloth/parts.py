@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary, ref
 
 import torch
@@ -12,6 +13,7 @@ from torch import nn
 from .boundaries import AbstractBoundary
 from .effects import AbstractEffect
 from .errors import InvalidInput
+from .materials import AbstractMaterial
 from .meshes import Mesh
 from .validation import check_axes, check_fields, check_part
 
@@ -53,6 +55,25 @@ def check_free(mesh: Mesh, parts: Iterable[tuple[str, AbstractEffect | AbstractB
                 expected="one of its own",
                 remedy="make it anew, or copy.deepcopy it",
             )
+
+
+class Loose(NamedTuple):
+    """Copies of a cloth's parts that no cloth owns yet."""
+
+    material: AbstractMaterial
+    areal_density: torch.Tensor
+    effects: dict[str, AbstractEffect]
+    boundaries: dict[str, AbstractBoundary]
+
+
+def loose(cloth: Any) -> Loose:
+    """What another cloth may be built from, on any mesh; what they share among them they share still."""
+    memo = {id(cloth.mesh): cloth.mesh}
+    effects, boundaries = (
+        {name: copy.deepcopy(part, memo) for name, part in parts.items()} for parts in (cloth.effects, cloth.boundaries)
+    )
+    density = cloth.areal_density.value.detach().clone()
+    return Loose(copy.deepcopy(cloth.material, memo), density, effects, boundaries)
 
 
 _OWNERS: WeakKeyDictionary[nn.Module, ref[Parts]] = WeakKeyDictionary()

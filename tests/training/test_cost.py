@@ -26,7 +26,7 @@ def test_the_table_has_every_method_beside_the_others(tmp_path, capsys):
     newton, descent, paper = found.values()
     assert newton["chamfer_after"] <= descent["chamfer_after"] * 1.01
     assert abs(newton["youngs_modulus"] - 1) < 0.2 < abs(descent["youngs_modulus"] - 1)
-    assert paper["youngs_modulus"] == pytest.approx(2.5), "the start is nearer than 15 mm: the paper's rule stays there"
+    assert 1 < paper["youngs_modulus"] < 2.5  # of cells of 50 mm no fit has its vertices nearer than the rule's 15 mm
     assert call(tmp_path, "--problems", "sheet") == 0, "nothing is measured again"
 
 

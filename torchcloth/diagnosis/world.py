@@ -18,6 +18,7 @@ from ..identification.episodes import Episode
 from ..identification.replays import Frames, Replay, frames_of
 from ..materials import AbstractMaterial
 from ..meshes import Mesh
+from ..parts import loose
 from ..recordings import Recording
 
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
@@ -91,16 +92,16 @@ def rebuilt(
     mesh: Mesh | None = None,
 ) -> Cloth:
     """A new cloth with some parts replaced or added, which nobody trains; it shares the mesh alone with the old one."""
-    kept = copied(cloth)
+    kept = loose(cloth)
     found = Cloth(
-        mesh or kept.mesh,
+        mesh or cloth.mesh,
         material or kept.material,
-        kept.areal_density.value.detach().clone(),
-        {**dict(kept.effects.items()), **effects},  # type: ignore[dict-item]
-        {**dict(kept.boundaries.items()), **boundaries},  # type: ignore[dict-item]
-        kept.contact,
-        kept.transfer,
-        kept.engine,
+        kept.areal_density,
+        {**kept.effects, **effects},
+        {**kept.boundaries, **boundaries},
+        cloth.contact,
+        cloth.transfer,
+        cloth.engine,
     )
     return found.requires_grad_(False)
 

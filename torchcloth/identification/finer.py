@@ -8,10 +8,8 @@ third of d is added to the standard errors for what the extrapolation leaves ope
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 import torch
@@ -23,6 +21,7 @@ from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..meshes.patches import Patch
 from ..parameters import PhysicalParameter
+from ..parts import loose
 from ..recordings import Recording
 from . import gauss_newton
 from .carried import between, carried, with_patches
@@ -43,22 +42,22 @@ def finer_cloth(cloth: Cloth) -> Cloth:
         if isinstance(part, PhysicalParameter) and any(size in places for size in part.raw.shape[-2:]):
             expected = "one number for all triangles"
             raise InvalidInput(f"a finer mesh: {name}", got=f"shape {tuple(part.raw.shape)}", expected=expected)
-    mesh, kept = cloth.mesh, copy.deepcopy(cloth, {id(cloth.mesh): cloth.mesh})
+    mesh, kept = cloth.mesh, loose(cloth)
     ends, _ = _divided(mesh.faces)
     fine = _divided_mesh(mesh)
-    parts = cast("list[tuple[str, AbstractBoundary]]", list(kept.boundaries.items()))
+    parts = kept.boundaries.items()
     patches = {name: _patch(part, mesh) for name, part in parts}
     fine = with_patches(fine, [p for p in patches.values() if p])  # rounder than the coarse mesh has them
     boundaries = {name: part if patches[name] else _regripped(part, ends, mesh) for name, part in parts}
     return Cloth(
         fine,
         kept.material,
-        kept.areal_density.value.detach().clone(),
-        dict(kept.effects.items()),  # type: ignore[arg-type]
+        kept.areal_density,
+        kept.effects,
         boundaries,
-        kept.contact,
-        kept.transfer,
-        kept.engine,
+        cloth.contact,
+        cloth.transfer,
+        cloth.engine,
     )
 
 
