@@ -5,8 +5,6 @@
 #include <exception>
 #include <mutex>
 
-#include <sys/mman.h>
-
 #include "program.h"
 
 namespace tc {
@@ -45,15 +43,6 @@ size_t records_size(const Program<R>& p, int64_t substeps, int64_t every) {
     return (rows + masks + LANES<R> - 1) / LANES<R> * LANES<R>;  // the next scene's begin on a cache line
 }
 
-// Memory that will be written from end to end: of small pages each one would be a fault.
-inline void in_large_pages([[maybe_unused]] void* data, [[maybe_unused]] size_t bytes) {
-#ifdef MADV_HUGEPAGE
-    constexpr uintptr_t page = 2 << 20;
-    const uintptr_t first = (uintptr_t(data) + page - 1) / page, last = (uintptr_t(data) + bytes) / page;
-    if (last > first) madvise(reinterpret_cast<void*>(first * page), (last - first) * page, MADV_HUGEPAGE);
-#endif
-}
-
 template <class R>
 class Run {
     static constexpr int64_t LONG = 4;  // substeps that are worth the start of a second thread
@@ -75,7 +64,6 @@ class Run {
         each(call.scenes, [&](int64_t scene) {
             Memory m = memory(scene, Mode::value, call.scenes);
             R* first = call.every ? record(scene, 0) : nullptr;
-            if (call.every) in_large_pages(first, records_size(program, call.substeps, call.every) * sizeof(R));
             if (call.every) clear_record(scene, call.every == 1 ? 0 : (call.substeps + call.every - 1) / call.every);
             m.rows.reset(2 * program.record_size);
             R *row = call.every == 1 ? first : m.rows.data, *after = nullptr;
