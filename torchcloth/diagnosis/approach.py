@@ -55,15 +55,17 @@ def _on_either_side(
     model: Model, setting: Setting, progress: Progress, before: Evidence | None, width: Tensor
 ) -> tuple[Evidence, Tensor]:
     """Evidence a width on either side of every coordinate, or as much of it as can be simulated; (it, the width)."""
-    for left in reversed(range(HALVINGS + 1)):
+
+    def gathered() -> Evidence:
         shifts = [(k, sign * w) for sign in (1.0, -1.0) for k, w in enumerate(width.tolist())]
+        return gather(model, setting, (), progress, before, shifts)
+
+    for _ in range(HALVINGS):
         try:
-            return gather(model, setting, (), progress, before, shifts), width
+            return gathered(), width
         except IMPOSSIBLE:
-            if left == 0:
-                raise
             width = 0.5 * width
-    raise AssertionError
+    return gathered(), width
 
 
 def _possible(model: Model, coordinate: int, width: float) -> float:

@@ -224,12 +224,10 @@ def cross_validated(
         raise InvalidInput("tables", got=f"{len(angles)} directions", expected="three or more, to leave one out")
     left_out: list[dict[str, float | None]] = [{} for _ in tables]
     for angle in angles:
-        own = [abs(_folded(t.angle) - angle) < SAME for t in tables]
-        others = [t for t, is_own in zip(tables, own, strict=True) if not is_own]
-        part = fit_tension(cloth, others, list(fit.keys), **options)
-        for k, table in enumerate(tables):
-            if own[k]:
-                left_out[k] = excess(part.model, table)
+        own = [k for k, table in enumerate(tables) if abs(_folded(table.angle) - angle) < SAME]
+        part = fit_tension(cloth, [t for k, t in enumerate(tables) if k not in own], list(fit.keys), **options)
+        for k in own:
+            left_out[k] = excess(part.model, tables[k])
         yield part
     yield replace(fit, model=with_left_out(fit.model, left_out))
 
