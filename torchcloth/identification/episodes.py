@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._math import last_knot
 from ..boundaries import Grasp, Plane
 from ..boundaries.motion import interpolate
 from ..cloth import Cloth
@@ -339,7 +340,7 @@ def _check_place(name: str, cloth: Cloth, motion: Mapping[str, Trajectory], x: T
     """Refuse a cloth that is not where its grippers are: only their increments move it, so nothing else would show."""
     for key, boundary in cloth.boundaries.items():
         if isinstance(boundary, Grasp):
-            knot = int(torch.searchsorted(motion[key].t.double(), start + 1e-9, right=True)) - 1
+            knot = int(last_knot(motion[key].t.double(), torch.tensor([start + 1e-9], dtype=torch.float64)))
             if not motion[key].closed[max(knot, 0)]:  # it comes for the cloth later
                 continue
             pose = interpolate(motion[key], torch.tensor([start], dtype=torch.float64))
