@@ -48,7 +48,8 @@ class Program:
         self._written: list[tuple[str, tuple]] = []
 
     def __del__(self) -> None:
-        if getattr(self, "_handle", None) is not None:  # there is none where ``__init__`` was not run
+        # there is no handle where ``__init__`` was not run, and no library when Python ends
+        if getattr(self, "_handle", None) is not None and library is not None:
             self._call("free")
 
     # -- fields ---------------------------------------------------------------------------------------------------

@@ -11,9 +11,11 @@ from torch import Tensor
 
 from .fields import Field, Kind
 from .library import Call, Port
+from .pool import Pool
 from .program import Program
 
 BUDGET = 192 * 2**20  # bytes of records that a simulation keeps for its adjoint
+MEMORY = Pool(BUDGET)
 ANEW = 96 * 2**20  # bytes of records that the adjoint makes at a time, of substeps that it goes through again
 ALIGNED = 64  # bytes
 WORTH = 8e5  # operations of a substep for which another thread is worth while: some 20 us
@@ -38,7 +40,7 @@ def forward(job: Job, every: int = 0) -> tuple[dict[Field, Tensor], Tensor]:
     """(nexts and sums [scenes, (frames,) rows, comps], records); ``every``: substeps between records, 0 for none."""
     like = next(iter(job.inputs.values()))
     results = {f: like.new_empty(job.scenes, *job.frames, f.rows, f.comps) for f in job.program.outputs}
-    records = like.new_empty(job.scenes, record_size(job.program, job.substeps, every))
+    records = MEMORY.lend(job.scenes, record_size(job.program, job.substeps, every), dtype=like.dtype)
     ports = _ports(job)
     for f, tensor in results.items():
         ports[f.id].result = tensor.data_ptr()
