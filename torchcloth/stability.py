@@ -43,8 +43,11 @@ class Limits(NamedTuple):
         return max((self.longest(n) / (1 + STAGE * n), self.longest(n)) for n in self._stages())[1]
 
     def stages(self, dt: float) -> int:
-        """Fewest with which ``dt`` [s], of at most ``step``, is stable; 0 for a step that overflowed."""
-        return next((n for n in self._stages() if dt <= self.longest(n) * (1 + 1e-9)), 0)
+        """Fewest for ``dt`` [s], of at most ``step``; 0 for a step that overflowed.
+
+        Who shortens the step wants room, for rates that stretching raises: their square grows as the step shrinks.
+        """
+        return next((n for n in self._stages() if (dt * self.step) ** 0.5 <= self.longest(n) * (1 + 1e-9)), 0)
 
     def _stages(self) -> list[int]:
         return [0, *range(2, MOST + 1)] if self.viscous > 0 else [0]

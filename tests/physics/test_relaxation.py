@@ -101,7 +101,7 @@ def test_a_sheet_in_a_hand_moves_as_it_does_with_short_steps(viscosity):
     cloth = sheet(effects, boundaries={"hand": tc.boundaries.Grasp(range(7))})
     motion, t = swung(cloth)
     found = limits(cloth)
-    exact = cloth(cloth.rest_state(), motion, t, dt=found.longest(0) / 8).x
+    exact = cloth(cloth.rest_state(), motion, t, dt=found.longest(0) ** 2 / found.step).x
     steps = [found.step / 2**k for k in range(3)]
     assert found.step > 5 * found.longest(0)
     assert all(found.stages(dt) > 0 for dt in steps)
@@ -114,7 +114,25 @@ def test_no_stages_where_nothing_is_viscous_or_the_step_is_short():
     plain = sheet({"gravity": E.Gravity(), "damping": E.MassDamping(1.0)})
     assert limits(plain).stages(limits(plain).step) == 0
     thick = limits(sheet({"viscous": E.KelvinVoigt(1.0)}))
-    assert thick.stages(thick.step) > thick.stages(0.5 * thick.step) > thick.stages(thick.longest(0)) == 0
+    assert thick.stages(thick.step) > thick.stages(0.5 * thick.step) > thick.stages(thick.longest(0) ** 2 / thick.step)
+    assert thick.stages(thick.longest(0) ** 2 / thick.step) == 0
+
+
+def test_a_shorter_step_is_for_cloth_that_is_pulled_farther():
+    """Its rate of damping is four times that at rest: the fewest stages of any step would have been too few."""
+    ends = {"left": tc.boundaries.Grasp(range(7)), "right": tc.boundaries.Grasp(range(42, 49))}
+    cloth = sheet({"viscous": E.KelvinVoigt(3.0)}, boundaries=ends)
+    x = cloth.rest_state().x.clone()
+    across = int((x[42] - x[0]).abs().argmax())
+    x[:, across] *= 2
+    t = torch.linspace(0, 0.2, 5)
+    still = tc.Trajectory(t, torch.eye(4).repeat(5, 1, 1), torch.ones(5, dtype=bool))
+    torch.manual_seed(0)
+    state = cloth.state(x, 0.3 * torch.randn(49, 3))
+    step = limits(cloth).step
+    with pytest.raises(tc.errors.SimulationDiverged):
+        cloth(state, dict.fromkeys(ends, still), t)
+    assert cloth(state, dict.fromkeys(ends, still), t, dt=step / 8).v[-1].abs().max() < 0.5
 
 
 def test_the_step_costs_as_the_root_of_the_viscosity():
