@@ -17,6 +17,7 @@ from torchcloth.errors import InvalidInput, RecordingError, TorchclothError
 from torchcloth.identification.journal import program
 
 Case = Callable[[], dict[str, Any]]
+MAKERS = ("hidden", "independent", "realdata")  # folders of tests/ that give studies their data
 
 
 class Kept:
@@ -152,8 +153,9 @@ def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def _of_this_code(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with a fingerprint of the library: results of two versions are no study."""
-    return {**settings, "code": program()}
+    """With a fingerprint of the code that makes data and studies them: results of two versions are no study."""
+    here = Path(__file__).resolve().parent
+    return {**settings, "code": program(here, *(here.parent / "tests" / name for name in MAKERS))}
 
 
 def unreadable(path: Path) -> RecordingError:

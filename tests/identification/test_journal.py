@@ -165,3 +165,17 @@ def test_beginnings_of_several_episodes_are_told_apart(tmp_path):
     plain = identify(twins.at(both[0]), both, names)
     kept = identify(twins.at(both[0]), both, names, journal=tmp_path / "journal")
     assert kept.parameters["youngs_modulus"].value == plain.parameters["youngs_modulus"].value
+
+
+def test_all_code_that_answers_is_in_the_fingerprint(tmp_path, monkeypatch):
+    """An editable install keeps the robots beside the library, not in it."""
+    monkeypatch.setattr(journal, "files", lambda name: tmp_path / name)
+    places = [tmp_path / "torchcloth" / "a.py", tmp_path / "torchcloth.robots" / "arm.py", tmp_path / "studies" / "s.h"]
+    for place in places:
+        place.parent.mkdir()
+        place.write_text("1")
+    known = [journal.program.__wrapped__(tmp_path / "studies")]
+    for place in places:
+        place.write_text("2")
+        known.append(journal.program.__wrapped__(tmp_path / "studies"))
+    assert len(set(known)) == 4

@@ -1,9 +1,12 @@
 """Runs of the fit: what they learn, and that they go on bit for bit."""
 
 import json
+import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,6 +16,7 @@ from lightning.pytorch.callbacks import Callback
 
 import torchcloth as tc
 import torchcloth.training.fit.run as run
+from torchcloth import recordings as rec
 from torchcloth.training.fit.command import main
 from torchcloth.training.fit.config import Learn, Network, load
 from torchcloth.training.fit.learned import Learned
@@ -135,6 +139,73 @@ def test_a_checkpoint_is_there_whole_or_as_before(config, tmp_path, monkeypatch)
     assert main(["--config", path, "--resume", "optimizer.steps=2"]) == 2
     assert same(state(tmp_path / "out"), before)
     assert not [f for f in (tmp_path / "out").iterdir() if f.name.startswith(".")]
+
+
+def test_a_run_anew_leaves_no_result_of_the_run_before(config, tmp_path, monkeypatch):
+    path = config(learn=EVERYTHING)
+    assert main(["--config", path]) == 0
+    assert {f.name for f in (tmp_path / "out").glob("fi*")} == {"fit.json", "fields.npz"}
+    stop_at(monkeypatch, 1)
+    with pytest.raises(Stopped):
+        run.fit(load(path))
+    assert not list((tmp_path / "out").glob("fi*"))
+
+
+def test_out_may_be_somebodys_home(config, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    path = config(optimizer={"steps": 1})
+    assert main(["--config", path, "out=~/mine"]) == 0
+    assert {"fit.json", "last.ckpt"} <= {f.name for f in (tmp_path / "mine").iterdir()}
+    assert main(["--config", path, "out=~/mine", "--resume", "optimizer.steps=2"]) == 0
+    assert not (tmp_path / "~").exists()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="signals of POSIX")
+def test_slurm_leaves_resuming_to_the_user(config, tmp_path, monkeypatch):
+    """Lightning's own checkpoint, upon SLURM's signal, was taken up by every later run in the folder."""
+    for name, value in {
+        "NTASKS": "1",
+        "NTASKS_PER_NODE": "1",
+        "JOB_NAME": "fit",
+        "PROCID": "0",
+        "LOCALID": "0",
+    }.items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    handlers, usual = [], FitModule.training_step
+
+    def watched(self, *args):
+        handlers.append(signal.getsignal(signal.SIGUSR1))
+        return usual(self, *args)
+
+    monkeypatch.setattr(FitModule, "training_step", watched)
+    assert main(["--config", config(optimizer={"steps": 2})]) == 0
+    assert handlers == [signal.SIG_DFL, signal.SIG_DFL]
+    assert len(json.loads((tmp_path / "out" / "fit.json").read_text())["history"]) == 2
+
+
+def test_what_is_doubtful_is_told(config, episodes, tmp_path, capsys):
+    seen = rec.read(episodes / "ep_0")
+    open_ = {name: replace(hand, closed=np.zeros_like(hand.closed)) for name, hand in seen.grippers.items()}
+    rec.write(replace(seen, grippers=open_), tmp_path / "open")
+    assert main(["--config", config(optimizer={"steps": 1}), f"data.train={tmp_path / 'open'}"]) == 0
+    assert "open: no gripper is ever closed" in json.loads((tmp_path / "out" / "fit.json").read_text())["warnings"][0]
+    assert "warning: open: no gripper is ever closed" in capsys.readouterr().out
+
+
+def test_a_loaded_module_leaves_the_callers_random_numbers(config, tmp_path):
+    run.fit(load(config(learn=EVERYTHING, optimizer={"steps": 1})))
+    torch.manual_seed(3)
+    before = torch.get_rng_state()
+    FitModule.load_from_checkpoint(tmp_path / "out" / "last.ckpt")
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_options_stand_in_any_order(config, tmp_path):
+    assert main(["--config", config(), f"out={tmp_path / 'there'}", "--resume", "optimizer.steps=1"]) == 2
+    assert main(["optimizer.steps=1", "--config", config(), f"out={tmp_path / 'there'}"]) == 0
+    assert (tmp_path / "there" / "fit.json").is_file()
 
 
 def test_more_steps_after_the_end(config, tmp_path):

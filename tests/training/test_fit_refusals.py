@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,12 +10,14 @@ from torch import nn
 
 pytest.importorskip("lightning")
 
+from torchcloth import recordings as rec
 from torchcloth.training.fit.command import main
 from torchcloth.training.fit.config import load
 from torchcloth.training.fit.data import Deal
 
 sys.path.insert(0, str(Path(__file__).parent))  # nets.py
 
+PAIR = "{in1_features: 2, in2_features: 2, out_features: 1}"
 SEVEN, TWO = "{in_features: 7, out_features: 1}", "{input_size: 2, hidden_size: 1}"
 LESS = "{in_features: -2, out_features: 1}"
 
@@ -55,7 +58,7 @@ LESS = "{in_features: -2, out_features: 1}"
         (["learn.network={module: torch.nn.Softmax, gives: [poisson_ratio]}"], "torch.nn.Softmax: output; got ["),
         (
             [f"learn.network={{module: torch.nn.Linear, arguments: {SEVEN}, gives: [poisson_ratio]}}"],
-            "torch.nn.Linear: input; got mat1 and mat2 shapes cannot be multiplied",
+            "torch.nn.Linear: forward; got RuntimeError: mat1 and mat2 shapes cannot be multiplied",
         ),
         (
             [f"learn.network={{module: torch.nn.Linear, arguments: {LESS}, gives: [poisson_ratio]}}"],
@@ -65,14 +68,22 @@ LESS = "{in_features: -2, out_features: 1}"
             [f"learn.network={{module: torch.nn.LSTM, arguments: {TWO}, gives: [poisson_ratio]}}"],
             "output; got tuple; exp",
         ),
+        (
+            [f"learn.network={{module: torch.nn.Bilinear, arguments: {PAIR}, gives: [poisson_ratio]}}"],
+            "torch.nn.Bilinear: forward; got TypeError: ",
+        ),
+        (["data.train={kilometres}"], "expected points of the cloth, in metres"),
         (["run.loggers=[wandb]"], "config: run.loggers; got 'wandb'; expected csv or tensorboard"),
         (["run.processes=4"], "config: run.processes; got 4; expected at most 3, the episodes at a step"),
         (["--resume"], "--resume; got no "),
     ],
 )
-def test_one_line(config, episodes, capsys, options, words):
-    path = config()
-    places = {"{held}": str(episodes / "held"), "{trained}": str(episodes / "ep_1")}
+def test_one_line(config, episodes, tmp_path, capsys, options, words):
+    path, wrong = config(), tmp_path / "kilometres"
+    if "{kilometres}" in options[0]:
+        seen = rec.read(episodes / "ep_0")
+        rec.write(replace(seen, points=replace(seen.points, xyz=1e-3 * seen.points.xyz)), wrong)
+    places = {"{held}": str(episodes / "held"), "{trained}": str(episodes / "ep_1"), "{kilometres}": str(wrong)}
     for name, place in places.items():
         options, words = [option.replace(name, place) for option in options], words.replace(name, place)
     assert main(["--config", path, *options]) == 2
@@ -170,6 +181,9 @@ def test_more_processes_than_the_config_says_are_refused_of_srun_too(config, cap
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     assert main(["--config", config()]) == 2
     assert "got 1, started as one of 4 processes (SLURM_NTASKS)" in capsys.readouterr().err
+    monkeypatch.setenv("SLURM_NTASKS", "2")
+    assert main(["--config", config(), "run.processes=2"]) == 2
+    assert "srun; got --ntasks=2 alone; expected --ntasks-per-node=2" in capsys.readouterr().err
 
 
 def test_seeds_have_an_end(config, capsys):

@@ -146,7 +146,7 @@ def test_what_the_system_kills_is_no_answer(monkeypatch, tmp_path):
 
 def test_one_round_is_of_one_code(called, tmp_path, monkeypatch):
     hidden.run(options(tmp_path, seed=9, cases=1))
-    monkeypatch.setattr(kept, "program", lambda: "another")
+    monkeypatch.setattr(kept, "program", lambda *beside: "another")
     with pytest.raises(InvalidInput, match="holds a study with code"):
         hidden.run(options(tmp_path, cases=2))
 

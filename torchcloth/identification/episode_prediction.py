@@ -16,6 +16,7 @@ from ..errors import SimulationDiverged, UnstableStep
 from ..losses import closest
 from ..losses.surface import distances
 from ..recordings import Recording
+from ..recordings.extents import check_size
 from .episodes import Episode, episode
 from .gauss_newton import NORMAL
 from .linearity import NONLINEAR
@@ -97,9 +98,11 @@ def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
-        RecordingError: the file cannot be read; or an episode that has no frames to predict.
+        RecordingError: the file cannot be read; an episode that has no frames to predict, or was seen in another unit
+            than metres.
     """
     model = read_saved(path)
+    check_size(recording)
     cloth = rebuilt(path, model, recording)
     unknowns, covariance = _known(model, cloth)
     data = episode(cloth, recording)
@@ -108,13 +111,14 @@ def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction
         frames, moved = tangents(cloth, unknowns, raw, data, model.dt)
         moved, lost = _held_to_steps(cloth, unknowns, raw, data, model.dt, (frames, moved), covariance)
     found = with_errors(cloth, data, frames, moved, covariance, model.left)
+    found = replace(found, warnings=tuple(data.doubts()))
     if not lost:
         return found
     text = (
         f"the motion is unstable or strongly nonlinear: tangents of {', '.join(lost)} miss what a standard error does, "
         "and were replaced by it; errors are no better than such a step"
     )
-    return replace(found, warnings=(text,))
+    return replace(found, warnings=(*found.warnings, text))
 
 
 @torch.no_grad()

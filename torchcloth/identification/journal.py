@@ -10,6 +10,7 @@ import hashlib
 import pickle
 from collections.abc import Callable, Sequence
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import TypeVar
 
@@ -91,11 +92,14 @@ class Journal:
 
 
 @cache
-def program() -> str:
-    """A fingerprint of the library's sources: what other physics has answered is no answer."""
-    root = Path(__file__).resolve().parents[1]
-    files = sorted(path for path in root.rglob("*") if path.suffix in (".py", ".h", ".cpp"))
-    return digest([part for path in files for part in (str(path.relative_to(root)), path.read_bytes())])
+def program(*beside: Path) -> str:
+    """A fingerprint of the sources of the library, and of folders beside: what other code said is no answer."""
+    folders = [Path(str(files(name))) for name in ("torchcloth", "torchcloth.robots")]
+    parts: list[object] = []
+    for folder in (*folders, *beside):
+        sources = sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".h", ".cpp"))
+        parts += [part for p in sources for part in (p.relative_to(folder).as_posix(), p.read_bytes())]
+    return digest(parts)
 
 
 def clear(folder: Path) -> None:

@@ -6,6 +6,7 @@ over the only one.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,19 @@ from torchcloth._files import atomically
 
 
 class Whole(TorchCheckpointIO):
-    """Written beside its place, then put there."""
+    """Written beside its place, then put there.
+
+    Args:
+        outdated: results of an earlier run in the folder, which the first checkpoint takes the place of.
+    """
+
+    def __init__(self, outdated: Iterable[Path] = ()) -> None:
+        self.outdated = list(outdated)
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """As torch.save has it; ``storage_options`` are not used."""
         with atomically(Path(path)) as part:
             torch.save(checkpoint, part)
+        for path in self.outdated:
+            path.unlink(missing_ok=True)
+        self.outdated.clear()

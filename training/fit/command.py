@@ -17,7 +17,7 @@ NAME = "torchcloth.training.fit"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
-    options, config = _parser().parse_args(arguments), None
+    options, config = _parser().parse_intermixed_args(arguments), None
     try:
         config = load(options.config, options.overrides)
         if find_spec("lightning") is None:
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("fit: another process ended; see its own line", file=sys.stderr)
         return 2
     except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
-        kept = config is not None and (Path(config.out) / CHECKPOINT).is_file()
+        kept = config is not None and (Path(config.out).expanduser() / CHECKPOINT).is_file()
         further = "; the same command with --resume goes on after the last whole step" if kept else ""
         print(f"fit: stopped{further}", file=sys.stderr)
         return 130

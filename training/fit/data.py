@@ -15,6 +15,7 @@ from torchcloth import Cloth, recordings
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import Episode, episode
 from torchcloth.recordings import Recording
+from torchcloth.recordings.extents import check_size
 
 from .config import Data
 from .described import described, same_cloth
@@ -28,7 +29,7 @@ def found(data: Data) -> tuple[list[Recording], list[Recording]]:
     Raises:
         InvalidInput: a pattern without episodes, nothing to train with, an episode to do both with, or episodes of
             different cloths.
-        RecordingError: an episode that cannot be trusted.
+        RecordingError: an episode that cannot be trusted, or was seen in another unit than metres.
     """
     places = _folders(data.train, "data.train"), _folders(data.val, "data.val")
     if both := places[0].keys() & places[1].keys():
@@ -44,6 +45,8 @@ def found(data: Data) -> tuple[list[Recording], list[Recording]]:
     train = [r for r in train if r.split.get("motion") not in data.val_motion]
     if not train:
         raise InvalidInput("config: data.train", got="no episodes", expected="one or more to train with")
+    for recording in (*train, *val):
+        check_size(recording)
     first = described(train[0])
     for other in (*train[1:], *val):
         if not same_cloth(first, described(other)):

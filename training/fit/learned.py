@@ -84,9 +84,10 @@ class Learned(nn.Module):
     def _given(self, network: nn.Module, name: str) -> Tensor:
         try:
             return network(self._places)
-        except RuntimeError as error:  # torch's, of shapes that do not fit
-            expected = f"a network of places {list(self._places.shape)}"
-            raise InvalidInput(f"{name}: input", got=str(error).splitlines()[0], expected=expected) from None
+        except Exception as error:  # of somebody's code, whatever it raises
+            got = f"{type(error).__name__}: {error}".splitlines()[0]
+            expected = f"a network that takes places {list(self._places.shape)}"
+            raise InvalidInput(f"{name}: forward", got=got, expected=expected) from error
 
     def entries(self) -> dict[str, Tensor]:
         """What the network gives, by the names of the cloth's stored tensors."""

@@ -37,9 +37,9 @@ class FitModule(pl.LightningModule):
         super().__init__()
         self.save_hyperparameters(logger=False)
         self.config, self.problem = from_dict(config), problem
-        torch.manual_seed(self.config.run.seed)  # a network's first weights
         cloth = built(description, self.config.model)
-        with precision(self.config.model.precision):
+        with precision(self.config.model.precision), torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.config.run.seed)  # a network's first weights
             self.learned = Learned(cloth, self.config.learn)
         self.loss = Loss(self.config.loss)
         self.begun: dict[str, float] = {}  # values before the present step

@@ -14,6 +14,7 @@ from .config import Config
 from .learned import summary
 from .module import FitModule
 
+RESULTS = ("fit.json", "fields.npz")  # in a run's folder
 REMARK = (
     "Gradient descent ends with values, not with error bars: nothing here says how well the data determine them. For "
     "standard errors and what is identifiable, start `identify` from these values; of fields and networks there are "
@@ -90,5 +91,7 @@ def show(content: dict[str, Any], folder: Path) -> None:
             before = content[kind].get("chamfer_before")
             start = "" if before is None else f", {1e3 * before:.2f} mm before"
             console.print(f"{kind}: {1e3 * after:.2f} mm from the points to the surface{start}")
+    for warning in content["warnings"]:
+        console.print(f"warning: {warning}", style="yellow", soft_wrap=True)
     console.print(REMARK, f"\n  {content['identify']}", style="dim", soft_wrap=True)
     console.print(f"result:   {folder / 'fit.json'}", soft_wrap=True)

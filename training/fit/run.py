@@ -11,6 +11,8 @@ from pathlib import Path
 
 import lightning.pytorch as pl
 import torch
+from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.strategies import DDPStrategy
@@ -51,7 +53,7 @@ def fit(config: Config, resume: bool = False) -> FitModule:
             that is not finite, before it is followed: the checkpoint is from the step before.
     """
     torch.set_num_threads(1)  # meshes of a thousand triangles: processes pay, threads do not
-    folder = Path(config.out)
+    folder = Path(config.out).expanduser()
     checkpoint = folder / CHECKPOINT
     if folder.exists() and not folder.is_dir():
         raise InvalidInput("out", got=f"{folder}, a file", expected="a folder, new or existing")
@@ -93,7 +95,7 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
     _check_processes(config.run)
     module = FitModule(asdict(config), description, _problem(config, cloth, data))
     initial = module.now()
-    trainer = _trainer(config, folder)
+    trainer = _trainer(config, folder, [] if checkpoint else [folder / name for name in result.RESULTS])
     trainer.fit(module, datamodule=data, ckpt_path=checkpoint)
     figures = {
         "train": {"episodes": len(train), **_after(trainer, module, data, data.train)},
@@ -101,6 +103,7 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
         "steps": trainer.global_step,
         "seconds": time.perf_counter() - began,
         "processes": trainer.world_size,
+        "warnings": [doubt for e in (*data.train, *data.val) for doubt in e.doubts()],
     }
     if data.per_step == len(train):  # else the first step told of a part of them
         first = module.history[0]
@@ -123,9 +126,11 @@ def _check_processes(run: Run) -> None:
             got=f"{run.processes * run.nodes}, started as one of {started} processes ({variable})",
             expected="as many as torchrun or the cluster starts",
         )
+    if variable == "SLURM_NTASKS" and started not in ("", "1") and "SLURM_NTASKS_PER_NODE" not in os.environ:
+        raise InvalidInput("srun", got=f"--ntasks={started} alone", expected=f"--ntasks-per-node={run.processes}")
 
 
-def _trainer(config: Config, folder: Path) -> pl.Trainer:
+def _trainer(config: Config, folder: Path, outdated: list[Path]) -> pl.Trainer:
     for message in QUIET:
         warnings.filterwarnings("ignore", f".*{message}")
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -145,11 +150,17 @@ def _trainer(config: Config, folder: Path) -> pl.Trainer:
             ModelCheckpoint(folder, Path(CHECKPOINT).stem, save_on_train_epoch_end=True, enable_version_counter=False),
             Told(),
         ],
-        plugins=[Whole()],
+        plugins=[Whole(outdated), *_cluster()],
         default_root_dir=folder,
         enable_progress_bar=False,
         enable_model_summary=False,
     )
+
+
+def _cluster() -> list[SLURMEnvironment]:
+    """SLURM's, if it started this process: what Lightning saves at its signals would be taken without --resume."""
+    alone = SLURMEnvironment.detect() and not TorchElasticEnvironment.detect()
+    return [SLURMEnvironment(auto_requeue=False)] if alone else []
 
 
 def _loggers(names: list[str], folder: Path) -> list[Logger]:
@@ -172,4 +183,5 @@ def _problem(config: Config, cloth: Cloth, data: Episodes) -> str:
     """Fingerprint of data, model, options and the library's code; of what may change while a run rests, nothing."""
     fixed = replace(config, out="", run=Run(seed=config.run.seed), data=replace(config.data, train=[], val=[]))
     fixed = replace(fixed, optimizer=replace(config.optimizer, steps=Optimizer.steps))
-    return digest([program(), fixed, len(data.train), *Objective(cloth, [], [*data.train, *data.val]).identity()])
+    code = program(Path(__file__).resolve().parent)
+    return digest([code, fixed, len(data.train), *Objective(cloth, [], [*data.train, *data.val]).identity()])
