@@ -17,7 +17,7 @@ from torchcloth.types import Trajectory
 
 from .arm import Arm
 from .clearance import Gap
-from .crowd import between_arms, within_arm
+from .crowd import STEP, between_arms, within_arm
 from .holds import Hold, candidates, inward
 from .inverse import reach
 from .primitives import Action
@@ -100,6 +100,10 @@ def plan(
             )
     if unknown := action.motion.keys() - scene.arms.keys():
         raise InvalidInput("action moves unknown arms", got=sorted(unknown), expected=f"among {list(scene.arms)}")
+    if unknown := (holds or {}).keys() - scene.arms.keys():
+        raise InvalidInput("holds of unknown arms", got=sorted(unknown), expected=f"among {list(scene.arms)}")
+    if not action.motion:
+        raise InvalidInput("action", got="no motion", expected=f"a path for one or more of {list(scene.arms)}")
     for name, value in {"acceleration": acceleration, "clearance": clearance, "period": period}.items():
         if not (math.isfinite(value) and value > 0):
             raise InvalidInput(name, got=value, expected="a finite value > 0")
@@ -154,7 +158,7 @@ def _options(
         except InvalidInput as error:
             refusals.append(error)
             continue
-        found.append((way, within_arm(scene, name, way.spline.q, task.path.t, clearance)[0]))
+        found.append((way, within_arm(scene, name, *way.spline.sampled(STEP), clearance)[0]))
         if len(found) == KEPT:
             break
     if not found:

@@ -35,6 +35,11 @@ class Spline(NamedTuple):
         q = self.q[k] + s * (start + s * (self.acceleration[k] / 2 + s * rise / 6))
         return q, start + s * (self.acceleration[k] + s * rise / 2)
 
+    def sampled(self, period: float) -> tuple[Tensor, Tensor]:
+        """Positions [N, J] at the times [N] s of ``finer``, and these."""
+        times = self.finer(period)
+        return self.at(times)[0], times
+
     def slower(self, factor: float) -> Spline:
         """The same curve in ``factor`` times the time."""
         return Spline(factor * self.t, self.q, self.acceleration / factor**2)

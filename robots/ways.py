@@ -13,6 +13,7 @@ from torchcloth.types import Trajectory
 
 from . import trajectories
 from .arm import Arm
+from .crowd import STEP
 from .holds import ELBOWS, Hold
 from .inverse import Unreachable
 from .spline import Spline
@@ -116,7 +117,7 @@ def follow(task: Task, hold: Hold) -> Way:
             remedy="move the path, or choose another hold",
         )
     _check_tracking(arm, path, spline)
-    if refusal := task.check(spline.q, path.t):
+    if refusal := task.check(*spline.sampled(STEP)):
         raise refusal
     return Way(hold, spline, load(arm, spline, task.acceleration))
 

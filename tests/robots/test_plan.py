@@ -2,16 +2,19 @@
 
 import math
 import shutil
+import sys
 
 import numpy as np
 import pytest
 import torch
 
+import torchcloth.robots.crowd as crowd
 from torchcloth import recordings, robots
 from torchcloth.boundaries.motion import interpolate
 from torchcloth.errors import InvalidInput
 from torchcloth.robots import Hold, plan
 from torchcloth.robots import primitives as P
+from torchcloth.robots.arm import Primitive
 from torchcloth.robots.description import locate
 from torchcloth.robots.inverse import reach
 from torchcloth.robots.primitives.moves import PERIOD
@@ -155,31 +158,82 @@ def test_the_joints_lead_along_the_path_between_knots_too(rig, made, family, arm
 
 @pytest.mark.parametrize("family", CASES)
 def test_solids_keep_their_distance(rig, made, family):
-    """Points of the arms' solids are outside each other and above the table: no formula shared with the planner."""
+    """Points of one arm's solids are outside the other's and above the table: no formula shared with the planner."""
     _, found = made[family]
-    q = {name: value[::5] for name, value in found.q.items()}
-    clouds = {name: [_corners(p) for p in rig[name].geometry(q[name])[4:]] for name in q}
-    for name, cloud in clouds.items():
-        lowest = min(float(points[..., 2].min()) for points in cloud)
-        assert lowest > -1e-3, name
-        assert min(float(points[..., 2].min()) for points in cloud[:-1]) > 0.02 - 1e-3, name
-    far = min(
-        float((a[:, :, None] - b[:, None]).norm(dim=-1).min())
-        for a in clouds["left"][-4:]
-        for b in clouds["right"][-4:]
-    )
-    assert far > 0.02
+    solids = {name: rig[name].geometry(value[::5]) for name, value in found.q.items()}
+    for name, own in solids.items():
+        lowest = [float(_points(p)[..., 2].min()) for p in own[4:]]
+        assert min(lowest) > -1e-3, name
+        assert min(lowest[:-1]) > 0.02 - 1e-3, name
+    for one, other in (("left", "right"), ("right", "left")):
+        points = torch.cat([_points(p) for p in solids[one]], 1)
+        assert min(float(_outside(p, points).min()) for p in solids[other]) > 0.02 - 1e-3
 
 
-def _corners(p):
-    """Points [T, N, 3] on the surface of a solid."""
+def test_points_know_solids_that_cross():
+    """What the test above relies on: two bars that cross in their middles have no corner near each other."""
+    bar = lambda *size: Primitive("box", size, torch.eye(4, dtype=torch.float64).expand(1, 4, 4), "bar")  # noqa: E731
+    one, other = bar(0.4, 0.02, 0.02), bar(0.02, 0.4, 0.02)
+    assert float(_outside(other, _points(one)).min()) < 0
+    post = other._replace(kind="cylinder", size=(0.01, 0.4))
+    assert float(_outside(post, _points(one)).min()) < 0
+    assert float(_outside(one, _points(post)).min()) < 0
+
+
+def _points(p, apart=0.01):
+    """[T, N, 3] on the surface of a box or cylinder, about ``apart`` m from each other."""
+    line = lambda length: torch.linspace(-0.5, 0.5, 2 + int(length / apart), dtype=torch.float64) * length  # noqa: E731
     if p.kind == "box":
-        local = torch.cartesian_prod(*[torch.tensor([-s / 2, s / 2], dtype=torch.float64) for s in p.size])
+        x, y, z = map(line, p.size)
+        local = torch.cartesian_prod(x, y, z)
+        half = torch.tensor(p.size, dtype=torch.float64) / 2
+        local = local[((local.abs() - half).abs() < 1e-9).any(1)]
     else:
-        angle = torch.linspace(0, 2 * math.pi, 13, dtype=torch.float64)[:-1]
-        ring = torch.stack([p.size[0] * angle.cos(), p.size[0] * angle.sin()], -1)
-        local = torch.cat([torch.cat([ring, torch.full((12, 1), s * p.size[1] / 2)], -1) for s in (-1, 1)])
+        radius, length = p.size
+        angle = torch.linspace(0, 2 * math.pi, 2 + int(2 * math.pi * radius / apart), dtype=torch.float64)[:-1]
+        circle = torch.stack([angle.cos(), angle.sin()], -1)
+        at = lambda r, z: torch.cat([r * circle, torch.full((len(angle), 1), float(z))], -1)  # noqa: E731
+        ends = [at(r, z) for r in torch.arange(0, radius, apart) for z in (-length / 2, length / 2)]
+        local = torch.cat([*ends, *(at(radius, z) for z in line(length))])
     return (p.pose[:, None, :3, :3] @ local[None, :, :, None])[..., 0] + p.pose[:, None, :3, 3]
+
+
+def _outside(p, points):
+    """Signed distance [T, N] m of points [T, N, 3] from a box or cylinder."""
+    local = ((points - p.pose[:, None, :3, 3])[..., None, :] @ p.pose[:, None, :3, :3])[..., 0, :]
+    if p.kind == "box":
+        beyond = local.abs() - torch.tensor(p.size, dtype=torch.float64) / 2
+    else:
+        beyond = torch.stack([local[..., :2].norm(dim=-1) - p.size[0], local[..., 2].abs() - p.size[1] / 2], -1)
+    return beyond.clamp(min=0).norm(dim=-1) + beyond.amax(-1).clamp(max=0)
+
+
+def test_no_instant_is_farther_from_the_next_than_is_said(rig, made, monkeypatch):
+    """A path whose knots are farther apart is looked at between them."""
+    looked = []
+
+    def within(scene, name, q, times, clearance):
+        looked.append(float(times.diff().max()))
+        return crowd.within_arm(scene, name, q, times, clearance)
+
+    monkeypatch.setattr(sys.modules["torchcloth.robots.plan"], "within_arm", within)
+    action, left, right = CASES["hang"]
+    coarse = {}
+    for name, path in action.motion.items():
+        knots = torch.linspace(0, len(path.t) - 1, 90).round().long().unique()
+        coarse[name] = Trajectory(path.t[knots], path.pose[knots], path.closed[knots])
+    assert float(coarse["left"].t.diff().max()) > 0.03
+    plan(rig, action._replace(motion=coarse), holds={"left": Hold(*left), "right": Hold(*right)})
+    assert looked
+    assert max(looked) <= 0.02 + 1e-9
+
+
+def test_holds_of_nobody_and_no_motion_are_refused(rig, made):
+    action, left, _ = CASES["hang"]
+    with pytest.raises(InvalidInput, match=r"holds of unknown arms; got \['Left'\]; expected among"):
+        plan(rig, action, holds={"Left": Hold(*left)})
+    with pytest.raises(InvalidInput, match="action; got no motion"):
+        plan(rig, action._replace(motion={}))
 
 
 @pytest.mark.parametrize("family", ["fling", "hang"])

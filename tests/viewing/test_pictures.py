@@ -168,6 +168,9 @@ def test_durations_are_hundredths_whose_sum_is_right():
     assert set(found) == {30, 40}
     assert sum(found[:30]) == 1000
     assert _durations(np.array([3.0])) == [1000]
+    uneven = np.arange(501) / 60 * 1.2  # 50 a second of 60: every other one is nearer than a GIF can show
+    uneven[1::2] -= 0.004
+    assert sum(_durations(uneven)[:500]) == 10000
 
 
 def test_a_gif_has_at_most_fifty_frames_a_second(film, tmp_path):

@@ -37,7 +37,7 @@ from ..types import Trajectory
 from .garments import data_sheet, numbers
 from .orders import Order
 from .sensors import DEPTH_SCALE, view
-from .staging import FRICTION, Staged, stage
+from .staging import FRICTION, LAYERS, Staged, stage
 
 SETTLING = 0.6  # s, in which hanging cloth comes to rest before the first frame
 AIR = 1.204  # kg/m^3
@@ -133,7 +133,7 @@ def _recorded(
         provenance=f"synthetic: torchcloth {metadata.version('torchcloth')} simulate, same engine (inverse crime)",
         licence="CC0-1.0",
         grasps={name: GraspInfo(vertices=held) for name, held in staged.held.items()},
-        colliders={"table": Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), FRICTION)},
+        colliders={"table": Collider(np.array([0.0, 0.0, LAYERS / 2]), np.array([0.0, 0.0, 1.0]), FRICTION)},
         cameras={"cam0": camera},
         points=points,
         truth=truth,

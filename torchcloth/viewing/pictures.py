@@ -116,5 +116,7 @@ def _durations(times: Array) -> list[int]:
     if len(times) == 1:
         return [1000]
     ends = np.append(times[1:], 2 * times[-1] - times[-2]) - times[0]
-    hundredths = np.diff(np.round(100 * ends).astype(int), prepend=0)
-    return (10 * np.maximum(hundredths, 2)).tolist()
+    shown = [0]
+    for end in np.round(100 * ends).astype(int).tolist():
+        shown.append(max(end, shown[-1] + 2))  # what one frame is too long, the next are shorter
+    return (10 * np.diff(shown)).tolist()
