@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.stats import t
 
-from torchcloth.diagnosis.comparison import Gain, heard, spread
+from torchcloth.diagnosis.comparison import Gain, heard, spread, told_by
 from torchcloth.diagnosis.screening import Row
 from torchcloth.diagnosis.trials import (
     NORMAL,
@@ -117,6 +117,34 @@ def test_a_rival_may_be_larger_than_a_cause(amplitude, named, rival):
     tried = replace(tried, fitted=replace(tried.fitted, model=model))
     assert known(tried.fitted, "cause", list("abcd"), tried) == named
     assert _agreed(tried, list("abcd")) == rival
+
+
+@pytest.mark.parametrize(("alone", "least", "named"), [({"a"}, 30.0, True), ({"a"}, 20.0, False), (set(), 30.0, False)])
+def test_halves_of_one_motion_need_not_agree_about_the_size_of_what_is_overwhelming(alone, least, named):
+    """Creases of 5 1/s in one fold: 43 in log density, 0.4 standard errors by slopes of what has levelled off."""
+    tried = replace(candidate(0.1, 0.0), alone=alone, gain=gain(0.7)._replace(least=least), sure=1e3)
+    cells = tried.fitted.evidence.cells
+    for k, c in enumerate(cells):
+        cells[k] = c._replace(value=c.value - (0.03, -0.03, 0.02, -0.02)[k] * c.jacobian[:, 1])
+    model = tried.fitted.model
+    tried = replace(tried, fitted=replace(toys.fitted(tried.fitted.evidence), model=model))
+    assert known(tried.fitted, "cause", list("abcd"), tried) == named
+    nothing = replace(model, amplitudes=(0.0,))
+    assert not known(replace(tried.fitted, model=nothing), "cause", list("abcd"), tried)
+
+
+def test_as_many_tell_as_would_say_as_much():
+    slopes = toys.smooth(1, 3)
+    all_alike = slopes[:1].expand(4, -1, -1).clone()
+    one = all_alike.clone()
+    one[1:, :, 1] = 0.0
+    told = [
+        told_by(toys.fitted(toys.evidence(own, 2, [], torch.zeros(2).double(), 0)), 1, list("abcd"), halved)
+        for own, halved in ((all_alike, ()), (one, ()), (one, {"a"}))
+    ]
+    assert told[0] == pytest.approx(4.0, abs=1e-6)
+    assert 1.0 < told[1] < 1.5  # the others tell of the first number, which it is told beside
+    assert told[1] + 0.3 < told[2] < 3.0
 
 
 def candidate(asked, numerics):

@@ -172,3 +172,15 @@ def test_nothing_open_asks_for_nothing():
     end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
     found, none = SimpleNamespace(causes=[], minor=[], screened=[], end=end), {"causes": [], "minor": []}
     assert propose(found, none, SimpleNamespace(recordings=()), print) is None
+
+
+def test_what_does_the_same_as_a_fitted_number_is_not_waited_for():
+    """No motion tells a density from the fabric's own; its data sheet alone does."""
+    end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
+    twin, other = replace(toys.hypothesis("a"), twin=end.model.parameters[0].name), toys.hypothesis("b")
+    end = replace(end, evidence=replace(end.evidence, hypotheses=[twin, other]))
+    rows = [SimpleNamespace(hypothesis=h, decision="inconclusive") for h in (twin, other)]
+    found, none = SimpleNamespace(causes=[], minor=[], screened=rows, end=end), {"causes": [], "minor": []}
+    assert question_of(found, none).amplitudes.keys() == {"b"}
+    found.screened = rows[:1]
+    assert question_of(found, none) is None

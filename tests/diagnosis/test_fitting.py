@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from torchcloth.diagnosis import fitting
+from torchcloth.diagnosis.evidence import as_held
 from torchcloth.diagnosis.fitting import fit, with_cause
+from torchcloth.diagnosis.stepwise import _impossible
 from torchcloth.errors import SimulationDiverged
 
 TRUTH = torch.tensor([0.4]).double()
@@ -65,15 +67,17 @@ def test_a_step_into_the_impossible_is_not_taken(looks, iterations):
     assert seen[-1] == (0.0, 1)
 
 
-@pytest.mark.parametrize(("promised", "steps"), [([9.0, 0.0, 0.0, 0.0], 3), ([0.0], 0), ([9.0, 9.0, 9.0], 3)])
-def test_it_goes_on_while_steps_gain_whatever_slopes_promise(looks, monkeypatch, promised, steps):
-    """From 0 to 0.4, where the data are, by 0.2 a step: the third gains nothing any more."""
+@pytest.mark.parametrize(
+    ("promised", "steps", "tried"), [([9.0, 0.0, 0.0, 0.0], 2, 3), ([0.0], 0, 0), ([9.0, 9.0, 9.0], 2, 4)]
+)
+def test_it_goes_on_while_steps_gain_whatever_slopes_promise(looks, monkeypatch, promised, steps, tried):
+    """From 0 to 0.4, where the data are, by 0.2 a step: the third loses and is not taken, nor is half of it."""
     seen, model = looks
     ahead = iter(promised)
     monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.2]).double(), next(ahead, 0.0)))
     found = fit(model, None)  # type: ignore[arg-type]
     assert float(found.model.point[0]) == pytest.approx(0.2 * steps)
-    assert len(seen) == steps + 1
+    assert len(seen) == tried + 1
 
 
 def test_what_only_the_later_point_meets_is_no_loss(looks, monkeypatch):
@@ -81,7 +85,15 @@ def test_what_only_the_later_point_meets_is_no_loss(looks, monkeypatch):
     seen.hidden = 5  # of six
     ahead = iter([9.0])
     monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.2]).double(), next(ahead, 0.0)))
-    assert float(fit(model, None).model.point[0]) == pytest.approx(0.6)  # type: ignore[arg-type]
+    assert float(fit(model, None).model.point[0]) == pytest.approx(0.4)  # type: ignore[arg-type]
+
+
+def test_half_a_step_may_gain(looks, monkeypatch):
+    """Slopes that lead twice as far as the data are."""
+    _, model = looks
+    ahead = iter([9.0, 9.0])
+    monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.9]).double(), next(ahead, 0.0)))
+    assert float(fit(model, None).model.point[0]) == pytest.approx(0.45)  # type: ignore[arg-type]
 
 
 def test_where_it_begins_must_be_possible(looks):
@@ -119,3 +131,22 @@ def test_amplitudes_stop_where_a_world_ends():
     assert model.plus(ortho).at(torch.tensor([0.1, 1.5]).double()).amplitudes == (0.9,)
     plain = replace(ortho, signed=False, low=0.1)
     assert model.plus(plain).at(torch.tensor([0.1, -1.5]).double()).amplitudes == (0.1,)
+
+
+def test_cells_that_the_base_model_had_not_keep_their_nuisances():
+    """They would err by noise alone, however late the clock may be."""
+    here = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0)).evidence
+    later = [c.rows(c.window > 0) for c in here.cells]
+    known = replace(here, cells=[c._replace(jacobian=2 * c.jacobian) for c in later])
+    for own, held, like in zip(here.cells, as_held(here, known).cells, known.cells, strict=True):
+        new = own.window == 0
+        assert torch.equal(held.jacobian[new], own.jacobian[new])
+        assert torch.equal(held.jacobian[~new, 1], like.jacobian[:, 1])
+        assert torch.equal(held.jacobian[:, 0], own.jacobian[:, 0])
+
+
+def test_what_cannot_be_simulated_beside_a_cause_is_told():
+    there = toys.fitted(toys.evidence(toys.smooth(1, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
+    asked = [toys.hypothesis(name) for name in "abcd"]
+    model = replace(there.model, accepted=(asked[2],), amplitudes=(0.1,))
+    assert _impossible(replace(there, model=model), asked) == ["d"]

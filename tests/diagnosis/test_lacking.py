@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchcloth.diagnosis import doubts, lack_of_fit
-from torchcloth.diagnosis.lacking import RARE, SENSOR, Left, explained
+from torchcloth.diagnosis.lacking import RARE, SENSOR, Left, explained, is_lacking
 
 NAMES = ["a"]
 SLOPES = toys.smooth(1, 4)  # two parameters, one hypothesis, one nuisance
@@ -81,7 +81,16 @@ def test_where_most_motions_fold_apart_what_is_held_out_says_how_much_is_mended(
     start = toys.fitted(replace(wrong, numerics=rough))
     end = toys.fitted(replace(wrong, cells=[*right.cells[:3], wrong.cells[3]], numerics=rough))
     assert doubts.mended(start, end, MOTIONS) == pytest.approx(share, abs=0.1)
-    assert doubts.mended(start, toys.fitted(replace(right, numerics=rough)), MOTIONS) == 1.0
+    assert doubts.mended(start, toys.fitted(replace(right, numerics=rough)), MOTIONS) == pytest.approx(1.0, abs=0.1)
+
+
+def test_where_all_motions_fold_apart_more_is_no_mending():
+    """Nothing is judged to be lacking then, neither before nor after."""
+    worse, wrong = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (6.0, 1.0))
+    rough = [torch.full_like(c.value, 0.03) for c in wrong.cells]
+    start, end = (toys.fitted(replace(e, numerics=rough)) for e in (wrong, worse))
+    assert not is_lacking(end, MOTIONS)
+    assert doubts.mended(start, end, MOTIONS) < 0
 
 
 def test_how_much_is_mended_is_counted_on_cells_that_both_fits_have():

@@ -150,6 +150,14 @@ def test_an_episode_in_which_nothing_is_held_says_so(recording, model):
     assert "no gripper is ever closed" in doubt
 
 
+def test_a_gripper_without_a_grasp_says_so(recording, model):
+    hand = next(iter(recording.grippers.values()))
+    (doubt,) = episode(model, replace(recording, grippers={**recording.grippers, "third": hand})).doubts()
+    assert "no grasp is called third" in doubt
+    away = replace(hand, closed=np.zeros_like(hand.closed))
+    assert episode(model, replace(recording, grippers={**recording.grippers, "third": away})).doubts() == []
+
+
 def test_until_keeps_the_early_frames(recording, model):
     seen = episode(model, recording)
     assert len(seen.until(0.5).clouds) == len(seen.until(0.5).times) == round(0.5 * twins.FRAMES)

@@ -14,7 +14,7 @@ import twins
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import cloth_from, draw, episode, identify, print_fit, replayed, streams
 from torchcloth.identification.blocks import USES
-from torchcloth.identification.null import CARRIED, UNFELT, no_better_than
+from torchcloth.identification.null import CARRIED, STAYS, UNFELT, no_better_than
 from torchcloth.identification.replays import Frames
 
 STIFFNESS = ["youngs_modulus"]
@@ -107,6 +107,7 @@ def test_a_fit_is_held_against_the_null_of_the_data_that_tell(felt):
     assert told(still, "points", "force") == ""
     assert told(still, "points", "force", force=-1.0) == UNFELT
     assert told(still, "points") == ""
+    assert told(still, "points", shift=0.5) == STAYS
     assert told(moved, "points", "force", force=-1.0) == ""
     assert told(moved, "points", "force", shift=0.5) == CARRIED
     assert told(moved, "force", shift=0.5) == ""

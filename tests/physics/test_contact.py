@@ -1,6 +1,7 @@
 """Layers of cloth on each other: gap, search for near layers, collision, friction."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 import torchcloth as tc
 from torchcloth import apic, functional, self_contact
 from torchcloth.transfer import FADING, GAP, TOUCH
+from torchcloth.transfer.neighbours import over
 
 SPACING, STIFFNESS, DENSITY = 0.01, 100.0, 0.15  # m, k h [N/m], kg/m^2
 
@@ -286,3 +288,29 @@ def test_large_cells_of_an_uneven_mesh_have_no_holes(cell):
     with torch.no_grad():
         end = cloth(cloth.rest_state(), still(), times=[0.0, 0.2]).x[-1, count:, 2]
     assert float(end.min()) > 0.01
+
+
+@pytest.mark.parametrize(("contact", "told"), [(tc.Contact(), True), (tc.Contact.with_gap(0.01), False)])
+def test_layers_that_do_not_meet_are_told(contact, told):
+    """A shirt on a grid as coarse as its mesh: the way round its seams is too short for the layers to be any."""
+    mesh = tc.meshes.shirt(triangles=2000 if not told else 300)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3, 5e4), DENSITY, contact=contact)
+        tc.Cloth(tc.meshes.rectangle(0.3, 0.3, resolution=(9, 9)), tc.materials.AEP(1e5), DENSITY)
+    texts = [str(w.message) for w in said]
+    assert len(texts) == told
+    assert all("lie over another layer do not see it" in text for text in texts)
+
+
+def test_what_lies_over_what():
+    """Two sheets 1 cm apart, each of whose triangles has some of the other over it; none of its own."""
+    cloth, _ = layers(0.01)
+    found = over(cloth.mesh, 0.02)
+    assert len(found)
+    assert ((found[:, 0] < 32) != (found[:, 1] < 32)).all()
+    assert not len(over(cloth.mesh, 0.005))
+    bent = tc.meshes.rectangle(0.3, 0.3, resolution=(20, 20))
+    vertices = bent.vertices.copy()
+    vertices[:, 2] = 0.05 * np.sin(20 * vertices[:, 0])
+    assert not len(over(tc.meshes.Mesh.build(vertices, bent.faces, bent.uv), 0.03))

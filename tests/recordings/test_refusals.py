@@ -66,6 +66,21 @@ def test_texture_coordinates_are_no_pattern(episode):
     refused(episode, r"cloth.obj: vt; got edges .* 3.33 to 5 times .*; expected about the same; vt must be in metres")
 
 
+@pytest.mark.parametrize(("path", "wrong"), [(["grasps"], "grasp"), (["cloth", "areal_density"], "area_density")])
+def test_a_misspelt_key_is_not_ignored(episode, path, wrong):
+    """The cloth would fall, of nothing but a lacking letter."""
+    content = json.loads((episode / "episode.json").read_text())
+    value = content[path[0]] if len(path) == 1 else content[path[0]][path[1]]
+    edit_json(episode, path, DROP)
+    edit_json(episode, [*path[:-1], wrong], value)
+    refused(episode, f"{wrong} is unknown; got '{wrong}'; expected '{path[-1]}'|{path[-1]} is missing")
+
+
+def test_a_key_of_ones_own_beside_one_like_it_is_kept(episode):
+    edit_json(episode, ["grasp"], {"by": "Ada"})
+    assert rec.read(episode).extra["grasp"] == {"by": "Ada"}
+
+
 MIRROR = np.diag([-1.0, 1, 1, 1]).tolist()
 MILLI = [[1, 0, 0, 500.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 SHEAR = [[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

@@ -36,7 +36,8 @@ def _with_wind(axis: int, world: World, speed: float) -> World:
     """Where there is no drag yet, a flat plate's comes along: wind acts through it alone."""
     n, t, wind, density = _drag(world)
     wind[axis] += speed
-    return world.with_cloth({DRAG: AirDrag(n or AirDrag.amplitudes["normal"].typical, density, t, wind)})
+    normal = n if DRAG in dict(world.cloth.effects.items()) else AirDrag.amplitudes["normal"].typical
+    return world.with_cloth({DRAG: AirDrag(normal, density, t, wind)})
 
 
 def _added(name: str, make: type[AbstractEffect], world: World, amplitude: float) -> World:

@@ -169,13 +169,29 @@ def _member(found: Fitted, groups: Sequence[str]) -> Tensor:
 
 def telling(found: Fitted, groups: Sequence[str]) -> set[str]:
     """The group that alone tells of the last accepted cause, beside what is fitted anyway; none, as a rule."""
-    count, member = found.evidence.own, _member(found, groups)
-    own, prior = found.white.jacobian[:, :count], prior_precision(found.model)
-    others = torch.cat([own[:, :-1], torch.diag(prior[:-1].sqrt())])
-    asked = torch.cat([own[:, -1], own.new_zeros(count - 1)])
-    left = (asked - others @ torch.linalg.lstsq(others, asked[:, None]).solution[:, 0])[: len(own)].square()
+    left, member = _informed(found, found.evidence.own - 1), _member(found, groups)
     share = torch.stack([left[member == k].sum() for k in range(len(set(groups)))]) / left.sum().clamp(min=1e-30)
     return {sorted(set(groups))[int(share.argmax())]} if float(share.max()) > ALONE else set()
+
+
+def told_by(found: Fitted, place: int, groups: Sequence[str], halved: Collection[str] = ()) -> float:
+    """How many of what ``predict`` leaves out together tell of a coordinate: as many as would say as much, all alike.
+
+    Of Satterthwaite's degrees of freedom, for means that weigh what differs alike unequally, one more.
+    """
+    left = _informed(found, place)
+    share = torch.stack([left[inside].sum() for inside in _folds(found, groups, halved)])
+    return float(share.sum() ** 2 / share.square().sum().clamp(min=1e-60))
+
+
+def _informed(found: Fitted, place: int) -> Tensor:
+    """[C] information on a coordinate beside the others, within their priors."""
+    count = found.evidence.own
+    own, prior = found.white.jacobian[:, :count], prior_precision(found.model)
+    rest = [k for k in range(count) if k != place]
+    others = torch.cat([own[:, rest], torch.diag(prior[rest].sqrt())])
+    asked = torch.cat([own[:, place], own.new_zeros(count - 1)])
+    return (asked - others @ torch.linalg.lstsq(others, asked[:, None]).solution[:, 0])[: len(own)].square()
 
 
 def _adjusted(found: Fitted, k: int, likely: Tensor) -> Tensor:

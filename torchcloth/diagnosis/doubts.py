@@ -22,10 +22,8 @@ def pruned(
 ) -> tuple[Fitted, list[Step]]:
     """Less the causes that the others have made needless."""
     for step in steps:
-        name, last = step.best.hypothesis.name, step is steps[-1]
+        name = step.best.hypothesis.name
         sure = known(current, name, setting.names, step.best)
-        if sure and last:  # it has just been tried
-            continue
         less, now = without_cause(current, name), staged(progress, f"without {name}")
         try:
             less = fit(less, setting, (), 0, now, current.noise, current.evidence)
@@ -77,12 +75,12 @@ def mended(start: Fitted, end: Fitted, names: Sequence[str], alone: Collection[s
     meshes agree about less than half of the motions, the share held out, of all. Of cells that both fits have: points
     that vacuum finds on another part of the cloth would come back as if the causes had brought what is wrong with them.
     """
-    if not is_lacking(end, names):
-        return 1.0
     alike = (replace(f, evidence=shared(f.evidence, [other.evidence])) for f, other in ((start, end), (end, start)))
     first, left = (lack_of_fit(found, names) for found in alike)
     folded = {row.episode for row in (*first, *left) if not row.stable}
     if 2 * len(folded) <= len(names):
+        if not is_lacking(end, names):
+            return 1.0
         share = explained(first, left)
         return share if share < 0 or any(row.lacking for row in first) else 1.0
     before, after = (predict(f, names, alone) for f in weighed_alike(start, end))
@@ -92,7 +90,7 @@ def mended(start: Fitted, end: Fitted, names: Sequence[str], alone: Collection[s
 def unheard(start: Fitted, end: Fitted, steps: Sequence[Step], names: Sequence[str]) -> bool:
     """Of the causes, motions that fit in the end say nothing, where some do."""
     left = lack_of_fit(end, names)  # a motion whose cells all jump is not among them
-    sound = {row.motion for row in left} - {row.motion for row in left if row.lacking}
+    sound = {row.motion for row in left} - {row.motion for row in left if row.lacking or not row.stable}
     told = [k for k, name in enumerate(names) if name in sound]
     alone = alone_in(steps)
     if not told:

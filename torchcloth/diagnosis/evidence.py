@@ -183,12 +183,18 @@ def _known_slopes(before: Evidence, k: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def as_held(evidence: Evidence, like: Evidence) -> Evidence:
-    """With another's slopes along nuisances: what episodes may differ by is the same for all models."""
+    """With another's slopes along nuisances: what episodes may differ by is the same for all models.
+
+    Cells that the other has not keep their own.
+    """
     cells = []
     for k, own in enumerate(evidence.cells):
         key, slopes, _ = _known_slopes(like, k)
-        kept = own.jacobian[:, : own.jacobian.shape[1] - len(evidence.stds[k])]
-        cells.append(own._replace(jacobian=torch.cat([kept, aligned(own.key, key, slopes)], 1)))
+        count = own.jacobian.shape[1] - len(evidence.stds[k])
+        theirs = aligned(own.key, key, slopes)
+        if len(like.stds[k]) == len(evidence.stds[k]):
+            theirs = torch.where(torch.isin(own.key, key)[:, None], theirs, own.jacobian[:, count:])
+        cells.append(own._replace(jacobian=torch.cat([own.jacobian[:, :count], theirs], 1)))
     return replace(evidence, cells=cells, stds=like.stds)
 
 

@@ -63,8 +63,8 @@ def fit(
 
     Fits are compared with the same ``noise``; None: estimated. The nuisances' slopes are those of ``before``, if given.
     ``here`` is the evidence at the model's point, where that is known already: nothing of it is simulated again. A step
-    into what is ``IMPOSSIBLE`` is not taken. Slopes promise too little where cloth ripples, so the search ends only
-    where the last step gained little, too.
+    into what is ``IMPOSSIBLE`` is not taken; of one that loses clearly, half is tried. Slopes promise too little where
+    cloth ripples, so the search ends only where the last step gained little, too.
     """
     about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
 
@@ -74,7 +74,7 @@ def fit(
             return gather(at, setting, (), staged(progress, f"fit {steps + 1}"), before)
         return gather(at, setting, hypotheses, staged(progress, about), before)
 
-    asked = here is None and not iterations
+    asked, share = here is None and not iterations, 1.0
     last: tuple[Noise, Model, Evidence] | None = None
     here = here or look(model, 0)
     for taken in range(1, iterations + 1):
@@ -82,11 +82,18 @@ def fit(
         step, ahead = leap(whitened(here, level), model)
         if ahead < ENOUGH and not (last and _gained(*last, model, here) >= ENOUGH):
             break
-        further, last = model.at(model.point + step), (level, model, here)
+        further = model.at(model.point + share * step)
         try:
-            model, here, asked = further, look(further, taken), taken == iterations
+            there = look(further, taken)
         except IMPOSSIBLE:
             break
+        if _gained(level, model, here, further, there) < -ENOUGH:
+            if ahead < ENOUGH:
+                break
+            share /= 2
+            continue
+        last, share = (level, model, here), 1.0
+        model, here, asked = further, there, taken == iterations
     if hypotheses and not asked:
         here = here if before is None else as_held(here, before)
         here = asked_about(here, model, setting, hypotheses, staged(progress, about))

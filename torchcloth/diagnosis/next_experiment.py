@@ -110,19 +110,21 @@ def question_of(found: Found, content: Mapping[str, Any]) -> Question | None:
     ``content`` holds what was said of causes, and of what is too small to matter: that may have rivals that would.
     """
     said = [*content["causes"], *content["minor"]]
+    fitted = {p.name for p in found.end.model.parameters}  # what does the same as one of them, no experiment shows
     for step, cause in zip([*found.causes, *found.minor], said, strict=True):
-        known = {h.name for h in step.before.evidence.hypotheses}
+        known = {h.name for h in step.before.evidence.hypotheses if h.twin not in fitted}
         open_to = known & {cause["effect"], *(r["effect"] for r in cause["rivals"])}
         amplitudes = {h.name: a for h, a in found.alike(step) if h.name in open_to}
         rows = {r.hypothesis.name: r.amplitude for r in step.screened if not r.wrong_sign}
-        amplitudes |= {name: rows[name] for name in cause.get("class", ()) if name in rows and name not in amplitudes}
+        more = known & rows.keys() & set(cause.get("class", ()))
+        amplitudes |= {name: rows[name] for name in sorted(more - amplitudes.keys())}
         best = step.best.hypothesis.name
         pairs = tuple((best, other) for other in amplitudes if other != best)
         if best in amplitudes and pairs:
             return Question(step.before, amplitudes, pairs)
     if found.causes:
         return None
-    known = {h.name for h in found.end.evidence.hypotheses}
+    known = {h.name for h in found.end.evidence.hypotheses if h.twin not in fitted}
     open_rows = [r for r in found.screened if r.decision in ("present", "inconclusive") and r.hypothesis.name in known]
     amplitudes = {r.hypothesis.name: r.hypothesis.smallest for r in open_rows[:MANY]}
     return Question(found.end, amplitudes) if amplitudes else None

@@ -112,9 +112,14 @@ def search(
     current, steps, left = _chain(start, setting, hypotheses, progress, TRIED)
     if not steps:
         current, steps, left = _anew(start, setting, hypotheses, progress)
-    able = {h.name for h in start.evidence.hypotheses}
-    impossible = tuple(h.name for h in hypotheses if h.name not in able)
-    return replace(_found(start, current, steps, left), impossible=impossible)
+    impossible = (*_impossible(start, hypotheses), *(_impossible(current, hypotheses) if steps else ()))
+    return replace(_found(start, current, steps, left), impossible=tuple(dict.fromkeys(impossible)))
+
+
+def _impossible(found: Fitted, hypotheses: Sequence[Hypothesis]) -> list[str]:
+    """What was asked about and could not be simulated beside the model."""
+    able = {h.name for h in found.evidence.hypotheses}
+    return [h.name for h in found.model.others(hypotheses) if h.name not in able]
 
 
 def _anew(start: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress) -> Chain:

@@ -137,7 +137,7 @@ def one_step(
     beside = lambda c: placebo(renoised(c.fitted, noise, like), setting.names, c.alone)  # noqa: E731
     chance = None
     while useful and not (chance := beside(useful[0])).passed:
-        useful = useful[1:]
+        others, useful = [*others, useful[0]], useful[1:]
     if not useful or chance is None:
         return None
     best = useful[0]
@@ -268,13 +268,17 @@ def _agreed(c: Candidate, names: Sequence[str]) -> bool:
 def known(found: Fitted, name: str, names: Sequence[str], c: Candidate, most: float = PLAUSIBLE) -> bool:
     """Of a size that makes sense and that numerics do not ask for, and motions agree so far that there is something.
 
-    It makes sense up to ``most`` times the typical amplitude.
+    It makes sense up to ``most`` times the typical amplitude; what has ended at nothing is not there. Halves of the one
+    motion that tells of it need not agree about its size where it gains overwhelmingly in both: what creases do levels
+    off with their rate, and its slopes there say little.
     """
     place = found.model.place(name)
+    amplitude, largest = found.model.amplitudes[place], most * abs(found.model.accepted[place].typical)
     middle, std = (float(v[len(found.model.parameters) + place]) for v in spread(found, names, c.alone))
-    largest = most * abs(found.model.accepted[place].typical)
+    if c.alone and c.gain.least > VERY_MUCH:
+        middle, std = amplitude, 0.0
     least = max(c.sure * std, NORMAL * abs(c.row.bias))
-    return c.sure < math.inf and least < abs(middle) and abs(found.model.amplitudes[place]) < largest
+    return c.sure < math.inf and least < abs(middle) and 0 < abs(amplitude) < largest
 
 
 def worth_naming(c: Candidate, gain: Gain) -> bool:

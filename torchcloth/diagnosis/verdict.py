@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
+from scipy.special import stdtrit
 from torch import Tensor
 
 from ..errors import InvalidInput
 from ..identification.result import or_none
 from .classes import alike, fitted_alike
-from .comparison import Gain, by_motion, heard, spread
+from .comparison import Gain, by_motion, heard, spread, told_by
 from .drifting import drifts
 from .gate import Fault
 from .lacking import lack_of_fit
@@ -164,7 +165,7 @@ def _given(found: Found, names: Sequence[str]) -> list[dict[str, Any]]:
 def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     best, h, count = step.best, step.best.hypothesis, len(found.end.model.parameters)
     place, amplitude = found.end.model.place(h.name), found.amplitude(step)
-    std = (float(_errors(found, names, best.alone)[count + place]) ** 2 + best.row.bias**2) ** 0.5
+    std = (_error(found, count + place, names, best.alone) ** 2 + best.row.bias**2) ** 0.5
     beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
     apart = beaten | {s.best.hypothesis.name for s in found.steps} - {h.name}
     others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in apart]
@@ -178,20 +179,30 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
         "class": sorted({h.name, *kin, *h.kin}),
         "rivals": [_told(c.hypothesis, c.amplitude) for c in rivals],
         "gain_mm": 1e3 * (best.gain.before - best.gain.after),
-        "placebo": {"log_density": step.placebo.gain, "chance": step.placebo.chance},
+        "placebo": {"log_density": step.placebo.gain, "chance": step.placebo.chance or None},
         "share_of_explainable": _share(found, best.gain),
         **shown(found.end, h.name, names, found.setting.episodes),
     }
 
 
-def _errors(found: Found, names: Sequence[str], alone: Collection[str] = ()) -> Tensor:
+def _errors(found: Found, names: Sequence[str]) -> Tensor:
     """[P + A] standard errors of the model's coordinates: the wider of what noise allows and motions disagree by.
 
     Few motions know little of what they disagree by: NORMAL of these errors is as wide as Student's interval.
     """
     own = found.end.covariance.diagonal().sqrt()
-    wider = between_motions(heard(found.end.white.episode, names), alone) / NORMAL
-    return torch.maximum(own, wider * spread(found.end, names, alone)[1]) if wider < math.inf else own
+    wider = between_motions(heard(found.end.white.episode, names)) / NORMAL
+    return torch.maximum(own, wider * spread(found.end, names)[1]) if wider < math.inf else own
+
+
+def _error(found: Found, place: int, names: Sequence[str], alone: Collection[str]) -> float:
+    """As ``_errors``, of one coordinate, by as many motions as tell of it: where one alone does, little is known."""
+    own = float(found.end.covariance[place, place]) ** 0.5
+    count = told_by(found.end, place, names, alone)
+    if count <= 1.0:
+        return own
+    wider = float(stdtrit(max(count - 1.0, 1.0), 0.975)) / NORMAL
+    return max(own, wider * float(spread(found.end, names, alone)[1][place]))
 
 
 def _share(found: Found, gain: Gain) -> float | None:

@@ -214,8 +214,9 @@ class Model:
         for parameter, coordinate in zip(self.parameters, self.values.tolist(), strict=True):
             world = parameter.apply(world, coordinate)
         own = zip(self.accepted, self.amplitudes, strict=True)
+        brought = {h.brings for h in self.accepted}  # none of it, where that was found, is not what comes along
         for hypothesis, amplitude in (*own, *extra):
-            if amplitude:
+            if amplitude or hypothesis.name in brought:
                 world = hypothesis.apply(world, amplitude)
         return world
 

@@ -54,6 +54,7 @@ class Episode:
         eye: [3] m, where the camera stands; None where there is none, or more than one.
         dropped: frames after the motion's end, which are not simulated.
         unused: force readings after the last frame of what was seen, which are not simulated either.
+        idle: grippers that close and hold nothing: the cloth has no grasp of their name.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Episode:
     eye: Tensor | None = None
     dropped: int = 0
     unused: int = 0
+    idle: tuple[str, ...] = ()
 
     def identity(self) -> list[object]:
         """What simulations of it, and what is seen of them, depend on."""
@@ -102,6 +104,9 @@ class Episode:
             )
         if self.motion and not any(bool(m.closed.any()) for m in self.motion.values()):
             out.append(f"{self.name}: no gripper is ever closed: the cloth was simulated as let go")
+        if self.idle:
+            names = ", ".join(self.idle)
+            out.append(f"{self.name}: no grasp is called {names}: the cloth was simulated as not held by it")
         return out
 
     def beyond(self, reach: float) -> Episode:
@@ -253,6 +258,7 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
         wrenches=streams.wrenches(recording, needed, times, dtype),
         eye=_eye(recording, dtype),
         dropped=dropped,
+        idle=tuple(key for key in motion if key not in needed and bool(motion[key].closed.any())),
         unused=int((felt > times[-1] + float(np.diff(times).max())).sum()),
     )
 

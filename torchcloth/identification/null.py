@@ -16,7 +16,8 @@ from .objective import Objective
 from .replays import Frames
 
 STILL = 1e-3  # m, that cloth moves with grippers that stand
-CARRIED, UNFELT = "cloth carried rigidly by the grippers", "no force at all"
+WORSE = 1.5  # times as far from what was seen as cloth that stays where it lay, from which a fit tells nothing
+STAYS, CARRIED, UNFELT = "cloth that stays where it lay", "cloth carried rigidly by the grippers", "no force at all"
 ARM = 0.05  # m, length of the axes that carry a gripper's orientation into the alignment
 
 
@@ -43,8 +44,8 @@ def constant_force(episode: Episode) -> dict[str, Tensor]:
 def no_better_than(objective: Objective, frames: Sequence[Frames]) -> str:
     """The null that ``frames`` of the objective's episodes do not beat, in words; empty where they do or none exists.
 
-    By distance to what was seen while grippers moved, else by force: cloth that hangs still lies where it lay at first,
-    whatever it is made of.
+    By distance to what was seen while grippers moved, else by force. Cloth that hangs still lies where it lay at first,
+    whatever it is made of; but not far from there.
     """
     used = {block.name for block in objective.blocks}
     if used & {*USES["points"], *USES["markers"]}:
@@ -54,6 +55,10 @@ def no_better_than(objective: Objective, frames: Sequence[Frames]) -> str:
         own, null = (figures([x[k] for k in moved], seen, objective.faces) for x in ([f.x for f in frames], rigid))
         if not math.isnan(own.chamfer):
             return CARRIED if own.chamfer >= null.chamfer else ""
+        if not moved:
+            own, null = (figures(x, objective.episodes, objective.faces) for x in ([f.x for f in frames], rigid))
+            if own.chamfer > WORSE * null.chamfer:
+                return STAYS
     if used & {*USES["force"]} and any(e.wrenches for e in objective.episodes):
         felt = forces_rms([f.wrench for f in frames], objective.episodes)
         return UNFELT if felt >= forces_rms([no_force(e) for e in objective.episodes], objective.episodes) else ""

@@ -6,6 +6,7 @@ import math
 import re
 import reprlib
 from collections.abc import Callable
+from difflib import get_close_matches
 from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
 
 import numpy as np
@@ -18,6 +19,7 @@ LONGEST_EPISODE = 86_400.0  # s
 HUGE = 1e100  # stands for infinity: nothing physical comes near, and squares of smaller numbers stay finite
 UNIT_TOLERANCE = 1e-3  # quaternions and rotations are often stored as float32 or with four digits
 EXACT = 1e-9  # of R R^T or a length: nothing was rounded
+ALIKE = 0.8  # of two keys, as difflib measures it: one of them is misspelt
 
 _KINDS = {"float": ("iuf", np.float64), "int": ("iu", np.int64), "bool": ("b", np.bool_)}
 _NAME = re.compile(r"[^./\\\x00][^/\\\x00]*")
@@ -158,7 +160,7 @@ class Fields:
     def __init__(self, value: Any, place: str, joint: str = ".") -> None:
         if not isinstance(value, dict):
             raise RecordingError(f"{place} is not an object of named values", got=reprlib.repr(value))
-        self.place, self._joint, self.rest = place, joint, dict(value)
+        self.place, self._joint, self.rest, self._given = place, joint, dict(value), set(value)
         self.asked: list[str] = []  # every key that was looked for
 
     def at(self, key: str) -> str:
@@ -243,5 +245,15 @@ class Fields:
         return {name(k, f"{group.place} name"): group.inside(k) for k in list(group.rest)}
 
     def left(self, **groups: Fields) -> dict[str, Any]:
-        """What nobody took, here and, under their own names, in the small groups inside."""
+        """What nobody took, here and, under their own names, in the small groups inside.
+
+        Raises:
+            RecordingError: a key that is nearly one that is looked for and not there: misspelt, it would be ignored.
+        """
+        absent = [key for key in self.asked if key not in self._given]
+        for key in self.rest:
+            if meant := get_close_matches(key, absent, 1, ALIKE):
+                raise RecordingError(
+                    f"{self.at(key)} is unknown", got=repr(key), expected=repr(meant[0]), remedy="rename it"
+                )
         return {**self.rest, **{key: group.rest for key, group in groups.items() if group.rest}}

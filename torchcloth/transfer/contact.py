@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..errors import InvalidInput
 from ..meshes import Mesh
-from .neighbours import apart
+from .neighbours import apart, over
 
 SKIN = 2.0  # grid spacings that layers may approach each other before the search for near ones is repeated
 RANGE = 4.0  # grid spacings: the splines of points farther apart have no node of any weight in common
@@ -21,6 +21,7 @@ GAP = 1.4  # grid spacings between layers at rest, with the default play
 SPARSEST = 1.4  # grid spacings between corners of sub-triangles: no hole between the points exceeds 0.7 spacings
 ROOM = 1.6  # times the longest way along the cloth: the extent at which the grid wraps, so that layers never alias
 MOST = 100  # points along a triangle's edge: 10 000 in it
+UNMET = 0.5  # share of the triangles of layers that do not see the other layer, from which a cloth says so
 TURNED = 1.7  # layers are folded on each other where the way along the cloth is that much longer than through space
 
 
@@ -48,6 +49,20 @@ class Grid(NamedTuple):
         return (
             f"layers rest {gap:.3g} mm apart, unseen within {unseen:.3g} mm along the cloth; "
             f"{len(self.points)} point(s) per triangle"
+        )
+
+    def unmet(self, mesh: Mesh) -> str:
+        """What a user must know of layers of the mesh that lie over each other and do not meet; empty where most do."""
+        pairs = over(mesh, 2 * GAP * self.spacing)
+        if self.apart is None or not len(pairs):
+            return ""
+        layered, seen = np.unique(pairs[:, 0]), np.unique(pairs[self.apart.numpy()[pairs[:, 0], pairs[:, 1]], 0])
+        share = 1 - len(seen) / len(layered)
+        if share <= UNMET:
+            return ""
+        return (
+            f"contact: {100 * share:.0f} % of the triangles that lie over another layer do not see it and pass through "
+            f"({self.words}): give contact=Contact.with_gap(...) a smaller gap, or the mesh more triangles"
         )
 
 

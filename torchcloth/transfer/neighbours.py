@@ -1,4 +1,4 @@
-"""Which triangles are neighbours along the cloth."""
+"""Which triangles are neighbours along the cloth, and which lie over each other."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from heapq import heappop, heappush
 import numpy as np
 
 from ..meshes import Mesh
+
+BESIDE = 0.6  # mean edges, of centroids of triangles that lie over each other
+STEEP = 0.3  # height over that: of bent cloth neighbours are less
 
 
 def apart(mesh: Mesh, distance: float) -> np.ndarray:
@@ -46,3 +49,27 @@ def _links(mesh: Mesh) -> list[list[tuple[int, float]]]:
         for own, half in meeting:
             links[own] += [(other, half + rest) for other, rest in meeting if other != own]
     return links
+
+
+def over(mesh: Mesh, gap: float) -> np.ndarray:
+    """[N, 2] triangles of which the first lies over the second as the mesh is given, nearer than ``gap`` [m].
+
+    Straight over it, but for a part of an edge, and without a common vertex: no two of a smooth sheet are.
+    """
+    middle = mesh.vertices[mesh.faces].mean(1)
+    if np.linalg.svd(middle - middle.mean(0), compute_uv=False)[-1] < 1e-9 * mesh.extent:
+        return np.zeros((0, 2), dtype=int)  # flat
+    from scipy.spatial import cKDTree  # costs what a flat cloth need not wait for
+
+    tree, beside = cKDTree(middle), BESIDE * mesh.mean_edge
+    pairs = tree.query_pairs(float(np.hypot(gap, beside)), output_type="ndarray")
+    own, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
+    normal = np.cross(sides[:, 0], sides[:, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    away = middle[other] - middle[own]
+    height = (away * normal[own]).sum(1)
+    off = np.linalg.norm(away - height[:, None] * normal[own], axis=1)
+    joined = (mesh.faces[own][:, :, None] == mesh.faces[other][:, None]).any((1, 2))
+    kept = (np.abs(height) < gap) & (np.abs(height) > STEEP * off) & (off < beside) & ~joined
+    return np.column_stack([own, other])[kept]
