@@ -91,8 +91,9 @@ class Scene(nn.Module):
         }
 
     def _check_names(self, argument: str, given: Mapping[str, Tensor]) -> None:
-        if given.keys() != set(self.arms):
-            raise InvalidInput(f"{argument} names other arms", got=sorted(given), expected=str(list(self.arms)))
+        names = sorted(given) if isinstance(given, Mapping) else f"a {type(given).__name__}"
+        if names != sorted(self.arms):
+            raise InvalidInput(f"{argument} names other arms", got=names, expected=f"by name, {list(self.arms)}")
 
 
 def bimanual_rig(model: str = "rizon4", frame: str = "tcp_closed", dtype: torch.dtype = torch.float64) -> Scene:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from importlib import metadata, util
 from pathlib import Path
 
@@ -19,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parent / "identification"))
 from twins import doubles, first, twin
 
 from torchcloth import recordings
-from torchcloth.cli import main
+from torchcloth.cli import doctor, main
 from torchcloth.cli.folders import check_file, check_folder
 from torchcloth.errors import InvalidInput
 from torchcloth.observe import render
@@ -445,3 +446,15 @@ def test_a_place_that_can_be_written_is_left_as_it_is(tmp_path, monkeypatch):
 def test_what_the_system_says_is_said_like_everything_else(folder, tmp_path, capsys, monkeypatch, error, said):
     monkeypatch.setattr(recordings, "read", lambda *_, **__: (_ for _ in ()).throw(error))
     assert f"torchcloth: {said}" in refuse(capsys, tmp_path / "out", "identify", folder)
+
+
+def test_what_the_library_warns_of_is_one_line(monkeypatch, capsys):
+    def run(options):
+        warnings.warn("settle: the cloth still moves", stacklevel=1)
+        return 0
+
+    monkeypatch.setattr(doctor, "_doctor", run)
+    before = warnings.showwarning
+    assert main(["doctor"]) == 0
+    assert capsys.readouterr().err == "torchcloth: warning: settle: the cloth still moves\n"
+    assert warnings.showwarning is before

@@ -2,6 +2,7 @@
 
 import math
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -39,15 +40,16 @@ def test_a_file_registers_and_what_depends_on_it_knows_its_content(file):
     assert len(own_causes.digests()) == 1
 
 
-def test_what_the_file_imports_counts_as_well_and_it_may_be_run_again(file, monkeypatch):
-    """What is registered again is the same object then; a search that goes on depends on where it comes from."""
+def test_what_the_file_imports_counts_as_well_and_it_may_be_run_again(file):
+    """From beside it. What is registered again is the same object then; a search that goes on depends on its source."""
     helper = file.parent / "my_helper_of_causes.py"
     helper.write_text(FILE.format(typical=2.0).replace("register(", "CAUSE = ("))
     file.write_text(
         "from torchcloth.diagnosis import register\nfrom my_helper_of_causes import CAUSE\nregister(CAUSE)\n"
     )
-    monkeypatch.syspath_prepend(str(file.parent))
+    path = list(sys.path)
     first, before = register_file(file), own_causes.digests()
+    assert sys.path == path
     assert register_file(file) == first
     assert own_causes.digests() == before
     helper.write_text(helper.read_text() + "# another law\n")

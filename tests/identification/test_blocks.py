@@ -12,6 +12,7 @@ from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import episode, identify, streams
 from torchcloth.identification.blocks import blocks_for
+from torchcloth.identification.nuisances import chosen
 from torchcloth.identification.objective import Objective
 from torchcloth.identification.unknowns import collect
 
@@ -154,3 +155,15 @@ def test_a_point_far_from_everything_does_not_count(pulled, model):
     clean, dirty = (identify(model, r, ["youngs_modulus"], use=["points"], iterations=2) for r in (pulled, spoilt))
     a, b = (fit.parameters["youngs_modulus"] for fit in (clean, dirty))
     assert abs(a.value - b.value) < 0.3 * a.std
+
+
+def test_one_name_may_stand_for_a_list_and_numbers_for_nothing(pulled, model):
+    """Letter by letter, "points" was "got 'p'"."""
+    assert blocks_for("markers") == blocks_for(["markers"])
+    assert [type(n) for n in chosen("clock")] == [type(n) for n in chosen(["clock"])]
+    with pytest.raises(InvalidInput, match="got 'youngs_modulu'; expected one of"):
+        identify(model, pulled, "youngs_modulu")
+    with pytest.raises(InvalidInput, match=r"prior of youngs_modulus; got 2.0; expected \(value, factor > 1\)"):
+        identify(model, pulled, "youngs_modulus", priors={"youngs_modulus": 2.0})
+    with pytest.raises(InvalidInput, match=r"iterations; got 1\.5; expected at least 1, and whole"):
+        identify(model, pulled, iterations=1.5)

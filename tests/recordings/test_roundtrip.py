@@ -324,3 +324,11 @@ def test_the_room_needs_only_numpy():
     code = "import sys, torchcloth.recordings.reading as r; print(*[m for m in sys.modules if m in {'PIL', 'trimesh'}])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+def test_frames_are_chosen_by_mask_number_or_slice(recording):
+    points = recording.points
+    mask = np.arange(len(points.t)) < 2
+    for frames in (mask, [0, 1], slice(0, 2), np.array([1, 0])):
+        assert points.only(frames).t.tolist() == points.t[:2].tolist()
+        assert np.array_equal(points.only(frames).xyz, points.xyz[: points.counts[:2].sum()])

@@ -53,7 +53,9 @@ def test_refuses_other_names(rig):
     for name in ("arm.left", "keys"):
         with pytest.raises(InvalidInput, match=f"name of an arm; got '{name}'"):
             robots.Scene({name: rig["left"]})
-    with pytest.raises(InvalidInput, match=r"q names other arms; got \['left'\]; expected \['left', 'right'\]"):
+    with pytest.raises(
+        InvalidInput, match=r"q names other arms; got \['left'\]; expected by name, \['left', 'right'\]"
+    ):
         rig({"left": rig["left"].home})
     with pytest.raises(InvalidInput, match="closed names unknown arms"):
         rig.motion(homes(rig, 2), T, {"middle": torch.ones(2, dtype=torch.bool)})

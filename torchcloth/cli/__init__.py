@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib import metadata
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from ..errors import InvalidInput, TorchclothError
 from . import bench, confirm, convert, diagnose, doctor, identify, inspect, pose, predict, simulate, view
@@ -30,6 +31,12 @@ WITH_MODELS = ("identify", "predict", "pose", "diagnose", "confirm", "view")  # 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
     options = _parser().parse_args(arguments)
+    with warnings.catch_warnings():
+        warnings.showwarning = _warn
+        return _run(options)
+
+
+def _run(options: argparse.Namespace) -> int:
     try:
         if getattr(options, "causes", None) is not None:
             from ..diagnosis import register_file
@@ -44,6 +51,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         said = getattr(options, "stopped", "")
         print(f"torchcloth: stopped{said(options) if callable(said) else said}", file=sys.stderr)
         return 130
+
+
+def _warn(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+    """One line, without the place in the library's sources."""
+    print(f"torchcloth: warning: {message}", file=sys.stderr)
 
 
 def _of_system(error: OSError) -> TorchclothError:

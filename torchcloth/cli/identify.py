@@ -127,7 +127,9 @@ def _identify(options: argparse.Namespace) -> int:
     episodes = [recordings.read(path) for path in options.episodes]
     cloth = _cloth(options, together(episodes))
     size = f"{len(episodes)} episode(s), {len(cloth.mesh.faces)} triangles"
-    print(f"{size}, stable substep {cloth.stable_step():.3g} s with the start values")
+    seconds, step = sum(float(e.points.t[-1] - e.points.t[0]) for e in episodes if e.points), cloth.stable_step()
+    many = f", {seconds / step:.2g} in all frames" if seconds else ""
+    print(f"{size}, stable substep {step:.3g} s with the start values{many}")
     if options.fields:
         fields.spread_out(cloth, options.fields)
     fit = _fit(options, cloth, episodes)

@@ -28,7 +28,8 @@ def register_file(path: str | Path) -> list[Hypothesis]:
     path = Path(path)
     if not path.is_file():
         raise InvalidInput("causes", got=f"no file {path}", expected=EXPECTED)
-    before = set(sys.modules)
+    before, beside = set(sys.modules), str(path.resolve().parent)
+    sys.path.insert(0, beside)  # as Python has it for a script
     try:
         with hypotheses.noted() as found:
             runpy.run_path(str(path))
@@ -37,6 +38,8 @@ def register_file(path: str | Path) -> list[Hypothesis]:
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
         where = f"{path}{f', line {line}' if line else ''}"
         raise InvalidInput("causes", got=f"{type(error).__name__} in {where}: {error}", expected=EXPECTED) from None
+    finally:
+        sys.path.remove(beside)
     if not found:
         raise InvalidInput("causes", got=f"{path}, which registers nothing", expected=EXPECTED)
     imports = _imports.setdefault(path.resolve(), set())

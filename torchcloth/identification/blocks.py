@@ -107,12 +107,13 @@ BLOCKS = (
 USES = {"points": ("points", "edges"), "markers": ("markers",), "force": ("force", "torque")}
 
 
-def blocks_for(uses: Sequence[str] | None) -> tuple[Block, ...]:
-    """The kinds of data that are used; None: all.
+def blocks_for(uses: Sequence[str] | str | None) -> tuple[Block, ...]:
+    """The kinds of data that are used; None: all; a string: that one.
 
     Raises:
         InvalidInput: a name that is not one of ``USES``.
     """
+    uses = [uses] if isinstance(uses, str) else uses
     for use in uses or ():
         if use not in USES:
             raise InvalidInput("use", got=repr(use), expected=f"some of {', '.join(USES)}")

@@ -123,7 +123,8 @@ def identify(
         raise InvalidInput("profile", got="refine as well", expected="one of them: a profile is that of the given mesh")
     if refine:
         finer_cloth(cloth)  # refuses now what it would refuse at the end
-    names = default_parameters(cloth) if parameters is None else list(parameters)
+    asked = [parameters] if isinstance(parameters, str) else parameters
+    names = default_parameters(cloth) if asked is None else list(asked)
     measured = None if method in CHAMFER else episodes_in[0].cloth.weighed  # joins as a prior only
     unknowns = with_priors(collect(cloth, names, measured), priors or {})
     if not unknowns:
@@ -149,8 +150,8 @@ def _check(method: str, stop: str, iterations: int, starts: int) -> None:
         expected = f'{", ".join(map(repr, METHODS))}; "converged" or "paper"'
         raise InvalidInput("method or stop", got=f"{method!r}, {stop!r}", expected=expected)
     for name, number in (("iterations", iterations), ("starts", starts)):
-        if number < 1:
-            raise InvalidInput(name, got=number, expected="at least 1")
+        if not isinstance(number, int) or number < 1:
+            raise InvalidInput(name, got=number, expected="at least 1, and whole")
     if starts > MOST_STARTS:
         raise InvalidInput("starts", got=starts, expected=f"at most {MOST_STARTS}")
 

@@ -184,11 +184,12 @@ def implied(uses: Collection[str], episodes: Sequence[Episode]) -> list[str]:
 
 
 def chosen(wanted: Mapping[str, float | None] | Sequence[str], implied: Sequence[str] = ()) -> list[AbstractNuisance]:
-    """Nuisances by name, with a standard deviation of their own where one is given; 0 leaves one out.
+    """Nuisances by name, with a standard deviation of their own where one is given; 0 leaves one out; a string is one.
 
     Raises:
         InvalidInput: an unknown name, or a deviation that is negative or not finite.
     """
+    wanted = [wanted] if isinstance(wanted, str) else wanted
     given = dict(wanted) if isinstance(wanted, Mapping) else dict.fromkeys(wanted)
     for name, std in given.items():
         if name not in KINDS:

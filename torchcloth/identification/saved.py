@@ -223,7 +223,7 @@ def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:
             f"{path}: a fit of another model",
             got=f"{', '.join(sorted(other))} not alike in both",
             expected="the model that the episode describes",
-            remedy="fit this episode, or show a cloth of your own with viewing.with_cloth",
+            remedy="fit this episode",
         )
     for name, value in model.values.items():
         try:

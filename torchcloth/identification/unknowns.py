@@ -158,7 +158,8 @@ def with_priors(unknowns: Sequence[Unknown], priors: Mapping[str, tuple[float, f
         if name not in names:
             raise InvalidInput("priors", got=repr(name), expected=f"some of {', '.join(names)}")
         positive = unknowns[names.index(name)].parameter.domain == "positive"
-        if len(pair) != 2 or not (math.isfinite(pair[1]) and pair[1] > (1.0 if positive else 0.0)):
+        two = isinstance(pair, Sequence) and len(pair) == 2
+        if not two or not (math.isfinite(pair[1]) and pair[1] > (1.0 if positive else 0.0)):
             expected = "(value, factor > 1)" if positive else "(value, standard deviation > 0)"
             raise InvalidInput(f"prior of {name}", got=pair, expected=expected)
     return [_around(u, *priors[u.name]) if u.name in priors else u for u in unknowns]

@@ -83,7 +83,7 @@ def _learn(objective: Corrected, at: gauss_newton.Iterate) -> tuple[Tensor, Tens
             raise SimulationDiverged(
                 "pose: the force that corrects the simulation grows without end",
                 got=f"more than {FASTEST:g} m/s^2",
-                remedy="the motion amplifies small pushes too much: a longer window, fewer frames, or a better fabric",
+                remedy="the motion amplifies small pushes too much: fewer modes or frames, or a better fabric",
             )
         objective.expecting(squared.sqrt().clamp(min=LEAST))
     root, mean = solved()

@@ -119,7 +119,9 @@ def _refuse_no_episode(folder: Folder) -> None:
         raise RecordingError(f"{folder.shown} does not exist", expected="an episode folder", remedy="check the path")
     if not folder.path.is_dir():
         raise RecordingError(
-            f"{folder.shown} is a file", expected="an episode folder", remedy="pass the folder around it"
+            f"{folder.shown} is a file",
+            expected="an episode folder",
+            remedy="pass the folder around it, or make one of another format with `torchcloth convert`",
         )
     if not folder.has(EPISODE):
         raise RecordingError(

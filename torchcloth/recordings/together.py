@@ -72,7 +72,7 @@ _CLOTH = {
 }
 _SCENE = {
     "mesh (vertices, triangles)": lambda r: (
-        None if r.cloth.faces is None else [r.cloth.faces.max() + 1, len(r.cloth.faces)]
+        None if r.cloth.faces is None else [int(r.cloth.faces.max()) + 1, len(r.cloth.faces)]
     ),
     "numbering of the mesh (checksum of its triangles)": lambda r: (
         None if r.cloth.faces is None else f"{crc32(r.cloth.faces.astype('<i8').tobytes()):08x}"
@@ -99,6 +99,8 @@ def _equal(a: object, b: object) -> bool:
 
 
 def _shown(value: object) -> str:
+    if value is None:
+        return "none"
     if isinstance(value, float):
         return f"{value:.6g}"
     return " x ".join(f"{x:.4g}" for x in value) if isinstance(value, np.ndarray) else str(value)

@@ -6,7 +6,7 @@ written back.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -117,8 +117,11 @@ class PointClouds:
         end = int(np.cumsum(self.counts)[i])
         return self.xyz[end - int(self.counts[i]) : end]
 
-    def only(self, frames: np.ndarray) -> PointClouds:
-        """Those of some frames, by mask [T], without ``extra``."""
+    def only(self, frames: np.ndarray | Sequence[int] | slice) -> PointClouds:
+        """Those of some frames, by mask [T], indices or a slice, without ``extra``."""
+        mask = np.zeros(len(self.t), dtype=bool)
+        mask[frames] = True
+        frames = mask
         return PointClouds(self.t[frames], self.xyz[np.repeat(frames, self.counts)], self.counts[frames])
 
 

@@ -59,9 +59,9 @@ def over(mesh: Mesh, gap: float) -> np.ndarray:
     middle = mesh.vertices[mesh.faces].mean(1)
     if np.linalg.svd(middle - middle.mean(0), compute_uv=False)[-1] < 1e-9 * mesh.extent:
         return np.zeros((0, 2), dtype=int)  # flat
-    from scipy.spatial import cKDTree  # costs what a flat cloth need not wait for
+    from scipy.spatial import KDTree  # costs what a flat cloth need not wait for
 
-    tree, beside = cKDTree(middle), BESIDE * mesh.mean_edge
+    tree, beside = KDTree(middle), BESIDE * mesh.mean_edge
     pairs = tree.query_pairs(float(np.hypot(gap, beside)), output_type="ndarray")
     own, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
