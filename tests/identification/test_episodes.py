@@ -1,5 +1,6 @@
 """From recordings to what the solver takes: clocks, frames, refusals; what ``identify`` refuses before it begins."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -148,6 +149,17 @@ def test_an_episode_in_which_nothing_is_held_says_so(recording, model):
     open_ = {name: replace(g, closed=np.zeros_like(g.closed)) for name, g in recording.grippers.items()}
     (doubt,) = episode(model, replace(recording, grippers=open_)).doubts()
     assert "no gripper is ever closed" in doubt
+
+
+def test_a_cloud_beside_the_cloth_says_so(recording, model):
+    """Of half of the cloth, that is not missed; of a camera that is said to stand elsewhere, it is told where."""
+    points = recording.points
+    shifted = replace(recording, points=replace(points, xyz=points.xyz + np.array([0.3, 0.0, 0.0])))
+    (doubt,) = episode(model, shifted).doubts()
+    assert re.search(r"lies \(\+(29|30|31)\d, [+-]\d+, [+-]\d+\) mm from the cloth: check T_world_camera", doubt)
+    x = episode(model, recording).initial
+    half = replace(episode(model, recording), clouds=[x[x[:, 0] > x[:, 0].median()]])
+    assert half.doubts() == []
 
 
 def test_a_gripper_without_a_grasp_says_so(recording, model):

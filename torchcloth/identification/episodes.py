@@ -30,6 +30,7 @@ from .carried import between, carried, with_patches
 DEFAULT_STIFFNESS = 300.0  # N/m, a start in the middle of the published fabrics, where an episode names none
 DEFAULT_POISSON = 0.2
 SHEET_TRIANGLES = 288
+ELSEWHERE = 0.15  # of the cloth's diagonal, that what is seen first lies from it
 SAME = 1e-6  # m, on the pattern: one place
 FARTHEST = 0.2  # m, of a held patch from its gripper's origin at the first frame
 
@@ -107,7 +108,20 @@ class Episode:
         if self.idle:
             names = ", ".join(self.idle)
             out.append(f"{self.name}: no grasp is called {names}: the cloth was simulated as not held by it")
+        if self._is_elsewhere():
+            place = ", ".join(f"{1e3 * x:+.0f}" for x in (self.clouds[0].mean(0) - self.initial.mean(0)).tolist())
+            out.append(
+                f"{self.name}: what was seen first lies ({place}) mm from the cloth: check T_world_camera, the grasps' "
+                "poses and initial_vertices"
+            )
         return out
+
+    def _is_elsewhere(self) -> bool:
+        """Whether the points of the first frame are far from the cloth, most of them."""
+        if not len(self.clouds[0]):
+            return False
+        distance = torch.cdist(self.clouds[0], self.initial).amin(1)
+        return float(distance.median()) > ELSEWHERE * float((self.initial.amax(0) - self.initial.amin(0)).norm())
 
     def beyond(self, reach: float) -> Episode:
         """With frames after the last, for ``reach`` [s] or as long as the motion goes on: a late clock sees them."""
