@@ -278,5 +278,5 @@ def _divergence(interval: Interval, state: ClothState, after: ClothState) -> Sim
         f"simulation diverged at t = {float(interval.times()[k + 1]):.6g} s",
         got=f"vertex {vertex} not finite after substep {k + 1} of {interval.count}",
         expected="finite positions",
-        remedy="check the initial positions and the motion for jumps, or lower dt",
+        remedy="check the initial positions and the motion for jumps and units (m), or lower dt",
     )
