@@ -56,7 +56,7 @@ class Grid(NamedTuple):
         pairs = over(mesh, 2 * GAP * self.spacing)
         if self.apart is None or not len(pairs):
             return ""
-        layered, seen = np.unique(pairs[:, 0]), np.unique(pairs[self.apart.numpy()[pairs[:, 0], pairs[:, 1]], 0])
+        layered, seen = np.unique(pairs[:, 0]), np.unique(pairs[self.apart.cpu().numpy()[pairs[:, 0], pairs[:, 1]], 0])
         share = 1 - len(seen) / len(layered)
         if share <= UNMET:
             return ""
