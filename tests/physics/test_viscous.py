@@ -87,7 +87,7 @@ def test_a_spinning_sheet_keeps_spinning():
     assert kinetic == pytest.approx([1.0, 1.0], abs=2e-3)
 
 
-@pytest.mark.parametrize("share", [0.25, 0.07], ids=["in stages", "in one piece"])
+@pytest.mark.parametrize("share", [0.25, 0.004], ids=["in stages", "in one piece"])
 def test_axial_vibration_of_a_strip_decays(share):
     """Clamped at one end, first mode: u = a sin(k s) exp(-d t) cos(w t + phase), d = eta k^2 / (2 rho_A).
 

@@ -118,7 +118,7 @@ class Episode:
 
     def _is_elsewhere(self) -> bool:
         """Whether the points of the first frame are far from the cloth, most of them."""
-        if not len(self.clouds[0]):
+        if not self.clouds or not len(self.clouds[0]):
             return False
         distance = torch.cdist(self.clouds[0], self.initial).amin(1)
         return float(distance.median()) > ELSEWHERE * float((self.initial.amax(0) - self.initial.amin(0)).norm())
