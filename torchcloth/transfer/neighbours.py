@@ -5,10 +5,12 @@ from __future__ import annotations
 from heapq import heappop, heappush
 
 import numpy as np
+import torch
 
 from ..meshes import Mesh
 
 BESIDE = 0.6  # mean edges, of centroids of triangles that lie over each other
+AT_ONCE = 512  # triangles whose distances from all others are in memory
 STEEP = 0.3  # height over that: of bent cloth neighbours are less
 
 
@@ -59,11 +61,10 @@ def over(mesh: Mesh, gap: float) -> np.ndarray:
     middle = mesh.vertices[mesh.faces].mean(1)
     if np.linalg.svd(middle - middle.mean(0), compute_uv=False)[-1] < 1e-9 * mesh.extent:
         return np.zeros((0, 2), dtype=int)  # flat
-    from scipy.spatial import KDTree  # costs what a flat cloth need not wait for
-
-    tree, beside = KDTree(middle), BESIDE * mesh.mean_edge
-    pairs = tree.query_pairs(float(np.hypot(gap, beside)), output_type="ndarray")
-    own, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    beside, places = BESIDE * mesh.mean_edge, torch.from_numpy(middle - middle.mean(0))
+    reach = float(np.hypot(gap, beside))
+    near = [(torch.cdist(part, places) < reach).nonzero() for part in places.split(AT_ONCE)]
+    own, other = torch.cat([pairs + pairs.new_tensor([k * AT_ONCE, 0]) for k, pairs in enumerate(near)]).numpy().T
     sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
     normal = np.cross(sides[:, 0], sides[:, 1])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
