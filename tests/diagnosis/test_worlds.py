@@ -492,15 +492,9 @@ def test_an_episode_without_a_motion_has_a_name_that_no_other_has():
 
 
 def test_drag_that_was_found_and_is_none_does_not_come_along_with_wind(made):
-    """It jumped to a flat plate's where a fit ended at none, and only there."""
     model, _ = made
-    drag, wind = ({h.name: h for h in air.HYPOTHESES}[name] for name in ("air.drag_n", "air.wind[x]"))
-
-    def normal(*accepted):
-        causes, amplitudes = zip(*accepted, strict=True)
-        world = replace(model, accepted=causes, amplitudes=amplitudes).world()
-        return float(world.cloth.effects["air"].normal.value)
-
-    assert normal((drag, 0.0), (wind, 0.5)) == 0.0
-    assert normal((drag, 1e-3), (wind, 0.5)) == pytest.approx(1e-3)
-    assert normal((wind, 0.5)) == pytest.approx(1.2)
+    by = {h.name: h for h in EVERY}
+    blown = lambda of: float(of.plus(by["air.wind[x]"], 0.5).world().cloth.effects["air"].normal.value)  # noqa: E731
+    assert blown(model.plus(by["air.drag_n"], 0.0)) == 0.0
+    assert blown(model.plus(by["air.drag_n"], 1e-3)) == pytest.approx(1e-3)
+    assert blown(model) == pytest.approx(1.2)

@@ -57,5 +57,7 @@ class Pool:
         self._make_room()
 
     def _make_room(self, size: int = 0) -> None:
-        while self._waiting and sum(list(self._lent.values())) + self.waiting + size > self.most:
-            self._waiting.pop(next(iter(list(self._waiting)), 0), None)
+        for oldest in list(self._waiting):
+            if sum(list(self._lent.values())) + self.waiting + size <= self.most:
+                return
+            self._waiting.pop(oldest, None)

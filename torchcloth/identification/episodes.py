@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._math import last_knot
+from .._math import EXACT, last_knot
 from ..boundaries import Grasp, Plane
 from ..boundaries.motion import interpolate
 from ..cloth import Cloth
@@ -120,7 +120,7 @@ class Episode:
         """Whether the points of the first frame are far from the cloth, most of them."""
         if not self.clouds or not len(self.clouds[0]):
             return False
-        distance = torch.cdist(self.clouds[0], self.initial).amin(1)
+        distance = torch.cdist(self.clouds[0], self.initial, compute_mode=EXACT).amin(1)
         return float(distance.median()) > ELSEWHERE * float((self.initial.amax(0) - self.initial.amin(0)).norm())
 
     def beyond(self, reach: float) -> Episode:

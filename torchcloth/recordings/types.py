@@ -121,8 +121,7 @@ class PointClouds:
         """Those of some frames, by mask [T], indices or a slice, without ``extra``."""
         mask = np.zeros(len(self.t), dtype=bool)
         mask[frames] = True
-        frames = mask
-        return PointClouds(self.t[frames], self.xyz[np.repeat(frames, self.counts)], self.counts[frames])
+        return PointClouds(self.t[mask], self.xyz[np.repeat(mask, self.counts)], self.counts[mask])
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from heapq import heappop, heappush
 import numpy as np
 import torch
 
+from .._math import EXACT
 from ..meshes import Mesh
 
 BESIDE = 0.6  # mean edges, of centroids of triangles that lie over each other
@@ -61,9 +62,9 @@ def over(mesh: Mesh, gap: float) -> np.ndarray:
     middle = mesh.vertices[mesh.faces].mean(1)
     if np.linalg.svd(middle - middle.mean(0), compute_uv=False)[-1] < 1e-9 * mesh.extent:
         return np.zeros((0, 2), dtype=int)  # flat
-    beside, places = BESIDE * mesh.mean_edge, torch.from_numpy(middle - middle.mean(0))
+    beside, places = BESIDE * mesh.mean_edge, torch.from_numpy(middle)
     reach = float(np.hypot(gap, beside))
-    near = [(torch.cdist(part, places) < reach).nonzero() for part in places.split(AT_ONCE)]
+    near = [(torch.cdist(part, places, compute_mode=EXACT) < reach).nonzero() for part in places.split(AT_ONCE)]
     own, other = torch.cat([pairs + pairs.new_tensor([k * AT_ONCE, 0]) for k, pairs in enumerate(near)]).numpy().T
     sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
     normal = np.cross(sides[:, 0], sides[:, 1])

@@ -6,7 +6,6 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
-from pathlib import Path
 
 from torchcloth.errors import MissingDependency, TorchclothError
 
@@ -35,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("fit: another process ended; see its own line", file=sys.stderr)
         return 2
     except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
-        kept = config is not None and (Path(config.out).expanduser() / CHECKPOINT).is_file()
+        kept = config is not None and (config.folder / CHECKPOINT).is_file()
         further = "; the same command with --resume goes on after the last whole step" if kept else ""
         print(f"fit: stopped{further}", file=sys.stderr)
         return 130

@@ -86,6 +86,11 @@ class Config:
     optimizer: Optimizer = field(default_factory=Optimizer)
     run: Run = field(default_factory=Run)
 
+    @property
+    def folder(self) -> Path:
+        """``out``, which may be in somebody's home."""
+        return Path(self.out).expanduser()
+
 
 CHOICES = {
     "model.precision": ("float64", "float32"),

@@ -53,7 +53,7 @@ def fit(config: Config, resume: bool = False) -> FitModule:
             that is not finite, before it is followed: the checkpoint is from the step before.
     """
     torch.set_num_threads(1)  # meshes of a thousand triangles: processes pay, threads do not
-    folder = Path(config.out).expanduser()
+    folder = config.folder
     checkpoint = folder / CHECKPOINT
     if folder.exists() and not folder.is_dir():
         raise InvalidInput("out", got=f"{folder}, a file", expected="a folder, new or existing")
