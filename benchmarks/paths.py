@@ -46,14 +46,14 @@ class Pull(AbstractEffect):
         return c * now.x
 
 
-def sheet(engine: Setting, python: bool) -> tc.Cloth:
-    """0.5 m, 441 vertices, 800 triangles, without contact."""
+def sheet(engine: Setting, python: bool, contact: tc.Contact | None = None) -> tc.Cloth:
+    """0.5 m, 441 vertices, 800 triangles."""
     effects = {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(1.2), "bending": tc.effects.Bending(1e-5)}
     if python:
         effects["pull"] = Pull()
     mesh = tc.meshes.rectangle(0.5, 0.5, resolution=(21, 21))
     hands = {"hand": tc.boundaries.Grasp.corner("upper-left")}
-    return tc.Cloth(mesh, tc.materials.AEP(6e4, 0.3), 0.15, effects, hands, contact=None, engine=engine)
+    return tc.Cloth(mesh, tc.materials.AEP(6e4, 0.3), 0.15, effects, hands, contact=contact, engine=engine)
 
 
 def motion(end: float) -> dict[str, tc.Trajectory]:

@@ -1,12 +1,14 @@
-"""CUDA runs the same code; no figures yet, no machine of ours had one. Run with `pytest -m gpu -s`."""
+"""CUDA gives what the CPU gives. Run with `pytest -m gpu -s`; `tests/engine` looks at every kernel where there is a device."""
 
 import time
+from contextlib import nullcontext
 
 import pytest
 import torch
 
 import torchcloth as tc
 from torchcloth import captured
+from torchcloth.benchmarks import devices
 
 pytestmark = [
     pytest.mark.gpu,
@@ -22,7 +24,7 @@ def cuda():
         pytest.skip("no CUDA device")
 
 
-def lifted(device: str, engine: str, dtype: torch.dtype, contact: str, duration: float):
+def lifted(way: devices.Way, dtype: torch.dtype, contact: str, duration: float):
     """(positions, the modulus' gradient, seconds of the second call) of a sheet that a corner lifts."""
     t = torch.linspace(0, duration, 5, dtype=dtype)
     pose = torch.eye(4, dtype=dtype).repeat(5, 1, 1)
@@ -35,32 +37,63 @@ def lifted(device: str, engine: str, dtype: torch.dtype, contact: str, duration:
         {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(), "bending": tc.effects.Bending()},
         {"hand": tc.boundaries.Grasp.corner("upper-left"), "table": tc.boundaries.Plane((0.0, 0.0, -0.1))},
         contact=CONTACT[contact],
-        engine=engine,
-    ).to(device, dtype)
+        engine=way.engine,
+    ).to(way.device, dtype)
     for _ in range(2):
         cloth.zero_grad()
         began = time.perf_counter()
-        out = cloth(cloth.rest_state(), motion, times=[0.0, duration / 2, duration])
+        with devices.only_captured() if way.captured else nullcontext():
+            out = cloth(cloth.rest_state(), motion, times=[0.0, duration / 2, duration])
         out.x.square().sum().backward()
         grad = cloth.material.youngs_modulus.raw.grad.cpu()  # waits for the device
         seconds = time.perf_counter() - began
     return out.x.detach().cpu(), grad, seconds
 
 
+WAYS = {
+    "engine": devices.Way("cuda", "auto"),
+    "graphs": devices.Way("cuda", "auto", captured=True),
+    "one by one": devices.Way("cuda", "reference"),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("contact", CONTACT)
 @pytest.mark.parametrize(("dtype", "mark"), [(torch.float64, 1e-9), (torch.float32, 1e-4)])
-def test_cuda_equals_cpu(monkeypatch, dtype, mark, contact):
-    """Captured, and launched one by one."""
+def test_cuda_equals_cpu(monkeypatch, dtype, mark, contact, way):
     units = []
     usual = captured.Unit.__init__
     monkeypatch.setattr(captured.Unit, "__init__", lambda self, *how: (units.append(self), usual(self, *how))[1])
-    known, gradient, _ = lifted("cpu", "reference", dtype, contact, 0.2)
-    for engine in ("auto", "reference"):
-        units.clear()
-        x, grad, _ = lifted("cuda", engine, dtype, contact, 0.2)
-        torch.testing.assert_close(x, known, rtol=mark, atol=mark)
-        torch.testing.assert_close(grad, gradient, rtol=10 * mark, atol=10 * mark * float(gradient.abs()))
-        assert bool(units) == (engine == "auto"), "captured"
+    known, gradient, _ = lifted(devices.Way("cpu", "reference"), dtype, contact, 0.5)
+    x, grad, _ = lifted(WAYS[way], dtype, contact, 0.5)
+    torch.testing.assert_close(x, known, rtol=mark, atol=mark)
+    torch.testing.assert_close(grad, gradient, rtol=10 * mark, atol=10 * mark * float(gradient.abs()))
+    assert bool(units) == (way == "graphs"), "captured"
+
+
+def test_layers_that_meet_are_the_references():
+    """A sheet that falls onto itself."""
+    found = {}
+    for device in ("cpu", "cuda"):
+        mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(11, 11))
+        cloth = tc.Cloth(mesh, tc.materials.AEP(5e3), 0.3, {"gravity": tc.effects.Gravity()}).to(device)
+        x = cloth.rest_state().x.clone()
+        right = x[:, 0] > 0.1
+        x[right, 0], x[right, 2] = 0.2 - x[right, 0], x[right, 2] + 0.02
+        out = cloth(cloth.state(x), times=[0.0, 0.05, 0.1])
+        out.x.square().sum().backward()
+        found[device] = out.x.detach().cpu(), cloth.get_parameter("areal_density.raw").grad.cpu()
+    for one, other in zip(*found.values(), strict=True):
+        torch.testing.assert_close(other, one, rtol=1e-6, atol=1e-8)
+
+
+def test_sensitivities_are_those_of_the_cpu():
+    found = []
+    for device in ("cpu", "cuda"):
+        cloth = devices.sheet("auto", python=False).to(device, torch.float64)
+        along = tc.Directions({"areal_density.raw": torch.ones(1, device=device)})
+        found.append(cloth.sensitivities(cloth.rest_state(), {}, [0.0, 0.05], along=along)[1].x.cpu())
+    torch.testing.assert_close(found[1], found[0], rtol=1e-7, atol=1e-9)
 
 
 class Waits(tc.effects.AbstractEffect):
@@ -79,23 +112,25 @@ def test_a_part_that_waits_is_launched_one_by_one_and_spoils_nothing():
     stream = torch.cuda.current_stream()
     cloth = tc.Cloth(mesh, tc.materials.AEP(5e4), 0.3, {"waits": Waits()}, contact=None).cuda()
     with pytest.warns(UserWarning, match="no CUDA graph of the substeps"):
-        cloth(cloth.rest_state(), times=[0.0, 0.2])
+        cloth(cloth.rest_state(), times=[0.0, 1.0])
     assert torch.cuda.current_stream() == stream
     torch.cuda.empty_cache()
     assert not captured.Graphs.broken
     plain = tc.Cloth(mesh, tc.materials.AEP(5e4), 0.3, {"gravity": tc.effects.Gravity()}, contact=None).cuda()
-    assert torch.isfinite(plain(plain.rest_state(), times=[0.0, 0.2]).x).all()
+    assert torch.isfinite(plain(plain.rest_state(), times=[0.0, 1.0]).x).all()
 
 
-def test_graphs_pay():
+def test_the_engine_pays():
     """Prints by how much, forward and back together."""
-    *_, launched = lifted("cuda", "reference", torch.float32, "contact", 0.5)
-    *_, captured = lifted("cuda", "auto", torch.float32, "contact", 0.5)
-    print(f"\n{torch.cuda.get_device_name()}: {launched:.2f} s one by one, {captured:.2f} s in graphs")
-    assert captured < launched / 2
+    took = {way: lifted(WAYS[way], torch.float32, "contact", 0.5)[-1] for way in WAYS}
+    print(f"\n{torch.cuda.get_device_name()}: {', '.join(f'{way} {s:.3f} s' for way, s in took.items())}")
+    assert took["engine"] < took["graphs"] < took["one by one"] / 2
 
 
 def test_it_says_so():
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3))
-    cloth = tc.Cloth(mesh, tc.materials.AEP(5e3), 0.3).cuda()
-    assert cloth.engine_in_use == "reference, in CUDA graphs (tensors on cuda)"
+    assert tc.Cloth(mesh, tc.materials.AEP(5e3), 0.3, contact=None).cuda().engine_in_use == "fused"
+    apart = tc.Cloth(mesh, tc.materials.AEP(5e3), 0.3).cuda()
+    assert apart.engine_in_use == "fused; reference where layers of cloth meet"
+    own = tc.Cloth(mesh, tc.materials.AEP(5e3), 0.3, {"waits": Waits()}, contact=None).cuda()
+    assert own.engine_in_use == "reference, in CUDA graphs (effects.waits in torch, on cuda)"

@@ -49,7 +49,7 @@ def sensitivities(
     count = _check(along, cloth, state, motion)
     plan = cloth.plan(state, motion, times, dt)
     fused = plan.choice.fused
-    if fused is None or fused.torch_parts is not None:
+    if fused is None or not fused.has_tangents:
         return _by_copies(cloth, plan, motion, along, count, dt, settle)
     state, moved = plan.state, _tangent_of(plan.state, along, count)
     if settle:

@@ -13,6 +13,7 @@ from copy import deepcopy
 from typing import NamedTuple
 
 import torch
+from on_host import agrees
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -58,6 +59,7 @@ def agree(
     worse = {name: value for name, value in found.items() if not value <= marks[1]}
     assert not worse, worse
     runs_on_any_device(cloth, motion, state, dt, stages)
+    agrees(cloth, motion, state, dt=dt, stages=stages)
     found["tangents"] = tangents_transpose(cloth, motion, state, substeps, dt, stages)
     assert found["tangents"] <= marks[1], found["tangents"]
     if not stages:

@@ -13,7 +13,9 @@ from ..boundaries import Drive
 from ..errors import InvalidInput
 from ..model import Model
 from ..types import ClothState
-from .fused import Fused
+from . import devices
+from .apart import Apart
+from .fused import Fused, transformed
 from .library import Unbuilt, library
 from .lowering import Unfused
 
@@ -26,8 +28,11 @@ class Choice(NamedTuple):
     fused: Fused | None
     reason: str
     captured: bool = False  # substeps of the reference, as CUDA graphs
+    apart: Apart | None = None  # the fused engine, while no layers meet
 
     def __str__(self) -> str:
+        if self.apart is not None:
+            return "fused; reference where layers of cloth meet"
         if self.fused is None:
             return f"reference{', in CUDA graphs' if self.captured else ''} ({self.reason})"
         parts = () if self.fused.torch_parts is None else sorted(self.fused.torch_parts.parts)
@@ -55,6 +60,8 @@ def choose(setting: Setting, model: Model, state: ClothState, drives: Mapping[st
         return Choice(None, "as asked for")
     remedy = 'use engine="auto", which falls back to the reference'
     try:
+        if devices.elsewhere(state.x):
+            return _on_device(model, state, drives)
         return Choice(_fused(model, state, drives), "")
     except Unfused as miss:
         reason = f"{miss} has no kernels"
@@ -63,7 +70,7 @@ def choose(setting: Setting, model: Model, state: ClothState, drives: Mapping[st
     except Unbuilt as miss:
         reason = str(miss)
         remedy = f'{miss.remedy}, or use engine="auto"'
-        if setting == "auto":
+        if setting == "auto" and not devices.elsewhere(state.x):
             _warn(f"{reason}: simulations run on the torch reference, tens of times slower; {miss.remedy}")
     if setting == "fused":
         raise InvalidInput(
@@ -82,13 +89,35 @@ class _Elsewhere(Exception):
     """Tensors that the engine does not take."""
 
 
+def _on_device(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Choice:
+    """On CUDA; directors and parts in torch are the reference's."""
+    if transformed():
+        raise _Elsewhere("tangents on cuda")
+    _check_dtype(state)
+    library()  # it knows the kernels
+    if model.grid is not None:
+        apart = Apart(model, model.grid, state, drives)
+        fused, found = apart.fused, Choice(None, "", apart=apart)
+    else:
+        fused = Fused(model, state, drives)
+        found = Choice(fused, "")
+    if fused.torch_parts is not None:
+        raise _Elsewhere(f"{', '.join(sorted(fused.torch_parts.parts))} in torch, on cuda")
+    devices.prepare(fused.low.program, state.x.device)
+    return found
+
+
 def _fused(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Fused:
     if state.x.device.type != "cpu":
         raise _Elsewhere(f"tensors on {state.x.device.type}")
-    if state.x.dtype not in (torch.float32, torch.float64):
-        raise _Elsewhere(str(state.x.dtype).removeprefix("torch."))
+    _check_dtype(state)
     library()
     return Fused(model, state, drives)
+
+
+def _check_dtype(state: ClothState) -> None:
+    if state.x.dtype not in (torch.float32, torch.float64):
+        raise _Elsewhere(str(state.x.dtype).removeprefix("torch."))
 
 
 @cache

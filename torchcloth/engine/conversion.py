@@ -39,13 +39,13 @@ def drive_inputs(low: Lowering, drives: Mapping[str, Drive]) -> dict[Field, Tens
 
 
 def flat(low: Lowering, found: Mapping[Field, Tensor], batch: torch.Size, behind: int = 2) -> dict[Field, Tensor]:
-    """Contiguous tensors of the program's precision; ``batch``: the scenes' shape, before the last ``behind`` axes."""
+    """Contiguous tensors of the program's precision, where the cloth is; ``batch``: the scenes' shape, before the last ``behind`` axes."""
     out, scenes = {}, batch.numel()
     for field, t in found.items():
         own, rest = t.shape[:-behind], t.shape[-behind:]
         many = own.numel() > 1 or (scenes > 1 and field in _states(low))
         full = t.expand(*batch, *rest).reshape(-1, *rest) if many else t.reshape(1, *rest)
-        out[field] = full.to(low.program.dtype).contiguous()
+        out[field] = full.to(low.device, low.program.dtype).contiguous()
     return out
 
 

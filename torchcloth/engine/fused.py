@@ -15,7 +15,7 @@ from ..dynamics import Impulses, added
 from ..model import Model
 from ..self_contact import CHUNK
 from ..types import ClothState, Trajectory
-from . import conversion, running
+from . import conversion, devices, running
 from .fields import Field
 from .operators import Rollout
 from .running import Job
@@ -64,10 +64,10 @@ class Fused:
         checkpoint: bool = True,
     ) -> tuple[ClothState, Tensor | None, Impulses]:
         """As ``functional.stretch``."""
+        if self.torch_parts is None:
+            return self.measured(state, lost, dt, drives, substeps, first, checkpoint)[0]
         steps = torch.full((first + substeps,), dt, dtype=torch.float64)
         fixed, moves = self.coefficients(_batch(state)), self.moves(state, drives, steps)
-        if self.torch_parts is None:
-            return self._call(state, lost, fixed | _cut(moves, first, first + substeps), substeps, checkpoint)
         total: Impulses = {}
         again = checkpoint and recomputes()
         parts = self.torch_parts.as_they_are() if again else self.torch_parts
@@ -78,6 +78,21 @@ class Fused:
             state, lost, impulses = recompute(run, state, lost, use_reentrant=False) if again else run(state, lost)
             total = added(total, impulses)
         return state, lost, total
+
+    def measured(
+        self,
+        state: ClothState,
+        lost: Tensor | None,
+        dt: float,
+        drives: Mapping[str, Drive],
+        substeps: int,
+        first: int = 0,
+        checkpoint: bool = True,
+    ) -> tuple[tuple[ClothState, Tensor | None, Impulses], Tensor]:
+        """The same without parts in torch, with what ``devices.forward`` gives besides results."""
+        steps = torch.full((first + substeps,), dt, dtype=torch.float64)
+        others = self.coefficients(_batch(state)) | _cut(self.moves(state, drives, steps), first, first + substeps)
+        return self._call(state, lost, others, substeps, checkpoint)
 
     def frames(
         self,
@@ -91,12 +106,22 @@ class Fused:
 
         Of what ``is_plain``; ``steps``: [substeps] s.
         """
-        results, _ = running.forward(self.job(state, steps, drives, lost)._replace(ends=ends))
+        results, _ = devices.forward(self.job(state, steps, drives, lost)._replace(ends=ends))
         found = []
         for row in zip(*(t.unbind(1) for t in results.values()), strict=True):
             found.append(conversion.outcome(self.low, state, dict(zip(results, row, strict=True)), _batch(state)))
         last, lost, impulses = found[-1]  # who keeps it keeps no other frames
         return [*found[:-1], (last.map(torch.clone), None if lost is None else lost.clone(), impulses)]
+
+    @property
+    def has_tangents(self) -> bool:
+        """Whether ``FusedTangents`` is for it."""
+        return self.torch_parts is None and not self.is_elsewhere
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether its tensors are on a device."""
+        return devices.elsewhere(self.model.mass)
 
     def is_plain(self, state: ClothState, motion: Mapping[str, Trajectory]) -> bool:
         """The engine runs by itself on numbers from which nobody wants a derivative."""
@@ -138,7 +163,8 @@ class Fused:
         total: Impulses = {}
         for k in substeps:
             force, memory = parts.force(state, lost, dt)
-            state, lost, impulses = self._call(state, lost, fixed | _cut(moves, k, k + 1), 1, False, force)
+            found, _ = self._call(state, lost, fixed | _cut(moves, k, k + 1), 1, False, force)
+            state, lost, impulses = found
             state = state._replace(memory=state.memory | memory)
             total = added(total, impulses)
         return state, lost, total
@@ -151,7 +177,7 @@ class Fused:
         substeps: int,
         checkpoint: bool,
         force: Tensor | None = None,
-    ) -> tuple[ClothState, Tensor | None, Impulses]:
+    ) -> tuple[tuple[ClothState, Tensor | None, Impulses], Tensor]:
         low, program, batch = self.low, self.low.program, _batch(state)
         begin = conversion.state_inputs(low, state, lost)
         if low.torch_force is not None and force is not None:
@@ -160,13 +186,16 @@ class Fused:
         inputs = [by_field[field] for field in program.inputs]
         if _are_numbers(inputs):
             job = Job(program, dict(zip(program.inputs, inputs, strict=True)), batch.numel(), substeps)
-            return conversion.outcome(low, state, running.forward(job)[0], batch)
+            results, records = devices.forward(job)
+            return conversion.outcome(low, state, results, batch), records
         every = self._every(batch.numel(), substeps, checkpoint) if _needs_gradient(inputs) else 0
-        *results, _ = Rollout.apply(program.number, substeps, every, *inputs)  # type: ignore[misc]
-        return conversion.outcome(low, state, dict(zip(program.outputs, results, strict=True)), batch)
+        *results, records = Rollout.apply(program.number, substeps, every, *inputs)  # type: ignore[misc]
+        return conversion.outcome(low, state, dict(zip(program.outputs, results, strict=True)), batch), records
 
     def _every(self, scenes: int, substeps: int, checkpoint: bool) -> int:
         """Substeps between records: all while the budget lasts; 0: the adjoint makes its own when it comes here."""
+        if self.is_elsewhere:
+            return 0
         if not checkpoint:
             return 1
         size = running.full_size(self.low.program, scenes, substeps)

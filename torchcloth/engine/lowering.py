@@ -54,6 +54,7 @@ class Lowering:
     Attributes:
         model: the parts.
         program: what is built.
+        device: where the tensors are.
         x, v: positions and velocities.
         lost: in float32, what was too small to be added to the positions, see ``functional.stretch``; None in float64.
         memory: internal variables by key, as in ``ClothState.memory``.
@@ -74,6 +75,7 @@ class Lowering:
     ) -> None:
         self.model = model
         self.vertices, self.faces = state.x.shape[-2], len(model.geometry.area)
+        self.device = state.x.device
         self.program = Program(state.x.dtype, self.vertices)
         self.inputs: dict[Field, Tensor] = {}
         self._known: dict[int, Field] = {}
@@ -81,7 +83,7 @@ class Lowering:
         self.lost: State | None = None
         if state.x.dtype == torch.float32:
             self.lost = State(*self.program.state(self.vertices, 3))
-            self.inputs[self.lost.now] = torch.zeros(self.vertices, 3, dtype=torch.float32)
+            self.inputs[self.lost.now] = torch.zeros(self.vertices, 3, dtype=torch.float32, device=self.device)
         kept = {key: value for key, value in remembered(model, state).items() if key not in in_torch}
         self.memory = {key: State(*self.program.state(*value.shape[-2:])) for key, value in kept.items()}
         self.dt = self.program.drive(1)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInput
-from . import running
+from . import devices, running
 from .program import program_of
 from .running import Job
 
@@ -31,6 +31,7 @@ for schema in (
     torch.library.define(f"torchcloth::{schema.partition('(')[0]}", "(" + schema.partition("(")[2])
 ops = torch.ops.torchcloth
 _on_cpu = cast("Callable[[str], Callable]", partial(torch.library.impl, types="CPU"))
+_anywhere = cast("Callable[[str], Callable]", partial(torch.library.impl, types=("CPU", "CUDA")))
 _mapped = cast("Callable[[str], Callable]", torch.library.register_vmap)
 
 
@@ -47,13 +48,13 @@ def _scenes(inputs: Sequence[Tensor]) -> int:
 # -- values -----------------------------------------------------------------------------------------------------------
 
 
-@_on_cpu("torchcloth::rollout")
+@_anywhere("torchcloth::rollout")
 def _values(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -> list[Tensor]:
     """Results after the substeps [scenes, rows, components], and the records for the adjoint.
 
     ``every``: substeps between records; 0: none, the adjoint goes through the substeps again.
     """
-    results, records = running.forward(_job(program, substeps, inputs), every)
+    results, records = devices.forward(_job(program, substeps, inputs), every)
     return [*results.values(), records]
 
 
@@ -61,7 +62,7 @@ def _values(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -
 def _(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -> list[Tensor]:
     known, scenes = program_of(program), _scenes(inputs)
     results = [inputs[0].new_empty(scenes, f.rows, f.comps) for f in known.outputs]
-    return [*results, inputs[0].new_empty(scenes, running.record_size(known, substeps, every))]
+    return [*results, inputs[0].new_empty(scenes, devices.record_size(known, substeps, every, inputs[0]))]
 
 
 @_mapped("torchcloth::rollout")
@@ -75,7 +76,7 @@ def _(info: Any, dims: Any, program: int, substeps: int, every: int, inputs: Seq
 # -- reverse mode -----------------------------------------------------------------------------------------------------
 
 
-@_on_cpu("torchcloth::rollout_backward")
+@_anywhere("torchcloth::rollout_backward")
 def _adjoints(
     program: int,
     substeps: int,
@@ -87,12 +88,9 @@ def _adjoints(
 ) -> list[Tensor]:
     """Adjoints of the ``wanted`` inputs, each in its input's shape, from the seeds of all results."""
     job = _job(program, substeps, inputs)
-    if every == 0:
-        every = running.spacing(job)
-        records = running.forward(job, every)[1]
     fields = job.program.inputs
     given = dict(zip(job.program.outputs, (s.to(job.program.dtype).contiguous() for s in seeds), strict=True))
-    found = running.reverse(job, records.contiguous(), every, given, {fields[i] for i in wanted})
+    found = devices.reverse(job, records, every, given, {fields[i] for i in wanted})
     grads = [found[fields[i]] for i in wanted]
     return [g.sum(0, keepdim=True) if len(inputs[i]) < len(g) else g for i, g in zip(wanted, grads, strict=True)]
 

@@ -177,8 +177,14 @@ class Program:
                 while len(_KEPT) > MOST_KEPT:
                     _KEPT.popitem(last=False)
             _KEPT.move_to_end(key)
-        self._written.clear()
+        if known is not self:
+            self._written.clear()
         return known
+
+    @property
+    def written(self) -> list[tuple[str, tuple]]:
+        """What the engine was called with, of a program that is ready: names and arguments."""
+        return self._written
 
     @cached_property
     def inputs(self) -> list[Field]:

@@ -31,6 +31,11 @@ class Job(NamedTuple):
     ends: tuple[int, ...] = ()  # of values: substeps after which there are results, the last after all; (): only then
 
     @property
+    def like(self) -> Tensor:
+        """Of its precision, where it is."""
+        return next(iter(self.inputs.values()))
+
+    @property
     def frames(self) -> tuple[int, ...]:
         """Axis of the results, between scenes and rows; () where they come once."""
         return (len(self.ends),) if self.ends else ()
@@ -38,7 +43,7 @@ class Job(NamedTuple):
 
 def forward(job: Job, every: int = 0) -> tuple[dict[Field, Tensor], Tensor]:
     """(nexts and sums [scenes, (frames,) rows, comps], records); ``every``: substeps between records, 0 for none."""
-    like = next(iter(job.inputs.values()))
+    like = job.like
     results = {f: like.new_empty(job.scenes, *job.frames, f.rows, f.comps) for f in job.program.outputs}
     records = MEMORY.lend(job.scenes, record_size(job.program, job.substeps, every), dtype=like.dtype)
     ports = _ports(job)
@@ -54,7 +59,7 @@ def reverse(
     """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums."""
     if records.data_ptr() % ALIGNED:  # a hook kept them, and gives them back from elsewhere
         records = records.clone()
-    like = next(iter(job.inputs.values()))
+    like = job.like
     grads = {f: like.new_zeros(job.scenes, *job.inputs[f].shape[1:]) for f in wanted}
     ports = _ports(job)
     for f, tensor in seeds.items():
@@ -67,7 +72,7 @@ def reverse(
 
 def tangent(job: Job, dots: Mapping[Field, Tensor], directions: int) -> tuple[dict[Field, Tensor], dict[Field, Tensor]]:
     """(nexts and sums, their tangents [scenes, directions, rows, comps]) of inputs [scenes or 1, directions, ...]."""
-    like = next(iter(job.inputs.values()))
+    like = job.like
     results = {f: like.new_empty(job.scenes, f.rows, f.comps) for f in job.program.outputs}
     moved = {f: like.new_empty(job.scenes, directions, f.rows, f.comps) for f in results}
     ports = _ports(job)

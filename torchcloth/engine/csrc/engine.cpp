@@ -204,3 +204,14 @@ TC_API int tc_kernel_info(int k, int what) {
     const auto kernel = tc::all_kernels<double>()[k];
     return what == 0 ? kernel.inputs : what == 1 ? kernel.outputs : kernel.flops;
 }
+// Operation i of a kernel: {code as in tape.h, first, second, third operand or -1, whether it has a derivative}.
+TC_API int tc_kernel_size(int k) { return tc::all_kernels<double>()[k].listing.size; }
+TC_API void tc_kernel_listing(int k, int* operations, double* values, int* out) {
+    const auto kernel = tc::all_kernels<double>()[k];
+    for (int i = 0; i < kernel.listing.size; i++) {
+        const tc::Node& n = kernel.listing.nodes[i];
+        for (int number : {int(n.op), n.a, n.b, n.c, int(kernel.listing.varies[i])}) *operations++ = number;
+        *values++ = n.value;
+    }
+    for (int i = 0; i < kernel.outputs; i++) *out++ = kernel.listing.out[i];
+}

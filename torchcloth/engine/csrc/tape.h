@@ -361,10 +361,32 @@ void tangent(Wide<R>* regs, Along<R, N>* dots, const int* in, const int* out) {
 
 // ---- what the machine calls ----------------------------------------------------------------------------------------
 
+// A kernel's operations as plain numbers, for what compiles them otherwise: engine/cuda.
+struct Listing {
+    const Node* nodes;
+    const bool* varies;
+    const int* out;
+    int size;
+};
+template <class K>
+struct Compact {  // the trace without its empty rest
+    static constexpr int size = traced<K>.tape.size;
+    Node nodes[size]{};
+    bool varies[size]{};
+    int out[K::outputs]{};
+    constexpr Compact() {
+        for (int i = 0; i < size; i++) nodes[i] = traced<K>.tape.node[i], varies[i] = traced<K>.varies[i];
+        for (int i = 0; i < K::outputs; i++) out[i] = traced<K>.out[i];
+    }
+};
+template <class K>
+inline constexpr Compact<K> compact{};
+
 template <class R>
 struct Kernel {
     const char* name;
     int inputs, outputs, flops;
+    Listing listing;
     void (*value)(Wide<R>*, const int*, const int*);
     void (*adjoint)(const Wide<R>*, Wide<R>*, const int*, const int*);
     void (*few)(Wide<R>*, Along<R, FEW>*, const int*, const int*);
@@ -375,7 +397,8 @@ struct Kernel {
 
 template <class K, class R>
 constexpr Kernel<R> kernel() {
-    return {K::name, K::inputs, K::outputs, traced<K>.flops, value<K, R>, adjoint<K, R>, tangent<K, R, FEW>, tangent<K, R, MANY>};
+    constexpr const Compact<K>& c = compact<K>;
+    return {K::name, K::inputs, K::outputs, traced<K>.flops, {c.nodes, c.varies, c.out, c.size}, value<K, R>, adjoint<K, R>, tangent<K, R, FEW>, tangent<K, R, MANY>};
 }
 
 }  // namespace tc

@@ -5,12 +5,12 @@ import sys
 import pytest
 import torch
 
-from torchcloth.benchmarks import graphs
+from torchcloth.benchmarks import devices
 
 
 def asked(monkeypatch, *words: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["graphs", *words])
-    graphs.main()
+    monkeypatch.setattr(sys, "argv", ["devices", *words])
+    devices.main()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a device")
@@ -27,9 +27,10 @@ def test_scenes_are_some(monkeypatch, capsys):
 
 
 def test_ways_agree_and_are_told(monkeypatch, capsys):
-    monkeypatch.setattr(graphs, "WAYS", {"fused, CPU": ("cpu", "fused"), "one by one": ("cpu", "reference")})
+    ways = {"fused, CPU": devices.Way("cpu", "fused"), "one by one": devices.Way("cpu", "reference")}
+    monkeypatch.setattr(devices, "WAYS", ways)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "none")
-    asked(monkeypatch, "--scenes", "2", "--frames", "1", "--repeats", "1")
+    asked(monkeypatch, "--scenes", "2", "--contact", "--frames", "1", "--repeats", "1")
     rows = [line.split("|")[1:3] for line in capsys.readouterr().out.splitlines() if line.startswith("| 2")]
     assert [[cell.strip() for cell in row] for row in rows] == [["2", "fused, CPU"], ["2", "one by one"]]

@@ -1,0 +1,131 @@
+"""NVIDIA's run-time compiler and driver, by their C interfaces: both come with torch and the device."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import sysconfig
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+import torch
+
+from ..._files import atomically
+from ..building import Unbuilt, folders
+
+FLAGS = ("--std=c++17", "--fmad=true", "--extra-device-vectorization")
+LOG = 2000  # characters of what the compiler says
+
+
+def compiled(text: str, threads: int, device: torch.device) -> bytes:
+    """Machine code for a device; from the cache where it was made before.
+
+    Raises:
+        Unbuilt: there is no compiler, or it failed.
+    """
+    major, minor = torch.cuda.get_device_capability(device)
+    options = (*FLAGS, f"--gpu-architecture=sm_{major}{minor}", f"-DTHREADS={threads}")
+    known = hashlib.sha256("\0".join([text, *options, str(torch.version.cuda)]).encode()).hexdigest()[:20]
+    for folder in folders():
+        with suppress(OSError):
+            return (folder / f"program-{known}.cubin").read_bytes()
+    code = _compile(text, options)
+    for folder in folders():
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            with atomically(folder / f"program-{known}.cubin") as file:
+                file.write_bytes(code)
+            break
+    return code
+
+
+class Module:
+    """Kernels on a device."""
+
+    def __init__(self, code: bytes, device: torch.device) -> None:
+        self._device, self._code = device, code
+        self._functions: dict[str, ctypes.c_void_p] = {}
+        self._module = ctypes.c_void_p()
+        with torch.cuda.device(device):
+            torch.cuda.current_stream().synchronize()  # then there is a context
+            _check(_driver().cuModuleLoadData(ctypes.byref(self._module), code))
+
+    def launch(self, name: str, blocks: int, threads: int, shared: int, arguments: Sequence[int]) -> None:
+        """On torch's current stream; ``arguments``: pointers and counts, of 64 bits each or as ctypes.
+
+        Args:
+            name: of the kernel.
+            blocks: how many.
+            threads: of each.
+            shared: bytes of each.
+            arguments: ctypes' numbers.
+        """
+        with torch.cuda.device(self._device):
+            if name not in self._functions:
+                function = ctypes.c_void_p()
+                _check(_driver().cuModuleGetFunction(ctypes.byref(function), self._module, name.encode()))
+                self._functions[name] = function
+            pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(a) for a in arguments))  # type: ignore[arg-type]
+            stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
+            sizes = (ctypes.c_uint(n) for n in (blocks, 1, 1, threads, 1, 1, shared))
+            _check(_driver().cuLaunchKernel(self._functions[name], *sizes, stream, pointers, None))
+
+
+def _compile(text: str, options: Sequence[str]) -> bytes:
+    nvrtc = _compiler()
+    program = ctypes.c_void_p()
+    given = (ctypes.c_char_p * len(options))(*(o.encode() for o in options))
+    made = nvrtc.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"program.cu", 0, None, None)
+    if made:
+        raise Unbuilt(f"NVRTC: error {made}", "reinstall torch with CUDA")
+    try:
+        failed, size = nvrtc.nvrtcCompileProgram(program, len(options), given), ctypes.c_size_t()
+        if failed:
+            nvrtc.nvrtcGetProgramLogSize(program, ctypes.byref(size))
+            log = ctypes.create_string_buffer(size.value)
+            nvrtc.nvrtcGetProgramLog(program, log)
+            raise Unbuilt(f"NVRTC: {log.value.decode()[:LOG]}", "report it, with torch's version and the device")
+        nvrtc.nvrtcGetCUBINSize(program, ctypes.byref(size))
+        code = ctypes.create_string_buffer(size.value)
+        nvrtc.nvrtcGetCUBIN(program, code)
+        return code.raw
+    finally:
+        nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
+
+
+@cache
+def _compiler() -> ctypes.CDLL:
+    """torch's own NVRTC.
+
+    Raises:
+        Unbuilt: it is not there.
+    """
+    for name in _names():
+        with suppress(OSError):
+            return ctypes.CDLL(name)
+    raise Unbuilt("no libnvrtc", "install torch with CUDA, or CUDA's toolkit")
+
+
+def _names() -> Iterator[str]:
+    major = (torch.version.cuda or "").partition(".")[0]
+    yield f"libnvrtc.so.{major}"  # torch may have loaded it
+    for folder in (sysconfig.get_path("purelib"), Path(torch.__file__).parent.parent):
+        yield from map(str, sorted(Path(folder).glob(f"nvidia/*/lib/libnvrtc.so.{major}*")))
+    yield "libnvrtc.so"
+
+
+@cache
+def _driver() -> ctypes.CDLL:
+    try:
+        return ctypes.CDLL("libcuda.so.1")
+    except OSError as error:
+        raise Unbuilt(f"no CUDA driver: {error}", "install NVIDIA's driver") from error
+
+
+def _check(code: int) -> None:
+    if code:
+        text = ctypes.c_char_p()
+        _driver().cuGetErrorString(code, ctypes.byref(text))
+        raise RuntimeError(f"CUDA: {(text.value or b'error').decode()} ({code})")

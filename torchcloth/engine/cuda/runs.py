@@ -1,0 +1,156 @@
+"""Running a program on a device: values, and adjoints by going through a few substeps at a time again."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from functools import cache
+from itertools import pairwise
+from typing import Protocol
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+
+from ..fields import Field, Kind
+from ..program import Program
+from ..running import Job
+from .source import Source
+
+BUDGET = 256 * 2**20  # bytes of states that an adjoint keeps at a time
+MOST, FEWEST = 64, 8  # substeps of that
+THREADS = 512  # of a block; measured with 441 vertices, by how many scenes there are it hardly matters
+PORT = 5  # numbers of 64 bits, csrc: struct Port
+
+
+class Device(Protocol):
+    """What has a program's kernels."""
+
+    threads: int
+
+    def launch(self, name: str, blocks: int, shared: int, arguments: Sequence[ctypes._SimpleCData]) -> None:
+        """Start one of them."""
+        ...
+
+
+class OnDevice:
+    """A program on one device."""
+
+    def __init__(self, source: Source, kernels: Device, device: torch.device, dtype: torch.dtype) -> None:
+        self.source, self.kernels = source, kernels
+        self.data = torch.from_numpy(source.data).to(device, dtype)
+        self.tables = torch.from_numpy(source.tables).to(device)
+        warps = -(-kernels.threads // 32) if device.type == "cuda" else kernels.threads
+        self._shared = source.shared * (1 + warps) * dtype.itemsize
+
+    def launch(self, name: str, ports: Tensor, work: Tensor, scenes: int, *rest: ctypes._SimpleCData) -> None:
+        """One block for each scene."""
+        known = (ctypes.c_void_p(t.data_ptr()) for t in (ports, self.data, self.tables, work))
+        self.kernels.launch(name, scenes, self._shared, [*known, *rest])
+
+
+_KNOWN: WeakKeyDictionary[Program, dict[torch.device, OnDevice]] = WeakKeyDictionary()
+
+
+def on_device(program: Program, device: torch.device) -> OnDevice:
+    """The program there, compiled if need be.
+
+    Raises:
+        Unbuilt: it cannot be compiled.
+        Unfused: contact between layers.
+    """
+    known = _KNOWN.setdefault(program, {})
+    if device not in known:
+        source = Source(program.written, "double" if program.dtype == torch.float64 else "float")
+        known[device] = OnDevice(source, kernels(source, device), device, program.dtype)
+    return known[device]
+
+
+def kernels(source: Source, device: torch.device) -> Device:
+    """The source, compiled for a device."""
+    from . import driver
+
+    class Cuda:
+        threads = THREADS
+        _module = driver.Module(driver.compiled(source.text, THREADS, device), device)
+
+        def launch(self, name: str, blocks: int, shared: int, arguments: Sequence[ctypes._SimpleCData]) -> None:
+            self._module.launch(name, blocks, self.threads, shared, arguments)
+
+    return Cuda()
+
+
+def forward(job: Job) -> tuple[dict[Field, Tensor], Tensor]:
+    """(nexts and sums [scenes, (frames,) rows, comps], [scenes, 1] m: how far a vertex was, see ``devices.forward``)."""
+    like = job.like
+    there = on_device(job.program, like.device)
+    results = {f: like.new_empty(job.scenes, *job.frames, f.rows, f.comps) for f in job.program.outputs}
+    work = like.new_zeros(job.scenes * there.source.values_size)
+    far = like.new_empty(job.scenes, there.kernels.threads)
+    ends = _there(torch.tensor(job.ends or (job.substeps,)), like.device)
+    ports = _ports(job, like.device, results=results)
+    counts = ctypes.c_int(job.substeps), ctypes.c_int(len(ends))
+    pointers = ctypes.c_void_p(far.data_ptr()), ctypes.c_void_p(ends.data_ptr())
+    there.launch("values", ports, work, job.scenes, *pointers, *counts)
+    return results, far.amax(-1, keepdim=True)
+
+
+def reverse(job: Job, seeds: Mapping[Field, Tensor], wanted: set[Field]) -> dict[Field, Tensor]:
+    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums."""
+    like = job.like
+    there = on_device(job.program, like.device)
+    states = [f for f in job.program.inputs if f.kind == Kind.STATE]
+    after = dict(zip(states, [f for f in job.program.outputs if f.kind == Kind.NEXT], strict=True))
+    size = there.source.state_size * job.scenes * job.program.dtype.itemsize
+    chunk = min(max(BUDGET // max(size, 1), FEWEST), MOST)
+    ends = [*range(0, job.substeps, chunk), job.substeps]
+    starts = _states(job, ends[1:-1])
+    grads = {f: like.new_zeros(job.scenes, *job.inputs[f].shape[1:]) for f in wanted}
+    mine = {f: like.new_zeros(job.scenes, f.rows, f.comps) for f in states}  # before the present chunk
+    work = like.new_zeros(job.scenes * (there.source.adjoint_size + min(chunk, job.substeps) * there.source.state_size))
+    given = {f: t.contiguous() for f, t in seeds.items()}
+    for k in reversed(range(len(ends) - 1)):
+        first, last = ends[k], ends[k + 1]
+        now = {f: starts[after[f]][:, k - 1].contiguous() for f in states} if k else {}
+        ports = _ports(
+            job._replace(inputs={**job.inputs, **now}), like.device, seeds=given, gradients={**grads, **mine}
+        )
+        counts = ctypes.c_int(last - first), ctypes.c_int(first), ctypes.c_int(job.substeps)
+        there.launch("adjoint", ports, work, job.scenes, *counts)
+        given = {**given, **{after[f]: t.clone() for f, t in mine.items()}}
+    return {f: mine.get(f, grads[f]) for f in wanted}
+
+
+def _states(job: Job, ends: Sequence[int]) -> dict[Field, Tensor]:
+    """Results after some of the substeps; none of none."""
+    if not ends:
+        return {}
+    drives = {f: t[:, : ends[-1]].contiguous() for f, t in job.inputs.items() if f.kind == Kind.DRIVE}
+    return forward(job._replace(inputs={**job.inputs, **drives}, substeps=ends[-1], ends=tuple(ends)))[0]
+
+
+def _ports(
+    job: Job,
+    device: torch.device,
+    results: Mapping[Field, Tensor] | None = None,
+    seeds: Mapping[Field, Tensor] | None = None,
+    gradients: Mapping[Field, Tensor] | None = None,
+) -> Tensor:
+    """Where the program's fields are, field by field."""
+    ports = torch.zeros(len(job.program.fields), PORT, dtype=torch.int64)
+    for f, t in job.inputs.items():
+        shape = (job.substeps if f.kind == Kind.DRIVE else f.rows, f.comps)
+        if not t.is_contiguous() or t.dtype != job.program.dtype or t.device != device or t.shape[1:] != shape:
+            raise ValueError(
+                f"{f}: got {list(t.shape)} {t.dtype} on {t.device}, expected [scenes, *{shape}] on {device}"
+            )
+        ports[f.id, 0], ports[f.id, 1] = t.data_ptr(), t[0].numel() if len(t) > 1 else 0
+    for column, tensors in ((2, results), (3, seeds), (4, gradients)):
+        for f, t in (tensors or {}).items():
+            ports[f.id, column] = t.data_ptr()
+    return _there(ports, device)
+
+
+def _there(numbers: Tensor, device: torch.device) -> Tensor:
+    """On the device, for which nobody waits."""
+    return numbers.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else numbers

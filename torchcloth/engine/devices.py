@@ -1,0 +1,54 @@
+"""A job where its tensors are: on the processor (``running``), or on a CUDA device (``cuda``)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from . import running
+from .cuda import runs
+from .fields import Field
+from .program import Program
+from .running import Job
+
+
+def elsewhere(tensor: Tensor) -> bool:
+    """Whether such tensors are not the processor's."""
+    return tensor.is_cuda
+
+
+def forward(job: Job, every: int = 0) -> tuple[dict[Field, Tensor], Tensor]:
+    """(nexts and sums [scenes, (frames,) rows, comps], records).
+
+    ``every``: see ``running.forward``. On a device there are no records; in their place stands [scenes, 1] m, how far a
+    vertex was from where it began, before the last substep.
+    """
+    return runs.forward(job) if elsewhere(job.like) else running.forward(job, every)
+
+
+def reverse(
+    job: Job, records: Tensor, every: int, seeds: Mapping[Field, Tensor], wanted: set[Field]
+) -> dict[Field, Tensor]:
+    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums; ``every`` 0: without records."""
+    if elsewhere(job.like):
+        return runs.reverse(job, seeds, wanted)
+    if every == 0:
+        every = running.spacing(job)
+        records = running.forward(job, every)[1]
+    return running.reverse(job, records.contiguous(), every, seeds, wanted)
+
+
+def record_size(program: Program, substeps: int, every: int, like: Tensor) -> int:
+    """Numbers that ``forward`` gives of a scene besides results."""
+    return 1 if elsewhere(like) else running.record_size(program, substeps, every)
+
+
+def prepare(program: Program, device: torch.device) -> None:
+    """Compile for a device.
+
+    Raises:
+        Unbuilt: it cannot be.
+    """
+    runs.on_device(program, device)
