@@ -1,4 +1,4 @@
-"""CUDA gives what the CPU gives. Run with `pytest -m gpu -s`; `tests/engine` looks at every kernel where there is a device."""
+"""CUDA gives what the CPU gives: `pytest -m gpu -s`. With a device, `tests/engine` runs every kernel there."""
 
 import time
 from contextlib import nullcontext
@@ -64,8 +64,8 @@ def test_cuda_equals_cpu(monkeypatch, dtype, mark, contact, way):
     units = []
     usual = captured.Unit.__init__
     monkeypatch.setattr(captured.Unit, "__init__", lambda self, *how: (units.append(self), usual(self, *how))[1])
-    known, gradient, _ = lifted(devices.Way("cpu", "reference"), dtype, contact, 0.5)
-    x, grad, _ = lifted(WAYS[way], dtype, contact, 0.5)
+    known, gradient, _ = lifted(devices.Way("cpu", "auto"), dtype, contact, 0.3)
+    x, grad, _ = lifted(WAYS[way], dtype, contact, 0.3)
     torch.testing.assert_close(x, known, rtol=mark, atol=mark)
     torch.testing.assert_close(grad, gradient, rtol=10 * mark, atol=10 * mark * float(gradient.abs()))
     assert bool(units) == (way == "graphs"), "captured"
@@ -122,7 +122,7 @@ def test_a_part_that_waits_is_launched_one_by_one_and_spoils_nothing():
 
 def test_the_engine_pays():
     """Prints by how much, forward and back together."""
-    took = {way: lifted(WAYS[way], torch.float32, "contact", 0.5)[-1] for way in WAYS}
+    took = {way: lifted(WAYS[way], torch.float32, "contact", 0.3)[-1] for way in WAYS}
     print(f"\n{torch.cuda.get_device_name()}: {', '.join(f'{way} {s:.3f} s' for way, s in took.items())}")
     assert took["engine"] < took["graphs"] < took["one by one"] / 2
 

@@ -1,4 +1,4 @@
-"""Stands in for a CUDA device: the same source by the C++ compiler, a block's threads one after another or side by side.
+"""Stands in for a CUDA device: the same source by the C++ compiler, a block's threads one after another.
 
 Memory is the processor's, so programs run on tensors of the CPU.
 """
@@ -75,7 +75,7 @@ extern "C" void launch_adjoint(int blocks, Port* p, R* d, int* t, R* w, int subs
     each(blocks, [&] { adjoint(p, d, t, w, substeps, first, all); });
 }
 """
-FLAGS = "-std=c++20 -O1 -ffp-contract=off -fPIC -shared -pthread -w".split()
+FLAGS = ["-std=c++20", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-pthread", "-w"]
 
 
 class Host:

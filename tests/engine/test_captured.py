@@ -189,7 +189,7 @@ def test_gradients_of_gradients_are_refused():
     cloth, state, motion = scene()
     x = state.x.clone().requires_grad_()
     plan = cloth.plan(state._replace(x=x), motion, FRAMES, None)
-    out = run(plan._replace(graphs=Graphs(plan.model, sum(plan.counts), again)), checkpoint=True)
+    out = run(plan._replace(units=Graphs(plan.model, sum(plan.counts), again)), checkpoint=True)
     with pytest.raises(InvalidInput, match=r'create_graph=True; expected one; .*engine="reference"'):
         torch.autograd.grad(out.x.square().sum(), x, create_graph=True)
 
@@ -235,7 +235,7 @@ def test_a_backward_pass_comes_long_after():
     for capture in (None, again):
         cloth.zero_grad()
         plan = cloth.plan(state, motion, FRAMES, None)
-        plan = plan._replace(graphs=None if capture is None else Graphs(plan.model, sum(plan.counts), capture))
+        plan = plan._replace(units=None if capture is None else Graphs(plan.model, sum(plan.counts), capture))
         first = run(plan, True)
         faster = plan._replace(state=plan.state._replace(v=plan.state.v + 0.1))
         second = run(faster, True)

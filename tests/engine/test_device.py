@@ -100,8 +100,11 @@ def test_the_layer(contact, dtype, mark):
     for one, other in ((known.x, out.x), (known.x, plain.x), (known.wrench["left"], out.wrench["left"])):
         torch.testing.assert_close(other, one, rtol=0, atol=mark * float(one.detach().abs().max()))
     torch.testing.assert_close(out.state.d3, known.state.d3, rtol=0, atol=mark)
-    assert set(before) == set(after)
+    assert set(before) >= set(after)
     for name, t in before.items():
+        if name not in after:  # of contact, which nobody asked for
+            assert float(t.abs().max()) == 0, name
+            continue
         torch.testing.assert_close(after[name], t, rtol=0, atol=10 * mark * float(t.abs().max()), msg=name)
 
 
@@ -125,7 +128,7 @@ def test_layers_that_meet_are_the_references():
 @pytest.mark.parametrize("faster", [1e-9, 1e3])
 def test_what_moves_farther_than_was_looked_at_goes_in_smaller_pieces(faster, monkeypatch):
     cloth = sheet(contact=tc.Contact())
-    state = start(cloth)._replace(v=torch.full_like(start(cloth).v, 2.0))
+    state = start(cloth)._replace(v=torch.full_like(start(cloth).v, 20.0))
     known = cloth(state, opening(TIMES[-1]), TIMES)
     monkeypatch.setattr(apart, "FASTER", faster)
     asked = []
@@ -147,7 +150,7 @@ def test_what_it_cannot_do_is_said():
     with elsewhere(), patch.object(runs, "kernels", side_effect=Unbuilt("no libnvrtc", "install it")):
         assert sheet().engine_in_use == "reference (no libnvrtc)"
         with pytest.raises(tc.errors.InvalidInput, match=r"no libnvrtc.*install it"):
-            sheet(engine="fused")(sheet().rest_state(), times=[0.0, 0.01])
+            sheet(engine="fused")(start(sheet()), opening(TIMES[-1]), TIMES)
 
 
 def test_directions_are_the_references():

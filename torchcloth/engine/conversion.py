@@ -39,7 +39,10 @@ def drive_inputs(low: Lowering, drives: Mapping[str, Drive]) -> dict[Field, Tens
 
 
 def flat(low: Lowering, found: Mapping[Field, Tensor], batch: torch.Size, behind: int = 2) -> dict[Field, Tensor]:
-    """Contiguous tensors of the program's precision, where the cloth is; ``batch``: the scenes' shape, before the last ``behind`` axes."""
+    """Contiguous tensors of the program's precision, where the cloth is.
+
+    ``batch``: the scenes' shape, before the last ``behind`` axes.
+    """
     out, scenes = {}, batch.numel()
     for field, t in found.items():
         own, rest = t.shape[:-behind], t.shape[-behind:]

@@ -31,7 +31,10 @@ def forward(job: Job, every: int = 0) -> tuple[dict[Field, Tensor], Tensor]:
 def reverse(
     job: Job, records: Tensor, every: int, seeds: Mapping[Field, Tensor], wanted: set[Field]
 ) -> dict[Field, Tensor]:
-    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums; ``every`` 0: without records."""
+    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums.
+
+    ``every``: 0: without records.
+    """
     if elsewhere(job.like):
         return runs.reverse(job, seeds, wanted)
     if every == 0:

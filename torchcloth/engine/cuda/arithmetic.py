@@ -14,9 +14,9 @@ from ..library import kernels, library
 
 # as in csrc/tape.h
 OPERATIONS = (
-    "input constant add sub mul div addc rsubc mulc rdivc neg sqrt exp expm1 atan2 "
-    "abs at_least at_most less lessc cless select detach"
-).split()
+    *("input", "constant", "add", "sub", "mul", "div", "addc", "rsubc", "mulc", "rdivc", "neg", "sqrt", "exp", "expm1"),
+    *("atan2", "abs", "at_least", "at_most", "less", "lessc", "cless", "select", "detach"),
+)
 VALUES = {
     "add": "{a} + {b}",
     "sub": "{a} - {b}",

@@ -52,22 +52,24 @@ class Module:
             torch.cuda.current_stream().synchronize()  # then there is a context
             _check(_driver().cuModuleLoadData(ctypes.byref(self._module), code))
 
-    def launch(self, name: str, blocks: int, threads: int, shared: int, arguments: Sequence[int]) -> None:
-        """On torch's current stream; ``arguments``: pointers and counts, of 64 bits each or as ctypes.
+    def launch(
+        self, name: str, blocks: int, threads: int, shared: int, arguments: Sequence[ctypes._SimpleCData]
+    ) -> None:
+        """On torch's current stream.
 
         Args:
             name: of the kernel.
             blocks: how many.
             threads: of each.
             shared: bytes of each.
-            arguments: ctypes' numbers.
+            arguments: pointers and counts.
         """
         with torch.cuda.device(self._device):
             if name not in self._functions:
                 function = ctypes.c_void_p()
                 _check(_driver().cuModuleGetFunction(ctypes.byref(function), self._module, name.encode()))
                 self._functions[name] = function
-            pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(a) for a in arguments))  # type: ignore[arg-type]
+            pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(a) for a in arguments))
             stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
             sizes = (ctypes.c_uint(n) for n in (blocks, 1, 1, threads, 1, 1, shared))
             _check(_driver().cuLaunchKernel(self._functions[name], *sizes, stream, pointers, None))

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..fields import Kind
-from ..lowering import Unfused
 from ..loops import ADD, LOAD, PUT
+from ..lowering import Unfused
 
 
 class Place(NamedTuple):

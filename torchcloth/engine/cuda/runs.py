@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from functools import cache
-from itertools import pairwise
 from typing import Protocol
 from weakref import WeakKeyDictionary
 
@@ -20,7 +18,7 @@ from .source import Source
 BUDGET = 256 * 2**20  # bytes of states that an adjoint keeps at a time
 MOST, FEWEST = 64, 8  # substeps of that
 THREADS = 512  # of a block; measured with 441 vertices, by how many scenes there are it hardly matters
-PORT = 5  # numbers of 64 bits, csrc: struct Port
+PORT = 5  # numbers of 64 bits, as in source.py
 
 
 class Device(Protocol):
@@ -81,7 +79,7 @@ def kernels(source: Source, device: torch.device) -> Device:
 
 
 def forward(job: Job) -> tuple[dict[Field, Tensor], Tensor]:
-    """(nexts and sums [scenes, (frames,) rows, comps], [scenes, 1] m: how far a vertex was, see ``devices.forward``)."""
+    """(nexts and sums [scenes, (frames,) rows, comps], [scenes, 1] m: see ``devices.forward``)."""
     like = job.like
     there = on_device(job.program, like.device)
     results = {f: like.new_empty(job.scenes, *job.frames, f.rows, f.comps) for f in job.program.outputs}
