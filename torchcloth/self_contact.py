@@ -18,7 +18,6 @@ from .types import ClothState, Surface
 # Substeps between checkpoints of a long interval: memory ~ frames + CHUNK, one extra forward pass. Near layers are
 # searched again at each, as substeps that are computed anew start there.
 CHUNK = 48
-AT_ONCE = 2**24  # pairs of triangles whose distances are looked at together
 
 
 class Layers(NamedTuple):
@@ -55,9 +54,8 @@ def near_layers(model: Model, grid: Grid, x: Tensor, before: Layers | None = Non
     if grid.apart is None:
         near = torch.ones(centre.shape[:2], dtype=torch.bool, device=x.device)
     else:
-        scenes = max(1, AT_ONCE // centre.shape[1] ** 2)
-        near = torch.cat(
-            [((torch.cdist(p, p, compute_mode=EXACT) < grid.reach) & grid.apart).any(-1) for p in centre.split(scenes)]
+        near = torch.stack(
+            [((torch.cdist(p, p, compute_mode=EXACT) < grid.reach) & grid.apart).any(-1) for p in centre]
         )
     scene, triangle = near.nonzero(as_tuple=True)
     scenes, triangles = near.shape

@@ -56,7 +56,7 @@ static void next_one() {{
     end(), begin(round + 1);
 }}
 """
-LAUNCH = """
+EACH = """
 template <class F>
 static void each(int blocks, F work) {
     for (int block = 0; block < blocks; block++) {
@@ -68,6 +68,8 @@ static void each(int blocks, F work) {
         for (auto& other : others) other.join();
     }
 }
+"""
+PROGRAM = """
 extern "C" void launch_values(int blocks, Port* p, R* d, int* t, R* w, R* far, Count* ends, int substeps, int frames) {
     each(blocks, [&] { values(p, d, t, w, far, ends, substeps, frames); });
 }
@@ -75,15 +77,26 @@ extern "C" void launch_adjoint(int blocks, Port* p, R* d, int* t, R* w, int subs
     each(blocks, [&] { adjoint(p, d, t, w, substeps, first, all); });
 }
 """
+NEAR = """
+extern "C" void launch_near(int blocks, R* x, int* corners, unsigned char* apart, R* centres, int* found, int vertices,
+                            int triangles, double reach) {
+    each(blocks, [&] { near(x, corners, apart, centres, found, vertices, triangles, reach); });
+}
+"""
 FLAGS = ["-std=c++20", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-pthread", "-w"]
 
 
 class Host:
-    """A program's kernels."""
+    """A text, compiled here."""
 
-    def __init__(self, source, threads, reverse):
+    def __init__(self, text, threads, reverse):
         self.threads = threads
-        text = HOST.format(threads=threads, reversed=str(reverse).lower()) + source.text + LAUNCH
+        text = (
+            HOST.format(threads=threads, reversed=str(reverse).lower())
+            + text
+            + EACH
+            + (NEAR if "KERNEL near" in text else PROGRAM)
+        )
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "program.cpp"
             file.write_text(text)
@@ -99,7 +112,7 @@ class Host:
 def stand_in(threads=1, reverse=False):
     """Programs for the CPU are compiled for it."""
     with (
-        patch.object(runs, "kernels", lambda source, device: Host(source, threads, reverse)),
+        patch.object(runs, "Kernels", lambda text, _, device: Host(text, threads, reverse)),
         patch.object(runs, "_KNOWN", WeakKeyDictionary()),
     ):
         yield

@@ -13,9 +13,10 @@ import torchcloth as tc
 from torchcloth.boundaries.motion import drive
 from torchcloth.engine import apart, devices, running
 from torchcloth.engine.building import Unbuilt
-from torchcloth.engine.cuda import arithmetic, runs
+from torchcloth.engine.cuda import arithmetic, layers, runs
 from torchcloth.engine.fused import Fused
 from torchcloth.engine.library import kernels
+from torchcloth.self_contact import near_layers
 
 TIMES = [0.0, 0.01, 0.02]
 
@@ -125,6 +126,21 @@ def test_layers_that_meet_are_the_references():
     torch.testing.assert_close(out.x, known.x, rtol=1e-6, atol=1e-9)
 
 
+def test_near_layers_are_found():
+    """Scene by scene; the same as the reference finds."""
+    cloth = sheet(contact=tc.Contact(), n=11, boundaries={})
+    model, grid = cloth.model(), cloth.grid()
+    flat, over = cloth.rest_state().x, folded(cloth).x
+    up = torch.tensor([0.0, 0.0, 1.0])
+    lifted = [over + height * (over[:, :1] < 0.1) * up for height in (0.0, -0.02, -0.05, -0.2)]
+    with on_host.stand_in(threads=3):
+        search = layers.LayerSearch(model, grid)
+        for x in (flat, *lifted, torch.stack([flat, flat]), torch.stack([flat, over])):
+            assert search.any_near(x) == bool(len(near_layers(model, grid, x).active))
+        assert [search.any_near(x) for x in (flat, over)] == [False, True]
+        assert layers.LayerSearch(model, grid._replace(apart=None)).any_near(flat), "not known"
+
+
 @pytest.mark.parametrize("faster", [1e-9, 1e3])
 def test_what_moves_farther_than_was_looked_at_goes_in_smaller_pieces(faster, monkeypatch):
     cloth = sheet(contact=tc.Contact())
@@ -147,7 +163,7 @@ def test_what_it_cannot_do_is_said():
     for effects, contact in (({"own": Own()}, None), ({"own": Own()}, tc.Contact())):
         with elsewhere():
             assert "effects.own in torch, on cuda" in sheet(effects=effects, contact=contact).engine_in_use
-    with elsewhere(), patch.object(runs, "kernels", side_effect=Unbuilt("no libnvrtc", "install it")):
+    with elsewhere(), patch.object(runs, "Kernels", side_effect=Unbuilt("no libnvrtc", "install it")):
         assert sheet().engine_in_use == "reference (no libnvrtc)"
         with pytest.raises(tc.errors.InvalidInput, match=r"no libnvrtc.*install it"):
             sheet(engine="fused")(start(sheet()), opening(TIMES[-1]), TIMES)

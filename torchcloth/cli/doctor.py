@@ -32,9 +32,12 @@ def _doctor(options: argparse.Namespace) -> int:
     import torch
 
     from ..engine import library
+    from ..engine.cuda import driver
 
     print(f"torchcloth {metadata.version('torchcloth')}, torch {torch.__version__}, CUDA {torch.cuda.is_available()}")
     print(f"{'engine':20s} {library.status()}")
+    if torch.cuda.is_available():
+        print(f"{'engine on CUDA':20s} {driver.status()}")
     for name, extra in PACKAGES.items():
         state = "installed" if find_spec(name) else f'missing: pip install "torchcloth[{extra}]"'
         if name == "open3d" and find_spec(name):  # it may lack a library of the system

@@ -13,9 +13,9 @@ from torch import Tensor
 from ..boundaries import Drive
 from ..dynamics import Impulses, added
 from ..model import Model, surface
-from ..self_contact import Layers, near_layers
 from ..transfer import Grid
 from ..types import ClothState
+from .cuda.layers import LayerSearch
 from .fused import Fused
 
 FASTER = 1.2  # than a vertex is at the start of some substeps, in the middle of them
@@ -28,6 +28,7 @@ class Apart:
 
     Raises:
         Unfused: a part without kernels.
+        Unbuilt: no compiler for the device.
     """
 
     able = True
@@ -35,7 +36,8 @@ class Apart:
     def __init__(self, model: Model, grid: Grid, state: ClothState, drives: Mapping[str, Drive]) -> None:
         self.model, self.grid = model, grid
         self.fused = Fused(model._replace(grid=None), _without(state), drives)
-        self._layers: Layers | None = None
+        self._search = LayerSearch(model, grid)
+        self._clear: Tensor | None = None  # positions [..., V, 3] m, at which no layers were near
 
     def stretch(
         self,
@@ -61,15 +63,15 @@ class Apart:
         self, state: ClothState, lost: Tensor | None, dt: float, drives: Mapping[str, Drive], first: int, last: int
     ) -> tuple[Stretch, int] | None:
         """(as many substeps as are sure to meet no layers, which comes next)."""
-        layers = self._layers = near_layers(self.model, self.grid, state.x, self._layers)
-        moved = float((state.x.detach() - layers.x).abs().max())
+        moved = float("inf") if self._clear is None else float((state.x.detach() - self._clear).abs().max())
         if moved > self.grid.skin / 4:  # little room is left
-            layers, moved = near_layers(self.model, self.grid, state.x), 0.0
-            self._layers = layers
-        if len(layers.active):
-            return None
+            if self._search.any_near(state.x):
+                self._clear = None
+                return None
+            self._clear, moved = state.x.detach(), 0.0
         room = self.grid.skin / 2 - moved
-        count = min(last - first, max(1, int(room / (FASTER * dt * float(state.v.detach().abs().max()) + 1e-12))))
+        soon = room / (FASTER * dt * float(state.v.detach().abs().max()) + 1e-12)  # substeps
+        count = max(1, min(last - first, int(soon))) if soon == soon else last - first
         while True:
             found, way = self.fused.measured(_without(state), lost, dt, drives, count, first)
             # one substep goes nowhere before it is over; what is not finite is found by others

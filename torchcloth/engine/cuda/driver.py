@@ -41,26 +41,27 @@ def compiled(text: str, threads: int, device: torch.device) -> bytes:
     return code
 
 
-class Module:
-    """Kernels on a device."""
+class Kernels:
+    """A text, compiled for blocks of so many threads on a device.
 
-    def __init__(self, code: bytes, device: torch.device) -> None:
-        self._device, self._code = device, code
+    Raises:
+        Unbuilt: it cannot be.
+    """
+
+    def __init__(self, text: str, threads: int, device: torch.device) -> None:
+        self.threads, self._device, self._code = threads, device, compiled(text, threads, device)
         self._functions: dict[str, ctypes.c_void_p] = {}
         self._module = ctypes.c_void_p()
         with torch.cuda.device(device):
             torch.cuda.current_stream().synchronize()  # then there is a context
-            _check(_driver().cuModuleLoadData(ctypes.byref(self._module), code))
+            _check(_driver().cuModuleLoadData(ctypes.byref(self._module), self._code))
 
-    def launch(
-        self, name: str, blocks: int, threads: int, shared: int, arguments: Sequence[ctypes._SimpleCData]
-    ) -> None:
-        """On torch's current stream.
+    def launch(self, name: str, blocks: int, shared: int, arguments: Sequence[ctypes._SimpleCData]) -> None:
+        """Start a kernel on torch's current stream.
 
         Args:
             name: of the kernel.
             blocks: how many.
-            threads: of each.
             shared: bytes of each.
             arguments: pointers and counts.
         """
@@ -71,7 +72,7 @@ class Module:
                 self._functions[name] = function
             pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(a) for a in arguments))
             stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
-            sizes = (ctypes.c_uint(n) for n in (blocks, 1, 1, threads, 1, 1, shared))
+            sizes = (ctypes.c_uint(n) for n in (blocks, 1, 1, self.threads, 1, 1, shared))
             _check(_driver().cuLaunchKernel(self._functions[name], *sizes, stream, pointers, None))
 
 
@@ -95,6 +96,15 @@ def _compile(text: str, options: Sequence[str]) -> bytes:
         return code.raw
     finally:
         nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
+
+
+def status() -> str:
+    """Whether programs can be compiled for a device, in a line; compiles nothing."""
+    try:
+        _compiler(), _driver()
+    except Unbuilt as miss:
+        return f"not available, graphs of the torch reference serve: {miss}; {miss.remedy}"
+    return "programs are compiled at first use"
 
 
 @cache

@@ -13,6 +13,7 @@ from torch import Tensor
 from ..fields import Field, Kind
 from ..program import Program
 from ..running import Job
+from .driver import Kernels
 from .source import Source
 
 BUDGET = 256 * 2**20  # bytes of states that an adjoint keeps at a time
@@ -22,12 +23,12 @@ PORT = 5  # numbers of 64 bits, as in source.py
 
 
 class Device(Protocol):
-    """What has a program's kernels."""
+    """What has kernels."""
 
     threads: int
 
     def launch(self, name: str, blocks: int, shared: int, arguments: Sequence[ctypes._SimpleCData]) -> None:
-        """Start one of them."""
+        """Start one of them; ``shared``: bytes for each block."""
         ...
 
 
@@ -59,23 +60,14 @@ def on_device(program: Program, device: torch.device) -> OnDevice:
     """
     known = _KNOWN.setdefault(program, {})
     if device not in known:
-        source = Source(program.written, "double" if program.dtype == torch.float64 else "float")
-        known[device] = OnDevice(source, kernels(source, device), device, program.dtype)
+        source = Source(program.written, program.dtype)
+        known[device] = OnDevice(source, kernels(source.text, device), device, program.dtype)
     return known[device]
 
 
-def kernels(source: Source, device: torch.device) -> Device:
-    """The source, compiled for a device."""
-    from . import driver
-
-    class Cuda:
-        threads = THREADS
-        _module = driver.Module(driver.compiled(source.text, THREADS, device), device)
-
-        def launch(self, name: str, blocks: int, shared: int, arguments: Sequence[ctypes._SimpleCData]) -> None:
-            self._module.launch(name, blocks, self.threads, shared, arguments)
-
-    return Cuda()
+def kernels(text: str, device: torch.device) -> Device:
+    """The text, compiled for a device."""
+    return Kernels(text, THREADS, device)
 
 
 def forward(job: Job) -> tuple[dict[Field, Tensor], Tensor]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import torch
 
 from ..fields import Kind
 from ..loops import ADD, LOAD, OWN, PUT, SHARED
@@ -67,17 +68,25 @@ STAGE void clear(R* to, int count) {{
 """
 
 
+def prelude(dtype: torch.dtype) -> str:
+    """What kernels of one precision begin with.
+
+    Whoever compiles them gives THREADS; for another compiler than CUDA's also ON_HOST, and WARP, SYNC, STAGE, KERNEL,
+    SCENE and T.
+    """
+    return PRELUDE.format(real="double" if dtype == torch.float64 else "float")
+
+
 class Source:
     """The text, with what it reads.
 
     Attributes:
-        text: of one precision. Whoever compiles it gives THREADS; for another compiler than CUDA's also ON_HOST, and
-            WARP, SYNC, STAGE, KERNEL, SCENE and T.
+        text: of one precision, see ``prelude``.
         data: constants, one after the other.
         shared: numbers that the threads of a block share, times (1 + warps).
     """
 
-    def __init__(self, written: Sequence[tuple[str, tuple]], real: str) -> None:
+    def __init__(self, written: Sequence[tuple[str, tuple]], dtype: torch.dtype) -> None:
         self.of: Listing = listing(written)
         self.shared = 1
         self._tables = [np.asarray(t, np.int32).ravel() for t in self.of.tables]
@@ -88,7 +97,7 @@ class Source:
         self.lasting = self._lasting()
         self.active = self._with_derivatives()
         stages = [line for k in range(len(self.of.stages)) for line in self._stage(k)]
-        body = [PRELUDE.format(real=real), *self._here(), *stages, *self._values(), *self._adjoint()]
+        body = [prelude(dtype), *self._here(), *stages, *self._values(), *self._adjoint()]
         self.text = "\n".join(body) + "\n"
 
     # -- memory -------------------------------------------------------------------------------------------------------
