@@ -64,10 +64,10 @@ class Cloth(nn.Module):
         transfer: "mesh": elastic forces act on the vertices, the grid carries contact only. "apic": the usual material
             point method, everything through the grid, for comparison; one contact point per triangle, no play, no
             collision damping, no added mass; wrenches leave out what the grid takes up, some per cent of the weight.
-        engine: what computes the substeps. "auto": the fused engine (C++, on the CPU, in float32 or float64) where it
-            knows the parts, else the torch reference; ``print`` of the cloth tells which and why. "fused": an error
-            where it cannot. "reference": always torch. On CUDA "auto" captures the reference's substeps as graphs,
-            "reference" launches them one by one. The attribute of the same name may be set at any time.
+        engine: what computes the substeps. "auto": the fused engine (C++, CUDA C++; in float32 or float64) where it
+            knows the parts, else the torch reference, on CUDA in graphs; ``print`` of the cloth tells which and why.
+            "fused": an error where it cannot. "reference": always torch, on CUDA launched one by one. The attribute of
+            the same name may be set at any time.
 
     Raises:
         InvalidInput: a part that does not fit.

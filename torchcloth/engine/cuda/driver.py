@@ -101,7 +101,8 @@ def _compile(text: str, options: Sequence[str]) -> bytes:
 def status() -> str:
     """Whether programs can be compiled for a device, in a line; compiles nothing."""
     try:
-        _compiler(), _driver()
+        _compiler()
+        _driver()
     except Unbuilt as miss:
         return f"not available, graphs of the torch reference serve: {miss}; {miss.remedy}"
     return "programs are compiled at first use"
