@@ -352,8 +352,8 @@ class Cloth(nn.Module):
         if MATERIAL in state.memory:
             frames, counts, asked = divided(frames, counts)
             step_for = self._step_for(model, dt)
-        units = Graphs(model, sum(counts)) if choice.captured else choice.apart
-        plan = Plan(model, motion, frames, counts, state, choice, longest, step_for, asked, units)
+        graphs = Graphs(model, sum(counts)) if choice.captured else None
+        plan = Plan(model, motion, frames, counts, state, choice, longest, step_for, asked, graphs)
         plan.check(state)
         return plan
 

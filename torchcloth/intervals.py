@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial, reduce
 from itertools import pairwise
 from math import ceil
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torch.utils.checkpoint import checkpoint as recompute
 
 from . import functional
 from .boundaries import Drive, drive
-from .captured import unit_of
+from .captured import Graphs, unit_of
 from .dynamics import Impulses, added
 from .engine.choice import Choice
 from .engine.fused import Fused, recomputes, transformed
@@ -40,26 +40,11 @@ def divided(frames: Sequence[float], counts: Sequence[int]) -> tuple[list[float]
     return times, pieces, tuple(given)
 
 
-class Units(Protocol):
-    """What runs some substeps at a time in the place of the reference, where it can."""
-
-    @property
-    def able(self) -> bool:
-        """Whether it is worth asking."""
-        ...
-
-    def stretch(
-        self, state: ClothState, lost: Tensor | None, dt: float, drives: Mapping[str, Drive], substeps: int, first: int
-    ) -> tuple[ClothState, Tensor | None, Impulses] | None:
-        """As ``functional.stretch``; None where it cannot."""
-        ...
-
-
 class Interval(NamedTuple):
     """The time between two frames, in ``count`` equal substeps.
 
     ``fused``: the engine that runs them, or None. ``moves``: ``motion`` on the substeps, where it is there already.
-    ``units``: what may run some of the reference's substeps faster.
+    ``graphs``: of the reference's substeps, where they are captured.
     """
 
     model: functional.Model
@@ -69,7 +54,7 @@ class Interval(NamedTuple):
     count: int
     fused: Fused | None = None
     moves: Mapping[str, Drive] | None = None
-    units: Units | None = None
+    graphs: Graphs | None = None
 
     @property
     def dt(self) -> float:
@@ -110,7 +95,7 @@ class Plan(NamedTuple):
     longest: float  # m, extent that the contact grid has room for
     step_for: Callable[[ClothState], float] | None = None  # [s], longest from a state on; None: it does not matter
     asked: tuple[int, ...] | None = None  # frames that were asked for; None: all
-    units: Units | None = None
+    graphs: Graphs | None = None  # of the reference's substeps; None: they are launched one by one
 
     def intervals(self, now: Callable[[], ClothState]) -> Iterator[Interval]:
         """One after the other; ``now``: the state at the start of the next."""
@@ -161,7 +146,7 @@ class Plan(NamedTuple):
     def _bare(self) -> list[Interval]:
         """Without drives."""
         return [
-            Interval(self.model, self.motion, start, end, count, self.choice.fused, None, self.units)
+            Interval(self.model, self.motion, start, end, count, self.choice.fused, None, self.graphs)
             for (start, end), count in zip(pairwise(self.frames), self.counts, strict=True)
         ]
 
@@ -254,11 +239,11 @@ def _by_reference(
     model = interval.model
     if store:
         model = as_it_is(model)
-    units = None if transformed() else interval.units
-    chunk = unit_of(interval.count) if units is not None and units.able else CHUNK
+    graphs = None if transformed() else interval.graphs
+    chunk = unit_of(interval.count) if graphs is not None and graphs.able else CHUNK
     for first in range(0, interval.count, chunk):
         of = {"dt": interval.dt, "drives": drives, "substeps": min(chunk, interval.count - first), "first": first}
-        found = None if units is None else units.stretch(state, lost, **of)
+        found = None if graphs is None else graphs.stretch(state, lost, **of)
         if found is None:
             run = partial(functional.stretch, model, **of)
             found = recompute(run, state, lost, use_reentrant=False) if store else run(state, lost)

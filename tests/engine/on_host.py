@@ -24,7 +24,7 @@ HOST = """
 #include <mutex>
 #include <thread>
 #include <vector>
-using std::atan2, std::exp, std::expm1, std::sqrt;
+using std::atan2, std::exp, std::expm1, std::floor, std::sqrt;
 #define ON_HOST
 #define WARP 1
 #define THREADS {threads}
@@ -35,6 +35,15 @@ static double shared_memory[1 << 16];
 #define SYNC() next_one()
 #define STAGE static
 #define KERNEL extern "C" void
+#define FIXED static const
+#define ATOMIC_ADD added_to
+#define ATOMIC_CAS exchanged
+static int added_to(int* at, int more) {{ const int before = *at; *at += more; return before; }}
+static unsigned long long exchanged(unsigned long long* at, unsigned long long wanted, unsigned long long other) {{
+    const unsigned long long before = *at;
+    if (before == wanted) *at = other;
+    return before;
+}}
 
 // One thread runs at a time, in order or the other way round, each until all have to wait.
 static const bool reversed = {reversed};
@@ -56,7 +65,7 @@ static void next_one() {{
     end(), begin(round + 1);
 }}
 """
-EACH = """
+LAUNCH = """
 template <class F>
 static void each(int blocks, F work) {
     for (int block = 0; block < blocks; block++) {
@@ -68,19 +77,13 @@ static void each(int blocks, F work) {
         for (auto& other : others) other.join();
     }
 }
-"""
-PROGRAM = """
-extern "C" void launch_values(int blocks, Port* p, R* d, int* t, R* w, R* far, Count* ends, int substeps, int frames) {
-    each(blocks, [&] { values(p, d, t, w, far, ends, substeps, frames); });
+extern "C" void launch_values(int blocks, Port* p, R* d, int* t, R* w, unsigned char* masks, int* grids, Count* ends,
+                              int substeps, int frames) {
+    each(blocks, [&] { values(p, d, t, w, masks, grids, ends, substeps, frames); });
 }
-extern "C" void launch_adjoint(int blocks, Port* p, R* d, int* t, R* w, int substeps, int first, int all) {
-    each(blocks, [&] { adjoint(p, d, t, w, substeps, first, all); });
-}
-"""
-NEAR = """
-extern "C" void launch_near(int blocks, R* x, int* corners, unsigned char* apart, R* centres, int* found, int vertices,
-                            int triangles, double reach) {
-    each(blocks, [&] { near(x, corners, apart, centres, found, vertices, triangles, reach); });
+extern "C" void launch_adjoint(int blocks, Port* p, R* d, int* t, R* w, unsigned char* masks, int* grids, int substeps,
+                               int first, int all) {
+    each(blocks, [&] { adjoint(p, d, t, w, masks, grids, substeps, first, all); });
 }
 """
 FLAGS = ["-std=c++20", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-pthread", "-w"]
@@ -91,12 +94,7 @@ class Host:
 
     def __init__(self, text, threads, reverse):
         self.threads = threads
-        text = (
-            HOST.format(threads=threads, reversed=str(reverse).lower())
-            + text
-            + EACH
-            + (NEAR if "KERNEL near" in text else PROGRAM)
-        )
+        text = HOST.format(threads=threads, reversed=str(reverse).lower()) + text + LAUNCH
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "program.cpp"
             file.write_text(text)
@@ -126,8 +124,7 @@ def agrees(cloth, motion, state, substeps=12, dt=1e-4, stages=0, marks=(1e-11, 1
 
     Compilers take a while: only where there is a kernel that was not looked at yet, unless ``again``.
     """
-    model = cloth.model()._replace(stages=stages, grid=None)
-    state = state._replace(memory={key: t for key, t in state.memory.items() if key != "contact"})
+    model = cloth.model()._replace(stages=stages)
     drives = {name: drive(t, torch.arange(substeps + 1, dtype=torch.float64) * dt) for name, t in motion.items()}
     fused = Fused(model, state, drives)
     used = {str(given[0]) if name == "call" else name for name, given in fused.low.program.written}
@@ -137,6 +134,8 @@ def agrees(cloth, motion, state, substeps=12, dt=1e-4, stages=0, marks=(1e-11, 1
     job = fused.job(state, torch.full((substeps,), dt, dtype=torch.float64), drives)
     job = job._replace(inputs={f: t.detach().contiguous() for f, t in job.inputs.items()})
     ends = (substeps // 3, substeps)
+    if model.grid is not None:
+        ends = (substeps,)  # what goes on in contact is no frame
     known, _ = running.forward(job._replace(ends=ends))
     generator = torch.Generator().manual_seed(0)
     seeds = {f: torch.randn(job.scenes, f.rows, f.comps, generator=generator, dtype=job.like.dtype) for f in known}
@@ -144,8 +143,8 @@ def agrees(cloth, motion, state, substeps=12, dt=1e-4, stages=0, marks=(1e-11, 1
     device = "cuda" if torch.cuda.is_available() else "cpu"
     with stand_in(threads) if device == "cpu" else nullcontext():
         there = job._replace(inputs={f: t.to(device) for f, t in job.inputs.items()})
-        found, _ = runs.forward(there._replace(ends=ends))
-        after = runs.reverse(there, {f: t.to(device) for f, t in seeds.items()}, set(job.inputs))
+        found, masks = runs.forward(there._replace(ends=ends))
+        after = runs.reverse(there, masks, {f: t.to(device) for f, t in seeds.items()}, set(job.inputs))
     for one, other, mark in ((known, found, marks[0]), (before, after, marks[1])):
         for f, t in one.items():
             torch.testing.assert_close(other[f].cpu(), t, rtol=0, atol=mark * float(t.abs().max()) + 1e-300, msg=str(f))

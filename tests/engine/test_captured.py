@@ -64,7 +64,7 @@ def outcome(made, capture: captured.Capture | None = None):
     x = state.x.clone().requires_grad_()
     plan = cloth.plan(state._replace(x=x), motion, FRAMES, None)
     graphs = None if capture is None else Graphs(plan.model, sum(plan.counts), capture)
-    out = run(plan._replace(units=graphs), checkpoint=True)
+    out = run(plan._replace(graphs=graphs), checkpoint=True)
     weight = torch.randn(out.x.shape, generator=torch.Generator().manual_seed(1), dtype=out.x.dtype)
     ((weight * out.x).sum() + out.wrench["hand"].square().sum()).backward()
     named = {"x": x, "pose": motion["hand"].pose, **dict(cloth.named_parameters())}
@@ -100,7 +100,7 @@ def test_without_gradients_nothing_is_kept():
     with torch.no_grad():
         plan = cloth.plan(state, motion, FRAMES, None)
         graphs = Graphs(plan.model, sum(plan.counts), again)
-        usual, other = run(plan, True), run(plan._replace(units=graphs), True)
+        usual, other = run(plan, True), run(plan._replace(graphs=graphs), True)
     torch.testing.assert_close(other.x, usual.x, rtol=1e-12, atol=1e-13)
     assert all(unit.backward is None for unit in graphs._units.values())
     assert graphs._units
@@ -128,7 +128,7 @@ def test_layers_that_meet_are_not_captured(monkeypatch):
     plan = cloth.plan(cloth.state(folded), motion, FRAMES[:2], None)
     graphs = Graphs(plan.model, sum(plan.counts), again)
     with torch.no_grad():
-        run(plan._replace(units=graphs), True)
+        run(plan._replace(graphs=graphs), True)
     assert not graphs._units
     usual = outcome(scene())
     monkeypatch.setattr(captured.Graphs, "reach", property(lambda self: 1e-9))
@@ -189,7 +189,7 @@ def test_gradients_of_gradients_are_refused():
     cloth, state, motion = scene()
     x = state.x.clone().requires_grad_()
     plan = cloth.plan(state._replace(x=x), motion, FRAMES, None)
-    out = run(plan._replace(units=Graphs(plan.model, sum(plan.counts), again)), checkpoint=True)
+    out = run(plan._replace(graphs=Graphs(plan.model, sum(plan.counts), again)), checkpoint=True)
     with pytest.raises(InvalidInput, match=r'create_graph=True; expected one; .*engine="reference"'):
         torch.autograd.grad(out.x.square().sum(), x, create_graph=True)
 
@@ -204,7 +204,7 @@ def test_a_callers_checkpoint_is_not_captured():
             times.append(capture)
             plan = cloth.plan(state._replace(x=x), motion, FRAMES, None)
             graphs = None if capture is None else Graphs(plan.model, sum(plan.counts), capture)
-            return run(plan._replace(units=graphs), checkpoint=True).x
+            return run(plan._replace(graphs=graphs), checkpoint=True).x
 
         x = state.x.clone().requires_grad_()
         checkpoint(work, x, use_reentrant=False).square().sum().backward()
@@ -235,7 +235,7 @@ def test_a_backward_pass_comes_long_after():
     for capture in (None, again):
         cloth.zero_grad()
         plan = cloth.plan(state, motion, FRAMES, None)
-        plan = plan._replace(units=None if capture is None else Graphs(plan.model, sum(plan.counts), capture))
+        plan = plan._replace(graphs=None if capture is None else Graphs(plan.model, sum(plan.counts), capture))
         first = run(plan, True)
         faster = plan._replace(state=plan.state._replace(v=plan.state.v + 0.1))
         second = run(faster, True)

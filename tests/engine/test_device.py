@@ -1,6 +1,6 @@
 """Programs as CUDA C++, by a stand-in that runs anywhere; ``agreement.agree`` looks at every kernel."""
 
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from unittest.mock import patch
 
 import on_host
@@ -11,12 +11,11 @@ from clothes import opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.boundaries.motion import drive
-from torchcloth.engine import apart, devices, running
+from torchcloth.engine import devices
 from torchcloth.engine.building import Unbuilt
-from torchcloth.engine.cuda import arithmetic, layers, runs
+from torchcloth.engine.cuda import arithmetic, listing, runs
 from torchcloth.engine.fused import Fused
 from torchcloth.engine.library import kernels
-from torchcloth.self_contact import near_layers
 
 TIMES = [0.0, 0.01, 0.02]
 
@@ -28,8 +27,8 @@ def elsewhere(**how):
         yield
 
 
-def job_of(cloth, scenes=(2,), substeps=12):
-    state, dt = moving(cloth, scenes), 1e-4
+def job_of(cloth, scenes=(2,), substeps=12, state=None):
+    state, dt = moving(cloth, scenes) if state is None else state, 1e-4
     times = torch.arange(substeps + 1, dtype=torch.float64) * dt
     drives = {name: drive(t, times) for name, t in opening(float(times[-1])).items()}
     job = Fused(cloth.model(), state, drives).job(state, torch.full((substeps,), dt), drives)
@@ -42,15 +41,18 @@ def adjoints(job):
         f: torch.randn(job.scenes, f.rows, f.comps, generator=generator, dtype=job.like.dtype)
         for f in job.program.outputs
     }
-    return runs.reverse(job, seeds, set(job.inputs))
+    return runs.reverse(job, runs.forward(job)[1], seeds, set(job.inputs))
 
 
-def test_order_of_threads_between_waits_does_not_matter():
+@pytest.mark.parametrize("meets", [False, True])
+def test_order_of_threads_between_waits_does_not_matter(meets):
     """Bit by bit: nobody reads what another thread of a block writes before both have waited."""
-    job, found = job_of(sheet()), []
+    cloth = sheet(contact=tc.Contact(), n=9) if meets else sheet()
+    job, found = job_of(cloth, state=folded(cloth) if meets else None), []
     for reverse in (False, True):
         with on_host.stand_in(4, reverse):
             found.append((runs.forward(job)[0], adjoints(job)))
+            assert bool(runs.forward(job)[1][:, :-1].any()) == meets, "layers that meet"
     for one, other in zip(*found, strict=True):
         assert all(torch.equal(t, other[f]) for f, t in one.items())
 
@@ -63,16 +65,6 @@ def test_adjoints_do_not_depend_on_how_many_substeps_are_kept():
             other = adjoints(job)
     for f, t in usual.items():
         torch.testing.assert_close(other[f], t, rtol=0, atol=1e-12 * float(t.abs().max()))
-
-
-def test_how_far_a_vertex_came_is_told():
-    job = job_of(sheet())
-    known = torch.stack(
-        [running.forward(job._replace(ends=(k, 12)))[0][job.program.outputs[0]][:, 0] for k in range(1, 12)]
-    )
-    with on_host.stand_in():
-        _, way = runs.forward(job)
-    torch.testing.assert_close(way[:, 0], (known - job.inputs[job.program.inputs[0]]).abs().amax((0, 2, 3)))
 
 
 def simulated(cloth, times=TIMES):
@@ -94,19 +86,23 @@ def test_the_layer(contact, dtype, mark):
     cloth = sheet(contact=contact).to(dtype)
     known, before = simulated(cloth)
     with elsewhere():
-        assert cloth.engine_in_use == ("fused" if contact is None else "fused; reference where layers of cloth meet")
+        assert cloth.engine_in_use == "fused"
         out, after = simulated(cloth)
         with torch.no_grad():
             plain = cloth(start(cloth, (2,)), opening(TIMES[-1]), TIMES)
     for one, other in ((known.x, out.x), (known.x, plain.x), (known.wrench["left"], out.wrench["left"])):
         torch.testing.assert_close(other, one, rtol=0, atol=mark * float(one.detach().abs().max()))
     torch.testing.assert_close(out.state.d3, known.state.d3, rtol=0, atol=mark)
-    assert set(before) >= set(after)
+    assert set(before) == set(after)
     for name, t in before.items():
-        if name not in after:  # of contact, which nobody asked for
-            assert float(t.abs().max()) == 0, name
-            continue
         torch.testing.assert_close(after[name], t, rtol=0, atol=10 * mark * float(t.abs().max()), msg=name)
+
+
+def down():
+    """A hand that comes down by 20 mm."""
+    pose = torch.eye(4).repeat(3, 1, 1)
+    pose[:, 2, 3] = torch.tensor([0.0, -0.01, -0.02])
+    return tc.Trajectory(torch.linspace(0.0, TIMES[-1], 3), pose, torch.ones(3, dtype=torch.bool))
 
 
 def folded(cloth):
@@ -117,43 +113,31 @@ def folded(cloth):
     return cloth.state(x)
 
 
-def test_layers_that_meet_are_the_references():
-    cloth = sheet(contact=tc.Contact(), n=11, boundaries={})
-    with torch.no_grad():
-        known = cloth(folded(cloth), times=TIMES[:2])
-        with elsewhere(), patch.object(Fused, "measured", side_effect=AssertionError):
-            out = cloth(folded(cloth), times=TIMES[:2])
-    torch.testing.assert_close(out.x, known.x, rtol=1e-6, atol=1e-9)
+def test_layers_that_meet():
+    """Folded, and pressed by a hand; values and gradients through the cloth."""
+    cloth = sheet(contact=tc.Contact(), n=9, boundaries={"hand": tc.boundaries.Sphere(0.05, (0.0, 0.1, 0.07), moving=True)})
+    found = []
+    for where in (nullcontext(), elsewhere()):
+        with where:
+            state = folded(cloth)
+            x = state.x.clone().requires_grad_()
+            cloth.zero_grad()
+            out = cloth(state._replace(x=x), {"hand": down()}, TIMES)
+            (out.x[-1, :, 2].sum() + out.state.d3[:, 2].sum()).backward()
+        named = {name: p.grad for name, p in cloth.named_parameters() if p.grad is not None}
+        found.append({"end": out.x[-1].detach(), "d3": out.state.d3.detach(), "x": x.grad} | named)
+    known, there = found
+    assert float(known["material.contact_stiffness.raw"].abs()) > 0
+    assert set(there) == set(known)
+    for name, t in known.items():
+        torch.testing.assert_close(there[name], t, rtol=0, atol=1e-7 * float(t.abs().max()), msg=name)
 
 
-def test_near_layers_are_found():
-    """Scene by scene; the same as the reference finds."""
-    cloth = sheet(contact=tc.Contact(), n=11, boundaries={})
-    model, grid = cloth.model(), cloth.grid()
-    flat, over = cloth.rest_state().x, folded(cloth).x
-    up = torch.tensor([0.0, 0.0, 1.0])
-    lifted = [over + height * (over[:, :1] < 0.1) * up for height in (0.0, -0.02, -0.05, -0.2)]
-    with on_host.stand_in(threads=3):
-        search = layers.LayerSearch(model, grid)
-        for x in (flat, *lifted, torch.stack([flat, flat]), torch.stack([flat, over])):
-            assert search.any_near(x) == bool(len(near_layers(model, grid, x).active))
-        assert [search.any_near(x) for x in (flat, over)] == [False, True]
-        assert layers.LayerSearch(model, grid._replace(apart=None)).any_near(flat), "not known"
-
-
-@pytest.mark.parametrize("faster", [1e-9, 1e3])
-def test_what_moves_farther_than_was_looked_at_goes_in_smaller_pieces(faster, monkeypatch):
-    cloth = sheet(contact=tc.Contact())
-    state = start(cloth)._replace(v=torch.full_like(start(cloth).v, 20.0))
-    known = cloth(state, opening(TIMES[-1]), TIMES)
-    monkeypatch.setattr(apart, "FASTER", faster)
-    asked = []
-    usual = Fused.measured
-    monkeypatch.setattr(Fused, "measured", lambda self, *how: (asked.append(how[4]), usual(self, *how))[1])
-    with elsewhere():
-        out = cloth(state, opening(TIMES[-1]), TIMES)
-    torch.testing.assert_close(out.x, known.x, rtol=0, atol=1e-9)
-    assert min(asked) < max(asked) if faster < 1 else set(asked) == {1}
+def test_too_many_nodes_are_an_error():
+    cloth = sheet(contact=tc.Contact(), n=9, boundaries={})
+    small = property(lambda self: 16)
+    with elsewhere(), patch.object(listing.Layers, "room", small), pytest.raises(tc.errors.InvalidInput, match="nodes"):
+        cloth(folded(cloth), times=TIMES)
 
 
 def test_what_it_cannot_do_is_said():

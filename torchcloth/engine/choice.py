@@ -14,7 +14,6 @@ from ..errors import InvalidInput
 from ..model import Model
 from ..types import ClothState
 from . import devices
-from .apart import Apart
 from .fused import Fused, transformed
 from .library import Unbuilt, library
 from .lowering import Unfused
@@ -28,11 +27,8 @@ class Choice(NamedTuple):
     fused: Fused | None
     reason: str
     captured: bool = False  # substeps of the reference, as CUDA graphs
-    apart: Apart | None = None  # the fused engine, while no layers meet
 
     def __str__(self) -> str:
-        if self.apart is not None:
-            return "fused; reference where layers of cloth meet"
         if self.fused is None:
             return f"reference{', in CUDA graphs' if self.captured else ''} ({self.reason})"
         parts = () if self.fused.torch_parts is None else sorted(self.fused.torch_parts.parts)
@@ -90,21 +86,16 @@ class _Elsewhere(Exception):
 
 
 def _on_device(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Choice:
-    """On CUDA; directors and parts in torch are the reference's."""
+    """On CUDA; parts in torch are the reference's, as are tangents."""
     if transformed():
         raise _Elsewhere("tangents on cuda")
     _check_dtype(state)
     library()  # it knows the kernels
-    if model.grid is not None:
-        apart = Apart(model, model.grid, state, drives)
-        fused, found = apart.fused, Choice(None, "", apart=apart)
-    else:
-        fused = Fused(model, state, drives)
-        found = Choice(fused, "")
+    fused = Fused(model, state, drives)
     if fused.torch_parts is not None:
         raise _Elsewhere(f"{', '.join(sorted(fused.torch_parts.parts))} in torch, on cuda")
     devices.prepare(fused.low.program, state.x.device)
-    return found
+    return Choice(fused, "")
 
 
 def _fused(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Fused:

@@ -22,8 +22,8 @@ def elsewhere(tensor: Tensor) -> bool:
 def forward(job: Job, every: int = 0) -> tuple[dict[Field, Tensor], Tensor]:
     """(nexts and sums [scenes, (frames,) rows, comps], records).
 
-    ``every``: see ``running.forward``. On a device there are no records; in their place stands [scenes, 1] m, how far a
-    vertex was from where it began, before the last substep.
+    ``every``: see ``running.forward``. On a device, which goes through all substeps again, records are which triangles
+    met others.
     """
     return runs.forward(job) if elsewhere(job.like) else running.forward(job, every)
 
@@ -36,16 +36,19 @@ def reverse(
     ``every``: 0: without records.
     """
     if elsewhere(job.like):
-        return runs.reverse(job, seeds, wanted)
+        return runs.reverse(job, records, seeds, wanted)
     if every == 0:
         every = running.spacing(job)
         records = running.forward(job, every)[1]
     return running.reverse(job, records.contiguous(), every, seeds, wanted)
 
 
-def record_size(program: Program, substeps: int, every: int, like: Tensor) -> int:
-    """Numbers that ``forward`` gives of a scene besides results."""
-    return 1 if elsewhere(like) else running.record_size(program, substeps, every)
+def records_like(program: Program, scenes: int, substeps: int, every: int, like: Tensor) -> Tensor:
+    """The shape and precision of what ``forward`` gives besides results, without numbers."""
+    if elsewhere(like):
+        size = runs.mask_size(runs.on_device(program, like.device).source, substeps)
+        return like.new_empty(scenes, size, dtype=torch.uint8)
+    return like.new_empty(scenes, running.record_size(program, substeps, every))
 
 
 def prepare(program: Program, device: torch.device) -> None:

@@ -64,10 +64,10 @@ class Fused:
         checkpoint: bool = True,
     ) -> tuple[ClothState, Tensor | None, Impulses]:
         """As ``functional.stretch``."""
-        if self.torch_parts is None:
-            return self.measured(state, lost, dt, drives, substeps, first, checkpoint)[0]
         steps = torch.full((first + substeps,), dt, dtype=torch.float64)
         fixed, moves = self.coefficients(_batch(state)), self.moves(state, drives, steps)
+        if self.torch_parts is None:
+            return self._call(state, lost, fixed | _cut(moves, first, first + substeps), substeps, checkpoint)
         total: Impulses = {}
         again = checkpoint and recomputes()
         parts = self.torch_parts.as_they_are() if again else self.torch_parts
@@ -78,21 +78,6 @@ class Fused:
             state, lost, impulses = recompute(run, state, lost, use_reentrant=False) if again else run(state, lost)
             total = added(total, impulses)
         return state, lost, total
-
-    def measured(
-        self,
-        state: ClothState,
-        lost: Tensor | None,
-        dt: float,
-        drives: Mapping[str, Drive],
-        substeps: int,
-        first: int = 0,
-        checkpoint: bool = True,
-    ) -> tuple[tuple[ClothState, Tensor | None, Impulses], Tensor]:
-        """The same without parts in torch, with what ``devices.forward`` gives besides results."""
-        steps = torch.full((first + substeps,), dt, dtype=torch.float64)
-        others = self.coefficients(_batch(state)) | _cut(self.moves(state, drives, steps), first, first + substeps)
-        return self._call(state, lost, others, substeps, checkpoint)
 
     def frames(
         self,
@@ -163,8 +148,7 @@ class Fused:
         total: Impulses = {}
         for k in substeps:
             force, memory = parts.force(state, lost, dt)
-            found, _ = self._call(state, lost, fixed | _cut(moves, k, k + 1), 1, False, force)
-            state, lost, impulses = found
+            state, lost, impulses = self._call(state, lost, fixed | _cut(moves, k, k + 1), 1, False, force)
             state = state._replace(memory=state.memory | memory)
             total = added(total, impulses)
         return state, lost, total
@@ -177,7 +161,7 @@ class Fused:
         substeps: int,
         checkpoint: bool,
         force: Tensor | None = None,
-    ) -> tuple[tuple[ClothState, Tensor | None, Impulses], Tensor]:
+    ) -> tuple[ClothState, Tensor | None, Impulses]:
         low, program, batch = self.low, self.low.program, _batch(state)
         begin = conversion.state_inputs(low, state, lost)
         if low.torch_force is not None and force is not None:
@@ -186,11 +170,10 @@ class Fused:
         inputs = [by_field[field] for field in program.inputs]
         if _are_numbers(inputs):
             job = Job(program, dict(zip(program.inputs, inputs, strict=True)), batch.numel(), substeps)
-            results, records = devices.forward(job)
-            return conversion.outcome(low, state, results, batch), records
+            return conversion.outcome(low, state, devices.forward(job)[0], batch)
         every = self._every(batch.numel(), substeps, checkpoint) if _needs_gradient(inputs) else 0
-        *results, records = Rollout.apply(program.number, substeps, every, *inputs)  # type: ignore[misc]
-        return conversion.outcome(low, state, dict(zip(program.outputs, results, strict=True)), batch), records
+        *results, _ = Rollout.apply(program.number, substeps, every, *inputs)  # type: ignore[misc]
+        return conversion.outcome(low, state, dict(zip(program.outputs, results, strict=True)), batch)
 
     def _every(self, scenes: int, substeps: int, checkpoint: bool) -> int:
         """Substeps between records: all while the budget lasts; 0: the adjoint makes its own when it comes here."""

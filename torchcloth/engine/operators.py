@@ -62,7 +62,7 @@ def _values(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -
 def _(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -> list[Tensor]:
     known, scenes = program_of(program), _scenes(inputs)
     results = [inputs[0].new_empty(scenes, f.rows, f.comps) for f in known.outputs]
-    return [*results, inputs[0].new_empty(scenes, devices.record_size(known, substeps, every, inputs[0]))]
+    return [*results, devices.records_like(known, scenes, substeps, every, inputs[0])]
 
 
 @_mapped("torchcloth::rollout")

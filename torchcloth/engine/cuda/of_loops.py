@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from ..fields import Kind
-from ..loops import ADD, LOAD, OWN, PUT, SHARED
+from ..loops import ADD, COLLECT, LOAD, OWN, PUT, SHARED, SHARES, SPREAD, VARYING, By
 from .arithmetic import kernel
-from .listing import Call, Lookup, Loop, Move
+from .listing import CORNERS, Call, Lookup, Loop, Move, Transfer
+from .of_layers import ROW
 
 if TYPE_CHECKING:
     from .source import Source
@@ -19,6 +20,7 @@ class OfLoop:
 
     def __init__(self, source: Source, stage: Loop, begins: set[int]) -> None:
         self._source, self._stage, self._begins, self._fields = source, stage, begins, source.of.fields
+        self._rows: dict[int, int] = {}  # where in scratch those of points begin, forward (ADD) and back (LOAD)
 
     def forward(self) -> Iterator[str]:
         """Values."""
@@ -28,8 +30,11 @@ class OfLoop:
         yield from self._pointers("f")
         if sums:
             yield f"R {', '.join(f'{name} = R(0)' for name in shared.values())};"
-        yield from self._items()
+        yield from self._items(list(scratch.items()))
         for n, i in enumerate(self._stage.code):
+            if isinstance(i, Transfer) and i.code == SPREAD:
+                yield from self._given(i, [f"r{i.share + k}" for k in range(SHARES)], ADD)
+                continue
             if not isinstance(i, Move):
                 yield from self._computed(n, i)
                 continue
@@ -53,6 +58,9 @@ class OfLoop:
         for field, moves in self._by_field(scratch).items():
             begins = "=" if field in self._begins and self._source.fills(self._stage, field) else "+="
             yield from self._gathered(f"f{field}", moves, scratch, begins)
+        for i in self._stage.transfers(SPREAD):
+            begins = str(i.field in self._begins).lower()
+            yield f"gather(h.nodes, {_arms(i)}, scratch + {self._rows[ADD]}, h.f{i.field}, {begins});"
         if shared:
             yield from self._reduced([(f"h.f{field}[{c}]", name) for (field, c), name in shared.items()])
 
@@ -67,8 +75,10 @@ class OfLoop:
         yield from self._pointers("g")
         if shared:
             yield f"R {', '.join(f'{name} = R(0)' for name in shared.values())};"
-        yield from self._items()
+        yield from self._items(list(scratch.items()))
         for n, i in enumerate(self._stage.code):
+            if isinstance(i, Transfer) and i.code == SPREAD:
+                continue
             if not isinstance(i, Move):
                 yield from self._computed(n, i)
             elif i.code == LOAD:
@@ -84,6 +94,8 @@ class OfLoop:
                 seeds = [f"b{reg if reg >= 0 else ~reg}" for reg in i.outputs]
                 inputs = [f"b{reg}" for reg in i.inputs]
                 yield from (f"    {line}" for line in kernel(i.kernel).adjoints(f"n{n}_", seeds, inputs))
+            elif isinstance(i, Transfer):
+                yield from self._transferred_back(n, i)
             else:
                 for k in range(3):
                     yield f"    b{i.place + k} += b{i.out + k};"
@@ -91,6 +103,8 @@ class OfLoop:
         yield "SYNC();"
         for field, moves in self._by_field(scratch).items():
             yield from self._if_wanted(field, self._gathered(f"g{field}", moves, scratch, "+="))
+        for i in self._stage.transfers(COLLECT):
+            yield f"gather(h.nodes, {_arms(i)}, scratch + {self._rows[LOAD]}, h.g{i.field}, false);"
         for field in {field: None for field, _ in shared}:
             own = [(c, name) for (f, c), name in shared.items() if f == field]
             if self._fields[field].kind == Kind.PARAMETER:  # until the end
@@ -107,7 +121,9 @@ class OfLoop:
         return move.field in self._source.active
 
     def _pointers(self, letter: str) -> Iterator[str]:
-        """In registers."""
+        """In registers; not where contact has nothing to do."""
+        if letter == "f" and self._stage.counted >= 0:
+            yield f"if (!{('h.some', 'h.woken', '(h.step == h.all - 1)')[self._stage.counted]}) return;"
         read = {i.field for i in self._stage.code if not isinstance(i, Call)}
         for field in sorted(read):
             if letter == "f" or field in self._source.active:
@@ -115,19 +131,74 @@ class OfLoop:
         if letter == "f":
             yield "R* const scratch = h.scratch;"
 
-    def _items(self) -> Iterator[str]:
+    def _items(self, scratch: list[tuple[Move, int]]) -> Iterator[str]:
+        """Their loop begins; of those that contact leaves out, nothing lies in ``scratch``."""
         yield f"for (int i = T; i < {self._stage.items}; i += THREADS) {{"
+        if self._stage.counted >= 0:
+            takes = ("h.mask[t]", "h.mask[t] && !h.before[t]", "!h.mask[t]")[self._stage.counted]
+            yield "    const int t = i / EACH;"
+            yield f"    if (!({takes})) {{"
+            for m, at in scratch:
+                yield "        " + " ".join(
+                    f"scratch[{at + c * self._stage.items} + i] = R(0);" for c in range(self._comps(m))
+                )
+            yield "        continue;"
+            yield "    }"
+            for k in range(CORNERS):
+                yield f"    const int v{k} = h.tables[{self._source.corner(k)} + t];"
+            yield "    const int s = i % EACH;"
         for table in sorted({m.table for m in self._stage.moves(LOAD, ADD, PUT) if m.table >= 0}):
             yield f"    const int w{table} = h.tables[{self._source.table(table)} + i];"
 
     def _place(self, move: Move, c: int) -> str:
         if move.table == SHARED:
             return str(c)
-        return f"{'i' if move.table == OWN else f'w{move.table}'} * {self._comps(move)} + {c}"
+        if move.table <= VARYING:
+            row = ("v0", "v1", "v2", "t", "i", "s")[self._stage.listed(move.table)]
+        else:
+            row = "i" if move.table == OWN else f"w{move.table}"
+        return f"{row} * {self._comps(move)} + {c}"
 
-    def _computed(self, n: int, i: Call | Lookup) -> Iterator[str]:
+    def _computed(self, n: int, i: Call | Lookup | Transfer) -> Iterator[str]:
         """Values of instruction ``n``."""
+        if isinstance(i, Transfer):
+            return self._collected(n, i)
         return self._called(n, i) if isinstance(i, Call) else self._looked_up(n, i)
+
+    def _collected(self, n: int, i: Transfer) -> Iterator[str]:
+        yield f"    R c{n}[{SHARES}];"
+        yield f"    for (int k = 0; k < {SHARES}; k++) c{n}[k] = R(0);"
+        yield f"    const R o{n}[3] = {{{self._offset(i)}}};"
+        yield f"    look(h.nodes, i, {_arms(i)}, o{n}, f{i.field}, c{n}, nullptr, nullptr);"
+        for k in range(SHARES):
+            yield f"    R r{i.share + k} = c{n}[{k}];"
+
+    def _offset(self, i: Transfer) -> str:
+        return ", ".join(f"r{i.offset + d}" for d in range(3))
+
+    def _given(self, i: Transfer, shares: list[str], code: int) -> Iterator[str]:
+        """What a point gives to the nodes, in its row of scratch."""
+        for k, value in enumerate([*shares, *(f"r{i.offset + d}" for d in range(3))]):
+            yield f"    scratch[{self._rows[code]} + {ROW} * i + {k}] = {value};"
+
+    def _transferred_back(self, n: int, i: Transfer) -> Iterator[str]:
+        letter = "r" if i.code == SPREAD else "b"
+        shares = [f"{letter}{i.share + k}" for k in range(SHARES)]
+        yield "    {"
+        yield f"        const R o[3] = {{{self._offset(i)}}}, given[{SHARES}] = {{{', '.join(shares)}}};"
+        yield f"        R c[{SHARES}], turn[3] = {{R(0), R(0), R(0)}};"
+        yield f"        for (int k = 0; k < {SHARES}; k++) c[k] = R(0);"
+        if i.code == SPREAD:
+            yield f"        look(h.nodes, i, {_arms(i)}, o, g{i.field}, c, given, turn);"
+            for k in range(SHARES):
+                yield f"        b{i.share + k} += c[{k}];"
+        else:
+            yield f"        look(h.nodes, i, {_arms(i)}, o, f{i.field}, nullptr, given, turn);"
+        for d in range(3):
+            yield f"        b{i.offset + d} += turn[{d}];"
+        yield "    }"
+        if i.code == COLLECT:
+            yield from self._given(i, shares, LOAD)
 
     def _called(self, n: int, i: Call) -> Iterator[str]:
         found = kernel(i.kernel)
@@ -151,6 +222,8 @@ class OfLoop:
         for i in self._stage.code:
             if isinstance(i, Move):
                 found |= {i.reg + c for c in range(self._comps(i))}
+            elif isinstance(i, Transfer):
+                found |= {i.offset + d for d in range(3)} | {i.share + k for k in range(SHARES)}
             elif isinstance(i, Call):
                 found |= {*i.inputs, *(reg if reg >= 0 else ~reg for reg in i.outputs)}
             else:
@@ -172,6 +245,9 @@ class OfLoop:
             for m in moves:
                 found[m] = size
                 size += self._comps(m) * self._stage.items
+        self._rows[code] = size
+        if self._stage.transfers(SPREAD if code == ADD else COLLECT):
+            size += ROW * self._stage.items
         self._source.need(scratch=size)
         return found
 
@@ -232,3 +308,7 @@ class OfLoop:
                 yield f"    {asked}scratch[{scratch[m] + c * self._stage.items} + i] = {bar};"
             else:
                 yield f"    {asked}{place} += {bar};"
+
+
+def _arms(i: Transfer) -> str:
+    return str(i.by == By.ARMS).lower()

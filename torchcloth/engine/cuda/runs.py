@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
+from ...errors import InvalidInput
 from ..fields import Field, Kind
 from ..program import Program
 from ..running import Job
@@ -56,7 +57,6 @@ def on_device(program: Program, device: torch.device) -> OnDevice:
 
     Raises:
         Unbuilt: it cannot be compiled.
-        Unfused: contact between layers.
     """
     known = _KNOWN.setdefault(program, {})
     if device not in known:
@@ -71,22 +71,39 @@ def kernels(text: str, device: torch.device) -> Device:
 
 
 def forward(job: Job) -> tuple[dict[Field, Tensor], Tensor]:
-    """(nexts and sums [scenes, (frames,) rows, comps], [scenes, 1] m: see ``devices.forward``)."""
+    """(nexts and sums [scenes, (frames,) rows, comps], masks: which triangles met others, substep by substep).
+
+    Raises:
+        InvalidInput: contact has more nodes than there is room for.
+    """
     like = job.like
     there = on_device(job.program, like.device)
     results = {f: like.new_empty(job.scenes, *job.frames, f.rows, f.comps) for f in job.program.outputs}
     work = like.new_zeros(job.scenes * there.source.values_size)
-    far = like.new_empty(job.scenes, there.kernels.threads)
+    masks = like.new_zeros(job.scenes, mask_size(there.source, job.substeps), dtype=torch.uint8)
+    grids = like.new_empty(job.scenes, there.source.grid_size, dtype=torch.int32)
     ends = _there(torch.tensor(job.ends or (job.substeps,)), like.device)
     ports = _ports(job, like.device, results=results)
     counts = ctypes.c_int(job.substeps), ctypes.c_int(len(ends))
-    pointers = ctypes.c_void_p(far.data_ptr()), ctypes.c_void_p(ends.data_ptr())
+    pointers = (ctypes.c_void_p(t.data_ptr()) for t in (masks, grids, ends))
     there.launch("values", ports, work, job.scenes, *pointers, *counts)
-    return results, far.amax(-1, keepdim=True)
+    if masks.numel() and bool(masks[:, -1].any()):
+        raise InvalidInput(
+            "contact grid",
+            got="more nodes than there is room for",
+            expected=f"at most {there.source.room} around the points of a scene",
+            remedy='a wider contact (tc.Contact.with_gap), or engine="reference"',
+        )
+    return results, masks
 
 
-def reverse(job: Job, seeds: Mapping[Field, Tensor], wanted: set[Field]) -> dict[Field, Tensor]:
-    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums."""
+def mask_size(source: Source, substeps: int) -> int:
+    """Bytes of a scene: those of all substeps, and whether there was no room."""
+    return 0 if source.layers is None else substeps * source.mask_size + 1
+
+
+def reverse(job: Job, masks: Tensor, seeds: Mapping[Field, Tensor], wanted: set[Field]) -> dict[Field, Tensor]:
+    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums; ``masks``: of ``forward``."""
     like = job.like
     there = on_device(job.program, like.device)
     states = [f for f in job.program.inputs if f.kind == Kind.STATE]
@@ -98,7 +115,8 @@ def reverse(job: Job, seeds: Mapping[Field, Tensor], wanted: set[Field]) -> dict
     grads = {f: like.new_zeros(job.scenes, *job.inputs[f].shape[1:]) for f in wanted}
     mine = {f: like.new_zeros(job.scenes, f.rows, f.comps) for f in states}  # before the present chunk
     work = like.new_zeros(job.scenes * (there.source.adjoint_size + min(chunk, job.substeps) * there.source.state_size))
-    given = {f: t.contiguous() for f, t in seeds.items()}
+    grids = like.new_empty(job.scenes, there.source.grid_size, dtype=torch.int32)
+    given, masks = {f: t.contiguous() for f, t in seeds.items()}, masks.contiguous()
     for k in reversed(range(len(ends) - 1)):
         first, last = ends[k], ends[k + 1]
         now = {f: starts[after[f]][:, k - 1].contiguous() for f in states} if k else {}
@@ -106,7 +124,8 @@ def reverse(job: Job, seeds: Mapping[Field, Tensor], wanted: set[Field]) -> dict
             job._replace(inputs={**job.inputs, **now}), like.device, seeds=given, gradients={**grads, **mine}
         )
         counts = ctypes.c_int(last - first), ctypes.c_int(first), ctypes.c_int(job.substeps)
-        there.launch("adjoint", ports, work, job.scenes, *counts)
+        pointers = (ctypes.c_void_p(t.data_ptr()) for t in (masks, grids))
+        there.launch("adjoint", ports, work, job.scenes, *pointers, *counts)
         given = {**given, **{after[f]: t.clone() for f, t in mine.items()}}
     return {f: mine.get(f, grads[f]) for f in wanted}
 

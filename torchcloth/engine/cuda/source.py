@@ -8,18 +8,22 @@ some substeps again from the state where they begin, keeps the states on the way
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 
 from ..fields import Kind
-from ..loops import ADD, LOAD, OWN, PUT, SHARED
+from ..loops import ADD, LOAD, OWN, PUT, SHARED, SPREAD, VARYING
 from ..stages import Shape
-from .listing import Listing, Loop, Move, Place, Stencil, listing
+from .listing import Layers, Listing, Loop, Move, PerMass, Place, Stage, Stencil, listing
+from .of_layers import HERE, OfLayers, OfPerMass
 from .of_loops import OfLoop
 from .of_stencils import OfStencil
 
 WITHIN = (Kind.TEMPORARY, Kind.KEPT)
+INNER = (*WITHIN, Kind.POINTS)
+COMMON = "const Port* ports, const R* data, const int* tables, R* work, unsigned char* masks, int* grids"
 PRELUDE = """
 typedef {real} R;
 #ifndef ON_HOST
@@ -27,6 +31,9 @@ typedef {real} R;
 #define SYNC() __syncthreads()
 #define STAGE __device__
 #define KERNEL extern "C" __global__ void __launch_bounds__(THREADS)
+#define FIXED static __device__ const
+#define ATOMIC_ADD atomicAdd
+#define ATOMIC_CAS atomicCAS
 #define SCENE blockIdx.x
 #define T int(threadIdx.x)
 extern __shared__ double shared_memory[];
@@ -59,6 +66,22 @@ STAGE void reduce(const R* own, int n, R* shared) {{
     }}
     SYNC();
 }}
+// Whether it holds for any thread.
+STAGE bool any(bool own, R* shared) {{
+#if WARP > 1
+    return __syncthreads_or(own);
+#else
+    volatile int* flag = reinterpret_cast<volatile int*>(shared);
+    SYNC();
+    if (T == 0) *flag = 0;
+    SYNC();
+    if (own) *flag = 1;
+    SYNC();
+    const bool found = *flag;
+    SYNC();
+    return found;
+#endif
+}}
 STAGE void copy(R* to, const R* from, int count) {{
     for (int i = T; i < count; i += THREADS) to[i] = from[i];
 }}
@@ -72,7 +95,7 @@ def prelude(dtype: torch.dtype) -> str:
     """What kernels of one precision begin with.
 
     Whoever compiles them gives THREADS; for another compiler than CUDA's also ON_HOST, and WARP, SYNC, STAGE, KERNEL,
-    SCENE and T.
+    FIXED, ATOMIC_ADD, ATOMIC_CAS, SCENE and T.
     """
     return PRELUDE.format(real="double" if dtype == torch.float64 else "float")
 
@@ -92,12 +115,14 @@ class Source:
         self._tables = [np.asarray(t, np.int32).ravel() for t in self.of.tables]
         self._at: dict[bytes, int] = {}
         self._scratch = 0
-        self._fields = self.of.fields
+        self._fields, self.layers = self.of.fields, self.of.layers
         self._data = self._constants()
+        self._contact = None if self.layers is None else OfLayers(self, self.layers, set())
         self.lasting = self._lasting()
         self.active = self._with_derivatives()
         stages = [line for k in range(len(self.of.stages)) for line in self._stage(k)]
-        body = [prelude(dtype), *self._here(), *stages, *self._values(), *self._adjoint()]
+        contact = [] if self._contact is None else [self._contact.text()]
+        body = [prelude(dtype), *contact, *self._here(), *stages, *self._values(), *self._adjoint()]
         self.text = "\n".join(body) + "\n"
 
     # -- memory -------------------------------------------------------------------------------------------------------
@@ -122,13 +147,19 @@ class Source:
         """Where a table of the program begins."""
         return sum(len(t) for t in self._tables[:which])
 
-    def _index(self, numbers: np.ndarray) -> int:
+    def own_table(self, numbers: np.ndarray) -> int:
         """Where a table of our own begins."""
         key = numbers.astype(np.int32).tobytes()
         if key not in self._at:
             self._at[key] = len(self._tables)
             self._tables.append(numbers.astype(np.int32).ravel())
         return self.table(self._at[key])
+
+    def corner(self, which: int) -> int:
+        """Where the corners of all triangles in contact begin."""
+        if self.layers is None:
+            raise ValueError("no contact")
+        return self.own_table(self.layers.corners[which])
 
     def _some(self, *kinds: Kind) -> list[tuple[int, Place]]:
         return [(k, f) for k, f in enumerate(self._fields) if f.kind in kinds]
@@ -148,20 +179,44 @@ class Source:
 
     @property
     def values_size(self) -> int:
-        """Two states, fields within a substep, sums, and what is yet to be added up."""
-        return 2 * self.state_size + self._laid_out(*WITHIN, Kind.SUM)[1] + self._scratch
+        """Two states, fields within a substep, sums, nodes, and what is yet to be added up."""
+        return 2 * self.state_size + self._inner[1] + self._scratch + self._reference
+
+    @property
+    def _inner(self) -> tuple[dict[int, int], int]:
+        return self._laid_out(*INNER, Kind.SUM, Kind.NODES)
+
+    @property
+    def _reference(self) -> int:
+        """Positions at the last search for layers."""
+        return 0 if self.layers is None else self._fields[self.layers.x].size
+
+    @property
+    def grid_size(self) -> int:
+        """Integers of a scene for the nodes of contact."""
+        return 0 if self._contact is None else self._contact.memory
+
+    @property
+    def room(self) -> int:
+        """Nodes of contact that a scene may have."""
+        return 0 if self.layers is None else self.layers.room
+
+    @property
+    def mask_size(self) -> int:
+        """Bytes of a substep, that say which triangles take part."""
+        return 0 if self.layers is None else self.layers.triangles
 
     @property
     def adjoint_size(self) -> int:
         """The same with adjoints; ``state_size`` more for every substep."""
-        return self.values_size + 2 * self.state_size + self._laid_out(*WITHIN, Kind.SUM)[1]
+        return self.values_size + 2 * self.state_size + self._inner[1]
 
     def _with_derivatives(self) -> set[int]:
-        found = {k for k, _ in self._some(Kind.PARAMETER, Kind.STATE, Kind.DRIVE, Kind.NEXT, Kind.SUM)}
+        found = {k for k, _ in self._some(Kind.PARAMETER, Kind.STATE, Kind.DRIVE, Kind.NEXT, Kind.SUM, Kind.NODES)}
         for stage in self.of.stages:
             if isinstance(stage, Stencil):
                 found |= {stage.x, stage.y}
-            elif not stage.flat:
+            elif isinstance(stage, Loop) and not stage.flat:
                 found |= {m.field for m in stage.moves(ADD, PUT)}
         return {k for k in found if self._fields[k].kind != Kind.CONSTANT}
 
@@ -179,6 +234,8 @@ class Source:
             yield f"    R *f{k}, *g{k};"
         yield f"    R *scratch, *shared, sums[{max(len(self.lasting), 1)}];"
         yield "    const int* tables;"
+        if self.layers is not None:
+            yield HERE
         yield "};"
 
     # -- stages -------------------------------------------------------------------------------------------------------
@@ -186,8 +243,7 @@ class Source:
     def _stage(self, k: int) -> Iterator[str]:
         """Functions ``stage`` and ``back`` of one."""
         stage = self.of.stages[k]
-        begins = self._begins(k)
-        emit = OfLoop(self, stage, begins) if isinstance(stage, Loop) else OfStencil(self, stage, begins)
+        emit = _EMIT[type(stage)](self, stage, self._begins(k))
         for name, lines in (("stage", emit.forward()), ("back", emit.reverse())):
             yield f"STAGE void {name}{k}(Here& h) {{"
             yield from (f"    {line}" for line in lines)
@@ -196,17 +252,19 @@ class Source:
     def _begins(self, k: int) -> set[int]:
         """Fields within a substep that no stage before this one has written to."""
         written = {f for stage in self.of.stages[:k] for f in _written(stage)}
-        return {f for f in _written(self.of.stages[k]) if f not in written and self._fields[f].kind in WITHIN}
+        return {f for f in _written(self.of.stages[k]) if f not in written and self._fields[f].kind in _FRESH}
 
     def _blank(self) -> list[int]:
         """Fields that must be zero when a substep begins."""
         filled = {f for k, stage in enumerate(self.of.stages) for f in self._begins(k) if self.fills(stage, f)}
         return [k for k, _ in self._some(*WITHIN) if k not in filled]
 
-    def fills(self, stage: Loop | Stencil, field: int) -> bool:
+    def fills(self, stage: Stage, field: int) -> bool:
         """Whether a stage writes to all rows, if it begins."""
-        if isinstance(stage, Stencil):
+        if not isinstance(stage, Loop):
             return True
+        if stage.counted >= 0:
+            return False
         own = self._fields[field]
         return all(
             (m.table == OWN and stage.items == own.rows)
@@ -219,11 +277,20 @@ class Source:
         """No two items, and no two instructions, come to the same row."""
         if move.table == SHARED or sum(m.field == move.field for m in stage.moves(code)) > 1:
             return False
-        return move.table == OWN or len(np.unique(self._tables[move.table])) == len(self._tables[move.table])
+        rows = self._rows(stage, move)
+        return len(np.unique(rows)) == len(rows)
+
+    def _rows(self, stage: Loop, move: Move) -> np.ndarray:
+        """Of all items."""
+        if move.table == OWN:
+            return np.arange(stage.items)
+        if move.table <= VARYING and self.layers is not None:
+            return self.layers.rows(stage.listed(move.table))
+        return self._tables[move.table][: stage.items]
 
     def gather(self, stage: Loop, moves: Sequence[Move]) -> tuple[int, int]:
         """Where two tables begin, for a field to whose rows several items add: first entries, and places in scratch."""
-        rows = [np.arange(stage.items) if m.table == OWN else self._tables[m.table][: stage.items] for m in moves]
+        rows = [self._rows(stage, m) for m in moves]
         comps, n = self._fields[moves[0].field].comps, stage.items
         places = np.concatenate([k * comps * n + np.arange(n) for k in range(len(moves))])
         return self._sorted(np.concatenate(rows), places, self._fields[moves[0].field].rows)
@@ -238,7 +305,7 @@ class Source:
     def _sorted(self, rows: np.ndarray, places: np.ndarray, count: int) -> tuple[int, int]:
         order = np.argsort(rows, kind="stable")
         first = np.searchsorted(rows[order], np.arange(count + 1))
-        return self._index(first), self._index(places[order])
+        return self.own_table(first), self.own_table(places[order])
 
     def need(self, scratch: int = 0, shared: int = 0) -> None:
         """Memory that a stage wants."""
@@ -257,11 +324,16 @@ class Source:
             yield f"    h.f{k} = const_cast<R*>(data) + {place};"
         for k, _ in self._some(Kind.PARAMETER):
             yield f"    h.f{k} = ports[{k}].value + scene * ports[{k}].stride;"
-        within, size = self._laid_out(*WITHIN, Kind.SUM)
+        within, size = self._inner
         for k, place in within.items():
             yield f"    h.f{k} = own + {place};"
         yield f"    h.scratch = own + {size};"
-        yield f"    R* states = own + {size + self._scratch};"
+        yield f"    R* states = own + {size + self._scratch + self._reference};"
+        if self._contact is not None:
+            yield f"    h.reference = own + {size + self._scratch}, h.knows = {str(adjoint).lower()};"
+            every = f"(Count({'all' if adjoint else 'substeps'}) * {self.mask_size} + 1)"
+            yield f"    h.masks = masks + scene * {every}, h.all = {'all' if adjoint else 'substeps'};"
+            yield from self._contact.places()
         if adjoint:
             for k, place in within.items():
                 yield f"    h.g{k} = states + (substeps + 2) * {self.state_size} + {2 * self.state_size + place};"
@@ -277,7 +349,9 @@ class Source:
                 at = f"(scene * all + {row}) * {f.comps}"
                 yield f"        h.g{k} = ports[{k}].gradient ? ports[{k}].gradient + {at} : nullptr;"
 
-    def _substep(self) -> Iterator[str]:
+    def _substep(self, number: str) -> Iterator[str]:
+        if self._contact is not None:
+            yield f"        h.step = {number};"
         for k in self._blank():
             yield f"        clear(h.f{k}, {self._fields[k].size});"
         if self._blank():
@@ -297,24 +371,19 @@ class Source:
 
     def _values(self) -> Iterator[str]:
         size = self.state_size
-        x, places = self._some(Kind.STATE)[0], self._laid_out(Kind.STATE)[0]
-        yield "KERNEL values(const Port* ports, const R* data, const int* tables, R* work, R* far, const Count* ends,"
-        yield "              int substeps, int frames) {"
+        places = self._laid_out(Kind.STATE)[0]
+        yield f"KERNEL values({COMMON},"
+        yield "              const Count* ends, int substeps, int frames) {"
         yield from self._begin(adjoint=False)
         yield from self._loaded()
         for k, f in self._some(Kind.SUM):
             yield f"    clear(h.f{k}, {f.size});"
         yield "    SYNC();"
-        yield f"    R *now = states, *after = states + {size}, farthest = R(0);"
-        yield f"    const R* start = ports[{x[0]}].value + scene * ports[{x[0]}].stride;"
+        yield f"    R *now = states, *after = states + {size};"
         yield "    for (int k = 0, frame = 0; k < substeps; k++) {"
-        yield f"        for (int i = T; i < {x[1].size}; i += THREADS) {{"
-        yield f"            const R way = now[{places[x[0]]} + i] - start[i], far_now = way < R(0) ? -way : way;"
-        yield "            farthest = far_now > farthest ? far_now : farthest;"
-        yield "        }"
         yield from self._point("now", "after")
         yield from self._drives("k", adjoint=False)
-        yield from self._substep()
+        yield from self._substep("k")
         yield "        R* swapped = now; now = after, after = swapped;"
         yield "        if (k + 1 != ends[frame]) continue;"
         for k, place in places.items():
@@ -329,14 +398,15 @@ class Source:
         yield "        SYNC();"
         yield "        frame++;"
         yield "    }"
-        yield "    far[scene * THREADS + T] = farthest;"
+        if self._contact is not None:  # whether there was no room for nodes
+            yield f"    if (T == 0) h.masks[Count(substeps) * {self.mask_size}] = h.nodes.totals[3];"
         yield "}"
 
     def _adjoint(self) -> Iterator[str]:
         size, last = self.state_size, len(self.of.stages) - 1
         yield "// From the seeds of the last of some substeps, of `all`, to the gradients before the first of them."
-        yield "KERNEL adjoint(const Port* ports, const R* data, const int* tables, R* work, int substeps, int first,"
-        yield "               int all) {"
+        yield f"KERNEL adjoint({COMMON},"
+        yield "               int substeps, int first, int all) {"
         yield from self._begin(adjoint=True)
         yield from self._loaded()
         yield f"    R *seed = states + (substeps + 2) * {size}, *given = seed + {size};"
@@ -352,11 +422,15 @@ class Source:
         yield f"        R* now = states + k * {size};"
         yield from self._point("now", f"(now + {size})")
         yield from self._drives("(first + k)", adjoint=True)
-        yield from self._substep()
+        yield from self._substep("first + k")
         yield "        if (there) continue;"
         for k, f in self._some(*WITHIN):
             if k in self.active:
                 yield f"        clear(h.g{k}, {f.size});"
+        if self._contact is not None:
+            points = [(k, f) for k, f in self._some(Kind.POINTS) if k in self.active]
+            yield "        if (h.some) " + ", ".join(f"clear(h.g{k}, {f.size})" for k, f in points) + ";"
+            yield from self._contact.cleared()
         yield f"        clear(given, {size});"
         yield from self._point("given", "seed", "g")
         yield "        SYNC();"
@@ -376,7 +450,13 @@ class Source:
         yield "}"
 
 
-def _written(stage: Loop | Stencil) -> list[int]:
+def _written(stage: Stage) -> list[int]:
     if isinstance(stage, Stencil):
         return [stage.x if stage.shape == Shape.TRANSPOSED else stage.y]
-    return [m.field for m in stage.moves(ADD, PUT)]
+    if isinstance(stage, Loop):
+        return [m.field for m in (*stage.moves(ADD, PUT), *stage.transfers(SPREAD))]
+    return [stage.out] if isinstance(stage, PerMass) else []
+
+
+_FRESH = (*WITHIN, Kind.NODES)  # written anew in every substep
+_EMIT: dict[type, Any] = {Loop: OfLoop, Stencil: OfStencil, Layers: OfLayers, PerMass: OfPerMass}
