@@ -26,6 +26,7 @@ from .validation import check_extent, check_substeps
 
 AT_ONCE = 4_000_000  # vertices times substeps of one call, which nobody can interrupt
 FEW = 250  # vertices, as which fewer count
+SIDE_BY_SIDE = 128  # scenes on a device
 PIECE = 64  # substeps after which one looks at what has set
 
 
@@ -116,7 +117,10 @@ class Plan(NamedTuple):
     def stretches(self) -> Iterator[tuple[list[Interval], dict[str, Drive]]]:
         """Intervals that one call of the engine may take together, with the drives of all of them."""
         whole, first, last, some = self.drives(), 0, 0, []
-        most = AT_ONCE // max(self.state.x.numel() // 3, FEW)
+        vertices = self.state.x.numel() // 3
+        if self.choice.fused is not None and self.choice.fused.is_elsewhere:
+            vertices //= SIDE_BY_SIDE
+        most = AT_ONCE // max(vertices, FEW)
         for interval in (*self._bare(), None):
             if some and (interval is None or last - first + interval.count > most):
                 yield some, _parts(whole, first, last)

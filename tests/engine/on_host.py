@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 import torch
 
 from torchcloth.boundaries.motion import drive
-from torchcloth.engine import building, running
+from torchcloth.engine import building, devices, running
 from torchcloth.engine.cuda import runs
 from torchcloth.engine.fused import Fused
 
@@ -110,7 +110,7 @@ class Host:
 def stand_in(threads=1, reverse=False):
     """Programs for the CPU are compiled for it."""
     with (
-        patch.object(runs, "Kernels", lambda text, _, device: Host(text, threads, reverse)),
+        patch.object(runs, "kernels", lambda text, device: Host(text, threads, reverse)),
         patch.object(runs, "_KNOWN", WeakKeyDictionary()),
     ):
         yield
@@ -126,7 +126,8 @@ def agrees(cloth, motion, state, substeps=12, dt=1e-4, stages=0, marks=(1e-11, 1
     """
     model = cloth.model()._replace(stages=stages)
     drives = {name: drive(t, torch.arange(substeps + 1, dtype=torch.float64) * dt) for name, t in motion.items()}
-    fused = Fused(model, state, drives)
+    with patch.object(devices, "elsewhere", lambda tensor: True):
+        fused = Fused(model, state, drives)
     used = {str(given[0]) if name == "call" else name for name, given in fused.low.program.written}
     if used <= CHECKED and not again:
         return

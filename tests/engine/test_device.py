@@ -31,7 +31,9 @@ def job_of(cloth, scenes=(2,), substeps=12, state=None):
     state, dt = moving(cloth, scenes) if state is None else state, 1e-4
     times = torch.arange(substeps + 1, dtype=torch.float64) * dt
     drives = {name: drive(t, times) for name, t in opening(float(times[-1])).items()}
-    job = Fused(cloth.model(), state, drives).job(state, torch.full((substeps,), dt), drives)
+    with patch.object(devices, "elsewhere", lambda tensor: True):
+        fused = Fused(cloth.model(), state, drives)
+    job = fused.job(state, torch.full((substeps,), dt), drives)
     return job._replace(inputs={f: t.detach().contiguous() for f, t in job.inputs.items()})
 
 
@@ -47,7 +49,7 @@ def adjoints(job):
 @pytest.mark.parametrize("meets", [False, True])
 def test_order_of_threads_between_waits_does_not_matter(meets):
     """Bit by bit: nobody reads what another thread of a block writes before both have waited."""
-    cloth = sheet(contact=tc.Contact(), n=9) if meets else sheet()
+    cloth = sheet(contact=tc.Contact(), n=17) if meets else sheet()
     job, found = job_of(cloth, state=folded(cloth) if meets else None), []
     for reverse in (False, True):
         with on_host.stand_in(4, reverse):
@@ -114,16 +116,18 @@ def folded(cloth):
 
 
 def test_layers_that_meet():
-    """Folded, and pressed by a hand; values and gradients through the cloth."""
-    cloth = sheet(contact=tc.Contact(), n=9, boundaries={"hand": tc.boundaries.Sphere(0.05, (0.0, 0.1, 0.07), moving=True)})
+    """Folded, pressed by a hand and falling; values and gradients through the cloth."""
+    hand = tc.boundaries.Sphere(0.05, (0.0, 0.1, 0.07), moving=True)
+    cloth = sheet(contact=tc.Contact(), n=17, boundaries={"hand": hand})
     found = []
     for where in (nullcontext(), elsewhere()):
         with where:
             state = folded(cloth)
             x = state.x.clone().requires_grad_()
             cloth.zero_grad()
-            out = cloth(state._replace(x=x), {"hand": down()}, TIMES)
-            (out.x[-1, :, 2].sum() + out.state.d3[:, 2].sum()).backward()
+            v = torch.tensor([0.0, 0.0, -2.0]) * (state.x[:, 2:] > 0)
+            out = cloth(state._replace(x=x, v=v), {"hand": down()}, TIMES)
+            (out.x[-1].square().sum() + out.state.d3[:, 2].sum()).backward()
         named = {name: p.grad for name, p in cloth.named_parameters() if p.grad is not None}
         found.append({"end": out.x[-1].detach(), "d3": out.state.d3.detach(), "x": x.grad} | named)
     known, there = found
@@ -134,7 +138,7 @@ def test_layers_that_meet():
 
 
 def test_too_many_nodes_are_an_error():
-    cloth = sheet(contact=tc.Contact(), n=9, boundaries={})
+    cloth = sheet(contact=tc.Contact(), n=17, boundaries={})
     small = property(lambda self: 16)
     with elsewhere(), patch.object(listing.Layers, "room", small), pytest.raises(tc.errors.InvalidInput, match="nodes"):
         cloth(folded(cloth), times=TIMES)
@@ -147,8 +151,9 @@ def test_what_it_cannot_do_is_said():
     for effects, contact in (({"own": Own()}, None), ({"own": Own()}, tc.Contact())):
         with elsewhere():
             assert "effects.own in torch, on cuda" in sheet(effects=effects, contact=contact).engine_in_use
-    with elsewhere(), patch.object(runs, "Kernels", side_effect=Unbuilt("no libnvrtc", "install it")):
-        assert sheet().engine_in_use == "reference (no libnvrtc)"
+    with elsewhere(), patch.object(runs, "kernels", side_effect=Unbuilt("no libnvrtc", "install it")):
+        with pytest.warns(UserWarning, match="no libnvrtc: simulations run on the torch reference"):
+            assert sheet().engine_in_use == "reference (no libnvrtc)"
         with pytest.raises(tc.errors.InvalidInput, match=r"no libnvrtc.*install it"):
             sheet(engine="fused")(start(sheet()), opening(TIMES[-1]), TIMES)
 
@@ -169,3 +174,22 @@ def test_every_kernel_can_be_written_down():
         lines = list(kernel.values("n", [f"r{k}" for k in range(takes)]))
         lines += kernel.adjoints("n", ["g"] * gives, [f"b{k}" for k in range(takes)])
         assert all(line.endswith(";") and "{" not in line for line in lines), name
+
+
+def test_what_does_not_compile_is_tried_once():
+    runs._kernels.cache_clear()
+    device = torch.device("cpu")
+    with patch.object(runs, "Kernels", side_effect=Unbuilt("NVRTC: no", "report it")) as tried:
+        for _ in range(2):
+            with pytest.raises(Unbuilt, match="NVRTC: no"):
+                runs.kernels("text", device)
+        assert tried.call_count == 1
+    runs._kernels.cache_clear()
+
+
+def test_masks_are_bits():
+    masks = (torch.rand(2, 3, 29) < 0.5).to(torch.uint8)[:, 0]
+    bits = runs._packed(masks)
+    assert bits.shape == (2, 4)
+    assert torch.equal(runs._unpacked(bits, 29), masks)
+    assert runs._packed(masks[:, :0]).shape == (2, 0)

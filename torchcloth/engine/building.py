@@ -79,7 +79,7 @@ def folders() -> list[Path]:
 
 def cached() -> Path | None:
     """The library in the cache; None: not there."""
-    return next((folder / file_name() for folder in folders() if _is_safe(folder / file_name())), None)
+    return next((folder / file_name() for folder in folders() if is_safe(folder / file_name())), None)
 
 
 def build() -> Path:
@@ -89,18 +89,24 @@ def build() -> Path:
         Unbuilt: no compiler, it failed, or there is no folder to write to.
     """
     command = compiler()
-    for folder in folders():
+    for folder in own_folders():
         with suppress(OSError):
-            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            if not _is_safe(folder):
-                continue
             target = folder / file_name()
             with _alone(folder):  # another process may be building the same
-                if not _is_safe(target):
+                if not is_safe(target):
                     _compile(command, target)
             return target
     places = ", ".join(str(f) for f in folders())
     raise Unbuilt(f"no folder for the engine's library can be written to ({places})", "name one in TORCHCLOTH_CACHE")
+
+
+def own_folders() -> Iterator[Path]:
+    """Those that are there, or can be made, and are nobody else's; best first."""
+    for folder in folders():
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if is_safe(folder):
+                yield folder
 
 
 def _sources() -> list[Path]:
@@ -118,7 +124,7 @@ def _processor() -> str:
     return platform.processor()
 
 
-def _is_safe(path: Path) -> bool:
+def is_safe(path: Path) -> bool:
     """Is there, and was not put there by somebody else where everybody can write."""
     try:
         own = not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()

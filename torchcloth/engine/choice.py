@@ -66,13 +66,13 @@ def choose(setting: Setting, model: Model, state: ClothState, drives: Mapping[st
     except Unbuilt as miss:
         reason = str(miss)
         remedy = f'{miss.remedy}, or use engine="auto"'
-        if setting == "auto" and not devices.elsewhere(state.x):
+        if setting == "auto":
             _warn(f"{reason}: simulations run on the torch reference, tens of times slower; {miss.remedy}")
     if setting == "fused":
         raise InvalidInput(
             "engine", got='"fused"', expected=f"a cloth that the engine can run: {reason}", remedy=remedy
         )
-    return Choice(None, reason, captured=state.x.is_cuda)
+    return Choice(None, reason, captured=state.x.is_cuda and not transformed())
 
 
 def still_drives(model: Model) -> dict[str, Drive]:

@@ -47,7 +47,7 @@ def records_like(program: Program, scenes: int, substeps: int, every: int, like:
     """The shape and precision of what ``forward`` gives besides results, without numbers."""
     if elsewhere(like):
         size = runs.mask_size(runs.on_device(program, like.device).source, substeps)
-        return like.new_empty(scenes, size, dtype=torch.uint8)
+        return like.new_empty(scenes, -(-size // 8), dtype=torch.uint8)
     return like.new_empty(scenes, running.record_size(program, substeps, every))
 
 

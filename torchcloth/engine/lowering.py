@@ -18,6 +18,7 @@ from ..effects._bent import BentSheet
 from ..model import Model
 from ..strain import MATERIAL
 from ..types import ClothState
+from . import devices
 from .constants import array
 from .fields import Field
 from .loops import Loop
@@ -191,7 +192,7 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive], in_torch
     velocity.drift()
     if contact is not None:
         contact.follow()
-    low.program = low.program.ready()
+    low.program = low.program.ready(keep=devices.elsewhere(state.x))
     return low
 
 

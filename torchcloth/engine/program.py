@@ -46,6 +46,7 @@ class Program:
         self._stages: list[Loop | Stencil | Sieve | Layers | PerMass] = []
         self._lists = 0
         self._written: list[tuple[str, tuple]] = []
+        self.written: list[tuple[str, tuple]] = []  # names and arguments, of a program that keeps them: see ``ready``
 
     def __del__(self) -> None:
         # there is no handle where ``__init__`` was not run, and no library when Python ends
@@ -164,8 +165,11 @@ class Program:
         """y += differences of x over ``near`` [N, V] with weights [count, N, V]; transposed: x -= transpose of y."""
         self._stages.append(Stencil(self.table(near), weight, x, y, shape))
 
-    def ready(self) -> Program:
-        """The program to run: an earlier one where there is the same, else this one, handed to the engine."""
+    def ready(self, keep: bool = False) -> Program:
+        """The program to run: an earlier one where there is the same, else this one, handed to the engine.
+
+        ``keep``: what was written down, for another compiler.
+        """
         for stage in self._stages:
             stage.emit(self._handle, self._api)
         key = self._key()
@@ -177,14 +181,10 @@ class Program:
                 while len(_KEPT) > MOST_KEPT:
                     _KEPT.popitem(last=False)
             _KEPT.move_to_end(key)
-        if known is not self:
-            self._written.clear()
+        if keep and not known.written:
+            known.written = self._written
+        self._written = []
         return known
-
-    @property
-    def written(self) -> list[tuple[str, tuple]]:
-        """What the engine was called with, of a program that is ready: names and arguments."""
-        return self._written
 
     @cached_property
     def inputs(self) -> list[Field]:

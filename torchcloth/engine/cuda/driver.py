@@ -13,32 +13,37 @@ from pathlib import Path
 import torch
 
 from ..._files import atomically
-from ..building import Unbuilt, folders
+from .. import building
+from ..building import Unbuilt
 
 FLAGS = ("--std=c++17", "--fmad=true", "--extra-device-vectorization")
 LOG = 2000  # characters of what the compiler says
 
 
-def compiled(text: str, threads: int, device: torch.device) -> bytes:
-    """Machine code for a device; from the cache where it was made before.
-
-    Raises:
-        Unbuilt: there is no compiler, or it failed.
-    """
+def _options(threads: int, device: torch.device) -> tuple[str, ...]:
     major, minor = torch.cuda.get_device_capability(device)
-    options = (*FLAGS, f"--gpu-architecture=sm_{major}{minor}", f"-DTHREADS={threads}")
+    return (*FLAGS, f"--gpu-architecture=sm_{major}{minor}", f"-DTHREADS={threads}")
+
+
+def _name(text: str, options: Sequence[str]) -> str:
+    """Of a file with the machine code."""
     known = hashlib.sha256("\0".join([text, *options, str(torch.version.cuda)]).encode()).hexdigest()[:20]
-    for folder in folders():
-        with suppress(OSError):
-            return (folder / f"program-{known}.cubin").read_bytes()
-    code = _compile(text, options)
-    for folder in folders():
-        with suppress(OSError):
-            folder.mkdir(parents=True, exist_ok=True)
-            with atomically(folder / f"program-{known}.cubin") as file:
-                file.write_bytes(code)
-            break
-    return code
+    return f"program-{known}.cubin"
+
+
+def _cached(name: str) -> bytes | None:
+    for folder in building.folders():
+        if building.is_safe(folder / name):
+            with suppress(OSError):
+                return (folder / name).read_bytes()
+    return None
+
+
+def _keep(name: str, code: bytes) -> None:
+    for folder in building.own_folders():
+        with suppress(OSError), atomically(folder / name) as file:
+            file.write_bytes(code)
+            return
 
 
 class Kernels:
@@ -49,12 +54,25 @@ class Kernels:
     """
 
     def __init__(self, text: str, threads: int, device: torch.device) -> None:
-        self.threads, self._device, self._code = threads, device, compiled(text, threads, device)
+        self.threads, self._device = threads, device
         self._functions: dict[str, ctypes.c_void_p] = {}
-        self._module = ctypes.c_void_p()
-        with torch.cuda.device(device):
+        options = _options(threads, device)
+        name = _name(text, options)
+        known = _cached(name)
+        module = None if known is None else self._loaded(known)
+        if module is None:  # nothing is there, or what does not load
+            code = _compile(text, options)
+            module = self._loaded(code)
+            if module is None:
+                raise Unbuilt("the driver does not load what NVRTC compiles", "update NVIDIA's driver, or torch")
+            _keep(name, code)
+        self._module = module
+
+    def _loaded(self, code: bytes) -> ctypes.c_void_p | None:
+        module = ctypes.c_void_p()
+        with torch.cuda.device(self._device):
             torch.cuda.current_stream().synchronize()  # then there is a context
-            _check(_driver().cuModuleLoadData(ctypes.byref(self._module), self._code))
+            return None if _driver().cuModuleLoadData(ctypes.byref(module), code) else module
 
     def launch(self, name: str, blocks: int, shared: int, arguments: Sequence[ctypes._SimpleCData]) -> None:
         """Start a kernel on torch's current stream.

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from math import isqrt
 from typing import Protocol
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ...errors import InvalidInput
+from ..building import Unbuilt
 from ..fields import Field, Kind
-from ..program import Program
+from ..program import MOST_KEPT, Program
 from ..running import Job
 from .driver import Kernels
 from .source import Source
@@ -20,6 +24,7 @@ from .source import Source
 BUDGET = 256 * 2**20  # bytes of states that an adjoint keeps at a time
 MOST, FEWEST = 64, 8  # substeps of that
 THREADS = 512  # of a block; measured with 441 vertices, by how many scenes there are it hardly matters
+SHARED = 48 * 2**10  # bytes, for which a device need not be asked
 PORT = 5  # numbers of 64 bits, as in source.py
 
 
@@ -42,9 +47,16 @@ class OnDevice:
         self.tables = torch.from_numpy(source.tables).to(device)
         warps = -(-kernels.threads // 32) if device.type == "cuda" else kernels.threads
         self._shared = source.shared * (1 + warps) * dtype.itemsize
+        if self._shared > SHARED:
+            raise Unbuilt(
+                f"{self._shared} bytes that a block's threads share, {SHARED} at most", "take fewer bodies and effects"
+            )
 
     def launch(self, name: str, ports: Tensor, work: Tensor, scenes: int, *rest: ctypes._SimpleCData) -> None:
         """One block for each scene."""
+        if self.data.is_cuda:  # other programs may take this one's place before it is done
+            for t in (self.data, self.tables):
+                t.record_stream(torch.cuda.current_stream(t.device))
         known = (ctypes.c_void_p(t.data_ptr()) for t in (ports, self.data, self.tables, work))
         self.kernels.launch(name, scenes, self._shared, [*known, *rest])
 
@@ -66,12 +78,28 @@ def on_device(program: Program, device: torch.device) -> OnDevice:
 
 
 def kernels(text: str, device: torch.device) -> Device:
-    """The text, compiled for a device."""
-    return Kernels(text, THREADS, device)
+    """The text, compiled for a device.
+
+    Raises:
+        Unbuilt: it cannot be.
+    """
+    found = _kernels(text, device)
+    if isinstance(found, Unbuilt):
+        raise Unbuilt(str(found), found.remedy)
+    return found
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def _kernels(text: str, device: torch.device) -> Kernels | Unbuilt:
+    """Once, also where it failed."""
+    try:
+        return Kernels(text, THREADS, device)
+    except Unbuilt as miss:
+        return miss
 
 
 def forward(job: Job) -> tuple[dict[Field, Tensor], Tensor]:
-    """(nexts and sums [scenes, (frames,) rows, comps], masks: which triangles met others, substep by substep).
+    """(nexts and sums [scenes, (frames,) rows, comps], bits: which triangles met others, substep by substep).
 
     Raises:
         InvalidInput: contact has more nodes than there is room for.
@@ -94,29 +122,43 @@ def forward(job: Job) -> tuple[dict[Field, Tensor], Tensor]:
             expected=f"at most {there.source.room} around the points of a scene",
             remedy='a wider contact (tc.Contact.with_gap), or engine="reference"',
         )
-    return results, masks
+    return results, _packed(masks)
+
+
+def _packed(masks: Tensor) -> Tensor:
+    """Eight in a byte."""
+    padded = torch.nn.functional.pad(masks, (0, -masks.shape[-1] % 8)).unflatten(-1, (-1, 8))
+    return (padded << torch.arange(8, dtype=torch.uint8, device=masks.device)).sum(-1, dtype=torch.uint8)
+
+
+def _unpacked(bits: Tensor, size: int) -> Tensor:
+    """[scenes, size] of as many bits."""
+    found = bits.unsqueeze(-1) >> torch.arange(8, dtype=torch.uint8, device=bits.device)
+    return (found & 1).flatten(-2)[..., :size].contiguous()
 
 
 def mask_size(source: Source, substeps: int) -> int:
-    """Bytes of a scene: those of all substeps, and whether there was no room."""
+    """Of a scene: a number for each triangle in each substep, and whether there was no room."""
     return 0 if source.layers is None else substeps * source.mask_size + 1
 
 
 def reverse(job: Job, masks: Tensor, seeds: Mapping[Field, Tensor], wanted: set[Field]) -> dict[Field, Tensor]:
-    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums; ``masks``: of ``forward``."""
+    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums; ``masks``: ``forward``'s."""
     like = job.like
     there = on_device(job.program, like.device)
     states = [f for f in job.program.inputs if f.kind == Kind.STATE]
     after = dict(zip(states, [f for f in job.program.outputs if f.kind == Kind.NEXT], strict=True))
     size = there.source.state_size * job.scenes * job.program.dtype.itemsize
-    chunk = min(max(BUDGET // max(size, 1), FEWEST), MOST)
+    # the states at the starts of all chunks are there at once: no shorter than the root of all
+    chunk = max(min(max(BUDGET // max(size, 1), FEWEST), MOST), isqrt(job.substeps))
     ends = [*range(0, job.substeps, chunk), job.substeps]
     starts = _states(job, ends[1:-1])
     grads = {f: like.new_zeros(job.scenes, *job.inputs[f].shape[1:]) for f in wanted}
     mine = {f: like.new_zeros(job.scenes, f.rows, f.comps) for f in states}  # before the present chunk
     work = like.new_zeros(job.scenes * (there.source.adjoint_size + min(chunk, job.substeps) * there.source.state_size))
     grids = like.new_empty(job.scenes, there.source.grid_size, dtype=torch.int32)
-    given, masks = {f: t.contiguous() for f, t in seeds.items()}, masks.contiguous()
+    masks = _unpacked(masks, mask_size(there.source, job.substeps))
+    given = {f: t.contiguous() for f, t in seeds.items()}
     for k in reversed(range(len(ends) - 1)):
         first, last = ends[k], ends[k + 1]
         now = {f: starts[after[f]][:, k - 1].contiguous() for f in states} if k else {}
@@ -146,18 +188,18 @@ def _ports(
     gradients: Mapping[Field, Tensor] | None = None,
 ) -> Tensor:
     """Where the program's fields are, field by field."""
-    ports = torch.zeros(len(job.program.fields), PORT, dtype=torch.int64)
+    ports = np.zeros((len(job.program.fields), PORT), np.int64)
     for f, t in job.inputs.items():
         shape = (job.substeps if f.kind == Kind.DRIVE else f.rows, f.comps)
-        if not t.is_contiguous() or t.dtype != job.program.dtype or t.device != device or t.shape[1:] != shape:
-            raise ValueError(
-                f"{f}: got {list(t.shape)} {t.dtype} on {t.device}, expected [scenes, *{shape}] on {device}"
-            )
+        if not t.is_contiguous() or t.dtype != job.program.dtype or t.device != device:
+            raise ValueError(f"{f}: not contiguous, of another precision, or elsewhere than on {device}")
+        if t.shape[1:] != shape or len(t) not in (1, job.scenes):
+            raise ValueError(f"{f}: got shape {list(t.shape)}, expected [1 or {job.scenes}, {shape[0]}, {shape[1]}]")
         ports[f.id, 0], ports[f.id, 1] = t.data_ptr(), t[0].numel() if len(t) > 1 else 0
     for column, tensors in ((2, results), (3, seeds), (4, gradients)):
         for f, t in (tensors or {}).items():
             ports[f.id, column] = t.data_ptr()
-    return _there(ports, device)
+    return _there(torch.from_numpy(ports), device)
 
 
 def _there(numbers: Tensor, device: torch.device) -> Tensor:
