@@ -119,7 +119,7 @@ def stand_in(threads=1, reverse=False):
 CHECKED: set[str] = set()  # kernels, in this process
 
 
-def agrees(cloth, motion, state, substeps=12, dt=1e-4, stages=0, marks=(1e-11, 1e-8), threads=1, again=False):
+def agrees(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1e-9), threads=1, again=False):
     """Values and adjoints of a program on a device, or here, and by the processor's own engine, in float64.
 
     Compilers take a while: only where there is a kernel that was not looked at yet, unless ``again``.
