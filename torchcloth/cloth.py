@@ -44,6 +44,7 @@ from .validation import (
     check_substeps,
     check_times,
     check_transfer,
+    doubts,
     expand_state,
 )
 
@@ -113,8 +114,9 @@ class Cloth(nn.Module):
         self.boundaries.update(boundaries)
         check_grasps(dict(self._parts()), self.boundaries)
         self.contact, self._grid = contact, None if contact is None else contact.grid(mesh)
-        if self._grid is not None and (unmet := self._grid.unmet(mesh)):
-            warnings.warn(unmet, stacklevel=2)
+        unmet = None if self._grid is None else self._grid.unmet(mesh)
+        for doubt in (*doubts(mesh, self.areal_density.value), *([unmet] if unmet else [])):
+            warnings.warn(doubt, stacklevel=2)
         self._store_geometry()
         for own in (*self.parameters(), *self.buffers()):  # tensors keep their precision until a cloth has one
             if own.is_floating_point():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from .effects import AbstractEffect
 from .errors import InvalidInput, SimulationDiverged, UnstableStep
 from .materials import AbstractMaterial
 from .meshes import Mesh
+from .meshes.mesh import HEAVIEST, LARGEST
 from .model import Model
 from .parameters import PhysicalParameter
 from .transfer import Contact
@@ -64,6 +65,15 @@ def check_field(name: str, raw: Tensor, triangles: int | None) -> None:
             "a scalar or [B, 1]" if triangles is None else f"a scalar, [{triangles}] (one per triangle) or [B, 1]"
         )
         raise InvalidInput(name, got=f"shape {tuple(raw.shape)}", expected=expected)
+
+
+def doubts(mesh: Mesh, density: Tensor) -> Iterator[str]:
+    """What looks like another unit, though somebody may mean it."""
+    span, heaviest = float(np.ptp(mesh.vertices, axis=0).max()), float(density.detach().max())
+    if span > LARGEST:
+        yield f"the mesh spans {span:.4g} m: is it in millimetres? Lengths are in metres"
+    if heaviest > HEAVIEST:
+        yield f"areal_density is {heaviest:.4g} kg/m^2: is it in g/m^2? Fabrics weigh 0.02 to 1 kg/m^2"
 
 
 def check_axes(mesh: Mesh, parts: Mapping[str, AbstractMaterial | AbstractEffect]) -> None:

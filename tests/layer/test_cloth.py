@@ -483,3 +483,15 @@ def test_parts_that_were_put_in_a_places_are_looked_at_again(engine):
     cloth.material.cone = tc.PhysicalParameter(torch.tensor([0.3, 0.6]), "-", "nonnegative")
     with pytest.raises(InvalidInput, match=r"material\.cone; got shape \(2,\); expected a scalar, \[18\]"):
         cloth(cloth.rest_state(), times=[0.0, 0.001])
+
+
+def test_other_units_are_doubted():
+    """They may be meant, so nothing is refused."""
+    mesh, law = tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3)), tc.materials.AEP(1e4)
+    with pytest.warns(UserWarning, match=r"areal_density is 150 kg/m\^2: is it in g/m\^2"):
+        tc.Cloth(mesh, law, 150.0, contact=None)
+    with pytest.warns(UserWarning, match="the mesh spans 500 m: is it in millimetres"):
+        tc.Cloth(tc.meshes.rectangle(500.0, 300.0, resolution=(3, 3)), law, 0.15, contact=None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tc.Cloth(mesh, law, 2.0, contact=None)

@@ -15,6 +15,7 @@ UNEVEN = 1.5  # times the mean edge, beyond which a longest edge is not that of 
 UNLIKE, TEXTURE = 1.2, 1.05  # times an edge that lies there, beyond which a pattern's is in another unit
 FEW = 0.1  # of the edges, that may be longer or shorter: gathered or stretched where the cloth lies
 LARGEST = 20.0  # m, of a cloth; the same number in millimetres is a handkerchief
+HEAVIEST = 20.0  # kg/m^2, of a cloth; the same number in g/m^2 is a veil
 
 
 @dataclass(frozen=True, eq=False)

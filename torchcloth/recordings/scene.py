@@ -9,14 +9,13 @@ import numpy as np
 
 from ..errors import InvalidInput, RecordingError
 from ..meshes import obj
-from ..meshes.mesh import check_metres, per_vertex
+from ..meshes.mesh import HEAVIEST, check_metres, per_vertex
 from . import checks
 from .checks import Fields
 from .files import Folder
 from .images import ImageStream, Kind
 from .types import Camera, ClothInfo, Collider, GraspInfo, RobotInfo
 
-HEAVIEST = 20.0  # kg/m^2; above this a density was given in g/m^2
 THICKEST = 0.05  # m
 WIDEST_GRASP = 1.0  # m
 NOMINAL: dict[str, dict[str, Any]] = {  # bounds; far above every fabric, where a number is in another unit
