@@ -78,8 +78,8 @@ static void each(int blocks, F work) {
     }
 }
 extern "C" void launch_values(int blocks, Port* p, R* d, int* t, R* w, unsigned char* masks, int* grids, Count* ends,
-                              int substeps, int frames) {
-    each(blocks, [&] { values(p, d, t, w, masks, grids, ends, substeps, frames); });
+                              int substeps, int frames, int keeps) {
+    each(blocks, [&] { values(p, d, t, w, masks, grids, ends, substeps, frames, keeps); });
 }
 extern "C" void launch_adjoint(int blocks, Port* p, R* d, int* t, R* w, unsigned char* masks, int* grids, int substeps,
                                int first, int all) {

@@ -127,6 +127,9 @@ def test_layers_that_meet():
             cloth.zero_grad()
             v = torch.tensor([0.0, 0.0, -2.0]) * (state.x[:, 2:] > 0)
             out = cloth(state._replace(x=x, v=v), {"hand": down()}, TIMES)
+            with torch.no_grad():
+                plain = cloth(state._replace(v=v), {"hand": down()}, TIMES).x
+            torch.testing.assert_close(plain, out.x, rtol=0, atol=1e-12)
             (out.x[-1].square().sum() + out.state.d3[:, 2].sum()).backward()
         named = {name: p.grad for name, p in cloth.named_parameters() if p.grad is not None}
         found.append({"end": out.x[-1].detach(), "d3": out.state.d3.detach(), "x": x.grad} | named)
@@ -135,6 +138,15 @@ def test_layers_that_meet():
     assert set(there) == set(known)
     for name, t in known.items():
         torch.testing.assert_close(there[name], t, rtol=0, atol=1e-7 * float(t.abs().max()), msg=name)
+
+
+def test_what_diverges_is_told():
+    """And its points, which are nowhere, are not gathered in one place."""
+    cloth = sheet(contact=tc.Contact(), n=17, boundaries={})
+    state = folded(cloth)
+    state = state._replace(v=1e200 * torch.randn(state.v.shape))
+    with elsewhere(), pytest.raises(tc.errors.SimulationDiverged, match="not finite"):
+        cloth(state, times=TIMES)
 
 
 def test_too_many_nodes_are_an_error():

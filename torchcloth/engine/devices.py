@@ -19,13 +19,13 @@ def elsewhere(tensor: Tensor) -> bool:
     return tensor.is_cuda
 
 
-def forward(job: Job, every: int = 0) -> tuple[dict[Field, Tensor], Tensor]:
+def forward(job: Job, every: int = 0, keep: bool = False) -> tuple[dict[Field, Tensor], Tensor]:
     """(nexts and sums [scenes, (frames,) rows, comps], records).
 
     ``every``: see ``running.forward``. On a device, which goes through all substeps again, records are which triangles
-    met others.
+    met others, where ``keep`` says that there will be a reverse sweep.
     """
-    return runs.forward(job) if elsewhere(job.like) else running.forward(job, every)
+    return runs.forward(job, keep) if elsewhere(job.like) else running.forward(job, every)
 
 
 def reverse(

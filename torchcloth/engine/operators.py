@@ -54,7 +54,7 @@ def _values(program: int, substeps: int, every: int, inputs: Sequence[Tensor]) -
 
     ``every``: substeps between records; 0: none, the adjoint goes through the substeps again.
     """
-    results, records = devices.forward(_job(program, substeps, inputs), every)
+    results, records = devices.forward(_job(program, substeps, inputs), every, keep=True)
     return [*results.values(), records]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import sysconfig
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -17,6 +17,8 @@ from .. import building
 from ..building import Unbuilt
 
 FLAGS = ("--std=c++17", "--fmad=true", "--extra-device-vectorization")
+OUT_OF_MEMORY = 2
+UNFIT = (200, 209, 218, 222, 300)  # machine code that is damaged, or for another device or driver
 LOG = 2000  # characters of what the compiler says
 
 
@@ -72,7 +74,9 @@ class Kernels:
         module = ctypes.c_void_p()
         with torch.cuda.device(self._device):
             torch.cuda.current_stream().synchronize()  # then there is a context
-            return None if _driver().cuModuleLoadData(ctypes.byref(module), code) else module
+            if _again(lambda: _driver().cuModuleLoadData(ctypes.byref(module), code)) in UNFIT:
+                return None
+            return module
 
     def launch(self, name: str, blocks: int, shared: int, arguments: Sequence[ctypes._SimpleCData]) -> None:
         """Start a kernel on torch's current stream.
@@ -90,8 +94,9 @@ class Kernels:
                 self._functions[name] = function
             pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(a) for a in arguments))
             stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
-            sizes = (ctypes.c_uint(n) for n in (blocks, 1, 1, self.threads, 1, 1, shared))
-            _check(_driver().cuLaunchKernel(self._functions[name], *sizes, stream, pointers, None))
+            sizes = tuple(ctypes.c_uint(n) for n in (blocks, 1, 1, self.threads, 1, 1, shared))
+            given = (self._functions[name], *sizes, stream, pointers, None)
+            _again(lambda: _driver().cuLaunchKernel(*given))
 
 
 def _compile(text: str, options: Sequence[str]) -> bytes:
@@ -153,6 +158,16 @@ def _driver() -> ctypes.CDLL:
         return ctypes.CDLL("libcuda.so.1")
     except OSError as error:
         raise Unbuilt(f"no CUDA driver: {error}", "install NVIDIA's driver") from error
+
+
+def _again(call: Callable[[], int]) -> int:
+    """The driver's answer; once more with what memory torch can spare. What no other code would mend is raised."""
+    code = call()
+    if code == OUT_OF_MEMORY:
+        torch.cuda.empty_cache()
+        code = call()
+    _check(0 if code in UNFIT else code)
+    return code
 
 
 def _check(code: int) -> None:

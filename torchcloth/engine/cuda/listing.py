@@ -10,7 +10,7 @@ import numpy as np
 from ..fields import Kind
 from ..loops import ADD, LOAD, PUT, VARYING, By
 
-ROOM = 4  # slots for nodes, at least, for every point that a cloth has; most see the same nodes
+ROOM = 8  # slots for nodes, at least, for every point that a cloth has; most see the same nodes
 CORNERS = 3  # of a triangle
 LISTS = (0, 7, 13)  # where those of points, of woken ones and of those asleep begin: parts/contact.py
 

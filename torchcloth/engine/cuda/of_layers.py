@@ -25,7 +25,7 @@ HERE = """
     unsigned char* masks;                // of all substeps
     R* reference;                        // positions at the last search
     int step, all;                       // substeps
-    bool knows;                          // masks are there already
+    bool knows, keeps;                   // masks are there already; those of all substeps stay
     bool some, woken;                    // whether any take part, any that did not before
     Nodes nodes;
 """
@@ -53,13 +53,17 @@ STAGE Count key_of(Count x, Count y, Count z) {{
 }}
 STAGE int slot_of(Count key) {{ return int((unsigned long long)(key) * 0x9E3779B97F4A7C15ull >> SHIFT); }}
 STAGE int insert(const Nodes& n, Count key) {{
+    volatile int* full = n.totals + 3;  // then all that follows would take for ever
     int at = slot_of(key);
-    for (int tries = 0; tries < ROOM; tries++, at = (at + 1) & (ROOM - 1)) {{
+    for (int tries = 0; tries < ROOM && !*full; tries++, at = (at + 1) & (ROOM - 1)) {{
         const Count there = Count(ATOMIC_CAS((unsigned long long*)(n.key + at), ~0ull, (unsigned long long)(key)));
-        if (there == -1) n.slots[ATOMIC_ADD(n.totals + 1, 1)] = at;
-        if (there == -1 || there == key) return at;
+        if (there == key) return at;
+        if (there != -1) continue;
+        const int number = ATOMIC_ADD(n.totals + 1, 1);
+        n.slots[number] = at;
+        if (number >= ROOM - ROOM / 8) *full = 1;
+        return at;
     }}
-    n.totals[3] = 1;
     return at;
 }}
 STAGE int find(const Nodes& n, Count key) {{
@@ -188,7 +192,8 @@ class OfLayers:
         yield f"const int* corners = h.tables + {self._source.own_table(s.corners)};"
         self._source.need(scratch=3 * s.triangles, shared=1)
         yield f"const R* x = h.f{s.x};"
-        yield "h.mask = h.masks + Count(h.step) * TRIANGLES, h.before = h.step > 0 ? h.mask - TRIANGLES : h.mask;"
+        yield "h.mask = h.masks + Count(h.keeps ? h.step : h.step % 2) * TRIANGLES;"
+        yield "h.before = h.step == 0 ? h.mask : h.masks + Count(h.keeps ? h.step - 1 : (h.step - 1) % 2) * TRIANGLES;"
         yield "if (!h.knows) {"
         yield "    unsigned char* mask = const_cast<unsigned char*>(h.mask);"
         yield f"    bool moved = h.step % {s.chunk} == 0;"
@@ -210,13 +215,6 @@ class OfLayers:
 
     def _searched(self) -> Iterator[str]:
         """Triangles far from each other along the cloth whose centres are near."""
-        if self._stage.apart is None:
-            yield "for (int t = T; t < TRIANGLES; t += THREADS) mask[t] = 1;"
-            return
-        words = -(-self._stage.triangles // 32)
-        bits = np.zeros((self._stage.triangles, 32 * words), bool)
-        bits[:, : self._stage.triangles] = self._stage.apart
-        apart = self._source.own_table(np.packbits(bits, axis=1, bitorder="little").view(np.int32))
         yield "R* centre = h.scratch;"
         yield "bool lost = false;"
         yield "for (int t = T; t < TRIANGLES; t += THREADS)"
@@ -226,8 +224,16 @@ class OfLayers:
         yield "        lost = lost || !(centre[3 * t + d] - centre[3 * t + d] == R(0));"
         yield "    }"
         yield "if (any(lost, h.shared)) {  // who called will see that it went wrong"
-        yield "    for (int t = T; t < TRIANGLES; t += THREADS) mask[t] = h.step > 0 ? h.before[t] : 0;"
+        yield "    for (int t = T; t < TRIANGLES; t += THREADS) mask[t] = 0;"
         yield "} else for (int t = T; t < TRIANGLES; t += THREADS) {"
+        if self._stage.apart is None:
+            yield "    mask[t] = 1;"
+            yield "}"
+            return
+        words = -(-self._stage.triangles // 32)
+        bits = np.zeros((self._stage.triangles, 32 * words), bool)
+        bits[:, : self._stage.triangles] = self._stage.apart
+        apart = self._source.own_table(np.packbits(bits, axis=1, bitorder="little").view(np.int32))
         yield "    const R a = centre[3 * t], b = centre[3 * t + 1], c = centre[3 * t + 2];"
         yield f"    const int* far = h.tables + {apart} + t * {words};"
         yield "    bool near = false;"
@@ -242,6 +248,7 @@ class OfLayers:
     def _laid_out(self) -> Iterator[str]:
         s = self._stage
         yield "const Nodes& n = h.nodes;"
+        yield "if (n.totals[3]) h.some = h.woken = false;  // nobody changes that before all have waited"
         yield "for (int m = T; m < n.totals[1]; m += THREADS) n.key[n.slots[m]] = -1, n.count[n.slots[m]] = 0;"
         yield "SYNC();"
         yield "if (T == 0) n.totals[0] = n.totals[1] = n.totals[2] = 0;"
@@ -269,6 +276,10 @@ class OfLayers:
         yield f"        n.around[{AROUND} * m + q] = insert(n, key_of(a + q / 9, b + q / 3 % 3, c + q % 3));"
         yield "}"
         yield "SYNC();"
+        yield "if (n.totals[3]) {"
+        yield "    h.some = h.woken = false;"
+        yield "    return;"
+        yield "}"
         yield "for (int p = T; p < POINTS; p += THREADS)"
         yield "    if (h.mask[p / EACH]) n.list[n.start[n.home[p]] + n.rank[p]] = p;"
         yield "SYNC();"
@@ -305,6 +316,7 @@ class OfPerMass:
     def _each(self) -> Iterator[str]:
         yield "if (!h.some) return;"
         yield "const Nodes& n = h.nodes;"
+        yield "if (n.totals[3]) h.some = h.woken = false;  // nobody changes that before all have waited"
         yield "for (int m = T; m < n.totals[1]; m += THREADS) {"
         yield "    const int at = 4 * n.slots[m];"
         yield f"    const R mass = h.f{self._stage.mass}[at];"

@@ -98,8 +98,10 @@ def _kernels(text: str, device: torch.device) -> Kernels | Unbuilt:
         return miss
 
 
-def forward(job: Job) -> tuple[dict[Field, Tensor], Tensor]:
+def forward(job: Job, keep: bool = True) -> tuple[dict[Field, Tensor], Tensor]:
     """(nexts and sums [scenes, (frames,) rows, comps], bits: which triangles met others, substep by substep).
+
+    ``keep``: these; else none.
 
     Raises:
         InvalidInput: contact has more nodes than there is room for.
@@ -108,11 +110,12 @@ def forward(job: Job) -> tuple[dict[Field, Tensor], Tensor]:
     there = on_device(job.program, like.device)
     results = {f: like.new_empty(job.scenes, *job.frames, f.rows, f.comps) for f in job.program.outputs}
     work = like.new_zeros(job.scenes * there.source.values_size)
-    masks = like.new_zeros(job.scenes, mask_size(there.source, job.substeps), dtype=torch.uint8)
+    size = mask_size(there.source, job.substeps if keep else 2)
+    masks = like.new_zeros(job.scenes, size, dtype=torch.uint8)
     grids = like.new_empty(job.scenes, there.source.grid_size, dtype=torch.int32)
     ends = _there(torch.tensor(job.ends or (job.substeps,)), like.device)
     ports = _ports(job, like.device, results=results)
-    counts = ctypes.c_int(job.substeps), ctypes.c_int(len(ends))
+    counts = ctypes.c_int(job.substeps), ctypes.c_int(len(ends)), ctypes.c_int(keep)
     pointers = (ctypes.c_void_p(t.data_ptr()) for t in (masks, grids, ends))
     there.launch("values", ports, work, job.scenes, *pointers, *counts)
     if masks.numel() and bool(masks[:, -1].any()):
@@ -120,15 +123,18 @@ def forward(job: Job) -> tuple[dict[Field, Tensor], Tensor]:
             "contact grid",
             got="more nodes than there is room for",
             expected=f"at most {there.source.room} around the points of a scene",
-            remedy='a wider contact (tc.Contact.with_gap), or engine="reference"',
+            remedy='a shorter dt where it diverges; a wider contact (tc.Contact.with_gap), or engine="reference"',
         )
-    return results, _packed(masks)
+    return results, _packed(masks) if keep else masks[:, :0]
 
 
 def _packed(masks: Tensor) -> Tensor:
-    """Eight in a byte."""
-    padded = torch.nn.functional.pad(masks, (0, -masks.shape[-1] % 8)).unflatten(-1, (-1, 8))
-    return (padded << torch.arange(8, dtype=torch.uint8, device=masks.device)).sum(-1, dtype=torch.uint8)
+    """Eight in a byte, a few scenes at a time."""
+    places, found = torch.arange(8, dtype=torch.uint8, device=masks.device), []
+    for some in masks.split(max(1, BUDGET // max(8 * masks.shape[-1], 1))):
+        padded = torch.nn.functional.pad(some, (0, -some.shape[-1] % 8)).unflatten(-1, (-1, 8))
+        found.append((padded << places).sum(-1, dtype=torch.uint8))
+    return torch.cat(found)
 
 
 def _unpacked(bits: Tensor, size: int) -> Tensor:
@@ -177,7 +183,7 @@ def _states(job: Job, ends: Sequence[int]) -> dict[Field, Tensor]:
     if not ends:
         return {}
     drives = {f: t[:, : ends[-1]].contiguous() for f, t in job.inputs.items() if f.kind == Kind.DRIVE}
-    return forward(job._replace(inputs={**job.inputs, **drives}, substeps=ends[-1], ends=tuple(ends)))[0]
+    return forward(job._replace(inputs={**job.inputs, **drives}, substeps=ends[-1], ends=tuple(ends)), keep=False)[0]
 
 
 def _ports(

@@ -331,7 +331,9 @@ class Source:
         yield f"    R* states = own + {size + self._scratch + self._reference};"
         if self._contact is not None:
             yield f"    h.reference = own + {size + self._scratch}, h.knows = {str(adjoint).lower()};"
-            every = f"(Count({'all' if adjoint else 'substeps'}) * {self.mask_size} + 1)"
+            kept = "all" if adjoint else "(keeps ? substeps : 2)"
+            every = f"(Count({kept}) * {self.mask_size} + 1)"
+            yield f"    h.keeps = {'true' if adjoint else 'keeps'};"
             yield f"    h.masks = masks + scene * {every}, h.all = {'all' if adjoint else 'substeps'};"
             yield from self._contact.places()
         if adjoint:
@@ -373,7 +375,7 @@ class Source:
         size = self.state_size
         places = self._laid_out(Kind.STATE)[0]
         yield f"KERNEL values({COMMON},"
-        yield "              const Count* ends, int substeps, int frames) {"
+        yield "              const Count* ends, int substeps, int frames, int keeps) {"
         yield from self._begin(adjoint=False)
         yield from self._loaded()
         for k, f in self._some(Kind.SUM):
@@ -399,7 +401,7 @@ class Source:
         yield "        frame++;"
         yield "    }"
         if self._contact is not None:  # whether there was no room for nodes
-            yield f"    if (T == 0) h.masks[Count(substeps) * {self.mask_size}] = h.nodes.totals[3];"
+            yield f"    if (T == 0) h.masks[Count(keeps ? substeps : 2) * {self.mask_size}] = h.nodes.totals[3];"
         yield "}"
 
     def _adjoint(self) -> Iterator[str]:
