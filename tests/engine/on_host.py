@@ -119,17 +119,17 @@ def stand_in(threads=1, reverse=False):
 CHECKED: set[str] = set()  # kernels, in this process
 
 
-def agrees(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1e-9), threads=1, again=False):
+def agrees(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1e-9)):
     """Values and adjoints of a program on a device, or here, and by the processor's own engine, in float64.
 
-    Compilers take a while: only where there is a kernel that was not looked at yet, unless ``again``.
+    Compilers take a while: only where there is a kernel that was not looked at yet.
     """
     model = cloth.model()._replace(stages=stages)
     drives = {name: drive(t, torch.arange(substeps + 1, dtype=torch.float64) * dt) for name, t in motion.items()}
     with patch.object(devices, "elsewhere", lambda tensor: True):
         fused = Fused(model, state, drives)
     used = {str(given[0]) if name == "call" else name for name, given in fused.low.program.written}
-    if used <= CHECKED and not again:
+    if used <= CHECKED:
         return
     CHECKED.update(used)
     job = fused.job(state, torch.full((substeps,), dt, dtype=torch.float64), drives)
@@ -142,7 +142,7 @@ def agrees(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1
     seeds = {f: torch.randn(job.scenes, f.rows, f.comps, generator=generator, dtype=job.like.dtype) for f in known}
     before = running.reverse(job, running.forward(job, 1)[1], 1, seeds, set(job.inputs))
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    with stand_in(threads) if device == "cpu" else nullcontext():
+    with stand_in() if device == "cpu" else nullcontext():
         there = job._replace(inputs={f: t.to(device) for f, t in job.inputs.items()})
         found, masks = runs.forward(there._replace(ends=ends))
         after = runs.reverse(there, masks, {f: t.to(device) for f, t in seeds.items()}, set(job.inputs))

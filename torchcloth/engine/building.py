@@ -77,9 +77,10 @@ def folders() -> list[Path]:
     return [*found, Path(tempfile.gettempdir()) / f"torchcloth-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"]
 
 
-def cached() -> Path | None:
-    """The library in the cache; None: not there."""
-    return next((folder / file_name() for folder in folders() if is_safe(folder / file_name())), None)
+def cached(name: str | None = None) -> Path | None:
+    """A file in the cache, by default the library; None: not there."""
+    name = file_name() if name is None else name
+    return next((folder / name for folder in folders() if is_safe(folder / name)), None)
 
 
 def build() -> Path:

@@ -33,14 +33,6 @@ def _name(text: str, options: Sequence[str]) -> str:
     return f"program-{known}.cubin"
 
 
-def _cached(name: str) -> bytes | None:
-    for folder in building.folders():
-        if building.is_safe(folder / name):
-            with suppress(OSError):
-                return (folder / name).read_bytes()
-    return None
-
-
 def _keep(name: str, code: bytes) -> None:
     for folder in building.own_folders():
         with suppress(OSError), atomically(folder / name) as file:
@@ -60,8 +52,9 @@ class Kernels:
         self._functions: dict[str, ctypes.c_void_p] = {}
         options = _options(threads, device)
         name = _name(text, options)
-        known = _cached(name)
-        module = None if known is None else self._loaded(known)
+        module, known = None, building.cached(name)
+        with suppress(OSError):
+            module = None if known is None else self._loaded(known.read_bytes())
         if module is None:  # nothing is there, or what does not load
             code = _compile(text, options)
             module = self._loaded(code)
@@ -74,8 +67,10 @@ class Kernels:
         module = ctypes.c_void_p()
         with torch.cuda.device(self._device):
             torch.cuda.current_stream().synchronize()  # then there is a context
-            if _again(lambda: _driver().cuModuleLoadData(ctypes.byref(module), code)) in UNFIT:
+            answer = _again(lambda: _driver().cuModuleLoadData(ctypes.byref(module), code))
+            if answer in UNFIT:
                 return None
+            _check(answer)
             return module
 
     def launch(self, name: str, blocks: int, shared: int, arguments: Sequence[ctypes._SimpleCData]) -> None:
@@ -96,7 +91,7 @@ class Kernels:
             stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
             sizes = tuple(ctypes.c_uint(n) for n in (blocks, 1, 1, self.threads, 1, 1, shared))
             given = (self._functions[name], *sizes, stream, pointers, None)
-            _again(lambda: _driver().cuLaunchKernel(*given))
+            _check(_again(lambda: _driver().cuLaunchKernel(*given)))
 
 
 def _compile(text: str, options: Sequence[str]) -> bytes:
@@ -161,13 +156,12 @@ def _driver() -> ctypes.CDLL:
 
 
 def _again(call: Callable[[], int]) -> int:
-    """The driver's answer; once more with what memory torch can spare. What no other code would mend is raised."""
+    """The driver's answer; where memory is short, once more with what torch can spare."""
     code = call()
-    if code == OUT_OF_MEMORY:
-        torch.cuda.empty_cache()
-        code = call()
-    _check(0 if code in UNFIT else code)
-    return code
+    if code != OUT_OF_MEMORY:
+        return code
+    torch.cuda.empty_cache()
+    return call()
 
 
 def _check(code: int) -> None:

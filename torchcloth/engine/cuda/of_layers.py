@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..fields import Kind
-from .listing import Layers, PerMass
+from .listing import CORNERS, Layers, PerMass
 
 if TYPE_CHECKING:
     from .source import Source
@@ -35,6 +35,8 @@ TEXT = """
 #define EACH {each}
 #define ROOM {room}
 #define SHIFT {shift}
+#define AROUND {around}
+#define ROW {row}
 
 // The nodes of a scene, by a hash. A cell goes by its lowest node.
 struct Nodes {{
@@ -159,8 +161,7 @@ class OfLayers:
         room, points = self._stage.room, self._stage.points
         shift = 64 - (room.bit_length() - 1)
         numbers = {"points": points, "triangles": self._stage.triangles, "each": len(self._stage.places)}
-        body = TEXT.format(places=places, room=room, shift=shift, **numbers)
-        return body.replace("AROUND", str(AROUND)).replace("ROW", str(ROW))
+        return TEXT.format(places=places, room=room, shift=shift, around=AROUND, row=ROW, **numbers)
 
     @property
     def memory(self) -> int:
@@ -219,7 +220,7 @@ class OfLayers:
         yield "bool lost = false;"
         yield "for (int t = T; t < TRIANGLES; t += THREADS)"
         yield "    for (int d = 0; d < 3; d++) {"
-        at = " + ".join(f"x[3 * corners[{k} * TRIANGLES + t] + d]" for k in range(3))
+        at = _at_corners("{}")
         yield f"        centre[3 * t + d] = ({at}) / R(3);"
         yield "        lost = lost || !(centre[3 * t + d] - centre[3 * t + d] == R(0));"
         yield "    }"
@@ -259,7 +260,7 @@ class OfLayers:
         yield "    if (!h.mask[t]) continue;"
         yield "    Count low[3];"
         yield "    for (int d = 0; d < 3; d++) {"
-        at = " + ".join(f"PLACES[p % EACH][{k}] * x[3 * corners[{k} * TRIANGLES + t] + d]" for k in range(3))
+        at = _at_corners("PLACES[p % EACH][{k}] * {}")
         yield f"        const R place = floor(({at}) / R({s.spacing!r}) - R(0.5));"
         yield f"        h.f{s.base}[3 * p + d] = place, low[d] = Count(place);"
         yield "    }"
@@ -316,7 +317,6 @@ class OfPerMass:
     def _each(self) -> Iterator[str]:
         yield "if (!h.some) return;"
         yield "const Nodes& n = h.nodes;"
-        yield "if (n.totals[3]) h.some = h.woken = false;  // nobody changes that before all have waited"
         yield "for (int m = T; m < n.totals[1]; m += THREADS) {"
         yield "    const int at = 4 * n.slots[m];"
         yield f"    const R mass = h.f{self._stage.mass}[at];"
@@ -344,3 +344,8 @@ class OfPerMass:
         yield f"    if (counts) h.g{mass}[at] -= work;"
         yield "}"
         yield "SYNC();"
+
+
+def _at_corners(term: str) -> str:
+    """Sum over the corners k of triangle t of what ``term`` makes of component d of their positions."""
+    return " + ".join(term.format(f"x[3 * corners[{k} * TRIANGLES + t] + d]", k=k) for k in range(CORNERS))

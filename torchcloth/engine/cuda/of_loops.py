@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from ..fields import Kind
@@ -27,10 +27,7 @@ class OfLoop:
         sums = [(m, c) for m in self._stage.moves(ADD) if m.table == SHARED for c in range(self._comps(m))]
         shared = {(m.field, c): f"s{k}" for k, (m, c) in enumerate(sums)}
         scratch = self._scratched(ADD)
-        yield from self._pointers("f")
-        if sums:
-            yield f"R {', '.join(f'{name} = R(0)' for name in shared.values())};"
-        yield from self._items(list(scratch.items()))
+        yield from self._begun("f", scratch, shared)
         for n, i in enumerate(self._stage.code):
             if isinstance(i, Transfer) and i.code == SPREAD:
                 yield from self._given(i, [f"r{i.share + k}" for k in range(SHARES)], ADD)
@@ -47,7 +44,7 @@ class OfLoop:
                 elif i.table == SHARED:
                     yield f"    {shared[i.field, c]} += {reg};"
                 elif i in scratch:
-                    yield f"    scratch[{scratch[i] + c * self._stage.items} + i] = {reg};"
+                    yield f"    {self._slot(scratch[i], c)} = {reg};"
                 else:
                     begins = (
                         i.field in self._begins and i.table == OWN and self._stage.items == self._fields[i.field].rows
@@ -68,14 +65,10 @@ class OfLoop:
         """Adjoints."""
         if self._stage.flat:
             return
-        scratch = {m: at for m, at in self._scratched(LOAD).items() if self._is_active(m)}
+        scratch = self._scratched(LOAD)
         loads = [m for m in self._stage.moves(LOAD) if self._is_active(m) and m.table == SHARED]
         shared = {(m.field, c): f"s{k}_{c}" for k, m in enumerate(loads) for c in range(self._comps(m))}
-        yield from self._pointers("f")
-        yield from self._pointers("g")
-        if shared:
-            yield f"R {', '.join(f'{name} = R(0)' for name in shared.values())};"
-        yield from self._items(list(scratch.items()))
+        yield from self._begun("fg", scratch, shared)
         for n, i in enumerate(self._stage.code):
             if isinstance(i, Transfer) and i.code == SPREAD:
                 continue
@@ -120,6 +113,18 @@ class OfLoop:
     def _is_active(self, move: Move) -> bool:
         return move.field in self._source.active
 
+    def _begun(self, letters: str, scratch: dict[Move, int], shared: dict[tuple[int, int], str]) -> Iterator[str]:
+        """All before the instructions on an item."""
+        for letter in letters:
+            yield from self._pointers(letter)
+        if shared:
+            yield f"R {', '.join(f'{name} = R(0)' for name in shared.values())};"
+        yield from self._items(scratch)
+
+    def _slot(self, at: int, c: int) -> str:
+        """An item's number in scratch."""
+        return f"scratch[{at + c * self._stage.items} + i]"
+
     def _pointers(self, letter: str) -> Iterator[str]:
         """In registers; not where contact has nothing to do."""
         if letter == "f" and self._stage.counted >= 0:
@@ -131,17 +136,15 @@ class OfLoop:
         if letter == "f":
             yield "R* const scratch = h.scratch;"
 
-    def _items(self, scratch: list[tuple[Move, int]]) -> Iterator[str]:
+    def _items(self, scratch: dict[Move, int]) -> Iterator[str]:
         """Their loop begins; of those that contact leaves out, nothing lies in ``scratch``."""
         yield f"for (int i = T; i < {self._stage.items}; i += THREADS) {{"
         if self._stage.counted >= 0:
             takes = ("h.mask[t]", "h.mask[t] && !h.before[t]", "!h.mask[t]")[self._stage.counted]
             yield "    const int t = i / EACH;"
             yield f"    if (!({takes})) {{"
-            for m, at in scratch:
-                yield "        " + " ".join(
-                    f"scratch[{at + c * self._stage.items} + i] = R(0);" for c in range(self._comps(m))
-                )
+            for m, at in scratch.items():
+                yield "        " + " ".join(f"{self._slot(at, c)} = R(0);" for c in range(self._comps(m)))
             yield "        continue;"
             yield "    }"
             for k in range(CORNERS):
@@ -232,16 +235,10 @@ class OfLoop:
 
     def _scratched(self, code: int) -> dict[Move, int]:
         """Moves to rows where others may come, with the place of their numbers."""
+        wanted = [m for m in self._stage.moves(code) if code == ADD or self._is_active(m)]
+        met = [m for m in wanted if m.table != SHARED and not self._source.is_direct(self._stage, m, code)]
         found, size = {}, 0
-        for m in self._stage.moves(code):
-            if m.table != SHARED and not self._source.is_direct(self._stage, m, code):
-                if code == LOAD and not self._is_active(m):
-                    continue
-                found[m] = size
-                size += self._comps(m) * self._stage.items
-        by_field = self._by_field(found)  # a field's side by side
-        found, size = {}, 0
-        for moves in by_field.values():
+        for moves in self._by_field(met).values():  # a field's side by side
             for m in moves:
                 found[m] = size
                 size += self._comps(m) * self._stage.items
@@ -252,7 +249,7 @@ class OfLoop:
         return found
 
     @staticmethod
-    def _by_field(moves: dict[Move, int]) -> dict[int, list[Move]]:
+    def _by_field(moves: Iterable[Move]) -> dict[int, list[Move]]:
         found: dict[int, list[Move]] = {}
         for m in moves:
             found.setdefault(m.field, []).append(m)
@@ -305,7 +302,7 @@ class OfLoop:
             elif m.table == SHARED:
                 yield f"    {shared[m.field, c]} += {bar};"
             elif m in scratch:
-                yield f"    {asked}scratch[{scratch[m] + c * self._stage.items} + i] = {bar};"
+                yield f"    {asked}{self._slot(scratch[m], c)} = {bar};"
             else:
                 yield f"    {asked}{place} += {bar};"
 
