@@ -16,9 +16,9 @@ from ._surroundings import undisturbed
 from .boundaries import AbstractBoundary
 from .captured import Graphs
 from .effects import AbstractEffect
-from .engine.choice import Choice, Setting, check_setting, choose, still_drives
+from .engine.choice import TRIED, Choice, Setting, Trial, check_setting, choose, still_drives
 from .errors import TorchclothError
-from .initial import damped, first_state, held, likeness
+from .initial import damped, first_state, folded, held, likeness
 from .intervals import Plan, divided, run
 from .materials import AbstractMaterial
 from .meshes import Mesh
@@ -350,7 +350,8 @@ class Cloth(nn.Module):
             model = damped(model, settling)
         state = expand_state(state, model, motion)
         longest = float("inf") if self._grid is None else self._grid.longest
-        choice, step_for, asked = self._choice(model, state), None, None
+        steps = [(end - start) / count for (start, end), count in zip(pairwise(frames), counts, strict=True)]
+        choice, step_for, asked = self._choice(model, state, min(steps, default=None)), None, None
         if MATERIAL in state.memory:
             frames, counts, asked = divided(frames, counts)
             step_for = self._step_for(model, dt)
@@ -368,8 +369,10 @@ class Cloth(nn.Module):
 
         return longest
 
-    def _choice(self, model: Model, state: ClothState) -> Choice:
-        return choose(self.engine, model, state, still_drives(model))
+    def _choice(self, model: Model, state: ClothState, dt: float | None = None) -> Choice:
+        """``dt``: of the substeps [s]; None: there will be none."""
+        trial = None if dt is None else lambda: Trial(folded(model, self._vertices, TRIED * dt / 2), dt / 2)
+        return choose(self.engine, model, state, still_drives(model), trial)
 
     def extra_repr(self) -> str:
         """Data sheet: size, contact, step."""

@@ -29,6 +29,24 @@ def first_state(model: Model, x: Tensor, v: Tensor) -> ClothState:
     return ClothState(x, v, d3, _virgin(model, x))
 
 
+@torch.no_grad()
+def folded(model: Model, x: Tensor, duration: float) -> ClothState:
+    """One half over the other, and on its way down to it: layers meet, and press each other more and more.
+
+    Not quite even: nothing lies on the edge of a spline, where slopes of slopes jump.
+    """
+    spacing = 0.01 if model.grid is None else model.grid.spacing
+    low, high = x.amin(-2), x.amax(-2)
+    thin, *_, long = (high - low).argsort().tolist()
+    beyond = x[:, long] > (low + high)[long] / 2
+    noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x, v = x + 0.01 * spacing * noise.to(x), torch.zeros_like(x)
+    x[beyond, long] = (low + high)[long] - x[beyond, long]
+    x[beyond, thin] += spacing / 2
+    v[beyond, thin] = -spacing / 4 / duration
+    return first_state(model, x, v)
+
+
 def likeness(model: Model, x: Tensor) -> ClothState:
     """A state with the right shapes and no physics."""
     points = 0 if model.grid is None else len(model.geometry.area) * len(model.grid.points)

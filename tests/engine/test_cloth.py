@@ -128,8 +128,7 @@ def test_records_are_kept_while_the_budget_lasts(monkeypatch):
     """Three intervals, room for the records of one and a half: the first keeps, the others go through it again."""
     cloth, kept = sheet("fused"), []
     model, state = cloth.model(), start(cloth)
-    drives = {name: d._replace(increment=d.increment.repeat(9, 1, 1), pose=d.pose.repeat(9, 1, 1), closed=(True,) * 9)
-              for name, d in still_drives(model).items()}  # fmt: skip
+    drives = still_drives(model, 9)
     size = running.full_size(Fused(model, state, drives).low.program, 1, 9)
     monkeypatch.setattr(running, "BUDGET", int(1.5 * size))
     fused, forward = Fused(model, state, drives), running.forward

@@ -11,9 +11,9 @@ from clothes import opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.boundaries.motion import drive
-from torchcloth.engine import devices
+from torchcloth.engine import choice, devices
 from torchcloth.engine.building import Unbuilt
-from torchcloth.engine.cuda import arithmetic, listing, runs
+from torchcloth.engine.cuda import arithmetic, listing, runs, trial
 from torchcloth.engine.fused import Fused
 from torchcloth.engine.library import kernels
 
@@ -168,6 +168,39 @@ def test_what_it_cannot_do_is_said():
             assert sheet().engine_in_use == "reference (no libnvrtc)"
         with pytest.raises(tc.errors.InvalidInput, match=r"no libnvrtc.*install it"):
             sheet(engine="fused")(start(sheet()), opening(TIMES[-1]), TIMES)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_device_is_tried_once(dtype, monkeypatch):
+    """On a fold that is pressed; one that does something else is not believed."""
+    torch.set_default_dtype(dtype)
+    cloth = sheet(contact=tc.Contact(), n=17).to(dtype)
+    tried, forward, check = [], runs.forward, trial.check
+
+    def watched(job, rounding):
+        tried.append(bool(forward(job)[1][:, :-1].any()))
+        check(job, rounding)
+
+    monkeypatch.setattr(trial, "check", watched)
+    for _ in range(2):
+        with elsewhere():
+            for scenes in ((), (2,)):
+                cloth(start(cloth, scenes), opening(2e-3), [0.0, 2e-3])
+            assert cloth.engine_in_use == "fused"
+    assert tried == [True, True], "layers met"
+
+    def wrong(job, keep=True):
+        found, masks = forward(job, keep)
+        return {f: 1.1 * t for f, t in found.items()}, masks
+
+    monkeypatch.setattr(runs, "forward", wrong)
+    choice._warn.cache_clear()
+    with elsewhere():
+        with pytest.warns(UserWarning, match="is not the CPU's, 5 apart: simulations run on the torch reference"):
+            cloth(start(cloth), opening(2e-3), [0.0, 2e-3])
+        cloth(start(cloth), opening(2e-3), [0.0, 2e-3])
+        assert cloth.engine_in_use.startswith("reference (the engine on cpu is not the CPU's")
+    assert len(tried) == 3
 
 
 def test_directions_are_the_references():

@@ -27,8 +27,7 @@ def program(dtype, batch=()):
     cloth = sheet("fused").to(dtype)
     state = start(cloth, batch)
     model = cloth.model()
-    drives = {name: d._replace(increment=d.increment.repeat(STEPS, 1, 1), pose=d.pose.repeat(STEPS, 1, 1),
-                               closed=(True,) * STEPS) for name, d in still_drives(model).items()}  # fmt: skip
+    drives = still_drives(model, STEPS)
     job = Fused(model, state, drives).job(state, torch.full((STEPS,), 1e-4), drives)
     return job.program, [tensor.detach() for tensor in job.inputs.values()]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Literal, NamedTuple, get_args
 
@@ -19,6 +19,7 @@ from .library import Unbuilt, library
 from .lowering import Unfused
 
 Setting = Literal["auto", "reference", "fused"]
+TRIED = 16  # substeps
 
 
 class Choice(NamedTuple):
@@ -46,8 +47,23 @@ def check_setting(setting: str) -> Setting:
     return setting  # type: ignore[return-value]
 
 
-def choose(setting: Setting, model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Choice:
+class Trial(NamedTuple):
+    """On what a device is tried."""
+
+    state: ClothState  # without a batch
+    dt: float  # s
+
+
+def choose(
+    setting: Setting,
+    model: Model,
+    state: ClothState,
+    drives: Mapping[str, Drive],
+    trial: Callable[[], Trial] | None = None,
+) -> Choice:
     """The engine for one call; warns once per process where only a compiler is missing.
+
+    ``trial``: on what a device is tried that was not yet; None: it is not.
 
     Raises:
         InvalidInput: ``setting`` is "fused" and it cannot be.
@@ -57,7 +73,7 @@ def choose(setting: Setting, model: Model, state: ClothState, drives: Mapping[st
     remedy = 'use engine="auto", which falls back to the reference'
     try:
         if devices.elsewhere(state.x):
-            return _on_device(model, state, drives)
+            return _on_device(model, state, drives, trial)
         return Choice(_fused(model, state, drives), "")
     except Unfused as miss:
         reason = f"{miss} has no kernels"
@@ -75,17 +91,20 @@ def choose(setting: Setting, model: Model, state: ClothState, drives: Mapping[st
     return Choice(None, reason, captured=state.x.is_cuda and not transformed())
 
 
-def still_drives(model: Model) -> dict[str, Drive]:
-    """Drives of one substep in which every driven boundary is closed and stands still, to try an engine on."""
-    still = torch.eye(4, dtype=model.mass.dtype, device=model.mass.device).unsqueeze(0)
-    return {name: Drive(still, still, (True,)) for name, boundary in model.boundaries.items() if boundary.driven}
+def still_drives(model: Model, substeps: int = 1) -> dict[str, Drive]:
+    """Drives in which every driven boundary is closed and stands still, to try an engine on."""
+    still = torch.eye(4, dtype=model.mass.dtype, device=model.mass.device).repeat(substeps, 1, 1)
+    closed = (True,) * substeps
+    return {name: Drive(still, still, closed) for name, boundary in model.boundaries.items() if boundary.driven}
 
 
 class _Elsewhere(Exception):
     """Tensors that the engine does not take."""
 
 
-def _on_device(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Choice:
+def _on_device(
+    model: Model, state: ClothState, drives: Mapping[str, Drive], trial: Callable[[], Trial] | None
+) -> Choice:
     """On CUDA; parts in torch are the reference's, as are tangents."""
     if transformed():
         raise _Elsewhere("tangents on cuda")
@@ -94,8 +113,19 @@ def _on_device(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> 
     fused = Fused(model, state, drives)
     if fused.torch_parts is not None:
         raise _Elsewhere(f"{', '.join(sorted(fused.torch_parts.parts))} in torch, on cuda")
-    devices.prepare(fused.low.program, state.x.device)
+    tried = devices.prepare(fused.low.program, state.x.device)
+    if not tried and trial is not None:
+        _try(model, state.x.shape[:-2], *trial())
     return Choice(fused, "")
+
+
+@torch.no_grad()
+def _try(model: Model, batch: torch.Size, state: ClothState, dt: float) -> None:
+    """A few substeps of the first scene."""
+    drives, state = still_drives(model, TRIED), state.map(lambda t: t.expand(*batch, *t.shape))
+    fused = Fused(model, state, drives)  # its own, for numbers that nobody derives
+    job = fused.job(state, torch.full((TRIED,), dt, dtype=torch.float64), drives)
+    devices.try_out(job._replace(inputs={f: t[:1] for f, t in job.inputs.items()}, scenes=1), fused.rounding)
 
 
 def _fused(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Fused:

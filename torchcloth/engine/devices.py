@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from . import running
-from .cuda import runs
+from .building import Unbuilt
+from .cuda import runs, trial
 from .fields import Field
 from .program import Program
 from .running import Job
@@ -51,10 +52,28 @@ def records_like(program: Program, scenes: int, substeps: int, every: int, like:
     return like.new_empty(scenes, running.record_size(program, substeps, every))
 
 
-def prepare(program: Program, device: torch.device) -> None:
-    """Compile for a device.
+def prepare(program: Program, device: torch.device) -> bool:
+    """Compile for a device; whether it was tried there.
 
     Raises:
-        Unbuilt: it cannot be.
+        Unbuilt: it cannot be, or it failed when it was tried.
     """
-    runs.on_device(program, device)
+    there = runs.on_device(program, device)
+    if there.doubt is not None:
+        raise Unbuilt(str(there.doubt), there.doubt.remedy)
+    return there.tried
+
+
+def try_out(job: Job, rounding: Field | None) -> None:
+    """Compare a job's device with the processor; see ``trial.check``.
+
+    Raises:
+        Unbuilt: they do not agree.
+    """
+    there = runs.on_device(job.program, job.like.device)
+    try:
+        trial.check(job, rounding)
+    except Unbuilt as miss:
+        there.doubt = miss
+        raise
+    there.tried = True

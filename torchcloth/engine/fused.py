@@ -108,6 +108,11 @@ class Fused:
         """Whether its tensors are on a device."""
         return devices.elsewhere(self.model.mass)
 
+    @property
+    def rounding(self) -> Field | None:
+        """The result that holds what was lost in float32, and has no digits of its own; None in float64."""
+        return None if self.low.lost is None else self.low.lost.after
+
     def is_plain(self, state: ClothState, motion: Mapping[str, Trajectory]) -> bool:
         """The engine runs by itself on numbers from which nobody wants a derivative."""
         given = [state.x, state.v, state.d3, *state.memory.values(), *self.low.inputs.values()]

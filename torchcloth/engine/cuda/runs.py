@@ -39,7 +39,15 @@ class Device(Protocol):
 
 
 class OnDevice:
-    """A program on one device."""
+    """A program on one device.
+
+    Attributes:
+        tried: whether it was compared with the processor.
+        doubt: in what it was not the same.
+    """
+
+    tried = False
+    doubt: Unbuilt | None = None
 
     def __init__(self, source: Source, kernels: Device, device: torch.device, dtype: torch.dtype) -> None:
         self.source, self.kernels = source, kernels
