@@ -139,6 +139,32 @@ def test_what_nothing_tells_stays_open_under_ripples():
     assert float(deviation[:2].max()) < 0.3
 
 
+@pytest.mark.parametrize(("known", "failed"), [(0.0, 1.0), (1.0, 0.0), (None, 0.0)])
+def test_it_starts_where_all_frames_are_nearer(monkeypatch, known, failed):
+    """From the beginning's end or from that of tangents; None: a place that cannot be simulated."""
+    starts, problem = [], Rippling(0)
+    at = {end: SimpleNamespace(raw=torch.full((3,), float(k), dtype=torch.float64)) for k, end in enumerate("kf")}
+    far = {0.0: known, 1.0: failed}
+
+    def figures(raw):
+        if far[float(raw[0])] is None:
+            raise SimulationDiverged("torn")
+        return Figures(far[float(raw[0])], 0.0, torch.zeros(0))
+
+    def settle(around, posed, start, *rest):
+        starts.append(float(start[0]))
+        assert float(posed.prior_mean[0]) == 0.0, "the beginning's"
+        raise SimulationDiverged("seen enough")
+
+    monkeypatch.setattr(problem, "figures", figures, raising=False)
+    monkeypatch.setattr(ensemble, "covariance_of", lambda *_: torch.eye(3, dtype=torch.float64))
+    monkeypatch.setattr(ensemble, "later", lambda *_: None)
+    monkeypatch.setattr(ensemble, "_settle", settle)
+    begun = horizon.Within(problem, FAILED._replace(final=at["k"]), 0.5)
+    assert ensemble.resolved(problem, FAILED._replace(final=at["f"]), begun, 8, lambda raw: None) is None
+    assert starts == [0.0 if known == 0.0 else 1.0]
+
+
 def test_what_cannot_be_simulated_around_is_left_as_it_was():
     class Torn(Rippling):
         def evaluate_all(self, raw):
