@@ -157,9 +157,9 @@ def test_what_is_unknown_is_said(recording):
 def test_identify_finds_the_air_that_moves_along(recording):
     """The whole run, strokes included, gives the frequency of the free swings, 0.90 Hz, to which nothing was fitted.
 
-    Reached: 0.91 Hz; three other runs 0.92 Hz. Without added mass 16.1 mm are left instead of 14.9 mm where tangents end,
-    which are of no use there: they miss finite steps by their own size. So the first 2.4 s decide, 22 of 98 frames, and
-    of all frames 15.9 mm are left (19.7 mm if the cloth were carried along). No parameter is called identified, and
+    Reached: 0.91 Hz; three other runs 0.92 Hz. Without added mass 16.1 mm are left instead of 14.9 mm where tangents
+    end, which are of no use there: they miss finite steps by their own size. The first 2.4 s decide, 22 of 98 frames,
+    and of all frames 15.9 mm are left (19.7 mm if the cloth were carried along). No parameter is called identified, and
     rightly: nodes lean by 10 mm at rest already, and drag is another one at small amplitudes.
     """
     effects = {
