@@ -114,8 +114,8 @@ class Cloth(nn.Module):
         self.boundaries.update(boundaries)
         check_grasps(dict(self._parts()), self.boundaries)
         self.contact, self._grid = contact, None if contact is None else contact.grid(mesh)
-        unmet = None if self._grid is None else self._grid.unmet(mesh)
-        for doubt in (*doubts(mesh, self.areal_density.value), *([unmet] if unmet else [])):
+        of_contact = () if self._grid is None else self._grid.doubts(mesh)
+        for doubt in (*doubts(mesh, self.areal_density.value), *of_contact):
             warnings.warn(doubt, stacklevel=2)
         self._store_geometry()
         for own in (*self.parameters(), *self.buffers()):  # tensors keep their precision until a cloth has one

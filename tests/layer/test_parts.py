@@ -46,6 +46,14 @@ def test_coefficients_never_reach_beyond_their_rows():
             )
 
 
+def test_a_field_wants_an_effect_that_was_made_with_one():
+    """Stencils of bending differ, and are built with the cloth."""
+    cloth = sheet(effects={"bending": tc.effects.Bending(1e-5)})
+    field = {"effects.bending.stiffness.raw": torch.full((18,), 1e-5)}
+    with pytest.raises(InvalidInput, match=r"18 values for an effect that was made with one.*Bending\(torch.full"):
+        functional_call(cloth, field, (cloth.rest_state(), {}, (0.0, 0.01)))
+
+
 def test_a_part_of_another_cloth_is_not_bound_anew():
     bending, hand = tc.effects.Bending(1e-3), tc.boundaries.Grasp.corner("upper-right", radius=1e-3)
     first = sheet(effects={"bending": bending}, boundaries={"hand": hand})

@@ -303,6 +303,15 @@ def test_layers_that_do_not_meet_are_told(contact, told):
     assert all("lie over another layer do not see it" in text for text in texts)
 
 
+def test_contact_that_costs_a_hundred_times_as_much_is_told():
+    mesh = tc.meshes.rectangle(0.5, 0.5, resolution=(21, 21))
+    with pytest.warns(UserWarning, match=r"edges of some 28.5 mm take 64 points in each triangle near another layer"):
+        tc.Cloth(mesh, tc.materials.AEP(1e5), DENSITY, contact=tc.Contact.with_gap(0.004))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tc.Cloth(mesh, tc.materials.AEP(1e5), DENSITY, contact=tc.Contact.with_gap(0.01))
+
+
 def test_what_lies_over_what():
     """Two sheets 1 cm apart, each of whose triangles has some of the other over it; none of its own."""
     cloth, _ = layers(0.01)

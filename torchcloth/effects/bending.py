@@ -129,7 +129,11 @@ class Bending(AbstractEffect):
         return any(p is not None for p in (self.weft_ratio, self.twist_ratio, self.curl_warp, self.curl_weft))
 
     def coefficients(self) -> Coefficients:
-        """Resolved once per rollout."""
+        """Resolved once per rollout.
+
+        Raises:
+            InvalidInput: a value for each triangle, given to an effect that was made with one for all.
+        """
         field = self.stiffness.field
         time = None if self.damping_time is None else self.damping_time.field
         curl = self._curl(field)
@@ -137,6 +141,13 @@ class Bending(AbstractEffect):
             viscosity = torch.zeros_like(field) if time is None else field * time
             plate = None if curl is None else self._plate(field)
             return Coefficients(field, viscosity, None, plate, curl)
+        if not len(self.woven.locals):
+            raise InvalidInput(
+                "bending stiffness",
+                got=f"{field.shape[-2]} values for an effect that was made with one",
+                expected="one",
+                remedy="make it with a field, Bending(torch.full((E,), 1e-5)), whose stencils differ",
+            )
         plate = self._plate(field if field.shape[-2] == 1 else self._on_vertices(field))
         time = torch.zeros_like(field[..., :1, :]) if time is None else time
         return Coefficients(torch.ones_like(time), time, self.woven.entries(plate), plate, curl)

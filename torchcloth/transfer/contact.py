@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ GAP = 1.4  # grid spacings between layers at rest, with the default play
 SPARSEST = 1.4  # grid spacings between corners of sub-triangles: no hole between the points exceeds 0.7 spacings
 ROOM = 1.6  # times the longest way along the cloth: the extent at which the grid wraps, so that layers never alias
 MOST = 100  # points along a triangle's edge: 10 000 in it
+CROWDED = 64  # points in a triangle, of which a cloth says so; usual are 1 to 4
 UNMET = 0.5  # share of the triangles of layers that do not see the other layer, from which a cloth says so
 TURNED = 1.7  # layers are folded on each other where the way along the cloth is that much longer than through space
 
@@ -51,19 +53,24 @@ class Grid(NamedTuple):
             f"{len(self.points)} point(s) per triangle"
         )
 
-    def unmet(self, mesh: Mesh) -> str:
-        """What a user must know of layers of the mesh that lie over each other and do not meet; empty where most do."""
+    def doubts(self, mesh: Mesh) -> Iterator[str]:
+        """What a user must know: of what contact costs, and of layers that lie over each other and do not meet."""
+        if len(self.points) >= CROWDED:
+            yield (
+                f"contact: edges of some {1e3 * mesh.coarse_edge:.3g} mm take {len(self.points)} points in each "
+                f"triangle near another layer, and each costs as much as a triangle ({self.words}): give the mesh more "
+                "triangles, or contact=Contact.with_gap(...) a larger gap"
+            )
         pairs = over(mesh, 2 * GAP * self.spacing)
         if self.apart is None or not len(pairs):
-            return ""
+            return
         layered, seen = np.unique(pairs[:, 0]), np.unique(pairs[self.apart.cpu().numpy()[pairs[:, 0], pairs[:, 1]], 0])
         share = 1 - len(seen) / len(layered)
-        if share <= UNMET:
-            return ""
-        return (
-            f"contact: {100 * share:.0f} % of the triangles that lie over another layer do not see it and pass through "
-            f"({self.words}): give contact=Contact.with_gap(...) a smaller gap, or the mesh more triangles"
-        )
+        if share > UNMET:
+            yield (
+                f"contact: {100 * share:.0f} % of the triangles that lie over another layer do not see it and pass "
+                f"through ({self.words}): give contact=Contact.with_gap(...) a smaller gap, or the mesh more triangles"
+            )
 
 
 @dataclass(frozen=True)
