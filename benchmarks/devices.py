@@ -30,7 +30,7 @@ class Way(NamedTuple):
 
 WAYS = {
     "fused, CPU": Way("cpu", "fused"),
-    "fused, CUDA": Way("cuda", "auto"),
+    "fused, CUDA": Way("cuda", "fused"),
     "reference, CUDA, graphs": Way("cuda", "auto", captured=True),
     "reference, CUDA, one by one": Way("cuda", "reference"),
 }

@@ -14,6 +14,7 @@ pytestmark = [
     pytest.mark.gpu,
     pytest.mark.filterwarnings("error:no CUDA graph"),
     pytest.mark.filterwarnings("error:The CUDA Graph is empty"),
+    pytest.mark.filterwarnings("error:the engine on"),
 ]
 CONTACT = {"contact": tc.Contact(), "none": None}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Literal, cast
 
@@ -18,7 +19,7 @@ from .captured import Graphs
 from .effects import AbstractEffect
 from .engine.choice import TRIED, Choice, Setting, Trial, check_setting, choose, still_drives
 from .errors import TorchclothError
-from .initial import damped, first_state, folded, held, likeness
+from .initial import damped, first_state, held, likeness, pressed
 from .intervals import Plan, divided, run
 from .materials import AbstractMaterial
 from .meshes import Mesh
@@ -148,7 +149,10 @@ class Cloth(nn.Module):
 
     @property
     def engine_in_use(self) -> str:
-        """What computes the substeps: "fused", "fused, with effects.NAME in torch", or "reference (and why)"."""
+        """What computes the substeps: "fused", "fused, with effects.NAME in torch", or "reference (and why)".
+
+        A device is tried at the first call, after which this may say that the reference serves.
+        """
         with torch.no_grad(), undisturbed():
             model, _ = self._stepping()
             return str(self._choice(model, likeness(model, self._vertices)))
@@ -371,7 +375,9 @@ class Cloth(nn.Module):
 
     def _choice(self, model: Model, state: ClothState, dt: float | None = None) -> Choice:
         """``dt``: of the substeps [s]; None: there will be none."""
-        trial = None if dt is None else lambda: Trial(folded(model, self._vertices, TRIED * dt / 2), dt / 2)
+        trial = None
+        if dt is not None:
+            trial = Trial(partial(pressed, model, self._vertices, TRIED * dt / 2), dt / 2)
         return choose(self.engine, model, state, still_drives(model), trial)
 
     def extra_repr(self) -> str:

@@ -30,21 +30,30 @@ def first_state(model: Model, x: Tensor, v: Tensor) -> ClothState:
 
 
 @torch.no_grad()
-def folded(model: Model, x: Tensor, duration: float) -> ClothState:
-    """One half over the other, and on its way down to it: layers meet, and press each other more and more.
+def pressed(model: Model, x: Tensor, duration: float, batch: torch.Size, seed: int) -> ClothState:
+    """A batch of cloths x [V, 3] in motion, where there is contact one half over the other, on its way down to it.
 
-    Not quite even: nothing lies on the edge of a spline, where slopes of slopes jump.
+    None is even: nothing lies on the edge of a spline, or at the brink of pressing, where slopes jump.
     """
-    spacing = 0.01 if model.grid is None else model.grid.spacing
-    low, high = x.amin(-2), x.amax(-2)
+    generator = torch.Generator().manual_seed(seed)
+
+    def noise(like: Tensor) -> Tensor:
+        return torch.randn(*batch, *like.shape[-2:], generator=generator, dtype=torch.float64).to(like)
+
+    edge = model.geometry.area.mean().sqrt()
+    x, v = x + 0.01 * edge * noise(x), 0.05 * edge / duration * noise(x)
+    if model.grid is None:
+        return first_state(model, x, v)
+    low, high = x.amin((*range(len(batch)), -2)), x.amax((*range(len(batch)), -2))
     thin, *_, long = (high - low).argsort().tolist()
-    beyond = x[:, long] > (low + high)[long] / 2
-    noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    x, v = x + 0.01 * spacing * noise.to(x), torch.zeros_like(x)
-    x[beyond, long] = (low + high)[long] - x[beyond, long]
-    x[beyond, thin] += spacing / 2
-    v[beyond, thin] = -spacing / 4 / duration
-    return first_state(model, x, v)
+    middle = (low + high)[long] / 2
+    beyond = x[..., long] > middle
+    x[..., long] = middle - (x[..., long] - middle).abs()
+    x[..., thin] += model.grid.spacing / 2 * beyond
+    v[..., thin] -= model.grid.spacing / 4 / duration * beyond
+    state = first_state(model, x, v)
+    shorter = 0.1 * torch.rand(*state.d3.shape[:-1], 1, generator=generator, dtype=torch.float64)
+    return state._replace(d3=state.d3 * (1 - shorter.to(x)))
 
 
 def likeness(model: Model, x: Tensor) -> ClothState:

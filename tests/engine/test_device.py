@@ -1,6 +1,7 @@
 """Programs as CUDA C++, by a stand-in that runs anywhere; ``agreement.agree`` looks at every kernel."""
 
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from unittest.mock import patch
 
 import on_host
@@ -11,12 +12,14 @@ from clothes import opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.boundaries.motion import drive
-from torchcloth.engine import choice, devices
+from torchcloth.engine import choice, devices, fields, running
 from torchcloth.engine.building import Unbuilt
 from torchcloth.engine.cuda import arithmetic, listing, runs, trial
 from torchcloth.engine.fused import Fused
 from torchcloth.engine.library import kernels
+from torchcloth.initial import pressed
 
+pytestmark = pytest.mark.filterwarnings("error:the engine on")
 TIMES = [0.0, 0.01, 0.02]
 
 
@@ -149,9 +152,10 @@ def test_what_diverges_is_told():
         cloth(state, times=TIMES)
 
 
-def test_too_many_nodes_are_an_error():
+def test_too_many_nodes_are_an_error(monkeypatch):
     cloth = sheet(contact=tc.Contact(), n=17, boundaries={})
     small = property(lambda self: 16)
+    monkeypatch.setattr(trial, "agrees", lambda job, rounding: True)  # it has enough for its own
     with elsewhere(), patch.object(listing.Layers, "room", small), pytest.raises(tc.errors.InvalidInput, match="nodes"):
         cloth(folded(cloth), times=TIMES)
 
@@ -175,13 +179,13 @@ def test_a_device_is_tried_once(dtype, monkeypatch):
     """On a fold that is pressed; one that does something else is not believed."""
     torch.set_default_dtype(dtype)
     cloth = sheet(contact=tc.Contact(), n=17).to(dtype)
-    tried, forward, check = [], runs.forward, trial.check
+    tried, forward, agrees = [], runs.forward, trial.agrees
 
     def watched(job, rounding):
         tried.append(bool(forward(job)[1][:, :-1].any()))
-        check(job, rounding)
+        return agrees(job, rounding)
 
-    monkeypatch.setattr(trial, "check", watched)
+    monkeypatch.setattr(trial, "agrees", watched)
     for _ in range(2):
         with elsewhere():
             for scenes in ((), (2,)):
@@ -193,14 +197,49 @@ def test_a_device_is_tried_once(dtype, monkeypatch):
         found, masks = forward(job, keep)
         return {f: 1.1 * t for f, t in found.items()}, masks
 
-    monkeypatch.setattr(runs, "forward", wrong)
-    choice._warn.cache_clear()
-    with elsewhere():
-        with pytest.warns(UserWarning, match="is not the CPU's, 5 apart: simulations run on the torch reference"):
+    def failing(job, keep=True):
+        raise RuntimeError("CUDA: an illegal memory access\nat a place")
+
+    for other, said in ((wrong, "is not the CPU's"), (failing, "fails .CUDA: an illegal memory access.")):
+        monkeypatch.setattr(runs, "forward", other)
+        choice._warn.cache_clear()
+        with elsewhere():
+            with pytest.warns(UserWarning, match=f"the engine on cpu {said}: simulations run on the torch reference"):
+                cloth(start(cloth), opening(2e-3), [0.0, 2e-3])
             cloth(start(cloth), opening(2e-3), [0.0, 2e-3])
-        cloth(start(cloth), opening(2e-3), [0.0, 2e-3])
-        assert cloth.engine_in_use.startswith("reference (the engine on cpu is not the CPU's")
-    assert len(tried) == 3
+            assert cloth.engine_in_use.startswith("reference (the engine on cpu ")
+    assert len(tried) == 2 + 2 * choice.TRIALS
+
+
+@pytest.mark.parametrize("contact", [tc.Contact(), None])
+@pytest.mark.parametrize("n", [4, 9, 10])
+@pytest.mark.parametrize("offset", [0.0, 3.0])
+def test_rounding_is_no_reason_to_doubt_a_device(monkeypatch, contact, n, offset):
+    """Plastic cloth far from the origin in float32, on a device that rounds positions in another way."""
+    torch.set_default_dtype(torch.float32)
+    mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(n, n))
+    mesh = tc.meshes.Mesh.build(mesh.vertices + offset, mesh.faces, mesh.uv)
+    cloth = tc.Cloth(mesh, tc.materials.AEP(5e4, plastic=tc.materials.NormYield(0.02)), 0.2, contact=contact)
+
+    def rounded(job, keep=True):
+        x, _ = next((f, t) for f, t in job.inputs.items() if f.kind == fields.Kind.STATE)
+        noise = 0.3 * torch.finfo(torch.float32).eps * torch.randn_like(job.inputs[x])
+        job = job._replace(inputs={**job.inputs, x: job.inputs[x] * (1 + noise)})
+        return running.forward(job)[0], torch.zeros(0)
+
+    def reverse(job, masks, seeds, wanted, chunk):
+        return running.reverse(job, running.forward(job, 1)[1], 1, seeds, wanted)
+
+    monkeypatch.setattr(runs, "forward", rounded)
+    monkeypatch.setattr(runs, "reverse", reverse)
+    model, agreed = cloth.model(), []
+    dt = cloth.stable_step() / 2
+    begin = partial(pressed, model, cloth.rest_state().x, choice.TRIED * dt)
+    with patch.object(devices, "elsewhere", lambda tensor: True):
+        rounding = Fused(model, cloth.rest_state(), choice.still_drives(model)).rounding
+        for job in choice._trials(model, torch.Size(), choice.Trial(begin, dt)):
+            agreed.append(trial.agrees(job, rounding))
+    assert all(agreed)
 
 
 def test_directions_are_the_references():

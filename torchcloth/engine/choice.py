@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from typing import Literal, NamedTuple, get_args
 
@@ -17,9 +17,10 @@ from . import devices
 from .fused import Fused, transformed
 from .library import Unbuilt, library
 from .lowering import Unfused
+from .running import Job
 
 Setting = Literal["auto", "reference", "fused"]
-TRIED = 16  # substeps
+TRIALS, TRIED = 3, 16  # of a device: at most so many, of so many substeps
 
 
 class Choice(NamedTuple):
@@ -50,7 +51,7 @@ def check_setting(setting: str) -> Setting:
 class Trial(NamedTuple):
     """On what a device is tried."""
 
-    state: ClothState  # without a batch
+    begin: Callable[[torch.Size, int], ClothState]  # scenes, by their batch and a seed
     dt: float  # s
 
 
@@ -59,7 +60,7 @@ def choose(
     model: Model,
     state: ClothState,
     drives: Mapping[str, Drive],
-    trial: Callable[[], Trial] | None = None,
+    trial: Trial | None = None,
 ) -> Choice:
     """The engine for one call; warns once per process where only a compiler is missing.
 
@@ -102,9 +103,7 @@ class _Elsewhere(Exception):
     """Tensors that the engine does not take."""
 
 
-def _on_device(
-    model: Model, state: ClothState, drives: Mapping[str, Drive], trial: Callable[[], Trial] | None
-) -> Choice:
+def _on_device(model: Model, state: ClothState, drives: Mapping[str, Drive], trial: Trial | None) -> Choice:
     """On CUDA; parts in torch are the reference's, as are tangents."""
     if transformed():
         raise _Elsewhere("tangents on cuda")
@@ -115,17 +114,19 @@ def _on_device(
         raise _Elsewhere(f"{', '.join(sorted(fused.torch_parts.parts))} in torch, on cuda")
     tried = devices.prepare(fused.low.program, state.x.device)
     if not tried and trial is not None:
-        _try(model, state.x.shape[:-2], *trial())
+        devices.try_out(_trials(model, state.x.shape[:-2], trial), fused.rounding)
     return Choice(fused, "")
 
 
-@torch.no_grad()
-def _try(model: Model, batch: torch.Size, state: ClothState, dt: float) -> None:
-    """A few substeps of the first scene."""
-    drives, state = still_drives(model, TRIED), state.map(lambda t: t.expand(*batch, *t.shape))
-    fused = Fused(model, state, drives)  # its own, for numbers that nobody derives
-    job = fused.job(state, torch.full((TRIED,), dt, dtype=torch.float64), drives)
-    devices.try_out(job._replace(inputs={f: t[:1] for f, t in job.inputs.items()}, scenes=1), fused.rounding)
+def _trials(model: Model, batch: torch.Size, trial: Trial) -> Iterator[Job]:
+    """Of two scenes each, with numbers that nobody derives."""
+    drives, batch = still_drives(model, TRIED), batch if batch.numel() > 1 else torch.Size((2,))
+    steps = torch.full((TRIED,), trial.dt, dtype=torch.float64)
+    for seed in range(TRIALS):
+        with torch.no_grad():
+            state = trial.begin(batch, seed)
+            job = Fused(model, state, drives).job(state, steps, drives)
+        yield job._replace(inputs={f: t[:2] for f, t in job.inputs.items()}, scenes=2)
 
 
 def _fused(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Fused:

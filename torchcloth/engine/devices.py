@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import torch
 from torch import Tensor
 
+from ..errors import InvalidInput
 from . import running
 from .building import Unbuilt
 from .cuda import runs, trial
@@ -60,20 +61,41 @@ def prepare(program: Program, device: torch.device) -> bool:
     """
     there = runs.on_device(program, device)
     if there.doubt is not None:
-        raise Unbuilt(str(there.doubt), there.doubt.remedy)
+        raise Unbuilt(*there.doubt)
     return there.tried
 
 
-def try_out(job: Job, rounding: Field | None) -> None:
-    """Compare a job's device with the processor; see ``trial.check``.
+def try_out(jobs: Iterable[Job], rounding: Field | None) -> None:
+    """Compare a device with the processor, on jobs of one program until one agrees; see ``trial.agrees``.
+
+    A wrong kernel is always wrong; what lies on a kink, where rounding decides, does so in few of them.
 
     Raises:
-        Unbuilt: they do not agree.
+        Unbuilt: none agrees, or the device fails.
     """
-    there = runs.on_device(job.program, job.like.device)
+    doubt = None
+    for job in jobs:
+        there, doubt = runs.on_device(job.program, job.like.device), _doubt(job, rounding)
+        there.tried, there.doubt = doubt is None, doubt
+        if there.tried:
+            return
+    if doubt is not None:
+        raise Unbuilt(*doubt)
+
+
+def _doubt(job: Job, rounding: Field | None) -> tuple[str, str] | None:
+    """What a device does instead, and what to do about it."""
     try:
-        trial.check(job, rounding)
-    except Unbuilt as miss:
-        there.doubt = miss
+        if trial.agrees(job, rounding):
+            return None
+    except torch.OutOfMemoryError:
         raise
-    there.tried = True
+    except (RuntimeError, InvalidInput) as error:
+        said = str(error).partition("\n")[0]
+        return f"the engine on {_name(job)} fails ({said})", "begin a new process, and please report it"
+    return f"the engine on {_name(job)} is not the CPU's", "please report it"
+
+
+def _name(job: Job) -> str:
+    device = job.like.device
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)

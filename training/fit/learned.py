@@ -45,7 +45,9 @@ class Learned(nn.Module):
         self.paths = {name: available(cloth)[name] for name in names}
         for name in [*what.fields, *given]:
             if not self.paths[name].startswith(("material.", "areal_density")):
-                raise InvalidInput("config: learn", got=f"a field of {name}", expected="fields of the material")
+                raise InvalidInput(
+                    "config: learn", got=f"a field of {name}", expected="areal_density or one of the material"
+                )
         for name in what.fields:
             self.parameter(name).raw = nn.Parameter(self.parameter(name).raw.expand(len(cloth.mesh.faces)).clone())
         for name in (*what.parameters, *what.fields):

@@ -43,11 +43,11 @@ class OnDevice:
 
     Attributes:
         tried: whether it was compared with the processor.
-        doubt: in what it was not the same.
+        doubt: what it did instead, and what to do about it.
     """
 
     tried = False
-    doubt: Unbuilt | None = None
+    doubt: tuple[str, str] | None = None
 
     def __init__(self, source: Source, kernels: Device, device: torch.device, dtype: torch.dtype) -> None:
         self.source, self.kernels = source, kernels
@@ -156,15 +156,21 @@ def mask_size(source: Source, substeps: int) -> int:
     return 0 if source.layers is None else substeps * source.mask_size + 1
 
 
-def reverse(job: Job, masks: Tensor, seeds: Mapping[Field, Tensor], wanted: set[Field]) -> dict[Field, Tensor]:
-    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums; ``masks``: ``forward``'s."""
+def reverse(
+    job: Job, masks: Tensor, seeds: Mapping[Field, Tensor], wanted: set[Field], chunk: int | None = None
+) -> dict[Field, Tensor]:
+    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums; ``masks``: ``forward``'s.
+
+    ``chunk``: substeps whose states are kept at a time; None: by what there is room for.
+    """
     like = job.like
     there = on_device(job.program, like.device)
     states = [f for f in job.program.inputs if f.kind == Kind.STATE]
     after = dict(zip(states, [f for f in job.program.outputs if f.kind == Kind.NEXT], strict=True))
-    size = there.source.state_size * job.scenes * job.program.dtype.itemsize
-    # the states at the starts of all chunks are there at once: no shorter than the root of all
-    chunk = max(min(max(BUDGET // max(size, 1), FEWEST), MOST), isqrt(job.substeps))
+    if chunk is None:
+        size = there.source.state_size * job.scenes * job.program.dtype.itemsize
+        # the states at the starts of all chunks are there at once: no shorter than the root of all
+        chunk = max(min(max(BUDGET // max(size, 1), FEWEST), MOST), isqrt(job.substeps))
     ends = [*range(0, job.substeps, chunk), job.substeps]
     starts = _states(job, ends[1:-1])
     grads = {f: like.new_zeros(job.scenes, *job.inputs[f].shape[1:]) for f in wanted}
