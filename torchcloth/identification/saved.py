@@ -223,7 +223,7 @@ def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:
             f"{path}: a fit of another model",
             got=f"{', '.join(sorted(other))} not alike in both",
             expected="the model that the episode describes",
-            remedy="fit this episode",
+            remedy="fit this episode; where the fit began with --model FILE.tcm, give that file",
         )
     for name, value in model.values.items():
         try:

@@ -75,6 +75,6 @@ def open3d_or_refuse() -> Any:
         raise MissingDependency(
             "depth cameras and clouds need open3d",
             got=str(error),
-            remedy='pip install "torchcloth[observe]"; a missing libusb-1.0.so.0 is the system package libusb-1.0-0 '
-            "(apt-get install libusb-1.0-0)",
+            remedy='pip install "torchcloth[observe]"; what is missing of the system is in Debian: apt-get install '
+            "libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0 libgomp1",
         ) from error
