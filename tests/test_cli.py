@@ -458,3 +458,34 @@ def test_what_the_library_warns_of_is_one_line(monkeypatch, capsys):
     assert main(["doctor"]) == 0
     assert capsys.readouterr().err == "torchcloth: warning: settle: the cloth still moves\n"
     assert warnings.showwarning is before
+
+
+def test_what_is_written_is_there_before_it_is_shown(folder, tmp_path):
+    """`| head -1`: nobody reads on, and the files are whole; a folder's name may look like markup, or lead back."""
+    for verb in (["inspect", folder], ["identify", folder, *QUICK, "--iterations", "1", "--no-refine"]):
+        out = tmp_path / verb[0] / "new" / ".." / "a[b]"
+        command = [*COMMAND, *map(str, verb), "--out", str(out)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT) as p:
+            p.stdout.readline()
+            p.stdout.close()
+            said = p.stderr.read()
+        assert p.returncode in (0, 1, 141), said
+        assert "Traceback" not in said
+        assert [*(tmp_path / verb[0] / "a[b]").glob("*.json")]
+
+
+@pytest.mark.parametrize("verb", ["view", "inspect"])
+def test_nothing_is_written_into_an_episode(verb, folder, capsys):
+    before = sorted(folder.rglob("*"))
+    out = folder / "cam0" / "000000.png"
+    assert main([verb, str(folder), "--out", str(out)]) == 2
+    assert "within the episode" in one_line(capsys.readouterr().err)
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_letters_that_a_terminal_does_not_have_end_no_work(folder, tmp_path):
+    done = subprocess.run(
+        [*COMMAND, "inspect", str(folder), "--out", str(tmp_path / "ν")],
+        capture_output=True, text=True, timeout=300, env={**ENVIRONMENT, "PYTHONIOENCODING": "ascii"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr

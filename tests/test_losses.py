@@ -297,3 +297,13 @@ def test_edges_of_large_meshes_have_numbers_of_their_own():
     faces = torch.tensor([[28_633, 28_634, 150_000], [0, 39_971, 149_999]])  # 28633 * 150001 + 28634 is 39971 + 2^32
     for each in (faces, faces.int()):
         assert bool(_find_boundary(each)[0].all())
+
+
+def test_a_triangle_without_area_gives_no_nan():
+    x = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]], dtype=torch.float64, requires_grad=True)
+    faces, point = torch.tensor([[0, 1, 2]]), torch.tensor([[0.5, 0.0, 0.2]], dtype=torch.float64)
+    along, beside = residuals(point, x, closest(point, x, faces))
+    (along.sum() + beside.sum()).backward()
+    assert torch.isfinite(along).all()
+    assert torch.isfinite(beside).all()
+    assert torch.isfinite(x.grad).all()

@@ -74,6 +74,11 @@ def doubts(mesh: Mesh, density: Tensor) -> Iterator[str]:
         yield f"the mesh spans {span:.4g} m: is it in millimetres? Lengths are in metres"
     if heaviest > HEAVIEST:
         yield f"areal_density is {heaviest:.4g} kg/m^2: is it in g/m^2? Fabrics weigh 0.02 to 1 kg/m^2"
+    if torn := mesh.torn:
+        yield (
+            f"{torn} vertices of the mesh lie on others of another piece, so it falls apart there: if it is one cloth, "
+            "weld them, and give pattern coordinates to the triangles' corners"
+        )
 
 
 def check_axes(mesh: Mesh, parts: Mapping[str, AbstractMaterial | AbstractEffect]) -> None:

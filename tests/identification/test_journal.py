@@ -179,3 +179,14 @@ def test_all_code_that_answers_is_in_the_fingerprint(tmp_path, monkeypatch):
         place.write_text("2")
         known.append(journal.program.__wrapped__(tmp_path / "studies"))
     assert len(set(known)) == 4
+
+
+def test_two_problems_at_work_in_one_folder_do_not_share_answers(tmp_path):
+    """Neither had begun when the other looked; one that ends takes the folder away, and the other goes on."""
+    one, other = Journal(tmp_path / "j", ["a"], resume=None), Journal(tmp_path / "j", ["b"], resume=None)
+    assert float(one.ask("rows", POINT, answer(1.0))[0]) == 1.0
+    assert float(other.ask("rows", POINT, answer(2.0))[0]) == 2.0
+    journal.clear(tmp_path / "j")
+    journal.clear(tmp_path / "j")
+    assert float(other.ask("rows", POINT, answer(3.0))[0]) == 3.0
+    assert (tmp_path / "j" / journal.STAMP).read_text() == other.key

@@ -405,3 +405,16 @@ def test_what_makes_no_sheet_is_refused(make, message, tmp_path):
         (tmp_path / name).write_text("solid")
     with pytest.raises(InvalidInput, match=message):
         make(tmp_path)
+
+
+def test_vertices_that_a_file_has_split_are_counted():
+    """Two squares side by side that share an edge in space and no vertex."""
+    one = tc.meshes.rectangle(0.1, 0.1, resolution=(3, 3))
+    other = one.vertices + np.array([0.1, 0.0, 0.0])
+    vertices, faces = np.concatenate([one.vertices, other]), np.concatenate([one.faces, one.faces + len(one.vertices)])
+    torn = tc.meshes.Mesh.build(vertices, faces, vertices[:, :2])
+    assert (one.torn, torn.torn) == (0, 6)
+    with pytest.warns(UserWarning, match="6 vertices of the mesh lie on others of another piece"):
+        tc.Cloth(torn, tc.materials.AEP(1e5), 0.2, contact=None)
+    apart = tc.meshes.Mesh.build(vertices + 1e-3 * (np.arange(len(vertices)) > 8)[:, None], faces, vertices[:, :2])
+    assert apart.torn == 0

@@ -54,3 +54,11 @@ def test_round_trip_is_exact(form):
 def test_damage_is_named(text, message):
     with pytest.raises(InvalidInput, match=message):
         obj.parse(text, "cloth.obj")
+
+
+def test_a_quad_may_be_bent_and_not_be_concave():
+    """By 20 degrees along its diagonal, as cloth's are; a dart is refused."""
+    bent = "v 0 0 0\nv 1 0 0\nv 1 1 0.25\nv 0 1 0\nf 1 2 3 4\n"
+    assert len(obj.parse(bent, "bent")[1]) == 2
+    with pytest.raises(InvalidInput, match="not convex"):
+        obj.parse("v 0 0 0\nv 1 0 0\nv 0.2 0.2 0\nv 0 1 0\nf 2 3 4 1\n", "dart")

@@ -83,3 +83,8 @@ def test_thinning_to_a_spacing_keeps_one_measured_point_per_cube():
     assert len(thin_to_spacing(np.zeros((0, 3)), 0.1)) == 0
     with pytest.raises(InvalidInput, match="spacing"):
         thin_to_spacing(points, 0.0)
+
+
+def test_whole_numbers_are_no_metres():
+    with pytest.raises(InvalidInput, match=r"depth; got whole numbers \(uint16\); expected metres.*0.001"):
+        to_points(CAMERA, np.full((576, 640), 800, np.uint16))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from torchcloth.errors import InvalidInput
-from torchcloth.observe import DepthNoise, lost_edges
+from torchcloth.observe import DepthNoise, StereoNoise, lost_edges
 
 
 @pytest.mark.parametrize("z", [0.4, 1.0, 2.5])
@@ -98,3 +98,12 @@ def test_the_kinect_s_bias_keeps_within_the_maker_s_bound():
     inside = np.abs(errors) < 0.011 + 0.001 * 2
     assert inside.mean() == pytest.approx(0.954, abs=0.03)  # two standard deviations
     assert not noise.without_bias().biased
+
+
+def test_a_bias_of_another_camera_is_refused_and_far_depths_are_none():
+    depth, rng = np.full((30, 40), 1.0, np.float32), np.random.default_rng(0)
+    for noise, other in ((DepthNoise(), StereoNoise.d435()), (StereoNoise.d435(), DepthNoise())):
+        with pytest.raises(InvalidInput, match=r"bias; got shape .*; expected a field"):
+            noise.apply(depth, rng, other.bias_field(depth.shape, rng))
+    depth[0, 0] = np.inf
+    assert DepthNoise().apply(depth, rng)[0, 0] == 0

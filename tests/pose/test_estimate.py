@@ -265,3 +265,24 @@ def test_a_late_clock_sees_beyond_the_last_stamp(scene, monkeypatch):
     assert found.nuisances["clock"].value == pytest.approx(late, rel=0.1)
     monkeypatch.setattr(nuisances, "LATEST", 0.0)
     assert last(found) < 0.5 * last(ask())
+
+
+def test_few_points_of_each_frame_tell_together(scene):
+    """12 points a frame tell no field from noise, 12 of each of two frames do: the errors are not zero."""
+    cloth = model(scene, WRONG)
+    data = episode(cloth, scene.recording)
+    few = replace(data, clouds=[cloud[:12] for cloud in data.clouds])
+    held, modes, x = held_at(cloth, data), modes_of(cloth.mesh), scene.truth + 5e-3 * torch.sin(40 * scene.truth)
+    std = [unexplained(x, some, torch.as_tensor(cloth.mesh.faces), modes, 4, held, 1e-3, 1e-3) for some in (data, few)]
+    sizes = [float(s.square().mean().sqrt()) for s in std]
+    assert sizes[0] > 1e-3
+    assert 0.3 < sizes[1] / sizes[0] < 3
+
+
+def test_the_values_that_it_moved_with_can_be_set(scene):
+    uncertain = {"youngs_modulus": (WRONG.membrane / twins.THICKNESS, 2.0)}
+    cloth = model(scene, WRONG)
+    found = estimate_pose(cloth, scene.recording, uncertain=uncertain, modes=2, window=0.3)
+    value = found.parameters["youngs_modulus"].value
+    assert value > 1.2 * uncertain["youngs_modulus"][0]
+    assert float(found.apply(cloth).material.youngs_modulus.value.detach()) == pytest.approx(value)

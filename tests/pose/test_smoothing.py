@@ -2,29 +2,41 @@
 
 import torch
 
-from torchcloth.pose.smoothing import root_of
+from torchcloth.pose import smoothing
+from torchcloth.pose.smoothing import Told, posterior
 
 
-def test_the_root_is_that_of_the_inverse():
+def problem(size, rows=30, count=12):
     draw = torch.Generator().manual_seed(0)
-    jacobian = torch.randn(30, 12, generator=draw, dtype=torch.float64)
+    jacobian = size * torch.randn(rows, count, generator=draw, dtype=torch.float64)
+    value, offset = torch.randn(rows, generator=draw).double(), torch.randn(count, generator=draw).double()
+    q, r = torch.linalg.qr(jacobian)
+    return jacobian, value, offset, Told(r, -(q.mT @ value))
+
+
+def test_the_posterior_is_that_of_least_squares(monkeypatch):
+    """In both ways."""
+    jacobian, value, offset, told = problem(1.0)
     prior_std = torch.logspace(-3, 1, 12, dtype=torch.float64)
-    information = jacobian.mT @ jacobian
-    root = root_of(information, prior_std)
-    expected = torch.linalg.inv(information + torch.diag(prior_std**-2))
-    torch.testing.assert_close(root @ root.mT, expected, rtol=1e-8, atol=1e-12)
+    information = jacobian.mT @ jacobian + torch.diag(prior_std**-2)
+    mean = torch.linalg.solve(information, -jacobian.mT @ value + offset / prior_std**2)
+    for steep in (1e99, 0.0):
+        monkeypatch.setattr(smoothing, "STEEP", steep)
+        root, step = posterior(told, prior_std, offset)
+        torch.testing.assert_close(root @ root.mT, torch.linalg.inv(information), rtol=1e-8, atol=1e-12)
+        torch.testing.assert_close(step, mean, rtol=1e-8, atol=1e-12)
 
 
-def test_slopes_of_an_unstable_motion_leave_a_covariance():
+def test_slopes_of_an_unstable_motion_leave_a_covariance_and_a_step():
     """Information whose rounding is larger than the prior's: directions that it does not tell keep the prior's size."""
-    draw = torch.Generator().manual_seed(1)
-    jacobian = 1e12 * torch.randn(5, 12, generator=draw, dtype=torch.float64)
-    prior_std = torch.ones(12, dtype=torch.float64)
+    jacobian, _, offset, told = problem(1e12, rows=5)
     information = jacobian.mT @ jacobian
     assert int(torch.linalg.cholesky_ex(information + torch.eye(12, dtype=torch.float64))[1])
-    root = root_of(information, prior_std)
+    root, step = posterior(told, torch.ones(12, dtype=torch.float64), offset)
     covariance = root @ root.mT
-    told = torch.linalg.qr(jacobian.mT)[0]
-    assert float((told.mT @ covariance @ told).diagonal().max()) < 1e-3
-    assert float(covariance.trace()) < 7 + 1e-3
-    assert float(covariance.diagonal().min()) > 0
+    seen = torch.linalg.qr(jacobian.mT)[0]
+    assert float((seen.mT @ covariance @ seen).diagonal().max()) < 1e-3
+    torch.testing.assert_close(covariance.trace(), torch.tensor(7.0, dtype=torch.float64))
+    unseen = torch.eye(12, dtype=torch.float64) - seen @ seen.mT
+    torch.testing.assert_close(unseen @ step, unseen @ offset)
+    assert float((seen.mT @ step).abs().max()) < 1e-6

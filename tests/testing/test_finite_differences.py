@@ -98,3 +98,10 @@ def test_check_gradients_names_the_input():
     assert max(best.values()) < 1e-7
     with pytest.raises(AssertionError, match="gradient in 'b'"):
         check_gradients(lambda a, b: a.sin() * b.detach(), {"a": POINT, "b": ALONG})
+
+
+@pytest.mark.parametrize("claim", [math.inf, -math.inf])
+def test_a_derivative_without_bounds_fails(claim):
+    x, one = torch.tensor([2.0], dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+    with pytest.raises(AssertionError, match="not finite"):
+        finite_difference_sweep(lambda p: p.square().sum(), x, one, claim).check()

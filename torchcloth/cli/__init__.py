@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import io
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -29,8 +31,15 @@ WITH_MODELS = ("identify", "predict", "pose", "diagnose", "confirm", "view")  # 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
-    options = _parser().parse_args(arguments)
+    """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted, 141 where nobody reads on)."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal that has no such letter
+    try:
+        options = _parser().parse_args(arguments)
+    except KeyboardInterrupt:
+        print("torchcloth: stopped", file=sys.stderr)
+        return 130
     with warnings.catch_warnings():
         warnings.showwarning = _warn
         return _run(options)
@@ -43,6 +52,9 @@ def _run(options: argparse.Namespace) -> int:
 
             register_file(options.causes)
         return options.run(options)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes what is left at its end
+        return 141
     except (TorchclothError, OSError) as error:
         said = error if isinstance(error, TorchclothError) else _of_system(error)
         print(f"torchcloth: {said}", file=sys.stderr)

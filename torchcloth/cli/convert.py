@@ -38,12 +38,13 @@ def add(verbs: Any) -> None:
 
 def _convert(options: argparse.Namespace) -> int:
     from rich.console import Console
+    from rich.markup import escape
 
     from .. import recordings
     from ..recordings import formats
 
     _check_target(options)
-    with Console(stderr=True).status(f"reading {options.source}"):  # silent where nobody looks
+    with Console(stderr=True).status(escape(f"reading {options.source}")):  # silent where nobody looks
         recording = formats.read(options.source, format=options.format, scene=options.scene, episode=options.episode)
     write = formats.write_mcap if options.target.suffix == MCAP else recordings.write
     _with_progress(

@@ -11,7 +11,7 @@ from typing import Any
 
 from .._files import PROGRESS
 from ..errors import InvalidInput
-from .folders import check_folder, how_to_go_on, place
+from .folders import check_folder, how_to_go_on, place, say
 
 LONG = 10.0  # s, of an episode
 
@@ -92,7 +92,7 @@ def _refuse_own_result(options: argparse.Namespace) -> None:
 def progress_line() -> Iterator[Callable[[str], None]]:
     """One line that changes on a terminal; in a log, a line for every stage."""
     if not sys.stderr.isatty():
-        yield lambda text: None if text.endswith("left") else print(text, flush=True)
+        yield lambda text: None if text.endswith("left") else say(text)
         return
     from rich.console import Console
     from rich.markup import escape

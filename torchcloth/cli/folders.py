@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import tempfile
 from pathlib import Path
 
@@ -24,6 +25,14 @@ def how_to_go_on(options: argparse.Namespace) -> str:
     return "; `--resume` goes on from there" if kept else "; nothing was kept yet"
 
 
+def say(text: str) -> None:
+    """A line of progress; who does not want to read on stops no work."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - for the rest of the process
+
+
 def replaces(path: Path) -> str:
     """What to say beside a result's name, asked before it is written."""
     return " (the last one is replaced)" if path.exists() else ""
@@ -35,13 +44,13 @@ def check_folder(path: Path, option: str = "--out") -> None:
     Raises:
         InvalidInput: the path, or what should be a folder above it, is a file, or the system lets nothing be made.
     """
-    above = next(part for part in (path, *path.parents) if os.path.lexists(part) or part == part.parent)
+    plain = Path(os.path.abspath(path))
+    above = next(part for part in (plain, *plain.parents) if os.path.lexists(part) or part == part.parent)
     if not above.is_dir():
         raise InvalidInput(option, got=f"{above}, a file", expected="a folder, new or existing")
-    plain = Path(os.path.abspath(path))
     try:  # in a place of its own: two commands may make the same folder at once
         with tempfile.TemporaryDirectory(prefix=".torchcloth-", dir=above) as trial:
-            (Path(trial) / plain.relative_to(os.path.abspath(above))).mkdir(parents=True, exist_ok=True)
+            (Path(trial) / plain.relative_to(above)).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInput(
             option,
@@ -49,6 +58,17 @@ def check_folder(path: Path, option: str = "--out") -> None:
             expected="a folder, new or existing, where files can be made",
             remedy="choose another, or change its permissions",
         ) from None
+
+
+def check_apart(path: Path, episode: str | Path, option: str = "--out") -> None:
+    """Refuse a place within an episode's folder, whose files would be replaced or taken for its own.
+
+    Raises:
+        InvalidInput: it is one.
+    """
+    inside, folder = path.resolve(), Path(episode).resolve()
+    if folder in inside.parents:
+        raise InvalidInput(option, got=f"{path}, within the episode {episode}", expected="a place outside it")
 
 
 def check_file(path: Path, option: str = "--out") -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from .._files import PROGRESS
 from ..errors import InvalidInput
 from . import fields
-from .folders import check_folder, how_to_go_on, place, replaces
+from .folders import check_folder, how_to_go_on, place, replaces, say
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -240,7 +240,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             text = f"{used}, {text}"
             progress.update(task, completed=iteration, description=text)
             if not progress.console.is_terminal:  # a log file shows a bar once, at the end
-                print(f"iteration {iteration}: {text}", flush=True)
+                say(f"iteration {iteration}: {text}")
 
         if options.fields:
             return fields.fit(options, cloth, episodes, options.out / PROGRESS, advance)

@@ -7,7 +7,9 @@ import json
 from typing import Any
 
 from .._files import write_text
-from .folders import check_folder, place
+from .folders import check_apart, check_folder, place, replaces
+
+RESULT = "inspection.json"
 
 
 def add(verbs: Any) -> None:
@@ -21,21 +23,24 @@ def add(verbs: Any) -> None:
 
 def _inspect(options: argparse.Namespace) -> int:
     from rich.console import Console
+    from rich.markup import escape
 
     from .. import inspection, recordings
 
     if options.out is not None:
+        check_apart(options.out, options.episode)
         check_folder(options.out)
-    with Console(stderr=True).status(f"looking at {options.episode}"):
+    with Console(stderr=True).status(escape(f"looking at {options.episode}")):
         report = inspection.inspect(recordings.read(options.episode))
     text = json.dumps(report.as_dict(), indent=1, allow_nan=False) + "\n"
+    written = ""
+    if options.out is not None:  # before anything is printed: who reads may stop
+        note = replaces(options.out / RESULT)
+        picture = inspection.draw(report, options.out)
+        written = f"result:  {write_text(options.out / RESULT, text)}{note}\npicture: {picture}\n"
     if options.json:
         print(text, end="")
     else:
         inspection.show(report)
-    if options.out is not None:
-        picture = inspection.draw(report, options.out)
-        path = write_text(options.out / "inspection.json", text)
-        if not options.json:
-            print(f"result:  {path}\npicture: {picture}")
+        print(written, end="")
     return 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
-from .folders import check_folder, place, replaces
+from .folders import check_folder, place, replaces, say
 from .identify import assignments, nuisances_of, say_what_is_beside
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def _estimate(
             text = f"{stage}: corrective force {100 * share:.1f} % of the weight"
             progress.update(task, description=text)
             if not progress.console.is_terminal:
-                print(text, flush=True)
+                say(text)
 
         return estimate_pose(
             cloth,

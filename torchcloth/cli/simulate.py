@@ -13,8 +13,9 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .._files import atomically
 from ..errors import InvalidInput, TorchclothError
-from .folders import check_folder, place
+from .folders import check_folder, place, say
 
 if TYPE_CHECKING:
     from ..recordings import Recording
@@ -127,8 +128,10 @@ def _make(out: Path, order: Order) -> None:
             error.args = (f"{order.name}: {error}",)
             raise
         advance("writing", 0, 1)
-        (out / f"{order.name}.gif").unlink(missing_ok=True)  # of an episode that is gone
+        if _finished(out / order.name, order):
+            return  # by another command, meanwhile
         recordings.write(recording, out / order.name)
+        (out / f"{order.name}.gif").unlink(missing_ok=True)  # of an episode that is gone
 
 
 @contextmanager
@@ -144,7 +147,7 @@ def _progress(name: str) -> Iterator[Callable[[str, int, int], None]]:
         def advance(stage: str, done: int, of: int) -> None:
             progress.update(task, description=f"{name}: {stage}", completed=done, total=of)
             if not progress.console.is_terminal and stage not in stages:
-                print(f"{name}: {stage}", flush=True)
+                say(f"{name}: {stage}")
                 stages.append(stage)
 
         yield advance
@@ -169,18 +172,18 @@ def _draw(out: Path, orders: list[Order]) -> None:
         sheet = Image.new("RGB", (max(r.width for r in rows), sum(r.height for r in rows)), "white")
         for i, row in enumerate(rows):
             sheet.paste(row, (0, sum(r.height for r in rows[:i])))
-        part = out / f".{OVERVIEW}.partial.png"
-        sheet.save(part, optimize=True)
-        part.replace(out / OVERVIEW)
+        with atomically(out / OVERVIEW) as part:
+            sheet.save(part, optimize=True)
 
 
 def _print(out: Path, rows: list[tuple[Order, float | None]]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from .. import recordings
 
-    table = Table("episode", "frames", "seconds", "slower", "limited by", "nearest", "CPU", title=str(out))
+    table = Table("episode", "frames", "seconds", "slower", "limited by", "nearest", "CPU", title=escape(str(out)))
     for order, spent in rows:
         recording = recordings.read(out / order.name)
         table.add_row(order.name, *_facts(recording), "was there" if spent is None else f"{spent:.0f} s")

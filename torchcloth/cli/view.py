@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
-from .folders import check_file, place
+from .folders import check_apart, check_file, place, replaces
 
 if TYPE_CHECKING:
     from ..viewing import Film
@@ -45,8 +45,9 @@ def _view(options: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     if options.out is None:
         return _serve(film, options.port or PORT)
+    note = replaces(options.out)
     _write(film, options.out, size, options.fps)
-    print(f"{options.out}: {options.out.stat().st_size / 1e3:.0f} kB")
+    print(f"{options.out}: {options.out.stat().st_size / 1e3:.0f} kB{note}")
     return 0
 
 
@@ -57,6 +58,7 @@ def _checked(options: argparse.Namespace) -> tuple[int, int] | None:
     if out is not None and suffix not in PICTURES + OTHERS:
         raise InvalidInput("--out", got=repr(out.name), expected=f"a name with {', '.join(PICTURES + OTHERS)}")
     if out is not None:
+        check_apart(out, options.episode)
         check_file(out)
     if options.port is not None and (out is not None or not 0 < options.port < 65536):
         raise InvalidInput("--port", got=options.port, expected="1 to 65535, without --out")

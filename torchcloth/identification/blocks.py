@@ -35,6 +35,7 @@ def point_rows(scene: Scene) -> Rows | None:
         x0, x1, x2 = x[corners].unflatten(0, (-1, 3)).unbind(1)
         normal = cross(x1 - x0, x2 - x0)
         size = dot(normal, normal).sqrt()
+        size = torch.where(size > 0, size, torch.inf)  # a triangle without area has no normal
         normal = normal / size
         offset = cloud - hits.on(x)
         value = dot(normal, offset)

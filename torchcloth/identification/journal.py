@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -21,14 +22,15 @@ from .._files import atomically, write_text
 from ..cloth import Cloth
 from ..errors import InvalidInput
 
-FORMAT = 1
+FORMAT = 2
+TRIES = 3  # of writing an answer
 STAMP = "problem"  # file that makes a folder a journal
 DAMAGED = (RuntimeError, KeyError, ValueError, EOFError, OSError, pickle.UnpicklingError)  # torch's, of half a file
 T = TypeVar("T", bound=Sequence)
 
 
 class Journal:
-    """Answers by question in a folder, one file each.
+    """Answers by question in a folder, one file each; no other problem's, though one may be at work there as well.
 
     Args:
         folder: made when the first answer is written; it must be a journal's or not exist.
@@ -72,7 +74,7 @@ class Journal:
 
     def ask(self, question: str, raw: Tensor, work: Callable[[], T]) -> T:
         """The answer of before, or that of ``work``, which is kept: a tuple of tensors."""
-        path = self.folder / f"{question}-{digest([raw])}.pt"
+        path = self.folder / f"{question}-{digest([self.key, raw])}.pt"
         try:
             answer = torch.load(path, weights_only=True)
             self.recalled += 1
@@ -83,12 +85,13 @@ class Journal:
         return answer
 
     def _write(self, path: Path, answer: tuple) -> None:
-        stamp = self.folder / STAMP
-        if not stamp.exists():
-            self.folder.mkdir(parents=True, exist_ok=True)  # several answers may come at once
-            write_text(stamp, self.key)
-        with atomically(path) as part:
-            torch.save(answer, part)
+        for _ in range(TRIES):  # another run into this folder that has ended takes it away
+            with suppress(FileNotFoundError):
+                if not (self.folder / STAMP).exists():
+                    write_text(self.folder / STAMP, self.key)  # several answers may come at once
+                with atomically(path) as part:
+                    torch.save(answer, part)
+                return
 
 
 @cache
@@ -114,10 +117,10 @@ def clear(folder: Path) -> None:
     inside = [path for path in folder.iterdir() if path != stamp]
     if not stamp.exists() and any(not path.name.startswith(f".{STAMP}.") for path in inside):  # these are half a stamp
         raise InvalidInput("journal", got=f"{folder} with other content", expected="a new folder, or a journal")
-    for path in inside:
-        path.unlink()
-    stamp.unlink(missing_ok=True)
-    folder.rmdir()
+    for path in (*inside, stamp):
+        path.unlink(missing_ok=True)
+    with suppress(OSError):  # another run has written there again, or has cleared it too
+        folder.rmdir()
 
 
 def digest(parts: Sequence[object]) -> str:

@@ -48,7 +48,8 @@ def of_markers(markers: Markers, still: np.ndarray, use: np.ndarray) -> Noise | 
     """
     stretches = [markers.xyz[stretch][use[stretch]] for stretch in _stretches(still)]
     stretches = [xyz - median(xyz, 0) for xyz in stretches if len(xyz) >= SHORTEST]
-    stretches = [xyz for xyz in stretches if np.isfinite(_scatter(xyz)).all()]
+    told = lambda xyz: np.isfinite([_scatter(xyz), _scatter(np.diff(xyz, axis=0))]).all()  # noqa: E731
+    stretches = [xyz for xyz in stretches if told(xyz)]
     if not stretches:
         return None
     about = [_scatter(xyz) for xyz in stretches]

@@ -15,10 +15,12 @@ def taken(given: Tensor | np.ndarray) -> Tensor:
 
 
 def check_places(places: Tensor, name: str, least: int = 0) -> None:
-    """Refuse what is not [N, 3] with N >= least."""
+    """Refuse what is not [N, 3] real numbers with N >= least."""
     if places.ndim != 2 or places.shape[1] != 3 or len(places) < least:
         expected = "[N, 3] in metres" + (f", N >= {least}" if least else "")
         raise InvalidInput(name, got=f"shape {tuple(places.shape)}", expected=expected, remedy="pass one frame at once")
+    if not places.is_floating_point():
+        raise InvalidInput(name, got=str(places.dtype).removeprefix("torch."), expected="real numbers, in metres")
 
 
 def check_triangles(faces: Tensor, count: int) -> None:

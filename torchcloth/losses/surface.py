@@ -60,7 +60,8 @@ def residuals(points: Tensor, vertices: Tensor, hits: Hits) -> tuple[Tensor, Ten
     points, vertices = taken(points), taken(vertices)
     x0, x1, x2 = vertices.index_select(-2, hits.corners.reshape(-1)).unflatten(-2, (-1, 3)).unbind(-2)
     normal = cross(x1 - x0, x2 - x0)
-    normal = normal / dot(normal, normal).sqrt()
+    size = safe_norm(normal)
+    normal = normal / torch.where(size > 0, size, 1.0)  # a triangle without area has none
     offset = points - hits.on(vertices)
     along = dot(normal, offset)
     beside = offset - along * normal

@@ -9,6 +9,8 @@ from .._math import EXACT
 from ..errors import InvalidInput
 from .shapes import check_places, taken
 
+AT_A_TIME = 4_000_000  # distances
+
 
 def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
     """One-sided Chamfer distance cloud -> vertices [m]: mean over the points of the distance to the nearest vertex.
@@ -29,5 +31,6 @@ def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
         raise InvalidInput("points", got=points.dtype, expected=f"the vertices' precision, {vertices.dtype}")
     with torch.no_grad():
         # by products of the coordinates, distances would lose their digits far from the origin
-        nearest = torch.cdist(points, vertices, compute_mode=EXACT).argmin(-1)
+        some = points.split(max(1, AT_A_TIME // len(vertices)))
+        nearest = torch.cat([torch.cdist(part, vertices, compute_mode=EXACT).argmin(-1) for part in some])
     return (points - vertices[nearest]).norm(dim=-1).mean()

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from ..errors import InvalidInput
 from . import topology
 
+SAME = 1e-6  # of the largest extent: vertices that near lie in one place
+
 UNEVEN = 1.5  # times the mean edge, beyond which a longest edge is not that of an even mesh: ours have 1.24 to 1.46
 UNLIKE, TEXTURE = 1.2, 1.05  # times an edge that lies there, beyond which a pattern's is in another unit
 FEW = 0.1  # of the edges, that may be longer or shorter: gathered or stretched where the cloth lies
@@ -112,6 +114,22 @@ class Mesh:
     def pieces(self) -> int:
         """How many parts have no vertex in common."""
         return topology.pieces(self.faces)
+
+    @property
+    def torn(self) -> int:
+        """How many vertices lie where one of another piece does, as where a file splits them by texture coordinates."""
+        own = topology.piece_of(self.faces)
+        if own.max(initial=0) == 0:
+            return 0
+        used = np.unique(self.faces)
+        span = np.ptp(self.vertices, axis=0).max()
+        _, place = np.unique(
+            np.round(self.vertices[used] / (SAME * span)).astype(np.int64), axis=0, return_inverse=True
+        )
+        place = place.reshape(-1)
+        pairs = np.unique(np.column_stack([place, own[used]]), axis=0)
+        shared = np.bincount(pairs[:, 0]) > 1
+        return int(shared[place].sum())
 
     @property
     def area(self) -> np.ndarray:

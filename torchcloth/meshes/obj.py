@@ -61,12 +61,12 @@ def check_convex(polygons: np.ndarray, place: str) -> None:
     """Refuse polygons [N, K, 3] that a fan of triangles does not cover once.
 
     Raises:
-        InvalidInput: one is not convex, or folded.
+        InvalidInput: one is not convex, or folded onto itself.
     """
     edges = polygons[:, 1:] - polygons[:, :1]
     twice = np.cross(edges[:, :-1], edges[:, 1:])
-    bent = np.linalg.norm(twice, axis=-1).sum(1) > 1.01 * np.linalg.norm(twice.sum(1), axis=-1)
-    if bent.any():
+    bent = (twice * twice.sum(1, keepdims=True)).sum(-1) < -1e-9 * (twice**2).sum((-2, -1))[:, None]
+    if (bent := bent.any(1)).any():
         got = f"polygon {int(np.flatnonzero(bent)[0]) + 1} of {len(polygons)}"
         raise InvalidInput(f"{place}: a polygon is not convex", got=got, remedy="triangulate on export")
 

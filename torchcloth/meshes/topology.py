@@ -34,6 +34,13 @@ def pieces(faces: np.ndarray) -> int:
     return int(_joined(faces).max()) + 1
 
 
+def piece_of(faces: np.ndarray) -> np.ndarray:
+    """[V] the part of each vertex of a triangle, numbers from 0 on; 0 for others."""
+    out = np.zeros(int(faces.max(initial=-1)) + 1, np.int64)
+    out[faces.ravel()] = np.repeat(_joined(faces), 3)
+    return out
+
+
 def firsts(faces: np.ndarray) -> np.ndarray:
     """[pieces] a vertex of each."""
     return faces[np.unique(_joined(faces), return_index=True)[1], 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ ROUNDS, FINE, REVIEW = 25, 4, 5  # of matching points anew; the last with all po
 OUTLINE = (0.06, 0.01)  # m, in the first and last round: rims farther from points count as hidden
 POINTS, COARSE, FEWEST = 1000, 250, 20  # that take part, that do so at first, and that are asked for
 PAIRS = 400_000  # of rays and triangles per pass
+AT_A_TIME = 4_000_000  # distances
 LARGEST = 1.2  # extents of the cloth that a cloud may span
 IN_FRONT = 1e-3  # m, that something must be nearer to hide a triangle
 HUBER = 2.5  # standard deviations beyond which a point counts linearly
@@ -126,7 +128,8 @@ def _outline(x: Tensor, cloud: Tensor, faces: Tensor, scatter: float, near: floa
     sides = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(-1).values
     edges, count = sides.unique(dim=0, return_counts=True)
     rim = edges[count == 1].unique()
-    distance, nearest = torch.cdist(x[rim], cloud).min(-1)
+    found = [part.min(-1) for part in _distances(x[rim], cloud)]
+    distance, nearest = (torch.cat(parts) for parts in zip(*found, strict=True))
     direction = (cloud[nearest] - x[rim]) / distance.clamp_min(1e-12).unsqueeze(-1)
     equations = Equations(rim.unsqueeze(-1), direction.unsqueeze(1) / scatter, (distance / scatter - 1).clamp_min(0))
     return equations.weighted((1 + (distance / near) ** 2) ** -2 * (distance > scatter))
@@ -135,7 +138,13 @@ def _outline(x: Tensor, cloud: Tensor, faces: Tensor, scatter: float, near: floa
 def _spacing(cloud: Tensor) -> float:
     """Median distance [m] of a point to its nearest neighbour."""
     some = cloud[:: max(1, len(cloud) // 500)]
-    return float(torch.cdist(some, cloud).topk(2, largest=False).values[:, 1].median())
+    second = [part.topk(2, largest=False).values[:, 1] for part in _distances(some, cloud)]
+    return float(torch.cat(second).median())
+
+
+def _distances(points: Tensor, cloud: Tensor) -> Iterator[Tensor]:
+    """[some, N] m from points to all of the cloud, a few points at a time."""
+    return (torch.cdist(some, cloud) for some in points.split(max(1, AT_A_TIME // len(cloud))))
 
 
 def _visible(x: Tensor, faces: Tensor, eye: Tensor | None) -> Tensor:
@@ -170,7 +179,8 @@ def _judge(
     visible = _visible(x, faces, eye)
     seen, area = faces[visible], torch.as_tensor(mesh.area)[visible]
     distance = (points - closest(points, x, seen).on(x)).norm(dim=-1)
-    near = torch.cdist(x[seen].mean(1), cloud).min(-1).values < 3 * (noise + _spacing(cloud))
+    nearest = torch.cat([part.amin(-1) for part in _distances(x[seen].mean(1), cloud)])
+    near = nearest < 3 * (noise + _spacing(cloud))
     matrix = torch.eye(4, dtype=x.dtype)
     matrix[:3, :3], matrix[:3, 3] = pose
     sides = (x[faces] - x[faces].roll(-1, 1)).norm(dim=-1)

@@ -32,7 +32,14 @@ def to_points(camera: DepthCamera, depth: Array, mask: Array | None = None) -> A
 
 
 def has_reading(depth: Array) -> Array:
-    """Pixels [H, W] whose depth says where something is: ROS writes NaN for none and infinity for too far (REP 118)."""
+    """Pixels [H, W] whose depth says where something is: ROS writes NaN for none and infinity for too far (REP 118).
+
+    Raises:
+        InvalidInput: whole numbers, which are no metres.
+    """
+    if depth.dtype.kind in "iu":
+        remedy = "a camera's file is in other units: times metres per unit, 0.001 for millimetres"
+        raise InvalidInput("depth", got=f"whole numbers ({depth.dtype})", expected="metres", remedy=remedy)
     return (depth > 0) & (depth < np.inf)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +15,13 @@ Array = np.ndarray
 
 
 class AbstractNoise(ABC):
-    """A sensor's errors: random ones in every image, and a bias that stays with the device."""
+    """A sensor's errors: random ones in every image, and a bias that stays with the device.
+
+    Attributes:
+        leading: axes of the bias before those of the image.
+    """
+
+    leading: ClassVar[tuple[int, ...]] = ()
 
     @abstractmethod
     def sigma(self, depth: Array) -> Array:
@@ -47,19 +54,20 @@ class AbstractNoise(ABC):
         """The image as float32.
 
         Raises:
-            InvalidInput: no image, or a bias that is missing or of another size.
+            InvalidInput: no image, or a bias that is missing or of another shape than ``bias_field`` draws.
         """
         depth = np.asarray(depth, np.float32)
         if depth.ndim != 2:
             raise InvalidInput("depth", got=f"shape {depth.shape}", expected="[H, W]")
-        if self.biased and (bias is None or bias.shape[-2:] != depth.shape):
+        shape = (*self.leading, *depth.shape)
+        if (self.biased and bias is None) or (bias is not None and np.shape(bias) != shape):
             raise InvalidInput(
                 "bias",
-                got=None if bias is None else f"shape {bias.shape}",
-                expected=f"a field {depth.shape} when a bias amplitude is set",
+                got=None if bias is None else f"shape {np.shape(bias)}",
+                expected=f"a field {shape} when a bias amplitude is set",
                 remedy="draw one by bias_field(shape, rng)",
             )
-        return depth
+        return np.where(np.isfinite(depth), depth, np.float32(0))
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from statistics import NormalDist
+from typing import ClassVar
 
 import numpy as np
 
@@ -58,6 +59,8 @@ class StereoNoise(AbstractNoise):
             raise InvalidInput("holes", got=self.holes, expected="a share below 1")
         if self.bias_length < 1:
             raise InvalidInput("bias_length", got=self.bias_length, expected="at least 1 px")
+
+    leading: ClassVar[tuple[int, ...]] = (2,)
 
     @classmethod
     def d435(cls) -> StereoNoise:

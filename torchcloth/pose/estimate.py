@@ -27,7 +27,7 @@ from ..recordings import Recording
 from ..recordings.extents import check_size
 from ..recordings.together import check_recording
 from .local import unexplained
-from .modes import Modes, modes_of
+from .modes import Modes, check_count, modes_of
 from .objective import Corrected, Correction, pushable, windows_of
 from .result import PoseEstimate
 from .seen import seen_vertices
@@ -90,8 +90,9 @@ def estimate_pose(
     on_cpu(cloth)
     check_recording(recording)
     check_size(recording)
+    check_count(cloth.mesh, modes)
     data, fields = episode(cloth, recording), modes_of(cloth.mesh)
-    coarse = modes_of(cloth.mesh, modes).fields.to(data.initial)
+    coarse = fields.fields[:modes].to(data.initial)
     density = recording.cloth.weighed if uncertain else None
     unknowns = with_priors(collect(cloth, list(uncertain or {}), density), uncertain or {})
     blocks = blocks_for(use)
@@ -155,7 +156,7 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         parameters={u.name: fabric[u.name] for u in objective.unknowns},
         nuisances=next(iter(nuisance_estimates([data], objective.placed, raw, found.covariance).values())),
         fit=fit,
-        warnings=warnings_of(fit, shares, seen, used, ends, _stated(objective, used)),
+        warnings=warnings_of(fit, shares, seen, used, ends, _stated(objective, used), found.holds),
     )
 
 

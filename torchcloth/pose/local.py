@@ -21,7 +21,7 @@ FAINT = 1e-3  # of the coarsest field's variance, below which finer ones are lef
 SIZES = torch.cat([torch.zeros(1), torch.logspace(-4, -1.5, 26)])  # m, standard deviations that are tried
 OUTLIER = 5.0  # standard deviations
 FARTHEST = 2.0  # standard deviations of the field that residuals may claim
-FEWEST = 20  # points of a frame that tell a field from noise
+FEWEST = 20  # points that tell a field from noise: of a frame, or of several
 
 
 class _Frame(NamedTuple):
@@ -49,7 +49,7 @@ def unexplained(
     bases = [of_kind[k] for k in which.tolist()]
     frames = [_rows(cloud, x[t], faces, bases[t], noise) for t, cloud in enumerate(episode.clouds)]
     noise = max(noise, _noise(frames) or usual)
-    sizes = _smoothed(torch.tensor([_size(frame, noise) for frame in frames]).to(x))
+    sizes = _smoothed(torch.tensor([_size(_around(frames, t), noise) for t in range(len(frames))]).to(x))
     each = zip(frames, bases, sizes, strict=True)
     return torch.stack([_left(frame, size * basis, size, noise) for frame, basis, size in each])
 
@@ -82,7 +82,7 @@ def _basis(modes: Modes, coarse: int, held: Tensor) -> Tensor:
 
 
 def _rows(cloud: Tensor, x: Tensor, faces: Tensor, basis: Tensor, noise: float) -> _Frame | None:
-    if len(cloud) < FEWEST or not len(basis):
+    if not len(cloud) or not len(basis):
         return None
     hits = closest(cloud, x, faces)
     a, b, c = x[hits.corners].unbind(1)
@@ -90,7 +90,7 @@ def _rows(cloud: Tensor, x: Tensor, faces: Tensor, basis: Tensor, noise: float) 
     value = dot(normal, cloud - hits.on(x)).squeeze(-1)
     spread = max(noise, 1.4826 * float(value.abs().median()))
     good = (value.abs() < OUTLIER * spread) & ~hits.beyond
-    if int(good.sum()) < FEWEST:
+    if not bool(good.any()):
         return None
     rows = (hits.weights.unsqueeze(-1) * basis.mT[hits.corners]).sum(1)
     return _Frame(rows[good], value[good])
@@ -107,17 +107,30 @@ def _noise(frames: list[_Frame | None]) -> float:
     return (left / freedom) ** 0.5 if freedom else 0.0
 
 
-def _size(frame: _Frame | None, noise: float) -> float:
+def _around(frames: list[_Frame | None], t: int) -> list[_Frame]:
+    """A frame, with as many on both sides as it takes to have enough points; none where all have too few."""
+    for reach in range(len(frames)):
+        near = [frame for frame in frames[max(0, t - reach) : t + reach + 1] if frame is not None]
+        if sum(len(frame.value) for frame in near) >= FEWEST:
+            return near
+    return []
+
+
+def _size(frames: list[_Frame], noise: float) -> float:
     """Root mean square of the field's standard deviation over its likelihood [m]; NaN where nothing tells it."""
-    if frame is None:
+    if not frames:
         return torch.nan
-    values, vectors = torch.linalg.eigh(frame.rows.mT @ frame.rows)
-    values = values.clamp(min=1e-12)
-    along = (vectors.mT @ (frame.rows.mT @ frame.value)).square() / values  # squared residual along each direction
-    variance = SIZES.to(values)[:, None] ** 2 * values + noise**2
-    likelihood = torch.softmax(-0.5 * (variance.log() + along / variance).sum(1), 0)
-    squared = float((likelihood * SIZES.to(values) ** 2).sum())
-    return min(squared, float(frame.value.square().mean())) ** 0.5  # sparse points leave it open upwards
+    sizes = SIZES.to(frames[0].value)
+    likely = torch.zeros_like(sizes)
+    for frame in frames:
+        values, vectors = torch.linalg.eigh(frame.rows.mT @ frame.rows)
+        values = values.clamp(min=1e-12)
+        along = (vectors.mT @ (frame.rows.mT @ frame.value)).square() / values  # squared residual along each direction
+        variance = sizes[:, None] ** 2 * values + noise**2
+        likely -= 0.5 * (variance.log() + along / variance).sum(1)
+    squared = float((torch.softmax(likely, 0) * sizes**2).sum())
+    most = float(torch.cat([frame.value for frame in frames]).square().mean())
+    return min(squared, most) ** 0.5  # sparse points leave it open upwards
 
 
 def _smoothed(size: Tensor) -> Tensor:

@@ -18,6 +18,17 @@ class Modes(NamedTuple):
     wave: Tensor  # [M] 1/m, wave numbers, ascending
 
 
+def check_count(mesh: Mesh, count: int) -> None:
+    """Refuse a number of modes that a mesh does not have.
+
+    Raises:
+        InvalidInput: fewer than one, or more than the mesh has vertices.
+    """
+    size = len(mesh.vertices)
+    if not isinstance(count, int) or not 1 <= count <= size:
+        raise InvalidInput("modes", got=count, expected=f"1 to {size}, the mesh's vertices")
+
+
 def modes_of(mesh: Mesh, count: int | None = None) -> Modes:
     """The ``count`` coarsest; None: as many as there are vertices.
 
@@ -29,8 +40,7 @@ def modes_of(mesh: Mesh, count: int | None = None) -> Modes:
     """
     size = len(mesh.vertices)
     count = size if count is None else count
-    if not 1 <= count <= size:
-        raise InvalidInput("modes", got=count, expected=f"1 to {size}, the mesh's vertices")
+    check_count(mesh, count)
     rest, faces = torch.as_tensor(mesh.rest).double(), torch.as_tensor(mesh.faces)
     edges = torch.stack([rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0]], dim=-1)
     two = torch.linalg.inv(edges)  # rows: gradients of the second and third corner's hat functions

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ..cloth import Cloth
 from ..effects import BodyForce
-from ..errors import InvalidInput
+from ..errors import InvalidInput, SimulationDiverged
 from ..identification import gauss_newton
 from ..identification.blocks import Block
 from ..identification.episodes import Episode
@@ -190,6 +190,12 @@ class Corrected(Objective):
             call = (state, episode, times, self.dt, settles, along)
             out, way = called(_Window(self.cloth), entries, call)
             state, moved = out.state, way.state
+            if not bool(moved.x.isfinite().all()):
+                raise SimulationDiverged(
+                    "pose: what a small push does grows beyond all numbers",
+                    got=f"after {float(times[-1]):.2f} s",
+                    remedy="the motion is unstable: fewer frames, or float64",
+                )
             parts.append(frames_of(out))
             spread = torch.tensor(index)
             full = lambda d, at=spread: d.new_zeros(len(raw), *d.shape[1:]).index_copy(0, at, d)  # noqa: E731

@@ -12,8 +12,10 @@ import numpy as np
 from torch import Tensor
 
 from .._files import atomically, write_text
+from ..cloth import Cloth
 from ..identification.result import or_none
 from ..identification.statements import Estimate
+from ..identification.unknowns import available
 from ..types import ClothState
 
 CONVENTION = (
@@ -40,7 +42,8 @@ class PoseEstimate:
         shares: [W] of the corrective force in the weight, rms over the cloth.
         alone: [T, V, 3] m, the simulation without corrective force.
         null: [T, V, 3] m, the cloth carried rigidly.
-        last: the simulation's state at the last frame, to go on from; with ``Cloth.forward`` of the same model.
+        last: the simulation's state at the last frame, to go on from; with ``Cloth.forward`` of the same model, after
+            ``apply`` where values were uncertain.
         parameters: fabric parameters that were uncertain, as this episode has them.
         nuisances: the same of clock, grasp, camera, rim.
         fit: distances [m], shares, counts, seconds.
@@ -63,6 +66,13 @@ class PoseEstimate:
     nuisances: Mapping[str, Estimate]
     fit: Mapping[str, Any]
     warnings: list[str]
+
+    def apply(self, cloth: Cloth) -> Cloth:
+        """Set the values of the uncertain parameters, with which the estimate has moved, in ``cloth``; returns it."""
+        names = available(cloth)
+        for name, estimate in self.parameters.items():
+            cloth.get_submodule(names[name]).set(estimate.value)  # type: ignore[operator]
+        return cloth
 
     def as_dict(self) -> dict[str, Any]:
         """The content of pose.json."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -18,6 +18,8 @@ LEAST = 0.01  # m/s^2, a thousandth of gravity
 FASTEST = 1e4  # m/s^2, a thousand times gravity: no cloth needs that to be where it was seen
 TRIES = 40  # of expectation and maximisation, on one linearisation
 SMALL = 0.2  # standard errors per unknown, rms, of a step that ends the search
+STEEP = 1e8  # information over the prior's, from which its square root is worked with: squared, digits are lost
+GROWING = 3, 2  # where tangents run away: rounds of each beginning, and steps of each
 
 Tell = Callable[[str, Tensor], None]  # stage, unknowns
 
@@ -29,6 +31,7 @@ class Smoothed(NamedTuple):
     final: gauss_newton.Iterate
     root: Tensor  # [K, K], times its own transpose the covariance
     converged: bool
+    holds: int  # frames in which tangents describe a motion
 
     @property
     def covariance(self) -> Tensor:
@@ -48,37 +51,74 @@ def smooth(objective: Corrected, tell: Tell) -> Smoothed:
     for number in range(ROUNDS):
         tell(f"all frames, round {number + 1}", raw)
         final = gauss_newton.minimise(objective.problem(), raw, 1, lambda _: False)
+        if number == 0 and holds_for(objective, final.raw) < len(objective.episodes[0].times):
+            raw = _window_by_window(objective, tell)
+            final = gauss_newton.minimise(objective.problem(), raw, 1, lambda _: False)
         raw = final.raw
-        root, information, best = _learn(objective, final)
-        step = best - raw  # what a round asks for, not what it came to: one that fails makes no step at all
-        prior = (step / objective.prior_std).square().sum()
-        converged = float(step @ information @ step + prior) < SMALL**2 * len(raw)
+        found = _learn(objective, final)
+        prior = (found.step / objective.prior_std).square().sum()  # of what a round asks for: it may make none
+        converged = float((found.told.root @ found.step).square().sum() + prior) < SMALL**2 * len(raw)
         if converged:
             break
-    return Smoothed(raw, final, root, converged)
+    holds = holds_for(objective, raw)
+    return Smoothed(raw, final, found.root, converged and holds == len(objective.episodes[0].times), holds)
 
 
-def _learn(objective: Corrected, at: gauss_newton.Iterate) -> tuple[Tensor, Tensor, Tensor]:
+def holds_for(objective: Corrected, raw: Tensor) -> int:
+    """Frames in which no push of the size that is expected moves the cloth farther than it is long, by tangents."""
+    moved = objective.tangents(raw)[1].x[objective.pushes]
+    size = (moved * objective.correction.stds.to(moved)[:, None, None, None]).square().sum(-1).mean(-1).sqrt().amax(0)
+    far = ~(size <= objective.cloth.mesh.extent)  # NaN is far
+    return int(far.nonzero()[0]) if bool(far.any()) else len(far)
+
+
+def _window_by_window(objective: Corrected, tell: Tell) -> Tensor:
+    """[K] from beginnings that grow by one window: a push far ahead has tangents that end in no motion."""
+    raw, count = objective.start, len(objective.episodes[0].times)
+    rounds, steps = GROWING
+    for _, last in objective.correction.windows[:-1]:
+        part = cast("Corrected", objective.part((last + 1) / count))
+        if not part.told:
+            continue
+        tell(f"the first {last + 1} of {count} frames", raw)
+        part.expecting(objective.correction.std)
+        for _ in range(rounds):
+            at = gauss_newton.minimise(part.problem(), raw, steps, lambda _: False)
+            raw = at.raw
+            _learn(part, at)
+        objective.expecting(part.correction.std)
+    return raw
+
+
+class Told(NamedTuple):
+    """What data tell of all unknowns about a point: least squares of no more rows than there are unknowns."""
+
+    root: Tensor  # [K or less, K], times its own transpose from the left the information
+    value: Tensor  # [K or less]
+
+    @classmethod
+    def of(cls, at: gauss_newton.Iterate) -> Told:
+        """By weighted rows."""
+        weight = at.influence()[0].sqrt()
+        q, r = torch.linalg.qr(weight[:, None] * at.linear.jacobian)
+        return cls(r, -(q.mT @ (weight * at.linear.value)))
+
+
+class _Learnt(NamedTuple):
+    told: Told
+    root: Tensor  # [K, K] of the covariance
+    step: Tensor  # [K] to the likeliest unknowns
+
+
+def _learn(objective: Corrected, at: gauss_newton.Iterate) -> _Learnt:
     """Set the prior's size of every mode to what the numbers and their errors show.
-
-    Returns:
-        (root of the covariance with that prior [K, K], information of the data [K, K], the likeliest unknowns with
-        both [K], of the linearised problem)
 
     Expectation and maximisation (Dempster et al. 1977) on the linearised problem, where both are closed forms.
     """
-    jacobian, weight = at.linear.jacobian, at.influence()[0][:, None]
-    information = (weight * jacobian).mT @ jacobian
-    pull = (weight * jacobian).mT @ (jacobian @ at.raw - at.linear.value)
-    shape = len(objective.correction.windows), len(objective.correction.modes), 3
-
-    def solved() -> tuple[Tensor, Tensor]:
-        root = root_of(information, objective.prior_std)
-        return root, root @ (root.mT @ (pull + objective.middle / objective.prior_std**2))
-
+    told, shape = Told.of(at), (len(objective.correction.windows), len(objective.correction.modes), 3)
     for _ in range(TRIES):
-        root, mean = solved()
-        squared = (mean.square() + root.square().sum(1))[objective.pushes].reshape(shape).mean((0, 2))
+        root, step = posterior(told, objective.prior_std, objective.middle - at.raw)
+        squared = ((at.raw + step).square() + root.square().sum(1))[objective.pushes].reshape(shape).mean((0, 2))
         if not bool((squared < FASTEST**2).all()):
             raise SimulationDiverged(
                 "pose: the force that corrects the simulation grows without end",
@@ -86,21 +126,26 @@ def _learn(objective: Corrected, at: gauss_newton.Iterate) -> tuple[Tensor, Tens
                 remedy="the motion amplifies small pushes too much: fewer modes or frames, or a better fabric",
             )
         objective.expecting(squared.sqrt().clamp(min=LEAST))
-    root, mean = solved()
-    return root, information, mean
+    return _Learnt(told, *posterior(told, objective.prior_std, objective.middle - at.raw))
 
 
-def root_of(information: Tensor, prior_std: Tensor) -> Tensor:
-    """[K, K], whose product with its own transpose is the covariance by data and priors.
+def posterior(told: Told, prior_std: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """(root [K, K], whose product with its own transpose is the covariance by data and priors, step [K] to the mean).
 
-    In units of the priors' standard deviations, where no eigenvalue is below 1. Steep tangents can make others so large
-    that rounding takes this away: what they leave of such a direction is then the prior.
+    In units of the priors' standard deviations, where no eigenvalue of the information is below 1. Where steep tangents
+    make others so large that rounding would take this away, no square is formed.
+
+    Args:
+        told: by the data.
+        prior_std: [K].
+        offset: [K] of the priors' means from the point.
     """
-    scaled = prior_std[:, None] * information * prior_std
-    scaled = 0.5 * (scaled + scaled.mT)
-    eye = torch.eye(len(scaled), dtype=scaled.dtype)
-    factor, failed = torch.linalg.cholesky_ex(scaled + eye)
-    if not int(failed):
-        return prior_std[:, None] * torch.linalg.solve_triangular(factor, eye, upper=False).mT
-    values, vectors = torch.linalg.eigh(scaled)
-    return prior_std[:, None] * vectors * (1 + values.clamp(min=0)).rsqrt()
+    scaled, wanted = told.root * prior_std, offset / prior_std
+    eye = torch.eye(len(prior_std), dtype=scaled.dtype)
+    if float(scaled.square().sum(0).amax()) < STEEP:
+        factor = torch.linalg.cholesky(scaled.mT @ scaled + eye)
+        root = prior_std[:, None] * torch.linalg.solve_triangular(factor, eye, upper=False).mT
+        return root, root @ (root.mT @ ((scaled.mT @ told.value + wanted) / prior_std))
+    q, r = torch.linalg.qr(torch.cat([scaled, eye]))
+    root = prior_std[:, None] * torch.linalg.solve_triangular(r, eye, upper=True)
+    return root, root @ (q.mT @ torch.cat([told.value, wanted]))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..identification.episodes import Episode
+from .local import FEWEST
 
 LARGE = 0.1  # of the weight, from which a corrective force says that the model is wrong
 MISSED = 1.3  # rms over the stated noise
@@ -22,8 +23,9 @@ def warnings_of(
     data: Episode,
     windows: Sequence[Tensor],
     noise: float | None,
+    holds: int,
 ) -> list[str]:
-    """Sentences; ``noise``: of a point, as it was given [m]."""
+    """Sentences; ``noise``: of a point, as it was given [m]; ``holds``: frames in which tangents describe a motion."""
     out = []
     if fit["force_share"] > LARGE:
         first, last = windows[int(shares.argmax())].tolist()
@@ -39,10 +41,16 @@ def warnings_of(
         )
     if fit["chamfer_after"] >= fit["chamfer_null"]:
         out.append("no better than a cloth that is carried rigidly: do not use this estimate")
-    if not fit["converged"]:
+    if holds < len(data.times):
+        out.append(
+            f"the motion is unstable: from {float(data.times[max(holds - 1, 0)]):.2f} s on pushes of the size that is "
+            "expected grow beyond the cloth: the estimate is one of many motions, which no standard error covers"
+        )
+    elif not fit["converged"]:
         out.append("the search did not converge: another estimate may fit as well")
-    if not any(len(cloud) for cloud in data.clouds):
-        out.append("no points were seen: shapes finer than the correction's modes are in no standard error")
+    if (count := sum(len(cloud) for cloud in data.clouds)) < FEWEST:
+        seen_points = f"only {count} points" if count else "no points"
+        out.append(f"{seen_points} were seen: shapes finer than the correction's modes are in no standard error")
     felt = torch.zeros(len(data.times), dtype=torch.bool)
     for wrench in data.wrenches.values():
         felt |= wrench.isfinite().any(-1)

@@ -175,8 +175,11 @@ def _occluders(done: Performance) -> Callable[[int], Sequence[Any]]:
     table = [] if done.scene.table is None else solid_meshes([done.scene.table.primitive()])
     if done.plan is None:
         return lambda i: table
-    knots = np.searchsorted(done.plan.t.numpy(), done.t).clip(max=len(done.plan.t) - 1)
-    solids = done.scene.geometry({name: q[torch.as_tensor(knots)] for name, q in done.plan.q.items()})
+    knots = done.plan.t.numpy()
+    joints = {
+        name: np.stack([np.interp(done.t, knots, own) for own in q.T.numpy()], -1) for name, q in done.plan.q.items()
+    }
+    solids = done.scene.geometry({name: torch.as_tensor(q).to(done.plan.q[name]) for name, q in joints.items()})
     return lambda i: [*table, *solid_meshes(solids, i)]
 
 

@@ -62,12 +62,12 @@ class Order:
     @property
     def cloth_fabric(self) -> str:
         """The fabric that is used."""
-        return self.fabric or GARMENTS[self.garment].fabric
+        return GARMENTS[self.garment].fabric if self.fabric is None else self.fabric
 
     @property
     def name(self) -> str:
         """Of the episode's folder."""
-        parts = [self.garment, self.motion, *([self.fabric] if self.fabric else [])]
+        parts = [self.garment, self.motion, *([] if self.fabric is None else [self.fabric])]
         return "_".join([*parts, *([f"seed{self.seed}"] if self.seed else [])])
 
     def facts(self) -> dict[str, Any]:

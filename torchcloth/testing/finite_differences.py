@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -60,7 +61,7 @@ class Sweep:
         Raises:
             AssertionError: with the table of steps, errors and slopes.
         """
-        if not bool(torch.isfinite(self.estimates).all()) or self.derivative != self.derivative:
+        if not bool(torch.isfinite(self.estimates).all()) or not math.isfinite(self.derivative):
             raise AssertionError(f"not finite\n{self}")
         errors, floor = self.errors, self.floor
         visible = errors > torch.clamp(10 * floor, min=tolerance / 100)
@@ -70,7 +71,7 @@ class Sweep:
         if len(counts) < 3:
             raise AssertionError(f"the error does not fall with the square of the step\n{self}")
         best = float(counts.min())
-        if best > tolerance:
+        if not best <= tolerance:
             raise AssertionError(f"the error never falls to {tolerance:.1e}; best {best:.1e}\n{self}")
         return best
 

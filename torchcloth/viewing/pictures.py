@@ -16,6 +16,7 @@ from .stage import Stage
 
 RATE, FASTEST = 25.0, 50.0  # 1/s; browsers slow a faster GIF down
 COLOURS = 96  # of a GIF
+LONGEST = 65535  # hundredths of a second, of a frame: what 16 bits hold
 GIF, MOMENT = (560, 420), (480, 420)  # pixels
 PANELS = 4  # moments on a PNG
 
@@ -119,4 +120,9 @@ def _durations(times: Array) -> list[int]:
     shown = [0]
     for end in np.round(100 * ends).astype(int).tolist():
         shown.append(max(end, shown[-1] + 2))  # what one frame is too long, the next are shorter
+    if (longest := int(np.diff(shown).max())) > LONGEST:
+        expected = f"at most {LONGEST / 100:.0f} s, which a GIF can say"
+        raise InvalidInput(
+            "frames", got=f"{longest / 100:.0f} s between two", expected=expected, remedy=".png or .html"
+        )
     return (10 * np.diff(shown)).tolist()
