@@ -13,6 +13,7 @@ from ..identification import gauss_newton
 from .objective import Corrected
 
 PARTS = (0.25, 0.5)  # of the frames: far from the truth a long motion is too nonlinear to start with
+FABRIC = 3  # steps of each part where values of the fabric are uncertain
 ROUNDS = 8  # of all frames, at most
 LEAST = 0.01  # m/s^2, a thousandth of gravity
 FASTEST = 1e4  # m/s^2, a thousand times gravity: no cloth needs that to be where it was seen
@@ -41,18 +42,13 @@ class Smoothed(NamedTuple):
 
 def smooth(objective: Corrected, tell: Tell) -> Smoothed:
     """The likeliest unknowns and their covariance, the force's size included (restricted maximum likelihood)."""
-    raw = objective.start
-    for share in PARTS:
-        part = objective.part(share)
-        if part.told and len(part.episodes[0].times) < len(objective.episodes[0].times):
-            tell(f"the first {100 * share:.0f} % of the frames", raw)
-            raw = gauss_newton.minimise(part.problem(), raw, 1, lambda _: False).raw
+    raw = _begun(objective, tell)
     converged = False
     for number in range(ROUNDS):
         tell(f"all frames, round {number + 1}", raw)
         final = gauss_newton.minimise(objective.problem(), raw, 1, lambda _: False)
         if number == 0 and holds_for(objective, final.raw) < len(objective.episodes[0].times):
-            raw = _window_by_window(objective, tell)
+            raw = _window_by_window(objective, raw, tell)
             final = gauss_newton.minimise(objective.problem(), raw, 1, lambda _: False)
         raw = final.raw
         found = _learn(objective, final)
@@ -64,6 +60,23 @@ def smooth(objective: Corrected, tell: Tell) -> Smoothed:
     return Smoothed(raw, final, found.root, converged and holds == len(objective.episodes[0].times), holds)
 
 
+def _begun(objective: Corrected, tell: Tell) -> Tensor:
+    """[K] from beginnings, and where values of the fabric are uncertain from these first.
+
+    A force that may be large does their work, and is learnt to be large: meanwhile it is expected to be the least.
+    """
+    raw, expected, fabric = objective.start, objective.correction.std, bool(objective.unknowns)
+    if fabric:
+        objective.expecting(torch.full_like(expected, LEAST))
+    for share in (*PARTS, 1.0) if fabric else PARTS:
+        part = objective.part(share) if share < 1 else objective
+        if part.told and (share == 1 or len(part.episodes[0].times) < len(objective.episodes[0].times)):
+            tell(f"the first {100 * share:.0f} % of the frames" if share < 1 else "all frames, the fabric", raw)
+            raw = gauss_newton.minimise(part.problem(), raw, FABRIC if fabric else 1, lambda _: False).raw
+    objective.expecting(expected)
+    return raw
+
+
 def holds_for(objective: Corrected, raw: Tensor) -> int:
     """Frames in which no push of the size that is expected moves the cloth farther than it is long, by tangents."""
     moved = objective.tangents(raw)[1].x[objective.pushes]
@@ -72,9 +85,9 @@ def holds_for(objective: Corrected, raw: Tensor) -> int:
     return int(far.nonzero()[0]) if bool(far.any()) else len(far)
 
 
-def _window_by_window(objective: Corrected, tell: Tell) -> Tensor:
+def _window_by_window(objective: Corrected, raw: Tensor, tell: Tell) -> Tensor:
     """[K] from beginnings that grow by one window: a push far ahead has tangents that end in no motion."""
-    raw, count = objective.start, len(objective.episodes[0].times)
+    count = len(objective.episodes[0].times)
     rounds, steps = GROWING
     for _, last in objective.correction.windows[:-1]:
         part = cast("Corrected", objective.part((last + 1) / count))
