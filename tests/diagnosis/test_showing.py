@@ -36,7 +36,7 @@ def told(found):
 def test_it_shows_where_and_when_it_does_what_parameters_do_not():
     answer = told(with_cause())
     assert answer["where"]["at"] == pytest.approx(PLACE.tolist())
-    assert answer["when"] == {"motion": "c", "from": pytest.approx(0.6), "to": pytest.approx(0.8)}
+    assert answer["when"] == {"episode": 2, "motion": "c", "from": pytest.approx(0.6), "to": pytest.approx(0.8)}
     assert answer["moves"] == {"value": pytest.approx(AMPLITUDE * BUMP, rel=0.1), "unit": "m"}
 
 

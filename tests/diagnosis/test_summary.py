@@ -96,7 +96,10 @@ def test_a_missing_force_is_a_pressure_at_a_place():
     part = {"motion": "swing", "at": [0.1, 0.2], "from": 0.2, "to": 0.4, "pressure": [0.0, 3.0, 4.0], "sure": True}
     part["until"] = None
     (line,) = (t for t in summary("unexplained", missing_force={"weight": 2.0, "motions": [part]}) if "missing" in t)
-    assert "A pressure of 5 Pa (250 % of the cloth's own weight) is missing in swing, about (100, 200) mm" in line
+    assert (
+        "A pressure of 5 Pa (250 % of the cloth's own weight) towards (0.0, 0.6, 0.8) of the world is missing" in line
+    )
+    assert "in swing, about (100, 200) mm" in line
     until = summary(
         "unexplained", missing_force={"weight": 2.0, "motions": [part, part | {"motion": "hang", "until": 0.6}]}
     )

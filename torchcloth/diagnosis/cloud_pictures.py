@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ LEAST = 1.0  # mm, that the colour bar spans at least: less would dramatise nois
 MOST = 2000  # points of a picture
 ASIDE, ABOVE = 50.0, 18.0  # degrees, of the eye from the cloth's normal and over the horizon
 TITLES = ("base model", "with causes")
+ACROSS, WIDE = 3, 30  # moments beside each other, letters of a title's line
 
 
 def over_cloud(overlays: Sequence[Overlay], faces: np.ndarray) -> Any:
@@ -28,16 +30,22 @@ def over_cloud(overlays: Sequence[Overlay], faces: np.ndarray) -> Any:
     """
     from matplotlib.figure import Figure
 
-    rows, columns = len(overlays[0].sheets), len(overlays)
+    rows, count = len(overlays[0].sheets), len(overlays)
+    across, down = min(count, ACROSS), -(-count // ACROSS)
     every = np.concatenate([o.distances[0].numpy() for o in overlays])
     limit = max(1e3 * float(np.quantile(every, SHOWN)), LEAST)
-    figure = Figure(figsize=(2.6 * columns + 1.4, 2.7 * rows + 0.4), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": "3d"})
-    for column, o in zip(axes.T, overlays, strict=True):
+    figure = Figure(figsize=(2.9 * across + 1.4, (2.8 * rows + 0.3) * down), layout="constrained")
+    axes = figure.subplots(rows * down, across, squeeze=False, subplot_kw={"projection": "3d"})
+    for k, o in enumerate(overlays):
+        column = axes[k // across * rows : (k // across + 1) * rows, k % across]
         for axis, x, distance, told in zip(column, o.sheets, o.distances, TITLES, strict=False):
             drawn = _moment(axis, o, x.numpy(), 1e3 * distance.numpy(), faces, limit)
             axis.set_title(f"{told}: {1e3 * float(distance.mean()):.1f} mm", fontsize=8)
-        column[0].set_title(f"{o.motion}, {o.time:.2f} s\n{column[0].get_title()}", fontsize=8, parse_math=False)
+        named = textwrap.fill(f"{o.motion}, {o.time:.2f} s", WIDE)
+        column[0].set_title(f"{named}\n{column[0].get_title()}", fontsize=8, parse_math=False)
+    for k in range(count, across * down):
+        for row in range(rows):
+            axes[k // across * rows + row, k % across].set_axis_off()
     figure.colorbar(drawn, ax=axes, label="point to surface, mm", shrink=0.8)  # pyright: ignore[reportPossiblyUnbound]
     return figure
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
-from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.optimize import linear_sum_assignment
 
 from ..boundaries import Grasp
 from ..cloth import Cloth
@@ -143,14 +143,12 @@ def _swapped(seen: Seen) -> Iterator[tuple[str, str]]:
     place = np.stack([seen.first[held[name]].mean(0).numpy() for name in names])
     hands = np.stack([seen.paths[name].at(start)[0][0] for name in names])
     away = np.linalg.norm(place[:, None] - hands, axis=-1)
-    orders = {
-        order: float(np.mean([away[i, k] for i, k in enumerate(order)])) for order in permutations(range(len(names)))
-    }
-    own, best = orders[tuple(range(len(names)))], min(orders, key=lambda order: orders[order])
-    if own > AWAY and orders[best] < 0.5 * own:
-        pairs = ", ".join(f"{names[i]} holds what {names[k]} should" for k, i in enumerate(best) if i != k)
+    rows, best = linear_sum_assignment(away)
+    own, then = float(away.diagonal().mean()), float(away[rows, best].mean())
+    if own > AWAY and then < 0.5 * own:
+        pairs = ", ".join(f"{names[i]} holds what {names[k]} should" for k, i in enumerate(best.tolist()) if i != k)
         yield (
-            f"the grippers are swapped: {pairs} ({100 * own:.0f} cm from its place, {100 * orders[best]:.0f} cm then)",
+            f"the grippers are swapped: {pairs} ({100 * own:.0f} cm from its place, {100 * then:.0f} cm then)",
             "exchange their names in motion.npz or in grasps",
         )
 

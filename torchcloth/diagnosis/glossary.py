@@ -41,6 +41,10 @@ GLOSSARY = {
     "obs.depth_bias": "The camera's depths are too large by a constant.",
 }
 
+ALIKE = {
+    "robot.base": "The robot stands elsewhere than stated: it looks as if the camera did."
+}  # asked about as another
+
 
 def table(hypotheses: list[Hypothesis]) -> str:
     """All causes as a table in Markdown; axes of one effect share a row."""

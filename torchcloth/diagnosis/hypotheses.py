@@ -11,12 +11,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
-from ..errors import InvalidInput, TorchclothError
+from ..errors import InvalidInput
 from ..recordings import Recording
 from . import air, fabric, grip, observer
-from .world import RESIDUAL, Hypothesis, Model
+from .tried_causes import blamed
+from .world import RESIDUAL, Hypothesis, Model, World
 
-TAKEN = frozenset({air.DRAG, "linear", "added_mass", "viscosity", "hem", "seam", "rest_shape", "gravity", "bending"})
+TAKEN = frozenset(
+    {air.DRAG, "linear", "added_mass", "viscosity", "hem", "seam", "rest_shape", "gravity", "bending"}
+    | {"bending_friction", "shear_friction", RESIDUAL}
+)
+BEGIN, END = "slip_", "_pull"  # of names with a gripper's or a table's
 _registered: list[Hypothesis] = []
 _notes: list[list[Hypothesis]] = []
 
@@ -46,12 +51,28 @@ def register(hypothesis: Hypothesis) -> Hypothesis:
 
 
 def _check_size(hypothesis: Hypothesis) -> None:
+    for key in ("name", "unit"):
+        if not isinstance(said := getattr(hypothesis, key), str) or not said:
+            raise InvalidInput(f"{key} of a hypothesis", got=repr(said), expected="a word")
+    for key in ("typical", "share", "step", "low", "high"):
+        if not isinstance(number := getattr(hypothesis, key), (int, float)):
+            raise InvalidInput(f"{key} of {hypothesis.name!r}", got=repr(number), expected="a number")
+    if not callable(hypothesis.apply):
+        raise InvalidInput(f"apply of {hypothesis.name!r}", got=repr(hypothesis.apply), expected="a function")
     wrong = hypothesis.typical == 0 or (hypothesis.typical < 0 and not hypothesis.signed)
     if wrong or not math.isfinite(hypothesis.typical):
         expected = "another than 0" if hypothesis.signed else "a value > 0, or signed=True"
         raise InvalidInput(f"typical of {hypothesis.name!r}", got=hypothesis.typical, expected=expected)
     if not 0 < hypothesis.share < math.inf:
         raise InvalidInput(f"share of {hypothesis.name!r}", got=hypothesis.share, expected="a value > 0, e.g. 0.4")
+    if not 0 < hypothesis.step < math.inf:
+        raise InvalidInput(f"step of {hypothesis.name!r}", got=hypothesis.step, expected="a value > 0, e.g. 0.1")
+    ends = hypothesis.low, hypothesis.high
+    if not ends[0] <= min(0.0, hypothesis.typical) <= max(0.0, hypothesis.typical) <= ends[1]:
+        expected = f"ends about 0 and the typical {hypothesis.typical:g}"
+        raise InvalidInput(
+            f"low and high of {hypothesis.name!r}", got=f"{ends[0]:g} and {ends[1]:g}", expected=expected
+        )
 
 
 def forget(name: str) -> None:
@@ -79,18 +100,20 @@ def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]
     without = () if "bending" in model.base.cloth.effects else fabric.OF_BENDING
     asked = [h for h in model.others(known()) if h.effect not in without]
     for own in _registered:
-        _refuse_taken(own, model)
+        with blamed(own):
+            _refuse_taken(own, model)
+            any(own.needs(r) for r in recordings)
     return [here(h, model, recordings) for h in asked if any(h.needs(r) for r in recordings)]
 
 
 def _refuse_taken(own: Hypothesis, model: Model) -> None:
     """Of two effects of one name the later would silently take the place of the earlier."""
-    try:
-        effects = own.apply(model.base, own.typical).cloth.effects
-    except TorchclothError:
-        return  # the search says so
-    for name, effect in effects.items():
-        if name in TAKEN and not type(effect).__module__.startswith("torchcloth."):
+    world = own.apply(model.base, own.typical)
+    if not isinstance(world, World):
+        raise TypeError(f"apply gives {type(world).__name__}, no World")
+    for name, effect in world.cloth.effects.items():
+        taken = name in TAKEN or name.startswith(BEGIN) or name.endswith(END)
+        if taken and not type(effect).__module__.startswith("torchcloth."):
             got = f"an effect {type(effect).__name__} named {name!r}, as the catalogue calls one of its own"
             raise InvalidInput(f"hypothesis {own.name!r}", got=got, expected="another name")
 

@@ -42,7 +42,7 @@ class Numbers(NamedTuple):
     file: str  # for messages, like the place in it
     place: str
     coordinates: dict[str, float]
-    causes: list[tuple[str, float]]
+    causes: list[tuple[str, float, str]]
 
     def of(self, parameters: Sequence[Parameter]) -> Tensor:
         """[P] coordinates in the order of a model's parameters.
@@ -144,7 +144,7 @@ def _collider(fields: Fields) -> Collider:
 
 def _numbers(fields: Fields) -> Numbers:
     coordinates = {name: said.number("coordinate") for name, said in fields.each("parameters").items()}
-    causes = [(cause.text("effect"), cause.number("amplitude")) for cause in _objects(fields, "causes")]
+    causes = [(c.text("effect"), c.number("amplitude"), c.text("unit")) for c in _objects(fields, "causes")]
     return Numbers(fields.place, fields.at("parameters"), coordinates, causes)
 
 

@@ -145,14 +145,21 @@ def of_fabric(path: str | Path, own: Recording, scene: Recording) -> Recording:
     return replace(scene, cloth=replace(b, **{name: getattr(a, name) for name in sheet}))
 
 
-def _extended(path: Path, model: Model, causes: Sequence[tuple[str, float]]) -> Model:
+def _extended(path: Path, model: Model, causes: Sequence[tuple[str, float, str]]) -> Model:
     by_name = {h.name: h for h in (*known(), *TERMS)}
-    for name, amplitude in causes:
+    for name, amplitude, unit in causes:
         if name not in by_name:
             raise InvalidInput(
                 f"{path}: effect {name!r}",
                 got="not in the catalogue",
                 remedy="name the file that registers it (--causes FILE.py, diagnosis.register_file)",
+            )
+        if unit != by_name[name].unit:
+            raise InvalidInput(
+                f"{path}: unit of {name!r}",
+                got=repr(unit),
+                expected=repr(by_name[name].unit),
+                remedy="register the cause as it was, or diagnose again",
             )
         model = model.plus(here(by_name[name], model), amplitude)
     return model

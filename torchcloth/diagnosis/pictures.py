@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,6 +24,9 @@ MAPPED: dict[str, Own] = {  # what lies on the fabric, by what is shown of it
     "upwards": lambda c: (c.block == NAMES.index("markers")) & (c.patch % 3 == 2),
 }
 FARTHEST = 2.2  # typical amplitudes that are shown
+FLOOR_LABELS = {"sensor only": "what the sensor alone would leave", "repetitions": "what repetitions differ by"}
+WIDE = 26  # letters of a title's line
+ACROSS = 3  # pictures beside each other, that a page shows legibly
 UNSEEN = "#c4c4c4"
 
 
@@ -42,13 +46,15 @@ def residual_maps(answer: Diagnosis) -> Any:
     middles = _middles(both, own)
     before, after = (_maps(e, list(middles), own) for e in both)
     told = [f"{100 * u:.0f}, {100 * v:.0f}" for u, v in middles.values()]
-    names, count = answer.content["motions"], len(before)
+    names, count = titles(answer.content), len(before)
     limit = max(float(np.nanquantile(np.abs(np.concatenate([m.ravel() for m in before])), 0.98)), 1e-6)
     rows = 2 if found.steps else 1
-    figure = Figure(figsize=(2.6 * count + 1.8, 2.6 * rows + 0.6), layout="constrained")
-    axes = np.atleast_2d(figure.subplots(rows, count, sharey=True, squeeze=False))
+    across, down = min(count, ACROSS), -(-count // ACROSS)
+    figure = Figure(figsize=(2.9 * across + 1.8, (2.8 * rows + 0.3) * down + 0.3), layout="constrained")
+    axes = figure.subplots(rows * down, across, sharey=True, squeeze=False)
     for row, maps in enumerate((before, after)[:rows]):
-        for k, (axis, field) in enumerate(zip(axes[row], maps, strict=True)):
+        for k, field in enumerate(maps):
+            axis = axes[k // across * rows + row, k % across]
             extent = (0, field.shape[1] * STRETCH, field.shape[0], 0)
             image = axis.imshow(field, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto", extent=extent)
             axis.set_facecolor(UNSEEN)
@@ -56,13 +62,31 @@ def residual_maps(answer: Diagnosis) -> Any:
             axis.set_title(names[k] if row == 0 else "", fontsize=9, parse_math=False)
             if row == rows - 1:
                 axis.set_xlabel("time, s")
-        axes[row, 0].set_ylabel(f"{('before', 'after')[row]}: part of the fabric,\nits middle u, v in cm", fontsize=9)
+        for axis in axes[row::rows, 0]:
+            axis.set_ylabel(f"{('before', 'after')[row]}: part of the fabric,\nits middle u, v in cm", fontsize=9)
+    _without_unused(axes, count, rows)
     figure.colorbar(
         image,
         ax=axes,  # pyright: ignore[reportPossiblyUnbound]
         label=f"measured minus simulated, {seen[0]}, mm",
     )
     return figure
+
+
+def titles(content: dict[str, Any]) -> list[str]:
+    """What each episode's motion is called, with the episode's name where another has the same; folded."""
+    motions = content["motions"]
+    names = [e["name"] for e in content.get("episodes", [])] or [str(k + 1) for k in range(len(motions))]
+    told = [m if motions.count(m) == 1 else f"{m} ({name})" for m, name in zip(motions, names, strict=True)]
+    return [textwrap.fill(text, WIDE) for text in told]
+
+
+def _without_unused(axes: Any, count: int, rows: int) -> None:
+    """Places of a grid, ``rows`` of which belong to one line of ``count`` pictures."""
+    across = axes.shape[1]
+    for k in range(count, axes.size // rows):
+        for row in range(rows):
+            axes[k // across * rows + row, k % across].set_axis_off()
 
 
 def screening(rows: Sequence[Row]) -> Any:
@@ -81,7 +105,7 @@ def screening(rows: Sequence[Row]) -> Any:
         if abs(asked) > FARTHEST:  # beyond the picture
             axis.plot(np.copysign(FARTHEST - 0.05, asked), k, ">" if asked > 0 else "<", color=COLOURS[r.decision])
         axis.errorbar(asked, k, xerr=1.96 * r.total / typical, fmt="o", ms=4, color=COLOURS[r.decision])
-    axis.set_yticks(range(len(shown)), [r.hypothesis.name for r in reversed(shown)], fontsize=8)
+    axis.set_yticks(range(len(shown)), [r.hypothesis.name for r in reversed(shown)], fontsize=8, parse_math=False)
     axis.set_xlim(-FARTHEST, FARTHEST)
     axis.set_ylim(-1, len(shown))
     axis.axvline(0, color="k", lw=0.6)
@@ -97,7 +121,8 @@ def isolability(answer: Diagnosis) -> Any:
 
     start = answer.found.start
     visible = {r.hypothesis.name for r in answer.found.screened if r.decision != "unresolvable"}
-    visible |= {c["effect"] for c in answer.content["causes"]}
+    for cause in answer.content["causes"]:
+        visible |= {cause["effect"], *cause["class"], *(r["effect"] for r in cause["rivals"])}
     index = [k for k, h in enumerate(start.evidence.hypotheses) if h.name in visible]
     if not index:
         return None
@@ -106,8 +131,8 @@ def isolability(answer: Diagnosis) -> Any:
     figure = Figure(figsize=(0.28 * len(index) + 2.6, 0.28 * len(index) + 2.0), layout="constrained")
     axis = figure.subplots()
     shown = axis.imshow(rho, cmap="Blues", vmin=0, vmax=1)
-    axis.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
-    axis.set_yticks(range(len(names)), names, fontsize=7)
+    axis.set_xticks(range(len(names)), names, rotation=90, fontsize=7, parse_math=False)
+    axis.set_yticks(range(len(names)), names, fontsize=7, parse_math=False)
     figure.colorbar(shown, ax=axis, label="|correlation|", shrink=0.7)
     return figure
 
@@ -116,20 +141,26 @@ def courses(answer: Diagnosis, before: Predicted, after: Predicted | None) -> An
     """RMS of position cells over time, each motion predicted from the others; mm."""
     from matplotlib.figure import Figure
 
-    names = answer.content["motions"]
-    figure = Figure(figsize=(2.6 * len(names) + 0.8, 2.6), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(1, len(names), sharey=True))
+    names = titles(answer.content)
+    across, down = min(len(names), ACROSS), -(-len(names) // ACROSS)
+    figure = Figure(figsize=(2.9 * across + 0.8, 2.5 * down), layout="constrained")
+    grid = figure.subplots(down, across, sharey=True, squeeze=False)
+    axes = grid.ravel()[: len(names)]
     for k, axis in enumerate(axes):
         for label, p, colour in (("base model", before, "#b0653a"), ("with causes", after, "#1f6f8b")):
             if p is not None:
                 time, rms = _course(p, k)
                 axis.plot(time, 1e3 * rms, color=colour, label=label)
-        axis.axhline(1e3 * answer.found.floor, color="#888888", ls=":", label=answer.content["floor"]["source"])
+        axis.axhline(
+            1e3 * answer.found.floor, color="#888888", ls=":", label=FLOOR_LABELS[answer.content["floor"]["source"]]
+        )
         axis.set_title(names[k], fontsize=9, parse_math=False)
         axis.set_xlabel("time, s")
     axes[0].set_ylim(bottom=0)
-    axes[0].set_ylabel("held out, mm RMS")
+    for row in grid:
+        row[0].set_ylabel("held out, mm RMS")
     axes[0].legend(fontsize=8)
+    _without_unused(grid, len(names), 1)
     return figure
 
 
@@ -141,8 +172,10 @@ def missing_force(found: MissingForce) -> Any:
     from matplotlib.figure import Figure
 
     count = len(found.parts)
-    figure = Figure(figsize=(2.9 * count + 1.2, 4.6), layout="constrained")
-    axes = figure.subplots(2, count, squeeze=False, height_ratios=(3, 1))
+    across_page, down = min(count, ACROSS), -(-count // ACROSS)
+    figure = Figure(figsize=(3.0 * across_page + 1.2, 4.6 * down), layout="constrained")
+    grid = figure.subplots(2 * down, across_page, squeeze=False, height_ratios=(3, 1) * down)
+    axes = np.array([[grid[k // across_page * 2 + row, k % across_page] for k in range(count)] for row in (0, 1)])
     split = [_local(found, m) for m in found.parts]
     limit = max(*(float(np.abs(across).max()) for across, _ in split), 1e-3)
     for k, (m, (across, along)) in enumerate(zip(found.parts, split, strict=True)):
@@ -153,6 +186,9 @@ def missing_force(found: MissingForce) -> Any:
         axis.set_ylim(0, 1.15 * max(SURE, *(float(q.certainty.max()) for q in found.parts)))
         axis.set_xlabel("time, s")
     axes[1, 0].set_ylabel("standard errors")
+    axes[0, 0].set_xlabel("u, m", fontsize=8)
+    axes[0, 0].set_ylabel("v, m", fontsize=8)
+    _without_unused(grid, count, 2)
     figure.colorbar(image, ax=axes[0], label="along the normal, share of the weight")  # pyright: ignore[reportPossiblyUnbound]
     return figure
 

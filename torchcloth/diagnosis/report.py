@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,17 @@ from typing import Any
 from .._files import write_text
 from . import pictures
 from .cloud_pictures import over_cloud
-from .glossary import GLOSSARY
+from .glossary import ALIKE, GLOSSARY
 from .screening import Row, screen
 from .verdict import Diagnosis
 
+ASIDE = (
+    "Too small to matter",
+    "Would have to be",
+    "Undecided",
+    "Cannot be seen",
+    "Does nothing here",
+)  # lists of names
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
 h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem } img { max-width: 100% }
@@ -28,7 +36,7 @@ def write_report(answer: Diagnosis, folder: Path) -> Path:
     """Write report.html into ``folder``; returns its path."""
     verdict = [
         f'<p class="verdict">Verdict: <b>{answer.verdict}</b></p>',
-        *(f"<p>{html.escape(line)}</p>" for line in answer.summary().splitlines()),
+        *_told(answer),
     ]
     parts = verdict if answer.searched is None else verdict + _evidence(answer)
     title = "What the simulation gets wrong"
@@ -36,35 +44,94 @@ def write_report(answer: Diagnosis, folder: Path) -> Path:
     return write_text(folder / "report.html", f"{page}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")
 
 
+def _told(answer: Diagnosis) -> list[str]:
+    """The answer in words; what else was asked about is folded away."""
+    lines = answer.summary().splitlines()
+    aside = [line for line in lines if line.startswith(ASIDE)]
+    out = [f"<p>{html.escape(line)}</p>" for line in lines if line not in aside]
+    if aside:
+        lists = "".join(f"<p>{html.escape(line)}</p>" for line in aside)
+        out.append(f"<details><summary>What else was asked about</summary>{lists}</details>")
+    return out
+
+
 def _evidence(answer: Diagnosis) -> list[str]:
     """Pictures and tables of a search."""
-    found = answer.found
+    found, content = answer.found, answer.content
     before, after = found.held_out
+    instead = {n: c["effect"] for c in content["causes"] for n in (*c["class"], *(r["effect"] for r in c["rivals"]))}
     return [
+        *_causes(content["causes"]),
         *_over_cloud(answer),
         "<h2>Where and when</h2>",
-        "<p>Grey: not seen, or left out because it jumps between shapes of the cloth.</p>",
+        "<p>Means over parts of the fabric and 0.2 s, as a fit to all motions leaves them. Grey: not seen, or left out "
+        "because it jumps between shapes of the cloth.</p>",
         _image(pictures.residual_maps(answer), "Neither points nor markers were seen."),
         "<h2>Motions held out</h2>",
+        "<p>Each motion is predicted from the others. Small errors of clock, camera and grip that differ between "
+        "episodes are taken out, so that a camera that stands elsewhere hardly shows here.</p>",
         _image(pictures.courses(answer, before, after if found.steps else None)),
         _gained(answer.content["gain"]),
         "<h2>What the residuals of the base model ask for</h2>",
-        "<p>A first guess by slopes, which decides what is fitted. The causes above are what fits ended with.</p>",
+        "<p>A first guess by slopes, which decides what is fitted, with 95 % intervals. The causes above are what fits "
+        "ended with.</p>",
         _image(pictures.screening(screen(found.start))),
         "<h2>What is left</h2>" if found.steps else "<h2>All hypotheses</h2>",
-        _table(found.screened),
+        _table(found.screened, instead),
         "<h2>Lack of fit</h2>",
         f"<p>{LACK}</p>",
-        _left(answer.content["lack_of_fit"]),
+        _left(content["lack_of_fit"], pictures.titles(content)),
         _drifts(answer.content["drifts"]),
         *_missing(answer),
         *_learned(answer.content["residual"]),
         "<h2>What these motions can tell apart</h2>",
+        "<p>Dark: the two look alike in these data; above 0.99 they cannot be told apart.</p>",
         _image(pictures.isolability(answer), "Nothing that was asked about shows in them."),
         "<h2>Parameters of the model</h2>",
         _parameters(answer.content["parameters"]),
         "<h2>What the names mean</h2>",
-        *(f"<p><b>{name}</b>: {html.escape(said)}</p>" for name, said in GLOSSARY.items()),
+        *(f"<p><b>{n}</b>: {html.escape(said)}</p>" for n, said in (GLOSSARY | ALIKE).items() if n in _named(answer)),
+    ]
+
+
+def _named(answer: Diagnosis) -> set[str]:
+    """Effects that the report speaks of, without axes."""
+    content = answer.content
+    names = {r.hypothesis.name for r in (*answer.found.screened, *screen(answer.found.start))}
+    names |= {n for c in content["causes"] for n in (c["effect"], *c["class"], *(r["effect"] for r in c["rivals"]))}
+    return {name.partition("[")[0] for name in names}
+
+
+def _causes(rows: list[dict[str, Any]]) -> list[str]:
+    """What is named: how large, how much it mends and how sure that is."""
+    if not rows:
+        return []
+
+    def told(c: dict[str, Any]) -> list[str]:
+        unit, (low, high), placebo = c["unit"].replace("-", ""), c["ci95"], c["placebo"]
+        chance = "–" if placebo["chance"] is None else f"{placebo['chance']:.1f}"
+        share = "–" if c["share_of_explainable"] is None else f"{100 * c['share_of_explainable']:.0f} %"
+        others = [n for n in c["class"] if n != c["effect"]] + [r["effect"] for r in c["rivals"]]
+        return [
+            c["effect"],
+            f"{c['amplitude']:.4g} {unit}",
+            f"{low:.4g} to {high:.4g}",
+            f"{c['amplitude'] / c['typical']:.2g}",
+            f"{c['gain_mm']:.2f}",
+            share,
+            f"{placebo['log_density']:.0f}",
+            chance,
+            ", ".join(dict.fromkeys(others)) or "nothing",
+        ]
+
+    head = (
+        "cause", "amplitude", "95 %", "of typical", "mends, mm", "of what is explainable", "log density", "by chance",
+        "cannot be told from",
+    )  # fmt: skip
+    return [
+        "<h2>Causes</h2>",
+        f"<p>{CAUSES}</p>",
+        _ruled(head, ((told(c), False) for c in rows)),
     ]
 
 
@@ -80,7 +147,7 @@ def _over_cloud(answer: Diagnosis) -> list[str]:
     return [
         "<h2>Measured points over the simulation</h2>",
         f"<p>{told}</p>",
-        _image(over_cloud(answer.overlays, faces)),
+        _image(over_cloud(answer.overlays, faces), alt="Measured points over the simulated cloth"),
     ]
 
 
@@ -97,18 +164,22 @@ def _gained(gain: dict[str, Any] | None) -> str:
     return _ruled(head, ((told(row), False) for row in gain["per_motion"]))
 
 
-def _image(figure: Any, otherwise: str = "") -> str:
+def _image(figure: Any, otherwise: str = "", alt: str = "As the heading says") -> str:
     if figure is None:
         return f"<p>{otherwise}</p>"
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
-    return f'<img src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
+    return f'<img alt="{alt}" src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
 
 
 COLUMNS = (
-    "hypothesis", "unit", "amplitude", "std. error", "of numerics", "matters from", "shows from", "typical",
+    "hypothesis", "unit", "amplitude", "std. error", "shift by the mesh", "matters from", "shows from", "typical",
     "typical moves, mm", "decision",
 )  # fmt: skip
+CAUSES = (
+    "Mends and log density: gained on motions that were held out; each unit of log density makes them e times "
+    "likelier. By chance (its own slopes, put in wrong places) it would rarely gain more than the number beside it."
+)
 LACK = (
     "What a right model leaves: the sensor's slow errors, what another mesh changes, and ripples, which another cloth "
     "has elsewhere. Where these are large, little can be called lacking."
@@ -121,12 +192,14 @@ DECISIONS = (
 )
 
 
-def _table(rows: list[Row]) -> str:
+def _table(rows: list[Row], instead: dict[str, str]) -> str:
+    """``instead``: by name, the cause that is named for it as well."""
     body = []
     for r in rows:
         h = r.hypothesis
         numbers = (r.amplitude, r.std, r.bias, abs(h.smallest), r.detectable, h.typical, 1e3 * r.size)
-        cells = [h.name, h.unit, *(f"{x:.3g}" for x in numbers), r.decision]
+        decision = f"not told from {instead[h.name]}" if h.name in instead else r.decision
+        cells = [h.name, h.unit, *(f"{x:.3g}" if math.isfinite(x) else "–" for x in numbers), decision]
         body.append("".join(f"<td>{html.escape(c)}</td>" for c in cells))
     heads = "".join(f"<th>{name}</th>" for name in COLUMNS)
     return f"<p>{DECISIONS}</p><table><tr>{heads}</tr>{''.join(f'<tr>{row}</tr>' for row in body)}</table>"
@@ -141,13 +214,13 @@ def _ruled(head: Sequence[str], rows: Iterable[tuple[Sequence[str], bool]]) -> s
     return f"<table><tr>{''.join(f'<th>{h}</th>' for h in head)}</tr>{body}</table>"
 
 
-def _left(rows: list[dict[str, Any]]) -> str:
-    """What remains, by motion and kind of data, beside what a right model would leave; lacking rows in bold."""
+def _left(rows: list[dict[str, Any]], titles: list[str]) -> str:
+    """What remains, by episode and kind of data, beside what a right model would leave; lacking rows in bold."""
 
     def told(r: dict[str, Any]) -> list[str]:
         scale, unit = {"m": (1e3, "mm"), "N": (1e3, "mN"), "N m": (1e3, "mN m")}[r["unit"]]
         numbers = [f"{scale * r[key]:.2f}" for key in ("left", "expected", "numerics")]
-        return [r["motion"], r["kind"], *numbers, unit, f"{r['ratio']:.2f}", f"{r['p']:.2g}"]
+        return [titles[r["episode"]], r["kind"], *numbers, unit, f"{r['ratio']:.2f}", f"{r['p']:.2g}"]
 
     head = ("motion", "data", "left", "a right model leaves", "of which numerics", "", "ratio", "chance")
     return _ruled(head, ((told(r), r["lacking"]) for r in rows))
@@ -168,7 +241,8 @@ def _missing(answer: Diagnosis) -> list[str]:
         return []
     return [
         "<h2>The force that is missing</h2>",
-        "<p>Beside the model and its causes, where and when it is the surest in each motion. Names no cause.</p>",
+        "<p>Beside the model and its causes, where and when it is the surest in each motion. Red: along the normal "
+        "u × v; arrows: along the cloth, where sure. Names no cause.</p>",
         _image(pictures.missing_force(answer.missing)),
     ]
 

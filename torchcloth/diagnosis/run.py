@@ -19,7 +19,7 @@ from ..recordings.marks import each_once, mark
 from ..recordings.together import listed, together
 from .base_model import base_model
 from .gate import check
-from .hypotheses import catalogue
+from .hypotheses import catalogue, registered
 from .keeping import kept_in
 from .lacking import lack_of_fit
 from .missing import missing_force
@@ -30,6 +30,7 @@ from .report import write_report
 from .residual import doubted, is_residual, learn_residual
 from .setting import Progress, motions_of, setting_of, somewhere_seen, staged
 from .stepwise import Found, search
+from .tried_causes import check_own
 from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
 
@@ -96,6 +97,8 @@ def diagnose(
     plan = hashlib.sha256(json.dumps([[h.name, h.typical, h.share] for h in asked]).encode()).hexdigest()[:16]
     setting = setting_of(model, recordings)
     somewhere_seen(setting)
+    own = {h.name for h in registered()}
+    check_own([h for h in asked if h.name in own], model.base, setting.episodes)
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     many = torch.get_num_threads()

@@ -28,8 +28,8 @@ def shown(found: Fitted, name: str, names: Sequence[str], episodes: Sequence[Epi
         episodes: that it was fitted to.
 
     Returns:
-        "where": {"at": [u, v] m on the pattern} or {"gripper": name}; "when": {"motion", "from", "to"} s from the first
-        frame; "moves": {"value", "unit"} there, at the fitted amplitude.
+        "where": {"at": [u, v] m on the pattern} or {"gripper": name}; "when": {"episode", "motion", "from", "to"} s
+        from the first frame; "moves": {"value", "unit"} there, at the fitted amplitude.
     """
     cells = found.evidence.cells
     moved = torch.cat(_alone(found, name))
@@ -46,7 +46,7 @@ def shown(found: Fitted, name: str, names: Sequence[str], episodes: Sequence[Epi
     felt = list(episodes[k].wrenches)
     return {
         "where": {"gripper": felt[int(part[first])]} if kind >= SEEN else {"at": place[first, :2].tolist()},
-        "when": {"motion": names[k], "from": round(w * STRETCH, 9), "to": round((w + 1) * STRETCH, 9)},
+        "when": {"episode": k, "motion": names[k], "from": round(w * STRETCH, 9), "to": round((w + 1) * STRETCH, 9)},
         "moves": {"value": float(moved[chosen].norm()), "unit": BLOCKS[kind].unit},
     }
 

@@ -38,7 +38,7 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
         out.append(f"Cause: {_sized(c)}; {abs(c['typical']):.4g} is typical.")
         others = [name for name in c["class"] if name != c["effect"]] + [r["effect"] for r in c["rivals"]]
         out += [f"  {said}" for said in (GLOSSARY.get(c["effect"].partition("[")[0]),) if said]
-        out.append(f"  {_shown(c)}")
+        out.append(f"  {_shown(c, content)}")
         if others:
             out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
     if content["causes"]:
@@ -46,6 +46,8 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
             "These intervals know of noise, meshes and how far motions disagree, not of what is wrong in all alike."
         )
     words = {
+        "identified": "Each cause that is named stands alone: nothing else that was asked about does the same.",
+        "ambiguous": "A cause is named, and these data cannot tell it from others.",
         "adequate": "No known cause is surely larger than what matters.",
         "unexplained": "The fit is lacking, and no known cause mends it.",
         "inconclusive": "Something may be wrong; these data cannot say what.",
@@ -86,14 +88,17 @@ def _sized(row: dict[str, Any]) -> str:
     return f"{_size(row)} (95 %: {low:.4g} to {high:.4g})"
 
 
-def _shown(c: dict[str, Any]) -> str:
+def _shown(c: dict[str, Any], content: dict[str, Any]) -> str:
     """Where and when a cause stands out most."""
     when, where, moves = c["when"], c["where"], c["moves"]
     u, v = (1e3 * s for s in where.get("at", (0.0, 0.0)))
     place = f"at ({u:.0f}, {v:.0f}) mm of the pattern" if "at" in where else f"in what gripper {where['gripper']} feels"
     time = f"{when['from']:.1f} to {when['to']:.1f} s"
     beyond = "beyond what fitted numbers could do instead"
-    return f"Surest in {when['motion']} from {time}, {place}: {1e3 * moves['value']:.3g} m{moves['unit']} {beyond}."
+    motion, named = when["motion"], [e["name"] for e in content.get("episodes", [])]
+    if named and content["motions"].count(motion) > 1:
+        motion = f"{motion} ({named[when['episode']]})"
+    return f"Surest in {motion} from {time}, {place}: {1e3 * moves['value']:.3g} m{moves['unit']} {beyond}."
 
 
 def _size(row: dict[str, Any]) -> str:
@@ -106,8 +111,8 @@ def _lacking(content: dict[str, Any]) -> list[str]:
     drifting, rows = ([row for row in content[key] if row["lacking"]] for key in ("drifts", "lack_of_fit"))
     told = [
         f"The force on each gripper along {d['axis']} drifts from the simulation's by {1e3 * d['rate']:.0f} mN/s "
-        f"(standard error {1e3 * d['std']:.0f}) in all motions alike: cloth that gains or loses weight, or "
-        "sensors. Empty grippers, recorded as long, would tell."
+        f"(standard error {1e3 * d['std']:.0f}) in all motions alike: {_drifting(d)}sensors. "
+        "Empty grippers, recorded as long, would tell."
         for d in drifting
     ]
     out = [*told, *([f"Lacking: {', '.join(map(_left, rows))}."] if rows else [])]
@@ -117,7 +122,8 @@ def _lacking(content: dict[str, Any]) -> list[str]:
         size = sum(c * c for c in m["pressure"]) ** 0.5
         share = 100 * size / missing["weight"]
         out.append(
-            f"  A pressure of {size:.2g} Pa ({share:.0f} % of the cloth's own weight) is missing in "
+            f"  A pressure of {size:.2g} Pa ({share:.0f} % of the cloth's own weight) towards "
+            f"({', '.join(f'{c / max(size, 1e-30):.1f}' for c in m['pressure'])}) of the world is missing in "
             f"{m['motion']}, about ({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
         )
     unasked = [f"{m['motion']} from {m['until']:.1f} s on" for m in missing["motions"] if m["until"] is not None]
@@ -126,6 +132,13 @@ def _lacking(content: dict[str, Any]) -> list[str]:
             f"  What force is missing there cannot be asked: small pushes grow without end in {', '.join(unasked)}."
         )
     return out + _residual(content["residual"])
+
+
+def _drifting(d: dict[str, Any]) -> str:
+    """What it may be: cloth that hangs pulls along -z."""
+    if d["axis"] != "z":
+        return ""
+    return f"cloth that {'gains' if d['rate'] < 0 else 'loses'} weight, or "
 
 
 def _left(row: dict[str, Any]) -> str:
@@ -165,7 +178,8 @@ def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> lis
     if found.impossible:
         out.append(f"{', '.join(found.impossible)}: could not be simulated here, so nothing is said of it")
     if found.withdrawn:
-        out.append(f"one local law predicts much better than {', '.join(found.withdrawn)}: withdrawn")
+        names_of = ", ".join(found.withdrawn)
+        out.append(f"{names_of} was withdrawn: a local law that is no known cause predicts much better")
     if found.left_out:
         out.append(f"{100 * found.left_out:.1f} % of the cells jump between shapes of the cloth and are left out")
     folded = sorted({row.motion for row in left if not row.stable})
@@ -183,7 +197,8 @@ def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> lis
         out.append(f"{len(set(names))} kind(s) of motion: many causes look alike in them")
     if found.whole is not None and found.whole.few:
         out.append(
-            f"{found.whole.few} episodes show little of their own spread: the explained share's interval is doubled"
+            f"{found.whole.few} episodes, fewer than eight, tell little of how they scatter: the interval of the "
+            "explained share was doubled to be safe"
         )
     return out
 

@@ -32,6 +32,7 @@ DEFAULT_POISSON = 0.2
 SHEET_TRIANGLES = 288
 ELSEWHERE = 0.15  # of the cloth's diagonal, that what is seen first lies from it
 SAME = 1e-6  # m, on the pattern: one place
+FEW = 0.1  # force readings per frame, that may be left out without a word
 FARTHEST = 0.2  # m, of a held patch from its gripper's origin at the first frame
 
 
@@ -98,7 +99,7 @@ class Episode:
                 f"{self.name}: {self.dropped} of {self.observed + self.dropped} frames come after the motion's end and "
                 "were left out: record the motion as long, or check clock_offset"
             )
-        if self.unused:
+        if self.unused > FEW * self.observed:
             out.append(
                 f"{self.name}: {self.unused} force readings come after the last frame that was seen and were left out: "
                 "leave points and markers out of the recording to use forces alone"

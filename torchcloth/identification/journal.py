@@ -68,7 +68,7 @@ class Journal:
             raise InvalidInput(
                 "resume",
                 got=f"{self.folder} of another fit, or of another version of torchcloth",
-                expected="the same episodes, parameters, options and program",
+                expected="the same episodes, parameters, options, causes and program",
                 remedy=f"to start over, delete {self.folder}",
             )
 

@@ -1,0 +1,83 @@
+"""Causes of one's own that misbehave are told before anything long is simulated."""
+
+import pytest
+import sheets
+
+from torchcloth import effects
+from torchcloth.diagnosis.base_model import base_model
+from torchcloth.diagnosis.hypotheses import Hypothesis, catalogue, forget, register
+from torchcloth.diagnosis.setting import setting_of
+from torchcloth.diagnosis.tried_causes import check_own
+from torchcloth.errors import InvalidInput
+
+
+def fails(*_):
+    return 1 / 0
+
+
+WRONG = {
+    "nothing": (lambda w, a: None, "TypeError: apply gives NoneType, no World"),
+    "divides": (fails, "ZeroDivisionError: division by zero in .*test_tried_causes.py, line"),
+    "a motion": (lambda w, a: w.with_motion(fails), "ZeroDivisionError: .*test_tried_causes.py, line"),
+    "a view": (lambda w, a: w.with_view(fails), "ZeroDivisionError: .*test_tried_causes.py, line"),
+    "a factor": (
+        lambda w, a: w.with_cloth({"my": effects.MassDamping(5 * (1 + a))}),
+        "from next to nothing of it.*amplitude 0 to be the world as it is",
+    ),
+}
+
+
+@pytest.fixture
+def world():
+    recordings = [sheets.episode(motion) for motion in ("slow", "fast")]
+    model = base_model(recordings[0])
+    return recordings, model, setting_of(model, recordings)
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_cause_of_ones_own_is_tried(world, case):
+    _, model, setting = world
+    apply, said = WRONG[case]
+    own = Hypothesis("my.own", "-", 1.0, apply)
+    with pytest.raises(InvalidInput, match=f"hypothesis 'my.own'; got .*{said}"):
+        check_own([own], model.base, setting.episodes)
+
+
+def test_a_right_one_passes(world):
+    _, model, setting = world
+    check_own(
+        [Hypothesis("my.own", "1/s", 1.0, lambda w, a: w.with_cloth({"mine": effects.MassDamping(a)}))],
+        model.base,
+        setting.episodes,
+    )
+
+
+def test_no_effect_may_take_the_place_of_the_catalogues(world):
+    recordings, model, _ = world
+    for name in ("shear_friction", "slip_left", "residual"):
+
+        class Mine(effects.MassDamping):
+            """A law of one's own."""
+
+        register(Hypothesis("my.own", "1/s", 1.0, lambda w, a, own=Mine, key=name: w.with_cloth({key: own(a)})))
+        try:
+            with pytest.raises(InvalidInput, match=f"named '{name}', as the catalogue calls one of its own"):
+                catalogue(model, recordings)
+        finally:
+            forget("my.own")
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"name": None}, "name of a hypothesis; got None"),
+        ({"typical": "1"}, "typical of 'my.own'; got '1'; expected a number"),
+        ({"apply": None}, "apply of 'my.own'"),
+        ({"step": 0.0}, "step of 'my.own'"),
+        ({"low": 0.5}, "low and high of 'my.own'; got 0.5 and inf"),
+        ({"high": 0.5}, "low and high of 'my.own'"),
+    ],
+)
+def test_what_cannot_be_registered(given, said):
+    with pytest.raises(InvalidInput, match=said):
+        register(Hypothesis(**{"name": "my.own", "unit": "-", "typical": 1.0, "apply": lambda w, a: w, **given}))

@@ -1,0 +1,71 @@
+"""Causes of a user's own, tried before anything long is simulated."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..errors import InvalidInput, TorchclothError
+from ..identification.episodes import Episode
+from .world import Hypothesis, World
+
+LIBRARY = Path(__file__).parents[1]
+NEAR = 1e-6  # of the typical amplitude: as good as none
+CONTINUOUS = 0.1  # of what the typical amplitude does, that such an amplitude may do
+NOTHING = 1e-9  # m
+
+
+def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode]) -> None:
+    """Simulate some frames with each of them, and with next to nothing of it.
+
+    Raises:
+        InvalidInput: one fails in an error of its own, gives no world, or does not end where the world is as it is.
+    """
+    if not own:
+        return
+    early = episodes[0].until(0.0)
+    plain = base.frames(early).x
+    for hypothesis in own:
+        with blamed(hypothesis):
+            moved = []
+            for amplitude in (NEAR * hypothesis.typical, hypothesis.typical):
+                world = hypothesis.apply(base, amplitude)
+                if not isinstance(world, World):
+                    raise TypeError(f"apply gives {type(world).__name__}, no World")
+                for episode in episodes:
+                    world.driven(episode)
+                moved.append(float((world.frames(early).x - plain).square().mean().sqrt()))
+            if moved[0] > CONTINUOUS * moved[1] + NOTHING:
+                raise InvalidInput(
+                    f"hypothesis {hypothesis.name!r}",
+                    got=f"{1e3 * moved[0]:.2g} mm from next to nothing of it, {1e3 * moved[1]:.2g} mm from a usual one",
+                    expected="amplitude 0 to be the world as it is",
+                    remedy="of a factor, take what it differs from 1 by",
+                )
+
+
+@contextmanager
+def blamed(hypothesis: Hypothesis) -> Iterator[None]:
+    """Errors that are none of the library's are said by the place in the user's file; what a world cannot be passes.
+
+    Raises:
+        InvalidInput: for them.
+    """
+    try:
+        yield
+    except InvalidInput as error:
+        if f"hypothesis {hypothesis.name!r}" in str(error):
+            raise
+    except TorchclothError:
+        pass  # the search says so
+    except Exception as error:
+        places = [p for p in traceback.extract_tb(error.__traceback__) if not Path(p.filename).is_relative_to(LIBRARY)]
+        own = [p for p in places if "site-packages" not in p.filename]
+        where = f" in {own[-1].filename}, line {own[-1].lineno}" if own else ""
+        raise InvalidInput(
+            f"hypothesis {hypothesis.name!r}",
+            got=f"{type(error).__name__}: {error}{where}",
+            expected="apply(world, amplitude) that gives a world, whose motions give episodes and views frames",
+        ) from error
