@@ -85,7 +85,7 @@ def _evidence(answer: Diagnosis) -> list[str]:
         *_missing(answer),
         *_learned(answer.content["residual"]),
         "<h2>What these motions can tell apart</h2>",
-        "<p>Dark: the two look alike in these data; above 0.99 they cannot be told apart.</p>",
+        "<p>Dark: the two look alike in these data, by slopes. Which cannot be told apart by fits is said above.</p>",
         _image(pictures.isolability(answer), "Nothing that was asked about shows in them."),
         "<h2>Parameters of the model</h2>",
         _parameters(answer.content["parameters"]),

@@ -42,14 +42,20 @@ class Smoothed(NamedTuple):
 
 def smooth(objective: Corrected, tell: Tell) -> Smoothed:
     """The likeliest unknowns and their covariance, the force's size included (restricted maximum likelihood)."""
-    raw = _begun(objective, tell)
+    begun, expected = _begun(objective, tell), objective.correction.std
+    found = _rounds(objective, begun, tell)
+    if found.holds < len(objective.episodes[0].times):  # it was sought where tangents are of no use
+        objective.expecting(expected)
+        found = _rounds(objective, _window_by_window(objective, begun, tell), tell)
+    return found
+
+
+def _rounds(objective: Corrected, raw: Tensor, tell: Tell) -> Smoothed:
+    """Gauss-Newton on all frames, with the force's size learnt after each step."""
     converged = False
     for number in range(ROUNDS):
         tell(f"all frames, round {number + 1}", raw)
         final = gauss_newton.minimise(objective.problem(), raw, 1, lambda _: False)
-        if number == 0 and holds_for(objective, final.raw) < len(objective.episodes[0].times):
-            raw = _window_by_window(objective, raw, tell)
-            final = gauss_newton.minimise(objective.problem(), raw, 1, lambda _: False)
         raw = final.raw
         found = _learn(objective, final)
         prior = (found.step / objective.prior_std).square().sum()  # of what a round asks for: it may make none
