@@ -32,6 +32,7 @@ class AirDrag(AbstractEffect):
     ``a`` is the triangle's current area, u = v - wind the velocity of its centroid relative to the air, u_n its normal
     component and u_t its tangential vector. C_t counts both sides of the sheet. The wind is uniform and steady; gusts
     and the sheet's own wake are not modelled. A wind without drag coefficients does nothing, and has no gradient there.
+    The stable step knows the wind and not the sheet's own speed: in air that suffices, in water it does not.
 
     Args:
         normal: drag coefficient C_n >= 0; a flat plate has about 1.2.

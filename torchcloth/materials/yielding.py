@@ -16,7 +16,8 @@ class NormYield(nn.Module):
 
     The DiffCP paper bounds |F - 1|, which a rigid rotation violates; this is its objective form. It acts on the right
     stretch: the rotation is kept, the strain U - 1 is shortened to length c without turning, and the set is recorded in
-    the material's axes. Rate-independent: a strain held for longer sets no further.
+    the material's axes. Rate-independent: a strain held for longer sets no further. Shear counts as any strain, which
+    woven cloth would take back, and its yarns do not follow the set (as in ``RestShape``).
 
     Args:
         limit: c [-], the elastic strain that does not set; 0.02 is 2 % along one axis. Scalar or one per triangle.
