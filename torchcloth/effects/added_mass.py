@@ -13,13 +13,13 @@ from .base import AbstractEffect, Amplitude
 class AddedMass(AbstractEffect):
     """Inertia of the air that a sheet pushes aside: t = -rho length n (n . dv/dt), along the normal only.
 
-    Air as deep as ``length`` moves with the sheet. For a sheet of side L that swings as a whole it is about 0.3 to
-    0.4 L, for a standing wave wavelength / pi. It slows what moves across the sheet, leaves every static shape alone,
-    and takes the momentum that the sheet seems to lose: with normals that do not turn, sum (m + m_air n n') v is
-    conserved. Where the sheet turns, the air's own change of direction is left out. In its place it would then turn
-    alike, but a sheet that moves along itself while it turns lacks -rho length n (v . dn/dt), and the energy of sheet and
-    air is not kept: at a depth of 0.1 m a light sheet that flutters freely gains 29 % in a quarter of a second. A swing,
-    which moves across itself, hardly notices.
+    Air as deep as ``length`` moves with the sheet. For a sheet of side L that swings as a whole it is about 0.3 to 0.4
+    L, for a standing wave wavelength / pi. It slows what moves across the sheet, leaves every static shape alone, and
+    takes the momentum that the sheet seems to lose: with normals that do not turn, sum (m + m_air n n') v is conserved.
+    Where the sheet turns, the air's own change of direction is left out. In its place it would then turn alike, but a
+    sheet that moves along itself while it turns lacks -rho length n (v . dn/dt), and the energy of sheet and air is not
+    kept: at a depth of 0.1 m a light sheet that flutters freely gains 29 % in a quarter of a second. A swing, which
+    moves across itself, hardly notices.
 
     Args:
         length: depth of the air [m], >= 0; scalar, one value per triangle, or [B, 1] for a batch.

@@ -26,8 +26,9 @@ class Adhesion(AbstractEffect):
 
     per area at rest, d the height over the plane. It resists being lifted, and adds to the push on the plane, so that
     friction grows (Derjaguin, Muller and Toporov 1975: mu (N + stress A)). Charges of 5e-6 C/m^2 make 1.4 Pa, the
-    weight of a light cloth; wet cloth has 100 to 1000 Pa. Lifting costs 8/15 stress gap per area. A collider's ``offset``
-    counts as height: cloth that is kept half a gap above the plane feels 56 % of the stress, at a whole gap none.
+    weight of a light cloth; wet cloth has 100 to 1000 Pa. Lifting costs 8/15 stress gap per area. A collider's
+    ``offset`` counts as height: cloth that is kept half a gap above the plane feels 56 % of the stress, at a whole gap
+    none.
 
     Args:
         stress: [Pa], >= 0: a number, or [B, 1] for a batch.
