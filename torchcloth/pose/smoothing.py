@@ -20,6 +20,7 @@ FASTEST = 1e4  # m/s^2, a thousand times gravity: no cloth needs that to be wher
 TRIES = 40  # of expectation and maximisation, on one linearisation
 SMALL = 0.2  # standard errors per unknown, rms, of a step that ends the search
 STEEP = 1e8  # information over the prior's, from which its square root is worked with: squared, digits are lost
+LOST, USUAL = 5.0, 2e-3  # times the noise [m], which is as large where nobody says: so far off nothing was followed
 GROWING = 3, 2  # where tangents run away: rounds of each beginning, and steps of each
 
 Tell = Callable[[str, Tensor], None]  # stage, unknowns
@@ -44,10 +45,16 @@ def smooth(objective: Corrected, tell: Tell) -> Smoothed:
     """The likeliest unknowns and their covariance, the force's size included (restricted maximum likelihood)."""
     begun, expected = _begun(objective, tell), objective.correction.std
     found = _rounds(objective, begun, tell)
-    if found.holds < len(objective.episodes[0].times):  # it was sought where tangents are of no use
-        objective.expecting(expected)
-        found = _rounds(objective, _window_by_window(objective, begun, tell), tell)
-    return found
+    left, noise = objective.figures(found.raw).rms, objective.floors.get("points", objective.episodes[0].noise)
+    if found.holds == len(objective.episodes[0].times) or not left > LOST * (noise or USUAL):
+        return found
+    first, learnt = found, objective.correction.std  # it was sought where tangents are of no use
+    objective.expecting(expected)
+    found = _rounds(objective, _window_by_window(objective, begun, tell), tell)
+    if objective.figures(found.raw).rms < left:
+        return found
+    objective.expecting(learnt)
+    return first
 
 
 def _rounds(objective: Corrected, raw: Tensor, tell: Tell) -> Smoothed:
