@@ -55,14 +55,17 @@ def test_what_lacks_in_one_stretch_of_time_only_is_said_to():
 def test_numbers_without_a_unit_have_none():
     cause = {"effect": "air.drag_n", "amplitude": 1.19, "unit": "-", "ci95": [1.05, 1.32], "typical": 1.2}
     cause |= {"class": [], "rivals": []}
-    cause |= {"when": {"motion": "swing", "from": 0.4, "to": 0.6}, "moves": {"value": 0.0123, "unit": "m"}}
+    cause |= {
+        "when": {"episode": 0, "motion": "swing", "from": 0.4, "to": 0.6},
+        "moves": {"value": 0.0123, "unit": "m"},
+    }
     cause |= {"where": {"at": [0.1, 0.25]}}
-    said = summary("identified", causes=[cause])
+    said = summary("identified", causes=[cause], motions=["swing"])
     assert "Cause: air.drag_n = 1.19 (95 %: 1.05 to 1.32); 1.2 is typical." in said
     beyond = "beyond what fitted numbers could do instead"
     assert f"  Surest in swing from 0.4 to 0.6 s, at (100, 250) mm of the pattern: 12.3 mm {beyond}." in said
     felt = cause | {"where": {"gripper": "left"}, "moves": {"value": 0.035, "unit": "N"}}
-    said = summary("identified", causes=[felt])
+    said = summary("identified", causes=[felt], motions=["swing"])
     assert f"  Surest in swing from 0.4 to 0.6 s, in what gripper left feels: 35 mN {beyond}." in said
 
 

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from .overlays import Overlay
+from .page import laid, without_unused
 
 SHOWN = 0.98  # quantile of the distances at the end of the colour bar
 LEAST = 1.0  # mm, that the colour bar spans at least: less would dramatise noise
 MOST = 2000  # points of a picture
 ASIDE, ABOVE = 50.0, 18.0  # degrees, of the eye from the cloth's normal and over the horizon
 TITLES = ("base model", "with causes")
-ACROSS, WIDE = 3, 30  # moments beside each other, letters of a title's line
+WIDE = 30  # letters of a title's line
 
 
 def over_cloud(overlays: Sequence[Overlay], faces: np.ndarray) -> Any:
@@ -31,7 +32,7 @@ def over_cloud(overlays: Sequence[Overlay], faces: np.ndarray) -> Any:
     from matplotlib.figure import Figure
 
     rows, count = len(overlays[0].sheets), len(overlays)
-    across, down = min(count, ACROSS), -(-count // ACROSS)
+    across, down = laid(count)
     every = np.concatenate([o.distances[0].numpy() for o in overlays])
     limit = max(1e3 * float(np.quantile(every, SHOWN)), LEAST)
     figure = Figure(figsize=(2.9 * across + 1.4, (2.8 * rows + 0.3) * down), layout="constrained")
@@ -43,9 +44,7 @@ def over_cloud(overlays: Sequence[Overlay], faces: np.ndarray) -> Any:
             axis.set_title(f"{told}: {1e3 * float(distance.mean()):.1f} mm", fontsize=8)
         named = textwrap.fill(f"{o.motion}, {o.time:.2f} s", WIDE)
         column[0].set_title(f"{named}\n{column[0].get_title()}", fontsize=8, parse_math=False)
-    for k in range(count, across * down):
-        for row in range(rows):
-            axes[k // across * rows + row, k % across].set_axis_off()
+    without_unused(axes, count, rows)
     figure.colorbar(drawn, ax=axes, label="point to surface, mm", shrink=0.8)  # pyright: ignore[reportPossiblyUnbound]
     return figure
 

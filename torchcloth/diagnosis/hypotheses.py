@@ -14,8 +14,8 @@ from dataclasses import replace
 from ..errors import InvalidInput
 from ..recordings import Recording
 from . import air, fabric, grip, observer
-from .tried_causes import blamed
-from .world import RESIDUAL, Hypothesis, Model, World
+from .tried_causes import applied, blamed
+from .world import RESIDUAL, Hypothesis, Model
 
 TAKEN = frozenset(
     {air.DRAG, "linear", "added_mass", "viscosity", "hem", "seam", "rest_shape", "gravity", "bending"}
@@ -108,10 +108,7 @@ def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]
 
 def _refuse_taken(own: Hypothesis, model: Model) -> None:
     """Of two effects of one name the later would silently take the place of the earlier."""
-    world = own.apply(model.base, own.typical)
-    if not isinstance(world, World):
-        raise TypeError(f"apply gives {type(world).__name__}, no World")
-    for name, effect in world.cloth.effects.items():
+    for name, effect in applied(own, model.base, own.typical).cloth.effects.items():
         taken = name in TAKEN or name.startswith(BEGIN) or name.endswith(END)
         if taken and not type(effect).__module__.startswith("torchcloth."):
             got = f"an effect {type(effect).__name__} named {name!r}, as the catalogue calls one of its own"

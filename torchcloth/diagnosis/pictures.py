@@ -14,8 +14,10 @@ from .classes import correlations
 from .comparison import Predicted
 from .evidence import Evidence
 from .missing import SURE, Missing, MissingForce
+from .page import laid, without_unused
 from .screening import Row
 from .verdict import Diagnosis
+from .wording import FLOORS, labels
 
 COLOURS = {"present": "#b0653a", "inconclusive": "#c9a227", "absent": "#1f6f8b", "unresolvable": "#bbbbbb"}
 Own = Callable[[Cells], Tensor]  # [C] bool, of the cells of an episode
@@ -24,9 +26,7 @@ MAPPED: dict[str, Own] = {  # what lies on the fabric, by what is shown of it
     "upwards": lambda c: (c.block == NAMES.index("markers")) & (c.patch % 3 == 2),
 }
 FARTHEST = 2.2  # typical amplitudes that are shown
-FLOOR_LABELS = {"sensor only": "what the sensor alone would leave", "repetitions": "what repetitions differ by"}
 WIDE = 26  # letters of a title's line
-ACROSS = 3  # pictures beside each other, that a page shows legibly
 UNSEEN = "#c4c4c4"
 
 
@@ -49,7 +49,7 @@ def residual_maps(answer: Diagnosis) -> Any:
     names, count = titles(answer.content), len(before)
     limit = max(float(np.nanquantile(np.abs(np.concatenate([m.ravel() for m in before])), 0.98)), 1e-6)
     rows = 2 if found.steps else 1
-    across, down = min(count, ACROSS), -(-count // ACROSS)
+    across, down = laid(count)
     figure = Figure(figsize=(2.9 * across + 1.8, (2.8 * rows + 0.3) * down + 0.3), layout="constrained")
     axes = figure.subplots(rows * down, across, sharey=True, squeeze=False)
     for row, maps in enumerate((before, after)[:rows]):
@@ -64,7 +64,7 @@ def residual_maps(answer: Diagnosis) -> Any:
                 axis.set_xlabel("time, s")
         for axis in axes[row::rows, 0]:
             axis.set_ylabel(f"{('before', 'after')[row]}: part of the fabric,\nits middle u, v in cm", fontsize=9)
-    _without_unused(axes, count, rows)
+    without_unused(axes, count, rows)
     figure.colorbar(
         image,
         ax=axes,  # pyright: ignore[reportPossiblyUnbound]
@@ -75,18 +75,7 @@ def residual_maps(answer: Diagnosis) -> Any:
 
 def titles(content: dict[str, Any]) -> list[str]:
     """What each episode's motion is called, with the episode's name where another has the same; folded."""
-    motions = content["motions"]
-    names = [e["name"] for e in content.get("episodes", [])] or [str(k + 1) for k in range(len(motions))]
-    told = [m if motions.count(m) == 1 else f"{m} ({name})" for m, name in zip(motions, names, strict=True)]
-    return [textwrap.fill(text, WIDE) for text in told]
-
-
-def _without_unused(axes: Any, count: int, rows: int) -> None:
-    """Places of a grid, ``rows`` of which belong to one line of ``count`` pictures."""
-    across = axes.shape[1]
-    for k in range(count, axes.size // rows):
-        for row in range(rows):
-            axes[k // across * rows + row, k % across].set_axis_off()
+    return [textwrap.fill(text, WIDE) for text in labels(content)]
 
 
 def screening(rows: Sequence[Row]) -> Any:
@@ -141,8 +130,8 @@ def courses(answer: Diagnosis, before: Predicted, after: Predicted | None) -> An
     """RMS of position cells over time, each motion predicted from the others; mm."""
     from matplotlib.figure import Figure
 
-    names = titles(answer.content)
-    across, down = min(len(names), ACROSS), -(-len(names) // ACROSS)
+    names, source = titles(answer.content), answer.content["floor"]["source"]
+    across, down = laid(len(names))
     figure = Figure(figsize=(2.9 * across + 0.8, 2.5 * down), layout="constrained")
     grid = figure.subplots(down, across, sharey=True, squeeze=False)
     axes = grid.ravel()[: len(names)]
@@ -151,16 +140,14 @@ def courses(answer: Diagnosis, before: Predicted, after: Predicted | None) -> An
             if p is not None:
                 time, rms = _course(p, k)
                 axis.plot(time, 1e3 * rms, color=colour, label=label)
-        axis.axhline(
-            1e3 * answer.found.floor, color="#888888", ls=":", label=FLOOR_LABELS[answer.content["floor"]["source"]]
-        )
+        axis.axhline(1e3 * answer.found.floor, color="#888888", ls=":", label=f"what {FLOORS[source]}")
         axis.set_title(names[k], fontsize=9, parse_math=False)
         axis.set_xlabel("time, s")
     axes[0].set_ylim(bottom=0)
     for row in grid:
         row[0].set_ylabel("held out, mm RMS")
     axes[0].legend(fontsize=8)
-    _without_unused(grid, len(names), 1)
+    without_unused(grid, len(names), 1)
     return figure
 
 
@@ -172,7 +159,7 @@ def missing_force(found: MissingForce) -> Any:
     from matplotlib.figure import Figure
 
     count = len(found.parts)
-    across_page, down = min(count, ACROSS), -(-count // ACROSS)
+    across_page, down = laid(count)
     figure = Figure(figsize=(3.0 * across_page + 1.2, 4.6 * down), layout="constrained")
     grid = figure.subplots(2 * down, across_page, squeeze=False, height_ratios=(3, 1) * down)
     axes = np.array([[grid[k // across_page * 2 + row, k % across_page] for k in range(count)] for row in (0, 1)])
@@ -188,7 +175,7 @@ def missing_force(found: MissingForce) -> Any:
     axes[1, 0].set_ylabel("standard errors")
     axes[0, 0].set_xlabel("u, m", fontsize=8)
     axes[0, 0].set_ylabel("v, m", fontsize=8)
-    _without_unused(grid, count, 2)
+    without_unused(grid, count, 2)
     figure.colorbar(image, ax=axes[0], label="along the normal, share of the weight")  # pyright: ignore[reportPossiblyUnbound]
     return figure
 

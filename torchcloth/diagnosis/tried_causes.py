@@ -31,9 +31,7 @@ def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode
         with blamed(hypothesis):
             moved = []
             for amplitude in (NEAR * hypothesis.typical, hypothesis.typical):
-                world = hypothesis.apply(base, amplitude)
-                if not isinstance(world, World):
-                    raise TypeError(f"apply gives {type(world).__name__}, no World")
+                world = applied(hypothesis, base, amplitude)
                 for episode in episodes:
                     world.driven(episode)
                 moved.append(float((world.frames(early).x - plain).square().mean().sqrt()))
@@ -44,6 +42,18 @@ def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode
                     expected="amplitude 0 to be the world as it is",
                     remedy="of a factor, take what it differs from 1 by",
                 )
+
+
+def applied(hypothesis: Hypothesis, base: World, amplitude: float) -> World:
+    """The world with so much of it.
+
+    Raises:
+        TypeError: it gives something else.
+    """
+    world = hypothesis.apply(base, amplitude)
+    if not isinstance(world, World):
+        raise TypeError(f"apply gives {type(world).__name__}, no World")
+    return world
 
 
 @contextmanager

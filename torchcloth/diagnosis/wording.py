@@ -83,6 +83,13 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
     return [*out, *(f"Warning: {text}." for text in content["warnings"])]
 
 
+def labels(content: dict[str, Any]) -> list[str]:
+    """What each episode's motion is called, with the episode's name, or number, where another has the same."""
+    motions = content["motions"]
+    names = [e["name"] for e in content.get("episodes", [])] or [str(k + 1) for k in range(len(motions))]
+    return [m if motions.count(m) == 1 else f"{m} ({name})" for m, name in zip(motions, names, strict=True)]
+
+
 def _sized(row: dict[str, Any]) -> str:
     low, high = row["ci95"]
     return f"{_size(row)} (95 %: {low:.4g} to {high:.4g})"
@@ -95,10 +102,8 @@ def _shown(c: dict[str, Any], content: dict[str, Any]) -> str:
     place = f"at ({u:.0f}, {v:.0f}) mm of the pattern" if "at" in where else f"in what gripper {where['gripper']} feels"
     time = f"{when['from']:.1f} to {when['to']:.1f} s"
     beyond = "beyond what fitted numbers could do instead"
-    motion, named = when["motion"], [e["name"] for e in content.get("episodes", [])]
-    if named and content["motions"].count(motion) > 1:
-        motion = f"{motion} ({named[when['episode']]})"
-    return f"Surest in {motion} from {time}, {place}: {1e3 * moves['value']:.3g} m{moves['unit']} {beyond}."
+    motion, size = labels(content)[when["episode"]], f"{1e3 * moves['value']:.3g} m{moves['unit']}"
+    return f"Surest in {motion} from {time}, {place}: {size} {beyond}."
 
 
 def _size(row: dict[str, Any]) -> str:

@@ -12,7 +12,6 @@ from ..errors import InvalidInput
 from . import topology
 
 SAME = 1e-6  # of the largest extent: vertices that near lie in one place
-
 UNEVEN = 1.5  # times the mean edge, beyond which a longest edge is not that of an even mesh: ours have 1.24 to 1.46
 UNLIKE, TEXTURE = 1.2, 1.05  # times an edge that lies there, beyond which a pattern's is in another unit
 FEW = 0.1  # of the edges, that may be longer or shorter: gathered or stretched where the cloth lies
