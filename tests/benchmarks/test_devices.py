@@ -26,11 +26,12 @@ def test_scenes_are_some(monkeypatch, capsys):
     assert "--scenes: got 0, expected 1 or more" in capsys.readouterr().err
 
 
-def test_ways_agree_and_are_told(monkeypatch, capsys):
+@pytest.mark.parametrize("how", ["--contact", "--folded"])
+def test_ways_agree_and_are_told(monkeypatch, capsys, how):
     ways = {"fused, CPU": devices.Way("cpu", "fused"), "one by one": devices.Way("cpu", "reference")}
     monkeypatch.setattr(devices, "WAYS", ways)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "none")
-    asked(monkeypatch, "--scenes", "2", "--contact", "--frames", "1", "--repeats", "1")
+    asked(monkeypatch, "--scenes", "2", how, "--frames", "1", "--repeats", "1")
     rows = [line.split("|")[1:3] for line in capsys.readouterr().out.splitlines() if line.startswith("| 2")]
     assert [[cell.strip() for cell in row] for row in rows] == [["2", "fused, CPU"], ["2", "one by one"]]

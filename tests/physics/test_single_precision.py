@@ -7,6 +7,7 @@ import torch
 
 import torchcloth as tc
 from torchcloth.effects import AbstractEffect
+from torchcloth.transfer.reference import push, stencil
 
 SPEED = 1e-3  # m/s: some two units a substep at half a metre from the origin
 
@@ -145,3 +146,16 @@ def test_inner_friction_does_not_wear_off_as_cloth_is_turned(engine, seconds):
     with torch.no_grad():
         end = cloth(state._replace(memory={"effects.own": memory}), {"hand": turning}, times=[0.0, seconds]).state
     assert float(end.memory["effects.own"][..., half:].abs().mean()) == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("corner", [1.5 - 1e-7, 0.5 + 1e-7])
+def test_a_node_that_hardly_weighs_has_finite_derivatives(corner):
+    """One over the square of its mass is more than float32 holds: gradients of contact were NaN."""
+    grid = tc.Contact(spacing=0.01).grid(tc.meshes.rectangle(0.1, 0.1, resolution=(5, 5)))
+    place = (0.01 * torch.full((1, 3), corner)).requires_grad_()
+    mass = torch.tensor([[1e-6]], requires_grad=True)
+    nodes = stencil(place, mass, torch.zeros(1, dtype=torch.int64), grid, torch.zeros(grid.nodes**3, dtype=torch.int32))
+    change, moment = push(nodes, torch.ones(1, 3), torch.ones(1, 3), grid.spacing, 1e-4)
+    (change.sum() + moment.sum()).backward()
+    assert torch.isfinite(place.grad).all()
+    assert torch.isfinite(mass.grad).all()

@@ -40,7 +40,8 @@ def stencil(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, slots: Te
     weight, slope = _splines(offset, grid.spacing)
     node = _compact(_node_index(base.long(), scene, grid.nodes).reshape(-1), slots)
     total = through(node, mass * weight)
-    return Stencil(weight, slope, offset, node, 1.0 / torch.where(total > 0, total, 1.0))  # a weight may be exactly 0
+    least = torch.finfo(total.dtype).tiny ** 0.5  # kg; a weight may be 0, and the derivative of 1 / 1e-20 kg overflows
+    return Stencil(weight, slope, offset, node, 1.0 / torch.where(total > least, total, 1.0))
 
 
 def push(nodes: Stencil, pull: Tensor, director: Tensor, spacing: float, dt: float) -> tuple[Tensor, Tensor]:
