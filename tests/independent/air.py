@@ -87,7 +87,7 @@ class LinearDrag(Hook):
 
 
 class AddedMass(Hook):
-    """Air of a depth moves along the normal: -m_a n (n . a), lumped on the vertices and solved for exactly there."""
+    """Air of a depth moves along the normal: -m_a n d(n . v)/dt, lumped on the vertices, where n . a is solved for."""
 
     reacts = True
 
@@ -97,10 +97,21 @@ class AddedMass(Hook):
     def start(self, cloth: MujocoCloth, x: Array) -> None:
         self.cloth, self.triangles = cloth, Triangles(cloth)
 
+    def force(self, t: float, x: Array, v: Array) -> Array:
+        n, _ = self.normals(x)
+        # area normals are quadratic in positions: this difference is their rate, but for rounding
+        rate = self.triangles.shared(self.triangles.area_normals(x + v) - self.triangles.area_normals(x - v)) / 2
+        along = v - np.einsum("vc,vc->v", n, v)[:, None] * n
+        return -self.density * self.depth * np.einsum("vc,vc->v", along, rate)[:, None] * n
+
     def reaction(self, x: Array, total: Array) -> Array:
-        normal = self.triangles.shared(self.triangles.area_normals(x))
-        area = np.sqrt(np.einsum("vc,vc->v", normal, normal)) + 1e-30
-        n = normal / area[:, None]
+        n, area = self.normals(x)
         air = self.density * self.depth * area
         # (m + m_a n n') a = f: what a misses of f / m is m_a / (m + m_a) n n' f / m
         return -(air / (self.cloth.mass + air) * np.einsum("vc,vc->v", n, total))[:, None] * n
+
+    def normals(self, x: Array) -> tuple[Array, Array]:
+        """([V, 3] of unit length, areas [V] m^2)."""
+        normal = self.triangles.shared(self.triangles.area_normals(x))
+        area = np.sqrt(np.einsum("vc,vc->v", normal, normal)) + 1e-30
+        return normal / area[:, None], area

@@ -38,23 +38,46 @@ def test_falls_slower_across_and_as_ever_along():
     torch.testing.assert_close(out, expected.expand_as(out), rtol=1e-11, atol=1e-12)
 
 
-def test_impulse_of_cloth_and_air_is_conserved():
-    """One step from a bent and stretched state: sum (m + m_air n n') dv = 0, though the cloth alone gains momentum."""
+def normals(cloth, x):
+    """Unit normals [E, 1, 3]."""
+    a, b, c = x[torch.as_tensor(cloth.mesh.faces)].unbind(1)
+    return torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)[:, None]
+
+
+def test_what_the_cloth_gains_the_air_loses_along_its_normals():
+    """One step from a bent, stretched and moving state: m dv + m_air n d(n . v) = 0, a third of it at each corner."""
     cloth = sheet(air())
     torch.manual_seed(0)
-    x = cloth.rest_state().x + 0.02 * torch.randn(16, 3)
-    state, dt = cloth.state(x, torch.randn(16, 3)), cloth.stable_step()
-    after, _ = functional.step(cloth.model(), state, dt, {}, 0)
-    change = after.v - state.v
-    corners = x[torch.as_tensor(cloth.mesh.faces)]
-    vector = 0.5 * torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = vector.norm(dim=-1, keepdim=True)
-    n = vector / area
-    mean = change[torch.as_tensor(cloth.mesh.faces)].mean(1)  # a third of the air goes with each corner
-    impulse = (EXTRA * area * (n * mean).sum(-1, keepdim=True) * n).sum(0)
-    own = (cloth.model().mass * change).sum(0)
+    x, v = cloth.rest_state().x + 0.02 * torch.randn(16, 3), torch.randn(16, 3)
+    dt, faces = cloth.stable_step(), torch.as_tensor(cloth.mesh.faces)
+    after, _ = functional.step(cloth.model(), cloth.state(x, v), dt, {}, 0)
+    n, turn = torch.func.jvp(lambda x: normals(cloth, x), (x,), (v,))
+    change = (n * (after.v - v)[faces] + dt * turn * v[faces]).sum(-1, keepdim=True)
+    impulse = (EXTRA / 3 * torch.as_tensor(cloth.mesh.area)[:, None, None] * change * n).sum((0, 1))
+    own = (cloth.model().mass * (after.v - v)).sum(0)
     assert own.norm() > 1e3 * (own + impulse).norm()
     assert (own + impulse).norm() < 1e-12
+
+
+@pytest.mark.parametrize("engine", ["reference", "fused"])
+def test_cloth_and_air_keep_their_energy(engine):
+    """A sheet that flies along itself, turns and flutters."""
+    mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(9, 9))
+    cloth = tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), DENSITY, air(), None, contact=None, engine=engine)
+    faces, share = torch.as_tensor(mesh.faces), EXTRA / 3 * torch.as_tensor(mesh.area)[:, None, None]
+
+    def energy(state):
+        across = (normals(cloth, state.x) * state.v[faces]).sum(-1, keepdim=True)
+        return float(sum(cloth.energy(state).values()) + 0.5 * (share * across**2).sum())
+
+    x = cloth.rest_state().x
+    along = x[:, 0] - 0.15
+    across = 6 * along + 200 * (along**2 - 0.0075)
+    begin = cloth.state(x, torch.stack([torch.full_like(along, 2.0), 0 * along, across], -1))
+    for shorter in (1, 2):
+        out = cloth(begin, times=[0.0, 0.1, 0.25], dt=cloth.stable_step() / shorter)
+        for x, v in zip(out.x, out.v, strict=True):  # within what the step does; 16 % at 0.1 s without what turns
+            assert energy(cloth.state(x, v)) == pytest.approx(energy(begin), rel=0.05 / shorter)
 
 
 def hanging(effects):
@@ -105,7 +128,7 @@ def test_the_static_shape_stays():
     torch.testing.assert_close(*shapes, rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.6, 0.0, 0.8)])
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
 def test_a_spinning_sheet_is_not_braked(axis):
     cloth = sheet(air())
     omega = 6.0 * torch.tensor(axis)

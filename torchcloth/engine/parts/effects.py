@@ -65,9 +65,11 @@ def _added_mass(low: Lowering, name: str, effect: AddedMass, c: Any) -> None:
     if low.resistance is None:
         low.resistance = low.program.temporary(low.vertices, 6)
     t = low.triangles
-    air = t.loop.call("added_mass", t.parameter(c), t.normal, t.J, t.area)
+    air = t.parameter(c)
+    inertia = t.loop.call("added_mass", air, t.normal, t.area)
     for corner in low.corners:
-        t.loop.add(air, low.resistance, corner)
+        t.loop.add(inertia, low.resistance, corner)
+    t.push("turning_air", t.surface[6:], *t.v, t.shape, t.area, air)
 
 
 def _kelvin_voigt(low: Lowering, name: str, effect: KelvinVoigt, c: Any) -> None:

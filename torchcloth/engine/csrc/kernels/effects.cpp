@@ -50,18 +50,38 @@ struct LocalDrag {
     }
 };
 
-// Mass of the air per area, n, J, area -> a corner's third of it, along the normal only. effects/added_mass.py
+// Mass of the air per area, n, area -> a corner's third of it, along the normal only. effects/added_mass.py
 struct AddedMass {
     static constexpr const char* name = "added_mass";
-    static constexpr int inputs = 6, outputs = 6;
-    static constexpr auto fixed = bits(5, 1);
+    static constexpr int inputs = 5, outputs = 6;
+    static constexpr auto fixed = bits(4, 1);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Read<T> r{in};
         const T air = r.number();
         const auto n = r.vec();
-        const T J = r.number(), area = r.number();
-        Write<T>{out}.symmetric(outer((1.0 / 3) * (air * (area * J)), n));
+        Write<T>{out}.symmetric(outer((1.0 / 3) * (air * r.number()), n));
+    }
+};
+
+// cofactors, n, J, velocities of the corners, warp and weft coefficients, area, mass of the air per area -> forces on the
+// corners, of the air as normals turn. effects/added_mass.py
+struct TurningAir {
+    static constexpr const char* name = "turning_air";
+    static constexpr int inputs = 25, outputs = 9;
+    static constexpr auto fixed = bits(19, 5);
+    template <class T>
+    static constexpr void run(const T* in, T* out) {
+        Read<T> r{in};
+        const auto c1 = r.vec(), c2 = r.vec(), n = r.vec();
+        const T J = r.number();
+        const auto v0 = r.vec(), v1 = r.vec(), v2 = r.vec();
+        const T a1 = r.number(), a2 = r.number(), b1 = r.number(), b2 = r.number(), area = r.number(), air = r.number();
+        const auto d1 = v1 - v0, d2 = v2 - v0;
+        const auto turning = dot(a1 * d1 + a2 * d2, n) * c1 + dot(b1 * d1 + b2 * d2, n) * c2;
+        const auto share = ((1.0 / 3) * (air * area) / J) * n;
+        Write<T> w{out};
+        w.vec(dot(v0, turning) * share), w.vec(dot(v1, turning) * share), w.vec(dot(v2, turning) * share);
     }
 };
 
@@ -128,6 +148,6 @@ struct KelvinVoigt {
 
 }  // namespace
 
-TC_KERNELS(effect_kernels, AirDrag, LocalDrag, AddedMass, Weight, MassDamping, Adhesion, KelvinVoigt)
+TC_KERNELS(effect_kernels, AirDrag, LocalDrag, AddedMass, TurningAir, Weight, MassDamping, Adhesion, KelvinVoigt)
 
 }  // namespace tc
