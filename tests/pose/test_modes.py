@@ -38,3 +38,10 @@ def test_every_mode_of_a_mesh():
 def test_too_many(count):
     with pytest.raises(InvalidInput, match="modes"):
         modes_of(tc.meshes.rectangle(0.3, 0.3, resolution=(4, 4)), count)
+
+
+@pytest.mark.parametrize(("size", "told"), [((0.3, 0.3), [2, 5, 7]), ((0.3, 0.2), [])])
+def test_modes_that_symmetry_makes_equal_are_not_divided_silently(size, told):
+    modes = modes_of(tc.meshes.rectangle(*size, resolution=(8, 8)))
+    assert [count for count in range(1, 9) if modes.doubt(count)] == told
+    assert "take 1 or 3" in modes_of(tc.meshes.rectangle(0.3, 0.3, resolution=(8, 8))).doubt(2)[0]

@@ -156,7 +156,8 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         parameters={u.name: fabric[u.name] for u in objective.unknowns},
         nuisances=next(iter(nuisance_estimates([data], objective.placed, raw, found.covariance).values())),
         fit=fit,
-        warnings=warnings_of(fit, shares, seen, used, ends, _stated(objective, used), found.holds),
+        warnings=warnings_of(fit, shares, seen, used, ends, _stated(objective, used), found.holds)
+        + fields.doubt(len(objective.correction.modes)),
     )
 
 

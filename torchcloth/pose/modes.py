@@ -10,12 +10,23 @@ from torch import Tensor
 from ..errors import InvalidInput
 from ..meshes import Mesh
 
+EQUAL = 1e-6  # relative, wave numbers that symmetry makes equal
+
 
 class Modes(NamedTuple):
     """Vibration shapes of a membrane with a free rim, at rest."""
 
     fields: Tensor  # [M, V] -, each of unit mean square over the area; the first is constant
     wave: Tensor  # [M] 1/m, wave numbers, ascending
+
+    def doubt(self, count: int) -> list[str]:
+        """A sentence where the first ``count`` end between two of one wave number, of which rounding chooses."""
+        if count >= len(self.wave) or self.wave[count] - self.wave[count - 1] > EQUAL * self.wave[count]:
+            return []
+        return [
+            f"{count} modes end between two of one wavelength, as a square cloth has them: which of them counts is "
+            f"rounding's choice: take {count - 1} or {count + 1}"
+        ]
 
 
 def check_count(mesh: Mesh, count: int) -> None:
