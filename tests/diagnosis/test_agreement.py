@@ -121,7 +121,10 @@ def test_a_rival_may_be_larger_than_a_cause(amplitude, named, rival):
 
 @pytest.mark.parametrize(("alone", "least", "named"), [({"a"}, 30.0, True), ({"a"}, 20.0, False), (set(), 30.0, False)])
 def test_halves_of_one_motion_need_not_agree_about_the_size_of_what_is_overwhelming(alone, least, named):
-    """Creases of 5 1/s in one fold: 43 in log density, 0.4 standard errors by slopes of what has levelled off."""
+    """Creases of 5 1/s in one fold: 43 in log density, 0.4 standard errors by slopes of what has levelled off.
+
+    They leave other motions alone; friction in the place of a stiff patch (sealed 016) took a turn by a third worse.
+    """
     tried = replace(candidate(0.1, 0.0), alone=alone, gain=gain(0.7)._replace(least=least), sure=1e3)
     cells = tried.fitted.evidence.cells
     for k, c in enumerate(cells):
@@ -129,6 +132,7 @@ def test_halves_of_one_motion_need_not_agree_about_the_size_of_what_is_overwhelm
     model = tried.fitted.model
     tried = replace(tried, fitted=replace(toys.fitted(tried.fitted.evidence), model=model))
     assert known(tried.fitted, "cause", list("abcd"), tried) == named
+    assert not known(tried.fitted, "cause", list("abcd"), replace(tried, disturbs=True))
     nothing = replace(model, amplitudes=(0.0,))
     assert not known(replace(tried.fitted, model=nothing), "cause", list("abcd"), tried)
 

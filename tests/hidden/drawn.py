@@ -310,7 +310,8 @@ def _confounded(rng, turn, slot, size):
 def _outside(rng, turn, slot, size):
     name = list(OUTSIDE)[(2 * turn + slot) % len(OUTSIDE)]
     share = FULL if rng.random() < 0.5 else MORE
-    return {"kind": f"{share:g}", "effects": _hide(name, share, rng, OUTSIDE), "plans": _where(size, rng, name)}
+    along = (0.0, 180.0)  # a jet along y would pass beside the sheets, which hang half a metre out along x
+    return {"kind": f"{share:g}", "effects": _hide(name, share, rng, OUTSIDE, along), "plans": _where(size, rng, name)}
 
 
 def _fault(rng, turn, slot, size):

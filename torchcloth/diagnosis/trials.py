@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from .comparison import Gain, Predicted, compare, heard, predict, spread, telling
+from .comparison import Gain, Predicted, by_motion, compare, heard, predict, spread, telling
 from .evidence import Evidence, shared
 from .fitting import Fitted, fit, renoised, with_cause
 from .noise import Noise, fit_noise, to_fit_by
@@ -27,6 +27,7 @@ FEWEST = 3  # motions, of which one is held out: two name only what is overwhelm
 CLEAR = 4.0  # log density below which two models predict alike
 PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
 POSSIBLE = 10.0  # the same, of what predicts as well as something plausible
+DISTURBED = 0.1  # of what is wrong in a motion, by which it is predicted worse
 MUCH_OF_ALL = 1 / 3  # that is wrong, of which predictions say that it is there
 # standard errors between motions, from which they agree that there is something: 97.5 % of Student's t by one less than
 # there are motions; of the best of TRIED causes, with a fourth of that chance
@@ -47,6 +48,7 @@ class Candidate:
     gain: Gain  # over the model without it
     alone: set[str]  # the motion that alone tells of it, if any
     sure: float  # standard errors between motions that it must be away from zero
+    disturbs: bool = False  # positions of a motion that does not tell of it are predicted worse
     relieves: bool = False  # a fitted number that had left its data sheet is back with it
 
     @property
@@ -206,11 +208,13 @@ def _compared(
     for row, found in fits:
         after = renoised(found, noise, like)
         alone = telling(after, names)
-        predicted = predict(after, names, alone)
-        gain = compare(predict(before, names, alone), predicted, 0.0)
+        first, predicted = (predict(f, names, alone) for f in (before, after))
+        gain = compare(first, predicted, 0.0)
+        others = [m for name, m in by_motion(first, predicted, 0.0, names).items() if name not in alone]
+        disturbs = any(m.after > (1 + DISTURBED) * m.before for m in others)
         sure = standard_errors(gain, heard(predicted.episode, names), alone, not current.model.accepted)
         relieves = bool(strained - {p.name for p, _ in found.model.strained})
-        out.append(Candidate(row, found, predicted, gain, alone, sure, relieves))
+        out.append(Candidate(row, found, predicted, gain, alone, sure, disturbs, relieves))
     return out
 
 
@@ -269,13 +273,13 @@ def known(found: Fitted, name: str, names: Sequence[str], c: Candidate, most: fl
     """Of a size that makes sense and that numerics do not ask for, and motions agree so far that there is something.
 
     It makes sense up to ``most`` times the typical amplitude; what has ended at nothing is not there. Halves of the one
-    motion that tells of it need not agree about its size where it gains overwhelmingly in both: what creases do levels
-    off with their rate, and its slopes there say little.
+    motion that tells of it need not agree about its size where it gains overwhelmingly in both and leaves all others as
+    they were: what creases do levels off with their rate, and its slopes there say little.
     """
     place = found.model.place(name)
     amplitude, largest = found.model.amplitudes[place], most * abs(found.model.accepted[place].typical)
     middle, std = (float(v[len(found.model.parameters) + place]) for v in spread(found, names, c.alone))
-    if c.alone and c.gain.least > VERY_MUCH:
+    if c.alone and c.gain.least > VERY_MUCH and not c.disturbs:
         middle, std = amplitude, 0.0
     least = max(c.sure * std, NORMAL * abs(c.row.bias))
     return c.sure < math.inf and least < abs(middle) and 0 < abs(amplitude) < largest
