@@ -62,10 +62,22 @@ def test_where_the_data_sheet_is_no_world_nothing_begins_there(monkeypatch):
     assert resettled(found(OFTEN + 1), None, [CAUSE]) is None  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("after", "kept"), [(0.9e-3, True), (1.1e-3, False)])
-def test_causes_that_predict_all_positions_together_worse_are_none(monkeypatch, after, kept):
+@pytest.mark.parametrize(
+    ("after", "explained", "pulls", "lacking", "kept"),
+    [
+        (0.9e-3, 0.5, 0.0, False, True),
+        (1.1e-3, 0.5, 0.0, False, False),
+        (0.9e-3, 0.1, 0.0, False, False),  # friction for a stiff patch (sealed 016): 6 %, and 74 in log density
+        (0.9e-3, 0.1, 6e-3, False, True),  # pulls tell of it
+        (0.9e-3, 0.1, 0.0, True, True),  # of all that is lacking, a share that is judged otherwise
+    ],
+)
+def test_causes_with_which_positions_are_hardly_better_predicted_are_none(
+    monkeypatch, after, explained, pulls, lacking, kept
+):
     """Though each did better when it was accepted, with the noise of then."""
     one = found(0.1)
+    whole = SimpleNamespace(before=1e-3, after=after, explained=explained, mended=(4e-4, pulls))
     row = SimpleNamespace(hypothesis=CAUSE)
     first = Step(Candidate(row, one, None, None, set(), 0.0), None, [], [], [], one, None)  # type: ignore[arg-type]
     monkeypatch.setattr(stepwise, "fit", lambda *_, **__: one)
@@ -73,8 +85,9 @@ def test_causes_that_predict_all_positions_together_worse_are_none(monkeypatch, 
     monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
     monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
-    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: False)
-    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1e-3, after=after, mended=(4e-4, 0.0)))
+    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: lacking)
+    monkeypatch.setattr(stepwise, "_still", lambda start, current, setting, _: (start, current, setting))
+    monkeypatch.setattr(stepwise, "_of_all", lambda *_: whole)
     _, steps, _ = stepwise._chain(one, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert steps == ([first] if kept else [])
 
@@ -94,7 +107,7 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
     monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
     monkeypatch.setattr(stepwise, "is_lacking", lambda *_: False)
-    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5))
+    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
     end, _, _ = stepwise._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     ((current, begun),) = looked
     assert current is end is (anew if better else strained)
@@ -115,7 +128,7 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (doubted.append(current) or current, steps))
     monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
     monkeypatch.setattr(stepwise, "is_lacking", lambda *_: False)
-    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5))
+    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
     end, _, _ = stepwise._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert doubted == ([far, near] if ahead else [far])
     assert end is doubted[-1]
@@ -260,7 +273,7 @@ def test_cells_that_jump_with_a_cause_are_left_out_where_nothing_else_is_lacking
     monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
     monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
     monkeypatch.setattr(stepwise, "mended", lambda *_: float(kept))
-    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5))
+    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
     asked = Asked(["a"] * toys.EPISODES, first)
     found = stepwise._chain(start, asked, [], lambda _: None, 4, step)  # type: ignore[arg-type]
     assert found.steps == ([step] if kept else [])

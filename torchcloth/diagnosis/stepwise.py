@@ -22,6 +22,7 @@ from .trials import (
     FURTHER,
     SURELY,
     TRIED,
+    WORTH_PULL,
     Candidate,
     Step,
     alone_in,
@@ -36,6 +37,7 @@ from .worlds import if_possible
 MOST = 4  # causes
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
 LEAST = 1 / 3  # of what is wrong, that all causes explain beside something else
+FAINT = 0.25  # of what could be explained where nothing is lacking; what sealed causes explain of it: 0.78 and more
 HALF = 0.5  # the same of a further cause, and of what only motions tell that do not fit; of what is gained, a law more
 
 
@@ -233,7 +235,7 @@ def _chain(
     share = mended(start, current, setting.names, alone_in(steps)) if steps else 1.0
     little = share < LEAST or (share < HALF and unheard(start, current, steps, setting.names))
     far = any(far_from_sheet(step.best, step.best.gain) for step in steps)
-    if little or (steps and not far and worsens(_of_all(start, current, steps, setting))):
+    if little or (steps and not far and _idle(_of_all(start, current, steps, setting), start, steps, setting)):
         return nothing
     return Chain(current, steps, setting)
 
@@ -251,7 +253,15 @@ def _still(start: Fitted, current: Fitted, setting: Setting, progress: Progress)
 
 def _of_all(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> Gain:
     """What all causes together gain."""
-    return compare(*_held_out(start, current, steps, setting), 0.0)
+    return compare(*_held_out(start, current, steps, setting), floor_of(current.evidence, least()))
+
+
+def _idle(whole: Gain, start: Fitted, steps: list[Step], setting: Setting) -> bool:
+    """Positions are predicted worse, or hardly better, where nothing was lacking and no number of the fabric bent."""
+    if worsens(whole):
+        return True
+    faint = whole.explained < FAINT and whole.mended[1] < WORTH_PULL
+    return faint and not any(s.best.relieves for s in steps) and not is_lacking(start, setting.names)
 
 
 def _held_out(start: Fitted, current: Fitted, steps: list[Step], setting: Setting) -> tuple[Predicted, Predicted]:
