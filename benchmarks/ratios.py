@@ -14,13 +14,13 @@ CONVENTIONS = {
     "ratios tangents8_vs_forward, gradient_vs_forward, batch8_vs_batch1, batch32_vs_batch1": "costs: time over that of "
     "one forward run of the same substeps; a gradient is forward and backward",
     "ratios linear_*": "time per triangle (per substep) at the largest over that at 800 triangles (250 substeps)",
-    "forward_vs_taichi, forward_vs_warp, gradient_vs_*": "standard-everywhere: every triangle uses the grid, the same "
-    "grid work as theirs but that they clear all nodes of a box about the scene; ours takes 800 contact points through "
-    "it, theirs 441 vertices and 800 elements",
-    "*_default_*": "the same peers against torchcloth's default contact (case standard), where a sheet far from "
-    "other layers needs no grid",
-    "*_1s_*": "1 s in 6250 substeps and 25 frames; what a call costs however short it is no longer "
-    "shows, as it does in the runs of 250 substeps",
+    "forward_vs_taichi, _warp, _eager, forward_everywhere_*": "1 s in 6250 substeps and 25 frames; all others, "
+    "gradients and tangents too, are of one frame of 250 substeps, where what a call costs however short it is shows",
+    "*_vs_taichi, *_vs_warp": "the standard case: torchcloth's own contact, in which a sheet far from other layers "
+    "needs no grid, beside theirs, of the same particles, grid and steps",
+    "*_everywhere_*": "every triangle of torchcloth's uses the grid too, the same grid work as theirs but that they "
+    "clear all nodes of a box about the scene; ours takes 800 contact points through it, theirs 441 vertices and 800 "
+    "elements",
     "newton, mujoco": "sheet-800, without contact, like theirs; MuJoCo computes in float64; Newton's "
     "contact is on in case standard",
     "gradient": "of the mean squared end position by initial positions, Young's modulus and (torchcloth) the poses",
@@ -46,22 +46,24 @@ def pairs(engine: str) -> dict[str, tuple[str, str]]:
     """Name -> (key above, key below)."""
     equal, default, lone = "standard-everywhere", "standard", "sheet-800"
     found = {}
-    for quantity in ("forward", "gradient"):
+    for quantity, label in (("forward", ".1s"), ("gradient", ""), ("forward_250", "")):
+        run = quantity.partition("_")[0]
         for peer in ("taichi", "warp"):
-            found[f"{quantity}_vs_{peer}"] = (f"{quantity}.{equal}.{peer}", f"{quantity}.{equal}.{engine}")
-            found[f"{quantity}_default_vs_{peer}"] = (f"{quantity}.{equal}.{peer}", f"{quantity}.{default}.{engine}")
+            above = f"{run}.{equal}{label}.{peer}"
+            found[f"{quantity}_vs_{peer}"] = (above, f"{run}.{default}{label}.{engine}")
+            found[f"{quantity}_everywhere_vs_{peer}"] = (above, f"{run}.{equal}{label}.{engine}")
+    for quantity in ("forward", "gradient"):
         for peer in ("newton", "mujoco"):
             found[f"{quantity}_vs_{peer}"] = (f"{quantity}.{lone}.{peer}", f"{quantity}.{lone}.{engine}")
-    for peer in ("taichi", "warp"):
-        found[f"forward_1s_vs_{peer}"] = (f"forward.{equal}.1s.{peer}", f"forward.{equal}.1s.{engine}")
-        found[f"forward_default_1s_vs_{peer}"] = (f"forward.{equal}.1s.{peer}", f"forward.{default}.1s.{engine}")
-    found["forward_1s_vs_eager"] = (f"forward.{default}.1s.reference", f"forward.{default}.1s.{engine}")
-    found["gradient_vs_forward_1s"] = (f"gradient.{default}.1s.{engine}", f"forward.{default}.1s.{engine}")
     found["forward_default_vs_newton"] = (f"forward.{default}.newton", f"forward.{default}.{engine}")
-    for quantity in ("forward", "gradient", "tangents8"):
-        name = "forward_vs_eager" if quantity == "forward" else f"{quantity}_vs_eager"
-        found[name] = (f"{quantity}.{equal}.reference", f"{quantity}.{equal}.{engine}")
-        found[f"{quantity}_garment_vs_eager"] = (f"{quantity}.garment.reference", f"{quantity}.garment.{engine}")
+    found["forward_vs_eager"] = (f"forward.{default}.1s.reference", f"forward.{default}.1s.{engine}")
+    found["gradient_vs_forward_1s"] = (f"gradient.{default}.1s.{engine}", f"forward.{default}.1s.{engine}")
+    for quantity in ("forward_250", "gradient", "tangents8"):
+        run = quantity.partition("_")[0]
+        for case, name in ((equal, "everywhere"), ("garment", "garment")):
+            found[f"{quantity}_{name}_vs_eager"] = (f"{run}.{case}.reference", f"{run}.{case}.{engine}")
+    for quantity in ("gradient", "tangents8"):
+        found[f"{quantity}_vs_eager"] = (f"{quantity}.{default}.reference", f"{quantity}.{default}.{engine}")
     for case, suffix in ((equal, "_everywhere"), (default, ""), ("standard-usual", "_usual"), ("garment", "_garment")):
         for quantity in ("tangents8", "gradient"):
             found[f"{quantity}_vs_forward{suffix}"] = (f"{quantity}.{case}.{engine}", f"forward.{case}.{engine}")
