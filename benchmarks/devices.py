@@ -41,13 +41,14 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, nargs="+", default=[1, 32, 256], metavar="N", help="at a time")
-    parser.add_argument("--frames", type=int, default=8, help="at 30 Hz; cloth wrinkles, and after 8 rounding shows")
+    parser.add_argument("--frames", type=int, help="at 30 Hz: 8, folded 1; cloth wrinkles, and later rounding shows")
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS), metavar="WAY", help=f"of {list(WAYS)}")
     contact = parser.add_mutually_exclusive_group()
     contact.add_argument("--contact", action="store_true", help="with contact, though no layers meet")
-    contact.add_argument("--folded", action="store_true", help="with contact, one half on the other: 2 frames at most")
+    contact.add_argument("--folded", action="store_true", help="with contact, one half on the other")
     options = parser.parse_args()
+    options.frames = (1 if options.folded else 8) if options.frames is None else options.frames
     for name, least in (("scenes", min(options.scenes)), ("frames", options.frames), ("repeats", options.repeats)):
         if least < 1:
             parser.error(f"--{name}: got {least}, expected 1 or more")

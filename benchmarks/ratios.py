@@ -14,15 +14,16 @@ CONVENTIONS = {
     "ratios tangents8_vs_forward, gradient_vs_forward, batch8_vs_batch1, batch32_vs_batch1": "costs: time over that of "
     "one forward run of the same substeps; a gradient is forward and backward",
     "ratios linear_*": "time per triangle (per substep) at the largest over that at 800 triangles (250 substeps)",
-    "forward_vs_taichi, _warp, _eager, forward_everywhere_*": "1 s in 6250 substeps and 25 frames; all others, "
-    "gradients and tangents too, are of one frame of 250 substeps, where what a call costs however short it is shows",
-    "*_vs_taichi, *_vs_warp": "the standard case: torchcloth's own contact, in which a sheet far from other layers "
-    "needs no grid, beside theirs, of the same particles, grid and steps",
-    "*_everywhere_*": "every triangle of torchcloth's uses the grid too, the same grid work as theirs but that they "
+    "forward_vs_taichi, _warp, _eager, forward_everywhere_*, gradient_vs_forward_1s": "1 s in 6250 substeps and 25 "
+    "frames; all others but linear_*, gradients and tangents too, are of one frame of 250 substeps, where what a call "
+    "costs however short it is shows",
+    "forward_vs_*, gradient_vs_*, forward_250_vs_* taichi, warp": "the standard case: torchcloth's own contact, in "
+    "which a sheet far from other layers needs no grid, beside theirs, of the same particles, grid and steps",
+    "*everywhere*": "every triangle of torchcloth's uses the grid too, the same grid work as theirs but that they "
     "clear all nodes of a box about the scene; ours takes 800 contact points through it, theirs 441 vertices and 800 "
     "elements",
     "newton, mujoco": "sheet-800, without contact, like theirs; MuJoCo computes in float64; Newton's "
-    "contact is on in case standard",
+    "contact is on in forward_contact_vs_newton, case standard",
     "gradient": "of the mean squared end position by initial positions, Young's modulus and (torchcloth) the poses",
     "prepare_seconds": "building, compiling and a first run; Taichi and Warp keep compiled code between calls",
     "limits": "flops and bytes that the standard case needs at least, in torchcloth's scheme, against this machine's "
@@ -55,8 +56,9 @@ def pairs(engine: str) -> dict[str, tuple[str, str]]:
     for quantity in ("forward", "gradient"):
         for peer in ("newton", "mujoco"):
             found[f"{quantity}_vs_{peer}"] = (f"{quantity}.{lone}.{peer}", f"{quantity}.{lone}.{engine}")
-    found["forward_default_vs_newton"] = (f"forward.{default}.newton", f"forward.{default}.{engine}")
+    found["forward_contact_vs_newton"] = (f"forward.{default}.newton", f"forward.{default}.{engine}")
     found["forward_vs_eager"] = (f"forward.{default}.1s.reference", f"forward.{default}.1s.{engine}")
+    found["forward_250_vs_eager"] = (f"forward.{default}.reference", f"forward.{default}.{engine}")
     found["gradient_vs_forward_1s"] = (f"gradient.{default}.1s.{engine}", f"forward.{default}.1s.{engine}")
     for quantity in ("forward_250", "gradient", "tangents8"):
         run = quantity.partition("_")[0]

@@ -67,9 +67,9 @@ def test_where_the_data_sheet_is_no_world_nothing_begins_there(monkeypatch):
     [
         (0.9e-3, 0.5, 0.0, False, True),
         (1.1e-3, 0.5, 0.0, False, False),
-        (0.9e-3, 0.1, 0.0, False, False),  # friction for a stiff patch (sealed 016): 6 %, and 74 in log density
-        (0.9e-3, 0.1, 6e-3, False, True),  # pulls tell of it
-        (0.9e-3, 0.1, 0.0, True, True),  # of all that is lacking, a share that is judged otherwise
+        (0.9e-3, 0.06, 0.0, False, False),  # friction for a stiff patch (sealed 016): 6 %, and 74 in log density
+        (0.9e-3, 0.06, 6e-3, False, True),  # pulls tell of it
+        (0.9e-3, 0.06, 0.0, True, True),  # of all that is lacking, a share that is judged otherwise
     ],
 )
 def test_causes_with_which_positions_are_hardly_better_predicted_are_none(

@@ -87,7 +87,10 @@ class LinearDrag(Hook):
 
 
 class AddedMass(Hook):
-    """Air of a depth moves along the normal: -m_a n d(n . v)/dt, lumped on the vertices, where n . a is solved for."""
+    """Air of a depth moves along the normal: -m_a n d(n . v)/dt, lumped on the vertices, where n . a is solved for.
+
+    As much as the present area has: where a vertex is folded up it has none, and its normal no meaning.
+    """
 
     reacts = True
 

@@ -129,6 +129,18 @@ def test_added_mass_slows_the_fall_of_a_flat_sheet_and_not_of_an_upright_one():
     assert upright.v[-1][:, 2].mean() == pytest.approx(-G * 0.099, rel=1e-6)
 
 
+def test_added_mass_takes_the_energy_that_turning_normals_give():
+    """Its power is minus what the turn of the normals alone adds to 1/2 m_air (n . v)^2, areas held."""
+    x, v = crumpled(FREE)
+    hook, _ = started(AddedMass(0.1, 1.204), FREE, x)
+    step = 1e-6
+    (n, area), (after, _), (before, _) = (hook.normals(y) for y in (x, x + step * v, x - step * v))
+    speed, change = (np.einsum("vc,vc->v", m, v) for m in (n, (after - before) / (2 * step)))
+    power = np.einsum("vc,vc->v", hook.force(0.0, x, v), v)
+    np.testing.assert_allclose(power, -1.204 * 0.1 * area * speed * change, atol=1e-6 * np.abs(power).max())
+    assert np.abs(power).max() > 1e-4
+
+
 def leaning(hooks):
     """Angle of a strip that hangs at rest, from its first to its last row."""
     spec = SheetSpec(0.04, 0.2, nodes=(3, 11))

@@ -7,7 +7,7 @@ import torch
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
-from torchcloth.pose.modes import modes_of
+from torchcloth.pose.modes import Modes, modes_of
 
 
 def test_a_rectangle_has_cosines():
@@ -45,3 +45,9 @@ def test_modes_that_symmetry_makes_equal_are_not_divided_silently(size, told):
     modes = modes_of(tc.meshes.rectangle(*size, resolution=(8, 8)))
     assert [count for count in range(1, 9) if modes.doubt(count)] == told
     assert "take 1 or 3" in modes_of(tc.meshes.rectangle(0.3, 0.3, resolution=(8, 8))).doubt(2)[0]
+
+
+def test_a_cloth_in_two_pieces_has_two_constant_modes():
+    modes = Modes(torch.zeros(3, 4), torch.tensor([0.0, 0.0, 2.0]))
+    assert modes.doubt(1)[0].endswith("take 2")
+    assert not modes.doubt(2)

@@ -37,7 +37,7 @@ from .worlds import if_possible
 MOST = 4  # causes
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
 LEAST = 1 / 3  # of what is wrong, that all causes explain beside something else
-FAINT = 0.25  # of what could be explained where nothing is lacking; what sealed causes explain of it: 0.78 and more
+FAINT = 0.1  # of what could be explained, where nothing is lacking
 HALF = 0.5  # the same of a further cause, and of what only motions tell that do not fit; of what is gained, a law more
 
 
@@ -257,7 +257,10 @@ def _of_all(start: Fitted, current: Fitted, steps: list[Step], setting: Setting)
 
 
 def _idle(whole: Gain, start: Fitted, steps: list[Step], setting: Setting) -> bool:
-    """Positions are predicted worse, or hardly better, where nothing was lacking and no number of the fabric bent."""
+    """Positions are predicted worse, or hardly better where nothing was lacking, and pulls hardly better.
+
+    Hardly better is enough of what a number of the fabric, which is back with its data sheet, did until then.
+    """
     if worsens(whole):
         return True
     faint = whole.explained < FAINT and whole.mended[1] < WORTH_PULL

@@ -48,7 +48,7 @@ class Candidate:
     gain: Gain  # over the model without it
     alone: set[str]  # the motion that alone tells of it, if any
     sure: float  # standard errors between motions that it must be away from zero
-    disturbs: bool = False  # positions of a motion that does not tell of it are predicted worse
+    disturbs: bool = False  # where one motion alone tells of it: positions of another are predicted worse
     relieves: bool = False  # a fitted number that had left its data sheet is back with it
 
     @property
@@ -210,12 +210,16 @@ def _compared(
         alone = telling(after, names)
         first, predicted = (predict(f, names, alone) for f in (before, after))
         gain = compare(first, predicted, 0.0)
-        others = [m for name, m in by_motion(first, predicted, 0.0, names).items() if name not in alone]
-        disturbs = any(m.after > (1 + DISTURBED) * m.before for m in others)
+        disturbs = bool(alone) and _disturbs(first, predicted, names, alone)
         sure = standard_errors(gain, heard(predicted.episode, names), alone, not current.model.accepted)
         relieves = bool(strained - {p.name for p, _ in found.model.strained})
         out.append(Candidate(row, found, predicted, gain, alone, sure, disturbs, relieves))
     return out
+
+
+def _disturbs(first: Predicted, second: Predicted, names: Sequence[str], alone: set[str]) -> bool:
+    motions = by_motion(first, second, 0.0, names).items()
+    return any(m.after > (1 + DISTURBED) * m.before for name, m in motions if name not in alone)
 
 
 def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bool) -> float:

@@ -71,11 +71,6 @@ class Triangles:
         """Unit normal."""
         return self.surface[12:15]
 
-    @property
-    def J(self) -> list[int]:
-        """Area ratio."""
-        return self.surface[15:]
-
     def push(self, kernel: str, *inputs: list[int]) -> None:
         """Forces on the corners (9 numbers) that a kernel gives."""
         self._forces = self.loop.call(kernel, *inputs, into=self._forces)

@@ -21,12 +21,18 @@ class Modes(NamedTuple):
 
     def doubt(self, count: int) -> list[str]:
         """A sentence where the first ``count`` end between two of one wave number, of which rounding chooses."""
-        if count >= len(self.wave) or self.wave[count] - self.wave[count - 1] > EQUAL * self.wave[count]:
+        if not self._divides(count):
             return []
+        better = [n for n in range(1, len(self.wave) + 1) if not self._divides(n)]
+        near = [max([n for n in better if n < count], default=0), min(n for n in better if n > count)]
         return [
-            f"{count} modes end between two of one wavelength, as a square cloth has them: which of them counts is "
-            f"rounding's choice: take {count - 1} or {count + 1}"
+            f"{count} modes end between two of one wavelength, as a square cloth has them, or one in two pieces: which "
+            f"of them counts is rounding's choice: take {' or '.join(str(n) for n in near if n)}"
         ]
+
+    def _divides(self, count: int) -> bool:
+        last = self.wave[count - 1 : count + 1]
+        return len(last) == 2 and float(last[1] - last[0]) <= EQUAL * float(last[1])
 
 
 def check_count(mesh: Mesh, count: int) -> None:

@@ -64,8 +64,8 @@ struct AddedMass {
     }
 };
 
-// cofactors, n, J, velocities of the corners, warp and weft coefficients, area, mass of the air per area -> forces on the
-// corners, of the air as normals turn. effects/added_mass.py
+// cofactors, n, J, velocities of the corners, warp and weft coefficients, area, mass of the air per area -> forces on
+// the corners, of the air as normals turn. effects/added_mass.py
 struct TurningAir {
     static constexpr const char* name = "turning_air";
     static constexpr int inputs = 25, outputs = 9;
