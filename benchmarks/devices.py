@@ -110,11 +110,13 @@ def _measured(way: Way, scenes: int, times: list[float], options: argparse.Names
 
 def folded(cloth: tc.Cloth) -> tc.ClothState:
     """The right half over the left one, nearer than layers rest."""
-    x = cloth.rest_state().x.clone()
+    x, grid = cloth.rest_state().x.clone(), cloth.grid()
+    if grid is None:
+        raise ValueError("no contact, no layers")
     middle = x[:, 0].mean()
     right = x[:, 0] > middle + 1e-6
     x[right, 0] = 2 * middle - x[right, 0]
-    x[right, 2] += 1.3 * cloth.model().grid.spacing
+    x[right, 2] += 1.3 * grid.spacing
     return cloth.state(x)
 
 
