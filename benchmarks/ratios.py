@@ -46,26 +46,21 @@ def ratios(records: Mapping[str, Record], engine: str) -> dict[str, float]:
 def pairs(engine: str) -> dict[str, tuple[str, str]]:
     """Name -> (key above, key below)."""
     equal, default, lone = "standard-everywhere", "standard", "sheet-800"
-    found = {}
-    for quantity, label in (("forward", ".1s"), ("gradient", ""), ("forward_250", "")):
-        run = quantity.partition("_")[0]
+    short, found = ("forward_250", "forward"), {}  # the name of a ratio, and what is measured
+    for name, quantity, label in (("forward", "forward", ".1s"), ("gradient", "gradient", ""), (*short, "")):
         for peer in ("taichi", "warp"):
-            above = f"{run}.{equal}{label}.{peer}"
-            found[f"{quantity}_vs_{peer}"] = (above, f"{run}.{default}{label}.{engine}")
-            found[f"{quantity}_everywhere_vs_{peer}"] = (above, f"{run}.{equal}{label}.{engine}")
+            above = f"{quantity}.{equal}{label}.{peer}"
+            found[f"{name}_vs_{peer}"] = (above, f"{quantity}.{default}{label}.{engine}")
+            found[f"{name}_everywhere_vs_{peer}"] = (above, f"{quantity}.{equal}{label}.{engine}")
     for quantity in ("forward", "gradient"):
         for peer in ("newton", "mujoco"):
             found[f"{quantity}_vs_{peer}"] = (f"{quantity}.{lone}.{peer}", f"{quantity}.{lone}.{engine}")
     found["forward_contact_vs_newton"] = (f"forward.{default}.newton", f"forward.{default}.{engine}")
     found["forward_vs_eager"] = (f"forward.{default}.1s.reference", f"forward.{default}.1s.{engine}")
-    found["forward_250_vs_eager"] = (f"forward.{default}.reference", f"forward.{default}.{engine}")
     found["gradient_vs_forward_1s"] = (f"gradient.{default}.1s.{engine}", f"forward.{default}.1s.{engine}")
-    for quantity in ("forward_250", "gradient", "tangents8"):
-        run = quantity.partition("_")[0]
-        for case, name in ((equal, "everywhere"), ("garment", "garment")):
-            found[f"{quantity}_{name}_vs_eager"] = (f"{run}.{case}.reference", f"{run}.{case}.{engine}")
-    for quantity in ("gradient", "tangents8"):
-        found[f"{quantity}_vs_eager"] = (f"{quantity}.{default}.reference", f"{quantity}.{default}.{engine}")
+    for name, quantity in (short, ("gradient", "gradient"), ("tangents8", "tangents8")):
+        for case, suffix in ((equal, "_everywhere"), (default, ""), ("garment", "_garment")):
+            found[f"{name}{suffix}_vs_eager"] = (f"{quantity}.{case}.reference", f"{quantity}.{case}.{engine}")
     for case, suffix in ((equal, "_everywhere"), (default, ""), ("standard-usual", "_usual"), ("garment", "_garment")):
         for quantity in ("tangents8", "gradient"):
             found[f"{quantity}_vs_forward{suffix}"] = (f"{quantity}.{case}.{engine}", f"forward.{case}.{engine}")
