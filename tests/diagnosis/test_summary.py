@@ -23,6 +23,16 @@ def test_what_is_minor_is_said_with_what_it_cannot_be_told_from():
     assert any("obs.depth_bias = -0.0025 m" in line for line in said)
 
 
+def test_without_forces_mass_is_said_to_be_unknown():
+    def told(*kinds):
+        rows = [{"motion": "swing", "kind": kind, "ratio": 1.0, "lacking": False, "worst": None} for kind in kinds]
+        return any("mass itself cannot be told" in line for line in summary("adequate", lack_of_fit=rows))
+
+    assert told("points", "edges")
+    assert not told("points", "force", "torque")
+    assert not told()  # nothing was simulated
+
+
 def test_drifts_are_told_with_what_would_tell_more():
     x = {"axis": "x", "rate": 0.001, "std": 0.004, "p": 1.0, "lacking": False}
     z = {"axis": "z", "rate": -0.0196, "std": 0.0041, "p": 6e-6, "lacking": True}

@@ -15,6 +15,11 @@ from .world import Model
 
 NEARLY = 0.9  # of the largest amplitude that is believed: fits end a little beyond what slopes ask for
 RIPPLED = 0.01  # m, that a right model may leave of positions: more says nothing of what is lacking
+FELT = ("force", "torque")
+NO_MASS = (
+    "No forces were measured, so mass itself cannot be told: cloth that is heavier, and as much stiffer and dragged, "
+    "moves alike. What is said of it is what the data sheet says."
+)
 FLOORS = {"sensor only": "the sensor alone would leave", "repetitions": "repetitions of a command differ by"}
 
 
@@ -67,6 +72,8 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
         ("Undecided", content["undecided"]),
     ):
         out += [f"{label}: {', '.join(names)}."] if names else []
+    if content["lack_of_fit"] and not any(row["kind"] in FELT for row in content["lack_of_fit"]):
+        out.append(NO_MASS)
     if content["minor"]:
         out.append(f"There, but too small to matter: {', '.join(map(_size, content['minor']))}.")
     for m in content["minor"]:

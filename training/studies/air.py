@@ -1,8 +1,9 @@
 """Do real swings say that air is what vacuum lacks? Diagnoses of IRI swings, and what they mend of runs held out.
 
-Groups of three swings of different sizes are diagnosed, each from a base model in vacuum and about all that the
-catalogue knows. Then every group's model predicts whole runs that none has seen, without its causes and with them: the
-distance of the nodes, and frequency and decay of the free swings after the tool has stopped.
+Groups of three swings of different sizes are diagnosed as ``torchcloth diagnose`` does, each from a base model in
+vacuum and about all that the catalogue knows; their reports are kept. Then every group's model predicts whole runs
+that none has seen, without its causes and with them: the distance of the nodes, and frequency and decay of the free
+swings after the tool has stopped.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth._files import write_text
-from torchcloth.diagnosis import base_model, catalogue, judge, load_model, save_model, search, setting_of
+from torchcloth._files import PROGRESS, write_text
+from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, write_diagnosis
+from torchcloth.diagnosis.run import BASE, EXTENDED
+from torchcloth.identification.journal import clear
 from torchcloth.recordings import Recording
 from torchcloth.recordings.together import together
 
@@ -66,18 +69,17 @@ def grouped(names: Sequence[str]) -> list[list[str]]:
 
 
 def diagnosed(source: Path, names: Sequence[str], folder: Path, fast: bool) -> dict[str, Any]:
-    """The answer of one group; its models are written to the folder."""
+    """The answer of one group; its report and models are written to the folder."""
     seconds = FAST_SECONDS if fast else SECONDS
     recordings = [beginning(source, name, seconds) for name in names]
-    model = base_model(together(recordings))
-    asked = [h for h in catalogue(model, recordings) if not fast or h.name in FAST_ASKED]
-    setting = setting_of(model, recordings)
-    answer = judge(search(model, setting, asked), setting.names)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, end in (("before", answer.found.start), ("after", answer.found.end)):
-        save_model(folder / f"{name}.tcm", end.model, recordings[0], end.covariance)
+    asked = [h for h in catalogue(base_model(together(recordings)), recordings) if not fast or h.name in FAST_ASKED]
+    journal = folder / PROGRESS
+    answer = diagnose(recordings, hypotheses=asked, journal=journal, resume=journal.exists())
+    write_diagnosis(answer, recordings, folder)
+    clear(journal)
     keys = ("verdict", "causes", "gain", "also_unexplained", "ruled_out", "undecided", "unresolvable", "parameters")
-    return {"runs": list(names), "asked": len(asked), **{key: answer.content[key] for key in keys}}
+    said = {"residual": answer.content["residual"], "next_experiment": answer.content["next_experiment"]}
+    return {"runs": list(names), "asked": len(asked), **{key: answer.content[key] for key in keys}, **said}
 
 
 def beginning(source: Path, name: str, seconds: float) -> Recording:
@@ -90,7 +92,9 @@ def beginning(source: Path, name: str, seconds: float) -> Recording:
 
 def _predicted(source: Path, name: str, out: Path, groups: Sequence[str]) -> dict[str, Any]:
     worlds = {
-        f"{when} {g}": load_model(out / g / f"{when}.tcm").world() for when in ("before", "after") for g in groups
+        f"{when} {g}": load_model(out / g / file, residual=False).world()
+        for when, file in (("before", BASE), ("after", EXTENDED))
+        for g in groups
     }
     return predict(source, name, worlds)
 

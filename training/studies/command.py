@@ -20,6 +20,7 @@ STUDIES: tuple[str, ...] = (
     "pose",
     "cost",
     "hidden",
+    "parts",
     "salting",
     "air",
 )
