@@ -48,6 +48,8 @@ def test_hidden_drag_is_named(with_drag):
     assert gain["explained_fraction"] > 0.9
     assert [row["motion"] for row in gain["per_motion"]] == list(sheets.MOTIONS)
     assert all(row["rms_after"] < row["rms_before"] for row in gain["per_motion"])
+    for share, ends in (("explained_fraction", "ci95"), ("log_density", "log_density_ci95")):
+        assert all(row[ends][0] <= row[share] <= row[ends][1] for row in gain["per_motion"])
     squares = [[row[key] ** 2 for row in gain["per_motion"]] for key in ("rms_before", "rms_after")]
     assert min(squares[0]) < gain["rms_before"] ** 2 < max(squares[0])
     assert min(squares[1]) < gain["rms_after"] ** 2 < max(squares[1])
@@ -121,7 +123,7 @@ def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
     assert {"verdict", "causes", "ruled_out", "unresolvable", "gain", "next_experiment", "model", "warnings"} <= set(
         content
     )
-    assert content["plan_hash"]
+    assert len(content["plan_hash"]) == 24
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 5
     assert "<th>motion held out</th>" in page
@@ -155,6 +157,10 @@ def test_where_nothing_is_hidden_nothing_is_named():
     assert answer.content["gain"] is None
     withdrawn = replace(answer.found, withdrawn=("air.drag_n",))  # a law did more, and then did not hold
     assert judge(withdrawn, withdrawn.setting.names).verdict == "unexplained"
+    end = answer.found.end
+    apart = [torch.full_like(n, 0.03) for n in end.evidence.numerics]  # m, and N: both meshes fold the cloth elsewhere
+    folded = replace(answer.found, end=replace(end, evidence=replace(end.evidence, numerics=apart)))
+    assert judge(folded, folded.setting.names).verdict == "numerics"
     setting, (first, *others) = answer.found.setting, answer.found.setting.episodes
     late = replace(answer.found, setting=replace(setting, episodes=(replace(first, dropped=3), *others)))
     assert any("come after the motion's end" in text for text in judge(late, setting.names).content["warnings"])

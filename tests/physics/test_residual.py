@@ -93,6 +93,28 @@ def test_what_opposes_takes_power(law):
     assert float((force(cloth, x, v) * v).sum()) < 0
 
 
+@pytest.mark.parametrize("law", [law for law in LAWS if law != "mass"])
+@pytest.mark.parametrize("place", PLACES)
+def test_it_turns_with_the_cloth(law, place):
+    """In a room without a direction of its own: still air, no gravity."""
+    cloth = cloth_with(ResidualForce({f"{law}@{place}".rstrip("@"): 1.0}, held=[0]))
+    x, v = moving(cloth)
+    x = x + 0.01 * torch.randn(x.shape)  # bent and strained
+    turn = torch.linalg.qr(torch.randn(3, 3)).Q
+    turn = turn * torch.linalg.det(turn)  # no mirror
+    plain, turned = force(cloth, x, v), force(cloth, x @ turn.mT + 0.3, v @ turn.mT)
+    assert float(plain.abs().max()) > 0
+    assert torch.allclose(turned, plain @ turn.mT, rtol=1e-8, atol=1e-10 * float(plain.abs().max()))
+
+
+@pytest.mark.parametrize("law", ["strain_rate", "bend"])
+def test_what_acts_within_cloth_is_still_while_that_turns_rigidly(law):
+    cloth = cloth_with(ResidualForce({law: 1.0}))
+    x, v = moving(cloth)
+    rigid = torch.linalg.cross(torch.tensor([0.4, -1.0, 2.0]).expand_as(x), x) + torch.tensor([0.1, 0.2, -0.3])
+    assert float(force(cloth, x, rigid).abs().max()) < 1e-9 * max(float(force(cloth, x + 0.01 * v, v).abs().max()), 1.0)
+
+
 def test_it_says_what_it_does_and_refuses_what_it_does_not_know():
     assert (
         describe("across2@edge", 0.4)

@@ -1,10 +1,15 @@
 """What a simulation gets wrong, why, and what mending it gains.
 
-``diagnose`` runs all stages; each can be called alone: ``base_model``, ``setting_of``, ``gather``, ``fit_noise``,
-``fit``, ``screen``, ``predict``, ``compare``, ``search``, ``judge``. Read ``stepwise.py`` and ``trials.py`` first.
+``diagnose`` runs all stages; each can be called alone: ``check``, ``base_model``, ``setting_of``, ``approach``,
+``gather``, ``fit_noise``, ``fit``, ``unstable``, ``screen``, ``correlations``, ``predict``, ``compare``, ``placebo``,
+``search``, ``judge``, ``lack_of_fit``, ``drifts``, ``missing_force``, ``learn_residual``, ``propose``. Read
+``stepwise.py`` and ``trials.py`` first.
 """
 
+from .approach import approach
 from .base_model import base_model
+from .branches import unstable
+from .classes import correlations
 from .comparison import Gain, compare, predict
 from .confirming import Confirmation, confirm
 from .drifting import drifts
@@ -25,8 +30,10 @@ from .loading import (
 )
 from .missing import MissingForce, missing_force
 from .model_file import load_model, read_model, save_model
+from .next_experiment import propose
 from .noise import fit_noise
 from .own_causes import register_file
+from .placebo import placebo
 from .residual import Residual, learn_residual
 from .run import diagnose, write_diagnosis
 from .screening import screen
@@ -46,6 +53,7 @@ __all__ = [
     "Model",
     "Residual",
     "World",
+    "approach",
     "base_model",
     "begin_with",
     "beside_the_cloth",
@@ -54,6 +62,7 @@ __all__ = [
     "cloth_for",
     "compare",
     "confirm",
+    "correlations",
     "diagnose",
     "drifts",
     "fit",
@@ -66,8 +75,10 @@ __all__ = [
     "load_model",
     "load_world",
     "missing_force",
+    "placebo",
     "predict",
     "predicted",
+    "propose",
     "read_episodes",
     "read_model",
     "refused",
@@ -78,6 +89,7 @@ __all__ = [
     "search",
     "setting_of",
     "uncertain",
+    "unstable",
     "was_fitted",
     "write_diagnosis",
 ]

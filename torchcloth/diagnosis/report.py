@@ -158,9 +158,13 @@ def _gained(gain: dict[str, Any] | None) -> str:
 
     def told(row: dict[str, Any]) -> list[str]:
         rms = (row[key] for key in ("rms_before", "rms_after"))
-        return [row["motion"], *("–" if r is None else f"{1e3 * r:.2f}" for r in rms), f"{row['log_density']:.1f}"]
+        low, high = (100 * end for end in row["ci95"])
+        share = f"{100 * row['explained_fraction']:.0f} ({low:.0f} to {high:.0f})"
+        least, most = row["log_density_ci95"]
+        density = f"{row['log_density']:.1f} ({least:.0f} to {most:.0f})"
+        return [row["motion"], *("–" if r is None else f"{1e3 * r:.2f}" for r in rms), share, density]
 
-    head = ("motion held out", "RMS before, mm", "after, mm", "log density gained")
+    head = ("motion held out", "RMS before, mm", "after, mm", "% explained (95 %)", "log density gained (95 %)")
     return _ruled(head, ((told(row), False) for row in gain["per_motion"]))
 
 

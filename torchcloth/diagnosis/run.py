@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,6 +12,7 @@ import torch
 from .._files import as_json, write_text
 from .._surroundings import own_gradients
 from ..errors import InvalidInput
+from ..identification.journal import digest, program
 from ..recordings import Recording
 from ..recordings.marks import each_once, mark
 from ..recordings.together import listed, together
@@ -94,7 +93,6 @@ def diagnose(
     each_once(recordings)
     model = model or base_model(together(recordings))
     asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
-    plan = hashlib.sha256(json.dumps([[h.name, h.typical, h.share] for h in asked]).encode()).hexdigest()[:16]
     setting = setting_of(model, recordings)
     somewhere_seen(setting)
     own = {h.name for h in registered()}
@@ -110,9 +108,26 @@ def diagnose(
             following = propose(found, answer.content, setting, staged(progress, "next experiment"))
         over = overlays(answer.found, progress)
     warnings = [*answer.content["warnings"], *([NONE_TELLS] if answer.verdict == "ambiguous" and not following else [])]
-    files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
+    files = {
+        "plan_hash": _plan(model, asked, names),
+        "base": BASE,
+        "model": EXTENDED,
+        "episodes": [mark(r) for r in recordings],
+    }
     said = answer.content | files | {"next_experiment": following, "warnings": warnings}
     return replace(answer, content=said, overlays=over)
+
+
+def _plan(model: Model, asked: Sequence[Hypothesis], names: Sequence[str]) -> str:
+    """A fingerprint of what was decided before anything was simulated.
+
+    The sources hold all thresholds; beside them the base model's numbers with their priors, the causes that it comes
+    with, what is asked about and from what size it matters, and which episodes are held out together.
+    """
+    numbers = [(p.name, p.unit, p.std, p.step) for p in model.parameters]
+    given = [h.name for h in model.accepted]
+    causes = [(h.name, h.unit, h.typical, h.share, h.signed) for h in asked]
+    return digest([program(), numbers, given, model.point, causes, list(names)])
 
 
 @contextmanager

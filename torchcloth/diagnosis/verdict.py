@@ -121,7 +121,7 @@ def refused(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
     """The answer where episodes cannot be believed: what is wrong with them."""
     keys = "causes given minor ruled_out wrong_sign undecided unresolvable lack_of_fit drifts warnings"
     lists: dict[str, Any] = {key: [] for key in keys.split()}
-    none = dict.fromkeys(("gain", "missing_force", "residual", "next_experiment", "model"))
+    none = dict.fromkeys(("gain", "missing_force", "residual", "next_experiment", "model", "plan_hash"))
     said = [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults]
     content = {**lists, **none, "verdict": "invalid_data", "also_unexplained": False, "parameters": {}}
     return Diagnosis("invalid_data", {**content, "faults": said, "motions": list(names)}, None)
@@ -225,7 +225,15 @@ def _gain(found: Found, names: Sequence[str]) -> dict[str, Any] | None:
         "log_density": g.density,
         "log_density_ci95": list(g.ci95),
         "per_motion": [
-            {"motion": name, "rms_before": or_none(m.before), "rms_after": or_none(m.after), "log_density": m.density}
+            {
+                "motion": name,
+                "rms_before": or_none(m.before),
+                "rms_after": or_none(m.after),
+                "explained_fraction": m.explained,
+                "ci95": list(m.explained_ci95),
+                "log_density": m.density,
+                "log_density_ci95": list(m.ci95),
+            }
             for name, m in motions.items()
         ],
     }
