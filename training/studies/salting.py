@@ -2,7 +2,8 @@
 
 IRI swings with all errors of their own get later stamps, or other depths, or a camera that leans; so truth is exact.
 What a model with air sees of that is the difference of its cells with and without, screened as residuals are. Then the
-amplitude is fitted with and without, and the difference is what was put in.
+amplitude is fitted with and without, and the difference is what was put in. With ``--diagnose`` the plain swings are
+diagnosed from vacuum, and the salted ones from the model that this gives, about all causes: nobody says what is new.
 """
 
 from __future__ import annotations
@@ -18,12 +19,24 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchcloth._files import write_text
-from torchcloth.diagnosis import Hypothesis, base_model, catalogue, fit, screen, setting_of
+from torchcloth._files import PROGRESS, write_text
+from torchcloth.diagnosis import (
+    Hypothesis,
+    base_model,
+    begin_with,
+    catalogue,
+    diagnose,
+    fit,
+    screen,
+    setting_of,
+    write_diagnosis,
+)
 from torchcloth.diagnosis.approach import approach
 from torchcloth.diagnosis.cells import aligned
 from torchcloth.diagnosis.evidence import Evidence
 from torchcloth.diagnosis.fitting import Fitted, weighed
+from torchcloth.diagnosis.run import EXTENDED
+from torchcloth.identification.journal import clear
 from torchcloth.recordings import Camera, PointClouds, Recording
 from torchcloth.recordings.together import together
 
@@ -37,6 +50,7 @@ DISTANCE = 1.3  # m, of the camera, which the data do not say; depths grow from 
 OWN = "air.linear"  # what the swings lack first, by their own diagnosis
 ASKED = ("obs.", "env.gravity_tilt")  # beginnings of the causes that are asked about
 ITERATIONS = 4
+PLAIN = "plain"
 
 
 @dataclass(frozen=True)
@@ -78,6 +92,7 @@ SALTS = {
 def add(parser: argparse.ArgumentParser) -> None:
     """Options."""
     parser.add_argument("--source", type=Path, metavar="DIR", help=f"folder of measured data (${VARIABLE})")
+    parser.add_argument("--diagnose", action="store_true", help="and diagnose plain and salted swings: an hour")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -85,6 +100,10 @@ def run(options: argparse.Namespace) -> None:
     source = find(options.source) / swings.SOURCE
     kept = Kept(options.out, {"study": "salting", "fast": options.fast, "source": str(source.resolve())})
     found = kept.run({"all": partial(salted, source, options.fast)})["all"]
+    if options.diagnose:
+        labels = (PLAIN, *SALTS)
+        answers = kept.run({_file(label): partial(blind, source, label, options) for label in labels})
+        found = {**found, "diagnosed": {label: answers[_file(label)] for label in labels}}
     path = write_text(options.out / "salting.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
     show(found)
     print(f"result: {path}")
@@ -113,6 +132,25 @@ def salted(source: Path, fast: bool) -> dict[str, Any]:
             "std": sizes[1][1],  # of either fit; of their difference it is less, they have their noise in common
         }
     return out
+
+
+def blind(source: Path, label: str, options: argparse.Namespace) -> dict[str, Any]:
+    """What a diagnosis of the plain swings says, or of salted ones from the model that the plain ones gave."""
+    recordings = [_short(swings.recording(source, name), options.fast) for name in RUNS[: 2 if options.fast else 4]]
+    model, folder = None, options.out / _file(label)
+    if label in SALTS:
+        model, recordings = begin_with(
+            options.out / _file(PLAIN) / EXTENDED, [_with(r, SALTS[label]) for r in recordings]
+        )
+    journal = folder / PROGRESS
+    answer = diagnose(recordings, model, journal=journal, resume=journal.exists())
+    write_diagnosis(answer, recordings, folder)
+    clear(journal)
+    return {key: answer.content[key] for key in ("verdict", "causes", "given", "also_unexplained", "undecided")}
+
+
+def _file(label: str) -> str:
+    return "diagnosed-" + label.replace(" ", "-").replace("%", "percent")
 
 
 def difference(plain: Fitted, salted: Fitted) -> Fitted:
@@ -162,7 +200,7 @@ def show(found: dict[str, Any]) -> None:
 
     headings = ("put in", "as", "amplitude", "told first", "amplitude", "chi^2", "second", "chi^2", "fitted")
     filled = table("Known errors in real swings", *headings, left=2)
-    for label, case in found.items():
+    for label, case in ((label, found[label]) for label in SALTS):
         truth, (first, second, *_) = case["truth"], case["told"]
         fitted = f"{case['fitted']:.4f} ± {case['std']:.4f} {truth['unit']}"
         told = (escape(first["effect"]), f"{first['amplitude']:.4f}", f"{first['gain']:.0f}")
@@ -171,3 +209,31 @@ def show(found: dict[str, Any]) -> None:
     console = Console(highlight=False)
     console.width = max(console.width, 150)
     console.print(filled)
+    if "diagnosed" in found:
+        console.print(_blindly(found["diagnosed"]))
+
+
+def _blindly(answers: dict[str, Any]) -> Any:
+    from rich.markup import escape
+
+    headings = ("swings", "verdict", "cause", "cannot be told from", "amplitude (95 %)", "truth")
+    filled = table("Diagnosed, the salted ones from the model of the plain ones", *headings, left=4)
+    for label, answer in answers.items():
+        salt = SALTS.get(label)
+        truth = "" if salt is None else f"{salt.cause} {salt.amplitude:.4f} {salt.unit}"
+        rows = list(map(_cause, answer["causes"])) or [("none", "", "")]
+        for k, row in enumerate(rows):
+            first = (label, answer["verdict"]) if k == 0 else ("", "")
+            filled.add_row(*first, *map(escape, row), escape(truth) if k == 0 else "")
+    return filled
+
+
+def _cause(cause: dict[str, Any]) -> tuple[str, str, str]:
+    """Its name, what cannot be told from it, how large."""
+    others = {*cause["class"], *(r["effect"] for r in cause["rivals"])} - {cause["effect"]}
+    low, high = cause["ci95"]
+    return (
+        cause["effect"],
+        ", ".join(sorted(others)),
+        f"{cause['amplitude']:.4f} ({low:.4f} to {high:.4f}) {cause['unit']}",
+    )
