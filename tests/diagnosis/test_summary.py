@@ -2,6 +2,8 @@
 
 from types import SimpleNamespace
 
+import pytest
+
 from torchcloth.diagnosis.wording import RIPPLED, sentences, warnings_of
 
 LISTS = ("causes", "given", "minor", "ruled_out", "wrong_sign", "undecided", "unresolvable", "lack_of_fit", "drifts")
@@ -31,6 +33,15 @@ def test_without_forces_mass_is_said_to_be_unknown():
     assert told("points", "edges")
     assert not told("points", "force", "torque")
     assert not told()  # nothing was simulated
+
+
+@pytest.mark.parametrize("weights", [0.5, 70.0])
+def test_a_force_that_nothing_has_is_doubted(weights):
+    where = {"at": [0.1, 0.2], "from": 1.0, "to": 1.2}
+    m = {"motion": "swing", "sure": True, "pressure": [0.0, 0.0, 3.0 * weights], "until": None, **where}
+    (line,) = (text for text in summary("unexplained", missing_force={"weight": 3.0, "motions": [m]}) if "Pa" in text)
+    assert f"{100 * weights:.0f} % of the cloth's own weight" in line
+    assert ("Hardly anything pushes so much" in line) is (weights > 10)
 
 
 def test_drifts_are_told_with_what_would_tell_more():

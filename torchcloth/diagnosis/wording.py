@@ -15,6 +15,11 @@ from .world import Model
 
 NEARLY = 0.9  # of the largest amplitude that is believed: fits end a little beyond what slopes ask for
 RIPPLED = 0.01  # m, that a right model may leave of positions: more says nothing of what is lacking
+HEAVY = 10.0  # weights of the cloth, that hardly anything pushes with
+UNLIKELY = (
+    " Hardly anything pushes so much: what is left there is rather of the grip, of what is seen, or of a fold that "
+    "turns over."
+)
 FELT = ("force", "torque")
 NO_MASS = (
     "No forces were measured, so mass itself cannot be told: cloth that is heavier, and as much stiffer and dragged, "
@@ -133,10 +138,11 @@ def _lacking(content: dict[str, Any]) -> list[str]:
         where = ", ".join(f"{1e3 * c:.0f}" for c in m["at"])
         size = sum(c * c for c in m["pressure"]) ** 0.5
         share = 100 * size / missing["weight"]
+        doubt = UNLIKELY if size > HEAVY * missing["weight"] else ""
         out.append(
             f"  A pressure of {size:.2g} Pa ({share:.0f} % of the cloth's own weight) towards "
             f"({', '.join(f'{c / max(size, 1e-30):.1f}' for c in m['pressure'])}) of the world is missing in "
-            f"{m['motion']}, about ({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s."
+            f"{m['motion']}, about ({where}) mm of the pattern from {m['from']:.2f} to {m['to']:.2f} s.{doubt}"
         )
     unasked = [f"{m['motion']} from {m['until']:.1f} s on" for m in missing["motions"] if m["until"] is not None]
     if unasked:
