@@ -43,6 +43,16 @@ def test_a_planted_amplitude_is_found_within_its_error():
     assert 0.75 < float(z.std()) < 1.25
 
 
+@pytest.mark.parametrize("strength", [0.0, 2.5, 4.0])
+def test_power_is_that_of_the_normal_distribution(strength):
+    """Beyond t = 2.5 standard errors lie 1 - Phi(t - strength) of the scores of an effect so many of them large."""
+    std, count = row(asked([0.0] * 5), "b").std, 100
+    drawn = (row(asked([0.0, 0.0, 0.0, strength * std, 0.0], seed), "b") for seed in range(count))
+    hits = sum(r.amplitude / r.std > 2.5 for r in drawn)
+    power = 0.5 * math.erfc((2.5 - strength) / 2**0.5)
+    assert abs(hits / count - power) < 3 * (power * (1 - power) / count) ** 0.5 + 1 / count
+
+
 def test_single_stretches_are_surely_no_gain():
     """Of episodes of less than 0.8 s nothing is known of how their stretches scatter."""
     found = asked([0.3, 0.0, 0.0, 0.0, 0.0])
