@@ -7,7 +7,7 @@ import torch
 
 from torchcloth.diagnosis.bursts import calmed
 from torchcloth.diagnosis.fitting import leap
-from torchcloth.diagnosis.placebo import placebo
+from torchcloth.diagnosis.placebos import placebo
 
 SLOPES = toys.smooth(1, 4)  # two parameters, a cause, a nuisance
 MOTIONS = [f"motion {k}" for k in range(toys.EPISODES)]

@@ -26,13 +26,15 @@ def test_what_is_minor_is_said_with_what_it_cannot_be_told_from():
 
 
 def test_without_forces_mass_is_said_to_be_unknown():
-    def told(*kinds):
+    def told(*kinds, **content):
         rows = [{"motion": "swing", "kind": kind, "ratio": 1.0, "lacking": False, "worst": None} for kind in kinds]
-        return any("mass itself cannot be told" in line for line in summary("adequate", lack_of_fit=rows))
+        return any("mass itself cannot be told" in line for line in summary("adequate", lack_of_fit=rows, **content))
 
     assert told("points", "edges")
     assert not told("points", "force", "torque")
     assert not told()  # nothing was simulated
+    heavier = {"effect": "mass.density", "amplitude": 0.1, "unit": "-", "ci95": [0.05, 0.15]}
+    assert not told("points", given=[heavier])  # the stiffness of the data sheet says so
 
 
 @pytest.mark.parametrize("weights", [0.5, 70.0])

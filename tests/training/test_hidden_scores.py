@@ -214,7 +214,7 @@ def test_the_page_has_every_case_and_every_mark():
     text = markdown(cases())
     assert "| nulls with a named cause, or refused | ≤ 5 % | ≤ 2 % | 33 % | 1 %–91 % | 3 | missed |" in text
     assert text.count("\n| ") > 7 + 12 + 10
-    assert "13 s a diagnosis (median; longest 16 s; 7 of 7 within 4 minutes, of as many cores" in text
+    assert "13 s a diagnosis (median; longest 16 s; 7 of 7 within 4 minutes;" in text
     assert text.endswith("7 cases, 7 of them sealed\n")
     assert "no case is finished" in markdown([])
 

@@ -2,11 +2,11 @@
 
 ``diagnose`` runs all stages; each can be called alone: ``check``, ``base_model``, ``setting_of``, ``approach``,
 ``gather``, ``fit_noise``, ``fit``, ``unstable``, ``screen``, ``correlations``, ``predict``, ``compare``, ``placebo``,
-``search``, ``judge``, ``lack_of_fit``, ``drifts``, ``missing_force``, ``learn_residual``, ``propose``. Read
-``stepwise.py`` and ``trials.py`` first.
+``search``, ``doubted``, ``judge``, ``lack_of_fit``, ``drifts``, ``missing_force``, ``learn_residual``, ``propose``.
+Read ``stepwise.py`` and ``trials.py`` first.
 """
 
-from .approach import approach
+from .approaching import approach
 from .base_model import base_model
 from .branches import unstable
 from .classes import correlations
@@ -33,8 +33,8 @@ from .model_file import load_model, read_model, save_model
 from .next_experiment import propose
 from .noise import fit_noise
 from .own_causes import register_file
-from .placebo import placebo
-from .residual import Residual, learn_residual
+from .placebos import placebo
+from .residual import Residual, doubted, learn_residual
 from .run import diagnose, write_diagnosis
 from .screening import screen
 from .setting import setting_of
@@ -64,6 +64,7 @@ __all__ = [
     "confirm",
     "correlations",
     "diagnose",
+    "doubted",
     "drifts",
     "fit",
     "fit_noise",

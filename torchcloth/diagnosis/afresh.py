@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import torch
 
-from .approach import approach
+from .approaching import approach
 from .evidence import asked_about
 from .fitting import Fitted, fit, leap, leap_with, with_cause
 from .noise import unfitted, whitened

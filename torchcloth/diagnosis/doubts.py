@@ -10,7 +10,7 @@ from .evidence import shared
 from .fitting import Fitted, fit, renoised, weighed_alike, without_cause
 from .lacking import explained, is_lacking, lack_of_fit
 from .noise import floor_of
-from .placebo import placebo
+from .placebos import placebo
 from .setting import Progress, Setting, staged
 from .trials import CLEAR, FURTHER, Step, alone_in, known, worth_naming, worthwhile
 from .world import Hypothesis

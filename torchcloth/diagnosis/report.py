@@ -157,15 +157,19 @@ def _gained(gain: dict[str, Any] | None) -> str:
         return ""
 
     def told(row: dict[str, Any]) -> list[str]:
-        rms = (row[key] for key in ("rms_before", "rms_after"))
-        low, high = (100 * end for end in row["ci95"])
-        share = f"{100 * row['explained_fraction']:.0f} ({low:.0f} to {high:.0f})"
-        least, most = row["log_density_ci95"]
-        density = f"{row['log_density']:.1f} ({least:.0f} to {most:.0f})"
-        return [row["motion"], *("–" if r is None else f"{1e3 * r:.2f}" for r in rms), share, density]
+        rms = ("–" if row[key] is None else f"{1e3 * row[key]:.2f}" for key in ("rms_before", "rms_after"))
+        share = _within(row["explained_fraction"], row["ci95"], 100.0)
+        return [row["motion"], *rms, share, _within(row["log_density"], row["log_density_ci95"])]
 
     head = ("motion held out", "RMS before, mm", "after, mm", "% explained (95 %)", "log density gained (95 %)")
     return _ruled(head, ((told(row), False) for row in gain["per_motion"]))
+
+
+def _within(value: float | None, ends: list[float] | None, factor: float = 1.0) -> str:
+    """A number with its interval, as far as they are known."""
+    if value is None:
+        return "–"
+    return f"{factor * value:.0f}" + ("" if ends is None else " ({:.0f} to {:.0f})".format(*(factor * e for e in ends)))
 
 
 def _image(figure: Any, otherwise: str = "", alt: str = "As the heading says") -> str:

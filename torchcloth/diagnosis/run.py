@@ -12,7 +12,7 @@ import torch
 from .._files import as_json, write_text
 from .._surroundings import own_gradients
 from ..errors import InvalidInput
-from ..identification.journal import digest, program
+from ..identification.journal import digest, facts_of, program
 from ..recordings import Recording
 from ..recordings.marks import each_once, mark
 from ..recordings.together import listed, together
@@ -25,6 +25,7 @@ from .missing import missing_force
 from .model_file import save_model
 from .next_experiment import propose
 from .overlays import overlays
+from .own_causes import digests
 from .report import write_report
 from .residual import doubted, is_residual, learn_residual
 from .setting import Progress, motions_of, setting_of, somewhere_seen, staged
@@ -93,6 +94,7 @@ def diagnose(
     each_once(recordings)
     model = model or base_model(together(recordings))
     asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
+    plan = _plan(model, asked, names)
     setting = setting_of(model, recordings)
     somewhere_seen(setting)
     own = {h.name for h in registered()}
@@ -109,7 +111,7 @@ def diagnose(
         over = overlays(answer.found, progress)
     warnings = [*answer.content["warnings"], *([NONE_TELLS] if answer.verdict == "ambiguous" and not following else [])]
     files = {
-        "plan_hash": _plan(model, asked, names),
+        "plan_hash": plan,
         "base": BASE,
         "model": EXTENDED,
         "episodes": [mark(r) for r in recordings],
@@ -121,13 +123,13 @@ def diagnose(
 def _plan(model: Model, asked: Sequence[Hypothesis], names: Sequence[str]) -> str:
     """A fingerprint of what was decided before anything was simulated.
 
-    The sources hold all thresholds; beside them the base model's numbers with their priors, the causes that it comes
-    with, what is asked about and from what size it matters, and which episodes are held out together.
+    The sources hold all thresholds; beside them the base model's cloth and numbers with their priors, the causes that
+    it comes with, what is asked about and from what size it matters, whose causes those are, and which episodes are
+    held out together.
     """
-    numbers = [(p.name, p.unit, p.std, p.step) for p in model.parameters]
-    given = [h.name for h in model.accepted]
-    causes = [(h.name, h.unit, h.typical, h.share, h.signed) for h in asked]
-    return digest([program(), numbers, given, model.point, causes, list(names)])
+    numbers = [(p.name, p.unit, p.std, p.step, p.low, p.high) for p in model.parameters]
+    causes = [[(h.name, h.unit, *h.sizes) for h in hypotheses] for hypotheses in (model.accepted, asked)]
+    return digest([program(), *digests(), *facts_of(model.base.cloth), numbers, model.point, *causes, list(names)])
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from .afresh import afresh, resettled
-from .approach import approach
+from .approaching import approach
 from .branches import unstable, without
 from .comparison import Gain, Predicted, compare, heard, predict
 from .doubts import mended, plainer, predicts_better, pruned, unheard

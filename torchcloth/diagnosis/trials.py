@@ -11,7 +11,7 @@ from .comparison import Gain, Predicted, by_motion, compare, heard, predict, spr
 from .evidence import Evidence, shared
 from .fitting import Fitted, fit, renoised, with_cause
 from .noise import Noise, fit_noise, to_fit_by
-from .placebo import Placebo, placebo
+from .placebos import Placebo, placebo
 from .screening import MUCH, PRESENT, Row
 from .setting import Progress, Setting, staged
 from .world import Hypothesis, Model

@@ -229,10 +229,10 @@ def _gain(found: Found, names: Sequence[str]) -> dict[str, Any] | None:
                 "motion": name,
                 "rms_before": or_none(m.before),
                 "rms_after": or_none(m.after),
-                "explained_fraction": m.explained,
-                "ci95": list(m.explained_ci95),
+                "explained_fraction": None if math.isnan(m.before) else m.explained,
+                "ci95": None if math.isnan(m.before) or m.least == -math.inf else list(m.explained_ci95),
                 "log_density": m.density,
-                "log_density_ci95": list(m.ci95),
+                "log_density_ci95": None if m.least == -math.inf else list(m.ci95),
             }
             for name, m in motions.items()
         ],

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from .base_model import SILENT
+from .cells import NAMES, SEEN
 from .glossary import GLOSSARY
 from .lacking import TOLERATED, Left
 from .screening import MUCH, Row
@@ -20,10 +21,10 @@ UNLIKELY = (
     " Hardly anything pushes so much: what is left there is rather of the grip, of what is seen, or of a fold that "
     "turns over."
 )
-FELT = ("force", "torque")
+FELT = NAMES[SEEN:]
 NO_MASS = (
-    "No forces were measured, so mass itself cannot be told: cloth that is heavier, and as much stiffer and dragged, "
-    "moves alike. What is said of it is what the data sheet says."
+    "No forces were measured, so mass itself cannot be told: cloth that is heavier, and as many times stiffer and "
+    "braked harder, moves alike. What is said of it is what the data sheet says."
 )
 FLOORS = {"sensor only": "the sensor alone would leave", "repetitions": "repetitions of a command differ by"}
 
@@ -77,7 +78,7 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
         ("Undecided", content["undecided"]),
     ):
         out += [f"{label}: {', '.join(names)}."] if names else []
-    if content["lack_of_fit"] and not any(row["kind"] in FELT for row in content["lack_of_fit"]):
+    if _massless(content):
         out.append(NO_MASS)
     if content["minor"]:
         out.append(f"There, but too small to matter: {', '.join(map(_size, content['minor']))}.")
@@ -100,6 +101,13 @@ def labels(content: dict[str, Any]) -> list[str]:
     motions = content["motions"]
     names = [e["name"] for e in content.get("episodes", [])] or [str(k + 1) for k in range(len(motions))]
     return [m if motions.count(m) == 1 else f"{m} ({name})" for m, name in zip(motions, names, strict=True)]
+
+
+def _massless(content: dict[str, Any]) -> bool:
+    """Nothing was felt, and no cause is a mass."""
+    kinds = {row["kind"] for row in content["lack_of_fit"]}
+    named = {c["effect"] for c in (*content["causes"], *content["given"])}
+    return bool(kinds) and not kinds & set(FELT) and "mass.density" not in named
 
 
 def _sized(row: dict[str, Any]) -> str:
@@ -133,12 +141,12 @@ def _lacking(content: dict[str, Any]) -> list[str]:
         for d in drifting
     ]
     out = [*told, *([f"Lacking: {', '.join(map(_left, rows))}."] if rows else [])]
-    missing = content["missing_force"] or {"motions": []}
+    missing = content["missing_force"] or {"motions": [], "weight": 0.0}
     for m in (m for m in missing["motions"] if m["sure"]):
         where = ", ".join(f"{1e3 * c:.0f}" for c in m["at"])
         size = sum(c * c for c in m["pressure"]) ** 0.5
         share = 100 * size / missing["weight"]
-        doubt = UNLIKELY if size > HEAVY * missing["weight"] else ""
+        doubt = UNLIKELY if share > 100 * HEAVY else ""
         out.append(
             f"  A pressure of {size:.2g} Pa ({share:.0f} % of the cloth's own weight) towards "
             f"({', '.join(f'{c / max(size, 1e-30):.1f}' for c in m['pressure'])}) of the world is missing in "

@@ -149,6 +149,11 @@ class Hypothesis:
         return self.name.partition("[")[0]
 
     @property
+    def sizes(self) -> tuple[float | bool, ...]:
+        """What says from where on it matters, and how large it may be."""
+        return self.typical, self.share, self.step, self.signed, self.low, self.high
+
+    @property
     def smallest(self) -> float:
         """Of interest."""
         return self.share * self.typical

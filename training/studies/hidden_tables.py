@@ -11,7 +11,7 @@ from .fabric_tables import NOTHING, table
 from .hidden_rates import Mark, Rate, further, marks
 from .hidden_scores import NULLS
 
-LONG = 240.0  # s, that a diagnosis of this size may take on two cores
+LONG = 240.0  # s, that a diagnosis of this size may take
 HEADINGS = ("figure", "must", "aim", "is", "95 %", "of", "")
 
 
@@ -44,7 +44,7 @@ def seconds(cases: Sequence[Mapping[str, Any]]) -> str:
         return "no case is finished"
     return (
         f"{np.median(spent):.0f} s a diagnosis (median; longest {max(spent):.0f} s; {sum(t <= LONG for t in spent)} of "
-        f"{len(spent)} within {LONG / 60:.0f} minutes, of as many cores as --jobs leaves to each), {len(cases)} cases, "
+        f"{len(spent)} within {LONG / 60:.0f} minutes; cases that run beside it slow it down), {len(cases)} cases, "
         f"{sum(c['sealed'] for c in cases)} of them sealed"
     )
 

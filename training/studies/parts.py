@@ -1,28 +1,22 @@
-"""What screening would say without one of its parts: cases for development, most of which hide nothing.
+"""What screening would say without one of its parts: cases for development, most of which hide nothing that matters.
 
-Each case is fitted once; then its cells are screened as they are, and again with slow errors taken for white ones,
-without what differs from episode to episode, beside a data sheet that does not give way, tested against zero, on one
-mesh, and by tangents. What is "present" then is counted.
+Each case is fitted once; then its cells are screened as a diagnosis does, and again with slow errors that agree with
+no neighbour, with episodes that differ in nothing but noise, tested against zero, on one mesh, with cells that jump,
+from a data sheet that does not give way, and by tangents. What is "present" then is counted.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from torchcloth._files import write_text
-from torchcloth.diagnosis import Fitted, Model, base_model, catalogue, fit, screen, setting_of
-from torchcloth.diagnosis.approach import approach
-from torchcloth.diagnosis.evidence import Evidence
-from torchcloth.diagnosis.fitting import weighed
-from torchcloth.diagnosis.setting import Setting
+from torchcloth.diagnosis import Fitted, approach, base_model, catalogue, fit, screen, setting_of, unstable
+from torchcloth.diagnosis.branches import without
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings import read
 from torchcloth.recordings.together import together
@@ -30,13 +24,12 @@ from torchcloth.recordings.together import together
 from ..kept import Kept
 from .checkout import module
 from .fabric_tables import NOTHING, table
+from .left_out import WAYS, rigid, tangents
 
 # numbers for development: a null and four hard ones; half of a drag, and wind
 NULLS, SINGLES = (40, 42, 43, 44, 45), (6, 567)
-NODES = 19  # of the truth's sides, half as many as in the round
-NONE = 1e-9  # nearly, of a standard deviation
-SMALL = 1e-2  # of a typical amplitude: a tangent at zero
-ALL = "all parts"
+NODES = 19  # of the truth's sides, two thirds of the round's
+ALL = "with all parts"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -50,6 +43,7 @@ def run(options: argparse.Namespace) -> None:
         raise InvalidInput("--jobs", got=options.jobs, expected="1 or more")
     seeds = (*NULLS[:1], *SINGLES[:1]) if options.fast else (*NULLS, *SINGLES)
     kept = Kept(options.out, {"study": "parts", "fast": options.fast})
+    kept.begin()
     work = {str(seed): partial(one, options.out, seed, options.fast) for seed in seeds}
     found = list(kept.run(work, options.jobs).values())
     path = write_text(options.out / "parts.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
@@ -58,110 +52,62 @@ def run(options: argparse.Namespace) -> None:
 
 
 def one(out: Path, seed: int, fast: bool) -> dict[str, Any]:
-    """What is hidden in a case, and what each way of screening calls present."""
+    """What is hidden in a case, and what each way of screening says of it and calls present."""
     episodes = out / "episodes" / str(seed)
     how = ["--fast"] if fast else ["--nodes", str(NODES)]
-    if not episodes.exists() and module("hidden", "make").main(["--seed", str(seed), "--out", str(episodes), *how]):
+    if module("hidden", "make").main(["--seed", str(seed), "--out", str(episodes), *how]):
         raise InvalidInput("studies parts", got=f"case {seed} that could not be made", expected="its episodes")
     recordings = [read(path) for path in sorted(episodes.iterdir())]
     drawn = module("hidden", "drawn")
     truth = module("hidden", "reveal").truth(drawn.case(seed, drawn.SMALL if fast else drawn.REDUCED))
-    model, setting = base_model(together(recordings)), setting_of(base_model(together(recordings)), recordings)
-    asked = catalogue(model, recordings)
+    hidden = [e for e in truth["effects"] if e["share"] >= drawn.HALF]
+    told = {name: [_told(row) for row in screen(fit)] for name, fit in _ways(recordings).items()}
+    return {"seed": seed, "family": truth["family"], "hidden": hidden, "ways": told}
+
+
+def _ways(recordings: Sequence[Any]) -> dict[str, Fitted]:
+    """The fit as a diagnosis screens it, and without each part."""
+    model = base_model(together(recordings))
+    setting, asked = setting_of(model, recordings), catalogue(model, recordings)
     near, before = approach(model, setting)
-    fitted = fit(near, setting, asked, before=before)
-    ways = {name: way(fitted) for name, way in WAYS.items()}
-    ways["data sheet that does not give way"] = _rigid(fit(model, setting, asked, 0, before=before))
-    ways["by tangents"] = _tangents(fitted, setting)
+    whole = fit(near, setting, asked, before=before)
+    found = without(whole, unstable(whole, setting))
     return {
-        "seed": seed,
-        "family": truth["family"],
-        "hidden": [e for e in truth["effects"] if e["share"] >= drawn.HALF],
-        "ways": {name: [row for row in map(_told, screen(found)) if row] for name, found in ways.items()},
+        ALL: found,
+        **{name: way(found) for name, way in WAYS.items()},
+        "with cells that jump": whole,
+        "data sheet that does not give way": rigid(fit(model, setting, asked, 0, before=before)),
+        "by tangents": tangents(found, setting),
     }
 
 
-def _told(row: Any) -> dict[str, Any] | None:
-    if row.decision not in ("present", "inconclusive"):
-        return None
-    h = row.hypothesis
-    return {"effect": h.name, "amplitude": row.amplitude, "std": row.total, "decision": row.decision}
-
-
-def _white(found: Fitted) -> Fitted:
-    """What neighbours and moments share is taken for independent."""
-    noise = found.noise._replace(level=NONE * found.noise.level, depth=NONE * found.noise.depth)
-    cells = [c._replace(rough=torch.zeros_like(c.rough)) for c in found.evidence.cells]
-    return weighed(found.model, replace(found.evidence, cells=cells), noise)
-
-
-def _alike(found: Fitted) -> Fitted:
-    """Clock, camera, grasp, rim and tare are exact in every episode."""
-    stds = [NONE * s for s in found.evidence.stds]
-    return weighed(found.model, replace(found.evidence, stds=stds), found.noise)
-
-
-def _rigid(found: Fitted) -> Fitted:
-    """Fitted numbers lie at the data sheet, and stay there."""
-    model = found.model
-    narrow: Model = replace(model, parameters=[replace(p, std=NONE) for p in model.parameters])
-    return weighed(narrow, found.evidence, found.noise)
-
-
-def _against_zero(found: Fitted) -> Fitted:
-    """Any amplitude matters."""
-    anything = [replace(h, share=0.0) for h in found.evidence.hypotheses]
-    return replace(found, evidence=replace(found.evidence, hypotheses=anything))
-
-
-def _one_mesh(found: Fitted) -> Fitted:
-    """Residuals on the mesh that slopes are taken on, and nobody knows of another."""
-    evidence = found.evidence
-    cells = [c._replace(value=c.value + n) for c, n in zip(evidence.cells, evidence.numerics, strict=True)]
-    coarse: Evidence = replace(evidence, cells=cells, numerics=[torch.zeros_like(n) for n in evidence.numerics])
-    return weighed(found.model, coarse, found.noise)
-
-
-def _tangents(found: Fitted, setting: Setting) -> Fitted:
-    """Slopes at a hundredth of a typical amplitude."""
-    whole = found.evidence.hypotheses
-    small = [replace(h, typical=SMALL * h.typical) for h in whole]
-    near = fit(found.model, setting, small, 0, noise=found.noise, before=found.evidence)
-    named = {h.name: h for h in whole}
-    own = [named[h.name] for h in near.evidence.hypotheses]
-    return replace(near, evidence=replace(near.evidence, hypotheses=own))
-
-
-WAYS: Mapping[str, Callable[[Fitted], Fitted]] = {
-    ALL: lambda found: found,
-    "slow errors taken for white": _white,
-    "episodes alike": _alike,
-    "tested against zero": _against_zero,
-    "on one mesh": _one_mesh,
-}
+def _told(row: Any) -> dict[str, Any]:
+    std = row.total if row.total < float("inf") else None
+    return {"effect": row.hypothesis.name, "amplitude": row.amplitude, "std": std, "decision": row.decision}
 
 
 def show(found: Sequence[Mapping[str, Any]]) -> None:
     """As a table: what is present that is not there, and whether what is there is."""
     from rich.console import Console
 
-    nulls = [case for case in found if not case["hidden"]]
-    others = [case for case in found if case["hidden"]]
-    names = ["+".join(e["hypothesis"] for e in case["hidden"] if not e["beside"]) for case in others]
-    headings = ("screened", *(f"{case['seed']}: nothing" for case in nulls), *names)
-    filled = table("Present without being there (of what is: amplitude asked for / truth)", *headings, left=1)
+    order = sorted(found, key=lambda case: bool(case["hidden"]))
+    headings = (
+        "+".join(e["hypothesis"] for e in case["hidden"] if not e["beside"]) or f"{case['seed']}: {case['family']}"
+        for case in order
+    )
+    title = "Present, and not there or too small to matter (of what is there: amplitude asked for / truth)"
+    filled = table(title, "screened", *headings, left=1)
     for way in found[0]["ways"]:
-        filled.add_row(way, *(_counted(case, way) for case in (*nulls, *others)))
+        filled.add_row(way, *(counted(case, way) for case in order))
     console = Console(highlight=False, markup=False)
     console.width = max(console.width, 150)
     console.print(filled)
 
 
-def _counted(case: Mapping[str, Any], way: str) -> str:
+def counted(case: Mapping[str, Any], way: str) -> str:
     """How many are present and not there, and how large what is there would be."""
-    right = {name for e in case["hidden"] for name in (*e["names"], e["hypothesis"])}
     rows = [row for row in case["ways"][way] if row["decision"] == "present"]
-    false = sum(row["effect"].partition("[")[0] not in right and row["effect"] not in right for row in rows)
+    false = sum(not any(_is(row["effect"], e) for e in case["hidden"]) for row in rows)
     if not case["hidden"]:
         return str(false)
     sizes = [
@@ -171,3 +117,8 @@ def _counted(case: Mapping[str, Any], way: str) -> str:
         if row["effect"] == e["hypothesis"] and e["sign"] and not e["beside"]
     ]
     return f"{false} ({', '.join(sizes) or NOTHING})"
+
+
+def _is(name: str, hidden: Mapping[str, Any]) -> bool:
+    """The library's word for what is hidden; with an axis only along its own."""
+    return name == hidden["hypothesis"] or name in hidden["names"]

@@ -31,7 +31,7 @@ from torchcloth.diagnosis import (
     setting_of,
     write_diagnosis,
 )
-from torchcloth.diagnosis.approach import approach
+from torchcloth.diagnosis.approaching import approach
 from torchcloth.diagnosis.cells import aligned
 from torchcloth.diagnosis.evidence import Evidence
 from torchcloth.diagnosis.fitting import Fitted, weighed
@@ -221,7 +221,8 @@ def _blindly(answers: dict[str, Any]) -> Any:
     for label, answer in answers.items():
         salt = SALTS.get(label)
         truth = "" if salt is None else f"{salt.cause} {salt.amplitude:.4f} {salt.unit}"
-        rows = list(map(_cause, answer["causes"])) or [("none", "", "")]
+        given = [{"class": (), "rivals": (), **c, "effect": f"{c['effect']} (given)"} for c in answer["given"]]
+        rows = list(map(_cause, [*given, *answer["causes"]])) or [("none", "", "")]
         for k, row in enumerate(rows):
             first = (label, answer["verdict"]) if k == 0 else ("", "")
             filled.add_row(*first, *map(escape, row), escape(truth) if k == 0 else "")

@@ -1,0 +1,51 @@
+"""The fingerprint of what was decided beforehand: the same again, and another for every decision."""
+
+from dataclasses import replace
+
+import pytest
+import sheets
+import torch
+
+from torchcloth.diagnosis import base_model, catalogue, own_causes
+from torchcloth.diagnosis.run import _plan
+
+NAMES = ["swing", "hang"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _in_double():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(before)
+
+
+def decided():
+    recording = sheets.episode()
+    model = base_model(recording)
+    return recording, model, catalogue(model, [recording])
+
+
+def test_the_same_decisions_are_the_same_plan():
+    plans = [_plan(model, asked, NAMES) for _, model, asked in (decided(), decided())]
+    assert plans[0] == plans[1]
+
+
+def test_every_decision_changes_it(monkeypatch):
+    recording, model, asked = decided()
+    cloth = recording.cloth
+    stiffer = cloth.nominal | {"membrane_stiffness": 1.1 * cloth.nominal["membrane_stiffness"]}
+    first, *others = model.parameters
+    plans = {
+        "as it is": _plan(model, asked, NAMES),
+        "held out": _plan(model, asked, ["swing", "swing"]),
+        "asked": _plan(model, asked[1:], NAMES),
+        "matters": _plan(model, [replace(asked[0], share=0.3), *asked[1:]], NAMES),
+        "sheet": _plan(base_model(replace(recording, cloth=replace(cloth, nominal=stiffer))), asked, NAMES),
+        "prior": _plan(replace(model, parameters=(replace(first, std=0.1), *others)), asked, NAMES),
+        "given": _plan(model.plus(asked[0], 0.1), asked, NAMES),
+        "how much": _plan(model.plus(asked[0], 0.2), asked, NAMES),
+    }
+    monkeypatch.setitem(own_causes._files, "mine.py", "0123")
+    plans["whose"] = _plan(model, asked, NAMES)
+    assert len(set(plans.values())) == len(plans)
