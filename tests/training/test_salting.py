@@ -1,13 +1,16 @@
 """Errors that are put into recordings are what they are called; of real swings the diagnosis says which (slow)."""
 
+import io
 import json
 
 import numpy as np
 import pytest
 
+from torchcloth.training.studies import salting
 from torchcloth.training.studies.command import main
 from torchcloth.training.studies.salting import SALTS
 
+WORDS = ("plain", "air.linear", "obs.extrinsic")
 EYE, MIDDLE = np.array([0.0, -1.3, 0.2]), np.array([0.1, 0.0, 0.3])
 XYZ, T = MIDDLE + 0.1 * np.random.default_rng(0).standard_normal((50, 3)), np.linspace(0.0, 1.0, 10)
 
@@ -46,6 +49,29 @@ def test_without_data_it_says_so(tmp_path, monkeypatch, capsys):
     assert main(["salting", "--out", str(tmp_path / "s")]) == 2
     assert "set TORCHCLOTH_REALDATA" in capsys.readouterr().err
     assert not (tmp_path / "s").exists()
+
+
+def test_what_diagnoses_say_is_told_beside_the_truth():
+    from rich.console import Console
+
+    clock = {"effect": "obs.clock", "amplitude": -0.021, "unit": "s", "ci95": [-0.025, -0.017], "class": ["obs.clock"]}
+    air = {"effect": "air.linear", "amplitude": 2.8, "unit": "1/s", "ci95": [1.6, 4.0]}
+    answers = {
+        "plain": {"verdict": "unexplained", "causes": [], "given": []},
+        "stamps 20 ms late": {
+            "verdict": "ambiguous",
+            "causes": [clock | {"rivals": [{"effect": "obs.extrinsic[z]"}]}],
+            "given": [air],
+        },
+    }
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(salting._blindly(answers))
+    plain, given, named = (line for line in console.export_text().splitlines() if any(w in line for w in WORDS))
+    assert "unexplained" in plain
+    assert "air.linear (given)" in given
+    assert "obs.clock -0.0200 s" in given  # the truth, beside what is said first
+    assert "obs.extrinsic[z]" in named
+    assert "-0.0210 (-0.0250 to -0.0170) s" in named
 
 
 @pytest.mark.slow
