@@ -110,12 +110,7 @@ def diagnose(
             following = propose(found, answer.content, setting, staged(progress, "next experiment"))
         over = overlays(answer.found, progress)
     warnings = [*answer.content["warnings"], *([NONE_TELLS] if answer.verdict == "ambiguous" and not following else [])]
-    files = {
-        "plan_hash": plan,
-        "base": BASE,
-        "model": EXTENDED,
-        "episodes": [mark(r) for r in recordings],
-    }
+    files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
     said = answer.content | files | {"next_experiment": following, "warnings": warnings}
     return replace(answer, content=said, overlays=over)
 
