@@ -2,22 +2,12 @@
 
 from dataclasses import replace
 
-import pytest
 import sheets
-import torch
 
 from torchcloth.diagnosis import base_model, catalogue, own_causes
 from torchcloth.diagnosis.run import _plan
 
 NAMES = ["swing", "hang"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _in_double():
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(before)
 
 
 def decided():

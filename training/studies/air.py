@@ -18,16 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth._files import PROGRESS, write_text
-from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, write_diagnosis
+from torchcloth._files import write_text
+from torchcloth.diagnosis import base_model, catalogue, load_model
 from torchcloth.diagnosis.run import BASE, EXTENDED
-from torchcloth.identification.journal import clear
 from torchcloth.recordings import Recording
 from torchcloth.recordings.together import together
 
 from ..kept import Kept
 from . import air_tables
 from .checkout import module
+from .diagnosing import diagnosis_in
 from .measured import VARIABLE, find, swings
 from .measured.swing_predictions import predict, summary
 
@@ -73,13 +73,10 @@ def diagnosed(source: Path, names: Sequence[str], folder: Path, fast: bool) -> d
     seconds = FAST_SECONDS if fast else SECONDS
     recordings = [beginning(source, name, seconds) for name in names]
     asked = [h for h in catalogue(base_model(together(recordings)), recordings) if not fast or h.name in FAST_ASKED]
-    journal = folder / PROGRESS
-    answer = diagnose(recordings, hypotheses=asked, journal=journal, resume=journal.exists())
-    write_diagnosis(answer, recordings, folder)
-    clear(journal)
+    answer = diagnosis_in(folder, recordings, hypotheses=asked)
     keys = ("verdict", "causes", "gain", "also_unexplained", "ruled_out", "undecided", "unresolvable", "parameters")
-    said = {"residual": answer.content["residual"], "next_experiment": answer.content["next_experiment"]}
-    return {"runs": list(names), "asked": len(asked), **{key: answer.content[key] for key in keys}, **said}
+    keys = (*keys, "residual", "next_experiment")
+    return {"runs": list(names), "asked": len(asked), **{key: answer.content[key] for key in keys}}
 
 
 def beginning(source: Path, name: str, seconds: float) -> Recording:

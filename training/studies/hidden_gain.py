@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torchcloth.diagnosis import Hypothesis, Model, World, base_model, fit, load_model, setting_of
-from torchcloth.diagnosis.approaching import approach
+from torchcloth.diagnosis import Hypothesis, Model, World, approach, base_model, fit, load_model, setting_of
 from torchcloth.diagnosis.cells import SEEN, cells_of
 from torchcloth.diagnosis.hypotheses import known
 from torchcloth.diagnosis.setting import Setting

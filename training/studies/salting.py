@@ -19,28 +19,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchcloth._files import PROGRESS, write_text
-from torchcloth.diagnosis import (
-    Hypothesis,
-    base_model,
-    begin_with,
-    catalogue,
-    diagnose,
-    fit,
-    screen,
-    setting_of,
-    write_diagnosis,
-)
-from torchcloth.diagnosis.approaching import approach
+from torchcloth._files import write_text
+from torchcloth.diagnosis import Hypothesis, approach, base_model, begin_with, catalogue, fit, screen, setting_of
 from torchcloth.diagnosis.cells import aligned
 from torchcloth.diagnosis.evidence import Evidence
 from torchcloth.diagnosis.fitting import Fitted, weighed
 from torchcloth.diagnosis.run import EXTENDED
-from torchcloth.identification.journal import clear
 from torchcloth.recordings import Camera, PointClouds, Recording
 from torchcloth.recordings.together import together
 
 from ..kept import Kept
+from .diagnosing import diagnosis_in
 from .fabric_tables import table
 from .measured import VARIABLE, find, swings
 
@@ -137,15 +126,12 @@ def salted(source: Path, fast: bool) -> dict[str, Any]:
 def blind(source: Path, label: str, options: argparse.Namespace) -> dict[str, Any]:
     """What a diagnosis of the plain swings says, or of salted ones from the model that the plain ones gave."""
     recordings = [_short(swings.recording(source, name), options.fast) for name in RUNS[: 2 if options.fast else 4]]
-    model, folder = None, options.out / _file(label)
+    model = None
     if label in SALTS:
         model, recordings = begin_with(
             options.out / _file(PLAIN) / EXTENDED, [_with(r, SALTS[label]) for r in recordings]
         )
-    journal = folder / PROGRESS
-    answer = diagnose(recordings, model, journal=journal, resume=journal.exists())
-    write_diagnosis(answer, recordings, folder)
-    clear(journal)
+    answer = diagnosis_in(options.out / _file(label), recordings, model)
     return {key: answer.content[key] for key in ("verdict", "causes", "given", "also_unexplained", "undecided")}
 
 
