@@ -208,6 +208,9 @@ def test_marks_count_what_they_say():
     assert by_label["outside the catalogue: unexplained"].reached == "aim"
     assert by_label["next experiment resolves"].reached == ""
     assert by_label["gain over the oracle's, median"].number is None
+    shares = dict(rates.further([c | {"gain": g} for c, g in zip(cases(), (1.0, 0.9, -0.2), strict=False)]))
+    assert shares["gain over the oracle's, 10 % quantile"] == pytest.approx(0.02)
+    assert shares["gain over the oracle's below zero"] == rates.Rate(1, 3)
 
 
 def test_the_page_has_every_case_and_every_mark():

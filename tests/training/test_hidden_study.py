@@ -47,7 +47,8 @@ def called(monkeypatch):
 
 def options(tmp_path, **more):
     return Namespace(
-        **{"out": tmp_path / "s", "cases": None, "seed": None, "dev": False, "fast": False, "jobs": 1} | more
+        **{"out": tmp_path / "s", "cases": None, "seed": None, "dev": False, "fast": False, "jobs": 1, "kept": None}
+        | more
     )
 
 
@@ -76,6 +77,29 @@ def test_finished_cases_are_not_repeated_and_more_may_be_added(called, tmp_path,
     assert (tmp_path / "s" / "cases" / "002.json").read_text() == first
     assert "What must show" in capsys.readouterr().out
     assert (tmp_path / "s" / "hidden.md").read_text().count("| 00") == 4
+
+
+def test_kept_rounds_are_scored_beside_each_other_and_together(called, tmp_path, capsys):
+    for name, count in (("one", 3), ("two", 5)):
+        hidden.run(options(tmp_path, out=tmp_path / name, dev=True, cases=count))
+    del called[:]
+    hidden.run(options(tmp_path, out=tmp_path / "both", kept=[tmp_path / "one", tmp_path / "two"]))
+    assert not called
+    assert "rounds.md" in capsys.readouterr().out
+    lines = (tmp_path / "both" / "rounds.md").read_text().splitlines()
+    assert lines[0] == "| figure | one | two | together | 95 % |"
+    assert "| nulls with a named cause, or refused | 0 of 3 | 0 of 5 | 0 of 8 | 0 %–37 % |" in lines
+    assert (tmp_path / "both" / "hidden.md").read_text().count("| two/00") == 5
+
+
+@pytest.mark.parametrize("content", [None, "{", "{}", "[]", '{"truth": 1, "answer": 2}'])
+def test_what_is_no_kept_round_is_refused(tmp_path, content):
+    (tmp_path / "r" / "cases").mkdir(parents=True)
+    if content is not None:
+        (tmp_path / "r" / "cases" / "001.json").write_text(content)
+    with pytest.raises(InvalidInput, match="--kept"):
+        hidden.run(options(tmp_path, kept=[tmp_path / "r"]))
+    assert not (tmp_path / "s").exists()
 
 
 def test_a_round_that_is_stopped_in_its_first_case_keeps_its_secret(called, tmp_path, monkeypatch):

@@ -62,21 +62,46 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--seed", type=int, metavar="SECRET", help="that sealed cases are drawn from (default: a new one)"
     )
     which.add_argument("--dev", action="store_true", help="cases for development, on which thresholds may be tuned")
+    which.add_argument(
+        "--kept", type=Path, nargs="+", metavar="ROUND", help="only score finished rounds anew, each and all together"
+    )
 
 
 def run(options: argparse.Namespace) -> None:
     """Make, diagnose and reveal what is missing, then print and write hidden.json and hidden.md."""
+    if options.kept:
+        rounds = {folder.name: finished(folder) for folder in options.kept}
+        report(options.out, [{**c, "name": f"{name}/{c['name']}"} for name, cases in rounds.items() for c in cases])
+        write_text(options.out / "rounds.md", hidden_tables.beside(rounds) + "\n")
+        print(f"one beside the other: {options.out / 'rounds.md'}")
+        return
     chosen = drawn(options)
     kept = Kept(options.out, chosen.settings)
     kept.begin()
     work: dict[str, Callable[[], dict[str, Any]]] = {
         name: partial(one, options.out, name, seed, chosen.fast) for name, seed in chosen.seeds.items()
     }
-    cases = [scored(name, case) for name, case in kept.run(work, options.jobs).items()]
-    write_text(options.out / "hidden.json", json.dumps(cases, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
-    write_text(options.out / "hidden.md", hidden_tables.markdown(cases))
+    report(options.out, [scored(name, case) for name, case in kept.run(work, options.jobs).items()])
+
+
+def report(out: Path, cases: Sequence[Mapping[str, Any]]) -> None:
+    """Tables of judged cases, on the terminal and in files."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_text(out / "hidden.json", json.dumps(cases, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_text(out / "hidden.md", hidden_tables.markdown(cases))
     hidden_tables.show(cases)
-    print(f"result: {options.out / 'hidden.json'}, {options.out / 'hidden.md'}")
+    print(f"result: {out / 'hidden.json'}, {out / 'hidden.md'}")
+
+
+def finished(folder: Path) -> list[dict[str, Any]]:
+    """A kept round's cases, judged as they are today."""
+    paths = sorted(folder.glob("cases/*.json"))
+    if not paths:
+        raise InvalidInput("--kept", got=f"{folder}, without cases/*.json", expected="folders of hidden rounds")
+    try:
+        return [scored(path.stem, json.loads(path.read_text())) for path in paths]
+    except (ValueError, LookupError, TypeError) as error:
+        raise InvalidInput("--kept", got=f"{folder}: {error!r}", expected="cases as `hidden` keeps them") from None
 
 
 def drawn(options: argparse.Namespace) -> Round:

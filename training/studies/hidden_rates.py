@@ -72,7 +72,7 @@ def of(cases: Sequence[Judged], *families: str) -> list[Judged]:
     return [c for c in cases if c["family"] in families]
 
 
-def rate(cases: Sequence[Judged], hit: Callable[[Judged], Any]) -> Rate:
+def rate(cases: Sequence[Any], hit: Callable[[Any], Any]) -> Rate:
     """How many of the cases."""
     return Rate(sum(bool(hit(c)) for c in cases), len(cases))
 
@@ -83,7 +83,7 @@ def marks(cases: Sequence[Judged]) -> list[Mark]:
     sets = [c for c in singles if c["named"]]
     sizes = [size for c in sets for size in c["sizes"]]
     errors = amplitude_errors(cases)
-    gains = [c["gain"] for c in cases if c.get("gain") is not None]
+    gains = oracles_share(cases)
     return [
         Mark(
             "nulls with a named cause, or refused", rate(of(cases, *NULLS), lambda c: not c["right"]), 0.05, 0.02, False
@@ -130,11 +130,17 @@ def amplitude_errors(cases: Sequence[Judged]) -> list[float]:
     return [abs(a["error"]) for a in amplitudes(cases)]
 
 
+def oracles_share(cases: Sequence[Judged]) -> list[float]:
+    """Gains over the oracle's, where there was something to be gained."""
+    return [c["gain"] for c in cases if c.get("gain") is not None]
+
+
 def further(cases: Sequence[Judged]) -> list[tuple[str, Rate | float | None]]:
     """What else one should know, by words."""
     singles, doubles, known = of(cases, "single"), of(cases, "double"), amplitudes(cases)
     errors, extra = [abs(a["error"]) for a in known], of(cases, *WITH_EFFECT)
     random = [c for c in cases if c.get("random_resolved") is not None]
+    gains = oracles_share(cases)
     seen = [c for c in singles if not (c["said_invisible"][0] and not c["named"])]
     return [
         ("class identified, singles at 1.5", rate(at(singles, "1.5"), _found)),
@@ -151,6 +157,8 @@ def further(cases: Sequence[Judged]) -> list[tuple[str, Rate | float | None]]:
         ("causes that are none, a case", float(np.mean([c["spurious"] for c in extra])) if extra else None),
         ("amplitude error, 90 % quantile", float(np.quantile(errors, 0.9)) if errors else None),
         ("95 % intervals that hold the amplitude", rate(known, lambda a: a["inside"])),
+        ("gain over the oracle's, 10 % quantile", float(np.quantile(gains, 0.1)) if gains else None),
+        ("gain over the oracle's below zero", rate(gains, lambda g: g < 0)),
         ("outside the catalogue: a cause alone, and false", rate(of(cases, "outside"), lambda c: c["wrong"])),
         ("faulty recordings refused or rightly named", rate(of(cases, "fault"), lambda c: c["right"])),
         ("a random experiment resolves", rate(random, lambda c: c["random_resolved"])),

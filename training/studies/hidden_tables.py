@@ -37,6 +37,24 @@ def markdown(cases: Sequence[Mapping[str, Any]]) -> str:
     return "\n\n".join(parts) + f"\n\n{seconds(cases)}\n"
 
 
+def beside(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """Markdown with a column for each round and one for all their cases together."""
+    columns = [_figures(cases) for cases in (*rounds.values(), [c for cases in rounds.values() for c in cases])]
+    rows = [(label, *(c[label][0] for c in columns), columns[-1][label][1]) for label in columns[-1]]
+    return _lines(("figure", *rounds, "together", "95 %"), rows)
+
+
+def _figures(cases: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str, str]]:
+    """(figure, bounds) by its label."""
+    values = [*((m.label, m.value) for m in marks(cases)), *further(cases)]
+    return {label: _figure(label, value) for label, value in values}
+
+
+def _figure(label: str, value: Rate | float | None) -> tuple[str, str]:
+    point, bounds, count = _value(value, label.startswith("mean size") or label.endswith("a case"))
+    return (f"{value.hits} of {count}" if isinstance(value, Rate) and value.of else point), bounds
+
+
 def seconds(cases: Sequence[Mapping[str, Any]]) -> str:
     """What a case costs."""
     spent = [c["seconds"] for c in cases]
