@@ -9,6 +9,7 @@ from .description import models
 from .holds import Hold
 from .plan import ACCELERATION, Plan, plan
 from .replay import arm_of, gripper_motion, replay
+from .retrace import retrace
 from .scene import Scene, Table, bimanual_rig
 
 __all__ = [
@@ -28,4 +29,5 @@ __all__ = [
     "plan",
     "primitives",
     "replay",
+    "retrace",
 ]

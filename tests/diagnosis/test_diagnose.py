@@ -12,6 +12,7 @@ from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, run, search, setting_of, write_diagnosis
 from torchcloth.diagnosis.cloud_pictures import over_cloud
+from torchcloth.diagnosis.next_experiment import Proposal
 from torchcloth.diagnosis.pictures import residual_maps
 from torchcloth.diagnosis.verdict import judge
 from torchcloth.errors import InvalidInput
@@ -109,10 +110,13 @@ def test_rivals_that_no_motion_would_tell_apart_are_warned_of(with_drag, monkeyp
     """Only where experiments were tried: an answer of a search alone says nothing of them."""
     recordings, answer = with_drag
     open_ = replace(answer, verdict=verdict)
-    for name, result in (("search", None), ("doubted", None), ("_judged", open_), ("propose", following)):
+    proposal = None if following is None else Proposal(following, recordings[0])
+    for name, result in (("search", None), ("doubted", None), ("_judged", open_), ("propose", proposal)):
         monkeypatch.setattr(run, name, lambda *_, result=result: result)
-    content = diagnose(recordings, hypotheses=[]).content
+    found = diagnose(recordings, hypotheses=[])
+    content = found.content
     assert content["next_experiment"] == following
+    assert found.experiment is (proposal and recordings[0])
     assert (run.NONE_TELLS in content["warnings"]) is warned
     assert run.NONE_TELLS not in answer.content["warnings"]
 

@@ -37,6 +37,24 @@ def test_without_forces_mass_is_said_to_be_unknown():
     assert not told("points", given=[heavier])  # the stiffness of the data sheet says so
 
 
+@pytest.mark.parametrize(
+    ("arms", "said"),
+    [
+        (None, "it tells."),
+        ({"slower": 1.0, "limit": "joint4 of left: velocity", "refused": {}}, "it tells. The arms can do it."),
+        (
+            {"slower": 1.83, "limit": "joint4 of left: velocity", "refused": {"turn": "out of reach"}},
+            "The arms need 1.8 times as long as is asked of them (joint4 of left: velocity). 1 other is beyond them.",
+        ),
+    ],
+)
+def test_what_the_arms_can_do_is_said_with_the_next_experiment(arms, said):
+    (line,) = (
+        line for line in summary("ambiguous", next_experiment={"why": "it tells.", "arms": arms}) if "Next" in line
+    )
+    assert line.endswith(said)
+
+
 @pytest.mark.parametrize("weights", [0.5, 70.0])
 def test_a_force_that_nothing_has_is_doubted(weights):
     where = {"at": [0.1, 0.2], "from": 1.0, "to": 1.2}

@@ -22,7 +22,8 @@ def add(verbs: Any) -> None:
         "diagnose",
         help="find what a simulation of recorded episodes gets wrong, and why",
         description="Find what a simulation of one cloth's episodes gets wrong, and why. At least two motions "
-        "(split.motion in episode.json). Writes diagnosis.json, report.html, base.tcm and extended.tcm.",
+        "(split.motion in episode.json). Writes diagnosis.json, report.html, base.tcm and extended.tcm, and the motion "
+        "to record next.",
     )
     parser.add_argument("episodes", nargs="+", metavar="EPISODE", help="folders of one cloth's episodes")
     parser.add_argument("--model", metavar="MODEL", help="a .tcm file to start from (default: A-EP in vacuum)")
@@ -35,6 +36,7 @@ def _diagnose(options: argparse.Namespace) -> int:
     import torch
 
     from .. import diagnosis
+    from ..diagnosis.doable import FOLDER
     from ..diagnosis.run import RESULT
     from ..identification.journal import clear
 
@@ -68,7 +70,8 @@ def _diagnose(options: argparse.Namespace) -> int:
         clear(options.out / PROGRESS)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())
-    written = (path.name, "report.html", answer.content.get("base"), answer.content["model"])
+    proposed = FOLDER if answer.experiment is not None else None
+    written = (path.name, "report.html", answer.content.get("base"), answer.content["model"], proposed)
     print("\n".join(str(path.parent / name) for name in written if name))
     if replaced:
         print("the last diagnosis there is replaced")

@@ -137,19 +137,25 @@ def planned(experiment: Experiment, template: Recording) -> Recording:
         path = centre + offset + np.einsum("kab,kb->ka", spin, aside + 0.5 * apart[:, None] * outward)
         grippers[name] = _gripper(t, path, spin @ turn @ rotation, template, name)
     moved = (shape - centre) @ turn.T + centre
-    frames = np.arange(int(t[-1] * RATE) + 1) / RATE
-    points = np.repeat(moved.reshape(-1, 3)[:1], len(frames), axis=0)
+    placed = replace(template, cloth=replace(template.cloth, initial_vertices=moved))
     return replace(
-        template,
-        cloth=replace(template.cloth, initial_vertices=moved),
+        placed,
         grippers=grippers,
         joints={},
-        points=PointClouds(frames, points, np.ones(len(frames), int)),
+        points=blank_frames(placed, float(t[-1])),
         markers=None,
         clock_offset=0.0,
         split={"motion": str(experiment)},
         path=None,
     )
+
+
+def blank_frames(recording: Recording, end: float) -> PointClouds:
+    """One point of the first shape, in frames until ``end`` [s]."""
+    frames = np.arange(int(end * RATE) + 1) / RATE
+    initial = recording.cloth.initial_vertices
+    point = np.asarray(recording.cloth.vertices if initial is None else initial).reshape(-1, 3)[:1]
+    return PointClouds(frames, np.repeat(point, len(frames), axis=0), np.ones(len(frames), int))
 
 
 def _gripper(t: np.ndarray, path: np.ndarray, rotation: np.ndarray, template: Recording, name: str) -> GripperMotion:

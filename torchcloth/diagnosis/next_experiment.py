@@ -16,7 +16,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,8 +26,9 @@ from ..identification.episodes import Episode, episode
 from ..identification.replays import Frames
 from ..recordings import Recording
 from .cells import cells_of, directions, joined
+from .doable import Doable, doable
 from .evidence import central
-from .experiments import Experiment, planned, possible
+from .experiments import Experiment
 from .fitting import Fitted, prior_precision
 from .lacking import reference
 from .noise import Noise
@@ -64,23 +65,31 @@ class Question:
         return Worlds(self.fitted.model, both_ways(self.fitted.model))
 
 
-def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress: Progress) -> dict | None:
-    """The content of ``next_experiment``; None where nothing is open, or nothing can be done about it."""
+class Proposal(NamedTuple):
+    """An experiment that tells most."""
+
+    content: dict[str, Any]  # ``next_experiment`` of diagnosis.json
+    episode: Recording  # it, with blanks for what will be seen and felt
+
+
+def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress: Progress) -> Proposal | None:
+    """Of what the arms can do, the experiment that tells most; None: nothing is open, or nothing tells of it."""
     question = question_of(found, content)
     if question is None:
         return None
     names = list(question.amplitudes)
     now = distances(question, information(question, []))
 
-    def ask(choice: tuple[Experiment, Recording]) -> tuple[Experiment, Tensor] | None:
-        experiment, template = choice
-        progress(str(experiment))
+    def ask(choice: Doable) -> tuple[Doable, Tensor] | None:
+        progress(str(choice.experiment))
         try:
-            return experiment, whitened_slopes(question, planned(experiment, template), setting)
+            return choice, whitened_slopes(question, replace(choice.episode, joints={}), setting)
         except (TorchclothError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             return None  # it cannot be simulated, so it says nothing
 
-    tried = [answer for answer in side_by_side(ask, possible(setting.recordings)) if answer is not None]
+    choices = doable(setting.recordings, progress)
+    refused = {str(c.experiment): c.why_not for c in choices if c.why_not is not None}
+    tried = [answer for answer in side_by_side(ask, [c for c in choices if not c.why_not]) if answer is not None]
     if not tried:
         return None
     told = [distances(question, information(question, [slopes])) for _, slopes in tried]
@@ -88,9 +97,10 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
     if max(told[best].values()) <= 0:
         return None
     middle = sorted(range(len(tried)), key=lambda k: _worth(told[k], question))[len(tried) // 2]
-    experiment, slopes = tried[best]
+    choice, slopes = tried[best]
+    experiment, plan = choice.experiment, choice.plan
     repeats = _repeats(question, slopes)
-    return {
+    said = {
         "motion": experiment.motion,
         "heading": experiment.heading,
         "speed": experiment.speed,
@@ -98,10 +108,12 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
         "shows": [] if question.pairs else names,
         "expected_d": _weakest(told[best]),
         "d_now": _weakest(now),
-        "median": {"experiment": str(tried[middle][0]), "expected_d": _weakest(told[middle])},
+        "median": {"experiment": str(tried[middle][0].experiment), "expected_d": _weakest(told[middle])},
         "repeats": repeats,
+        "arms": None if plan is None else {"slower": plan.slower, "limit": plan.limiting, "refused": refused},
         "why": _why(experiment, question, now, told[best], _weakest(told[middle]), repeats),
     }
+    return Proposal(said, choice.episode)
 
 
 def question_of(found: Found, content: Mapping[str, Any]) -> Question | None:

@@ -17,6 +17,7 @@ from ..recordings import Recording
 from ..recordings.marks import each_once, mark
 from ..recordings.together import listed, together
 from .base_model import base_model
+from .doable import write_episode
 from .gate import check
 from .hypotheses import catalogue, registered
 from .keeping import kept_in
@@ -35,7 +36,7 @@ from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
 
 OPEN = ("ambiguous", "inconclusive", "unexplained")  # verdicts that another experiment may change
-NONE_TELLS = "no short motion was found that would tell the causes from what they cannot be told from"
+NONE_TELLS = "no short motion that can be done was found that would tell the causes from what is one with them"
 RESULT, BASE, EXTENDED = "diagnosis.json", "base.tcm", "extended.tcm"
 
 
@@ -105,14 +106,15 @@ def diagnose(
     with _threads(1):  # simulations run side by side: threads for the small arrays of each would wait for each other
         found = doubted(search(model, setting, asked, progress), staged(progress, "laws without a cause"))
         answer = _judged(found, many, progress)
-        following = None
+        proposal = None
         if answer.verdict in OPEN:
-            following = propose(found, answer.content, setting, staged(progress, "next experiment"))
+            proposal = propose(found, answer.content, setting, staged(progress, "next experiment"))
         over = overlays(answer.found, progress)
-    warnings = [*answer.content["warnings"], *([NONE_TELLS] if answer.verdict == "ambiguous" and not following else [])]
+    warnings = [*answer.content["warnings"], *([NONE_TELLS] if answer.verdict == "ambiguous" and not proposal else [])]
     files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
+    following, episode = proposal or (None, None)
     said = answer.content | files | {"next_experiment": following, "warnings": warnings}
-    return replace(answer, content=said, overlays=over)
+    return replace(answer, content=said, overlays=over, experiment=episode)
 
 
 def _plan(model: Model, asked: Sequence[Hypothesis], names: Sequence[str]) -> str:
@@ -155,6 +157,7 @@ def _judged(found: Found, threads: int, progress: Progress) -> Diagnosis:
 def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Path:
     """Write diagnosis.json, report.html and, unless data are invalid, the models; returns the first's path.
 
+    An experiment that is proposed becomes an episode beside them, ``next_experiment``, of which nothing is seen yet.
     ``recordings`` are the episodes, which say what the base model is of.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -167,6 +170,8 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
         start, end = answer.found.start, answer.found.end
         save_model(folder / BASE, start.model, scene, start.covariance, episodes=said)
         save_model(folder / EXTENDED, end.model, scene, end.covariance, residual, said)
+    if warning := write_episode(answer.experiment, folder):
+        answer = replace(answer, content=answer.content | {"warnings": [*answer.content["warnings"], warning]})
     path = write_text(folder / RESULT, as_json(answer.content))
     write_report(answer, folder)
     return path

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..errors import InvalidInput
 from ..identification.result import or_none
+from ..recordings import Recording
 from .classes import alike, fitted_alike
 from .comparison import Gain, by_motion, heard, spread, told_by
 from .drifting import drifts
@@ -44,6 +45,7 @@ class Diagnosis:
         missing: the force that is missing, where the fit is lacking.
         residual: laws of a force that were learned, where the fit is lacking or no cause is named.
         overlays: a moment of each episode, for pictures; none, where nobody simulated them.
+        experiment: the one that is proposed as an episode, with blanks for what will be seen and felt.
     """
 
     verdict: Verdict
@@ -52,6 +54,7 @@ class Diagnosis:
     missing: MissingForce | None = None
     residual: Residual | None = None
     overlays: Sequence[Overlay] = ()
+    experiment: Recording | None = None
 
     @property
     def found(self) -> Found:

@@ -92,7 +92,7 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
         names = [r["effect"] for r in content["unresolvable"] if (r["smallest_detectable"] is not None) == known]
         out += [f"{label}: {', '.join(names)}."] if names else []
     if content["next_experiment"]:
-        out.append(f"Next experiment: {content['next_experiment']['why']}")
+        out.append(f"Next experiment: {content['next_experiment']['why']}{_by_arms(content['next_experiment'])}")
     return [*out, *(f"Warning: {text}." for text in content["warnings"])]
 
 
@@ -101,6 +101,17 @@ def labels(content: dict[str, Any]) -> list[str]:
     motions = content["motions"]
     names = [e["name"] for e in content.get("episodes", [])] or [str(k + 1) for k in range(len(motions))]
     return [m if motions.count(m) == 1 else f"{m} ({name})" for m, name in zip(motions, names, strict=True)]
+
+
+def _by_arms(experiment: dict[str, Any]) -> str:
+    """What the arms need for it, and what they cannot do."""
+    arms = experiment["arms"]
+    if arms is None:
+        return ""
+    slower = f" The arms need {arms['slower']:.2g} times as long as is asked of them ({arms['limit']})."
+    many = len(arms["refused"])
+    refused = f" {many} other{'s are' if many > 1 else ' is'} beyond them."
+    return (slower if arms["slower"] > 1 else " The arms can do it.") + (refused if many else "")
 
 
 def _massless(content: dict[str, Any]) -> bool:

@@ -1,0 +1,113 @@
+"""Arms are asked what they can do of an experiment, and the proposed one becomes an episode to drive them by."""
+
+from dataclasses import replace
+from importlib.resources import files
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import sheets
+import torch
+from test_experiments import undecided
+
+from torchcloth import recordings, robots
+from torchcloth.diagnosis import doable as module
+from torchcloth.diagnosis import experiments, next_experiment
+from torchcloth.diagnosis.doable import FOLDER, Doable, doable, write_episode
+from torchcloth.diagnosis.experiments import Experiment, planned
+from torchcloth.errors import InvalidInput
+
+FAST = Experiment("swing-fast")
+
+
+def quiet(_):
+    pass
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return recordings.read(files("torchcloth") / "examples" / "bimanual_swing")
+
+
+@pytest.fixture(scope="module")
+def slowed(shipped):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiments, "LIBRARY", (FAST,))
+        (found,) = doable([shipped], quiet)
+    return found
+
+
+def test_an_experiment_is_as_fast_as_the_arms(shipped, slowed):
+    assert slowed.plan.slower > 1.5
+    assert slowed.experiment.speed == pytest.approx(1 / slowed.plan.slower, rel=0.05)
+    wanted, done = planned(FAST, shipped), slowed.episode
+    for name, asked in wanted.grippers.items():
+        t = asked.t * slowed.plan.slower
+        at = np.stack([np.interp(t, done.grippers[name].t, done.grippers[name].position[:, k]) for k in range(3)], 1)
+        np.testing.assert_allclose(at, asked.position, atol=3e-4)
+    assert done.points.t[-1] == pytest.approx(wanted.points.t[-1] * slowed.plan.slower, abs=0.1)
+
+
+def test_where_no_arm_is_named_none_is_asked(monkeypatch):
+    monkeypatch.setattr(experiments, "LIBRARY", (FAST, Experiment("turn", 90.0)))
+    found = doable([sheets.episode()], lambda _: pytest.fail("an arm was asked"))
+    assert [c.experiment for c in found] == [FAST, Experiment("turn", 90.0)]
+    assert {(c.plan, c.why_not) for c in found} == {(None, None)}
+
+
+def test_what_is_in_the_arms_way_is_said_and_not_proposed(shipped, monkeypatch):
+    monkeypatch.setattr(experiments, "LIBRARY", (FAST,))
+    far = {name: replace(r, T_world_base=r.T_world_base + np.eye(4, k=3) * 3.0) for name, r in shipped.robots.items()}
+    paths = {name: robots.gripper_motion(path) for name, path in robots.replay(shipped).items()}
+    (refused,) = doable([replace(shipped, grippers=paths, joints={}, robots=far)], quiet)
+    assert "reach" in refused.why_not
+    found, content, setting = undecided(("env.gravity_tilt[y]", "obs.rotation[x]"))
+    turn = Doable(Experiment("turn", -90.0), planned(Experiment("turn", -90.0), setting.recordings[0]))
+    hang = replace(refused, experiment=Experiment("hang"))
+    monkeypatch.setattr(next_experiment, "doable", lambda *_: [hang, turn])
+    proposed = next_experiment.propose(found, content, setting, quiet)
+    assert (proposed.content["motion"], proposed.content["arms"]) == ("turn", None)
+    assert proposed.episode is turn.episode
+    plan = SimpleNamespace(slower=1.3, limiting="joint4 of left: acceleration")
+    monkeypatch.setattr(next_experiment, "doable", lambda *_: [hang, replace(turn, plan=plan)])
+    arms = next_experiment.propose(found, content, setting, quiet).content["arms"]
+    assert arms == {"slower": 1.3, "limit": plan.limiting, "refused": {"hang": refused.why_not}}
+    monkeypatch.setattr(next_experiment, "doable", lambda *_: [hang])
+    assert next_experiment.propose(found, content, setting, quiet) is None
+
+
+def test_the_proposed_one_is_an_episode_without_blanks(slowed, tmp_path):
+    blank = np.zeros((len(slowed.episode.grippers["left"].t), 3))
+    felt = {name: replace(g, force=blank, torque=blank) for name, g in slowed.episode.grippers.items()}
+    assert write_episode(replace(slowed.episode, grippers=felt), tmp_path) is None
+    written = recordings.read(tmp_path / FOLDER)
+    assert (written.points, written.truth, written.grippers["left"].force) == (None, None, None)
+    for name, path in robots.replay(written).items():  # the joints, through the arms
+        torch.testing.assert_close(path.pose[:, :3, 3], torch.as_tensor(written.grippers[name].position))
+    np.testing.assert_array_equal(written.cloth.initial_vertices, slowed.episode.cloth.initial_vertices)
+
+
+def test_a_proposal_replaces_the_last_one_and_nothing_that_was_recorded(slowed, tmp_path):
+    hang = planned(Experiment("hang"), sheets.episode())
+    assert write_episode(hang, tmp_path) is None
+    assert write_episode(slowed.episode, tmp_path) is None
+    assert recordings.read(tmp_path / FOLDER).split == slowed.episode.split
+    assert set(p.name for p in (tmp_path / FOLDER).iterdir()) == module.FILES
+    assert write_episode(None, tmp_path) is None
+    assert not (tmp_path / FOLDER).exists()
+    recordings.write(hang, tmp_path / FOLDER)  # with points
+    before = sorted((tmp_path / FOLDER).iterdir())
+    for episode in (slowed.episode, None):
+        assert "left as it is" in write_episode(episode, tmp_path)
+        assert sorted((tmp_path / FOLDER).iterdir()) == before
+
+
+def test_an_arm_that_nobody_knows_is_a_reason(shipped, monkeypatch):
+    monkeypatch.setattr(experiments, "LIBRARY", (FAST,))
+
+    def unknown(_):
+        raise InvalidInput("model", got="nobody's", expected="one of models()")
+
+    monkeypatch.setattr(module, "retrace", unknown)
+    (found,) = doable([shipped], quiet)
+    assert "nobody's" in found.why_not

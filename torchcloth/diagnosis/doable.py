@@ -1,0 +1,97 @@
+"""What the arms that the episodes name can do of the experiments, and an experiment as a folder to drive them by."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import TorchclothError
+from ..recordings import GripperMotion, Recording, write
+from ..robots import Plan, gripper_motion, retrace  # pyright: ignore[reportMissingImports] - mapped from robots/
+from .experiments import Experiment, blank_frames, planned, possible
+from .pieces import side_by_side
+from .setting import Progress
+
+FOLDER = "next_experiment"  # beside diagnosis.json
+FILES = frozenset(("episode.json", "motion.npz", "cloth.obj", "cloth_initial.npy"))  # in it while nothing is recorded
+
+
+@dataclass(frozen=True, eq=False)
+class Doable:
+    """An experiment as fast as it can be done.
+
+    Attributes:
+        experiment: at a speed that the arms can do.
+        episode: it, with what is not known yet left blank.
+        plan: of the arms; None where the episodes do not name them.
+        why_not: what is in the arms' way; None: nothing.
+    """
+
+    experiment: Experiment
+    episode: Recording
+    plan: Plan | None = None
+    why_not: str | None = None
+
+
+def doable(recordings: Sequence[Recording], progress: Progress) -> list[Doable]:
+    """All experiments that may be asked for, with what the arms can do about them."""
+
+    def ask(choice: tuple[Experiment, Recording]) -> Doable:
+        experiment, template = choice
+        episode = planned(experiment, template)
+        if template.robots:
+            progress(f"{experiment}: whether the arms can do it")
+        try:
+            done = retrace(episode)
+        except TorchclothError as error:
+            return Doable(experiment, episode, why_not=str(error))
+        if done is None:
+            return Doable(experiment, episode)
+        scene, plan = done
+        paths = {name: gripper_motion(path) for name, path in plan.motion(scene).items()}
+        grippers = {name: _blank(path, episode.grippers[name]) for name, path in paths.items()}
+        points = blank_frames(episode, float(plan.t[-1]))
+        slower = replace(experiment, speed=float(f"{experiment.speed / plan.slower:.2g}"))
+        return Doable(slower, replace(episode, grippers=grippers, joints=plan.joints(), points=points), plan)
+
+    return side_by_side(ask, possible(recordings))
+
+
+def _blank(path: GripperMotion, like: GripperMotion) -> GripperMotion:
+    """With empty readings where the other has some."""
+    none = np.zeros((len(path.t), 3))
+    return replace(path, **{key: none for key in ("force", "torque") if getattr(like, key) is not None})
+
+
+def write_episode(episode: Recording | None, folder: Path) -> str | None:
+    """An experiment that nobody has done yet as an episode beside diagnosis.json: paths, joints, the first shape.
+
+    It takes the place of an earlier diagnosis's; None takes that away. What was recorded there stays.
+
+    Returns:
+        A warning, or None.
+    """
+    target = folder / FOLDER
+    if target.exists() and not {path.name for path in target.iterdir()} <= FILES:
+        return f"{target} holds more than a proposal and was left as it is"
+    if episode is not None:
+        write(unseen(episode), target, overwrite=True)
+    elif target.exists():
+        shutil.rmtree(target)
+    return None
+
+
+def unseen(episode: Recording) -> Recording:
+    """Without the blanks for what will be seen and felt."""
+    return replace(
+        episode,
+        grippers={name: replace(g, force=None, torque=None) for name, g in episode.grippers.items()},
+        cameras={name: replace(c, depth=None, color=None, mask=None) for name, c in episode.cameras.items()},
+        points=None,
+        truth=None,
+        provenance="synthetic: an experiment that torchcloth diagnose proposes",
+    )
