@@ -122,6 +122,21 @@ def test_a_prediction_has_errors_and_meets_the_truth(made, tmp_path):
     assert json.loads((tmp_path / "p" / "prediction.json").read_text())["measured"]["rms"] == found.figures["rms"]
 
 
+def test_a_motion_that_is_only_planned_is_predicted_and_drawn(made, tmp_path):
+    folder, seen, _ = made
+    rec.write(replace(seen, points=None), tmp_path / "e")
+    model = folder / "extended.tcm"
+    assert main(["predict", str(model), str(tmp_path / "e"), "--out", str(tmp_path / "p")]) == 0
+    found, known = (dx.predicted(model, e) for e in (rec.read(tmp_path / "e"), seen))
+    torch.testing.assert_close(found.episode.times.diff(), torch.full((len(found.std) - 1,), 0.05))
+    k = [int((known.episode.times - t).abs().argmin()) for t in found.episode.times]
+    near = (known.episode.times[k] - found.episode.times).abs() < 1e-9
+    assert near.sum() > 3
+    torch.testing.assert_close(found.frames.x[near], known.frames.x[k][near], atol=1e-5, rtol=0)
+    film = film_of_fit(rec.read(tmp_path / "e"), model)
+    assert film.sheets["cloth"].vertices.shape == tuple(found.frames.x.shape)
+
+
 def test_a_model_is_looked_at_beside_the_points(made):
     folder, seen, _ = made
     base, extended = (film_of_fit(seen, folder / name) for name in ("base.tcm", "extended.tcm"))

@@ -81,9 +81,19 @@ def test_what_it_says_is_json(found):
     assert 0 < content["std_parameters"]["rms"] <= content["std_parameters"]["max"]
 
 
-def test_an_episode_of_which_nothing_is_to_be_compared_has_forces_or_is_refused(pair, other, tmp_path):
-    with pytest.raises(RecordingError, match="points"):
-        predict_episode(pair.save(tmp_path), replace(other, points=None))
+def test_what_nobody_has_seen_yet_is_predicted_along_its_motion(pair, other, tmp_path, capsys):
+    """Where the frames are does not matter to where the cloth goes, but for the intervals that are integrated."""
+    found, seen = (predict_episode(pair.save(tmp_path), e) for e in (replace(other, points=None), other))
+    start = float(next(iter(found.episode.motion.values())).t[0])
+    torch.testing.assert_close(found.episode.times[:3], start + torch.tensor([0.0, 0.05, 0.1]))
+    for k, t in enumerate(found.episode.times.tolist()):
+        same = (seen.episode.times - t).abs().argmin()
+        if abs(float(seen.episode.times[same]) - t) < 1e-9:
+            torch.testing.assert_close(found.frames.x[k], seen.frames.x[same], atol=1e-6, rtol=0)
+    assert found.as_dict()["std_parameters"]["rms"] > 0
+    assert set(found.as_dict()["measured"].values()) == {None}
+    print_predicted(found)
+    assert "nothing was seen or felt in this episode to compare with" in capsys.readouterr().out
 
 
 def test_another_model_is_refused(pair, other, tmp_path):

@@ -11,7 +11,7 @@ import torch
 
 from ..cloth import Cloth
 from ..identification.episode_prediction import EpisodePrediction, with_errors
-from ..identification.episodes import Episode, episode
+from ..identification.episodes import RATE, Episode, episode
 from ..identification.replays import Frames, each
 from ..recordings import Recording
 from ..recordings.marks import alike, mark
@@ -107,11 +107,12 @@ def watched(world: World, data: Episode) -> Frames:
 def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
     """Where the cloth goes in any episode, with errors from the covariance of the model's numbers.
 
-    Robot and observer err as the model says. Raises as ``cloth_for``, or RecordingError for an episode without frames.
+    Robot and observer err as the model says. Where nothing was seen there are twenty frames a second. Raises as
+    ``cloth_for``.
     """
     file = read_model(path, recording)
     model, world = file.model, file.model.world()
-    data, every = episode(model.base.cloth, recording), one_way(model)
+    data, every = episode(model.base.cloth, recording, RATE), one_way(model)
     covariance = torch.zeros(len(every), len(every)) if file.covariance is None else file.covariance
     shifts = every[: len(covariance)]  # a residual force, which comes last, has no errors
     worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]

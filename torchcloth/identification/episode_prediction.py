@@ -17,7 +17,7 @@ from ..losses import closest
 from ..losses.surface import distances
 from ..recordings import Recording
 from ..recordings.extents import check_size
-from .episodes import Episode, episode
+from .episodes import RATE, Episode, episode
 from .gauss_newton import NORMAL
 from .linearity import NONLINEAR
 from .misfit import figures, forces_rms
@@ -94,7 +94,8 @@ def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction
 
     Args:
         path: identification.json, or the folder that holds it.
-        recording: describes the same kind of cloth; points, markers and forces are only compared with.
+        recording: describes the same kind of cloth; points, markers and forces are only compared with. Without any
+            there are twenty frames a second.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
@@ -105,7 +106,7 @@ def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction
     check_size(recording)
     cloth = rebuilt(path, model, recording)
     unknowns, covariance = _known(model, cloth)
-    data = episode(cloth, recording)
+    data = episode(cloth, recording, RATE)
     raw = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
     with step_of(path):
         frames, moved = tangents(cloth, unknowns, raw, data, model.dt)

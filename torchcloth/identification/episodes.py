@@ -30,6 +30,7 @@ from .carried import between, carried, with_patches
 DEFAULT_STIFFNESS = 300.0  # N/m, a start in the middle of the published fabrics, where an episode names none
 DEFAULT_POISSON = 0.2
 SHEET_TRIANGLES = 288
+RATE = 20.0  # Hz, of frames that nobody has seen
 ELSEWHERE = 0.15  # of the cloth's diagonal, that what is seen first lies from it
 SAME = 1e-6  # m, on the pattern: one place
 FEW = 0.1  # force readings per frame, that may be left out without a word
@@ -240,8 +241,13 @@ def on_cpu(cloth: Cloth) -> None:
         raise InvalidInput("cloth", got=f"on {device}", expected="a cloth on the CPU", remedy="cloth.cpu()")
 
 
-def episode(cloth: Cloth, recording: Recording) -> Episode:
+def episode(cloth: Cloth, recording: Recording, rate: float | None = None) -> Episode:
     """Check a recording against a cloth and turn it into tensors of the cloth's dtype.
+
+    Args:
+        cloth: with a grasp for each gripper that holds it.
+        recording: what was recorded.
+        rate: Hz, of frames along the motion of one in which nothing was seen or felt; None refuses it.
 
     Raises:
         RecordingError: nothing was seen or felt, or no motion for one of the cloth's grasps.
@@ -255,7 +261,7 @@ def episode(cloth: Cloth, recording: Recording) -> Episode:
     missing = [key for key in needed if key not in motion]
     if missing:
         raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=f"motion of {sorted(motion)}")
-    times, dropped = _frame_times(name, recording, motion, needed)
+    times, dropped = _frame_times(name, recording, motion, needed, rate)
     initial = first_shape(name, cloth, recording).to(dtype)
     _check_place(name, cloth, motion, initial, times[0])
     markers = streams.markers(recording, times, dtype)
@@ -292,19 +298,24 @@ def eye_of(recording: Recording) -> Camera | None:
 
 
 def _frame_times(
-    name: str, recording: Recording, motion: Mapping[str, Trajectory], needed: list[str]
+    name: str, recording: Recording, motion: Mapping[str, Trajectory], needed: list[str], rate: float | None
 ) -> tuple[np.ndarray, int]:
     """(times, number of frames after the motion's end, left out) of points and markers, else of force readings.
+
+    Where there are neither, all along the motion at ``rate`` [Hz].
 
     The first frame is the points' where there are points.
     """
     seen = [s.t + recording.clock_offset for s in (recording.points, recording.markers) if s is not None]
     if not seen:
         felt = streams.felt(recording, needed)
+        begin = max((float(motion[key].t[0]) for key in needed), default=0.0)
+        if not len(felt) and needed and rate is not None:
+            span = min(float(motion[key].t[-1]) for key in needed) - begin
+            return begin + np.arange(int(span * rate + 1e-6) + 1) / rate, 0
         if not len(felt):
             recording.require("points", by="a fit")
-        start = max(float(motion[key].t[0]) for key in needed)
-        return _overlap(felt[felt >= start - streams.SAME], motion, needed)
+        return _overlap(felt[felt >= begin - streams.SAME], motion, needed)
     first = seen[0]
     if len(first) < 2:
         stream = "points" if recording.points is not None else "markers"

@@ -21,7 +21,7 @@ from ..recordings.marks import alike, mark
 from ..recordings.together import together
 from ..transfer import Contact
 from .described import beyond
-from .episodes import Episode, cloth_from, episode
+from .episodes import RATE, Episode, cloth_from, episode
 from .files import number, read_result
 from .misfit import figures
 from .replays import Replay
@@ -89,7 +89,7 @@ def replayed(path: str | Path, recording: Recording) -> Replayed:
     own = mark(recording)
     before = [kept["chamfer"] for kept in model.episodes if alike(kept, own)]
     cloth = rebuilt(path, model, recording)
-    data = episode(cloth, recording)
+    data = episode(cloth, recording, RATE)
     with torch.no_grad(), step_of(path):
         frames = Replay(cloth)(data, model.dt).x
     found = figures([frames], [data], torch.as_tensor(cloth.mesh.faces))

@@ -11,7 +11,7 @@ import torch
 from ..diagnosis import read_model
 from ..diagnosis.loading import watched
 from ..identification import replayed
-from ..identification.episodes import episode
+from ..identification.episodes import RATE, episode
 from ..identification.streams import SAME
 from ..losses import closest
 from ..recordings import Recording
@@ -55,7 +55,7 @@ def film_of_fit(recording: Recording, fit: str | Path, *, truth: bool = False) -
 def _film_of_model(recording: Recording, path: str | Path, truth: bool) -> Film:
     """As ``film_of_fit``, with the cloth, robot and observer of a model file."""
     model = read_model(path, recording).model
-    world, data = model.world(), episode(model.base.cloth, recording)
+    world, data = model.world(), episode(model.base.cloth, recording, RATE)
     film = film_of(recording, truth=truth, times=data.times.numpy())
     x = watched(world, data).x.numpy()
     told = _when(recording, film.times)
