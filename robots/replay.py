@@ -67,9 +67,14 @@ def arm_of(recording: Recording, name: str) -> Arm:
             remedy="name the model and its base pose",
         )
     robot = recording.robots[name]
-    beside = None if recording.path is None else recording.path / robot.model
-    model = robot.model if beside is None or not beside.is_file() else beside
-    return load(model, frame=robot.tool_frame or "flange", base=_tensor(robot.T_world_base))
+    return load(model_of(recording, name), frame=robot.tool_frame or "flange", base=_tensor(robot.T_world_base))
+
+
+def model_of(recording: Recording, name: str) -> str:
+    """What an arm of an episode is loaded by: the path of a URDF file beside it, or what the episode says."""
+    model = recording.robots[name].model
+    beside = None if recording.path is None else recording.path / model
+    return model if beside is None or not beside.is_file() else str(beside.resolve())
 
 
 def _tensor(array: np.ndarray) -> Tensor:

@@ -1,7 +1,9 @@
 """Arms are asked what they can do of an experiment, and the proposed one becomes an episode to drive them by."""
 
+import shutil
 from dataclasses import replace
 from importlib.resources import files
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -100,6 +102,26 @@ def test_a_proposal_replaces_the_last_one_and_nothing_that_was_recorded(slowed, 
     for episode in (slowed.episode, None):
         assert "left as it is" in write_episode(episode, tmp_path)
         assert sorted((tmp_path / FOLDER).iterdir()) == before
+
+
+@pytest.mark.parametrize("make", [lambda p: p.write_text("mine"), lambda p: p.symlink_to("elsewhere"), Path.mkdir])
+def test_what_is_no_proposal_is_left_and_no_diagnosis_is_lost_for_it(slowed, tmp_path, make):
+    make(tmp_path / FOLDER)
+    if (tmp_path / FOLDER).is_dir():
+        (tmp_path / FOLDER / "notes.txt").write_text("mine")
+    assert "left as it is" in write_episode(slowed.episode, tmp_path)
+    nameless = replace(slowed.episode, provenance="", grippers={}, joints={}, cloth=None)
+    assert "was not written" in write_episode(nameless, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_urdf_beside_the_episode_is_found_from_a_proposal(shipped, tmp_path):
+    (tmp_path / "e").mkdir()
+    shutil.copy(robots.description.locate("rizon4"), tmp_path / "e" / "arm.urdf")
+    own = {name: replace(r, model="arm.urdf") for name, r in shipped.robots.items()}
+    episode = planned(FAST, replace(shipped, robots=own, path=tmp_path / "e"))
+    assert {r.model for r in episode.robots.values()} == {str(tmp_path / "e" / "arm.urdf")}
+    assert robots.arm_of(episode, "left").model == str(tmp_path / "e" / "arm.urdf")
 
 
 def test_an_arm_that_nobody_knows_is_a_reason(shipped, monkeypatch):

@@ -102,6 +102,15 @@ def test_what_is_no_kept_round_is_refused(tmp_path, content):
     assert not (tmp_path / "s").exists()
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"kept": ["a/r", "b/r"]}, {"kept": ["r"], "cases": 3}, {"kept": ["r"], "fast": True}]
+)
+def test_kept_rounds_have_different_names_and_draw_nothing(tmp_path, wrong):
+    rounds = [tmp_path / name for name in wrong.get("kept", ["r"])]
+    with pytest.raises(InvalidInput, match="--kept"):
+        hidden.run(options(tmp_path, **wrong | {"kept": rounds}))
+
+
 def test_a_round_that_is_stopped_in_its_first_case_keeps_its_secret(called, tmp_path, monkeypatch):
     def stopped(*_):
         raise KeyboardInterrupt

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -73,16 +74,23 @@ def write_episode(episode: Recording | None, folder: Path) -> str | None:
     It takes the place of an earlier diagnosis's; None takes that away. What was recorded there stays.
 
     Returns:
-        A warning, or None.
+        A warning, or None; a proposal that cannot be written is no reason to lose a diagnosis.
     """
     target = folder / FOLDER
-    if target.exists() and not {path.name for path in target.iterdir()} <= FILES:
-        return f"{target} holds more than a proposal and was left as it is"
-    if episode is not None:
-        write(unseen(episode), target, overwrite=True)
-    elif target.exists():
-        shutil.rmtree(target)
+    if os.path.lexists(target) and not _is_proposal(target):
+        return f"{target} is no proposal, or holds more than one, and was left as it is"
+    try:
+        if episode is not None:
+            write(unseen(episode), target, overwrite=True)
+        elif target.exists():
+            shutil.rmtree(target)
+    except TorchclothError as error:
+        return f"the proposed experiment was not written: {error}"
     return None
+
+
+def _is_proposal(target: Path) -> bool:
+    return target.is_dir() and not target.is_symlink() and {path.name for path in target.iterdir()} <= FILES
 
 
 def unseen(episode: Recording) -> Recording:

@@ -17,6 +17,7 @@ import torch
 from ..recordings import GripperMotion, PointClouds, Recording
 from ..robots import gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..robots.paths import holding  # pyright: ignore[reportMissingImports]
+from ..robots.replay import model_of  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
 
 STILL, KNOT = 0.2, 0.01  # s, all stand still before and after; between knots
@@ -142,6 +143,7 @@ def planned(experiment: Experiment, template: Recording) -> Recording:
         placed,
         grippers=grippers,
         joints={},
+        robots={name: replace(r, model=model_of(template, name)) for name, r in template.robots.items()},
         points=blank_frames(placed, float(t[-1])),
         markers=None,
         clock_offset=0.0,

@@ -70,7 +70,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Make, diagnose and reveal what is missing, then print and write hidden.json and hidden.md."""
     if options.kept:
-        rounds = {folder.name: finished(folder) for folder in options.kept}
+        rounds = together(options)
         report(options.out, [{**c, "name": f"{name}/{c['name']}"} for name, cases in rounds.items() for c in cases])
         write_text(options.out / "rounds.md", hidden_tables.beside(rounds) + "\n")
         print(f"one beside the other: {options.out / 'rounds.md'}")
@@ -91,6 +91,16 @@ def report(out: Path, cases: Sequence[Mapping[str, Any]]) -> None:
     write_text(out / "hidden.md", hidden_tables.markdown(cases))
     hidden_tables.show(cases)
     print(f"result: {out / 'hidden.json'}, {out / 'hidden.md'}")
+
+
+def together(options: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
+    """The judged cases of each kept round, by its folder's name."""
+    names = [folder.resolve().name for folder in options.kept]
+    if len(set(names)) < len(names):
+        raise InvalidInput("--kept", got=f"rounds named {', '.join(names)}", expected="folders of different names")
+    if options.fast or options.cases is not None:
+        raise InvalidInput("--kept", got="with --fast or --cases", expected="alone: no case is drawn")
+    return {name: finished(folder) for name, folder in zip(names, options.kept, strict=True)}
 
 
 def finished(folder: Path) -> list[dict[str, Any]]:
