@@ -16,30 +16,44 @@ from .replay import arm_of, replay
 from .scene import Scene, Table
 
 AROUND = 0.1  # m, that a table reaches beyond cloth and paths: an episode gives its plane alone
-LEVEL = 0.999  # upward part of a table's normal
+LEVEL = 0.97  # upward part of a table's normal
 
 
-def retrace(recording: Recording) -> tuple[Scene, Plan] | None:
-    """The arms and their motion along the paths of the grippers that hold the cloth; None where one has no arm.
+def scene_of(recording: Recording) -> Scene | None:
+    """The arms of the grippers that hold the cloth, and the table; None where one of them has no arm.
 
-    Tools turn as the paths say, from a hold that is chosen anew: cloth is clamped between the fingers. Arms that hold
-    nothing are not looked at, nor colliders that are not level.
-
-    Args:
-        recording: an episode with ``robots``; its first shape says how far a table reaches.
+    The table is as high as the highest plane that is about level anywhere under cloth and paths, and ends 0.1 m beyond
+    them. Other colliders are not looked at.
 
     Raises:
-        InvalidInput: the arms cannot do it; names the joint or the pair of solids in the way.
-        RecordingError: no motion, or an arm that nobody knows.
+        InvalidInput: an arm or a frame that nobody knows.
+        MissingDependency: the packages for kinematics are not installed.
     """
     names = list(holding(recording))
     if not names or any(name not in recording.robots for name in names):
         return None
+    return Scene({name: arm_of(recording, name) for name in names}, _table(recording))
+
+
+def retrace(recording: Recording, scene: Scene | None = None) -> Plan | None:
+    """Joint motions along the paths of the grippers that hold the cloth; None where one of them has no arm.
+
+    Tools turn as the paths say, from a hold that is chosen anew: cloth is clamped between the fingers.
+
+    Args:
+        recording: an episode with ``robots``, whose grippers begin at one time and end at one, at rest.
+        scene: None: ``scene_of`` the episode.
+
+    Raises:
+        InvalidInput: the arms cannot do it; names the joint or the pair of solids in the way. Or as ``scene_of``.
+    """
+    scene = scene_of(recording) if scene is None else scene
+    if scene is None:
+        return None
     every = replay(recording)
-    motion = {name: _turns(every[name]) for name in names}
-    scene = Scene({name: arm_of(recording, name) for name in names}, _table(recording, motion))
+    motion = {name: _turns(every[name]) for name in scene.arms}
     end = max(float(path.t[-1]) for path in motion.values())
-    return scene, plan(scene, Action(motion, end, end))
+    return plan(scene, Action(motion, end, end))
 
 
 def _turns(path: Trajectory) -> Trajectory:
@@ -49,13 +63,14 @@ def _turns(path: Trajectory) -> Trajectory:
     return path._replace(pose=pose)
 
 
-def _table(recording: Recording, motion: dict[str, Trajectory]) -> Table | None:
-    """The highest level plane, below cloth and paths."""
-    heights = [float(c.point[2] / c.normal[2]) for c in recording.colliders.values() if c.normal[2] > LEVEL]
-    if not heights:
+def _table(recording: Recording) -> Table | None:
+    planes = [c for c in recording.colliders.values() if c.normal[2] > LEVEL]
+    if not planes:
         return None
-    places = [torch.cat([path.pose[:, :2, 3] for path in motion.values()]).numpy()]
+    places = [torch.cat([path.pose[:, :2, 3] for path in replay(recording).values()]).numpy()]
     if recording.cloth.initial_vertices is not None:
         places.append(recording.cloth.initial_vertices.reshape(-1, 3)[:, :2])
-    (x0, y0), (x1, y1) = (f(np.concatenate(places), axis=0) for f in (np.min, np.max))
-    return Table((x0 - AROUND, x1 + AROUND), (y0 - AROUND, y1 + AROUND), max(heights))
+    low, high = (f(np.concatenate(places), axis=0) + way for f, way in ((np.min, -AROUND), (np.max, AROUND)))
+    corners = np.array([(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])])
+    heights = [p.point[2] - (corners - p.point[:2]) @ p.normal[:2] / p.normal[2] for p in planes]
+    return Table((low[0], high[0]), (low[1], high[1]), float(np.max(heights)))

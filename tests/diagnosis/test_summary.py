@@ -41,10 +41,11 @@ def test_without_forces_mass_is_said_to_be_unknown():
     ("arms", "said"),
     [
         (None, "it tells."),
+        ({"unasked": "unknown robot"}, "it tells. The arms were not asked: unknown robot."),
         ({"slower": 1.0, "limit": "joint4 of left: velocity", "refused": {}}, "it tells. The arms can do it."),
         (
             {"slower": 1.83, "limit": "joint4 of left: velocity", "refused": {"turn": "out of reach"}},
-            "The arms need 1.8 times as long as is asked of them (joint4 of left: velocity). 1 other is beyond them.",
+            "it takes 1.8 times as long as asked (joint4 of left: velocity). 1 other is beyond them.",
         ),
     ],
 )

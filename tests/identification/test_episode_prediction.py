@@ -86,10 +86,13 @@ def test_what_nobody_has_seen_yet_is_predicted_along_its_motion(pair, other, tmp
     found, seen = (predict_episode(pair.save(tmp_path), e) for e in (replace(other, points=None), other))
     start = float(next(iter(found.episode.motion.values())).t[0])
     torch.testing.assert_close(found.episode.times[:3], start + torch.tensor([0.0, 0.05, 0.1]))
-    for k, t in enumerate(found.episode.times.tolist()):
-        same = (seen.episode.times - t).abs().argmin()
-        if abs(float(seen.episode.times[same]) - t) < 1e-9:
-            torch.testing.assert_close(found.frames.x[k], seen.frames.x[same], atol=1e-6, rtol=0)
+    same = (seen.episode.times - found.episode.times[:, None]).abs() < 1e-9
+    k, known = same.nonzero(as_tuple=True)
+    assert len(k) > 3
+    torch.testing.assert_close(found.frames.x[k], seen.frames.x[known], atol=1e-6, rtol=0)
+    brief = {name: replace(g, t=0.01 * g.t) for name, g in other.grippers.items()}
+    with pytest.raises(RecordingError, match=r"at least 0\.05 s"):
+        predict_episode(pair.save(tmp_path), replace(other, points=None, grippers=brief))
     assert found.as_dict()["std_parameters"]["rms"] > 0
     assert set(found.as_dict()["measured"].values()) == {None}
     print_predicted(found)

@@ -87,12 +87,16 @@ def test_kept_rounds_are_scored_beside_each_other_and_together(called, tmp_path,
     assert not called
     assert "rounds.md" in capsys.readouterr().out
     lines = (tmp_path / "both" / "rounds.md").read_text().splitlines()
-    assert lines[0] == "| figure | one | two | together | 95 % |"
+    assert lines[0] == "| figure | one (3) | two (5) | together | 95 % |"
     assert "| nulls with a named cause, or refused | 0 of 3 | 0 of 5 | 0 of 8 | 0 %–37 % |" in lines
     assert (tmp_path / "both" / "hidden.md").read_text().count("| two/00") == 5
+    with pytest.raises(InvalidInput, match="--out"):
+        hidden.run(options(tmp_path, out=tmp_path / "one", kept=[tmp_path / "two"]))
 
 
-@pytest.mark.parametrize("content", [None, "{", "{}", "[]", '{"truth": 1, "answer": 2}'])
+@pytest.mark.parametrize(
+    "content", [None, "{", "{}", "[]", "null", '{"truth": {}, "answer": []}', '{"truth": 1, "answer": 2}']
+)
 def test_what_is_no_kept_round_is_refused(tmp_path, content):
     (tmp_path / "r" / "cases").mkdir(parents=True)
     if content is not None:
@@ -103,7 +107,8 @@ def test_what_is_no_kept_round_is_refused(tmp_path, content):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"kept": ["a/r", "b/r"]}, {"kept": ["r"], "cases": 3}, {"kept": ["r"], "fast": True}]
+    "wrong",
+    [{"kept": ["a/r", "b/r"]}, {"kept": ["r"], "cases": 3}, {"kept": ["r"], "fast": True}, {"kept": ["r"], "jobs": 0}],
 )
 def test_kept_rounds_have_different_names_and_draw_nothing(tmp_path, wrong):
     rounds = [tmp_path / name for name in wrong.get("kept", ["r"])]

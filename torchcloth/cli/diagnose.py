@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -36,7 +37,7 @@ def _diagnose(options: argparse.Namespace) -> int:
     import torch
 
     from .. import diagnosis
-    from ..diagnosis.doable import FOLDER
+    from ..diagnosis.feasible import FOLDER
     from ..diagnosis.run import RESULT
     from ..identification.journal import clear
 
@@ -70,7 +71,10 @@ def _diagnose(options: argparse.Namespace) -> int:
         clear(options.out / PROGRESS)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())
-    proposed = FOLDER if answer.experiment is not None else None
+    said = json.loads(path.read_text())["warnings"]
+    amiss = [text for text in said if text not in answer.content["warnings"]]
+    print("".join(f"Warning: {text}.\n" for text in amiss), end="")
+    proposed = FOLDER if answer.experiment is not None and not amiss else None
     written = (path.name, "report.html", answer.content.get("base"), answer.content["model"], proposed)
     print("\n".join(str(path.parent / name) for name in written if name))
     if replaced:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from ..identification.episodes import RATE
 from ..recordings import GripperMotion, PointClouds, Recording
 from ..robots import gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..robots.paths import holding  # pyright: ignore[reportMissingImports]
@@ -21,7 +22,6 @@ from ..robots.replay import model_of  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
 
 STILL, KNOT = 0.2, 0.01  # s, all stand still before and after; between knots
-RATE = 20.0  # Hz, of frames
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Experiment:
 
     def __str__(self) -> str:
         turned = f", grippers and cloth turned by {self.heading:g} degrees" if self.heading else ""
-        return f"{self.motion}{turned}" + (f", {self.speed:g} times as fast" if self.speed != 1 else "")
+        return f"{self.motion}{turned}" + (f", {self.speed:.3g} times as fast" if self.speed != 1 else "")
 
 
 LIBRARY = (
@@ -139,11 +139,12 @@ def planned(experiment: Experiment, template: Recording) -> Recording:
         grippers[name] = _gripper(t, path, spin @ turn @ rotation, template, name)
     moved = (shape - centre) @ turn.T + centre
     placed = replace(template, cloth=replace(template.cloth, initial_vertices=moved))
+    arms = {name: robot for name, robot in template.robots.items() if name in grippers}
     return replace(
         placed,
         grippers=grippers,
         joints={},
-        robots={name: replace(r, model=model_of(template, name)) for name, r in template.robots.items()},
+        robots={name: replace(r, model=model_of(template, name)) for name, r in arms.items()},
         points=blank_frames(placed, float(t[-1])),
         markers=None,
         clock_offset=0.0,

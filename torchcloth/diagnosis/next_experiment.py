@@ -26,9 +26,9 @@ from ..identification.episodes import Episode, episode
 from ..identification.replays import Frames
 from ..recordings import Recording
 from .cells import cells_of, directions, joined
-from .doable import Doable, doable
 from .evidence import central
 from .experiments import Experiment
+from .feasible import Choice, feasible
 from .fitting import Fitted, prior_precision
 from .lacking import reference
 from .noise import Noise
@@ -80,14 +80,14 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
     names = list(question.amplitudes)
     now = distances(question, information(question, []))
 
-    def ask(choice: Doable) -> tuple[Doable, Tensor] | None:
+    def ask(choice: Choice) -> tuple[Choice, Tensor] | None:
         progress(str(choice.experiment))
         try:
             return choice, whitened_slopes(question, replace(choice.episode, joints={}), setting)
         except (TorchclothError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             return None  # it cannot be simulated, so it says nothing
 
-    choices = doable(setting.recordings, progress)
+    choices = feasible(setting.recordings, progress)
     refused = {str(c.experiment): c.why_not for c in choices if c.why_not is not None}
     tried = [answer for answer in side_by_side(ask, [c for c in choices if not c.why_not]) if answer is not None]
     if not tried:
@@ -98,7 +98,7 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
         return None
     middle = sorted(range(len(tried)), key=lambda k: _worth(told[k], question))[len(tried) // 2]
     choice, slopes = tried[best]
-    experiment, plan = choice.experiment, choice.plan
+    experiment = choice.experiment
     repeats = _repeats(question, slopes)
     said = {
         "motion": experiment.motion,
@@ -110,10 +110,17 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
         "d_now": _weakest(now),
         "median": {"experiment": str(tried[middle][0].experiment), "expected_d": _weakest(told[middle])},
         "repeats": repeats,
-        "arms": None if plan is None else {"slower": plan.slower, "limit": plan.limiting, "refused": refused},
+        "arms": _arms(choice, refused),
         "why": _why(experiment, question, now, told[best], _weakest(told[middle]), repeats),
     }
     return Proposal(said, choice.episode)
+
+
+def _arms(choice: Choice, refused: Mapping[str, str]) -> dict[str, Any] | None:
+    """What the arms make of it; None where none are named."""
+    if choice.plan is not None:
+        return {"slower": choice.plan.slower, "limit": choice.plan.limiting, "refused": refused}
+    return None if choice.unasked is None else {"unasked": choice.unasked}
 
 
 def question_of(found: Found, content: Mapping[str, Any]) -> Question | None:

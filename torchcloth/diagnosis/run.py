@@ -17,7 +17,7 @@ from ..recordings import Recording
 from ..recordings.marks import each_once, mark
 from ..recordings.together import listed, together
 from .base_model import base_model
-from .doable import write_episode
+from .feasible import write_episode
 from .gate import check
 from .hypotheses import catalogue, registered
 from .keeping import kept_in
@@ -36,7 +36,7 @@ from .verdict import Diagnosis, judge, refused
 from .world import Hypothesis, Model
 
 OPEN = ("ambiguous", "inconclusive", "unexplained")  # verdicts that another experiment may change
-NONE_TELLS = "no short motion that can be done was found that would tell the causes from what is one with them"
+NONE_TELLS = "no short motion that can be done would tell the causes from what they cannot be told from now"
 RESULT, BASE, EXTENDED = "diagnosis.json", "base.tcm", "extended.tcm"
 
 

@@ -16,6 +16,7 @@ from .world import Model
 
 NEARLY = 0.9  # of the largest amplitude that is believed: fits end a little beyond what slopes ask for
 RIPPLED = 0.01  # m, that a right model may leave of positions: more says nothing of what is lacking
+SLOWER = 1.05  # times as long as asked, that is worth a word
 HEAVY = 10.0  # weights of the cloth, that hardly anything pushes with
 UNLIKELY = (
     " Hardly anything pushes so much: what is left there is rather of the grip, of what is seen, or of a fold that "
@@ -108,10 +109,12 @@ def _by_arms(experiment: dict[str, Any]) -> str:
     arms = experiment["arms"]
     if arms is None:
         return ""
-    slower = f" The arms need {arms['slower']:.2g} times as long as is asked of them ({arms['limit']})."
+    if "unasked" in arms:
+        return f" The arms were not asked: {arms['unasked']}."
+    slower = f" The arms cannot do it faster: it takes {arms['slower']:.2g} times as long as asked ({arms['limit']})."
     many = len(arms["refused"])
     refused = f" {many} other{'s are' if many > 1 else ' is'} beyond them."
-    return (slower if arms["slower"] > 1 else " The arms can do it.") + (refused if many else "")
+    return (slower if arms["slower"] > SLOWER else " The arms can do it.") + (refused if many else "")
 
 
 def _massless(content: dict[str, Any]) -> bool:

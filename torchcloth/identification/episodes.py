@@ -312,6 +312,9 @@ def _frame_times(
         begin = max((float(motion[key].t[0]) for key in needed), default=0.0)
         if not len(felt) and needed and rate is not None:
             span = min(float(motion[key].t[-1]) for key in needed) - begin
+            if span < 1 / rate:
+                got, expected = f"{max(span, 0):g} s of all grippers together", f"at least {1 / rate:g} s"
+                raise RecordingError(f"{name}: motion", got=got, expected=expected, remedy="record all of it")
             return begin + np.arange(int(span * rate + 1e-6) + 1) / rate, 0
         if not len(felt):
             recording.require("points", by="a fit")

@@ -98,8 +98,10 @@ def together(options: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
     names = [folder.resolve().name for folder in options.kept]
     if len(set(names)) < len(names):
         raise InvalidInput("--kept", got=f"rounds named {', '.join(names)}", expected="folders of different names")
-    if options.fast or options.cases is not None:
-        raise InvalidInput("--kept", got="with --fast or --cases", expected="alone: no case is drawn")
+    if options.fast or options.cases is not None or options.jobs != 1:
+        raise InvalidInput("--kept", got="with --fast, --cases or --jobs", expected="alone: no case is drawn")
+    if (options.out / "study.json").exists():
+        raise InvalidInput("--out", got=f"{options.out}, which holds a round", expected="a folder for the tables")
     return {name: finished(folder) for name, folder in zip(names, options.kept, strict=True)}
 
 
@@ -110,7 +112,7 @@ def finished(folder: Path) -> list[dict[str, Any]]:
         raise InvalidInput("--kept", got=f"{folder}, without cases/*.json", expected="folders of hidden rounds")
     try:
         return [scored(path.stem, json.loads(path.read_text())) for path in paths]
-    except (ValueError, LookupError, TypeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise InvalidInput("--kept", got=f"{folder}: {error!r}", expected="cases as `hidden` keeps them") from None
 
 

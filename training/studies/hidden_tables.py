@@ -38,10 +38,11 @@ def markdown(cases: Sequence[Mapping[str, Any]]) -> str:
 
 
 def beside(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """Markdown with a column for each round and one for all their cases together."""
+    """Markdown with a column for each round, with its number of cases, and one for all their cases together."""
     columns = [_figures(cases) for cases in (*rounds.values(), [c for cases in rounds.values() for c in cases])]
     rows = [(label, *(c[label][0] for c in columns), columns[-1][label][1]) for label in columns[-1]]
-    return _lines(("figure", *rounds, "together", "95 %"), rows)
+    counts = [f"{name} ({len(cases)})" for name, cases in rounds.items()]
+    return _lines(("figure", *counts, "together", "95 %"), rows)
 
 
 def _figures(cases: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str, str]]:

@@ -11,53 +11,68 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import TorchclothError
-from ..recordings import GripperMotion, Recording, write
+from ..recordings import GripperMotion, Recording, read, write
 from ..robots import Plan, gripper_motion, retrace  # pyright: ignore[reportMissingImports] - mapped from robots/
+from ..robots.retrace import scene_of  # pyright: ignore[reportMissingImports]
 from .experiments import Experiment, blank_frames, planned, possible
 from .pieces import side_by_side
 from .setting import Progress
 
 FOLDER = "next_experiment"  # beside diagnosis.json
 FILES = frozenset(("episode.json", "motion.npz", "cloth.obj", "cloth_initial.npy"))  # in it while nothing is recorded
+PROPOSED = "synthetic: an experiment that torchcloth diagnose proposes"
 
 
 @dataclass(frozen=True, eq=False)
-class Doable:
+class Choice:
     """An experiment as fast as it can be done.
 
     Attributes:
         experiment: at a speed that the arms can do.
         episode: it, with what is not known yet left blank.
-        plan: of the arms; None where the episodes do not name them.
+        plan: of the arms; None where no arm was asked.
         why_not: what is in the arms' way; None: nothing.
+        unasked: why arms that are named could not be asked; None: they were, or none are.
     """
 
     experiment: Experiment
     episode: Recording
     plan: Plan | None = None
     why_not: str | None = None
+    unasked: str | None = None
 
 
-def doable(recordings: Sequence[Recording], progress: Progress) -> list[Doable]:
+def feasible(recordings: Sequence[Recording], progress: Progress) -> list[Choice]:
     """All experiments that may be asked for, with what the arms can do about them."""
 
-    def ask(choice: tuple[Experiment, Recording]) -> Doable:
+    def ask(choice: tuple[Experiment, Recording]) -> Choice:
         experiment, template = choice
         episode = planned(experiment, template)
-        if template.robots:
-            progress(f"{experiment}: whether the arms can do it")
         try:
-            done = retrace(episode)
+            scene = scene_of(episode)
         except TorchclothError as error:
-            return Doable(experiment, episode, why_not=str(error))
-        if done is None:
-            return Doable(experiment, episode)
-        scene, plan = done
+            return Choice(experiment, episode, unasked=str(error))
+        if scene is None:
+            return Choice(experiment, episode)
+        if bare := [name for name in scene.arms if scene[name].unshaped]:
+            return Choice(experiment, episode, unasked=f"solids of {bare[0]!r} are meshes, which cannot be kept apart")
+        progress(f"{experiment}: whether the arms can do it")
+        try:
+            plan = retrace(episode, scene)
+        except TorchclothError as error:
+            progress(f"{experiment}: the arms cannot do it: {error}")
+            return Choice(experiment, episode, why_not=str(error))
+        slower = replace(experiment, speed=experiment.speed / plan.slower)
         paths = {name: gripper_motion(path) for name, path in plan.motion(scene).items()}
         grippers = {name: _blank(path, episode.grippers[name]) for name, path in paths.items()}
-        points = blank_frames(episode, float(plan.t[-1]))
-        slower = replace(experiment, speed=float(f"{experiment.speed / plan.slower:.2g}"))
-        return Doable(slower, replace(episode, grippers=grippers, joints=plan.joints(), points=points), plan)
+        done = replace(
+            episode,
+            grippers=grippers,
+            joints=plan.joints(),
+            points=blank_frames(episode, float(plan.t[-1])),
+            split={"motion": str(slower)},
+        )
+        return Choice(slower, done, plan)
 
     return side_by_side(ask, possible(recordings))
 
@@ -77,20 +92,28 @@ def write_episode(episode: Recording | None, folder: Path) -> str | None:
         A warning, or None; a proposal that cannot be written is no reason to lose a diagnosis.
     """
     target = folder / FOLDER
-    if os.path.lexists(target) and not _is_proposal(target):
-        return f"{target} is no proposal, or holds more than one, and was left as it is"
     try:
+        if os.path.lexists(target) and not _is_proposal(target):
+            return f"{target} is no proposal, or holds more than one, and was left as it is"
         if episode is not None:
             write(unseen(episode), target, overwrite=True)
         elif target.exists():
             shutil.rmtree(target)
-    except TorchclothError as error:
+    except (TorchclothError, OSError) as error:
         return f"the proposed experiment was not written: {error}"
     return None
 
 
 def _is_proposal(target: Path) -> bool:
-    return target.is_dir() and not target.is_symlink() and {path.name for path in target.iterdir()} <= FILES
+    """Written here, and nothing recorded into it since."""
+    if target.is_symlink() or not target.is_dir() or not {path.name for path in target.iterdir()} <= FILES:
+        return False
+    try:
+        found = read(target)
+    except TorchclothError:
+        return False
+    felt = [g.force is not None or g.torque is not None for g in (*found.grippers.values(), *found.joints.values())]
+    return found.provenance == PROPOSED and not any(felt)
 
 
 def unseen(episode: Recording) -> Recording:
@@ -101,5 +124,5 @@ def unseen(episode: Recording) -> Recording:
         cameras={name: replace(c, depth=None, color=None, mask=None) for name, c in episode.cameras.items()},
         points=None,
         truth=None,
-        provenance="synthetic: an experiment that torchcloth diagnose proposes",
+        provenance=PROPOSED,
     )
