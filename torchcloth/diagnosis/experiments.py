@@ -164,11 +164,16 @@ def blank_frames(recording: Recording, end: float) -> PointClouds:
 def _gripper(t: np.ndarray, path: np.ndarray, rotation: np.ndarray, template: Recording, name: str) -> GripperMotion:
     """With empty readings where the template has some."""
     measured = template.grippers.get(name) or template.joints.get(name)
-    zero = {key: np.zeros((len(t), 3)) for key in ("force", "torque") if getattr(measured, key, None) is not None}
     pose = np.tile(np.eye(4), (len(t), 1, 1))
     pose[:, :3, :3], pose[:, :3, 3] = rotation, path
     closed = torch.ones(len(t), dtype=torch.bool)
-    return replace(gripper_motion(Trajectory(torch.as_tensor(t), torch.as_tensor(pose), closed)), **zero)
+    return blank_readings(gripper_motion(Trajectory(torch.as_tensor(t), torch.as_tensor(pose), closed)), measured)
+
+
+def blank_readings(path: GripperMotion, like: object) -> GripperMotion:
+    """With zero force and torque where the other has measured some."""
+    zero = np.zeros((len(path.t), 3))
+    return replace(path, **{key: zero for key in ("force", "torque") if getattr(like, key, None) is not None})
 
 
 def _first(template: Recording) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -8,13 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from ..errors import TorchclothError
-from ..recordings import GripperMotion, Recording, read, write
+from ..recordings import Recording, read, write
 from ..robots import Plan, gripper_motion, retrace  # pyright: ignore[reportMissingImports] - mapped from robots/
 from ..robots.retrace import scene_of  # pyright: ignore[reportMissingImports]
-from .experiments import Experiment, blank_frames, planned, possible
+from .experiments import Experiment, blank_frames, blank_readings, planned, possible
 from .pieces import side_by_side
 from .setting import Progress
 
@@ -64,7 +62,7 @@ def feasible(recordings: Sequence[Recording], progress: Progress) -> list[Choice
             return Choice(experiment, episode, why_not=str(error))
         slower = replace(experiment, speed=experiment.speed / plan.slower)
         paths = {name: gripper_motion(path) for name, path in plan.motion(scene).items()}
-        grippers = {name: _blank(path, episode.grippers[name]) for name, path in paths.items()}
+        grippers = {name: blank_readings(path, episode.grippers[name]) for name, path in paths.items()}
         done = replace(
             episode,
             grippers=grippers,
@@ -75,12 +73,6 @@ def feasible(recordings: Sequence[Recording], progress: Progress) -> list[Choice
         return Choice(slower, done, plan)
 
     return side_by_side(ask, possible(recordings))
-
-
-def _blank(path: GripperMotion, like: GripperMotion) -> GripperMotion:
-    """With empty readings where the other has some."""
-    none = np.zeros((len(path.t), 3))
-    return replace(path, **{key: none for key in ("force", "torque") if getattr(like, key) is not None})
 
 
 def write_episode(episode: Recording | None, folder: Path) -> str | None:
