@@ -123,7 +123,8 @@ def test_rivals_that_no_motion_would_tell_apart_are_warned_of(with_drag, monkeyp
 
 def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
     recordings, answer = with_drag
-    content = json.loads(write_diagnosis(answer, recordings, tmp_path).read_text())
+    write_diagnosis(answer, recordings, tmp_path)
+    content = json.loads((tmp_path / "diagnosis.json").read_text())
     assert {"verdict", "causes", "ruled_out", "unresolvable", "gain", "next_experiment", "model", "warnings"} <= set(
         content
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -66,17 +65,16 @@ def _diagnose(options: argparse.Namespace) -> int:
                 episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume or None
             )
     replaced = (options.out / RESULT).exists()
-    path = diagnosis.write_diagnosis(answer, episodes, options.out)
+    written = diagnosis.write_diagnosis(answer, episodes, options.out)
     if answer.searched is not None:  # a stopped diagnosis goes on once the episodes can be read
         clear(options.out / PROGRESS)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())
-    said = json.loads(path.read_text())["warnings"]
-    amiss = [text for text in said if text not in answer.content["warnings"]]
+    amiss = [text for text in written.content["warnings"] if text not in answer.content["warnings"]]
     print("".join(f"Warning: {text}.\n" for text in amiss), end="")
     proposed = FOLDER if answer.experiment is not None and not amiss else None
-    written = (path.name, "report.html", answer.content.get("base"), answer.content["model"], proposed)
-    print("\n".join(str(path.parent / name) for name in written if name))
+    files = (RESULT, "report.html", answer.content.get("base"), answer.content["model"], proposed)
+    print("\n".join(str(options.out / name) for name in files if name))
     if replaced:
         print("the last diagnosis there is replaced")
     return 0

@@ -154,10 +154,11 @@ def _judged(found: Found, threads: int, progress: Progress) -> Diagnosis:
     return judge(found, found.setting.names, missing, residual)
 
 
-def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Path:
-    """Write diagnosis.json, report.html and, unless data are invalid, the models; returns the first's path.
+def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Diagnosis:
+    """Write diagnosis.json, report.html and, unless data are invalid, the models; returns the answer as written.
 
-    An experiment that is proposed becomes an episode beside them, ``next_experiment``, of which nothing is seen yet.
+    An experiment that is proposed becomes an episode beside them, ``next_experiment``, of which nothing is seen yet; a
+    warning says where it could not.
     ``recordings`` are the episodes, which say what the base model is of.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -172,6 +173,6 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
         save_model(folder / EXTENDED, end.model, scene, end.covariance, residual, said)
     if warning := write_episode(answer.experiment, folder):
         answer = replace(answer, content=answer.content | {"warnings": [*answer.content["warnings"], warning]})
-    path = write_text(folder / RESULT, as_json(answer.content))
+    write_text(folder / RESULT, as_json(answer.content))
     write_report(answer, folder)
-    return path
+    return answer
