@@ -54,7 +54,7 @@ def test_power_is_that_of_the_normal_distribution(strength):
 
 
 def test_single_stretches_are_surely_no_gain():
-    """Of episodes of less than 0.8 s nothing is known of how their stretches scatter."""
+    """Of episodes of 0.4 s or less nothing is known of how their stretches scatter."""
     found = asked([0.3, 0.0, 0.0, 0.0, 0.0])
     short = [p._replace(window=0 * p.window) for p in (as_it_is(found), predict(found, list("abcd")))]
     assert compare(*short, 0.0).density > 0
