@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
-import shutil
 import subprocess
 import tempfile
 import time
@@ -13,6 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+
+from torchcloth.engine.building import Unbuilt, compiler
 
 from .cases import Case
 
@@ -114,15 +115,16 @@ def _by_matmul() -> float:
 
 def _by_compiler(threads: int) -> float | None:
     """None without a compiler that works."""
-    compiler = shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++")
-    if compiler is None:
+    try:
+        command = compiler()
+    except Unbuilt:
         return None
     with tempfile.TemporaryDirectory() as folder:
         source, library = Path(folder) / "fma.cpp", Path(folder) / "fma.so"
         source.write_text(FMA)
         flags = ["-O3", "-march=native", "-ffast-math", "-mprefer-vector-width=512", "-shared", "-fPIC", "-pthread"]
         for chosen in (flags, [f for f in flags if not f.startswith("-mprefer")]):
-            built = subprocess.run([compiler, *chosen, str(source), "-o", str(library)], capture_output=True)
+            built = subprocess.run([*command, *chosen, str(source), "-o", str(library)], capture_output=True)
             if not built.returncode:
                 break
         else:

@@ -76,6 +76,47 @@ def test_a_misspelt_key_is_not_ignored(episode, path, wrong):
     refused(episode, f"{wrong} is unknown; got '{wrong}'; expected '{path[-1]}'|{path[-1]} is missing")
 
 
+MISSPELT = [
+    ("grasps.left", "radius", "radios"),
+    ("robots.right", "tool_frame", "tool_frme"),
+    ("cameras.cam0", "distortion", "distorsion"),
+    ("colliders.table", "friction", "fricton"),
+    ("colliders.table.plane", "normal", "normals"),
+    ("observation_noise", "std", "stdd"),
+    ("air", "density", "densty"),
+    ("split", "replicate_of", "replica_of"),
+]
+
+
+@pytest.mark.parametrize(("place", "right", "wrong"), MISSPELT)
+def test_a_misspelt_key_is_not_ignored_wherever_it_stands(episode, place, right, wrong):
+    content = json.loads((episode / "episode.json").read_text())
+    keys, node = place.split("."), content
+    for key in keys:
+        node = node.setdefault(key, {})
+    node.pop(right, None)
+    node[wrong] = 1.0
+    (episode / "episode.json").write_text(json.dumps(content))
+    refused(episode, rf"{place}.{wrong} is unknown; got '{wrong}'; expected '{right}'|{place}.{right} is missing")
+
+
+@pytest.mark.parametrize(
+    ("file", "right", "wrong"),
+    [
+        ("motion.npz", "left/force", "left/forces"),
+        ("motion.npz", "spare/width", "spare/widht"),
+        ("markers.npz", "uv", "u_v"),
+    ],
+)
+def test_a_misspelt_array_is_not_ignored(episode, file, right, wrong):
+    with np.load(episode / file) as stored:
+        there = right in stored
+    if there:
+        edit_npz(episode, file, right, DROP)
+    edit_npz(episode, file, wrong, np.zeros(3))
+    refused(episode, rf"{wrong} is unknown; got '{wrong.split('/')[-1]}'; expected '{right.split('/')[-1]}'; rename it")
+
+
 def test_a_key_of_ones_own_beside_one_like_it_is_kept(episode):
     edit_json(episode, ["grasp"], {"by": "Ada"})
     assert rec.read(episode).extra["grasp"] == {"by": "Ada"}
@@ -108,6 +149,11 @@ JSON = [
     (("cloth", "mesh"), "x" * 5000, "is missing"),
     (("cloth", "mesh"), None, r"cloth_initial.npy belongs to no mesh; got \[12, 3\]; expected \[M, N, 3\]"),
     (("cloth", "nominal"), {"youngs_modulos": 1e6}, r"nominal.youngs_modulos is unknown; expected .*youngs_modulus, "),
+    (
+        ("cloth", "nominal"),
+        {"membrane_stiffness": 300, "youngs_modulus": 1e7},
+        "nominal.membrane_stiffness is not youngs_modulus times thickness; got 300 N/m; expected .* N/m",
+    ),
     (("cloth", "nominal", "membrane_stiffness"), "soft", "membrane_stiffness is not a finite number; got 'soft'"),
     (("cloth", "nominal", "membrane_stiffness"), True, "membrane_stiffness is not a finite number; got True"),
     (("cloth", "nominal", "membrane_stiffness"), -50, "membrane_stiffness is too small; got -50; expected more than 0"),
@@ -164,6 +210,7 @@ JSON = [
         {"sphere": 1},
         r"colliders.table is of an unknown shape; got \['sphere'\]; expected plane",
     ),
+    (("colliders", "table", "box"), {"size": 1}, r"of an unknown shape; got \['plane', .*'box'.*\]; expected plane"),
     (("colliders", "table", "plane", "normal"), [0, 0, 2], "colliders.table.plane.normal is not unit; got length 2"),
     (("colliders", "table", "friction"), -0.1, "colliders.table.friction is too small"),
     (("observation_noise", "std"), 2.0, "observation_noise.std looks like millimetres"),

@@ -226,6 +226,7 @@ def test_a_network_loads_back(config, tmp_path):
     assert cloth.material.youngs_modulus.value.shape == (32,)
     assert cloth.stable_step() > 0
     assert (tmp_path / "out" / "fields.npz").is_file()
+    assert json.loads((tmp_path / "out" / "fit.json").read_text())["identify"] is None  # no number to start from
 
 
 def test_validation_is_held_out(config, episodes, tmp_path):

@@ -21,6 +21,7 @@ from ..materials import AEP, AbstractMaterial
 from ..meshes import Mesh, rectangle
 from ..meshes.patches import Patch
 from ..recordings import Camera, Recording
+from ..recordings.scene import THICKNESS
 from ..robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..transfer import Contact
 from ..types import Trajectory
@@ -427,7 +428,7 @@ def effects_of(recording: Recording) -> dict[str, AbstractEffect]:
 
 def material_of(recording: Recording) -> AEP:
     """At the episode's nominal values, or at a start in the middle of published fabrics."""
-    nominal, h = recording.cloth.nominal, recording.cloth.thickness or 1e-3
+    nominal, h = recording.cloth.nominal, recording.cloth.thickness or THICKNESS
     stiffness = _number(nominal, "membrane_stiffness", DEFAULT_STIFFNESS)
     youngs = _number(nominal, "youngs_modulus", stiffness / h)
     return AEP(youngs, _number(nominal, "poisson_ratio", DEFAULT_POISSON), thickness=h)

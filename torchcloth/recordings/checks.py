@@ -256,4 +256,5 @@ class Fields:
                 raise RecordingError(
                     f"{self.at(key)} is unknown", got=repr(key), expected=repr(meant[0]), remedy="rename it"
                 )
-        return {**self.rest, **{key: group.rest for key, group in groups.items() if group.rest}}
+        inside = {key: group.left() for key, group in groups.items()}
+        return {**self.rest, **{key: rest for key, rest in inside.items() if rest}}

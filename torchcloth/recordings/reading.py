@@ -159,7 +159,7 @@ def _provenance(root: Fields) -> str:
 def _split(root: Fields) -> dict:
     split = root.inside("split")
     known = {key: split.maybe(split.text, key) for key in ("motion", "replicate_of")}
-    return {**{key: value for key, value in known.items() if value is not None}, **split.rest}
+    return {**{key: value for key, value in known.items() if value is not None}, **split.left()}
 
 
 def _check_cloth(recording: Recording, told: str) -> None:

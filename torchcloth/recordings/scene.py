@@ -16,7 +16,7 @@ from .files import Folder
 from .images import ImageStream, Kind
 from .types import Camera, ClothInfo, Collider, GraspInfo, RobotInfo
 
-THICKEST = 0.05  # m
+THICKEST, THICKNESS = 0.05, 1e-3  # m; the second where nothing is said
 WIDEST_GRASP = 1.0  # m
 NOMINAL: dict[str, dict[str, Any]] = {  # bounds; far above every fabric, where a number is in another unit
     "membrane_stiffness": {"above": 0, "most": 1e9, "suspect": "another unit"},
@@ -25,6 +25,7 @@ NOMINAL: dict[str, dict[str, Any]] = {  # bounds; far above every fabric, where 
     "bending_stiffness": {"least": 0, "most": 1.0, "suspect": "micronewton metres"},
     "bending_damping_time": {"least": 0, "most": 100.0, "suspect": "milliseconds"},
 }
+SHAPES = {"box", "capsule", "cylinder", "mesh", "sphere"}  # of colliders that are not built
 NOTE = "units"  # of the data sheet, for people
 DISTORTIONS = (0, 4, 5, 8, 12, 14)  # coefficients in OpenCV's order: a calibration has no other number of them
 
@@ -51,12 +52,14 @@ def cloth(fields: Fields, folder: Folder) -> ClothInfo:
 
 def fabric(fields: Fields) -> dict[str, Any]:
     """What is known of a cloth beside its shape, as `ClothInfo` names it."""
-    return {
+    found = {
         "areal_density": fields.number("areal_density", above=0, most=HEAVIEST, suspect="grams per square metre"),
         "areal_density_std": fields.maybe(fields.number, "areal_density_std", least=0, most=HEAVIEST, suspect="g/m^2"),
         "thickness": fields.maybe(fields.number, "thickness", above=0, most=THICKEST, suspect="millimetres"),
         "nominal": _nominal(fields.inside("nominal")),
     }
+    _check_stiffness(found["nominal"], found["thickness"] or THICKNESS, fields.at("nominal"))
+    return found
 
 
 def grasp(fields: Fields) -> GraspInfo:
@@ -66,21 +69,21 @@ def grasp(fields: Fields) -> GraspInfo:
             raise RecordingError(f"{fields.place} holds twice", got="uv and vertices", expected="one of them")
         return GraspInfo(vertices=fields.array("vertices", "N", kind="int"), extra=fields.left())
     radius = fields.number("radius", above=0, most=WIDEST_GRASP, suspect="millimetres")
-    return GraspInfo(fields.array("uv", "G", 2), radius, fields.rest)
+    return GraspInfo(fields.array("uv", "G", 2), radius, fields.left())
 
 
 def robot(fields: Fields) -> RobotInfo:
     """Read one robot."""
-    return RobotInfo(
-        fields.text("model"), _transform(fields, "T_world_base"), fields.maybe(fields.text, "tool_frame"), fields.rest
-    )
+    model, base = fields.text("model"), _transform(fields, "T_world_base")
+    return RobotInfo(model, base, fields.maybe(fields.text, "tool_frame"), fields.left())
 
 
 def collider(fields: Fields) -> Collider:
     """Read one collider; a shape that this version does not know is refused, for it would change the motion."""
     plane = fields.inside("plane")
-    if not plane.rest:
-        raise RecordingError(f"{fields.place} is of an unknown shape", got=sorted(fields.rest), expected="plane")
+    if not plane.rest or SHAPES & fields.rest.keys():
+        got = [*(["plane"] if plane.rest else []), *sorted(fields.rest)]
+        raise RecordingError(f"{fields.place} is of an unknown shape", got=got, expected="plane")
     point, normal = plane.array("point", 3), checks.unit(plane.array("normal", 3), plane.at("normal"))
     return Collider(point, normal, fields.maybe(fields.number, "friction", least=0), fields.left(plane=plane))
 
@@ -107,7 +110,7 @@ def camera(fields: Fields, images_of: Callable[[tuple[int, int]], dict[Kind, Ima
         distortion=_distortion(fields),
         depth_scale=fields.maybe(fields.number, "depth_scale", above=0, most=0.1, suspect="units per metre"),
         **streams,
-        extra=fields.rest,
+        extra=fields.left(),
     )
 
 
@@ -175,6 +178,19 @@ def _nominal(fields: Fields) -> dict[str, Any]:
                 fields.number(key, **NOMINAL[key])
             found[key] = value  # as it is written, so that it is written so again
     return found
+
+
+def _check_stiffness(nominal: dict[str, Any], thickness: float, place: str) -> None:
+    """Of a membrane that is told twice both must agree: one of them would be ignored."""
+    if {"membrane_stiffness", "youngs_modulus"} <= nominal.keys():
+        told, follows = nominal["membrane_stiffness"], nominal["youngs_modulus"] * thickness
+        if not np.isclose(told, follows, rtol=0.01):
+            raise RecordingError(
+                f"{place}.membrane_stiffness is not youngs_modulus times thickness",
+                got=f"{told:g} N/m",
+                expected=f"{follows:g} N/m",
+                remedy="correct one of them, or leave it out",
+            )
 
 
 def _transform(fields: Fields, key: str) -> np.ndarray:

@@ -33,9 +33,9 @@ def motions(
         arm = _arm(fields, len(shared["t"])) if "q" in group else {}
         pose = _pose(fields, shared) if {"position", "quat_wxyz"} & group.keys() else {}
         if arm:
-            joints[name] = JointMotion(**shared, **arm, extra=fields.rest)
+            joints[name] = JointMotion(**shared, **arm, extra=fields.left())
         if pose:
-            grippers[name] = GripperMotion(**shared, **pose, extra=fields.rest)
+            grippers[name] = GripperMotion(**shared, **pose, extra=fields.left())
     return grippers, joints
 
 
@@ -71,7 +71,7 @@ def points(arrays: dict[str, np.ndarray], file: str) -> PointClouds:
         got = f"counts for {sum(counts.tolist())} points, {len(xyz)} in xyz"
         raise RecordingError(f"{fields.at('counts')} does not match xyz", got=got, expected="sum(counts) == len(xyz)")
     checks.metres(xyz, fields.at("xyz"))
-    return PointClouds(t, xyz, counts, fields.rest)
+    return PointClouds(t, xyz, counts, fields.left())
 
 
 def markers(folder: Folder) -> Markers:
@@ -90,7 +90,7 @@ def markers(folder: Folder) -> Markers:
         )
     checks.metres(xyz, fields.at("xyz"))
     uv = fields.maybe(fields.array, "uv", xyz.shape[1], 2)
-    return Markers(t, xyz, uv, fields.rest)
+    return Markers(t, xyz, uv, fields.left())
 
 
 def truth(folder: Folder) -> Truth:
@@ -104,7 +104,7 @@ def truth(folder: Folder) -> Truth:
         raise RecordingError(
             f"{fields.at('faces')} does not fit vertices", expected=f"indices below {vertices.shape[1]}"
         )
-    return Truth(t, vertices, faces, fields.rest)
+    return Truth(t, vertices, faces, fields.left())
 
 
 def groups(folder: Folder) -> dict[str, dict[str, np.ndarray]]:

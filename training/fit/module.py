@@ -58,7 +58,7 @@ class FitModule(pl.LightningModule):
     # -- simulation -----------------------------------------------------------------------------------------------
 
     def forward(self, episode: Episode) -> Scene:
-        """An episode as it is simulated now, beside what was measured; memory as of one frame interval."""
+        """An episode as it is simulated now, beside what was measured."""
         if self.sheet is None:
             raise InvalidInput("forward", got="a module without data", expected="a module in a run, or use cloth()")
         entries = {f"cloth.{key}": value for key, value in self.learned.entries().items()}
@@ -161,7 +161,7 @@ class FitModule(pl.LightningModule):
     def transfer_batch_to_device(
         self, batch: list[Episode], device: torch.device, dataloader_idx: int
     ) -> list[Episode]:
-        """Episodes stay on the CPU, where the engine is."""
+        """Episodes stay on the CPU, where fits run."""
         return batch
 
     # -- checkpoints ----------------------------------------------------------------------------------------------

@@ -61,12 +61,13 @@ def save(
     return content
 
 
-def _command(config: Config, episodes: list[str], values: dict[str, float]) -> str:
-    """How to go on from here to error bars."""
+def _command(config: Config, episodes: list[str], values: dict[str, float]) -> str | None:
+    """How to go on from here to error bars; None: there are no numbers to go on with."""
+    if not values:
+        return None
     starts = {**config.model.start, **values}
-    words = ["torchcloth", "identify", *episodes, "--out", f"{config.out}/identify"]
-    words += ["--start", *(f"{name}={value:.6g}" for name, value in starts.items())] if starts else []
-    words += ["--fit", *values] if values else []
+    words = ["torchcloth", "identify", *episodes, "--out", str(config.folder / "identify")]
+    words += ["--start", *(f"{name}={value:.6g}" for name, value in starts.items()), "--fit", *values]
     words += ["--contact", f"{config.model.contact:g}"] if config.model.contact else []
     return shlex.join(words)
 
@@ -93,5 +94,6 @@ def show(content: dict[str, Any], folder: Path) -> None:
             console.print(f"{kind}: {1e3 * after:.2f} mm from the points to the surface{start}")
     for warning in content["warnings"]:
         console.print(f"warning: {warning}", style="yellow", soft_wrap=True)
-    console.print(REMARK, f"\n  {content['identify']}", style="dim", soft_wrap=True)
+    command = content["identify"]
+    console.print(REMARK, "" if command is None else f"\n  {command}", style="dim", soft_wrap=True)
     console.print(f"result:   {folder / 'fit.json'}", soft_wrap=True)

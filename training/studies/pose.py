@@ -141,7 +141,10 @@ def _model(recording: Recording, name: str) -> tuple[tc.Cloth, Uncertain]:
 
 
 def _identified(start: tc.Cloth, recording: Recording) -> tuple[tc.Cloth, Uncertain]:
-    """The fit's values and errors, a factor of 2 where it calls them not identifiable: its search ended there."""
+    """The fit's values and errors, a factor of 2 where it calls them not identifiable: its search ended there.
+
+    Drag that ended at nothing stays there.
+    """
     fit = tc.identify(start, recording, ["youngs_modulus", "air.normal"])
     stiff, drag = fit.parameters["youngs_modulus"], fit.parameters["air.normal"]
     uncertain = {
@@ -149,7 +152,7 @@ def _identified(start: tc.Cloth, recording: Recording) -> tuple[tc.Cloth, Uncert
         "air.normal": (drag.value, min(drag.std, 0.5 * drag.value)),
     }
     nominal = float(_stiffness(_cloth(recording)).value.detach())
-    return _cloth(recording, stiff.value / nominal, drag.value), uncertain
+    return _cloth(recording, stiff.value / nominal, drag.value), {k: v for k, v in uncertain.items() if v[1] > 0}
 
 
 def _geometry(scene: Scene) -> dict[str, Any]:
