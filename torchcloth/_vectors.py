@@ -30,10 +30,22 @@ def place(what: str, given: Sequence[float]) -> Tensor:
     Raises:
         InvalidInput: not three finite numbers.
     """
+    return numbers(what, given, 3, "three finite numbers")
+
+
+def numbers(what: str, given: Sequence[float], count: int, expected: str) -> Tensor:
+    """[count] finite numbers, which ``expected`` describes.
+
+    Raises:
+        InvalidInput: something else.
+    """
     check_value(what, given)
-    vector = torch.as_tensor(given, dtype=torch.get_default_dtype())
-    if vector.shape != (3,) or not bool(torch.isfinite(vector).all()):
-        raise InvalidInput(what, got=given, expected="three finite numbers")
+    try:
+        vector = torch.as_tensor(given, dtype=torch.get_default_dtype())
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InvalidInput(what, got=f"{given!r:.40}", expected=expected) from error
+    if vector.shape != (count,) or not bool(torch.isfinite(vector).all()):
+        raise InvalidInput(what, got=given, expected=expected)
     return vector
 
 

@@ -38,9 +38,11 @@ def step(
     press = pressure(model, grid, layers, state, s, dt)
     columns = add_columns(layers, membrane_stress(model, s, memory), press)
     nothing = (torch.zeros_like(columns[0]), torch.zeros_like(columns[1]))
-    # Weight, air: triangles get their share of it as well.
-    outer = vertex_forces(model, state, s, memory, nothing, lost)
-    force = vertex_forces(model, state, s, memory, columns, lost) - outer
+    # Weight, air: triangles get their share of it as well. Of air that moves along, nothing.
+    light = {name: (effect, c) for name, (effect, c) in model.effects.items() if effect.inertia(c, s) is None}
+    airless = model._replace(effects=light)
+    outer = vertex_forces(airless, state, s, memory, nothing, lost)
+    force = vertex_forces(airless, state, s, memory, columns, lost) - outer
     v = state.v + dt * outer / model.mass
 
     batch, vertices = state.x.shape[:-2], state.x.shape[-2]

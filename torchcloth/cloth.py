@@ -227,7 +227,8 @@ class Cloth(nn.Module):
         if speed > STILL:
             text = f"settle: after {duration:g} s the cloth still moves at {speed:.2g} m/s (rms), and is stopped there"
             warnings.warn(text, stacklevel=3)
-        memory = {name: torch.zeros_like(own) if name == "apic" else own for name, own in settled.memory.items()}
+        moves = ("apic", "contact")  # velocities, which rest has none of
+        memory = {name: torch.zeros_like(own) if name in moves else own for name, own in settled.memory.items()}
         return settled._replace(v=torch.zeros_like(settled.v), memory=memory)
 
     def sensitivities(

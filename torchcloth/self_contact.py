@@ -43,7 +43,8 @@ class Pressure(NamedTuple):
 
 @torch.no_grad()
 def near_layers(model: Model, grid: Grid, x: Tensor, before: Layers | None = None) -> Layers:
-    """Triangles whose points may meet those of another layer before a vertex has moved by half the grid's skin.
+    """Triangles whose points may meet those of another layer before a vertex has moved by half the grid's skin
+    along any axis.
 
     Another layer is what is near in space but far along the cloth.
     """

@@ -238,8 +238,9 @@ def check_positions(x: Tensor, v: Tensor, vertices: int) -> None:
         raise InvalidInput("x", got=f"shape {tuple(x.shape)}", expected=f"[..., {vertices}, 3] in metres")
     if v.shape != x.shape:
         raise InvalidInput("v", got=f"shape {tuple(v.shape)}", expected=f"x's, {tuple(x.shape)}")
-    if not bool(torch.isfinite(x.detach()).all()):
-        raise InvalidInput("x", got="NaN or infinite entries", expected="finite positions in metres")
+    for name, field, kind in (("x", x, "positions in metres"), ("v", v, "velocities in m/s")):
+        if not bool(torch.isfinite(field.detach()).all()):
+            raise InvalidInput(name, got="NaN or infinite entries", expected=f"finite {kind}")
 
 
 def check_state(state: ClothState, like: ClothState, finite: bool = True) -> None:

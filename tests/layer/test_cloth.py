@@ -53,6 +53,10 @@ def held():
         ({"hand": trajectory()._replace(pose=torch.eye(4))}, r"pose \[\.\.\., K, 4, 4\]"),
         ({"hand": trajectory()._replace(closed=torch.tensor(True))}, r"closed \[K\]"),
         ({"hand": trajectory(pose=torch.full((2, 4, 4), math.nan))}, "NaN"),
+        (
+            {"hand": trajectory(pose=(torch.eye(4) + torch.eye(4)[3, :, None] * 0.1).repeat(2, 1, 1))},
+            "a last row that is not 0 0 0 1; .*transpose",
+        ),
         ({"hand": turning(1.0, math.radians(95), 2)}, "over 90 degrees between knots; .*more knots"),
         ([trajectory()], "motion; got list; expected a dict"),
         ({"hand": torch.eye(4)}, r"motion\['hand'\]; got Tensor; expected a Trajectory"),

@@ -102,6 +102,26 @@ def test_published_poisson_ratio_becomes_the_symmetric_one():
     assert back == pytest.approx(0.2)
 
 
+def test_published_poisson_ratio_stays_the_wefts_contraction_with_moduli_of_ones_own():
+    fabric = presets.find("cotton")
+    given = fabric.orthotropic(shear_modulus=1e5, weft_modulus=fabric.membrane_warp / 1e-3 / 4)
+    assert given["poisson_ratio"] * (given["youngs_modulus"] / given["weft_modulus"]) ** 0.5 == pytest.approx(0.15)
+    assert fabric.orthotropic(shear_modulus=1e5, poisson_ratio=0.3)["poisson_ratio"] == 0.3
+    with pytest.raises(InvalidInput, match=r"published poisson_ratio of 0.15, which is 0.6 with these moduli"):
+        fabric.orthotropic(shear_modulus=1e5, weft_modulus=16 * fabric.membrane_warp / 1e-3)
+
+
+@pytest.mark.parametrize("law", [AEP, OrthotropicAEP])
+def test_no_thickness_is_refused(law):
+    with pytest.raises(InvalidInput, match="thickness; got 0.* m; expected a value > 0"):
+        law.preset("cotton", thickness=0.0)
+
+
+def test_a_number_is_no_plastic_set():
+    with pytest.raises(InvalidInput, match="plastic; got 0.02; expected a NormYield"):
+        AEP(1e5, plastic=0.02)
+
+
 def test_every_preset_gives_a_material_or_says_why_not():
     made, refusals = {AEP: 0, OrthotropicAEP: 0}, []
     given = {AEP: {}, OrthotropicAEP: {"shear_modulus": 5e4}}  # which no source states

@@ -73,10 +73,11 @@ class Stribeck(Coulomb):
 
 
 class Elliptic(Coulomb):
-    """Friction that depends on the direction of slip: an elliptical cone, on planes.
+    """Friction that depends on the direction of slip: an elliptical cone, made for planes.
 
     Not associated: the force opposes the slip, with the size of the cone in that direction; slip is never deflected.
-    ``across == along`` is Coulomb's law, bitwise.
+    ``across == along`` is Coulomb's law, bitwise. Where another solid's surface is not along the axis, what of the slip
+    is along the axis counts as along, so that all slip is across where the axis is the surface's normal.
 
     Args:
         along: mu of slip along ``axis`` [-], > 0; a batch is [B, 1].

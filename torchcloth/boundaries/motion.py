@@ -49,6 +49,14 @@ def check(trajectory: Trajectory, name: str) -> None:
         raise InvalidInput(f"{where}.pose", got=f"none, shape {tuple(pose.shape)}", expected="one scene at least")
     rotation = pose.detach()[..., :3, :3]
     error = (rotation @ rotation.mT - torch.eye(3).to(rotation)).abs().amax()
+    row = (pose.detach()[..., 3, :] - pose.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax()
+    if float(row) > 1e-6:
+        raise InvalidInput(
+            f"{where}.pose",
+            got="a last row that is not 0 0 0 1",
+            expected="rigid poses [R p; 0 1]",
+            remedy="transpose them, where they are stored column by column",
+        )
     if float(error) > 1e-2 or bool((dot(cross(*rotation.unbind(-1)[:2]), rotation[..., 2]) < 0).any()):
         raise InvalidInput(f"{where}.pose", got="matrices that are not rotations", expected="rigid poses [R p; 0 1]")
     turn = (rotation[..., 1:, :, :] * rotation[..., :-1, :, :]).sum((-2, -1))  # trace of the relative rotation

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -26,7 +28,7 @@ def check_threshold(value: float, name: str, unit: str) -> float:
     Raises:
         InvalidInput: unless it is positive.
     """
-    if not value > 0:
+    if not 0 < value < math.inf:
         raise InvalidInput(f"{name} threshold", got=f"{value} {unit}", expected="a value > 0")
     return float(value)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from torch import Tensor
 
 from .._math import dot
@@ -36,7 +38,7 @@ class AddedMass(AbstractEffect):
 
     def __init__(self, length: float | Tensor = 0.15, density: float = 1.204) -> None:
         super().__init__()
-        if not density > 0:
+        if not 0 < density < math.inf:
             raise InvalidInput("air density", got=f"{density} kg/m^3", expected="a value > 0")
         self.length = PhysicalParameter(length, "m", "nonnegative", name="depth of the air that moves along")
         self.density = float(density)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from .._math import dot, safe_norm
-from .._vectors import check_value
+from .._vectors import numbers
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
@@ -36,9 +37,9 @@ class AirDrag(AbstractEffect):
 
     Args:
         normal: drag coefficient C_n >= 0; a flat plate has about 1.2.
+        density: of the air [kg/m^3], a constant.
         tangential: friction coefficient C_t >= 0 of both sides together; laminar flow at Re 3e4 has about 0.016.
         wind: [3] m/s, velocity of the air in world axes. Learnable.
-        density: of the air [kg/m^3], a constant.
 
     Raises:
         InvalidInput: negative coefficient, non-positive density, or a wind that is not three finite numbers.
@@ -60,15 +61,11 @@ class AirDrag(AbstractEffect):
         wind: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         super().__init__()
-        if not density > 0:
+        if not 0 < density < math.inf:
             raise InvalidInput("air density", got=f"{density} kg/m^3", expected="a value > 0")
-        check_value("wind", wind)
-        vector = torch.as_tensor(wind, dtype=torch.get_default_dtype())
-        if vector.shape != (3,) or not torch.isfinite(vector).all():
-            raise InvalidInput("wind", got=wind, expected="three finite numbers in m/s")
         self.normal = PhysicalParameter(normal, "-", "nonnegative", name="air drag coefficient")
         self.tangential = PhysicalParameter(tangential, "-", "nonnegative", name="tangential air drag coefficient")
-        self.wind = nn.Parameter(vector.clone())
+        self.wind = nn.Parameter(numbers("wind", wind, 3, "three finite numbers in m/s").clone())
         self.density = float(density)
         self.register_buffer("share", torch.zeros(0, 1), persistent=False)
         self.register_buffer("rim", torch.zeros(0, 1), persistent=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, cast
 
 import torch
@@ -46,7 +47,7 @@ class CreasingBending(Bending):
         **options: Any,
     ) -> None:
         super().__init__(stiffness, **options)
-        if not yield_curvature > 0:
+        if not 0 < yield_curvature < math.inf:
             raise InvalidInput("yield_curvature", got=f"{yield_curvature} 1/m", expected="a value > 0")
         self.mobility = PhysicalParameter(mobility, "1/s", "nonnegative", name="crease mobility")
         self.yield_curvature = float(yield_curvature)

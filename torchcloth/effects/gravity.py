@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from .._vectors import check_value
-from ..errors import InvalidInput
+from .._vectors import numbers
 from ..types import Moment
 from .base import AbstractEffect, Amplitude
 
@@ -54,8 +53,4 @@ class Gravity(AbstractEffect):
 
 
 def _vector(name: str, values: Sequence[float], size: int, expected: str) -> nn.Parameter:
-    check_value(name, values)
-    vector = torch.as_tensor(values, dtype=torch.get_default_dtype())
-    if vector.shape != (size,) or not torch.isfinite(vector).all():
-        raise InvalidInput(name, got=values, expected=expected)
-    return nn.Parameter(vector.clone())
+    return nn.Parameter(numbers(name, values, size, expected).clone())

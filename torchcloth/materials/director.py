@@ -46,6 +46,10 @@ class DirectorMaterial(AbstractMaterial, ABC):
         self.contact_stiffness = PhysicalParameter(contact_stiffness, "Pa", name="contact_stiffness")
         self.shear_stiffness = PhysicalParameter(shear_stiffness, "Pa", name="shear_stiffness")
         self.cone = PhysicalParameter(cone, "-", "nonnegative", name="cone")
+        if plastic is not None and not isinstance(plastic, NormYield):
+            raise InvalidInput(
+                "plastic", got=f"{plastic!r:.40}", expected="a NormYield, or None", remedy="NormYield(0.02)"
+            )
         self.plastic = plastic
 
     def _director(self) -> dict[str, Tensor]:

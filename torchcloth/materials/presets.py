@@ -58,6 +58,8 @@ class Fabric(NamedTuple):
                 remedy=f'use OrthotropicAEP.preset("{self.name}"), or give youngs_modulus=... [Pa]',
             )
         given = {"youngs_modulus": self.membrane_warp, **self._director()}
+        if self.poisson is not None and "poisson_ratio" not in changes:
+            self._checked(self.poisson)
         return self._arguments(given, self.poisson, ["youngs_modulus"], changes)
 
     def orthotropic(self, **changes: Any) -> dict[str, Any]:
@@ -71,10 +73,11 @@ class Fabric(NamedTuple):
             "weft_modulus": self.membrane_weft,
             "shear_modulus": self.membrane_shear,
         }
-        poisson = self.poisson
-        if poisson is not None and self.membrane_warp and self.membrane_weft:
-            poisson = poisson * (self.membrane_weft / self.membrane_warp) ** 0.5  # the symmetric one
-        return self._arguments({**membrane, **self._director()}, poisson, list(membrane), changes)
+        given = self._arguments({**membrane, **self._director()}, self.poisson, list(membrane), changes)
+        if self.poisson is not None and "poisson_ratio" not in changes:  # the symmetric one, of the moduli as they are
+            weft, warp = given["weft_modulus"], given["youngs_modulus"]
+            given["poisson_ratio"] = self._checked(self.poisson * (weft / warp) ** 0.5)
+        return given
 
     def _director(self) -> _Numbers:
         return {"contact_stiffness": self.contact, "shear_stiffness": self.sliding}
@@ -83,6 +86,8 @@ class Fabric(NamedTuple):
         self, resultants: _Numbers, poisson: float | None, needed: list[str], changes: dict[str, Any]
     ) -> dict[str, Any]:
         thickness = changes.get("thickness", self.thickness or NOMINAL)
+        if not thickness > 0:
+            raise InvalidInput("thickness", got=f"{thickness} m", expected="a value > 0")
         given: dict[str, Any] = {"thickness": thickness}
         given |= {name: value / thickness for name, value in resultants.items() if value is not None}
         if poisson is not None:
@@ -95,14 +100,18 @@ class Fabric(NamedTuple):
                 expected="a value measured elsewhere",
                 remedy="give " + ", ".join(f"{name}=... [Pa]" for name in missing),
             )
-        if poisson is not None and not 0 < poisson < 0.5 and "poisson_ratio" not in changes:
+        return {**given, **changes}
+
+    def _checked(self, poisson: Any) -> Any:
+        """A field of moduli makes a field of them, which the material checks."""
+        if isinstance(poisson, float) and not 0 < poisson < 0.5:
             raise InvalidInput(
                 f"preset {self.name!r}",
-                got=f"a published poisson_ratio of {self.poisson:g}",
+                got=f"a published poisson_ratio of {self.poisson:g}, which is {poisson:.3g} with these moduli",
                 expected="a value in (0, 0.5)",
                 remedy="give poisson_ratio=...",
             )
-        return {**given, **changes}
+        return poisson
 
 
 _TEXT = ("name", "fabric", "structure", "grade", "source", "note")

@@ -166,6 +166,8 @@ class Contact:
             )
         needed = max(1, int(np.ceil(edge / (SPARSEST * spacing))))
         s = needed if self.subdivisions is None else int(self.subdivisions)
+        if self.subdivisions is not None and s != self.subdivisions:
+            raise InvalidInput("contact subdivisions", got=self.subdivisions, expected="a whole number")
         if s > MOST:
             raise InvalidInput("contact subdivisions", got=s, expected=f"at most {MOST}")
         if s < needed:
