@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -105,7 +106,8 @@ class Arm(nn.Module):
         self.joint_names, self.joint_types = description.joint_names, description.joint_types
         self._shapes, self._unshaped = description.shapes, description.unshaped
         prismatic = torch.tensor([kind == "prismatic" for kind in self.joint_types])
-        posture = torch.tensor(home or [0.0] * len(self.joint_names), dtype=torch.float64)
+        joints = len(self.joint_names)  # fewer than the vendor's where the frame is not the last link
+        posture = torch.tensor((home or [0.0] * joints)[:joints], dtype=torch.float64)
         buffers = {
             "base": torch.eye(4, dtype=torch.float64) if base is None else _checked_base(base, dtype),
             "home": posture.clamp(description.limits[2], description.limits[3]),
@@ -258,6 +260,8 @@ class Arm(nn.Module):
         if pose.ndim not in (2, 3) or pose.shape[-2:] != (4, 4) or len(pose) == 0:
             raise InvalidInput("pose has the wrong shape", got=tuple(pose.shape), expected="(K, 4, 4) or (4, 4)")
         check_rigid("pose", pose)
+        if not 0 < tolerance < math.inf:
+            raise InvalidInput("tolerance", got=tolerance, expected="a finite value > 0")
         start = self.home if q0 is None else self._posture("q0", q0)
         target = start if reference is None else self._posture("reference", reference)
         poses = pose.reshape(-1, 4, 4)

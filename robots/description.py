@@ -140,7 +140,12 @@ def _joints_to(robot: Any, frame: str, path: Path) -> list:
 
 
 def _matrix(origin: Any) -> Tensor:
-    return torch.eye(4, dtype=torch.float64) if origin is None else origin_matrix(origin.xyz, origin.rpy)
+    if origin is None:
+        return torch.eye(4, dtype=torch.float64)
+    matrix = origin_matrix(origin.xyz, origin.rpy)
+    if not bool(torch.isfinite(matrix).all()):
+        raise InvalidInput("origin in a URDF", got=f"xyz {origin.xyz}, rpy {origin.rpy}", expected="finite numbers")
+    return matrix
 
 
 def _axis(joint: Any) -> Tensor:
@@ -160,12 +165,16 @@ def _limits(joint: Any) -> tuple[float, ...]:
             lower, upper = joint.limit.lower, joint.limit.upper
     if not velocity > 0:
         raise InvalidInput(f"velocity limit of joint {joint.name!r}", got=velocity, expected="a value > 0")
-    if lower > upper:
+    if not lower <= upper:
         raise InvalidInput(f"limits of joint {joint.name!r}", got=f"{lower} to {upper}", expected="lower <= upper")
     soft = joint.safety_controller
     if soft is None or soft.soft_lower_limit >= soft.soft_upper_limit:
         return lower, upper, lower, upper, velocity, effort
-    return lower, upper, max(lower, soft.soft_lower_limit), min(upper, soft.soft_upper_limit), velocity, effort
+    within = max(lower, soft.soft_lower_limit), min(upper, soft.soft_upper_limit)
+    if not within[0] <= within[1]:
+        got, expected = f"{soft.soft_lower_limit} to {soft.soft_upper_limit}", f"some of {lower} to {upper}"
+        raise InvalidInput(f"soft limits of joint {joint.name!r}", got=got, expected=expected)
+    return lower, upper, *within, velocity, effort
 
 
 def _shapes(link: Any, body: int, placed: Tensor) -> list[Shape]:
@@ -173,6 +182,10 @@ def _shapes(link: Any, body: int, placed: Tensor) -> list[Shape]:
 
     def read(elements: list) -> list[Shape]:
         found = [(_primitive(element.geometry), element) for element in elements]
+        for primitive, element in found:
+            if primitive is not None and not all(0 < size < math.inf for size in primitive[1]):
+                what = f"{primitive[0]} of link {link.name!r}, {element.name!r}" if element.name else link.name
+                raise InvalidInput(f"size of a solid of {what}", got=primitive[1], expected="finite lengths > 0")
         return [
             Shape(*primitive, link.name, body, placed @ _matrix(element.origin))
             for primitive, element in found
@@ -183,8 +196,9 @@ def _shapes(link: Any, body: int, placed: Tensor) -> list[Shape]:
 
 
 def _unshaped(links: list) -> tuple[str, ...]:
-    solids = [(link.name, [*link.collisions, *link.visuals]) for link in links]
-    return tuple(name for name, own in solids if own and all(_primitive(e.geometry) is None for e in own))
+    """Links of which something, that would be in the way, is a mesh."""
+    solids = [(link.name, link.collisions or link.visuals) for link in links]
+    return tuple(name for name, own in solids if any(_primitive(e.geometry) is None for e in own))
 
 
 def _primitive(geometry: Any) -> tuple[str, tuple[float, ...]] | None:

@@ -79,7 +79,8 @@ def plan(
 
     Args:
         scene: the arms, and the table if there is one.
-        action: paths of grippers that have the names of arms; an arm without a path stands still at home.
+        action: paths of grippers that have the names of arms; an arm without a path stands still at home. Where it is
+            slowed down all times are multiplied, that of its beginning too.
         acceleration: the most that any joint may do [rad/s^2]; see ``ACCELERATION``.
         clearance: between two arms, and between an arm and the table [m]; the solids of the tool's own frame (the
             fingers) may come down to the table. Links of one arm keep 5 mm.
@@ -186,8 +187,9 @@ def _timed(scene: Scene, action: Action, chosen: dict[str, Way], gap: Gap, slow_
     if slower > 1 and not slow_down:
         raise _too_fast(scene, name, hardest.load)
     splines = {key: way.spline.slower(slower) for key, way in chosen.items()}
-    path = dense(next(iter(action.motion.values())))
-    t = Spline(slower * path.t, path.t[:, None], path.t[:, None]).finer(period)
+    knots = torch.cat([dense(path).t for path in action.motion.values()]).unique()
+    knots = knots[torch.cat([knots.new_ones(1, dtype=torch.bool), knots.diff() > SAME])]
+    t = Spline(slower * knots, knots[:, None], knots[:, None]).finer(period)
 
     def closed(name: str) -> Tensor:
         if name not in action.motion:

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcloth.errors import InvalidInput
 from torchcloth.recordings import Recording
 from torchcloth.types import Trajectory
 
@@ -45,11 +46,16 @@ def retrace(recording: Recording, scene: Scene | None = None) -> Plan | None:
         scene: None: ``scene_of`` the episode.
 
     Raises:
-        InvalidInput: the arms cannot do it; names the joint or the pair of solids in the way. Or as ``scene_of``.
+        InvalidInput: the arms cannot do it; names the joint or the pair of solids in the way. Or ``scene`` has other
+            arms than those that hold, or as ``scene_of``.
     """
     scene = scene_of(recording) if scene is None else scene
     if scene is None:
         return None
+    held = set(holding(recording))
+    if other := held.symmetric_difference(scene.arms):
+        got = f"{sorted(other)}, with an arm or held and not both"
+        raise InvalidInput("scene", got=got, expected=f"an arm for each of {sorted(held)}")
     every = replay(recording)
     motion = {name: _turns(every[name]) for name in scene.arms}
     end = max(float(path.t[-1]) for path in motion.values())

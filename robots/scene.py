@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
@@ -47,9 +48,14 @@ class Scene(nn.Module):
         super().__init__()
         if not arms:
             raise InvalidInput("arms is empty", expected="one arm or more")
-        if refused := [name for name in arms if "." in name or hasattr(nn.ModuleDict, name)]:
-            expected = "a name without dots that is no method of torch's ModuleDict"
-            raise InvalidInput("name of an arm", got=repr(refused[0]), expected=expected)
+        for name, arm in arms.items():
+            if not isinstance(name, str) or not name or "." in name or hasattr(nn.ModuleDict, name):
+                expected = "a name without dots that is no method of torch's ModuleDict"
+                raise InvalidInput("name of an arm", got=repr(name), expected=expected)
+            if not isinstance(arm, Arm):
+                raise InvalidInput(f"arm {name!r}", got=type(arm).__name__, expected="an Arm, see load")
+        if table is not None:
+            _check_table(table)
         self.arms = nn.ModuleDict(dict(arms))
         self.table = table
 
@@ -94,6 +100,15 @@ class Scene(nn.Module):
         names = sorted(given) if isinstance(given, Mapping) else f"a {type(given).__name__}"
         if names != sorted(self.arms):
             raise InvalidInput(f"{argument} names other arms", got=names, expected=f"by name, {list(self.arms)}")
+
+
+def _check_table(table: Table) -> None:
+    """One without volume or with NaN would be in nobody's way."""
+    (x0, x1), (y0, y1) = table.x, table.y
+    bounded = all(map(math.isfinite, (x0, x1, y0, y1, table.height, table.thickness)))
+    if not (bounded and x0 < x1 and y0 < y1 and table.thickness > 0):
+        expected = "finite x and y, each from the smaller to the larger, a finite height and a thickness > 0"
+        raise InvalidInput("table", got=table, expected=expected)
 
 
 def bimanual_rig(model: str = "rizon4", frame: str = "tcp_closed", dtype: torch.dtype = torch.float64) -> Scene:

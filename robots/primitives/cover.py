@@ -24,7 +24,8 @@ def cover(
         grips: where the grippers hold, at the start.
         reach: horizontal distance from the grip to the landing [m].
         heading: direction of the landing, from the world's x axis [rad].
-        height: of the arch's top above the grip [m]; None: half the reach, a semicircle.
+        height: of the arch over the straight way from grip to landing, in the middle [m]; None: half the reach, a
+            semicircle where the landing is as high as the grip.
         landing: the grip's height where it opens [m].
         roll: turn of the grippers on the way [rad]; pi lays the cloth without a twist at the grip, but brings an
             arm's hand to the table: ``bimanual_rig`` can do about 0.7.

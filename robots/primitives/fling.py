@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from .moves import Action, Grips, Limits, Move, action, along, check, lowest
+from .moves import Action, Grips, Limits, Move, action, along, check, finite, lowest
 
 
 def fling(
@@ -32,6 +32,7 @@ def fling(
         InvalidInput: a value that gives no motion, or a path through the table.
     """
     check(swing=swing, landing=landing)
+    finite(pull=pull)
     drop = landing - lowest(grips)
     check(**{"grips' height over the landing": -drop})
     shifts = [along(heading, -swing), along(heading, 2 * swing), along(heading, -pull, drop)]

@@ -152,7 +152,7 @@ def finite(**values: float) -> None:
 def whole(**values: float) -> None:
     """Refuses what is no number of times."""
     for name, value in values.items():
-        if not (value >= 1 and value == int(value)):
+        if not (1 <= value < math.inf and value == int(value)):
             raise InvalidInput(name, got=value, expected="a whole number >= 1")
 
 

@@ -113,12 +113,12 @@ def test_published_poisson_ratio_stays_the_wefts_contraction_with_moduli_of_ones
 
 @pytest.mark.parametrize("law", [AEP, OrthotropicAEP])
 def test_no_thickness_is_refused(law):
-    with pytest.raises(InvalidInput, match="thickness; got 0.* m; expected a value > 0"):
+    with pytest.raises(InvalidInput, match=r"thickness; got 0.* m; expected a value > 0"):
         law.preset("cotton", thickness=0.0)
 
 
 def test_a_number_is_no_plastic_set():
-    with pytest.raises(InvalidInput, match="plastic; got 0.02; expected a NormYield"):
+    with pytest.raises(InvalidInput, match=r"plastic; got 0\.02; expected a NormYield"):
         AEP(1e5, plastic=0.02)
 
 

@@ -300,6 +300,17 @@ def test_load_refuses_a_pattern_with_holes(tmp_path):
         tc.meshes.load(path)
 
 
+def test_load_refuses_such_polygons_of_a_ply(tmp_path):
+    path = tmp_path / "dart.ply"
+    head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    path.write_text(head + "0 0 0\n1 0 0\n0.2 0.2 0\n0 1 0\n4 1 2 3 0\n")
+    with pytest.raises(InvalidInput, match=r"a polygon is not convex.*triangulate"):
+        tc.meshes.load(path)
+    path.write_text(head + "0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 1 2 3 0\n")
+    np.testing.assert_allclose(tc.meshes.load(path).area.sum(), 1.0)
+
+
 @pytest.mark.parametrize("ring", ["1 2 3 4", "2 3 4 1"])
 def test_load_refuses_polygons_that_a_fan_does_not_cover_once(tmp_path, ring):
     """Of four times the area, by where it began."""

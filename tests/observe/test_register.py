@@ -87,6 +87,8 @@ def test_images_of_another_size_are_refused(color_camera):
     with pytest.raises(InvalidInput, match="color"):
         colors_at(np.zeros((4, 3)), np.zeros((4, 4, 3)), color_camera)
     color = np.zeros((color_camera.height, color_camera.width, 3), np.uint8)
+    with pytest.raises(InvalidInput, match=r"color; got float64; expected uint8"):
+        colors_at(np.zeros((4, 3)), color / 255, color_camera)
     with pytest.raises(InvalidInput, match=r"depth; .*registered"):  # that of the depth camera
         colors_at(np.zeros((4, 3)), color, color_camera, np.zeros((KINECT.height, KINECT.width)))
 

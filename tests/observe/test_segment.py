@@ -43,6 +43,7 @@ def pose(x, y, z):
         {"hsv": (0.1, 0.2)},
         {"hsv": ((100, 0, 0), (140, 255, 255))},
         {"table": (0.0, 0.0, -1.0, 0.0)},
+        {"table": (0.0, 0.0, 1.0, np.nan)},
         {"flat": None, "table": "find"},
         {"reach": None},
         {"crowd": None},

@@ -54,7 +54,9 @@ def test_the_cylinder_s_axis_is_z():
     np.testing.assert_allclose(np.ptp(vertices, axis=0), [0.2, 0.2, 0.5], atol=1e-3)
 
 
-@pytest.mark.parametrize(("kind", "size"), [("capsule", (1.0, 1.0)), ("box", (1.0,)), ("sphere", (-1.0,))])
+@pytest.mark.parametrize(
+    ("kind", "size"), [("capsule", (1.0, 1.0)), ("box", (1.0,)), ("sphere", (-1.0,)), ("sphere", (np.nan,))]
+)
 def test_unknown_or_impossible_solids_are_refused(kind, size):
     with pytest.raises(InvalidInput):
         solid_mesh(kind, size, np.eye(4))

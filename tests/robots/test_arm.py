@@ -50,6 +50,12 @@ def test_gripper_frames(frame, beyond):
     torch.testing.assert_close(tcp[..., :3, :3], flange[..., :3, :3], rtol=0, atol=1e-15)
 
 
+def test_a_frame_before_the_last_link_has_fewer_joints():
+    arm, whole = robots.load("rizon4", frame="link5"), robots.load("rizon4")
+    assert torch.equal(arm.home, whole.home[: len(arm.joint_names)])
+    assert arm(arm.home).shape == (4, 4)
+
+
 def test_any_batch_shape(random_q):
     arm = robots.load("rizon4")
     q = random_q(arm, 12)
@@ -193,6 +199,7 @@ def test_load_refuses(crane, tmp_path):
         ('effort="5"', "", "effort"),
         ('xyz="1 1 0"', 'xyz="0 0 0"', "axis of joint 'luff'"),
         ('lower="-1"', 'lower="3"', "limits of joint 'luff'"),
+        ('lower="-1"', 'lower="nan"', "limits of joint 'luff'"),
         ('velocity="2"', 'velocity="-1"', "velocity limit of joint 'luff'; got -1.0; expected a value > 0"),
         ('<parent link="ground"/>', '<parent link="hook"/>', "closes a loop"),
         ('<parent link="ground"/>', '<parent link="gone"/>', "no parent link"),

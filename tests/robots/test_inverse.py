@@ -108,5 +108,7 @@ def test_refuses_what_is_no_pose(arm):
             arm.inverse(bad)
     with pytest.raises(InvalidInput, match="q0 has the wrong shape"):
         arm.inverse(pose, arm.home[None])
+    with pytest.raises(InvalidInput, match="tolerance; got nan"):
+        arm.inverse(pose, tolerance=float("nan"))
     with pytest.raises(InvalidInput, match="reference has the wrong shape"):
         arm.inverse(pose, reference=arm.home[:6])

@@ -83,6 +83,9 @@ def test_without_an_arm_for_every_gripper_there_is_nothing_to_plan(swing):
     assert robots.retrace(replace(swing, robots={})) is None
     assert robots.retrace(replace(swing, robots={"left": swing.robots["left"]})) is None
     assert robots.retrace(replace(swing, grippers={}, robots={})) is None
+    other = robots.Scene({"left": robots.load("rizon4")})
+    with pytest.raises(InvalidInput, match=r"scene; got \['right'\]"):
+        robots.retrace(swing, other)
     strange = {name: replace(r, model="nobody's") for name, r in swing.robots.items()}
     with pytest.raises(InvalidInput, match="nobody's"):
         robots.retrace(replace(swing, robots=strange))

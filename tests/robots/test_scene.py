@@ -50,7 +50,9 @@ def test_geometry_holds_both_arms(rig):
 def test_refuses_other_names(rig):
     with pytest.raises(InvalidInput, match="arms is empty"):
         robots.Scene({})
-    for name in ("arm.left", "keys"):
+    with pytest.raises(InvalidInput, match="arm 'left'; got int; expected an Arm"):
+        robots.Scene({"left": 3})
+    for name in ("arm.left", "keys", ""):
         with pytest.raises(InvalidInput, match=f"name of an arm; got '{name}'"):
             robots.Scene({name: rig["left"]})
     with pytest.raises(
@@ -70,6 +72,12 @@ def test_the_table_stands_where_the_arms_work(rig):
     torch.testing.assert_close(low, torch.tensor([0.20, -0.82, -0.04], dtype=torch.float64))
     torch.testing.assert_close(high, torch.tensor([1.02, 0.82, 0.0], dtype=torch.float64))
     assert robots.Scene({"one": rig["left"]}).table is None
+
+
+@pytest.mark.parametrize("bad", [{"height": float("nan")}, {"x": (1.02, 0.2)}, {"thickness": 0.0}])
+def test_a_table_that_would_be_in_nobodys_way_is_refused(rig, bad):
+    with pytest.raises(InvalidInput, match=r"table; got Table\("):
+        robots.Scene({"one": rig["left"]}, robots.scene.Table(**bad))
 
 
 def test_infos_name_model_place_and_tool(rig):

@@ -67,7 +67,7 @@ def check_apart(path: Path, episode: str | Path, option: str = "--out") -> None:
         InvalidInput: it is one.
     """
     inside, folder = path.resolve(), Path(episode).resolve()
-    if folder in inside.parents:
+    if inside == folder or folder in inside.parents:
         raise InvalidInput(option, got=f"{path}, within the episode {episode}", expected="a place outside it")
 
 

@@ -171,6 +171,9 @@ def dress(
     neck_point, shoulder = (neck / 2, 0.0), (shoulders / 2, -shoulder_drop)
     underarm, waist_point = (bust / 2, -shoulder_drop - armhole), (waist / 2, -waist_height)
     skirt = length - waist_height
+    if not skirt > 0:
+        expected = f"a waist_height below the length, {length:g} m"
+        raise InvalidInput("skirt", got="no area", expected=expected)
     corner = (hem / 2, -length + hem / 2 * (hem - waist) / 4 / skirt)  # the hem meets the side at a right angle
     inward = (shoulders / 2 - 0.1 * armhole, -shoulder_drop - 0.8 * armhole)
     curves = {

@@ -217,8 +217,10 @@ class Mesh:
         The radius reaches through layers that lie on each other, as a gripper that pinches them does.
 
         Raises:
-            InvalidInput: the mesh has no place of that name.
+            InvalidInput: the mesh has no place of that name, or a radius that is negative.
         """
+        if not radius >= 0:
+            raise InvalidInput("radius", got=f"{radius} m", expected="a length >= 0")
         if place not in self.places:
             raise InvalidInput(
                 "place",

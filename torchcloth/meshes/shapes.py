@@ -12,6 +12,8 @@ from ..errors import InvalidInput, MissingDependency
 from . import obj
 from .mesh import Mesh, check_metres
 
+_INDEX = {"vertex_indices", "vertex_index"}  # names of a PLY's corners
+
 
 def rectangle(
     width: float, height: float, *, triangles: int | None = None, resolution: tuple[int, int] | None = None
@@ -80,11 +82,32 @@ def load(path: str | Path) -> Mesh:
         raise MissingDependency("reading PLY needs trimesh", remedy='pip install "torchcloth[robots]"') from error
     try:
         mesh = trimesh.load_mesh(path, process=False, maintain_order=True)
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, OSError) as error:
+    except Exception as error:  # a damaged file raises whatever the parser pleases
         raise InvalidInput("mesh file", got=f"{path} ({error})", expected="a readable OBJ or PLY file") from error
+    _check_polygons(mesh, path)
     uv = getattr(mesh.visual, "uv", None)
     arrays = mesh.vertices, mesh.faces, None if uv is None or len(uv) != len(mesh.vertices) else uv
     return _in_metres(Mesh.build(*(_wedges(mesh.metadata.get("_ply_raw"), path) or arrays)), path)
+
+
+def _check_polygons(mesh: Any, path: Path) -> None:
+    """trimesh cuts polygons into fans, whatever they are like."""
+    face = (mesh.metadata.get("_ply_raw") or {}).get("face") or {}
+    for name in _INDEX & (face.get("properties") or {}).keys():
+        found = face["data"][name]
+        corners = np.asarray(found["f1"] if getattr(found.dtype, "names", None) else found)
+        many = [corners] if corners.ndim == 2 else [np.stack(own) for own in _alike(corners)]
+        for polygons in many:
+            if polygons.shape[1] > 3:
+                obj.check_convex(np.asarray(mesh.vertices)[polygons], str(path))
+
+
+def _alike(rows: np.ndarray) -> list[list[np.ndarray]]:
+    """Polygons by their number of corners."""
+    found: dict[int, list[np.ndarray]] = {}
+    for row in rows:
+        found.setdefault(len(row), []).append(np.asarray(row))
+    return list(found.values())
 
 
 def _wedges(raw: Any, path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -101,8 +124,10 @@ def _wedges(raw: Any, path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray] |
         found = face["data"][key]
         return np.asarray(found["f1"] if getattr(found.dtype, "names", None) else found)
 
-    index = next(n for n in face["properties"] if n in ("vertex_indices", "vertex_index"))
-    corners, coordinates, place = rows(index), rows(name), raw["vertex"]["data"]
+    index = _INDEX & face["properties"].keys()
+    if not index:
+        raise InvalidInput("mesh file", got=f"{path}, faces without vertices", expected="a list of vertex_indices")
+    corners, coordinates, place = rows(index.pop()), rows(name), raw["vertex"]["data"]
     if corners.ndim != 2 or coordinates.shape != (len(corners), 2 * corners.shape[1]):
         got = f"{path}, polygons of several kinds with coordinates of their corners"
         raise InvalidInput("mesh file", got=got, expected="triangles", remedy="triangulate on export")

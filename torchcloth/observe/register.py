@@ -54,10 +54,11 @@ def colors_at(points: Array, color: Array, camera: DepthCamera, depth: Array | N
             Where it has no reading, 0 or NaN, nothing hides; None: nowhere.
 
     Raises:
-        InvalidInput: images that have not the camera's size.
+        InvalidInput: images that have not the camera's size, or colours beyond 0 to 255.
     """
     if np.shape(color) != (camera.height, camera.width, 3):
         raise InvalidInput("color", got=f"shape {np.shape(color)}", expected=f"{(camera.height, camera.width, 3)}")
+    check_bytes("color", np.asarray(color))
     if depth is not None and np.shape(depth) != (camera.height, camera.width):
         expected = f"{(camera.height, camera.width)}, registered to the colour camera (reproject)"
         raise InvalidInput("depth", got=f"shape {np.shape(depth)}", expected=expected)
@@ -69,6 +70,20 @@ def colors_at(points: Array, color: Array, camera: DepthCamera, depth: Array | N
         front = np.asarray(depth)[rows, columns]
         inside &= ~has_reading(front) | (z < front + 0.02)
     return np.where(inside[:, None], np.asarray(color)[rows, columns], 0).astype(np.uint8), inside
+
+
+def check_bytes(what: str, colors: Array) -> None:
+    """Refuse colours that are not whole numbers from 0 to 255.
+
+    Raises:
+        InvalidInput: shares, or 16 bits.
+    """
+    if colors.dtype.kind not in "iu":
+        remedy = "from 0 to 1: multiply by 255 and convert"
+        raise InvalidInput(what, got=colors.dtype, expected="uint8, 0 to 255", remedy=remedy)
+    if not 0 <= colors.min(initial=0) <= colors.max(initial=0) <= 255:
+        got, remedy = f"{colors.min()} to {colors.max()}", "divide by 257 what has 16 bits"
+        raise InvalidInput(what, got=got, expected="uint8, 0 to 255", remedy=remedy)
 
 
 def steep(depth: Array, edge: float) -> Array:

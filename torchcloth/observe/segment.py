@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import InvalidInput
 from .camera import DepthCamera
 from .cloud import has_reading, spaced, to_points
-from .register import steep
+from .register import check_bytes, steep
 from .render import open3d_or_refuse
 
 Array = np.ndarray
@@ -23,7 +23,7 @@ UNDER = 0.01  # share of the points that may lie under a table
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Segmentation:
-    """How cloth points are told from the rest. A stage whose number is None (or 0) is left out.
+    """How cloth points are told from the rest. A stage whose number is None (a length of 0) is left out.
 
     The stages run in the order of the attributes. Lengths are in m, in the world.
 
@@ -95,7 +95,12 @@ class Segmentation:
             raise InvalidInput("table", got=repr(self.table), expected='"find", a plane (a, b, c, d), or None')
         if self.table is not None and not isinstance(self.table, str):
             plane = np.asarray(self.table, dtype=float)
-            if plane.shape != (4,) or not abs(np.linalg.norm(plane[:3]) - 1) < 1e-6 or not plane[2] > 0:
+            if (
+                plane.shape != (4,)
+                or not np.isfinite(plane).all()
+                or not abs(np.linalg.norm(plane[:3]) - 1) < 1e-6
+                or not plane[2] > 0
+            ):
                 expected = "(a, b, c, d) with a unit normal (a, b, c) that points up"
                 raise InvalidInput("table", got=self.table, expected=expected)
 
@@ -225,12 +230,7 @@ def _check_colors(colors: Array, shape: tuple[int, ...]) -> None:
     if colors.shape != shape:
         got = "none" if colors.dtype == object else f"shape {colors.shape}"
         raise InvalidInput("colors", got=got, expected=f"{shape}, since hsv is given")
-    if colors.dtype.kind not in "iu":
-        remedy = "from 0 to 1: multiply by 255 and convert"
-        raise InvalidInput("colors", got=colors.dtype, expected="uint8, 0 to 255", remedy=remedy)
-    if not 0 <= colors.min(initial=0) <= colors.max(initial=0) <= 255:
-        got, remedy = f"{colors.min()} to {colors.max()}", "divide by 257 what has 16 bits"
-        raise InvalidInput("colors", got=got, expected="uint8, 0 to 255", remedy=remedy)
+    check_bytes("colors", colors)
 
 
 class _Cloud:

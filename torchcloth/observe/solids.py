@@ -66,7 +66,7 @@ def solid_mesh(kind: str, size: tuple[float, ...], pose: Array, segments: int = 
     wanted = {"box": 3, "cylinder": 2, "sphere": 1}
     if kind not in wanted:
         raise InvalidInput("kind", got=repr(kind), expected=f"one of {', '.join(wanted)}")
-    if len(size) != wanted[kind] or min(size) <= 0 or segments < 3:
+    if len(size) != wanted[kind] or not all(0 < length < np.inf for length in size) or segments < 3:
         raise InvalidInput("size", got=size, expected=f"{wanted[kind]} positive lengths in m", remedy="segments >= 3")
     if kind == "box":
         vertices, faces = _BOX * np.asarray(size, float), _BOX_FACES
@@ -76,6 +76,8 @@ def solid_mesh(kind: str, size: tuple[float, ...], pose: Array, segments: int = 
     if pose.shape != (4, 4):
         got = f"shape {pose.shape}"
         raise InvalidInput("pose", got=got, expected="[4, 4] of one moment", remedy="of many: solid_meshes(..., at=k)")
+    if not np.isfinite(pose).all():
+        raise InvalidInput("pose", got="NaN or infinite entries", expected="a rigid pose [R p; 0 1]")
     return vertices @ pose[:3, :3].T + pose[:3, 3], faces
 
 

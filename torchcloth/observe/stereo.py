@@ -55,6 +55,8 @@ class StereoNoise(AbstractNoise):
         for name in ("focal", "baseline", "edge"):
             if getattr(self, name) <= 0:
                 raise InvalidInput(name, got=getattr(self, name), expected="a positive number")
+        if self.fattening != int(self.fattening):
+            raise InvalidInput("fattening", got=self.fattening, expected="a whole number of px")
         if self.holes >= 1:
             raise InvalidInput("holes", got=self.holes, expected="a share below 1")
         if self.bias_length < 1:

@@ -86,12 +86,21 @@ def encode(depth: Array, depth_scale: float = 0.001) -> Array:
     Raises:
         InvalidInput: a scale that is not positive.
     """
-    if not depth_scale > 0:
-        raise InvalidInput("depth_scale", got=depth_scale, expected="a positive length in m per unit")
+    _check_scale(depth_scale)
     units = np.rint(np.nan_to_num(np.asarray(depth, dtype=float), posinf=0.0, neginf=0.0) / depth_scale)
     return np.where((units > 0) & (units <= np.iinfo(np.uint16).max), units, 0).astype(np.uint16)
 
 
+def _check_scale(depth_scale: float) -> None:
+    if not 0 < depth_scale < np.inf:
+        raise InvalidInput("depth_scale", got=depth_scale, expected="a positive length in m per unit")
+
+
 def decode(image: Array, depth_scale: float = 0.001) -> Array:
-    """Depth [H, W] float32 m of a stored image [H, W] in units of ``depth_scale`` m, 0 = invalid."""
+    """Depth [H, W] float32 m of a stored image [H, W] in units of ``depth_scale`` m, 0 = invalid.
+
+    Raises:
+        InvalidInput: a scale that is not positive.
+    """
+    _check_scale(depth_scale)
     return (np.asarray(image) * np.float32(depth_scale)).astype(np.float32)
