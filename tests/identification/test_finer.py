@@ -27,6 +27,11 @@ def test_the_finer_mesh_is_the_same_cloth(model, recording):
     assert np.abs(first).max() <= np.abs(coarse).max()
 
 
+def test_a_finer_mesh_keeps_the_gap_between_layers(model):
+    touching = tc.Cloth(model.mesh, tc.materials.AEP(1e5), 0.2)
+    assert finer_cloth(touching).grid().spacing == touching.grid().spacing
+
+
 def test_a_grip_holds_the_new_vertices_between_those_it_held():
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3))
     sheet = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, boundaries={"bar": Grasp([0, 1, 2])}, contact=None)

@@ -8,10 +8,11 @@ import pytest
 import torch
 import twins
 
+import torchcloth as tc
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import identify, journal
 from torchcloth.identification.episodes import episode
-from torchcloth.identification.journal import Journal, digest
+from torchcloth.identification.journal import Journal, digest, facts_of
 from torchcloth.identification.objective import Objective
 from torchcloth.identification.unknowns import collect
 
@@ -146,6 +147,19 @@ def test_what_is_no_tensor_tells_problems_apart(other):
         objective = Objective(cloth, collect(cloth, ["youngs_modulus"], None), [episode(cloth, recording)])
         ids.append(digest(objective.identity()))
     assert ids[0] != ids[1]
+
+
+def test_another_law_with_the_same_numbers_is_another_problem():
+    class Heavier(tc.effects.Gravity):
+        def force(self, c, now):
+            return 2 * super().force(c, now)
+
+    mesh = tc.meshes.rectangle(0.1, 0.1, triangles=8)
+    facts = [
+        digest(facts_of(tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, {"gravity": weight()}, contact=None)))
+        for weight in (tc.effects.Gravity, Heavier)
+    ]
+    assert facts[0] != facts[1]
 
 
 def test_another_engine_is_another_problem():

@@ -115,6 +115,8 @@ def test_what_is_refused():
         fit_tension(cloth(), data, ["stiffness"])
     with pytest.raises(InvalidInput, match="tables"):
         fit_tension(cloth(), [])
+    with pytest.raises(InvalidInput, match=r"tables\[0\].width; got nan m; expected a length > 0"):
+        fit_tension(cloth(), replace(data, width=float("nan")))
     with pytest.raises(InvalidInput, match="none above the preload"):
         fit_tension(cloth(), replace(data, preload=1e3))
     with pytest.raises(InvalidInput, match="no change of width"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 
 import torch
@@ -25,15 +26,23 @@ def descend(
     """Adam, or plain descent, on the unknowns [K] over their sizes; ``on_iterate(raw, objective)``: True to stop.
 
     The loss is the DiffCP paper's one-sided Chamfer distance, cloud to nearest vertex, without any prior. Plain
-    descent divides by the first gradient's length, so that its first step is ``rate`` long.
+    descent divides by the first gradient's length, so that its first step is ``rate`` long. A step to where nothing can
+    be simulated ends it, with a warning.
     """
     sizes = objective.sizes  # drag moves by tenths, bending by millionths: one rate for both would stall or leap
     scaled, seen = (start / sizes).requires_grad_(), start
     optimiser = torch.optim.Adam([scaled], lr=rate) if adam else torch.optim.SGD([scaled], lr=rate)
     length = 0.0
-    for _ in range(iterations):
-        seen = objective.clip(scaled.detach() * sizes)
-        _, slope = objective.value_and_slope("chamfer", seen, chamfer)
+    for k in range(iterations):
+        there = objective.clip(scaled.detach() * sizes)
+        try:
+            _, slope = objective.value_and_slope("chamfer", there, chamfer)
+        except (SimulationDiverged, UnstableStep) as error:
+            if k == 0:
+                raise
+            warnings.warn(f"descent: after {k} steps, {error}; the result is that of the step before", stacklevel=2)
+            break
+        seen = there
         if on_iterate(seen, objective):
             break
         scaled.grad = slope * sizes

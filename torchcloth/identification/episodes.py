@@ -199,6 +199,10 @@ def cloth_from(
     mesh = mesh_of(recording)
     if effects is None:
         effects = effects_of(recording)
+    if both := recording.colliders.keys() & recording.grasps.keys():
+        raise InvalidInput(
+            f"{recording.path}: names", got=f"a grasp and a collider {min(both)!r}", expected="a name for each"
+        )
     boundaries = {}
     for name, collider in recording.colliders.items():
         friction = 0.4 if collider.friction is None else collider.friction

@@ -32,7 +32,7 @@ from .objective import Objective
 from .replays import Frames, Replay, frames_of
 from .result import or_none
 from .search import Progress, Search
-from .unknowns import DECADE
+from .unknowns import DECADE, needs_contact
 
 NO_ERROR = "no error: gradient method"
 CONTRAST = 1.0
@@ -92,7 +92,8 @@ def fit_fields(
     """Fit material parameters that have one value per triangle, by L-BFGS on reverse-mode gradients.
 
     The prior is a graph Laplacian over the triangles, in the unconstrained coordinate (a logarithm for stiffnesses):
-    sum over inner edges of length / distance of the centres * difference^2 / (2 contrast^2), which does not depend on
+    sum over inner edges of length / distance of the centres * difference^2 / (2 contrast^2), of what a field has moved
+    from its start, which does not depend on
     the mesh, and a factor of 10 for all values of a piece of cloth together.
 
     Args:
@@ -113,6 +114,9 @@ def fit_fields(
         raise InvalidInput("contrast", got=contrast, expected="a number > 0")
     if iterations < 1:
         raise InvalidInput("iterations", got=iterations, expected="at least 1")
+    parameters = [parameters] if isinstance(parameters, str) else list(parameters)
+    if not parameters:
+        raise InvalidInput("parameters", got="none", expected="at least one name")
     every = given(recordings)
     own = {name: _field(cloth, name) for name in parameters}
     objective = _Fields(cloth, own, [episode(cloth, r) for r in every], dt, blocks_for(use), contrast)
@@ -141,6 +145,10 @@ def _field(cloth: Cloth, name: str) -> PhysicalParameter:
     if not isinstance(part, PhysicalParameter) or part.raw.shape != (count,) or part.domain == "nonnegative":
         expected = f"a parameter of the material with one value for each of {count} triangles"
         raise InvalidInput("field to fit", got=repr(name), expected=expected, remedy="identify fits single values")
+    if needs_contact(cloth, f"material.{name}"):
+        raise InvalidInput(
+            "field to fit", got=repr(name), expected="a parameter of the model", remedy="it needs contact"
+        )
     return part
 
 

@@ -49,13 +49,15 @@ def finer_cloth(cloth: Cloth) -> Cloth:
     patches = {name: _patch(part, mesh) for name, part in parts}
     fine = with_patches(fine, [p for p in patches.values() if p])  # rounder than the coarse mesh has them
     boundaries = {name: part if patches[name] else _regripped(part, ends, mesh) for name, part in parts}
+    grid, contact = cloth.grid(), cloth.contact  # a gap is no numerics
+    contact = contact and replace(contact, spacing=None if grid is None else grid.spacing)
     return Cloth(
         fine,
         kept.material,
         kept.areal_density,
         kept.effects,
         boundaries,
-        cloth.contact,
+        contact,
         cloth.transfer,
         cloth.engine,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -73,8 +74,8 @@ def identify(
     Args:
         cloth: model and start values; left unchanged (see ``Identification.apply``).
         recordings: one or several episodes of the same cloth.
-        parameters: public names, e.g. ["youngs_modulus", "air.normal"]; None: all material parameters that the model
-            contains, and the amplitudes of its effects.
+        parameters: public names, e.g. ["youngs_modulus", "air.normal"]; None: all material parameters that are not
+            zero, and the first amplitude of each effect.
         method: "gauss-newton" (robust residuals, forward-mode sensitivities) or "lbfgs" (the same, reverse mode);
             "adam" or "gradient-descent" (the paper's Chamfer distance to vertices, reverse mode), for comparison: a
             distance knows of no errors, so these take neither priors nor nuisances, and the density as exact.
@@ -91,7 +92,8 @@ def identify(
             [N]; as names, or with the standard deviation of the prior, e.g. {"clock": 0.4}. "rim" [m], an offset of
             the cloud's rim, always joins where there are points, unless it is given as 0.
         priors: by parameter (value, factor) for positive ones: 68 % within that factor; (value, standard deviation)
-            for others. Default: around the start, a factor of 10 for positive parameters.
+            for others. Default: around the start, a factor of 10 for positive parameters, 1 in the logit of 2 nu, twice
+            the start or the typical size of amplitudes.
         noise: least standard deviation by kind of data: "points", "edges", "markers" [m], "force" [N], "torque" [N m].
         starts: how many, the given one and others over two decades of every positive parameter; each is followed on the
             early frames, and the best goes on. ``fit["starts_agreeing"]`` counts those that led to the same values.
@@ -115,6 +117,8 @@ def identify(
         SimulationDiverged: the start values cannot be simulated.
     """
     _check(method, stop, iterations, starts)
+    if not 0 < rate < math.inf:
+        raise InvalidInput("rate", got=rate, expected="a number > 0")
     _check_priors(method, priors, nuisances)
     began = time.perf_counter()
     on_cpu(cloth)

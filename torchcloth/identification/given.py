@@ -8,14 +8,14 @@ from ..errors import InvalidInput
 from ..recordings import Recording
 from ..recordings.extents import check_size
 from ..recordings.marks import each_once
-from ..recordings.together import listed, same_cloth
+from ..recordings.together import listed, same_cloth, together
 
 
 def given(recordings: Recording | Sequence[Recording]) -> list[Recording]:
     """The episodes of a fit.
 
     Raises:
-        InvalidInput: none, one twice, different cloths, or something that is no recording.
+        InvalidInput: none, one twice, different cloths or tables, or something that is no recording.
         RecordingError: one was seen in another unit than metres.
     """
     found = listed(recordings)
@@ -25,4 +25,5 @@ def given(recordings: Recording | Sequence[Recording]) -> list[Recording]:
     each_once(found)
     for recording in found:
         check_size(recording)
+    together(found)  # tables that contradict each other are refused now, and not with the result
     return found

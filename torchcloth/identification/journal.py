@@ -7,6 +7,7 @@ That holds for every estimator alike, and there is no state of a search that cou
 from __future__ import annotations
 
 import hashlib
+import inspect
 import pickle
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -132,6 +133,16 @@ def digest(parts: Sequence[object]) -> str:
     return found.hexdigest()[:24]
 
 
+def _source(kind: type) -> str:
+    """Of a part that is not the library's; empty where it is, which ``program`` knows, or where nobody can tell."""
+    if kind.__module__.split(".")[0] in ("torchcloth", "torch"):
+        return ""
+    try:
+        return Path(inspect.getfile(kind)).read_text(encoding="utf-8")
+    except (TypeError, OSError, UnicodeDecodeError):
+        return ""
+
+
 def facts_of(cloth: Cloth) -> list[object]:
     """All that its simulations depend on: tensors by name, and what its parts keep as plain numbers and words."""
     tensors = [part for pair in (*cloth.named_parameters(), *cloth.named_buffers()) for part in pair]
@@ -141,4 +152,15 @@ def facts_of(cloth: Cloth) -> list[object]:
         for name, value in vars(part).items()
         if name != "training" and not name.startswith("_") and isinstance(value, (bool, int, float, str, tuple))
     ]
-    return [*tensors, *plain, cloth.mesh.rest.tobytes(), cloth.mesh.faces.tobytes(), cloth.contact, cloth.engine]
+    kinds = [(path, f"{type(part).__module__}.{type(part).__qualname__}") for path, part in cloth.named_modules()]
+    laws = [_source(kind) for kind in dict.fromkeys(type(part) for part in cloth.modules())]
+    return [
+        *kinds,
+        *laws,
+        *tensors,
+        *plain,
+        cloth.mesh.rest.tobytes(),
+        cloth.mesh.faces.tobytes(),
+        cloth.contact,
+        cloth.engine,
+    ]

@@ -19,7 +19,7 @@ from .linearity import Checked
 from .nuisances import Placed
 from .objective import Objective
 from .statements import Estimate, Profile
-from .unknowns import TRUSTED, Unknown, available, collect, needs_contact
+from .unknowns import TOLD, TRUSTED, Unknown, available, collect, needs_contact
 
 MISSED = 1.3  # rms over the sensor noise above which what the model misses may matter more than the noise
 STEADY = 0.9  # of the rms distance from constant forces, above which nothing but a weight was seen in them
@@ -193,7 +193,8 @@ def _estimate(unknown: Unknown, raw: float, deviation: float) -> Estimate:
     value = unknown.value(raw)
     std = unknown.slope(raw) * deviation
     low, high = (unknown.value(unknown.clip(raw + sign * NORMAL * deviation)) for sign in (-1, 1))
-    identifiable = std < TRUSTED * max(abs(value), unknown.typical)
+    told = unknown.measured or deviation < TOLD * unknown.prior_std  # a default prior is no knowledge
+    identifiable = told and std < TRUSTED * max(abs(value), unknown.typical)
     return Estimate(
         value,
         std,

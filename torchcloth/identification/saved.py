@@ -29,6 +29,8 @@ from .result import Identification, or_none
 from .unknowns import available
 
 RESULT = "identification.json"
+MOST = 100.0  # of the logarithm of a spread, which says nothing long before
+FRICTION = ".friction"  # of a table, behind its name
 FAITHFUL = 0.02  # relative difference of Chamfer between the fit and its replay that other machines explain
 STIFFEST = 1e13  # in SI units: simulated, a fabric of more would take more steps than can be counted
 SHORTEST, FINEST = 1e-7, 1e-5  # s, m: no fit ends that takes such steps, or has such a contact grid
@@ -42,7 +44,7 @@ class Replayed:
         cloth: with all values set.
         episode: what it was driven by and is compared with.
         frames: [T, V, 3] m at ``episode.times``.
-        chamfer: [T] m, mean distance of each frame's measured points from the simulated surface.
+        chamfer: [frames with points] m, mean distance of each frame's measured points from the simulated surface.
         fitted: whether the fit used the episode; else this is a prediction.
         warning: when the distances are not those that the fit had; else empty.
     """
@@ -111,7 +113,7 @@ def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tup
 
     Returns:
         The cloth, and by name of every fitted parameter (value, spread) as the ``priors`` of ``identify`` take it; the
-        spread of what the data left open is that of its prior.
+        spread of what the data left open is hardly less than that of its prior.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
@@ -124,7 +126,7 @@ def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tup
         value = model.values[name]
         positive = name in names and _parameter(cloth, names[name]).domain == "positive"
         if name in names and std > 0:
-            out[name] = (value, math.exp(std / value) if positive else std)
+            out[name] = (value, math.exp(min(std / value, MOST)) if positive else std)
     return cloth, out
 
 
@@ -181,8 +183,10 @@ def _model(content: dict[str, Any]) -> SavedModel:
     matrix = np.array([[number(row[name], -1.0) for name in correlation] for row in correlation.values()])
     if not len(matrix):
         raise ValueError("no fitted parameter in correlation")
-    if (np.abs(matrix) > 1 + 1e-9).any():
-        raise ValueError("a correlation above 1")
+    if (np.abs(matrix) > 1 + 1e-9).any() or not np.allclose(matrix, matrix.T) or not np.allclose(matrix.diagonal(), 1):
+        raise ValueError("a correlation that is none")
+    if unknown := correlation.keys() - model["values"].keys():
+        raise ValueError(f"no value of {min(unknown)}")
     left = content["fit"]["rms_after"]
     return SavedModel(
         {str(name): _value(name, value) for name, value in model["values"].items()},
@@ -218,14 +222,17 @@ def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:
     """
     cloth = cloth_from(recording, contact=model.contact)
     names = available(cloth)
-    if other := (model.values.keys() ^ names.keys()) | set(model.beyond):
+    tables = {name for name in model.values if name.endswith(FRICTION)} - names.keys()  # of tables that are not there
+    absent = {name for name in tables if name.removesuffix(FRICTION) not in recording.colliders}
+    if other := ((model.values.keys() - absent) ^ names.keys()) | set(model.beyond):
         raise InvalidInput(
             f"{path}: a fit of another model",
             got=f"{', '.join(sorted(other))} not alike in both",
             expected="the model that the episode describes",
             remedy="fit this episode; where the fit began with --model FILE.tcm, give that file",
         )
-    for name, value in model.values.items():
+    for name in model.values.keys() - absent:
+        value = model.values[name]
         try:
             _parameter(cloth, names[name]).set(value)
         except InvalidInput as error:

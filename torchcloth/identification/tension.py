@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -135,6 +136,9 @@ def _check(tables: list[ForceDisplacement], iterations: int) -> None:
     if not tables or iterations < 1:
         raise InvalidInput("tables or iterations", got=f"{len(tables)}, {iterations}", expected="at least one of each")
     for k, table in enumerate(tables):
+        for name in ("length", "width"):
+            if not 0 < getattr(table, name) < math.inf:
+                raise InvalidInput(f"tables[{k}].{name}", got=f"{getattr(table, name)} m", expected="a length > 0")
         if not (table.force > table.preload).any():
             got = f"none above the preload, {table.preload:g} N"
             raise InvalidInput(f"tables[{k}].force", got=got, expected="a pull")

@@ -60,7 +60,12 @@ class Band:
     def judge(self, seen: np.ndarray) -> dict[str, float]:
         """RMS and largest error as shares of the largest reading, and the share of readings inside the interval."""
         rows = np.isfinite(seen)
-        share = np.abs(self.value - seen)[rows] / np.abs(seen[rows]).max()
+        largest = np.abs(seen[rows]).max(initial=0.0)
+        if not largest > 0:
+            raise InvalidInput(
+                "readings", got="nothing but zeros", expected="some that are not", remedy="leave them out"
+            )
+        share = np.abs(self.value - seen)[rows] / largest
         low, high = self.ci95
         inside = (seen >= low) & (seen <= high)
         return {

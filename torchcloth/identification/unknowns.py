@@ -14,6 +14,7 @@ from ..errors import InvalidInput
 from ..parameters import PhysicalParameter, to_value
 
 DECADE = math.log(10.0)
+TOLD = 0.5  # of a prior's width, below which the data have told something
 TRUSTED = 0.25  # a parameter counts as identified when its standard error is below a quarter of its value
 ABSENT = {  # effects that an episode's facts bring into the model
     "air": "the model has no air: give air.density in episode.json",
@@ -35,7 +36,7 @@ class Unknown:
         prior_std: standard deviation of the prior, in the unconstrained coordinate.
         typical: size of an amplitude, which may be zero, in its unit; 0 of any other parameter.
         mean: the prior's middle; None: the start.
-        measured: known before the fit (areal density), by a prior narrower than ``TRUSTED``.
+        measured: known before the fit: a weighed areal density, or by a given prior that is narrower than ``TRUSTED``.
     """
 
     name: str
@@ -143,7 +144,7 @@ def _unknown(cloth: Cloth, name: str, path: str) -> Unknown:
         size = getattr(cloth.get_submodule(owner), "amplitudes", {}).get(own)
         # undeclared: the start says how large it is
         typical = TYPICAL.get(own, max(1.0, abs(start))) if size is None else size.typical
-        std = 2.0 * typical
+        std = 2.0 * max(typical, abs(start))
     return Unknown(name, f"{path}.raw", parameter, start, std, typical)
 
 
