@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .._files import PROGRESS
 from ..errors import InvalidInput
 from .folders import replaces
 
@@ -87,11 +89,13 @@ def report(folder: Path, found: FieldFit, cloth: Cloth) -> int:
     from rich.table import Table
 
     from ..identification.fields import RESULT
+    from ..identification.journal import clear
     from ..identification.pictures import field_maps, save_figure
 
     note = replaces(folder / RESULT)
     path = found.save(folder)
     picture = save_figure(field_maps(found.fields, cloth), folder / "fields.png")
+    clear(folder / PROGRESS)  # before anything is printed, to somebody who may stop reading
     table = Table(title=f"{len(cloth.mesh.faces)} triangles", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("field", "median", "5 %", "95 %", "unit"):
         table.add_column(heading, justify="left" if heading == "field" else "right")
@@ -102,7 +106,8 @@ def report(folder: Path, found: FieldFit, cloth: Cloth) -> int:
     console = Console(highlight=False)
     console.print(table)
     before, after = (1e3 * found.fit[f"chamfer_{key}"] for key in ("before", "after"))
-    console.print(f"Chamfer, one-sided, cloud to surface: {before:.2f} mm with the start values, {after:.2f} mm fitted")
+    if not math.isnan(after):
+        console.print(f"Chamfer, one-sided, cloud to surface: {before:.2f} mm before, {after:.2f} mm fitted")
     for warning in found.warnings:
         console.print(f"note: {warning}", style="yellow", markup=False)
     print(f"result:   {path}{note}\npicture:  {picture}")

@@ -117,7 +117,6 @@ def _identify(options: argparse.Namespace) -> int:
 
     from .. import recordings
     from ..identification import Identification
-    from ..identification.journal import clear
     from ..recordings.together import together
 
     torch.set_default_dtype(torch.float64)  # sensitivities lose digits over thousands of substeps in float32
@@ -135,9 +134,7 @@ def _identify(options: argparse.Namespace) -> int:
     fit = _fit(options, cloth, episodes)
     if isinstance(fit, Identification):
         return _report(options.out, fit, cloth, episodes)
-    code = fields.report(options.out, fit, cloth)
-    clear(options.out / PROGRESS)
-    return code
+    return fields.report(options.out, fit, cloth)
 
 
 def _defaults() -> argparse.Namespace:

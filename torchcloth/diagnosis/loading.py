@@ -14,6 +14,7 @@ from ..identification.episode_prediction import EpisodePrediction, with_errors
 from ..identification.episodes import RATE, Episode, episode
 from ..identification.replays import Frames, each
 from ..recordings import Recording
+from ..recordings.extents import check_size
 from ..recordings.marks import alike, mark
 from ..recordings.together import together
 from .cells import directions
@@ -108,8 +109,9 @@ def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
     """Where the cloth goes in any episode, with errors from the covariance of the model's numbers.
 
     Robot and observer err as the model says. Where nothing was seen there are twenty frames a second. Raises as
-    ``cloth_for``.
+    ``cloth_for``, and for what was seen in another unit than metres.
     """
+    check_size(recording)
     file = read_model(path, recording)
     model, world = file.model, file.model.world()
     data, every = episode(model.base.cloth, recording, RATE), one_way(model)

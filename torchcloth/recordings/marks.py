@@ -62,4 +62,5 @@ def _seen(recording: Recording) -> tuple[int, np.ndarray]:
         motions = (*recording.grippers.values(), *recording.joints.values())
         seen = [motion.force for motion in motions if motion.force is not None]
         frames = sum(map(len, seen))
-    return frames, np.concatenate(seen) if seen else np.zeros((0, 3))
+    every = np.concatenate(seen) if seen else np.zeros((0, 3))
+    return frames, every[np.isfinite(every).all(-1)]
