@@ -215,9 +215,11 @@ def test_episodes_of_two_cloths_are_refused(turned):
             check([turned, other])
     held = {name: rec.GraspInfo(vertices=np.array([0, 1]), uv=None) for name in turned.grasps}
     others = {name: replace(g, vertices=np.array([40, 41])) for name, g in held.items()}
+    beside = [{n: replace(g, vertices=np.array([k])) for n, g in held.items()} for k in (1500, 1501)]  # of a fine mesh
     wider = {name: replace(g, radius=2 * g.radius) for name, g in turned.grasps.items()}
     for one, two, what in (
         (replace(turned, grasps=held), replace(turned, grasps=others), "vertices of a grasp"),
+        (*(replace(turned, grasps=grasps) for grasps in beside), "vertices of a grasp"),
         (turned, replace(turned, grasps=wider), "radius of a grasp"),
         (replace(turned, air_density=None), replace(turned, air_density=1.2), "air"),
     ):

@@ -134,6 +134,18 @@ def test_a_damaged_checkpoint_is_not_resumed(config, tmp_path, capsys, damage):
     assert said.count("\n") == 1
 
 
+def test_a_network_whose_code_has_changed_is_not_resumed(config, tmp_path, capsys, monkeypatch):
+    """Its weights have the same shapes."""
+    code = "import torch\n\n\nclass Own(torch.nn.Linear):\n    def __init__(self):\n        super().__init__(2, 1)\n"
+    (tmp_path / "own_net.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    path = config(learn={"network": {"module": "own_net.Own", "gives": ["poisson_ratio"]}}, optimizer={"steps": 1})
+    assert main(["--config", path]) == 0
+    (tmp_path / "own_net.py").write_text(code + "\n    def forward(self, x):\n        return 2 * super().forward(x)\n")
+    assert main(["--config", path, "--resume", "optimizer.steps=2"]) == 2
+    assert "another" in capsys.readouterr().err
+
+
 def test_a_network_that_has_changed_is_not_resumed(config, capsys, monkeypatch):
     network = {"module": "nets.Wavy", "gives": ["poisson_ratio"]}
     monkeypatch.setattr("nets.Wavy", lambda: nn.Linear(2, 1), raising=False)

@@ -115,7 +115,7 @@ def _read(folder: Folder) -> ForceDisplacement:
         provenance=meta.text("provenance"),
         licence=meta.maybe(meta.text, "licence"),
         path=folder.shown,
-        extra=meta.rest,
+        extra=meta.left(),
         **columns,
     )
     if not np.any(table.force):

@@ -93,9 +93,12 @@ def _equal(a: object, b: object) -> bool:
     if a is None or b is None:
         return a is b
     try:
-        return bool(np.allclose(a, b, rtol=1e-3, atol=1e-6))  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+        one, two = np.asarray(a), np.asarray(b)
+    except ValueError:  # of several lengths
         return a == b
+    if one.dtype.kind != "f" or two.dtype.kind != "f":  # indices, counts, names
+        return a == b if isinstance(a, dict | str | list) else np.array_equal(one, two)
+    return one.shape == two.shape and bool(np.allclose(one, two, rtol=1e-3, atol=1e-6))
 
 
 def _shown(value: object) -> str:

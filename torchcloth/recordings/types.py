@@ -55,7 +55,7 @@ class ClothInfo:
         if self.sheet is None or grid is None or grid.ndim != 3:
             raise RecordingError("cloth has no initial grid", expected="a sheet with initial_vertices [M, N, 3]")
         place = np.asarray(uv) / self.sheet
-        if place.min() < -1e-9 or place.max() > 1 + 1e-9:
+        if not (place.min() >= -1e-9 and place.max() <= 1 + 1e-9):
             raise RecordingError("uv is not on the sheet", got=f"{place.min():g} to {place.max():g} of its sides")
         cells = np.array(grid.shape[:2]) - 1
         lower = np.clip((place * cells).astype(int), 0, cells - 1)

@@ -18,9 +18,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
     options, config = _parser().parse_intermixed_args(arguments), None
     try:
-        config = load(options.config, options.overrides)
-        if find_spec("lightning") is None:
+        if find_spec("lightning") is None:  # which brings YAML
             raise MissingDependency("lightning is not installed", remedy='run: pip install "torchcloth[training]"')
+        config = load(options.config, options.overrides)
         from .run import fit
 
         fit(config, options.resume)

@@ -157,7 +157,7 @@ def _parsed(what: str, text: str) -> Any:
 
     try:
         return yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # a day that no month has
         raise InvalidInput(what, got=str(error), expected="YAML") from None
 
 
@@ -218,7 +218,7 @@ def _scalar(kind: Any, value: Any, where: str) -> Any:
     try:
         if kind is float and type(value) in (int, float, str):
             return float(value)
-    except ValueError:
+    except (ValueError, OverflowError):
         pass
     name = {"int": "a whole number", "float": "a number", "str": "text"}[kind.__name__]
     raise InvalidInput(f"config: {where}", got=repr(value), expected=name)

@@ -7,6 +7,7 @@ import os
 import time
 import warnings
 from dataclasses import asdict, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import lightning.pytorch as pl
@@ -24,7 +25,7 @@ from torchcloth.identification.objective import Objective
 
 from . import result
 from .checkpoints import Whole
-from .config import CHECKPOINT, Config, Optimizer, Run
+from .config import CHECKPOINT, Config, Network, Optimizer, Run
 from .data import Episodes, found
 from .described import built, described, precision
 from .module import FitModule
@@ -179,9 +180,20 @@ def _after(trainer: pl.Trainer, module: FitModule, data: Episodes, episodes: lis
     return {f"{key.removeprefix('val/')}_after": value for key, value in found.items()}
 
 
+def _source(network: Network | None) -> bytes:
+    """The file that a network's class stands in; empty where there is none, which making it will tell."""
+    try:
+        spec = None if network is None else find_spec(network.module.rpartition(".")[0])
+        return b"" if spec is None or not spec.has_location else Path(str(spec.origin)).read_bytes()
+    except (ImportError, ValueError, OSError):
+        return b""
+
+
 def _problem(config: Config, cloth: Cloth, data: Episodes) -> str:
-    """Fingerprint of data, model, options and the library's code; of what may change while a run rests, nothing."""
+    """Fingerprint of data, model, options and code, the library's and a network's; of what may change while a run
+    rests, nothing.
+    """
     fixed = replace(config, out="", run=Run(seed=config.run.seed), data=replace(config.data, train=[], val=[]))
     fixed = replace(fixed, optimizer=replace(config.optimizer, steps=Optimizer.steps))
-    code = program(Path(__file__).resolve().parent)
-    return digest([code, fixed, len(data.train), *Objective(cloth, [], [*data.train, *data.val]).identity()])
+    code = program(Path(__file__).resolve().parent), _source(config.learn.network)
+    return digest([*code, fixed, len(data.train), *Objective(cloth, [], [*data.train, *data.val]).identity()])

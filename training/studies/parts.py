@@ -57,7 +57,8 @@ def one(out: Path, seed: int, fast: bool) -> dict[str, Any]:
     how = ["--fast"] if fast else ["--nodes", str(NODES)]
     if module("hidden", "make").main(["--seed", str(seed), "--out", str(episodes), *how]):
         raise InvalidInput("studies parts", got=f"case {seed} that could not be made", expected="its episodes")
-    recordings = [read(path) for path in sorted(episodes.iterdir())]
+    made = sorted(path for path in episodes.iterdir() if not path.name.startswith("."))  # nor what a stopped one left
+    recordings = [read(path) for path in made]
     drawn = module("hidden", "drawn")
     truth = module("hidden", "reveal").truth(drawn.case(seed, drawn.SMALL if fast else drawn.REDUCED))
     hidden = [e for e in truth["effects"] if e["share"] >= drawn.HALF]
