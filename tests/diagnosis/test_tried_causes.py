@@ -1,5 +1,7 @@
 """Causes of one's own that misbehave are told before anything long is simulated."""
 
+import math
+
 import pytest
 import sheets
 
@@ -20,6 +22,16 @@ WRONG = {
     "divides": (fails, "ZeroDivisionError: division by zero in .*test_tried_causes.py, line"),
     "a motion": (lambda w, a: w.with_motion(fails), "ZeroDivisionError: .*test_tried_causes.py, line"),
     "a view": (lambda w, a: w.with_view(fails), "ZeroDivisionError: .*test_tried_causes.py, line"),
+    "a view of one episode": (
+        lambda w, a: w.with_view(
+            lambda frames, e: fails() if float(e.motion["left"].pose[3, 1, 3]) > 0.005 else frames
+        ),
+        "ZeroDivisionError: .*test_tried_causes.py, line",
+    ),
+    "no numbers": (
+        lambda w, a: w.with_view(lambda frames, e: frames._replace(x=frames.x * math.nan)),
+        "frames that are no numbers",
+    ),
     "a factor": (
         lambda w, a: w.with_cloth({"my": effects.MassDamping(5 * (1 + a))}),
         "from next to nothing of it.*amplitude 0 to be the world as it is",
@@ -74,6 +86,7 @@ def test_no_effect_may_take_the_place_of_the_catalogues(world):
         ({"typical": "1"}, "typical of 'my.own'; got '1'; expected a number"),
         ({"apply": None}, "apply of 'my.own'"),
         ({"step": 0.0}, "step of 'my.own'"),
+        ({"kin": "obs.clock"}, "kin of 'my.own'; got 'obs.clock'; expected a tuple of names"),
         ({"low": 0.5}, "low and high of 'my.own'; got 0.5 and inf"),
         ({"high": 0.5}, "low and high of 'my.own'"),
     ],

@@ -77,8 +77,10 @@ def _print(found: Any) -> None:
 
 def _cells(gain: Gain) -> list[str]:
     low, high = gain.explained_ci95
-    share = f"{100 * gain.explained:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
-    density = f"{gain.density:+.0f} ({gain.ci95[0]:+.0f} to {gain.ci95[1]:+.0f})"
+    share, density = f"{100 * gain.explained:.0f} %", f"{gain.density:+.0f}"
+    if gain.least > -math.inf:  # else nothing is known of how it scatters
+        share += f" ({100 * low:.0f} to {100 * high:.0f})"
+        density += f" ({gain.ci95[0]:+.0f} to {gain.ci95[1]:+.0f})"
     if math.isnan(gain.before):  # forces only
         return ["–", "–", "–", density]
     return [f"{1e3 * gain.before:.2f}", f"{1e3 * gain.after:.2f}", share, density]

@@ -51,13 +51,14 @@ def _diagnose(options: argparse.Namespace) -> int:
         model = None
         if options.model is not None:
             model, episodes = diagnosis.begin_with(options.model, episodes)
-        seconds = sum(float(e.points.t[-1] - e.points.t[0]) for e in episodes if e.points is not None)
+        streams = [e.markers if e.points is None else e.points for e in episodes]
+        seen = [float(s.t[-1] - s.t[0]) for s in streams if s is not None]
+        seconds, longest = sum(seen), max(seen, default=0.0)
         print(
-            f"{len(episodes)} episodes, {seconds:.0f} s of points: some {max(1, round(seconds / 3)):.0f} minutes of a "
+            f"{len(episodes)} episodes, seen for {seconds:.0f} s: some {max(1, round(seconds / 3)):.0f} minutes of a "
             "core, up to four times as many where causes are found",
             flush=True,
         )
-        longest = max((float(e.points.t[-1] - e.points.t[0]) for e in episodes if e.points is not None), default=0.0)
         if longest > LONG:
             print(f"one lasts {longest:.0f} s: time and memory grow with the cube of that", flush=True)
         with progress_line() as progress:

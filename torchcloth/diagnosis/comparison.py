@@ -205,7 +205,7 @@ def compare(first: Predicted, second: Predicted, floor: float, seed: int = 0) ->
     """How much better the second predicts; intervals by resampling stretches of time. Not, where they share no cell."""
     one, two = _both(first, second)
     if not len(one.value):
-        return Gain(np.nan, np.nan, 0.0, (0.0, 0.0), 0.0, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), 0.0)
+        return Gain(np.nan, np.nan, 0.0, (0.0, 0.0), 0.0, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), -np.inf)
     owner, density, squares = _blocks(one, two)
     rng = np.random.default_rng(seed)
     drawn = _resampled(owner, rng)

@@ -71,16 +71,16 @@ class Confirmation:
 
 
 def _told(gain: Gain) -> dict[str, Any]:
-    """Shares are of positions: null where none were seen."""
-    seen = not math.isnan(gain.before)
+    """Shares are of positions: null where none were seen. Of single stretches of time no interval is known."""
+    seen, known = not math.isnan(gain.before), gain.least > -math.inf
     return {
         "rms_before": or_none(gain.before),
         "rms_after": or_none(gain.after),
         "unit": "m",
         "explained_fraction": gain.explained if seen else None,
-        "explained_ci95": list(gain.explained_ci95) if seen else None,
+        "explained_ci95": list(gain.explained_ci95) if seen and known else None,
         "log_density": gain.density,
-        "log_density_ci95": list(gain.ci95),
+        "log_density_ci95": list(gain.ci95) if known else None,
     }
 
 

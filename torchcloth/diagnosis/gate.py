@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import RecordingError
+from ..errors import InvalidInput, RecordingError
 from ..recordings import Recording, checks, read
 from ..recordings.reading import EPISODE
 from ..recordings.ticks import SLOWEST, times
@@ -49,8 +49,10 @@ def check(recordings: Sequence[Recording]) -> list[Fault]:
     """What makes these episodes unusable; empty where nothing does.
 
     Raises:
-        InvalidInput: the episodes are of different cloths, or of one that is held elsewhere.
+        InvalidInput: there are none, or they are of different cloths, or of one that is held elsewhere.
     """
+    if not recordings:
+        raise InvalidInput("episodes", got="none", expected="one at least")
     same_cloth(recordings)
     found = []
     for k, recording in enumerate(recordings):

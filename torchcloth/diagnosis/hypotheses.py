@@ -57,6 +57,8 @@ def _check_size(hypothesis: Hypothesis) -> None:
     for key in ("typical", "share", "step", "low", "high"):
         if not isinstance(number := getattr(hypothesis, key), (int, float)):
             raise InvalidInput(f"{key} of {hypothesis.name!r}", got=repr(number), expected="a number")
+    if not isinstance(kin := hypothesis.kin, tuple | list) or not all(isinstance(name, str) for name in kin):
+        raise InvalidInput(f"kin of {hypothesis.name!r}", got=repr(kin), expected='a tuple of names, ("obs.clock",)')
     if not callable(hypothesis.apply):
         raise InvalidInput(f"apply of {hypothesis.name!r}", got=repr(hypothesis.apply), expected="a function")
     wrong = hypothesis.typical == 0 or (hypothesis.typical < 0 and not hypothesis.signed)

@@ -108,7 +108,7 @@ def _causes(rows: list[dict[str, Any]]) -> list[str]:
         return []
 
     def told(c: dict[str, Any]) -> list[str]:
-        unit, (low, high), placebo = c["unit"].replace("-", ""), c["ci95"], c["placebo"]
+        unit, (low, high), placebo = "" if c["unit"] == "-" else c["unit"], c["ci95"], c["placebo"]
         chance = "–" if placebo["chance"] is None else f"{placebo['chance']:.1f}"
         share = "–" if c["share_of_explainable"] is None else f"{100 * c['share_of_explainable']:.0f} %"
         others = [n for n in c["class"] if n != c["effect"]] + [r["effect"] for r in c["rivals"]]

@@ -99,7 +99,9 @@ def diagnose(
     setting = setting_of(model, recordings)
     somewhere_seen(setting)
     own = {h.name for h in registered()}
-    check_own([h for h in asked if h.name in own], model.base, setting.episodes)
+    for place in (setting, setting.finer):  # each with a mesh of its own
+        if place is not None:
+            check_own([h for h in asked if h.name in own], place.base, place.episodes)
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     many = torch.get_num_threads()
@@ -162,8 +164,9 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
     ``recordings`` are the episodes, which say what the base model is of.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / RESULT).unlink(missing_ok=True)  # of an earlier diagnosis: it says nothing of other models
     if answer.searched is None:
-        for name in (BASE, EXTENDED):  # of an earlier diagnosis
+        for name in (BASE, EXTENDED):
             (folder / name).unlink(missing_ok=True)
     else:
         said, scene = [*answer.found.start.model.met, *answer.content["episodes"]], together(recordings)

@@ -11,11 +11,16 @@ def step_sizes(model: Model) -> list[tuple[int, float]]:
 
 
 def both_ways(model: Model) -> list[tuple[int, float]]:
-    """(coordinate, step) there and back along each of the model's own, but for what lies beyond its ends."""
+    """(coordinate, step) there and back along each of the model's own, but for what lies beyond its ends.
+
+    One of which both lie beyond goes there, as far as it may (``taken``).
+    """
     low, high = (end.tolist() for end in model.ends)
     here = model.point.tolist()
     every = [(k, sign * step) for k, step in step_sizes(model) for sign in (1.0, -1.0)]
-    return [(k, step) for k, step in every if low[k] <= here[k] + step <= high[k]]
+    within = [(k, step) for k, step in every if low[k] <= here[k] + step <= high[k]]
+    told = {k for k, _ in within}
+    return sorted([*within, *(way for way in step_sizes(model) if way[0] not in told)], key=lambda way: way[0])
 
 
 def one_way(model: Model) -> list[tuple[int, float]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ NOTHING = 1e-9  # m
 
 
 def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode]) -> None:
-    """Simulate some frames with each of them, and with next to nothing of it.
+    """Simulate the first frames of every episode with each of them, and those of one with next to nothing of it.
 
     Raises:
         InvalidInput: one fails in an error of its own, gives no world, or does not end where the world is as it is.
@@ -32,9 +33,17 @@ def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode
             moved = []
             for amplitude in (NEAR * hypothesis.typical, hypothesis.typical):
                 world = applied(hypothesis, base, amplitude)
-                for episode in episodes:
-                    world.driven(episode)
                 moved.append(float((world.frames(early).x - plain).square().mean().sqrt()))
+            for k, episode in enumerate(episodes):
+                world.driven(episode)
+                if k:
+                    world.frames(episode.until(0.0))
+            if not all(map(math.isfinite, moved)):
+                raise InvalidInput(
+                    f"hypothesis {hypothesis.name!r}",
+                    got="frames that are no numbers",
+                    expected="apply(world, amplitude) that gives a world, whose motions give episodes and views frames",
+                )
             if moved[0] > CONTINUOUS * moved[1] + NOTHING:
                 raise InvalidInput(
                     f"hypothesis {hypothesis.name!r}",

@@ -210,8 +210,10 @@ def _error(found: Found, place: int, names: Sequence[str], alone: Collection[str
 
 def _share(found: Found, gain: Gain) -> float | None:
     """Of what all causes explain together, by what each adds to the predictive density."""
-    every = sum(step.best.gain.density for step in found.steps)
-    return None if found.whole is None else max(0.0, found.whole.explained) * gain.density / every
+    every = sum(max(0.0, step.best.gain.density) for step in found.steps)
+    if found.whole is None or not every:
+        return None
+    return max(0.0, found.whole.explained) * max(0.0, gain.density) / every
 
 
 def _gain(found: Found, names: Sequence[str]) -> dict[str, Any] | None:
