@@ -92,7 +92,7 @@ def _corner(item: str, vertices: int, coordinates: int) -> tuple[int, int]:
     first, second, *_ = [*item.split("/"), ""]
     i = int(first) - 1 if int(first) > 0 else vertices + int(first)
     k = -1 if not second else int(second) - 1 if int(second) > 0 else coordinates + int(second)
-    if not 0 <= i < vertices or not (k >= 0 if second else k >= -1) or not k < coordinates:
+    if not 0 <= i < vertices or not (0 if second else -1) <= k < coordinates:
         raise ValueError(f"index out of range: {item}")
     return i, k
 
