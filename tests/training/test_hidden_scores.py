@@ -233,3 +233,15 @@ def test_what_shows_is_asked_of_the_truths_engine():
     cases = [{**judged(DRAG, answer()), "shows": known} for known in ([True], [False], None)]
     row = dict(rates.further(cases))["class identified, singles at typical size that show"]
     assert (row.hits, row.of) == (0, 1)
+
+
+def test_singles_are_counted_by_effect():
+    def case(name, kind, found, shows, family="single"):
+        return {"family": family, "hidden": [name], "kind": kind, "found": [found], "shows": [shows]}
+
+    cases = [case("hem", "0.5", True, True), case("hem", "0.5", False, False), case("hem", "1", True, True)]
+    cases += [case("drag", "1.5", False, True), case("drag", "two", True, True, "double")]
+    found = rates.by_effect(cases)
+    assert list(found) == ["drag", "hem"]
+    assert [tuple(rate) for rate in found["hem"]] == [(1, 2), (1, 1), (0, 0), (2, 2)]
+    assert [tuple(rate) for rate in found["drag"]] == [(0, 0), (0, 0), (0, 1), (0, 1)]

@@ -89,6 +89,7 @@ def test_kept_rounds_are_scored_beside_each_other_and_together(called, tmp_path,
     lines = (tmp_path / "both" / "rounds.md").read_text().splitlines()
     assert lines[0] == "| figure | one (3) | two (5) | together | 95 % |"
     assert "| nulls with a named cause, or refused | 0 of 3 | 0 of 5 | 0 of 8 | 0 %–37 % |" in lines
+    assert "| one effect, class identified | half its typical size | typical | 1.5 | of all that show |" in lines
     assert (tmp_path / "both" / "hidden.md").read_text().count("| two/00") == 5
     with pytest.raises(InvalidInput, match="--out"):
         hidden.run(options(tmp_path, out=tmp_path / "one", kept=[tmp_path / "two"]))

@@ -72,7 +72,9 @@ def run(options: argparse.Namespace) -> None:
     if options.kept:
         rounds = together(options)
         report(options.out, [{**c, "name": f"{name}/{c['name']}"} for name, cases in rounds.items() for c in cases])
-        write_text(options.out / "rounds.md", hidden_tables.beside(rounds) + "\n")
+        every = [case for cases in rounds.values() for case in cases]
+        tables = hidden_tables.beside(rounds), hidden_tables.by_effect(every)
+        write_text(options.out / "rounds.md", "\n\n".join(tables) + "\n")
         print(f"one beside the other: {options.out / 'rounds.md'}")
         return
     chosen = drawn(options)

@@ -107,7 +107,16 @@ def at(singles: Sequence[Judged], share: str) -> list[Judged]:
     return [c for c in singles if c["kind"] == share]
 
 
-def _shown(cases: Sequence[Judged]) -> list[Judged]:
+def by_effect(cases: Sequence[Judged]) -> dict[str, list[Rate]]:
+    """Singles whose class is identified, by effect: at half, typical and one and a half, and all of them that show."""
+    singles, out = of(cases, "single"), {}
+    for name in sorted({c["hidden"][0] for c in singles}):
+        own = [c for c in singles if c["hidden"][0] == name]
+        out[name] = [rate(some, _found) for some in (*(at(own, share) for share in ("0.5", "1", "1.5")), shown(own))]
+    return out
+
+
+def shown(cases: Sequence[Judged]) -> list[Judged]:
     """Those whose effects all change what is recorded."""
     return [c for c in cases if c.get("shows") and all(c["shows"])]
 
@@ -144,10 +153,10 @@ def further(cases: Sequence[Judged]) -> list[tuple[str, Rate | float | None]]:
     seen = [c for c in singles if not (c["said_invisible"][0] and not c["named"])]
     return [
         ("class identified, singles at 1.5", rate(at(singles, "1.5"), _found)),
-        ("class identified, singles at typical size that show", rate(_shown(at(singles, "1")), _found)),
-        ("class identified, singles at half that show", rate(_shown(at(singles, "0.5")), _found)),
-        ("both of two effects that show", rate(_shown(doubles), lambda c: c["right"])),
-        ("outside the catalogue that show: unexplained", rate(_shown(of(cases, "outside")), lambda c: c["right"])),
+        ("class identified, singles at typical size that show", rate(shown(at(singles, "1")), _found)),
+        ("class identified, singles at half that show", rate(shown(at(singles, "0.5")), _found)),
+        ("both of two effects that show", rate(shown(doubles), lambda c: c["right"])),
+        ("outside the catalogue that show: unexplained", rate(shown(of(cases, "outside")), lambda c: c["right"])),
         ("singles said to be invisible in these data, nothing named", Rate(len(singles) - len(seen), len(singles))),
         ("class identified, singles of all sizes but those", rate(seen, _found)),
         ("matched nulls with a named cause", rate(of(cases, "null"), lambda c: c["named"])),

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from . import hidden_rates
 from .fabric_tables import NOTHING, table
 from .hidden_rates import Mark, Rate, further, marks
 from .hidden_scores import NULLS
@@ -43,6 +44,13 @@ def beside(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     rows = [(label, *(c[label][0] for c in columns), columns[-1][label][1]) for label in columns[-1]]
     counts = [f"{name} ({len(cases)})" for name, cases in rounds.items()]
     return _lines(("figure", *counts, "together", "95 %"), rows)
+
+
+def by_effect(cases: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown with the singles of each effect."""
+    said = lambda r: f"{r.hits} of {r.of}" if r.of else NOTHING  # noqa: E731
+    rows = [(name, *map(said, rates)) for name, rates in hidden_rates.by_effect(cases).items()]
+    return _lines(("one effect, class identified", "half its typical size", "typical", "1.5", "of all that show"), rows)
 
 
 def _figures(cases: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str, str]]:
