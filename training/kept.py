@@ -64,7 +64,6 @@ class Kept:
         """All cases by name, the missing ones computed in turn, ``jobs`` at a time, with progress."""
         missing = [name for name in cases if self.find(name) is None]
         if missing:
-            self.begin()  # where nothing can be written, before anything is computed
             self._compute({name: cases[name] for name in missing}, len(cases), jobs)
         return {name: found for name in cases if (found := self.find(name)) is not None}
 
