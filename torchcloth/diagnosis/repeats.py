@@ -62,4 +62,4 @@ def repeats(predicted: Predicted, pairs: Sequence[tuple[int, int]]) -> Repeats |
         key, value = predicted.key[one][both], predicted.value[one][both]
         squares.append((value - aligned(key, predicted.key[two], predicted.value[two])).square() / 2)
     square = torch.cat(squares) if squares else predicted.value[:0]
-    return Repeats(sum(map(bool, map(len, squares))), float(square.mean().sqrt())) if len(square) else None
+    return Repeats(sum(len(own) > 0 for own in squares), float(square.mean().sqrt())) if len(square) else None

@@ -16,6 +16,7 @@ LIBRARY = Path(__file__).parents[1]
 NEAR = 1e-6  # of the typical amplitude: as good as none
 CONTINUOUS = 0.1  # of what the typical amplitude does, that such an amplitude may do
 NOTHING = 1e-9  # m
+GIVES = "apply(world, amplitude) that gives a world, whose motions give episodes and views frames"
 
 
 def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode]) -> None:
@@ -42,7 +43,7 @@ def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode
                 raise InvalidInput(
                     f"hypothesis {hypothesis.name!r}",
                     got="frames that are no numbers",
-                    expected="apply(world, amplitude) that gives a world, whose motions give episodes and views frames",
+                    expected=GIVES,
                 )
             if moved[0] > CONTINUOUS * moved[1] + NOTHING:
                 raise InvalidInput(
@@ -86,5 +87,5 @@ def blamed(hypothesis: Hypothesis) -> Iterator[None]:
         raise InvalidInput(
             f"hypothesis {hypothesis.name!r}",
             got=f"{type(error).__name__}: {error}{where}",
-            expected="apply(world, amplitude) that gives a world, whose motions give episodes and views frames",
+            expected=GIVES,
         ) from error

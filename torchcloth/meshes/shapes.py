@@ -94,12 +94,17 @@ def _check_polygons(mesh: Any, path: Path) -> None:
     """trimesh cuts polygons into fans, whatever they are like."""
     face = (mesh.metadata.get("_ply_raw") or {}).get("face") or {}
     for name in _INDEX & (face.get("properties") or {}).keys():
-        found = face["data"][name]
-        corners = np.asarray(found["f1"] if getattr(found.dtype, "names", None) else found)
+        corners = _rows(face, name)
         many = [corners] if corners.ndim == 2 else [np.stack(own) for own in _alike(corners)]
         for polygons in many:
             if polygons.shape[1] > 3:
                 obj.check_convex(np.asarray(mesh.vertices)[polygons], str(path))
+
+
+def _rows(face: Any, key: str) -> np.ndarray:
+    """A list property of the faces: one row each, of objects where they differ in length."""
+    found = face["data"][key]
+    return np.asarray(found["f1"] if getattr(found.dtype, "names", None) else found)
 
 
 def _alike(rows: np.ndarray) -> list[list[np.ndarray]]:
@@ -120,14 +125,10 @@ def _wedges(raw: Any, path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray] |
     if name is None:
         return None
 
-    def rows(key: str) -> np.ndarray:
-        found = face["data"][key]
-        return np.asarray(found["f1"] if getattr(found.dtype, "names", None) else found)
-
     index = _INDEX & face["properties"].keys()
     if not index:
         raise InvalidInput("mesh file", got=f"{path}, faces without vertices", expected="a list of vertex_indices")
-    corners, coordinates, place = rows(index.pop()), rows(name), raw["vertex"]["data"]
+    corners, coordinates, place = _rows(face, index.pop()), _rows(face, name), raw["vertex"]["data"]
     if corners.ndim != 2 or coordinates.shape != (len(corners), 2 * corners.shape[1]):
         got = f"{path}, polygons of several kinds with coordinates of their corners"
         raise InvalidInput("mesh file", got=got, expected="triangles", remedy="triangulate on export")
