@@ -159,7 +159,6 @@ def test_a_default_prior_is_no_knowledge(recording):
     assert stated(model, [0.3], ["poisson_ratio"])["poisson_ratio"].identifiable
     stiff = at(recording, **{"bending.stiffness": 1e-3})
     wide = collect(stiff, ["bending.stiffness"], None)[0].prior_std
-    assert wide == pytest.approx(2e-3)
     assert not stated(stiff, [wide], ["bending.stiffness"])["bending.stiffness"].identifiable
 
 

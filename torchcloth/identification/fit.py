@@ -93,7 +93,7 @@ def identify(
             the cloud's rim, always joins where there are points, unless it is given as 0.
         priors: by parameter (value, factor) for positive ones: 68 % within that factor; (value, standard deviation)
             for others. Default: around the start, a factor of 10 for positive parameters, 1 in the logit of 2 nu, twice
-            the start or the typical size of amplitudes.
+            the typical size of amplitudes.
         noise: least standard deviation by kind of data: "points", "edges", "markers" [m], "force" [N], "torque" [N m].
         starts: how many, the given one and others over two decades of every positive parameter; each is followed on the
             early frames, and the best goes on. ``fit["starts_agreeing"]`` counts those that led to the same values.

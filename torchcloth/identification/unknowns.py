@@ -144,7 +144,7 @@ def _unknown(cloth: Cloth, name: str, path: str) -> Unknown:
         size = getattr(cloth.get_submodule(owner), "amplitudes", {}).get(own)
         # undeclared: the start says how large it is
         typical = TYPICAL.get(own, max(1.0, abs(start))) if size is None else size.typical
-        std = 2.0 * max(typical, abs(start))
+        std = 2.0 * typical
     return Unknown(name, f"{path}.raw", parameter, start, std, typical)
 
 
