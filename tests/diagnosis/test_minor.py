@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import linear_toys as toys
 import pytest
 
-from torchcloth.diagnosis import doubts, trials
+from torchcloth.diagnosis import doubts, stepwise, trials
 from torchcloth.diagnosis.comparison import Gain
 from torchcloth.diagnosis.stepwise import Found
 from torchcloth.diagnosis.trials import Step, _open, _rival, _themselves
@@ -20,7 +20,7 @@ HEM = ("mass.hem", 0.02, 0.39 * MATTERS * 0.02)
 
 
 def candidate(name, typical, amplitude, **options):
-    return SimpleNamespace(hypothesis=toys.hypothesis(name, typical, **options), amplitude=amplitude)
+    return SimpleNamespace(hypothesis=toys.hypothesis(name, typical, **options), amplitude=amplitude, row=None)
 
 
 def ended(best, *rivals):
@@ -53,6 +53,27 @@ def test_of_two_that_cannot_be_told_apart_one_may_be_somewhat_small(scale, named
     for order in (alike, alike[::-1]):
         found = ended(*order)
         assert (found.causes, found.minor) == ((found.steps, []) if named else ([], found.steps))
+
+
+@pytest.mark.parametrize(
+    ("kin", "asked", "named"), [((), -0.02, False), ((), -0.05, True), (("contact.mu",), -0.02, True)]
+)
+def test_what_slopes_cannot_tell_from_a_cause_might_have_to_matter_too(monkeypatch, kin, asked, named):
+    """045 of d32337c: 0.024 of friction, which does not matter, looked like 0.41 by direction, which would.
+
+    What is the same by structure has no size of its own.
+    """
+    found = ended(("contact.aniso", -0.5, 0.41), EXTRINSIC)
+    (step,), mu = found.steps, toys.hypothesis("contact.mu", 0.2)
+    step.best.hypothesis = replace(step.best.hypothesis, kin=kin)
+    like = SimpleNamespace(hypothesis=mu, amplitude=asked, gain=1.0)
+    monkeypatch.setattr(stepwise, "alike", lambda before, row, amplitude, others: others)
+    found = replace(found, steps=[replace(step, screened=[like])])
+    assert (found.causes, found.minor) == ((found.steps, []) if named else ([], found.steps))
+    if not named:
+        told = _minor(found, found.steps[0])
+        assert told["effect"] == "contact.mu"
+        assert [r["effect"] for r in told["rivals"]] == ["contact.aniso", "obs.extrinsic[x]"]
 
 
 def test_a_rival_that_joins_the_model_beside_a_cause_is_none_any_more():

@@ -160,10 +160,10 @@ def test_frames_are_as_many_whatever_is_hidden(tiny, name):
 
 def test_motions_that_some_effects_need_are_made_for_others_as_well():
     """By cases on a table that hide nothing that creases or rubs."""
-    tables = [c for c in map(case, range(1000)) if not {"drag-fast", "fold"}.isdisjoint(t.motion for t in c.takes)]
+    tables = [c for c in map(case, range(1000)) if not {"drag-fast", "fold-open"}.isdisjoint(t.motion for t in c.takes)]
     plain = [c for c in tables if not {h.name for h in c.effects} & {"plast.crease", "contact.mu", "contact.aniso"}]
     with_one = lambda motion: sum(any(t.motion == motion for t in c.takes) for c in plain) / len(plain)  # noqa: E731
-    assert 0.1 < with_one("fold") < 0.35
+    assert 0.1 < with_one("fold-open") < 0.35
     assert 0.1 < with_one("drag") < 0.35
 
 

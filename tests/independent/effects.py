@@ -48,7 +48,7 @@ CATALOGUE = {
     "elas.ortho": Effect("membrane", "weft", "-", 0.5, "stretch"),
     "elas.shear": Effect("membrane", "shear", "-", -0.6, "stretch"),
     "elas.stiffen": Effect("membrane", "stiffening", "-", 10.0, "stretch"),
-    "plast.crease": Effect("plate", "crease", "1/s", 5.0, "fold", ("crease_yield",)),
+    "plast.crease": Effect("plate", "crease", "1/s", 5.0, "fold-open", ("crease_yield",)),
     "rest.curl": Effect("plate", "curl", "1/m", 3.0, "hang", ("curl_weft",)),
     "rest.shrink": Effect("sheet", "shrink_v", "-", 0.03, "hang"),
     "rest.shrink_u": Effect("sheet", "shrink_u", "-", 0.03, "hang"),

@@ -32,6 +32,8 @@ def alike(found: Fitted, row: Row, amplitude: float, others: Sequence[Row]) -> l
 
     Directions of the same effect are none, nor is what would have to have a sign that it cannot have.
     """
+    if not others:
+        return []
     index = {h.name: k for k, h in enumerate(found.evidence.hypotheses)}
     if row.hypothesis.name not in index:  # no world could have it there
         return []

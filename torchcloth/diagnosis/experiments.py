@@ -1,9 +1,9 @@
 """Short, safe motions from where the grippers are: what may be asked of a robot to tell causes apart.
 
-On a table all keep within 17 cm of the first pose, but for the lift (42 cm), in the air within 5 cm, but for the turn
-(each gripper on a quarter of a circle about the middle of all, which goes 4 cm ahead), and stretch the cloth by at most
-1 cm. They are those of ``tests/independent/motions.py``, so that another engine can carry an
-experiment out.
+On a table all keep within 17 cm of the first pose, but for the lift (42 cm) and the fold that is opened again (39 cm:
+what then stays is a crease), in the air within 5 cm, but for the turn (each gripper on a quarter of a circle about the
+middle of all, which goes 4 cm ahead), and stretch the cloth by at most 1 cm. They are those of
+``tests/independent/motions.py``, so that another engine can carry an experiment out.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ def _back_and_forth(amplitude: float, leg: float, cycles: int, axis: int) -> Pla
 
 HERE = (0.0, 0.0, 0.0)
 AHEAD = (0.04, 0.0, 0.0)
+OVER = (-0.22, 0.0, 0.07)
 PLANS = {
     "hang": Plan((0.0, 1.0), (HERE, HERE)),
     "swing": _back_and_forth(0.05, 0.85, 1, 0),
@@ -56,6 +57,9 @@ PLANS = {
     "drag": Plan((0.0, 0.25, 1.25), (HERE, (0.0, 0.0, 0.02), (0.16, 0.0, 0.02)), lying=True),
     "drag-fast": Plan((0.0, 0.25, 0.70), (HERE, (0.0, 0.0, 0.02), (0.16, 0.0, 0.02)), lying=True),
     "lift": Plan((0.0, 1.4), (HERE, (-0.12, 0.0, 0.40)), lying=True),
+    "fold-open": Plan(
+        (0.0, 0.6, 1.1, 1.3, 2.5), (HERE, (-0.12, 0.0, 0.15), OVER, OVER, (-0.15, 0.0, 0.36)), lying=True
+    ),
 }
 
 
@@ -87,7 +91,7 @@ LIBRARY = (
     Experiment("shake"),
     Experiment("stretch"),
     *(Experiment("turn", heading) for heading in (0.0, 90.0)),
-    *(Experiment(name) for name in ("drag", "drag-fast", "lift")),
+    *(Experiment(name) for name in ("drag", "drag-fast", "lift", "fold-open")),
 )
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from .afresh import afresh, resettled
 from .approaching import approach
 from .branches import unstable, without
+from .classes import alike
 from .comparison import Gain, Predicted, compare, heard, predict
 from .doubts import mended, plainer, predicts_better, pruned, unheard
 from .fitting import Fitted, fit, weighed_alike
@@ -70,7 +71,8 @@ class Found:
     def causes(self) -> list[Step]:
         """Those that are large enough to matter; the others stay in the model, so that nothing stands in for them.
 
-        Of what cannot be told apart one must matter, and the others be half as large as is of interest.
+        Of what cannot be told apart, by predictions or by slopes, one must matter, and the others be half as large as
+        is of interest.
         """
         large = lambda told: any(h.matters(a) for h, a in told) and all(h.might_matter(a) for h, a in told)  # noqa: E731
         return [s for s in self.steps if large(self.alike(s))]
@@ -85,10 +87,23 @@ class Found:
         there = {s.best.hypothesis.name for s in self.steps}
         return [c for c in step.rivals if c.hypothesis.name not in there]
 
+    def unseen(self, step: Step) -> list[Row]:
+        """What slopes cannot tell from a step's cause, where predictions did not and the model has it not."""
+        h = step.best.hypothesis
+        beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
+        apart = beaten | {s.best.hypothesis.name for s in self.steps} - {h.name}
+        others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in apart]
+        return alike(step.before, step.best.row, self.amplitude(step), others)
+
     def alike(self, step: Step) -> list[tuple[Hypothesis, float]]:
-        """A step's cause in the end and its rivals, with amplitudes."""
-        rivals = [(c.hypothesis, c.amplitude) for c in self.rivals(step)]
-        return [(step.best.hypothesis, self.amplitude(step)), *rivals]
+        """A step's cause in the end, its rivals and what slopes cannot tell from it, with amplitudes.
+
+        Less what is the same by structure, whose amplitude tells nothing more.
+        """
+        h, rivals = step.best.hypothesis, [(c.hypothesis, c.amplitude) for c in self.rivals(step)]
+        said = {*h.kin, *(other.name for other, _ in rivals)}
+        unseen = [(r.hypothesis, r.amplitude) for r in self.unseen(step) if r.hypothesis.name not in said]
+        return [(h, self.amplitude(step)), *rivals, *unseen]
 
     def amplitude(self, step: Step) -> float:
         """Of a step's cause in the end."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..errors import InvalidInput
 from ..identification.result import or_none
 from ..recordings import Recording
-from .classes import alike, fitted_alike
+from .classes import fitted_alike
 from .comparison import Gain, by_motion, heard, spread, told_by
 from .drifting import drifts
 from .gate import Fault
@@ -169,10 +169,7 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     best, h, count = step.best, step.best.hypothesis, len(found.end.model.parameters)
     place, amplitude = found.end.model.place(h.name), found.amplitude(step)
     std = (_error(found, count + place, names, best.alone) ** 2 + best.row.bias**2) ** 0.5
-    beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
-    apart = beaten | {s.best.hypothesis.name for s in found.steps} - {h.name}
-    others = [r for r in step.screened if r.gain > 0 and r.hypothesis.name not in apart]
-    kin = [r.hypothesis.name for r in alike(step.before, best.row, amplitude, others)]
+    kin = [r.hypothesis.name for r in found.unseen(step)]
     rivals = found.rivals(step)
     kin += [c.hypothesis.name for c in rivals if fitted_alike(best.fitted, c.fitted, step.noise)]
     return {
