@@ -474,12 +474,16 @@ def test_what_is_written_is_there_before_it_is_shown(folder, tmp_path):
         assert [*(tmp_path / verb[0] / "a[b]").glob("*.json")]
 
 
-@pytest.mark.parametrize("verb", ["view", "inspect"])
+@pytest.mark.parametrize(
+    "verb", ["view", "inspect", "identify", "diagnose", "pose --fit a.tcm", "predict a.tcm", "confirm a.tcm b.tcm"]
+)
 def test_nothing_is_written_into_an_episode(verb, folder, capsys):
     before = sorted(folder.rglob("*"))
     out = folder / "cam0" / "000000.png"
-    assert main([verb, str(folder), "--out", str(out)]) == 2
-    assert "within the episode" in one_line(capsys.readouterr().err)
+    name, *more = verb.split()
+    order = [str(folder), *more] if name == "pose" else [*more, str(folder)]
+    assert main([name, *order, "--out", str(out)]) == 2
+    assert f"within {folder}, which is read" in one_line(capsys.readouterr().err)
     assert sorted(folder.rglob("*")) == before
 
 

@@ -1,15 +1,18 @@
-"""Files that are there whole or not at all."""
+"""Files that are there whole or not at all, and folders for them."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from .errors import InvalidInput
 
 PROGRESS = "progress"  # folder in an output folder, while the work is not done
 
@@ -51,3 +54,25 @@ def _finite(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_finite(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def check_folder(path: Path, option: str = "--out") -> None:
+    """Refuse, before any work is done, a folder that cannot be made or written to; leaves nothing behind.
+
+    Raises:
+        InvalidInput: the path, or what should be a folder above it, is a file, or the system lets nothing be made.
+    """
+    plain = Path(os.path.abspath(path))
+    above = next(part for part in (plain, *plain.parents) if os.path.lexists(part) or part == part.parent)
+    if not above.is_dir():
+        raise InvalidInput(option, got=f"{above}, a file", expected="a folder, new or existing")
+    try:  # in a place of its own: two commands may make the same folder at once
+        with tempfile.TemporaryDirectory(prefix=".torchcloth-", dir=above) as trial:
+            (Path(trial) / plain.relative_to(above)).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInput(
+            option,
+            got=f"{path}, which cannot be written ({error.strerror})",
+            expected="a folder, new or existing, where files can be made",
+            remedy="choose another, or change its permissions",
+        ) from None

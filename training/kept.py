@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from torchcloth._files import as_json, write_text
+from torchcloth._files import as_json, check_folder, write_text
 from torchcloth.errors import InvalidInput, RecordingError, TorchclothError
 from torchcloth.identification.journal import program
 
@@ -124,8 +124,7 @@ def guarded(name: str, what: str, work: Callable[[], object]) -> int:
 
 def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
     """Raises InvalidInput where the folder cannot hold a study of these settings, or has one by other code."""
-    if folder.exists() and not folder.is_dir():
-        raise InvalidInput("--out", got=f"{folder}, a file", expected="a folder, new or existing")
+    check_folder(folder)
     try:
         found = json.loads((folder / "study.json").read_text())
     except FileNotFoundError:

@@ -193,3 +193,9 @@ def test_a_model_that_is_none_is_refused(tmp_path, capsys):
     (tmp_path / "m.tcm").write_text("x")
     assert main(["diagnose", str(folder), "--model", str(tmp_path / "m.tcm"), "--out", str(tmp_path / "out")]) == 2
     assert "m.tcm: unreadable" in capsys.readouterr().err
+
+
+def test_a_cause_is_asked_about_once(with_drag):
+    recordings, _ = with_drag
+    with pytest.raises(InvalidInput, match=r"hypotheses; got 'air\.drag_n' twice; expected each once"):
+        diagnose(recordings, hypotheses=2 * asked(recordings))

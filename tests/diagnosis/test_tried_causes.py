@@ -1,13 +1,14 @@
 """Causes of one's own that misbehave are told before anything long is simulated."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import sheets
 
 from torchcloth import effects
 from torchcloth.diagnosis.base_model import base_model
-from torchcloth.diagnosis.hypotheses import Hypothesis, catalogue, forget, register
+from torchcloth.diagnosis.hypotheses import Hypothesis, catalogue, forget, own_among, register
 from torchcloth.diagnosis.setting import setting_of
 from torchcloth.diagnosis.tried_causes import check_own
 from torchcloth.errors import InvalidInput
@@ -53,6 +54,15 @@ def test_a_cause_of_ones_own_is_tried(world, case):
     own = Hypothesis("my.own", "-", 1.0, apply)
     with pytest.raises(InvalidInput, match=f"hypothesis 'my.own'; got .*{said}"):
         check_own([own], model.base, setting.episodes)
+
+
+def test_what_is_given_and_not_registered_is_ones_own_as_well(world):
+    recordings, model, _ = world
+    known, own = catalogue(model, recordings), Hypothesis("my.own", "-", 1.0, lambda w, a: w)
+    assert own_among([*known, own]) == [own]
+    for wrong, said in (([own, own], "'my.own' twice"), ([replace(own, typical=0.0)], "typical of 'my.own'; got 0")):
+        with pytest.raises(InvalidInput, match=said):
+            own_among(wrong)
 
 
 def test_a_right_one_passes(world):

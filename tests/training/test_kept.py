@@ -79,6 +79,8 @@ def test_other_settings_damage_and_files_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidInput, match="a file; expected a folder"):
         Kept(tmp_path / "file", {})
+    with pytest.raises(InvalidInput, match="which cannot be written"):  # and not after the first case
+        Kept(tmp_path / ("x" * 300), {})
 
 
 def test_what_is_not_a_number_does_not_lose_a_case(tmp_path):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._files import write_text
 from .diagnose import progress_line
-from .folders import check_folder, place, replaces
+from .folders import check_apart, check_folder, place, replaces
 
 if TYPE_CHECKING:
     from ..diagnosis import Gain
@@ -46,6 +46,7 @@ def _confirm(options: argparse.Namespace) -> int:
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
     out = options.extended.parent / "confirmation" if options.out is None else options.out
+    check_apart(out, *options.episodes)
     check_folder(out)
     episodes = [recordings.read(path) for path in options.episodes]
     with progress_line() as progress:

@@ -11,7 +11,7 @@ from typing import Any
 
 from .._files import PROGRESS
 from ..errors import InvalidInput
-from .folders import check_folder, how_to_go_on, place, say
+from .folders import check_apart, check_folder, how_to_go_on, place, say
 
 LONG = 10.0  # s, of an episode
 
@@ -42,6 +42,7 @@ def _diagnose(options: argparse.Namespace) -> int:
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
+    check_apart(options.out, *options.episodes)
     check_folder(options.out)
     _refuse_own_result(options)
     episodes, faults = diagnosis.read_episodes(options.episodes)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import tempfile
 from pathlib import Path
 
-from .._files import PROGRESS
+from .._files import PROGRESS, check_folder
 from ..errors import InvalidInput
 
 
@@ -38,37 +37,17 @@ def replaces(path: Path) -> str:
     return " (the last one is replaced)" if path.exists() else ""
 
 
-def check_folder(path: Path, option: str = "--out") -> None:
-    """Refuse, before any work is done, a folder that cannot be made or written to; leaves nothing behind.
-
-    Raises:
-        InvalidInput: the path, or what should be a folder above it, is a file, or the system lets nothing be made.
-    """
-    plain = Path(os.path.abspath(path))
-    above = next(part for part in (plain, *plain.parents) if os.path.lexists(part) or part == part.parent)
-    if not above.is_dir():
-        raise InvalidInput(option, got=f"{above}, a file", expected="a folder, new or existing")
-    try:  # in a place of its own: two commands may make the same folder at once
-        with tempfile.TemporaryDirectory(prefix=".torchcloth-", dir=above) as trial:
-            (Path(trial) / plain.relative_to(above)).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidInput(
-            option,
-            got=f"{path}, which cannot be written ({error.strerror})",
-            expected="a folder, new or existing, where files can be made",
-            remedy="choose another, or change its permissions",
-        ) from None
-
-
-def check_apart(path: Path, episode: str | Path, option: str = "--out") -> None:
-    """Refuse a place within an episode's folder, whose files would be replaced or taken for its own.
+def check_apart(path: Path, *episodes: str | Path, option: str = "--out") -> None:
+    """Refuse a place within one of the episodes' folders, whose files would be replaced or taken for its own.
 
     Raises:
         InvalidInput: it is one.
     """
-    inside, folder = path.resolve(), Path(episode).resolve()
-    if inside == folder or folder in inside.parents:
-        raise InvalidInput(option, got=f"{path}, within the episode {episode}", expected="a place outside it")
+    inside = path.resolve()
+    for episode in episodes:
+        folder = Path(episode).resolve()
+        if inside == folder or folder in inside.parents:
+            raise InvalidInput(option, got=f"{path}, within {episode}, which is read", expected="a place outside it")
 
 
 def check_file(path: Path, option: str = "--out") -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from .._files import PROGRESS
 from ..errors import InvalidInput
 from . import fields
-from .folders import check_folder, how_to_go_on, place, replaces, say
+from .folders import check_apart, check_folder, how_to_go_on, place, replaces, say
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -121,6 +121,7 @@ def _identify(options: argparse.Namespace) -> int:
 
     torch.set_default_dtype(torch.float64)  # sensitivities lose digits over thousands of substeps in float32
     torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
+    check_apart(options.out, *options.episodes)
     check_folder(options.out)
     fields.check(options, _defaults())
     episodes = [recordings.read(path) for path in options.episodes]

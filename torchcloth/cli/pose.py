@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
-from .folders import check_folder, place, replaces, say
+from .folders import check_apart, check_folder, place, replaces, say
 from .identify import assignments, nuisances_of, say_what_is_beside
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ def _pose(options: argparse.Namespace) -> int:
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
+    check_apart(options.out, options.episode)
     check_folder(options.out)
     recording = recordings.read(options.episode, with_truth=options.truth)
     if options.truth:

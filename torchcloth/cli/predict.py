@@ -10,7 +10,7 @@ from typing import Any
 
 from .._files import write_text
 from ..errors import InvalidInput
-from .folders import check_folder, place, replaces
+from .folders import check_apart, check_folder, place, replaces
 
 RESULT = "prediction.json"
 TABLE = "table.json"  # of a folder with readings of a tension machine
@@ -53,6 +53,8 @@ def _predict(options: argparse.Namespace) -> int:
     torch.set_num_threads(1)
     folder = options.fit if options.fit.is_dir() else options.fit.parent
     out = folder / "prediction" if options.out is None else options.out
+    if options.seen is not None:
+        check_apart(out, options.seen)
     check_folder(out)
     given = any(getattr(options, name) is not None for name in STRIP)
     of_strip = given or (options.seen is not None and (options.seen / TABLE).is_file())

@@ -126,6 +126,17 @@ def here(hypothesis: Hypothesis, model: Model, recordings: Sequence[Recording] =
     return hypothesis
 
 
-def registered() -> list[Hypothesis]:
-    """The user's own."""
-    return list(_registered)
+def own_among(asked: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Those that the catalogue does not have, registered or not.
+
+    Raises:
+        InvalidInput: two of one name, or one that ``register`` would refuse for its numbers.
+    """
+    names = [h.name for h in asked]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InvalidInput("hypotheses", got=f"{twice[0]!r} twice", expected="each once")
+    theirs = {h.name for h in known()} - {h.name for h in _registered}
+    own = [h for h in asked if h.name not in theirs]
+    for hypothesis in own:
+        _check_size(hypothesis)
+    return own

@@ -19,7 +19,7 @@ from ..recordings.together import listed, together
 from .base_model import base_model
 from .feasible import write_episode
 from .gate import check
-from .hypotheses import catalogue, registered
+from .hypotheses import catalogue, own_among
 from .keeping import kept_in
 from .lacking import lack_of_fit
 from .missing import missing_force
@@ -62,7 +62,8 @@ def diagnose(
 
     Raises:
         InvalidInput: fewer than two episodes, too few motions to hold one out, different cloths, one episode twice, a
-            default dtype other than float64, or a model with a residual force.
+            default dtype other than float64, a model with a residual force, or hypotheses that ``register`` would
+            refuse.
         RecordingError: an episode that lacks what is needed.
         SimulationDiverged: the base model cannot be simulated.
     """
@@ -95,13 +96,13 @@ def diagnose(
     each_once(recordings)
     model = model or base_model(together(recordings))
     asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
+    own = own_among(asked)
     plan = _plan(model, asked, names)
     setting = setting_of(model, recordings)
     somewhere_seen(setting)
-    own = {h.name for h in registered()}
     for place in (setting, setting.finer):  # each with a mesh of its own
         if place is not None:
-            check_own([h for h in asked if h.name in own], place.base, place.episodes)
+            check_own(own, place.base, place.episodes)
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     many = torch.get_num_threads()
