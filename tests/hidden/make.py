@@ -53,11 +53,21 @@ def scenes(found: Case, take: Take) -> tuple[Scene, Scene]:
         ),
         plate=replace(plate, stiffness=fabric["bending_stiffness"] * found.said["bending_stiffness"]),
     )
-    for effect in (*found.effects, *take.own):
+    for effect in _as_one(*found.effects, *take.own):
         true = _hidden(true, effect)
     (u, _), grip = sheet.even.lines, true.grip
     beyond = found.pad - u[u <= grip.radius].max()
     return replace(true, grip=replace(grip, wider=grip.wider + beyond)), said
+
+
+def _as_one(*effects: Hidden) -> list[Hidden]:
+    """Robots that are off in two ways, for the case and for the episode, are off by the sum: along one heading."""
+    bases = [e for e in effects if e.name == "robot.base"]
+    if len(bases) < 2:
+        return list(effects)
+    along = sum(e.amplitude * np.exp(1j * np.deg2rad(e.options.get("heading", 0.0))) for e in bases)
+    whole = Hidden("robot.base", float(abs(along)), {"heading": float(np.rad2deg(np.angle(along)))})
+    return [*(e for e in effects if e.name != "robot.base"), whole]
 
 
 def _hidden(scene: Scene, effect: Hidden) -> Scene:

@@ -167,6 +167,17 @@ def test_motions_that_some_effects_need_are_made_for_others_as_well():
     assert 0.1 < with_one("drag") < 0.35
 
 
+def test_robots_that_are_off_in_two_ways_are_off_by_their_sum():
+    """The later heading took the place of the earlier, and a hard null's robot was off otherwise in each episode."""
+    found = next(c for c in map(case, range(1000)) if c.family == "hard null" and c.effects[0].name == "robot.base")
+    along = lambda size, heading: size * np.exp(1j * np.deg2rad(heading))  # noqa: E731
+    (hidden,) = found.effects
+    for take in found.takes:
+        grip, (own,) = scenes(found, take)[0].grip, take.own
+        both = along(hidden.amplitude, hidden.options["heading"]) + along(own.amplitude, own.options["heading"])
+        assert along(grip.base, grip.heading) == pytest.approx(both)
+
+
 def test_the_data_sheet_is_off_and_the_fabric_is_not(tiny):
     found = drawn.case(3, tiny)
     true, said = scenes(found, found.takes[0])

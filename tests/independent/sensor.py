@@ -18,6 +18,7 @@ from torchcloth.recordings import PointClouds
 Array = np.ndarray
 EYE = (1.66, 0.55, 0.60)  # m, the camera's usual place
 TARGET = (0.50, 0.0, 0.30)
+MIDDLE = (0.50, 0.0, 0.25)  # of a sheet of 0.3 m that hangs: a camera that leans about another place is elsewhere, too
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class SensorSpec:
         delay: s, by which the stamps are later than the light.
         shift: m, by which the camera is believed to stand further along ``heading`` degrees than it does;
             ``rotation`` rad, by which it is believed to be turned about the vertical.
-        lean: rad, by which it is believed to be turned, about what it looks at, around ``heading`` by the right hand.
+        lean: rad, by which it is believed to be turned, about ``MIDDLE``, around ``heading`` by the right hand.
         scale: -, share by which depths read too large; ``offset`` m is added to them.
         eye: m, where the camera is; ``target`` m, what it looks at; ``roll`` rad, by which it is turned about that way.
     """
@@ -122,7 +123,7 @@ def _believed(spec: SensorSpec) -> tuple[Array, Array]:
     along = np.array([np.cos(angle), np.sin(angle), 0.0])
     lean = Rotation.from_rotvec(spec.lean * along).as_matrix()
     turn = lean @ Rotation.from_rotvec([0.0, 0.0, spec.rotation]).as_matrix()
-    return turn, spec.place + (lean - np.eye(3)) @ (spec.place - np.array(spec.target)) + spec.shift * along
+    return turn, spec.place + (lean - np.eye(3)) @ (spec.place - np.array(MIDDLE)) + spec.shift * along
 
 
 def _image(spec: SensorSpec, points: Array) -> Array:

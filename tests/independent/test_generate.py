@@ -13,7 +13,7 @@ from effects import CATALOGUE, hide, parse
 from flex_sheet import SheetSpec, grid, rest_points
 from motions import GRIPPERS, NAMES, minimum_jerk, motion
 from scene import GripSpec, Scene, _grip, believed, evenly, hooks, play, stable_step
-from sensor import EYE, TARGET, SensorSpec, see
+from sensor import EYE, MIDDLE, TARGET, SensorSpec, see
 from sizes import size
 
 from torchcloth import recordings
@@ -162,8 +162,11 @@ def test_a_wrong_camera_moves_everything_rigidly():
     )
 
 
-def test_a_camera_that_leans_turns_the_cloth_about_what_it_looks_at():
-    lean, here, there = 0.02, seen().xyz - TARGET, seen(lean=0.02, heading=90.0).xyz - TARGET
+@pytest.mark.parametrize("target", [TARGET, (0.55, 0.04, 0.26)])
+def test_a_camera_that_leans_turns_the_cloth_about_its_middle(target):
+    """Wherever it looks: turned about another place, it would seem to stand elsewhere as well."""
+    here, there = (seen(target=target, **how).xyz - MIDDLE for how in ({}, {"lean": 0.02, "heading": 90.0}))
+    lean = 0.02
     along = np.array([0.0, 1.0, 0.0])
     np.testing.assert_allclose(there @ along, here @ along, atol=1e-12)
     turned = here * np.cos(lean) + np.cross(along, here) * np.sin(lean)

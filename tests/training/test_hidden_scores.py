@@ -10,7 +10,14 @@ from torchcloth.training.studies.hidden_tables import markdown
 def hidden(family, *effects, kind="1", **more):
     """A truth; an effect is (name, amplitude) or (name, amplitude, names)."""
     full = [
-        {"name": n, "amplitude": a, "names": list(rest[0]) if rest else [n], "sign": 1.0, "beside": False}
+        {
+            "name": n,
+            "amplitude": a,
+            "names": list(rest[0]) if rest else [n],
+            "sign": 1.0,
+            "beside": False,
+            "hypothesis": n,
+        }
         for n, a, *rest in effects
     ]
     return {
@@ -235,9 +242,23 @@ def test_what_shows_is_asked_of_the_truths_engine():
     assert (row.hits, row.of) == (0, 1)
 
 
+def test_axis_and_sign_are_counted_beside_what_is_right():
+    """A lean along the other axis, or the other way, is the same class."""
+    tilt = hidden("single", ("env.gravity_tilt", 0.01))
+    tilt["effects"][0]["hypothesis"] = "env.gravity_tilt[x]"
+    named = [("[x]", 0.011), ("[y]", 0.011), ("[x]", -0.011)]
+    cases = [judged(tilt, answer(cause(f"env.gravity_tilt{axis}", a))) for axis, a in named]
+    assert all(c["right"] for c in cases)
+    assert [c["ways"] for c in cases] == [[True], [False], [False]]
+    assert judged(tilt, answer(cause("mass.hem", alike=["env.gravity_tilt"])))["ways"] == [None]
+    row = dict(rates.further(cases))["named outright: axis and sign are right as well"]
+    assert tuple(row) == (1, 3)
+
+
 def test_singles_are_counted_by_effect():
     def case(name, kind, found, shows, family="single"):
-        return {"family": family, "hidden": [name], "kind": kind, "found": [found], "shows": [shows]}
+        hidden = ["what it needs", name]  # wind is hidden with the drag that makes it felt
+        return {"family": family, "hidden": hidden, "sought": [name], "kind": kind, "found": [found], "shows": [shows]}
 
     cases = [case("hem", "0.5", True, True), case("hem", "0.5", False, False), case("hem", "1", True, True)]
     cases += [case("drag", "1.5", False, True), case("drag", "two", True, True, "double")]

@@ -253,6 +253,8 @@ def scored(name: str, case: Mapping[str, Any]) -> dict[str, Any]:
     """A kept case as the tables have it."""
     truth, later = case["truth"], case.get("next")
     rest: dict[str, Any] = {key: case.get(key) for key in ("seconds", "gain")}
+    if rest["gain"] is not None and not case["answer"].get("causes"):
+        rest["gain"] = 0.0  # what an answer does not name counts for nothing: in rounds up to b3f2eda it did
     rest["shows"] = shows(truth, case.get("sizes"))
     if later is not None:
         asked = later["proposed"] is not None

@@ -24,16 +24,22 @@ class Wanted(NamedTuple):
     names: frozenset[str]  # any of them is right
     amplitude: float  # by the library's sign
     comparable: bool
+    hypothesis: str  # the library's name with its axis; "" where it has none
 
 
 class Named(NamedTuple):
     """One cause of an answer."""
 
-    best: str
+    whole: str  # with its axis
     alike: frozenset[str]  # with what no such data tell from it, itself included
     all: frozenset[str]  # with rivals, too
     amplitude: float
     ci95: tuple[float, float]
+
+    @property
+    def best(self) -> str:
+        """Without its axis."""
+        return effect(self.whole)
 
     @property
     def alone(self) -> bool:
@@ -53,7 +59,7 @@ def named(answer: Answer) -> list[Named]:
         alike = frozenset(map(effect, [cause["effect"], *cause["class"]]))
         rivals = frozenset(effect(r["effect"]) for r in cause["rivals"])
         low, high = cause["ci95"]
-        found.append(Named(effect(cause["effect"]), alike, alike | rivals, cause["amplitude"], (low, high)))
+        found.append(Named(cause["effect"], alike, alike | rivals, cause["amplitude"], (low, high)))
     return found
 
 
@@ -62,7 +68,7 @@ def wanted(truth: Truth) -> list[Wanted]:
     if truth["family"] in NULLS:
         return []
     return [
-        Wanted(frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"]))
+        Wanted(frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"]), e["hypothesis"])
         for e in truth["effects"]
         if e["names"] and not e["beside"]
     ]
@@ -86,14 +92,17 @@ def judged(truth: Truth, answer: Answer) -> dict[str, Any]:
         "spurious": sum(not c.all & right for c in causes),
         "sizes": [len(c.all) for c in causes],
         "no_answer": "refused" in answer or "failed" in answer,
+        "unexplained": unexplained(answer),
     }
     if asked:
         found = _matched(causes, asked)
         out |= {
+            "sought": [e["name"] for e in truth["effects"] if e["names"] and not e["beside"]],
             "found": [c is not None and bool(c.alike & w.names) for c, w in zip(found, asked, strict=True)],
             "covered": [c is not None for c in found],
             "said_invisible": [_invisible(answer, w) for w in asked],
             "amplitudes": [_amplitude(c, w) for c, w in zip(found, asked, strict=True)],
+            "ways": [_way(c, w) for c, w in zip(found, asked, strict=True)],
         }
     return out | {"right": _right(truth, answer, causes, asked, out)}
 
@@ -141,6 +150,13 @@ def _amplitude(cause: Named | None, w: Wanted) -> dict[str, Any] | None:
         return None
     low, high = cause.ci95
     return {"error": cause.amplitude / w.amplitude - 1, "inside": low <= w.amplitude <= high}
+
+
+def _way(cause: Named | None, w: Wanted) -> bool | None:
+    """Along the axis that is hidden, and of the sign; None of what is not named outright."""
+    if cause is None or cause.best not in w.names:
+        return None
+    return cause.whole == w.hypothesis and (not w.comparable or cause.amplitude * w.amplitude > 0)
 
 
 def _right(truth: Truth, answer: Answer, causes: Sequence[Named], asked: Sequence[Wanted], out: Mapping) -> bool:
