@@ -38,10 +38,11 @@ def test_share_of_the_oracles_gain(case, amplitude, low, high):
     """The oracle's fabric is fitted beside the drag, the others' was without it: no 1 can be had here."""
     folder, paths, recording, fitted = case
     model = fitted.model if amplitude is None else fitted.model.plus(DRAG, amplitude)
-    path = save_model(folder / f"{amplitude}.tcm", model, recording, torch.eye(len(model.point)).double())
-    given = [paths["slow"], paths["lift"]]
-    assert low <= gain(given, path, {"air.drag_n"}, paths["fast"], truth()) <= high
-    assert abs(gain(given, path, set(), paths["fast"], truth())) < 1e-9  # what has no name is not said
+    kept = lambda name, model: save_model(folder / name, model, recording, torch.eye(len(model.point)).double())  # noqa: E731
+    base, path = kept("base.tcm", fitted.model), kept(f"{amplitude}.tcm", model)
+    share = lambda named: gain([paths["slow"], paths["lift"]], base, path, named, paths["fast"], truth())  # noqa: E731
+    assert low <= share({"air.drag_n"}) <= high
+    assert share(set()) == 0.0  # what has no name is not said
 
 
 def test_what_nobody_can_know_is_not_compared(case):

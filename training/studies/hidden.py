@@ -206,8 +206,8 @@ def _gain(
     if not answer.get("model"):
         return 0.0
     (unseen,) = _made(make("--unseen", "--out", str(out / "episodes" / f"{name}-unseen")))
-    named = {cause["effect"] for cause in answer["causes"]}
-    return gain(given, out / "answers" / name / str(answer["model"]), named, unseen, truth)
+    named, folder = {cause["effect"] for cause in answer["causes"]}, out / "answers" / name
+    return gain(given, folder / str(answer["base"]), folder / str(answer["model"]), named, unseen, truth)
 
 
 def _made(said: str) -> list[Path]:

@@ -47,13 +47,19 @@ def knowing(model: Model, truth: Mapping[str, Any]) -> Oracle | None:
 
 
 def gain(
-    episodes: Sequence[Path], extended: Path, named: Collection[str], unseen: Path, truth: Mapping[str, Any]
+    episodes: Sequence[Path],
+    fitted: Path,
+    extended: Path,
+    named: Collection[str],
+    unseen: Path,
+    truth: Mapping[str, Any],
 ) -> float | None:
     """The share of the oracle's gain; None where nothing is to be gained, or where nobody can know all.
 
     Args:
         episodes: those that were diagnosed.
-        extended: the model that the diagnosis wrote.
+        fitted: the base model that the diagnosis wrote, with the fabric's numbers fitted.
+        extended: the same with its causes.
         named: its causes; what else it has, the answer does not say.
         unseen: an episode of another motion.
         truth: what was hidden.
@@ -63,10 +69,11 @@ def gain(
     oracle = knowing(base, truth)
     if oracle is None:
         return None
-    setting, found = setting_of(base, recordings), _saying(load_model(extended, residual=False), named)
-    fitted = _fitted(base, setting) if found.accepted else found  # without causes it is the fitted base
-    before, best = rms(fitted, last), rms(_fitted(oracle, setting), last)
-    return None if before - best < LEAST else (before - rms(found, last)) / (before - best)
+    before, best = rms(load_model(fitted), last), rms(_fitted(oracle, setting_of(base, recordings)), last)
+    if before - best < LEAST:
+        return None
+    found = _saying(load_model(extended, residual=False), named)
+    return (before - rms(found, last)) / (before - best) if found.accepted else 0.0
 
 
 def _saying(model: Model, named: Collection[str]) -> Model:
