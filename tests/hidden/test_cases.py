@@ -24,6 +24,7 @@ from test_independence import forbidden
 
 from torchcloth import recordings
 from torchcloth.diagnosis.hypotheses import known
+from torchcloth.training.studies import hidden_rates
 
 HERE = Path(__file__).parent
 MAKERS = ("beside", "drawn", "faults", "make", "partners", "reveal", "shows", "telling")
@@ -165,6 +166,10 @@ def test_motions_that_some_effects_need_are_made_for_others_as_well():
     with_one = lambda motion: sum(any(t.motion == motion for t in c.takes) for c in plain) / len(plain)  # noqa: E731
     assert 0.1 < with_one("fold-open") < 0.35
     assert 0.1 < with_one("drag") < 0.35
+
+
+def test_tables_know_every_kind_of_confounded_case():
+    assert hidden_rates.CONFOUNDED == drawn.CONFOUNDED
 
 
 def test_robots_that_are_off_in_two_ways_are_off_by_their_sum():

@@ -80,7 +80,8 @@ class Found:
     @property
     def minor(self) -> list[Step]:
         """Those that stay in the model without a name: they, or what predicts as well, are too small to matter."""
-        return [s for s in self.steps if s not in self.causes]
+        named = self.causes
+        return [s for s in self.steps if s not in named]
 
     def rivals(self, step: Step) -> list[Candidate]:
         """A step's rivals in the end; none is what joined the model beside its cause."""

@@ -21,6 +21,7 @@ MOVED, PULLED = 3e-4, 10e-3  # m and N, RMS: of an effect that shows
 class Wanted(NamedTuple):
     """One hidden effect that should be found."""
 
+    name: str  # the generator's
     names: frozenset[str]  # any of them is right
     amplitude: float  # by the library's sign
     comparable: bool
@@ -68,7 +69,7 @@ def wanted(truth: Truth) -> list[Wanted]:
     if truth["family"] in NULLS:
         return []
     return [
-        Wanted(frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"]), e["hypothesis"])
+        Wanted(e["name"], frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"]), e["hypothesis"])
         for e in truth["effects"]
         if e["names"] and not e["beside"]
     ]
@@ -97,7 +98,7 @@ def judged(truth: Truth, answer: Answer) -> dict[str, Any]:
     if asked:
         found = _matched(causes, asked)
         out |= {
-            "sought": [e["name"] for e in truth["effects"] if e["names"] and not e["beside"]],
+            "sought": [w.name for w in asked],
             "found": [c is not None and bool(c.alike & w.names) for c, w in zip(found, asked, strict=True)],
             "covered": [c is not None for c in found],
             "said_invisible": [_invisible(answer, w) for w in asked],
