@@ -30,9 +30,10 @@ FLOORS = (
     ("initial", "intervals", "parts"),
     ("sensitivities",),
     ("cloth", "robots"),
-    ("identification", "plan", "testing"),
+    ("identification", "testing"),
     ("pose",),
     ("diagnosis",),
+    ("planning",),
     ("inspection", "synthesis", "viewing"),
     ("",),  # torchcloth/__init__.py: the names a user sees
     ("training", "benchmarks", "demo"),

@@ -3,7 +3,7 @@
 ``tc.Cloth`` is the layer; ``tc.meshes``, ``tc.materials``, ``tc.effects``, ``tc.boundaries`` are its parts;
 ``tc.robots`` gives end-effector poses, ``tc.recordings`` episodes, ``tc.identify`` parameters with errors,
 ``tc.estimate_pose`` the mesh over time, ``tc.diagnose`` what a simulation of episodes gets wrong,
-``tc.load`` the model that it was extended to.
+``tc.load`` the model that it was extended to, ``tc.plan`` a motion after which the cloth lies where it shall.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from .transfer import Contact
 from .types import ClothState, Rollout, Trajectory
 
 if TYPE_CHECKING:
-    from . import diagnosis, identification, observe, pose, recordings, robots
+    from . import diagnosis, identification, observe, planning, pose, recordings, robots
     from .diagnosis import diagnose, load
     from .identification import identify
+    from .planning import plan
     from .pose import estimate_pose
 
 __version__ = "0.1.0"
@@ -47,17 +48,20 @@ __all__ = [
     "materials",
     "meshes",
     "observe",
+    "plan",
+    "planning",
     "pose",
     "recordings",
     "robots",
 ]
 
-ROOMS = ("diagnosis", "identification", "observe", "pose", "recordings", "robots")
+ROOMS = ("diagnosis", "identification", "observe", "planning", "pose", "recordings", "robots")
 VERBS = {
     "diagnose": "diagnosis",
     "estimate_pose": "pose",
     "identify": "identification",
     "load": "diagnosis",
+    "plan": "planning",
 }  # function: its room
 
 

@@ -12,7 +12,7 @@ from importlib import metadata
 from typing import Any, NoReturn
 
 from ..errors import InvalidInput, TorchclothError
-from . import bench, confirm, convert, diagnose, doctor, identify, inspect, pose, predict, simulate, view
+from . import bench, confirm, convert, diagnose, doctor, identify, inspect, plan, pose, predict, simulate, view
 
 VERBS = (
     identify,
@@ -20,6 +20,7 @@ VERBS = (
     pose,
     diagnose,
     confirm,
+    plan,
     inspect,
     view,
     convert,
@@ -27,7 +28,15 @@ VERBS = (
     doctor,
     bench,
 )  # each has add(verbs)
-WITH_MODELS = ("identify", "predict", "pose", "diagnose", "confirm", "view")  # which a user's own causes may be in
+WITH_MODELS = (
+    "identify",
+    "predict",
+    "pose",
+    "diagnose",
+    "confirm",
+    "plan",
+    "view",
+)  # which a user's own causes may be in
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

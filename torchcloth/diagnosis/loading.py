@@ -23,7 +23,9 @@ from .pieces import side_by_side
 from .setting import LATE
 from .steps import one_way, shifted
 from .world import Model, World
+from .worlds import if_possible
 
+TRIES = 5  # of drawing a world that there is, for each that is wanted
 TOLD = 0.5  # of the prior's width: a parameter that is known better is known from data
 
 
@@ -79,6 +81,27 @@ def uncertain(file: ModelFile) -> dict[str, tuple[float, float]]:
             positive = cloth.get_submodule(own[p.name]).domain == "positive"
             up, value, down = p.value(c + std), p.value(c), p.value(c - std)
             out[p.name] = (value, math.sqrt(up / down) if positive else abs(up - down) / 2)
+    return out
+
+
+def drawn_worlds(file: ModelFile, count: int, seed: int = 0) -> list[World]:
+    """``count`` worlds: the model's, then with its numbers drawn from their joint errors, as far as worlds have such.
+
+    A residual force, whose errors nobody knows, stays. Of a file without errors every world is the model's.
+    """
+    model, rng = file.model, torch.Generator().manual_seed(seed)
+    out = [model.world()]
+    if file.covariance is None:
+        return out * count
+    values, vectors = torch.linalg.eigh(file.covariance)
+    root = vectors * values.clamp(min=0.0).sqrt()
+    for _ in range(TRIES * count):
+        if len(out) >= count:
+            break
+        noise = root @ torch.randn(len(root), generator=rng, dtype=root.dtype)
+        step = torch.cat([noise, noise.new_zeros(len(model.point) - len(noise))])
+        found = if_possible(lambda s=step: model.at(model.point + s).world())
+        out += [] if found is None else [found]
     return out
 
 

@@ -1,5 +1,6 @@
 """From recordings to fabric parameters with error bars."""
 
+from .draws import drawn
 from .episode_prediction import EpisodePrediction, predict_episode
 from .episodes import Episode, cloth_from, episode
 from .fields import FieldFit, fit_fields
@@ -33,6 +34,7 @@ __all__ = [
     "cloth_from",
     "cross_validated",
     "draw",
+    "drawn",
     "episode",
     "fit_fields",
     "fit_tension",

@@ -8,6 +8,7 @@ from .distances import film_of_fit, with_cloth
 from .episodes import film_of
 from .film import Cloud, Curve, Film, Plane, Sheet, Solid, Trace, View
 from .pictures import RATE, animate, picture
+from .plans import film_of_plan
 from .poses import film_of_pose
 from .rerun_file import write_rrd
 from .viser_view import Viewer, write_viser
@@ -26,6 +27,7 @@ __all__ = [
     "animate",
     "film_of",
     "film_of_fit",
+    "film_of_plan",
     "film_of_pose",
     "picture",
     "with_cloth",

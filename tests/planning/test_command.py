@@ -1,0 +1,103 @@
+"""``torchcloth plan``: files, table, refusals."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from scenes import by_arm, by_hand, cloth_of
+
+from torchcloth import recordings as rec
+from torchcloth.cli import main
+from torchcloth.diagnosis import base_model, save_model
+from torchcloth.identification import episode
+from torchcloth.planning.result import PLANNED
+
+OPTIONS = ["--iterations", "3", "--wait", "0.1", "--waypoints", "2"]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return rec.write(by_arm(), tmp_path / "episode")
+
+
+@pytest.fixture
+def goal(tmp_path):
+    """The cloth as it hangs at first, 3 cm to the side."""
+    x = episode(cloth_of(by_arm()), by_arm(), 20.0).initial.numpy()
+    np.save(tmp_path / "goal.npy", x + np.array([0.0, 0.03, 0.0]))
+    return tmp_path / "goal.npy"
+
+
+def test_writes_what_was_planned(folder, goal, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["plan", str(folder), "--goal", str(goal), "--out", str(out), *OPTIONS]) == 0
+    words = json.loads((out / "plan.json").read_text())
+    assert words["distance"]["after"][0] < 0.3 * words["distance"]["before"][0]
+    assert words["limit"]["what"].endswith("of arm")
+    assert words["warnings"] == []
+    planned = rec.read(out / "episode")
+    assert planned.provenance == PLANNED
+    assert planned.joints["arm"].q.shape[1] == 7
+    assert (out / "plan.png").stat().st_size > 10_000
+    assert sorted(file.name for file in out.iterdir()) == ["episode", "plan.json", "plan.png"]
+    said = capsys.readouterr().out
+    assert "recorded motion" in said
+    assert "nearest solids" in said
+    assert "motion 2:" in said
+    assert main(["plan", str(folder), "--goal", str(goal), "--out", str(out), *OPTIONS]) == 0  # over an earlier plan
+    assert "replaced" in capsys.readouterr().out
+
+
+def test_plans_for_what_a_model_leaves_open(folder, goal, tmp_path, capsys):
+    recording = rec.read(folder)
+    model = base_model(recording)
+    covariance = 0.01 * np.eye(len(model.point))
+    save_model(tmp_path / "model.tcm", model, recording, torch.as_tensor(covariance))
+    arguments = [
+        "--goal",
+        str(goal),
+        "--fit",
+        str(tmp_path / "model.tcm"),
+        "--draws",
+        "3",
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    assert main(["plan", str(folder), *arguments, *OPTIONS]) == 0
+    distances = json.loads((tmp_path / "o" / "plan.json").read_text())["distance"]
+    assert len(set(distances["after"])) == 3
+    assert "most" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--goal", "nowhere.npy"], "goal"),
+        (["--fit", "nowhere"], "nowhere"),
+        (["--draws", "0"], "--draws"),
+        (["--draws", "4"], "--draws"),
+        (["--waypoints", "0"], "waypoints"),
+        (["--wait", "-1"], "wait"),
+        (["--resume"], "resume"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_wrong_input_is_one_line_and_leaves_nothing(folder, goal, tmp_path, capsys, more, said):
+    out = tmp_path / "out"
+    assert main(["plan", str(folder), "--goal", str(goal), "--out", str(out), *OPTIONS, *more]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert not out.exists()
+
+
+def test_what_was_recorded_where_the_plan_would_go_stays(folder, goal, tmp_path, capsys):
+    own = rec.write(by_hand(), tmp_path / "out" / "episode")
+    assert main(["plan", str(folder), "--goal", str(goal), "--out", str(own.parent), *OPTIONS]) == 2
+    assert "no earlier plan" in capsys.readouterr().err
+    assert rec.read(own).provenance == by_hand().provenance
+
+
+def test_nothing_is_written_into_the_episode(folder, goal, capsys):
+    assert main(["plan", str(folder), "--goal", str(goal), "--out", str(folder / "plan"), *OPTIONS]) == 2
+    assert "outside" in capsys.readouterr().err

@@ -1,0 +1,219 @@
+"""Plans: the cloth ends at the goal, what is expected happens, and what is in the way stays apart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scenes import LASTS, NOMINAL, by_arm, by_hand, cloth_of
+
+import torchcloth as tc
+from torchcloth import recordings as rec
+from torchcloth.diagnosis import World
+from torchcloth.errors import InvalidInput
+from torchcloth.identification import cloth_from, episode
+from torchcloth.identification.replays import Replay
+from torchcloth.planning import Goal
+from torchcloth.planning.rehearsal import Rehearsal
+from torchcloth.planning.staging import courses_of
+from torchcloth.planning.task import Task
+from torchcloth.robots import ACCELERATION
+from torchcloth.robots.primitives import Limits
+
+WAIT = 0.1
+QUICK = {"wait": WAIT, "iterations": 6}
+AWAY = torch.tensor([0.04, 0.02, 0.03])
+
+
+def task_of(recording, goal, waypoints=2):
+    cloth = cloth_of(recording).requires_grad_(False)
+    courses = courses_of(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())
+    return Task([Rehearsal(World(cloth), recording, courses, None)], courses, goal, None, None)
+
+
+def end_of(recording, at=None):
+    """([V, 3] m, faces) of the cloth at the end, with so much added."""
+    task = task_of(recording, Goal(torch.zeros(1, 3)))
+    at = task.start if at is None else at
+    return task.each(at)[1][-1], task.rehearsals[0].faces
+
+
+def shifted_goal(recording, way=AWAY):
+    """Where the recorded motion's cloth would be if all were shifted, as a surface."""
+    x, faces = end_of(recording)
+    return Goal(x + way, faces)
+
+
+@pytest.mark.parametrize("scene", [by_hand, by_arm])
+def test_slopes_are_derivatives_through_arm_and_cloth(scene):
+    recording = scene()
+    task = task_of(recording, shifted_goal(recording))
+    at, way = 0.02 * torch.randn(len(task.start)), torch.randn(len(task.start))
+    slope, pull = task.slope(at)[2], task.pull(at)
+    errors = {"distance": [], "square": []}
+    for h in (1e-4, 1e-5, 1e-6, 1e-7):
+        up, down = (task.look(at + sign * h * way) for sign in (1, -1))
+        for found, own, k in zip(errors.values(), (slope, pull.gradient), (0, 1), strict=True):
+            found.append(abs((up[k] - down[k]) / (2 * h) / float(own @ way) - 1))
+    assert min(errors["distance"]) < 1e-6
+    assert min(errors["square"]) < 1e-6
+
+
+def test_the_cloth_ends_at_a_goal_that_another_mesh_and_another_motion_made():
+    recording, motion = by_hand(), by_hand()
+    path = motion.grippers["hand"]
+    s = (path.t / LASTS)[:, None]
+    other = replace(path, position=path.position + (10 * s**3 - 15 * s**4 + 6 * s**5) * AWAY.numpy())
+    finer = tc.meshes.rectangle(0.2, 0.2, triangles=288)
+    x = np.array([0.0, 0.0, 0.5]) + np.stack([0 * finer.uv[:, 0], finer.uv[:, 0], finer.uv[:, 1] - 0.2], axis=-1)
+    info = rec.ClothInfo(
+        areal_density=0.3,
+        thickness=1e-3,
+        vertices=finer.vertices,
+        faces=finer.faces,
+        uv=finer.uv,
+        initial_vertices=x,
+        nominal=NOMINAL,
+    )
+    end, faces = end_of(replace(motion, cloth=info, grippers={"hand": other}))
+    found = tc.plan(cloth_of(recording), recording, Goal(end, faces), **QUICK)
+    assert found.before[0] > 0.015
+    assert found.after[0] < 2e-3 < 0.15 * found.before[0]
+    assert found.history[0] == found.before[0]
+    assert min(found.history) == pytest.approx(found.after[0])
+    assert 0.03 < found.moved["hand"] < 0.1
+
+
+def test_the_planned_episode_does_what_was_expected(tmp_path):
+    recording = by_arm()
+    found = tc.plan(cloth_of(recording), recording, shifted_goal(recording), **QUICK)
+    assert found.after[0] < 0.5 * found.before[0]
+    folder, _ = found.save(tmp_path)
+    again = rec.read(folder)
+    cloth = cloth_from(again)
+    seen = episode(cloth, again, 20.0)
+    with torch.no_grad():
+        x = Replay(cloth)(seen).x[-1]
+    assert torch.allclose(x, found.frames[-1], atol=2e-4)  # frames at other times, substeps of other lengths
+
+
+def test_a_free_motion_beyond_what_a_hand_can_do_is_not_planned():
+    recording = by_hand()
+    goal = shifted_goal(recording, 5 * AWAY)
+    slow = tc.plan(cloth_of(recording), recording, goal, limits=Limits(speed=0.2, acceleration=2.0), **QUICK)
+    t, path = slow.motion["hand"].t, slow.motion["hand"].pose[:, :3, 3]
+    assert slow.limit[0] == pytest.approx(1.0, abs=1e-3)
+    assert float((path.diff(dim=0) / t.diff()[:, None]).abs().max()) < 0.205
+    fast = tc.plan(cloth_of(recording), recording, goal, **QUICK)
+    assert fast.after[0] < 0.5 * slow.after[0]
+
+
+def test_adam_descends_too():
+    recording = by_hand()
+    found = tc.plan(
+        cloth_of(recording), recording, shifted_goal(recording), method="adam", iterations=25, rate=0.005, wait=WAIT
+    )
+    assert found.after[0] < 0.35 * found.before[0]
+    assert len(found.history) == 26
+
+
+def test_a_robot_that_errs_is_corrected_for():
+    """The arm's base is 2 cm elsewhere; what is seen is 1 cm elsewhere again."""
+    recording = by_hand()
+    off, blind = torch.tensor([0.0, 0.02, 0.0]), torch.tensor([0.01, 0.0, 0.0])
+
+    def driven(e):
+        moved = {}
+        for name, m in e.motion.items():
+            pose = m.pose.clone()
+            pose[:, :3, 3] += off
+            moved[name] = m._replace(pose=pose)
+        return replace(e, motion=moved, initial=e.initial + off)
+
+    world = World(cloth_of(recording)).with_motion(driven)
+    world = world.with_view(lambda frames, e: frames._replace(x=frames.x + blind))
+    x, faces = end_of(recording)
+    found = tc.plan(world, recording, Goal(x, faces), **QUICK)
+    assert found.before[0] > 8e-3
+    assert found.after[0] < 0.15 * found.before[0]
+    way = found.motion["hand"].pose[-1, :3, 3] - found.motion["hand"].pose.new_tensor([0.03, 0.0, 0.5])
+    assert torch.allclose(way, -(off + blind).to(way), atol=4e-3)
+
+
+def test_of_several_models_the_mean_is_descended():
+    recording = by_hand()
+    goal = shifted_goal(recording)
+    light, heavy = cloth_of(recording), cloth_of(recording)
+    heavy.areal_density.set(0.9)
+    both = tc.plan([light, heavy], recording, goal, **QUICK)
+    assert len(both.before) == len(both.after) == 2
+    assert both.history[0] == pytest.approx(sum(both.before) / 2)
+    assert both.before[0] != both.before[1]
+    assert sum(both.after) < 0.4 * sum(both.before)
+
+
+def test_a_stopped_search_goes_on_and_ends_alike(tmp_path):
+    recording = by_hand()
+    cloth, goal = cloth_of(recording), shifted_goal(recording)
+    whole = tc.plan(cloth, recording, goal, **QUICK)
+
+    def stop(number, distance, best):
+        if number == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tc.plan(cloth, recording, goal, journal=tmp_path / "kept", on_progress=stop, **QUICK)
+    with pytest.raises(InvalidInput, match="resume"):
+        tc.plan(cloth, recording, goal, journal=tmp_path / "kept", **QUICK)
+    with pytest.raises(InvalidInput, match="another fit"):
+        tc.plan(cloth, recording, shifted_goal(recording, -AWAY), journal=tmp_path / "kept", resume=True, **QUICK)
+    seen = []
+    again = tc.plan(
+        cloth,
+        recording,
+        goal,
+        journal=tmp_path / "kept",
+        resume=True,
+        on_progress=lambda *numbers: seen.append(numbers),
+        **QUICK,
+    )
+    assert again.history == whole.history
+    assert torch.equal(again.frames, whole.frames)
+
+
+def test_the_users_cloth_is_left_as_it_is():
+    recording = by_hand()
+    cloth = cloth_of(recording)
+    tc.plan(cloth, recording, shifted_goal(recording), wait=WAIT, iterations=1)
+    assert all(p.requires_grad and p.grad is None for p in cloth.parameters())
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"waypoints": 0}, "waypoints.*whole number > 0"),
+        ({"iterations": 2.5}, "iterations.*whole number"),
+        ({"wait": -1.0}, "wait.*0 or more"),
+        ({"rate": float("nan")}, "rate.*finite"),
+        ({"method": "newton"}, "method.*one of gauss-newton, adam"),
+        ({"clearance": 0.0}, "clearance.*> 0"),
+    ],
+)
+def test_options_that_give_no_search_are_refused(options, said):
+    recording = by_hand()
+    with pytest.raises(InvalidInput, match=said):
+        tc.plan(cloth_of(recording), recording, Goal(torch.zeros(4, 3)), **options)
+
+
+def test_a_goal_in_millimetres_is_refused():
+    recording = by_hand()
+    goal = Goal(1e3 * end_of(recording)[0])
+    with pytest.raises(InvalidInput, match=r"goal.*in metres"):
+        tc.plan(cloth_of(recording), recording, goal)
+
+
+def test_models_that_are_none_are_refused():
+    recording = by_hand()
+    for model in ([], ["cloth"], None):
+        with pytest.raises(InvalidInput, match=r"model.*a Cloth or a World"):
+            tc.plan(model, recording, Goal(torch.zeros(4, 3)))  # type: ignore[arg-type]

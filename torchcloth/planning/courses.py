@@ -1,0 +1,238 @@
+"""What may be added to the motion of a gripper: joint angles of its arm, or shifts and turns of a free hand.
+
+Added is a cubic spline through waypoints at even times, at rest at both ends (C2), so everything below is linear in the
+waypoints: position, velocity and acceleration at any instant, and with them the limits.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..recordings import Collider, JointMotion
+from ..robots import Arm  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
+from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
+from ..types import Trajectory
+
+PERIOD = 0.02  # s, between the instants at which limits are held
+OVER = 3  # periods, over which accelerations are taken: measured joints tremble from sample to sample
+TURNING = Limits(speed=2.0, acceleration=10.0)  # rad/s and rad/s^2, of a hand that no arm moves
+LEVEL = 0.97  # upward part of a table's normal
+
+
+class Span(NamedTuple):
+    """Times of what is added."""
+
+    begin: float  # s, from which on something is
+    end: float  # s, after which nothing changes any more
+    waypoints: int  # after the beginning, where nothing is added
+
+    def basis(self, times: Tensor) -> Tensor:
+        """[N, K], what each waypoint adds at ``times`` [N] s."""
+        knots = torch.linspace(self.begin, self.end, self.waypoints + 1, dtype=torch.float64)
+        each = torch.cat([torch.zeros(1, self.waypoints), torch.eye(self.waypoints)]).double()
+        return Spline.through(knots, each).at(times.double().clamp(self.begin, self.end))[0]
+
+    @property
+    def instants(self) -> Tensor:
+        """[N] s, where limits are held."""
+        count = math.ceil((self.end - self.begin) / PERIOD) + 1
+        return torch.linspace(self.begin, self.end, max(count, 2 * OVER + 1), dtype=torch.float64)
+
+
+ORDERS = ("position", "velocity", "acceleration")
+MET = 1e-12  # of room: there is none
+
+
+class Bounds(NamedTuple):
+    """low <= rows @ unknowns <= high: limits of positions, velocities, accelerations; to add nothing is within."""
+
+    rows: Tensor  # [R, N]
+    low: Tensor  # [R]
+    high: Tensor  # [R]
+    names: list[str]  # [R], what each is about
+
+    @staticmethod
+    def of(courses: Sequence[Course]) -> Bounds:
+        """All of several courses, whose waypoints [K, C] follow each other flat."""
+        every = [course.bounds() for course in courses]
+        rows = torch.block_diag(*(b.rows for b in every))
+        low, high = (torch.cat([getattr(b, end) for b in every]) for end in ("low", "high"))
+        return Bounds(rows, low, high, [name for b in every for name in b.names])
+
+    def nearest(self, at: Tensor) -> tuple[float, str]:
+        """(share of the way to the first limit, from where nothing is added; whose limit of what)."""
+        reached = self.rows @ at
+        room = self.high.where(reached > 0, -self.low)
+        share = (reached.abs() / room.clamp(min=MET)).where(reached.abs() > MET, 0.0)
+        first = int(share.argmax())
+        return min(float(share[first]), 1.0), self.names[first]
+
+
+@dataclass(frozen=True, eq=False)
+class Course(ABC):
+    """The motion of one gripper, to which [K, C] waypoints may be added.
+
+    Attributes:
+        name: of the gripper.
+        t: [S] s, knots as recorded, and of the wait after them.
+        closed: [S] bool.
+        span: when something is added.
+    """
+
+    name: str
+    t: Tensor
+    closed: Tensor
+    span: Span
+
+    @property
+    @abstractmethod
+    def start(self) -> Tensor:
+        """[S, C], coordinates as recorded."""
+
+    @abstractmethod
+    def trajectory(self, waypoints: Tensor) -> Trajectory:
+        """The poses with these [K, C] added; differentiable."""
+
+    @property
+    @abstractmethod
+    def labels(self) -> list[str]:
+        """[C] names of the coordinates."""
+
+    @abstractmethod
+    def _limits(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """[C] each: least and largest coordinate, fastest, hardest acceleration."""
+
+    @property
+    def nothing(self) -> Tensor:
+        """[K, C] waypoints that add nothing."""
+        return torch.zeros(self.span.waypoints, self.start.shape[1], dtype=torch.float64)
+
+    def coordinates(self, waypoints: Tensor) -> Tensor:
+        """[S, C] with these [K, C] added."""
+        return self.start + self.span.basis(self.t) @ waypoints
+
+    def bounds(self) -> Bounds:
+        """Within the limits, or within what the recorded motion does where that is beyond them."""
+        at = self.span.instants
+        step = float(at[1] - at[0])
+        start = linear(self.t, self.start, at)
+        least, largest, fastest, hardest = self._limits()
+        eye, parts = torch.eye(start.shape[1], dtype=torch.float64), []
+        for order, ends in ((0, (least, largest)), (1, (-fastest, fastest)), (2, (-hardest, hardest))):
+            before, more = (_derivative(values, order, step) for values in (start, self.span.basis(at)))
+            low, high = (ends[0] - before).clamp(max=0.0), (ends[1] - before).clamp(min=0.0)
+            names = [f"{ORDERS[order]} of {label} of {self.name}" for label in self.labels] * len(before)
+            parts.append((torch.kron(more, eye), low.flatten(), high.flatten(), names))
+        rows, low, high, names = zip(*parts, strict=True)
+        return Bounds(torch.cat(rows), torch.cat(low), torch.cat(high), [name for own in names for name in own])
+
+
+@dataclass(frozen=True, eq=False)
+class ArmCourse(Course):
+    """Joint angles [rad] (or m) of an arm, within its soft limits."""
+
+    arm: Arm
+    q: Tensor  # [S, J]
+    acceleration: float  # rad/s^2, at most
+
+    @property
+    def start(self) -> Tensor:
+        """[S, J] rad."""
+        return self.q
+
+    @property
+    def labels(self) -> list[str]:
+        """Of the joints."""
+        return list(self.arm.joint_names)
+
+    def trajectory(self, waypoints: Tensor) -> Trajectory:
+        """Through the arm's kinematics."""
+        return Trajectory(self.t, self.arm(self.coordinates(waypoints)), self.closed)
+
+    def _limits(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        limits = self.arm.limits
+        return (
+            limits.soft_lower,
+            limits.soft_upper,
+            limits.velocity,
+            torch.full_like(limits.velocity, self.acceleration),
+        )
+
+    def joints(self, waypoints: Tensor) -> JointMotion:
+        """As a recording stores it."""
+        q = self.coordinates(waypoints).detach().numpy()
+        return JointMotion(self.t.numpy(), q, closed=self.closed.numpy())
+
+
+@dataclass(frozen=True, eq=False)
+class HandCourse(Course):
+    """Shifts [m] and turns [rad, a rotation vector in world axes] of a gripper that no arm is named for."""
+
+    pose: Tensor  # [S, 4, 4] m
+    limits: Limits  # of the shifts along each axis
+    lowest: float  # m, of its origin: a table
+
+    @property
+    def start(self) -> Tensor:
+        """[S, 6]: places, and no turn."""
+        return torch.cat([self.pose[:, :3, 3], torch.zeros_like(self.pose[:, :3, 3])], 1)
+
+    @property
+    def labels(self) -> list[str]:
+        """Of shifts and turns."""
+        return ["x", "y", "z", "turn about x", "turn about y", "turn about z"]
+
+    def trajectory(self, waypoints: Tensor) -> Trajectory:
+        """Shifted, and turned about the gripper's origin."""
+        place, turn = self.coordinates(waypoints).split(3, dim=1)
+        top = torch.cat([rotation(turn) @ self.pose[:, :3, :3], place[:, :, None]], dim=2)
+        return Trajectory(self.t, torch.cat([top, self.pose[:, 3:]], dim=1), self.closed)
+
+    def _limits(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        far = torch.full((6,), math.inf, dtype=torch.float64)
+        least = -far
+        least[2] = self.lowest
+        speed, hardest = ([a] * 3 + [b] * 3 for a, b in zip(self.limits, TURNING, strict=True))
+        return least, far, torch.tensor(speed).double(), torch.tensor(hardest).double()
+
+
+def rotation(turn: Tensor) -> Tensor:
+    """[..., 3, 3] of rotation vectors [..., 3] rad."""
+    x, y, z = turn.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [torch.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    return torch.linalg.matrix_exp(torch.stack(rows, -2))
+
+
+def highest_table(colliders: dict[str, Collider], place: Tensor) -> float:
+    """m, of the highest plane that is about level, below places [N, 3] m; -inf where there is none."""
+    heights = []
+    for c in colliders.values():
+        if c.normal[2] > LEVEL:
+            xy = place[:, :2].numpy() - c.point[:2]
+            heights.append(float(np.max(c.point[2] - xy @ c.normal[:2] / c.normal[2])))
+    return max(heights, default=-math.inf)
+
+
+def linear(t: Tensor, values: Tensor, times: Tensor) -> Tensor:
+    """[N, C] at ``times`` [N] of values [S, C] at ``t`` [S]; held beyond the ends."""
+    columns = [np.interp(times.numpy(), t.numpy(), own) for own in values.detach().double().T.numpy()]
+    return torch.as_tensor(np.stack(columns, 1))
+
+
+def _derivative(values: Tensor, order: int, step: float) -> Tensor:
+    """Differences of samples [N, C]: of neighbours for velocities, over ``OVER`` periods for accelerations."""
+    if order == 0:
+        return values
+    if order == 1:
+        return values.diff(dim=0) / step
+    return (values[2 * OVER :] - 2 * values[OVER:-OVER] + values[: -2 * OVER]) / (OVER * step) ** 2

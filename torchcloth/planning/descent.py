@@ -1,0 +1,169 @@
+"""Searches for unknowns that bring the cloth to the goal, within what the arms can do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from ..errors import SimulationDiverged
+from .courses import Bounds
+from .feasible import step_within
+from .goal import Pull
+
+HALVINGS = 6  # of a step that leads into something
+FIRST, LEAST, MOST = 0.1, 1e-4, 1e4  # of the damping: a path's mean square beside the cloth's
+EASIER, HARDER = 0.2, 4.0  # times the damping, after a step that did what was expected, and after one that did not
+GOOD, POOR = 0.7, 0.2  # of what was expected
+ENOUGH = 0.005  # of the mean square distance, that a further step should gain
+LAST = 0.05  # of Adam's rate, at the end
+PATIENCE = 20  # of Adam's steps
+
+
+class Problem(Protocol):
+    """What is sought, and what is in the way."""
+
+    bounds: Bounds
+    metric: Tensor  # [N, N] mean square of the paths' changes, for each unknown squared
+
+    def look(self, at: Tensor) -> tuple[float, float]:
+        """(distance [m], mean square distance [m^2]) at unknowns [N]."""
+        ...
+
+    def pull(self, at: Tensor) -> Pull:
+        """What unknowns do to the mean square distance."""
+        ...
+
+    def slope(self, at: Tensor) -> tuple[float, float, Tensor]:
+        """As ``look``, and the gradient [N] of the distance."""
+        ...
+
+    def clear(self, at: Tensor) -> bool:
+        """Whether nothing is in the arms' way."""
+        ...
+
+
+OnLook = Callable[[int, float, float], None]  # (motions looked at, distance [m], the best so far)
+
+
+class Found(NamedTuple):
+    """What a search has found.
+
+    Attributes:
+        best: [N] unknowns.
+        history: m, the distance of every motion that was looked at, in order.
+        ended: why it ended, in words.
+    """
+
+    best: Tensor
+    history: list[float]
+    ended: str
+
+
+def gauss_newton(problem: Problem, start: Tensor, iterations: int, on_look: OnLook) -> Found:
+    """Levenberg's and Marquardt's method on the mean square distance, damped by how far the grippers' paths change.
+
+    Args:
+        problem: what is sought.
+        start: [N], within the bounds and clear.
+        iterations: at most so many steps, taken or not.
+        on_look: called after every motion that was looked at.
+    """
+    history: list[float] = []
+
+    def look(at: Tensor) -> float:
+        try:
+            distance, square = problem.look(at)
+        except SimulationDiverged:
+            if not history:
+                raise
+            distance = square = math.inf
+        history.append(distance)
+        on_look(len(history), distance, min(history))
+        return square
+
+    at, damping = start, FIRST
+    value, pull = look(at), problem.pull(at)
+    for _ in range(iterations):
+        damped = pull.curvature + damping * problem.metric
+        step = _clear(problem, at, lambda share: share * step_within(at, pull.gradient, damped, problem.bounds))  # noqa: B023
+        expected = -float(pull.gradient @ step + 0.5 * step @ pull.curvature @ step)
+        if expected <= ENOUGH * value:
+            if damping <= LEAST or not bool(step.any()):
+                return Found(at, history, f"a further step would gain less than {100 * ENOUGH:g} %")
+            damping = max(EASIER * damping, LEAST)
+            continue
+        there = look(at + step)
+        gained = (value - there) / expected
+        if there < value:
+            at, value = at + step, there
+            pull = problem.pull(at)
+        damping *= EASIER if gained > GOOD else HARDER if gained < POOR else 1.0
+        damping = max(damping, LEAST)
+        if damping > MOST:
+            return Found(at, history, "no smaller step led nearer")
+    return Found(at, history, f"after {iterations} iterations")
+
+
+def adam(problem: Problem, start: Tensor, iterations: int, rate: float, on_look: OnLook) -> Found:
+    """Adam (Kingma and Ba 2015) on the distance, by reverse mode, with a rate that falls as a cosine.
+
+    After every step, the nearest point within the bounds.
+
+    Args:
+        problem: what is sought.
+        start: [N], within the bounds and clear.
+        iterations: at most so many steps.
+        rate: of the first ones, of each unknown.
+        on_look: called after every motion that was looked at.
+    """
+    at = start.clone().requires_grad_()
+    optimiser = torch.optim.Adam([at], lr=rate)
+    falling = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda k: _share(k, iterations))
+    eye = torch.eye(len(start)).to(start)
+    best, bests, history = start, [], []
+    for k in range(iterations + 1):
+        before = at.detach().clone()
+        try:
+            value, _, gradient = problem.slope(before)
+        except SimulationDiverged:
+            if not history:
+                raise
+            value, gradient = math.inf, None
+        if value < min(history, default=math.inf):
+            best = before
+        history.append(value)
+        bests.append(min(history))
+        on_look(len(history), value, bests[-1])
+        if k == iterations:
+            break
+        if len(bests) > PATIENCE and bests[-1 - PATIENCE] - bests[-1] < ENOUGH * bests[-1]:
+            return Found(best, history, f"the last {PATIENCE} steps gained less than {100 * ENOUGH:g} %")
+        if gradient is None:
+            step = 0.5 * (best - before)
+        else:
+            at.grad = gradient
+            optimiser.step()
+            wanted = at.detach() - before
+            nearest = lambda share, b=before, w=wanted: step_within(b, -share * w, eye, problem.bounds)  # noqa: E731
+            step = _clear(problem, before, nearest)
+        falling.step()
+        with torch.no_grad():
+            at.copy_(before + step)
+    return Found(best, history, f"after {iterations} iterations")
+
+
+def _clear(problem: Problem, at: Tensor, step: Callable[[float], Tensor]) -> Tensor:
+    """The step, or as large a share of it as leads into nothing."""
+    for k in range(HALVINGS):
+        found = step(0.5**k)
+        if problem.clear(at + found):
+            return found
+    return torch.zeros_like(at)
+
+
+def _share(k: int, iterations: int) -> float:
+    return LAST + (1 - LAST) * 0.5 * (1 + math.cos(math.pi * k / max(iterations, 1)))

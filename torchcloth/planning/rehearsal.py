@@ -1,0 +1,94 @@
+"""The cloth under a motion, as one model has it, from the episode's first shape to the end of the wait."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..diagnosis.world import World
+from ..identification.episodes import RATE, Episode, episode
+from ..identification.replays import SETTLING, Frames, frames_of
+from ..recordings import Recording
+from ..sensitivities import Directions
+from ..types import Trajectory
+from .courses import Course
+from .staging import held_until
+
+NUDGE = 1e-3  # of a direction, by which what an observer has is differentiated
+
+
+class Rehearsal:
+    """One model, ready to be run under any motion of the courses.
+
+    Args:
+        world: the cloth, what robots do other than they say, and how it is seen.
+        recording: where the cloth is at first.
+        courses: of the grippers that are planned for; all others move as recorded.
+        dt: s, largest substep.
+    """
+
+    def __init__(self, world: World, recording: Recording, courses: Sequence[Course], dt: float | None) -> None:
+        self.world, self.dt = world, dt
+        self.faces = torch.as_tensor(world.cloth.mesh.faces)
+        seen = episode(world.cloth, recording, RATE)
+        span, last = courses[0].span, float(courses[0].t[-1])
+        count = max(1, round((last - span.begin) * RATE))
+        self.times = torch.linspace(span.begin, last, count + 1, dtype=torch.float64)
+        nothing = [seen.initial.new_zeros(0, 3)] * len(self.times)
+        others = {name: held_until(path, last) for name, path in seen.motion.items()}
+        self.blank: Episode = replace(
+            seen, motion=others, times=self.times, clouds=nothing, markers=None, places=None, wrenches={}, unseen=0
+        )
+        with torch.no_grad():
+            driven = self._driven({c.name: c.trajectory(c.nothing) for c in courses})
+            state = world.cloth.state(driven.initial)
+            if driven.settles:  # nothing is added to where grippers are at first, so it is the same under all motions
+                state = world.cloth.settle(state, driven.motion, start=span.begin, duration=SETTLING)
+            self.state = state
+
+    def run(self, motion: Mapping[str, Trajectory]) -> Tensor:
+        """[T, V, 3] m, what an observer has of the cloth under these motions; differentiable in their poses."""
+        driven = self._driven(motion)
+        return self._seen(frames_of(self.world.cloth(self.state, driven.motion, self.times, dt=self.dt)), driven)
+
+    def last(self, motion: Mapping[str, Trajectory], moved: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """([V, 3] m at the end, its derivatives [N, V, 3] where poses change by ``moved`` [N, K, 4, 4])."""
+        driven, along = self._driven(motion), self._tangents(motion, moved)
+        out, way = self.world.cloth.sensitivities(
+            self.state, driven.motion, self.times, along=Directions(motion=along), dt=self.dt
+        )
+        plain, moves = frames_of(out), frames_of(way)
+        x = self._seen(plain, driven)[-1]
+        if not self.world.views:
+            return x, moves.x[:, -1]
+        beside = [self._seen(_nudged(plain, moves, k), driven)[-1] for k in range(len(moves.x))]
+        return x, (torch.stack(beside) - x) / NUDGE
+
+    def identity(self) -> list[object]:
+        """What runs depend on beside the cloth and the motion."""
+        return [*self.blank.identity(), *self.state[:3], self.dt]
+
+    def _driven(self, motion: Mapping[str, Trajectory]) -> Episode:
+        as_cloth = {name: m._replace(pose=m.pose.to(self.blank.initial)) for name, m in motion.items()}
+        return self.world.driven(replace(self.blank, motion={**self.blank.motion, **as_cloth}))
+
+    def _tangents(self, motion: Mapping[str, Trajectory], moved: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Of what robots really do: their errors are not known as formulas, so by small steps where they have any."""
+        if not self.world.motions:
+            return {name: tangent.to(self.state.x) for name, tangent in moved.items()}
+        plain, count = self._driven(motion).motion, len(next(iter(moved.values())))
+        steps = []
+        for k in range(count):
+            nudged = {name: m._replace(pose=m.pose + NUDGE * moved[name][k]) for name, m in motion.items()}
+            steps.append(self._driven(nudged).motion)
+        return {name: torch.stack([(s[name].pose - plain[name].pose) / NUDGE for s in steps]) for name in moved}
+
+    def _seen(self, frames: Frames, driven: Episode) -> Tensor:
+        return self.world.seen(frames, driven).x
+
+
+def _nudged(plain: Frames, moves: Frames, k: int) -> Frames:
+    return plain._replace(x=plain.x + NUDGE * moves.x[k], v=plain.v + NUDGE * moves.v[k])
