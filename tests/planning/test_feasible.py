@@ -51,3 +51,11 @@ def test_a_bound_that_is_met_stops_what_goes_beyond_it_and_nothing_else():
     bounds = Bounds(torch.eye(2), torch.tensor([-1.0, -1.0]), torch.tensor([0.0, 1.0]), ["", ""])
     step = step_within(torch.zeros(2), torch.tensor([-1.0, -0.5]), torch.eye(2), bounds)
     assert torch.allclose(step, torch.tensor([0.0, 0.5]), atol=1e-4)
+
+
+def test_curvatures_of_which_most_are_lost_in_rounding_give_a_step():
+    stiff = 1e12 * torch.outer(torch.ones(6), torch.ones(6)) + 1e-6 * torch.eye(6)
+    bounds = Bounds(torch.eye(6), -torch.ones(6), torch.ones(6), [""] * 6)
+    step = step_within(torch.zeros(6), torch.randn(6), stiff, bounds)
+    assert bool(step.isfinite().all())
+    assert float(step.abs().max()) <= 1.0001

@@ -8,6 +8,7 @@ from torch import Tensor
 from .courses import Bounds
 
 ROUNDS = 1000  # of the dual's accelerated ascent
+ROUNDING = 1e-10  # of the largest curvature: where cloth is chaotic, others are lost beside it
 SLACK = 1e-5  # rad, rad/s, rad/s^2 (or with m): where there is no room left, it is sought so exactly
 
 
@@ -20,10 +21,11 @@ def step_within(at: Tensor, gradient: Tensor, curvature: Tensor, bounds: Bounds)
     Args:
         at: [N], within the bounds.
         gradient: [N].
-        curvature: [N, N], positive definite.
+        curvature: [N, N], positive definite up to rounding.
         bounds: low <= rows z <= high.
     """
-    root = torch.linalg.cholesky(curvature)
+    ridge = ROUNDING * float(curvature.diagonal().max()) * torch.eye(len(at)).to(curvature)
+    root = torch.linalg.cholesky(curvature + ridge)
     free = -torch.cholesky_solve(gradient[:, None], root)[:, 0]
     before = bounds.rows @ at
     low, high = (bounds.low - before).clamp(max=0.0), (bounds.high - before).clamp(min=0.0)

@@ -19,6 +19,7 @@ STUDIES: tuple[str, ...] = (
     "measured",
     "pose",
     "cost",
+    "reach",
     "hidden",
     "parts",
     "salting",

@@ -1,0 +1,203 @@
+"""Planned motions carried out in another engine: does the cloth end at the goal, and what is a fitted fabric worth?
+
+MuJoCo moves a sheet along a path that nobody is told; a depth camera's last points are the goal. From another motion,
+``torchcloth plan`` finds a path to there with the fabric's fitted values, and with those of a data sheet that is wrong.
+MuJoCo carries both out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from torchcloth import planning
+from torchcloth.identification import cloth_from, fitted, identify
+from torchcloth.identification.saved import RESULT
+from torchcloth.losses import chamfer_to_surface
+from torchcloth.planning import Goal
+from torchcloth.recordings import Recording
+from torchcloth.robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+
+from ..kept import Kept
+from .checkout import module
+from .manipulations.printing import heading_table, mm, show, write
+
+FIT = "fit"
+LEARNT = ("stretch", "swing")  # motions that the fabric is fitted to
+WRONG = {"membrane_stiffness": 3.0, "bending_stiffness": 0.4}  # times the truth, on the data sheet
+DRAG = 1.2
+FAR = 0.08  # m, of the hidden path's end from the known one's, along each axis
+TURN = 0.3  # rad about the vertical, likewise of the hands
+METHODS: dict[str, dict[str, Any]] = {
+    "fitted": {},
+    "data sheet": {},
+    "adam": {"method": "adam", "iterations": 60},  # with the fitted values
+}
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much is done."""
+
+    motions: tuple[str, ...] = ("swing", "swing-fast", "turn", "lift", "drag")
+    nodes: int = 25  # along each side of the truth's mesh
+    fit_nodes: int = 17
+    iterations: int = 12  # of the plan's Gauss-Newton
+
+
+FAST = Scale(motions=("swing-fast",), nodes=13, fit_nodes=9, iterations=5)
+
+
+class Scene(NamedTuple):
+    """Another engine's cloth, and what is said of it."""
+
+    true: Any
+    said: Any  # whose values the data sheet has
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Options."""
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="cases at a time (1)")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Fit the fabric, then every case; print and write reach.json."""
+    scale = FAST if options.fast else Scale()
+    kept = Kept(options.out, {"study": "reach", **asdict(scale)})
+    folder = options.out / FIT
+    cases: dict[str, Callable[[], dict[str, Any]]] = {FIT: partial(learn, scale, folder)}
+    found = kept.run(cases)
+    cases = {f"{k}-{name}": partial(reach, scale, k, name, folder) for k, name in enumerate(scale.motions)}
+    found |= kept.run(cases, options.jobs)
+    show(_table(found), NOTE)
+    write(options.out / "reach.json", found)
+
+
+def scene(scale: Scale) -> Scene:
+    """A knit in air, and the same with what a wrong data sheet says of it."""
+    make = module("independent", "scene").Scene()
+    hide = module("independent", "effects").hide
+    true = replace(make, sheet=replace(make.sheet, nodes=(scale.nodes, scale.nodes)))
+    said = replace(
+        true,
+        sheet=replace(true.sheet, membrane_stiffness=WRONG["membrane_stiffness"] * true.sheet.membrane_stiffness),
+        plate=replace(true.plate, stiffness=WRONG["bending_stiffness"] * true.plate.stiffness),
+    )
+    return Scene(hide(true, "air.drag_n", DRAG, {}), said)
+
+
+def learn(scale: Scale, folder: Path) -> dict[str, Any]:
+    """The fabric, from two motions."""
+    torch.set_default_dtype(torch.float64)
+    recordings = [_recorded(scale, name, k)[0] for k, name in enumerate(LEARNT)]
+    fit = identify(cloth_from(recordings[0]), recordings, nuisances=["grasp"])
+    fit.save(folder)
+    return {name: {"value": p.value, "std": p.std, "unit": p.unit} for name, p in fit.parameters.items()}
+
+
+def reach(scale: Scale, number: int, name: str, folder: Path) -> dict[str, Any]:
+    """One goal: how far the cloth is from it as recorded, as planned, and when the plan is carried out."""
+    torch.set_default_dtype(torch.float64)
+    generate, see = module("independent", "scene").simulate, module("independent", "sensor").see
+    episode, moved, begun = _recorded(scale, name, 10 + number)
+    cloth = scene(scale).true
+    hidden = _elsewhere(moved, np.random.default_rng([7, number]))
+    there = generate(cloth, hidden)
+    cloud = see(cloth.sensor, cloth.sheet, hidden.t, there.x, np.random.default_rng([8, number]))
+    goal = Goal(torch.as_tensor(cloud.frame(len(cloud) - 1)))
+    faces = torch.as_tensor(module("independent", "flex_sheet").grid(cloth.sheet)[1])
+    out: dict[str, Any] = {
+        "noise": _from_goal(goal, there.x[-1], faces),
+        "recorded": _from_goal(goal, begun.x[-1], faces) | {"vertices": _rms(begun.x[-1], there.x[-1])},
+    }
+    for label, how in METHODS.items():
+        model = cloth_from(episode) if label == "data sheet" else fitted(folder / RESULT, episode)[0]
+        began = time.perf_counter()
+        found = planning.plan(model, episode, goal, **({"iterations": scale.iterations, "wait": 0.0} | how))
+        done = generate(cloth, _along(moved, found.recording))
+        out[label] = {
+            "before": found.before[0],
+            "expected": found.after[0],
+            **_from_goal(goal, done.x[-1], faces),
+            "vertices": _rms(done.x[-1], there.x[-1]),
+            "looks": len(found.history),
+            "seconds": time.perf_counter() - began,
+            "limit": found.limit,
+        }
+    return out
+
+
+def _recorded(scale: Scale, name: str, seed: int) -> tuple[Recording, Any, Any]:
+    """(recording, motion, what happened) of a motion by name."""
+    record, cloth = module("independent", "generate").record, scene(scale)
+    moved = module("independent", "motions").motion(name, cloth.true.sheet)
+    result = module("independent", "scene").simulate(cloth.true, moved)
+    said = record(cloth.true, moved, result, name, seed, scale.fit_nodes, said=cloth.said)
+    return replace(said, air_density=cloth.true.air.density, truth=None), moved, result
+
+
+def _elsewhere(moved: Any, rng: np.random.Generator) -> Any:
+    """The motion with its end elsewhere: both hands shifted and turned about the vertical, ever more on the way."""
+    jerk = module("independent", "motions").minimum_jerk
+    t = moved.t
+    share = jerk(t, np.array([t[0] + 0.2, t[-1] - 0.2]), np.array([0.0, 1.0]))
+    shift, angle = rng.uniform(-FAR, FAR, 3), rng.uniform(-TURN, TURN)
+    shift[2] = abs(shift[2])  # up: a table may lie below
+    middle = np.mean([pose[:, :3, 3] for pose in moved.pose.values()], axis=0)
+    turn = module("independent", "motions")._about_z(share * angle)
+    pose = {}
+    for name, own in moved.pose.items():
+        new = own.copy()
+        new[:, :3, :3] = turn @ own[:, :3, :3]
+        new[:, :3, 3] = middle + np.einsum("kab,kb->ka", turn, own[:, :3, 3] - middle) + share[:, None] * shift
+        pose[name] = new
+    return replace(moved, pose=pose)
+
+
+def _along(moved: Any, planned: Recording) -> Any:
+    """The planned paths as another engine takes them."""
+    paths = replay(planned)
+    t = next(iter(paths.values())).t.numpy()
+    return replace(moved, t=t, pose={name: paths[name].pose.numpy() for name in moved.pose})
+
+
+def _from_goal(goal: Goal, x: np.ndarray, faces: torch.Tensor) -> dict[str, float]:
+    return {"distance": float(chamfer_to_surface(goal.points, torch.as_tensor(x), faces))}
+
+
+def _rms(x: np.ndarray, y: np.ndarray) -> float:
+    return float(np.sqrt(np.square(x - y).sum(-1).mean()))
+
+
+NOTE = (
+    "distance: of the goal's points, which carry the sensor's noise, from the cloth at the end (one-sided Chamfer); "
+    "expected: as the plan's own simulation has it; done: as MuJoCo does it. vertices: root mean square of where every "
+    "piece of cloth is, beside where the hidden path brought it."
+)
+
+
+def _table(found: dict[str, Any]):
+    title = "Distance from the goal [mm]"
+    table = heading_table(title, "motion", "planned with", "expected", "done", "vertices", "motions tried")
+    for name, case in found.items():
+        if name == FIT:
+            continue
+        first = case["recorded"]
+        table.add_row(name, "– (as recorded)", "", mm(first["distance"]), mm(first["vertices"]), "")
+        for label in METHODS:
+            own = case[label]
+            cells = [mm(own[key]) for key in ("expected", "distance", "vertices")]
+            said = "fitted, by Adam" if label == "adam" else label
+            table.add_row("", said, *cells, str(own["looks"]))
+        table.add_row(
+            "", "the hidden path itself", "", mm(case["noise"]["distance"]), mm(0.0), "", "", end_section=True
+        )
+    return table
