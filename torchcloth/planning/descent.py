@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import torch
@@ -86,26 +87,31 @@ def gauss_newton(problem: Problem, start: Tensor, iterations: int, on_look: OnLo
         return square
 
     at, damping = start, FIRST
-    value, pull = look(at), problem.pull(at)
+    value, pull = look(at), None
     for _ in range(iterations):
-        damped = pull.curvature + damping * problem.metric
-        step = _clear(problem, at, lambda share: share * step_within(at, pull.gradient, damped, problem.bounds))  # noqa: B023
-        expected = -float(pull.gradient @ step + 0.5 * step @ pull.curvature @ step)
-        if expected <= ENOUGH * value:
-            if damping <= LEAST or not bool(step.any()):
-                return Found(at, history, f"a further step would gain less than {100 * ENOUGH:g} %")
+        pull = problem.pull(at) if pull is None else pull
+        while True:
+            step = _clear(problem, at, partial(_damped, problem, at, pull, damping))
+            expected = -float(pull.gradient @ step + 0.5 * step @ pull.curvature @ step)
+            if expected > ENOUGH * value or damping <= LEAST or not bool(step.any()):
+                break
             damping = max(EASIER * damping, LEAST)
-            continue
+        if expected <= ENOUGH * value:
+            return Found(at, history, f"a further step would gain less than {100 * ENOUGH:g} %")
         there = look(at + step)
         gained = (value - there) / expected
-        if there < value:
-            at, value = at + step, there
-            pull = problem.pull(at)
         damping *= EASIER if gained > GOOD else HARDER if gained < POOR else 1.0
         damping = max(damping, LEAST)
-        if damping > MOST:
+        if there < value:
+            at, value, pull = at + step, there, None
+        elif damping > MOST:
             return Found(at, history, "no smaller step led nearer")
     return Found(at, history, f"after {iterations} iterations")
+
+
+def _damped(problem: Problem, at: Tensor, pull: Pull, damping: float, share: float) -> Tensor:
+    """A share of the step within the bounds, for so much damping."""
+    return share * step_within(at, pull.gradient, pull.curvature + damping * problem.metric, problem.bounds)
 
 
 def adam(problem: Problem, start: Tensor, iterations: int, rate: float, on_look: OnLook) -> Found:

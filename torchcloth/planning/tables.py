@@ -13,10 +13,11 @@ def print_plan(found: MotionPlan) -> None:
 
     console = Console(highlight=False)
     console.width = max(console.width, 100)
-    table = Table(title="Distance of the cloth from the goal, mm", title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(title_justify="left", box=box.SIMPLE_HEAD)
     several = len(found.after) > 1
-    for heading in ("", "mean", "least", "most") if several else ("", "mean"):
-        table.add_column(heading if several else "" if not heading else "at the end", no_wrap=True)
+    headings = ("mean of the models [mm]", "least", "most") if several else ("from the goal at the end [mm]",)
+    for heading in ("", *headings):
+        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
     for label, each in (("recorded motion", found.before), ("planned motion", found.after)):
         numbers = [sum(each) / len(each), *((min(each), max(each)) if several else ())]
         table.add_row(label, *(f"{1e3 * number:.2f}" for number in numbers))
