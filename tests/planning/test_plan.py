@@ -167,6 +167,9 @@ def test_a_stopped_search_goes_on_and_ends_alike(tmp_path):
         tc.plan(cloth, recording, goal, journal=tmp_path / "kept", **QUICK)
     with pytest.raises(InvalidInput, match="another fit"):
         tc.plan(cloth, recording, shifted_goal(recording, -AWAY), journal=tmp_path / "kept", resume=True, **QUICK)
+    elsewhere = World(cloth).with_view(lambda frames, e: frames._replace(x=frames.x + 0.01))
+    with pytest.raises(InvalidInput, match="another fit"):
+        tc.plan(elsewhere, recording, goal, journal=tmp_path / "kept", resume=True, **QUICK)
     seen = []
     again = tc.plan(
         cloth,

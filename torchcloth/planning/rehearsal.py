@@ -47,7 +47,7 @@ class Rehearsal:
             state = world.cloth.state(driven.initial)
             if driven.settles:  # nothing is added to where grippers are at first, so it is the same under all motions
                 state = world.cloth.settle(state, driven.motion, start=span.begin, duration=SETTLING)
-            self.state = state
+            self.state, self._driven_first = state, driven
 
     def run(self, motion: Mapping[str, Trajectory]) -> Tensor:
         """[T, V, 3] m, what an observer has of the cloth under these motions; differentiable in their poses."""
@@ -68,8 +68,10 @@ class Rehearsal:
         return x, (torch.stack(beside) - x) / NUDGE
 
     def identity(self) -> list[object]:
-        """What runs depend on beside the cloth and the motion."""
-        return [*self.blank.identity(), *self.state[:3], self.dt]
+        """What runs depend on beside the cloth and the motion; of functions, what they make of the first shape."""
+        x = self.state.x.expand(len(self.times), -1, -1)
+        probe = self._seen(Frames(x, x, {}, x.new_zeros(len(x))), self._driven_first)
+        return [*self._driven_first.identity(), *self.state[:3], probe, self.dt]
 
     def _driven(self, motion: Mapping[str, Trajectory]) -> Episode:
         as_cloth = {name: m._replace(pose=m.pose.to(self.blank.initial)) for name, m in motion.items()}
