@@ -72,6 +72,10 @@ def test_another_diagnosis_is_not_resumed(episodes, counted, tmp_path):
     for edited in (replace(episodes[0], cameras=camera), replace(episodes[0], grippers=open_)):
         with pytest.raises(InvalidInput, match="another fit"):
             diagnose([edited, *episodes[1:]], hypotheses=[], journal=tmp_path / "progress", resume=True)
+    base = base_model(episodes[0])
+    seen = replace(base, base=base.base.with_view(lambda frames, e: frames._replace(x=frames.x + 0.01)))
+    with pytest.raises(InvalidInput, match="another fit"):  # a function of the user's, which shows in what it does
+        diagnose(episodes, seen, hypotheses=[], journal=tmp_path / "progress", resume=True)
 
 
 def test_the_command_says_how_to_go_on(episodes, counted, tmp_path, capsys, monkeypatch):

@@ -42,6 +42,6 @@ def kept_in(folder: Path, model: Model, setting: Setting, resume: bool | None) -
 def _problem(model: Model, setting: Setting) -> list[object]:
     """All that an answer depends on beside the question."""
     cloth = model.base.cloth
-    data = [part for e in setting.episodes for part in e.identity()]
+    data = [part for e in setting.episodes for part in (*e.identity(), *model.base.identity(e))]
     parts = [(p.name, p.step, p.std) for p in model.parameters]
     return [setting.dt, parts, *digests(), *facts_of(cloth), setting.rest, *data]

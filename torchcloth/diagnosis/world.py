@@ -61,6 +61,14 @@ class World:
             frames = view(frames, episode)
         return frames
 
+    def identity(self, episode: Episode) -> list[object]:
+        """What simulations of it depend on beside the cloth: of functions, what they make of the first shape."""
+        driven = self.driven(episode)
+        x = driven.initial.expand(len(driven.times), -1, -1)
+        still = {name: x.new_zeros(len(x), 6) for name in driven.motion}
+        seen = self.seen(Frames(x, x, still, x.new_zeros(len(x))), driven)
+        return [*driven.identity(), seen.x, seen.v, *seen.wrench.values(), seen.edge]
+
     def with_motion(self, motion: Motion) -> World:
         """The same with one more error of the robot."""
         return replace(self, motions=(*self.motions, motion))

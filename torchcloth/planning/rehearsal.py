@@ -43,11 +43,12 @@ class Rehearsal:
             seen, motion=others, times=self.times, clouds=nothing, markers=None, places=None, wrenches={}, unseen=0
         )
         with torch.no_grad():
-            driven = self._driven({c.name: c.trajectory(c.nothing) for c in courses})
+            self._first = self._moved({c.name: c.trajectory(c.nothing) for c in courses})
+            driven = world.driven(self._first)
             state = world.cloth.state(driven.initial)
             if driven.settles:  # nothing is added to where grippers are at first, so it is the same under all motions
                 state = world.cloth.settle(state, driven.motion, start=span.begin, duration=SETTLING)
-            self.state, self._driven_first = state, driven
+            self.state = state
 
     def run(self, motion: Mapping[str, Trajectory]) -> Tensor:
         """[T, V, 3] m, what an observer has of the cloth under these motions; differentiable in their poses."""
@@ -68,14 +69,15 @@ class Rehearsal:
         return x, (torch.stack(beside) - x) / NUDGE
 
     def identity(self) -> list[object]:
-        """What runs depend on beside the cloth and the motion; of functions, what they make of the first shape."""
-        x = self.state.x.expand(len(self.times), -1, -1)
-        probe = self._seen(Frames(x, x, {}, x.new_zeros(len(x))), self._driven_first)
-        return [*self._driven_first.identity(), *self.state[:3], probe, self.dt]
+        """What runs depend on beside the cloth and the motion."""
+        return [*self.world.identity(self._first), *self.state[:3], self.dt]
 
     def _driven(self, motion: Mapping[str, Trajectory]) -> Episode:
+        return self.world.driven(self._moved(motion))
+
+    def _moved(self, motion: Mapping[str, Trajectory]) -> Episode:
         as_cloth = {name: m._replace(pose=m.pose.to(self.blank.initial)) for name, m in motion.items()}
-        return self.world.driven(replace(self.blank, motion={**self.blank.motion, **as_cloth}))
+        return replace(self.blank, motion={**self.blank.motion, **as_cloth})
 
     def _tangents(self, motion: Mapping[str, Trajectory], moved: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Of what robots really do: their errors are not known as formulas, so by small steps where they have any."""
