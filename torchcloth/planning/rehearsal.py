@@ -13,7 +13,7 @@ from ..identification.episodes import RATE, Episode, episode
 from ..identification.replays import SETTLING, Frames, frames_of
 from ..recordings import Recording
 from ..sensitivities import Directions
-from ..types import Trajectory
+from ..types import ClothState, Trajectory
 from .courses import Course
 from .staging import held_until
 
@@ -54,6 +54,10 @@ class Rehearsal:
         """[T, V, 3] m, what an observer has of the cloth under these motions; differentiable in their poses."""
         driven = self._driven(motion)
         return self._seen(frames_of(self.world.cloth(self.state, driven.motion, self.times, dt=self.dt)), driven)
+
+    def go_on(self, state: ClothState, motion: Mapping[str, Trajectory], begin: float, end: float) -> ClothState:
+        """The cloth itself at ``end`` [s] under these motions, from what it is at ``begin``."""
+        return self.world.cloth(state, self._driven(motion).motion, [begin, end], dt=self.dt, checkpoint=False).state
 
     def last(self, motion: Mapping[str, Trajectory], moved: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """([V, 3] m at the end, its derivatives [N, V, 3] where poses change by ``moved`` [N, K, 4, 4])."""

@@ -1,0 +1,90 @@
+"""The environment of ``torchcloth plan``'s scenes, and a learner in it."""
+
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "planning"))
+
+from scenes import by_arm, by_hand, cloth_of
+
+from torchcloth.diagnosis import World
+from torchcloth.planning import Goal
+from torchcloth.planning.rehearsal import Rehearsal
+from torchcloth.planning.staging import courses_of
+from torchcloth.planning.task import Task
+from torchcloth.robots import ACCELERATION
+from torchcloth.robots.primitives import Limits
+from torchcloth.training.rl import ReachEnv, learn
+from torchcloth.training.rl.env import Stepwise, stepwise
+
+WAIT = 0.1
+
+
+def task_of(recording, way=(0.04, 0.02, 0.03), waypoints=2, judge=None):
+    """Where the recorded motion's cloth would be if all were shifted."""
+    cloth = cloth_of(recording).requires_grad_(False)
+    courses = [stepwise(c) for c in courses_of(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())]
+    run = Rehearsal(World(cloth), recording, courses, None)
+    with torch.no_grad():
+        x = run.run({c.name: c.trajectory(c.nothing) for c in courses})[-1]
+    return Task([run], courses, Goal(x + torch.tensor(way), run.faces), judge, None)
+
+
+def test_a_step_is_done_in_its_own_stretch_of_time():
+    span = Stepwise(0.0, 1.0, 4)
+    share = span.basis(torch.tensor([0.0, 0.25, 0.5, 1.0, 2.0]))
+    assert torch.allclose(share[1], torch.tensor([1.0, 0, 0, 0]))
+    assert torch.allclose(share[2], torch.tensor([1.0, 1, 0, 0]))
+    assert torch.allclose(share[3:], torch.ones(2, 4))
+
+
+@pytest.mark.parametrize("scene", [by_hand, by_arm])
+def test_it_is_an_environment(scene):
+    from gymnasium.utils.env_checker import check_env
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of observations without ends
+        check_env(ReachEnv(task_of(scene())), skip_render_check=True)
+
+
+def test_step_by_step_the_cloth_goes_where_the_whole_motion_brings_it():
+    task = task_of(by_arm(), waypoints=3)
+    tried = []
+    env = ReachEnv(task, tried.append)
+    env.reset()
+    actions = np.random.default_rng(0).uniform(-1, 1, (3, env.count))
+    for k, action in enumerate(actions):
+        _, reward, over, _, info = env.step(action)
+        assert over == (k == 2)
+        assert reward == pytest.approx(-info["distance"] / env.first)
+    (last,) = tried
+    assert last.distance == pytest.approx(info["distance"])
+    assert task.look(last.at)[0] == pytest.approx(last.distance, rel=2e-2)  # substeps of other lengths
+    assert float(task.bounds.nearest(last.at)[0]) <= 1.0
+
+
+def test_what_is_in_the_way_is_not_stepped_into():
+    class Wall:
+        def nearest(self, t, q):
+            gone = q["arm"][: len(recorded)] - recorded
+            return None, "in the way" if float(gone.abs().max()) > 0.02 else None
+
+    recorded = torch.as_tensor(by_arm().joints["arm"].q)
+
+    env = ReachEnv(task_of(by_arm(), judge=Wall()))
+    env.reset()
+    for _ in range(2):
+        env.step(np.ones(env.count))
+    assert torch.equal(env.at, env.task.start)
+
+
+def test_sac_comes_nearer():
+    found = learn(task_of(by_hand()), motions=60, warm=20)
+    assert len(found.history) == 60
+    assert min(found.history) < 0.6 * found.history[0]
+    assert torch.get_default_dtype() == torch.float64

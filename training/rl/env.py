@@ -1,0 +1,134 @@
+"""A cloth in grippers as a gymnasium environment: decision after decision, how far to go, until the motion is over.
+
+The scene, the limits and what is in the way are those of ``torchcloth plan``. Decisions are causal: each adds a smooth
+step (quintic, at rest at both ends) within its own stretch of time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcloth.errors import MissingDependency
+from torchcloth.planning.courses import Course, Span
+from torchcloth.planning.feasible import step_within
+from torchcloth.planning.task import Task
+
+try:
+    import gymnasium
+except ImportError as error:
+    raise MissingDependency("reinforcement learning needs gymnasium", remedy='pip install "torchcloth[rl]"') from error
+
+SEEN = 32  # vertices that are observed, far apart
+SIZE = 0.5  # m, that observations are divided by
+
+
+class Stepwise(Span):
+    """What is added is added step by step: waypoint k from the end of stretch k - 1 to the end of stretch k."""
+
+    def basis(self, times: Tensor) -> Tensor:
+        """[N, K], the share of each step that is done at ``times`` [N] s."""
+        ends = torch.linspace(self.begin, self.end, self.waypoints + 1, dtype=torch.float64)
+        s = ((times.double()[:, None] - ends[:-1]) / ends.diff()).clamp(0.0, 1.0)
+        return s**3 * (10 - 15 * s + 6 * s * s)
+
+
+def stepwise(course: Course) -> Course:
+    """The same gripper, to which steps are added."""
+    return replace(course, span=Stepwise(*course.span))
+
+
+class Tried(NamedTuple):
+    """One finished motion."""
+
+    distance: float  # m, from the goal at the end
+    at: Tensor  # [N] steps, as ``Task`` has unknowns
+
+
+class ReachEnv(gymnasium.Env):
+    """One episode is one motion of the grippers; each action is one step of all of them.
+
+    Observation: places of some vertices from the goal's middle, their velocities, where the grippers' coordinates have
+    gone, and how much of the motion is over. Action: the step of every coordinate, as a share of the largest that the
+    limits allow. Reward: minus the distance from the goal over that of the recorded motion's end, after every step.
+
+    Args:
+        task: with ``stepwise`` courses and one model.
+        on_motion: called after every finished motion.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}
+
+    def __init__(self, task: Task, on_motion: Callable[[Tried], None] = lambda tried: None) -> None:
+        self.task, self.on_motion = task, on_motion
+        self.run = task.rehearsals[0]
+        course = task.courses[0]
+        self.stretches = course.span.waypoints
+        self.ends = np.linspace(course.span.begin, course.span.end, self.stretches + 1)
+        self.last = float(course.t[-1])  # of the wait
+        numbered = task.split(torch.arange(len(task.start)))
+        self.own = [torch.cat([z[k] for z in numbered]) for k in range(self.stretches)]  # unknowns of each stretch
+        self.count = len(self.own[0])
+        self.vertices = _far_apart(self.run.state.x, SEEN)
+        self.middle = task.goal.points.mean(0).to(self.run.state.x)
+        self.first = max(task.look(task.start)[0], 1e-9)
+        self.reach = _reach(task)
+        size = 6 * len(self.vertices) + self.count + 1
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.count,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None):
+        """The cloth at rest where it is first."""
+        super().reset(seed=seed)
+        self.at, self.done, self.state = self.task.start.clone(), 0, self.run.state
+        return self._seen(), {}
+
+    def step(self, action: np.ndarray):
+        """One stretch of time; the last one with the wait."""
+        k = self.done
+        wanted = torch.as_tensor(np.asarray(action, dtype=np.float64)).clamp(-1.0, 1.0) * self.reach[self.own[k]]
+        after = self.at.clone()
+        after[self.own[k]] = self._allowed(k, wanted)
+        if self.task.clear(after):
+            self.at = after
+        self.done += 1
+        over = self.done == self.stretches
+        end = self.last if over else float(self.ends[self.done])
+        with torch.no_grad():
+            self.state = self.run.go_on(self.state, self.task.motion(self.at), float(self.ends[k]), end)
+        distance = float(self.task.goal.distance(self.state.x, self.run.faces))
+        if over:
+            self.on_motion(Tried(distance, self.at))
+        return self._seen(), -distance / self.first, over, False, {"distance": distance}
+
+    def _allowed(self, k: int, wanted: Tensor) -> Tensor:
+        """The steps of stretch ``k`` nearest to these that keep the limits after what has been done."""
+        bounds, done = self.task.bounds, self.task.bounds.rows @ self.at
+        left = bounds._replace(rows=bounds.rows[:, self.own[k]], low=bounds.low - done, high=bounds.high - done)
+        return step_within(torch.zeros_like(wanted), -wanted, torch.eye(len(wanted)).to(wanted), left)
+
+    def _seen(self) -> np.ndarray:
+        x, v = self.state.x[self.vertices] - self.middle, self.state.v[self.vertices]
+        gone = torch.cat([z.sum(0) for z in self.task.split(self.at)])
+        parts = [(x / SIZE).flatten(), v.flatten(), gone, gone.new_tensor([self.done / self.stretches])]
+        return torch.cat(parts).numpy().astype(np.float32)
+
+
+def _reach(task: Task) -> Tensor:
+    """[N], the largest step of each coordinate alone that the limits allow either way."""
+    rows, room = task.bounds.rows.abs(), torch.minimum(task.bounds.high, -task.bounds.low)
+    return (room[:, None] / rows.clamp(min=1e-12)).where(rows > 1e-12, torch.inf).amin(0)
+
+
+def _far_apart(x: Tensor, count: int) -> Tensor:
+    """Indices of vertices, each the farthest from those before."""
+    chosen, distance = [0], (x - x[0]).norm(dim=1)
+    while len(chosen) < min(count, len(x)):
+        chosen.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (x - x[chosen[-1]]).norm(dim=1))
+    return torch.tensor(chosen)

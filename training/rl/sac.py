@@ -1,0 +1,63 @@
+"""Soft Actor-Critic (Haarnoja et al. 2018) on a cloth, by stable-baselines3."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchcloth.errors import MissingDependency
+from torchcloth.planning.task import Task
+
+from .env import ReachEnv, Tried
+
+
+class Learnt(NamedTuple):
+    """What learning has found.
+
+    Attributes:
+        best: [N] steps of the best motion that was tried.
+        history: m, the distance of every motion that was tried, in order.
+        policy: m, the distance that the final policy ends at, without exploring.
+    """
+
+    best: Tensor
+    history: list[float]
+    policy: float
+
+
+def learn(task: Task, motions: int, seed: int = 0, warm: int = 10) -> Learnt:
+    """Learn to reach the goal from so many motions.
+
+    Args:
+        task: with ``stepwise`` courses and one model.
+        motions: that are simulated.
+        seed: of networks and exploration.
+        warm: motions with random steps, before learning begins.
+
+    Raises:
+        MissingDependency: stable-baselines3 is not installed.
+    """
+    try:
+        from stable_baselines3 import SAC
+    except ImportError as error:
+        remedy = 'pip install "torchcloth[rl]"'
+        raise MissingDependency("SAC needs stable-baselines3", remedy=remedy) from error
+    tried: list[Tried] = []
+    env = ReachEnv(task, tried.append)
+    before, torch_type = torch.get_num_threads(), torch.get_default_dtype()
+    torch.set_num_threads(1)  # networks are small: more threads take tens of times as long
+    torch.set_default_dtype(torch.float32)  # as its networks want; the cloth keeps its own
+    try:
+        model = SAC("MlpPolicy", env, seed=seed, learning_starts=warm * env.stretches, gradient_steps=1, device="cpu")
+        model.learn(motions * env.stretches)
+        history = [t.distance for t in tried]
+        seen, over = env.reset()[0], False
+        while not over:
+            seen, _, over, _, _ = env.step(model.predict(seen, deterministic=True)[0])
+    finally:
+        torch.set_num_threads(before)
+        torch.set_default_dtype(torch_type)
+    best = min(tried, key=lambda t: t.distance)
+    return Learnt(best.at, history, tried[-1].distance)
