@@ -13,6 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "planning"))
 from scenes import by_arm, by_hand, cloth_of
 
 from torchcloth.diagnosis import World
+from torchcloth.errors import SimulationDiverged
 from torchcloth.planning import Goal
 from torchcloth.planning.rehearsal import Rehearsal
 from torchcloth.planning.staging import courses_of
@@ -83,8 +84,25 @@ def test_what_is_in_the_way_is_not_stepped_into():
     assert torch.equal(env.at, env.task.start)
 
 
+def test_a_motion_that_cannot_be_simulated_ends_there(monkeypatch):
+    tried = []
+    env = ReachEnv(task_of(by_hand()), tried.append)
+
+    def torn(*arguments):
+        raise SimulationDiverged("torn")
+
+    monkeypatch.setattr(env.run, "go_on", torn)
+    env.reset()
+    _, reward, over, _, _ = env.step(np.zeros(env.count))
+    assert over
+    assert reward < -1
+    assert tried[0].distance == np.inf
+    assert env.reset()[0].shape == env.observation_space.shape
+
+
 def test_sac_comes_nearer():
     found = learn(task_of(by_hand()), motions=60, warm=20)
-    assert len(found.history) == 60
+    assert len(found.history) == 61
+    assert found.history[-1] == found.policy
     assert min(found.history) < 0.6 * found.history[0]
     assert torch.get_default_dtype() == torch.float64

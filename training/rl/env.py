@@ -6,6 +6,7 @@ step (quintic, at rest at both ends) within its own stretch of time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcloth.errors import MissingDependency
+from torchcloth.errors import MissingDependency, SimulationDiverged
 from torchcloth.planning.courses import Course, Span
 from torchcloth.planning.feasible import step_within
 from torchcloth.planning.task import Task
@@ -26,6 +27,7 @@ except ImportError as error:
 
 SEEN = 32  # vertices that are observed, far apart
 SIZE = 0.5  # m, that observations are divided by
+TORN = 5.0  # of the recorded motion's distance, that a motion counts that cannot be simulated
 
 
 class Stepwise(Span):
@@ -99,12 +101,16 @@ class ReachEnv(gymnasium.Env):
         self.done += 1
         over = self.done == self.stretches
         end = self.last if over else float(self.ends[self.done])
-        with torch.no_grad():
-            self.state = self.run.go_on(self.state, self.task.motion(self.at), float(self.ends[k]), end)
-        distance = float(self.task.goal.distance(self.state.x, self.run.faces))
+        try:
+            with torch.no_grad():
+                self.state = self.run.go_on(self.state, self.task.motion(self.at), float(self.ends[k]), end)
+            distance = float(self.task.goal.distance(self.state.x, self.run.faces))
+            reward = -distance / self.first
+        except SimulationDiverged:  # cloth that is torn: the motion ends
+            distance, reward, over = math.inf, -TORN, True
         if over:
             self.on_motion(Tried(distance, self.at))
-        return self._seen(), -distance / self.first, over, False, {"distance": distance}
+        return self._seen(), reward, over, False, {"distance": distance}
 
     def _allowed(self, k: int, wanted: Tensor) -> Tensor:
         """The steps of stretch ``k`` nearest to these that keep the limits after what has been done."""

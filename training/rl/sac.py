@@ -18,8 +18,8 @@ class Learnt(NamedTuple):
 
     Attributes:
         best: [N] steps of the best motion that was tried.
-        history: m, the distance of every motion that was tried, in order.
-        policy: m, the distance that the final policy ends at, without exploring.
+        history: m, the distance of every motion that was tried, in order, the final policy's last.
+        policy: m, where that ends, without exploring.
     """
 
     best: Tensor
@@ -52,7 +52,6 @@ def learn(task: Task, motions: int, seed: int = 0, warm: int = 10) -> Learnt:
     try:
         model = SAC("MlpPolicy", env, seed=seed, learning_starts=warm * env.stretches, gradient_steps=1, device="cpu")
         model.learn(motions * env.stretches)
-        history = [t.distance for t in tried]
         seen, over = env.reset()[0], False
         while not over:
             seen, _, over, _, _ = env.step(model.predict(seen, deterministic=True)[0])
@@ -60,4 +59,4 @@ def learn(task: Task, motions: int, seed: int = 0, warm: int = 10) -> Learnt:
         torch.set_num_threads(before)
         torch.set_default_dtype(torch_type)
     best = min(tried, key=lambda t: t.distance)
-    return Learnt(best.at, history, tried[-1].distance)
+    return Learnt(best.at, [t.distance for t in tried], tried[-1].distance)

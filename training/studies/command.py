@@ -20,6 +20,7 @@ STUDIES: tuple[str, ...] = (
     "pose",
     "cost",
     "reach",
+    "trajectories",
     "hidden",
     "parts",
     "salting",
