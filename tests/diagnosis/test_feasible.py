@@ -14,9 +14,9 @@ from test_experiments import undecided
 
 from torchcloth import recordings, robots
 from torchcloth.diagnosis import experiments, next_experiment
-from torchcloth.diagnosis import feasible as module
 from torchcloth.diagnosis.experiments import Experiment, planned
-from torchcloth.diagnosis.feasible import FOLDER, Choice, feasible, write_episode
+from torchcloth.diagnosis.feasible import FOLDER, PROPOSED, Choice, feasible, write_episode
+from torchcloth.recordings.proposed import FILES, undone
 
 FAST = Experiment("swing-fast")
 
@@ -94,11 +94,11 @@ def test_a_proposal_replaces_the_last_one_and_nothing_that_was_recorded(slowed, 
     assert write_episode(hang, tmp_path) is None
     assert write_episode(slowed.episode, tmp_path) is None
     assert recordings.read(tmp_path / FOLDER).split == slowed.episode.split
-    assert set(p.name for p in (tmp_path / FOLDER).iterdir()) == module.FILES
+    assert set(p.name for p in (tmp_path / FOLDER).iterdir()) == FILES
     assert write_episode(None, tmp_path) is None
     assert not (tmp_path / FOLDER).exists()
     push = {name: replace(g, force=np.ones((len(g.t), 3))) for name, g in slowed.episode.grippers.items()}
-    felt = replace(module.unseen(slowed.episode), grippers=push, joints={})
+    felt = replace(undone(slowed.episode, PROPOSED), grippers=push, joints={})
     for recorded in (hang, felt, replace(felt, provenance="measured", grippers=slowed.episode.grippers)):
         recordings.write(recorded, tmp_path / FOLDER, overwrite=True)
         before = {p.name: p.stat().st_mtime_ns for p in (tmp_path / FOLDER).iterdir()}

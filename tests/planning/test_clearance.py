@@ -3,11 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
-from scenes import by_arm, by_hand
+from scenes import by_arm, by_hand, cloth_of
 
 from torchcloth import recordings as rec
 from torchcloth.planning.clearance import clearance_of
+from torchcloth.planning.staging import courses_of
+from torchcloth.robots import ACCELERATION
+from torchcloth.robots.primitives import Limits
 
 PALM = 0.212  # m, the lower side of the gripper's body at home
 
@@ -18,31 +22,39 @@ def over(height):
     return replace(by_arm(), colliders={"table": table})
 
 
-def angles(recording):
-    own = recording.joints["arm"]
-    return torch.as_tensor(own.t), {"arm": torch.as_tensor(own.q)}
+def looked_at(recording, least):
+    """(the course, what it is held against, why nothing is)."""
+    courses = courses_of(cloth_of(recording), recording, 2, 0.1, ACCELERATION, Limits())
+    return courses[0], *clearance_of(recording, courses, torch.tensor([[0.7, 0.0, 0.0]]), least)
 
 
 def test_a_motion_into_the_table_is_not_clear():
-    recording = over(PALM - 0.1)
-    t, q = angles(recording)
-    judge, doubt = clearance_of(recording, t, q, 0.05)
+    course, judge, doubt = looked_at(over(PALM - 0.1), 0.05)
     assert not doubt
-    assert judge.nearest(t, q)[1] is None
-    q["arm"][:, 1] -= 0.12 * (t / t[-1])  # the shoulder leans, the hand goes down by 8 cm
-    gap, refusal = judge.nearest(t, q)
+    q = course.at_instants(course.nothing)
+    assert judge.nearest({"arm": q})[1] is None
+    t = course.span.instants
+    q[:, 1] -= 0.12 * t / t[-1]  # the shoulder leans, the hand goes down by 8 cm
+    gap, refusal = judge.nearest({"arm": q})
     assert "the table" in str(refusal)
     assert gap.distance < 0.05
 
 
+def test_the_table_reaches_to_the_goal():
+    recording = over(PALM - 0.1)
+    courses = courses_of(cloth_of(recording), recording, 2, 0.1, ACCELERATION, Limits())
+    near, far = (clearance_of(recording, courses, torch.tensor([[x, 0.0, 0.0]]), 0.05)[0] for x in (0.6, 1.5))
+    assert far.scene.table.x[1] == pytest.approx(1.6)
+    assert near.scene.table.x[1] < 1.0
+
+
 def test_solids_that_the_recorded_motion_went_through_are_no_judges():
-    recording = over(PALM + 0.01)
-    judge, doubt = clearance_of(recording, *angles(recording), 0.02)
+    _, judge, doubt = looked_at(over(PALM + 0.01), 0.02)
     assert judge is None
     assert "the recorded motion itself is not clear" in doubt
 
 
 def test_of_a_hand_without_an_arm_nothing_is_known():
-    judge, doubt = clearance_of(by_hand(), torch.linspace(0, 1, 5), {}, 0.02)
+    _, judge, doubt = looked_at(by_hand(), 0.02)
     assert judge is None
     assert "not every gripper" in doubt

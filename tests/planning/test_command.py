@@ -104,6 +104,20 @@ def test_what_was_recorded_where_the_plan_would_go_stays(folder, goal, tmp_path,
     assert rec.read(own).provenance == by_hand().provenance
 
 
-def test_nothing_is_written_into_the_episode(folder, goal, capsys):
+def test_what_was_filmed_where_the_plan_would_go_stays(folder, goal, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["plan", str(folder), "--goal", str(goal), "--out", str(out), *OPTIONS]) == 0
+    (out / "episode" / "cam0").mkdir()
+    assert main(["plan", str(folder), "--goal", str(goal), "--out", str(out), *OPTIONS]) == 2
+    assert "holds more than one" in capsys.readouterr().err
+    assert (out / "episode" / "cam0").is_dir()
+
+
+def test_nothing_is_written_into_the_episode(folder, goal, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["plan", str(folder), "--goal", str(goal), "--out", str(out), *OPTIONS]) == 0
+    before = (out / "episode" / "motion.npz").read_bytes()
+    assert main(["plan", str(out / "episode"), "--goal", str(goal), "--out", str(out), *OPTIONS]) == 2  # its own plan
+    assert (out / "episode" / "motion.npz").read_bytes() == before
     assert main(["plan", str(folder), "--goal", str(goal), "--out", str(folder / "plan"), *OPTIONS]) == 2
     assert "outside" in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """Searches on formulas: how they step, what they do not step into, and when they end."""
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -82,3 +83,33 @@ def test_what_cannot_be_simulated_is_stepped_back_from(method):
 def test_a_beginning_that_cannot_be_simulated_is_told(method):
     with pytest.raises(SimulationDiverged):
         search(Bowl(diverges=lambda at: True), method)
+
+
+def test_what_blocks_every_step_is_said():
+    found = search(Bowl(blocked=lambda at: bool(at.any())), "gauss-newton")
+    assert torch.equal(found.best, torch.zeros(2))
+    assert "blocked" in found.ended
+
+
+def test_a_step_that_fails_is_not_tried_again():
+    """Slopes that lie: each of them points to a wall of distance, and no smaller step is worth it."""
+
+    class Liar(Bowl):
+        def look(self, at):
+            self.seen.append(at)
+            far = 1.0 + 10.0 * float(at.norm())
+            return far, far**2
+
+    problem = Liar()
+    found = search(problem, "gauss-newton")
+    assert "no smaller step" in found.ended
+    sizes = [float(at.norm()) for at in problem.seen[1:]]
+    assert all(b < 0.9 * a for a, b in pairwise(sizes))
+
+
+def test_slopes_that_are_lost_end_the_search():
+    class Lost(Bowl):
+        def pull(self, at):
+            return Pull(torch.tensor(1.0), torch.full((2,), torch.nan), torch.eye(2))
+
+    assert "chaotic" in search(Lost(), "gauss-newton").ended

@@ -78,11 +78,23 @@ def test_files(tmp_path):
     assert read_goal(tmp_path / "mesh.obj").faces.shape == FACES.shape
 
 
-@pytest.mark.parametrize("name", ["absent.npy", "words.txt", "damaged.npy", "other.npz"])
+def test_triangles_of_other_points_are_refused():
+    with pytest.raises(InvalidInput, match="faces"):
+        Goal(torch.zeros(3, 3), torch.tensor([[0, 1, 3]]))
+
+
+def test_a_path_is_no_goal():
+    with pytest.raises(InvalidInput, match="read_goal"):
+        Goal("goal.npy")
+
+
+@pytest.mark.parametrize("name", ["absent.npy", "words.txt", "damaged.npy", "other.npz", "torn.npz", "archive.npy"])
 def test_files_that_show_no_cloth_are_refused_in_one_line(tmp_path, name):
     (tmp_path / "words.txt").write_text("left")
     (tmp_path / "damaged.npy").write_bytes(b"\x93NUMPY")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    (tmp_path / "torn.npz").write_bytes((tmp_path / "other.npz").read_bytes()[:40])
+    (tmp_path / "archive.npy").write_bytes((tmp_path / "other.npz").read_bytes())
     with pytest.raises(InvalidInput, match=r"goal.*expected an episode") as caught:
         read_goal(tmp_path / name)
     assert "\n" not in str(caught.value)

@@ -9,15 +9,16 @@ from scenes import LASTS, NOMINAL, by_arm, by_hand, cloth_of
 
 import torchcloth as tc
 from torchcloth import recordings as rec
-from torchcloth.diagnosis import World
+from torchcloth.diagnosis import Model, World, base_model
+from torchcloth.diagnosis.hypotheses import known
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import cloth_from, episode
 from torchcloth.identification.replays import Replay
 from torchcloth.planning import Goal
-from torchcloth.planning.rehearsal import Rehearsal
+from torchcloth.planning.rehearsal import Rehearsal, plain
 from torchcloth.planning.staging import courses_of
 from torchcloth.planning.task import Task
-from torchcloth.robots import ACCELERATION
+from torchcloth.robots import ACCELERATION, gripper_motion
 from torchcloth.robots.primitives import Limits
 
 WAIT = 0.1
@@ -28,7 +29,7 @@ AWAY = torch.tensor([0.04, 0.02, 0.03])
 def task_of(recording, goal, waypoints=2):
     cloth = cloth_of(recording).requires_grad_(False)
     courses = courses_of(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())
-    return Task([Rehearsal(World(cloth), recording, courses, None)], courses, goal, None, None)
+    return Task([Rehearsal(plain(cloth), recording, courses, None)], courses, goal, None, None)
 
 
 def end_of(recording, at=None):
@@ -133,7 +134,7 @@ def test_a_robot_that_errs_is_corrected_for():
     world = World(cloth_of(recording)).with_motion(driven)
     world = world.with_view(lambda frames, e: frames._replace(x=frames.x + blind))
     x, faces = end_of(recording)
-    found = tc.plan(world, recording, Goal(x, faces), **QUICK)
+    found = tc.plan(Model(world, (), torch.zeros(0)), recording, Goal(x, faces), **QUICK)
     assert found.before[0] > 8e-3
     assert found.after[0] < 0.15 * found.before[0]
     way = found.motion["hand"].pose[-1, :3, 3] - found.motion["hand"].pose.new_tensor([0.03, 0.0, 0.5])
@@ -167,9 +168,10 @@ def test_a_stopped_search_goes_on_and_ends_alike(tmp_path):
         tc.plan(cloth, recording, goal, journal=tmp_path / "kept", **QUICK)
     with pytest.raises(InvalidInput, match="another fit"):
         tc.plan(cloth, recording, shifted_goal(recording, -AWAY), journal=tmp_path / "kept", resume=True, **QUICK)
-    elsewhere = World(cloth).with_view(lambda frames, e: frames._replace(x=frames.x + 0.01))
-    with pytest.raises(InvalidInput, match="another fit"):
-        tc.plan(elsewhere, recording, goal, journal=tmp_path / "kept", resume=True, **QUICK)
+    for view in (lambda frames, e: frames._replace(x=frames.x + 0.01), lambda f, e: f._replace(x=f.x + 0.02 * f.v)):
+        elsewhere = Model(World(cloth).with_view(view), (), torch.zeros(0))  # a camera, and a late clock
+        with pytest.raises(InvalidInput, match="another fit"):
+            tc.plan(elsewhere, recording, goal, journal=tmp_path / "kept", resume=True, **QUICK)
     seen = []
     again = tc.plan(
         cloth,
@@ -218,5 +220,91 @@ def test_a_goal_in_millimetres_is_refused():
 def test_models_that_are_none_are_refused():
     recording = by_hand()
     for model in ([], ["cloth"], None):
-        with pytest.raises(InvalidInput, match=r"model.*a Cloth or a World"):
+        with pytest.raises(InvalidInput, match=r"model.*a Cloth or a diagnosis.Model"):
             tc.plan(model, recording, Goal(torch.zeros(4, 3)))  # type: ignore[arg-type]
+
+
+def test_a_patch_that_a_diagnosis_moved_is_carried_over_once():
+    """With nothing added, what is rehearsed is what the model's world shows of the episode."""
+    recording = by_hand()
+    named = {h.name: h for h in known()}
+    for name, amplitude in (("robot.regrasp", 0.012), ("obs.clock", 0.02)):
+        model = base_model(recording).plus(named[name], amplitude)
+        courses = courses_of(model.base.cloth, recording, 2, 0.0, ACCELERATION, Limits())
+        run = Rehearsal(model, recording, courses, None)
+        seen = run.run({c.name: c.trajectory(c.nothing) for c in courses})
+        data = replace(episode(model.base.cloth, recording, 20.0), times=run.times)
+        plain_world = model.world().frames(data).x
+        assert torch.allclose(seen[:-1], plain_world[:-1], atol=1e-4)
+
+
+def test_in_float32_too():
+    torch.set_default_dtype(torch.float32)
+    recording = by_hand()
+    cloth = cloth_of(recording)
+    x = episode(cloth, recording, 20.0).initial
+    found = tc.plan(cloth, recording, Goal(x + torch.tensor([0.06, 0.0, 0.0])), wait=WAIT, iterations=2)
+    assert found.frames.dtype == torch.float32
+    assert found.after[0] < 0.5 * found.before[0]
+
+
+def test_two_hands_with_knots_of_their_own():
+    recording = by_hand()
+    one = recording.grippers["hand"]
+    t = np.linspace(0.0, LASTS, 13)
+    place = np.stack([np.interp(t, one.t, own) for own in one.position.T], -1)
+    other = rec.GripperMotion(t, place, np.tile([1.0, 0, 0, 0], (13, 1)), np.ones(13, bool))
+    left, right = (
+        rec.GraspInfo(uv=np.array([[0.0, 0.2]]), radius=0.04),
+        rec.GraspInfo(uv=np.array([[0.2, 0.2]]), radius=0.04),
+    )
+    recording = replace(recording, grasps={"a": left, "b": right}, grippers={"a": one, "b": other})
+    found = tc.plan(cloth_of(recording), recording, shifted_goal(recording), **QUICK)
+    assert found.after[0] < 0.4 * found.before[0]
+    assert set(found.motion) == {"a", "b"}
+    assert len(found.motion["a"].t) == len(found.motion["b"].t)
+
+
+def test_a_gripper_that_takes_hold_on_the_way_is_refused():
+    recording = by_hand()
+    own = recording.grippers["hand"]
+    for closed, said in ((own.t > 0.1, "after the first frame"), ((own.t < 0.1) | (own.t > 0.2), "again")):
+        late = replace(recording, grippers={"hand": replace(own, closed=closed)})
+        with pytest.raises(InvalidInput, match=said):
+            tc.plan(cloth_of(late), late, Goal(torch.zeros(4, 3)))
+
+
+def test_waypoints_that_tremble_are_refused():
+    recording = by_hand()
+    with pytest.raises(InvalidInput, match=r"waypoints.*0.1 s or more"):
+        tc.plan(cloth_of(recording), recording, Goal(torch.zeros(4, 3)), waypoints=9)
+
+
+def test_joints_that_no_arm_is_named_for_do_not_stay_beside_the_plan(tmp_path):
+    recording = replace(by_arm(), robots={})
+    arm = tc.robots.load("rizon4", frame="tcp_closed")
+    pose = arm(torch.as_tensor(recording.joints["arm"].q))
+    path = tc.Trajectory(torch.as_tensor(recording.joints["arm"].t), pose, torch.ones(41, dtype=torch.bool))
+    recording = replace(recording, grippers={"arm": gripper_motion(path)})
+    found = tc.plan(cloth_of(recording), recording, shifted_goal(recording), wait=WAIT, iterations=1)
+    assert not found.recording.joints
+    found.save(tmp_path)
+    assert rec.read(tmp_path / "episode").grippers["arm"].t[-1] == pytest.approx(LASTS + WAIT)
+
+
+def test_an_episode_that_begins_in_mid_motion_says_so():
+    recording = by_arm()
+    cloud = rec.PointClouds(np.array([0.1, 0.3]), np.tile(recording.cloth.initial_vertices[:5], (2, 1)), np.full(2, 5))
+    late = replace(recording, points=cloud)
+    found = tc.plan(
+        cloth_of(late), late, Goal(torch.as_tensor(recording.cloth.initial_vertices)), waypoints=2, iterations=1
+    )
+    assert any("under way" in text for text in found.warnings)
+    assert found.times[0] == pytest.approx(0.1)
+    assert found.recording.joints["arm"].t[0] == pytest.approx(0.1)
+
+
+def test_a_goal_elsewhere_in_the_world_is_doubted():
+    recording = by_hand()
+    found = tc.plan(cloth_of(recording), recording, shifted_goal(recording, torch.tensor([3.0, 0, 0])), iterations=1)
+    assert any("in one world" in text for text in found.warnings)

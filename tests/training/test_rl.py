@@ -12,10 +12,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "planning"))
 
 from scenes import by_arm, by_hand, cloth_of
 
-from torchcloth.diagnosis import World
 from torchcloth.errors import SimulationDiverged
 from torchcloth.planning import Goal
-from torchcloth.planning.rehearsal import Rehearsal
+from torchcloth.planning.rehearsal import Rehearsal, plain
 from torchcloth.planning.staging import courses_of
 from torchcloth.planning.task import Task
 from torchcloth.robots import ACCELERATION
@@ -30,7 +29,7 @@ def task_of(recording, way=(0.04, 0.02, 0.03), waypoints=2, judge=None):
     """Where the recorded motion's cloth would be if all were shifted."""
     cloth = cloth_of(recording).requires_grad_(False)
     courses = [stepwise(c) for c in courses_of(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())]
-    run = Rehearsal(World(cloth), recording, courses, None)
+    run = Rehearsal(plain(cloth), recording, courses, None)
     with torch.no_grad():
         x = run.run({c.name: c.trajectory(c.nothing) for c in courses})[-1]
     return Task([run], courses, Goal(x + torch.tensor(way), run.faces), judge, None)
@@ -71,11 +70,11 @@ def test_step_by_step_the_cloth_goes_where_the_whole_motion_brings_it():
 
 def test_what_is_in_the_way_is_not_stepped_into():
     class Wall:
-        def nearest(self, t, q):
-            gone = q["arm"][: len(recorded)] - recorded
-            return None, "in the way" if float(gone.abs().max()) > 0.02 else None
+        def nearest(self, q):
+            return None, "in the way" if float((q["arm"] - recorded).abs().max()) > 0.02 else None
 
-    recorded = torch.as_tensor(by_arm().joints["arm"].q)
+    course = task_of(by_arm()).courses[0]
+    recorded = course.at_instants(course.nothing)
 
     env = ReachEnv(task_of(by_arm(), judge=Wall()))
     env.reset()

@@ -15,7 +15,7 @@ from .folders import check_apart, check_folder, how_to_go_on, place, replaces, s
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
-    from ..diagnosis import World
+    from ..diagnosis import Model
     from ..recordings import Recording
 
 PICTURE = (520, 440)  # pixels of each of four moments
@@ -63,12 +63,13 @@ def _plan(options: argparse.Namespace) -> int:
 
     from .. import planning, recordings, viewing
     from ..identification.journal import clear
-    from ..planning.result import RESULT, check_place
+    from ..planning.result import EPISODE, RESULT, check_place
     from ..robots import ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
-    check_apart(options.out, options.episode, options.goal)
+    for path in (options.out, options.out / EPISODE):
+        check_apart(path, options.episode, options.goal)
     check_folder(options.out)
     check_place(options.out)
     recording, goal = recordings.read(options.episode), planning.read_goal(options.goal)
@@ -99,7 +100,7 @@ def _plan(options: argparse.Namespace) -> int:
     return 0
 
 
-def _models(options: argparse.Namespace, recording: Recording) -> list[Cloth] | list[World]:
+def _models(options: argparse.Namespace, recording: Recording) -> list[Cloth] | list[Model]:
     """What is believed of the cloth: the best values first, then draws."""
     from .. import diagnosis
     from ..identification import cloth_from, drawn
@@ -111,7 +112,7 @@ def _models(options: argparse.Namespace, recording: Recording) -> list[Cloth] | 
             raise InvalidInput("--draws", got="it without --fit", expected="a fit, which says what is open")
         return [cloth_from(recording)]
     if options.fit.suffix == ".tcm":
-        return diagnosis.drawn_worlds(diagnosis.read_model(options.fit, recording), options.draws)
+        return diagnosis.drawn_models(diagnosis.read_model(options.fit, recording), options.draws)
     return drawn(options.fit, recording, options.draws)
 
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import TorchclothError
-from ..recordings import Recording, read, write
+from ..recordings import Recording, write
+from ..recordings.proposed import is_undone, undone
 from ..robots import Plan, gripper_motion, retrace  # pyright: ignore[reportMissingImports] - mapped from robots/
 from ..robots.retrace import scene_of  # pyright: ignore[reportMissingImports]
 from .experiments import Experiment, blank_frames, blank_readings, planned, possible
@@ -17,7 +18,6 @@ from .pieces import side_by_side
 from .setting import Progress
 
 FOLDER = "next_experiment"  # beside diagnosis.json
-FILES = frozenset(("episode.json", "motion.npz", "cloth.obj", "cloth_initial.npy"))  # in it while nothing is recorded
 PROPOSED = "synthetic: an experiment that torchcloth diagnose proposes"
 
 
@@ -85,36 +85,12 @@ def write_episode(episode: Recording | None, folder: Path) -> str | None:
     """
     target = folder / FOLDER
     try:
-        if os.path.lexists(target) and not _is_proposal(target):
+        if os.path.lexists(target) and not is_undone(target, PROPOSED):
             return f"{target} is no proposal, or holds more than one, and was left as it is"
         if episode is not None:
-            write(unseen(episode), target, overwrite=True)
+            write(undone(episode, PROPOSED), target, overwrite=True)
         elif target.exists():
             shutil.rmtree(target)
     except (TorchclothError, OSError) as error:
         return f"the proposed experiment was not written: {error}"
     return None
-
-
-def _is_proposal(target: Path) -> bool:
-    """Written here, and nothing recorded into it since."""
-    if target.is_symlink() or not target.is_dir() or not {path.name for path in target.iterdir()} <= FILES:
-        return False
-    try:
-        found = read(target)
-    except TorchclothError:
-        return False
-    felt = [g.force is not None or g.torque is not None for g in (*found.grippers.values(), *found.joints.values())]
-    return found.provenance == PROPOSED and not any(felt)
-
-
-def unseen(episode: Recording) -> Recording:
-    """Without the blanks for what will be seen and felt."""
-    return replace(
-        episode,
-        grippers={name: replace(g, force=None, torque=None) for name, g in episode.grippers.items()},
-        cameras={name: replace(c, depth=None, color=None, mask=None) for name, c in episode.cameras.items()},
-        points=None,
-        truth=None,
-        provenance=PROPOSED,
-    )

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from ..cloth import Cloth
+from ..errors import InvalidInput
 from ..identification.episode_prediction import EpisodePrediction, with_errors
 from ..identification.episodes import RATE, Episode, episode
 from ..identification.replays import Frames, each
@@ -84,25 +85,25 @@ def uncertain(file: ModelFile) -> dict[str, tuple[float, float]]:
     return out
 
 
-def drawn_worlds(file: ModelFile, count: int, seed: int = 0) -> list[World]:
-    """``count`` worlds: the model's, then with its numbers drawn from their joint errors, as far as worlds have such.
+def drawn_models(file: ModelFile, count: int, seed: int = 0) -> list[Model]:
+    """``count`` models: the file's, then with its numbers drawn from their joint errors, where a world has such.
 
-    A residual force, whose errors nobody knows, stays. Of a file without errors every world is the model's.
+    A residual force, whose errors nobody knows, stays.
+
+    Raises:
+        InvalidInput: several are asked for and the file has no errors, or hardly any number within them has a world.
     """
-    model, rng = file.model, torch.Generator().manual_seed(seed)
-    out = [model.world()]
-    if file.covariance is None:
-        return out * count
-    values, vectors = torch.linalg.eigh(file.covariance)
-    root = vectors * values.clamp(min=0.0).sqrt()
+    model, rng, out = file.model, torch.Generator().manual_seed(seed), [file.model]
+    if count > 1 and file.covariance is None:
+        raise InvalidInput("draws", got=f"{count} of a model without errors", expected="1, or a model with them")
     for _ in range(TRIES * count):
-        if len(out) >= count:
-            break
-        noise = root @ torch.randn(len(root), generator=rng, dtype=root.dtype)
-        step = torch.cat([noise, noise.new_zeros(len(model.point) - len(noise))])
-        found = if_possible(lambda s=step: model.at(model.point + s).world())
-        out += [] if found is None else [found]
-    return out
+        if len(out) >= count or file.covariance is None:
+            return out
+        values, vectors = torch.linalg.eigh(file.covariance)
+        noise = vectors * values.clamp(min=0.0).sqrt() @ torch.randn(len(values), generator=rng, dtype=values.dtype)
+        drawn = model.at(model.point + torch.cat([noise, noise.new_zeros(len(model.point) - len(noise))]))
+        out += [] if if_possible(drawn.world) is None else [drawn]
+    raise InvalidInput("draws", got=f"{len(out)} of {count} for which there is a world", expected="fewer draws")
 
 
 def was_fitted(path: str | Path, recording: Recording) -> bool:

@@ -62,11 +62,12 @@ class World:
         return frames
 
     def identity(self, episode: Episode) -> list[object]:
-        """What simulations of it depend on beside the cloth: of functions, what they make of the first shape."""
+        """What simulations of it depend on beside the cloth: of functions, what they make of a shape that drifts."""
         driven = self.driven(episode)
-        x = driven.initial.expand(len(driven.times), -1, -1)
-        still = {name: x.new_zeros(len(x), 6) for name in driven.motion}
-        seen = self.seen(Frames(x, x, still, x.new_zeros(len(x))), driven)
+        v = torch.ones_like(driven.initial).expand(len(driven.times), -1, -1)
+        x = driven.initial + v * (driven.times - driven.times[0]).to(v)[:, None, None]
+        still = {name: v.new_zeros(len(v), 6) for name in driven.motion}
+        seen = self.seen(Frames(x, v, still, v.new_zeros(len(v))), driven)
         return [*driven.identity(), seen.x, seen.v, *seen.wrench.values(), seen.edge]
 
     def with_motion(self, motion: Motion) -> World:

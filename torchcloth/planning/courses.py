@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from ..recordings import Collider, JointMotion
@@ -23,9 +24,12 @@ from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
 
 PERIOD = 0.02  # s, between the instants at which limits are held
-OVER = 3  # periods, over which accelerations are taken: measured joints tremble from sample to sample
-TURNING = Limits(speed=2.0, acceleration=10.0)  # rad/s and rad/s^2, of a hand that no arm moves
+OVER = 3  # periods to either side, over which a recorded motion's accelerations are taken: measured joints tremble
+NUDGE = 1e-4  # s, by which what is added, which is smooth, is differentiated
+TURNING = Limits(speed=2.0, acceleration=10.0)  # rad/s and rad/s^2, of what a hand that no arm moves is turned more
 LEVEL = 0.97  # upward part of a table's normal
+ORDERS = ("position", "velocity", "acceleration")
+MET = 1e-12  # of room: there is none
 
 
 class Span(NamedTuple):
@@ -37,19 +41,20 @@ class Span(NamedTuple):
 
     def basis(self, times: Tensor) -> Tensor:
         """[N, K], what each waypoint adds at ``times`` [N] s."""
-        knots = torch.linspace(self.begin, self.end, self.waypoints + 1, dtype=torch.float64)
         each = torch.cat([torch.zeros(1, self.waypoints), torch.eye(self.waypoints)]).double()
-        return Spline.through(knots, each).at(times.double().clamp(self.begin, self.end))[0]
+        return Spline.through(self.knots, each).at(times.double().clamp(self.begin, self.end))[0]
+
+    @property
+    def knots(self) -> Tensor:
+        """[K + 1] s, of the beginning and of the waypoints."""
+        return torch.linspace(self.begin, self.end, self.waypoints + 1, dtype=torch.float64)
 
     @property
     def instants(self) -> Tensor:
-        """[N] s, where limits are held."""
+        """[N] s, where limits are held: those of the waypoints, where accelerations are greatest, among them."""
         count = math.ceil((self.end - self.begin) / PERIOD) + 1
-        return torch.linspace(self.begin, self.end, max(count, 2 * OVER + 1), dtype=torch.float64)
-
-
-ORDERS = ("position", "velocity", "acceleration")
-MET = 1e-12  # of room: there is none
+        even = torch.linspace(self.begin, self.end, count, dtype=torch.float64)
+        return torch.cat([even, self.knots]).unique()
 
 
 class Bounds(NamedTuple):
@@ -120,17 +125,21 @@ class Course(ABC):
         """[S, C] with these [K, C] added."""
         return self.start + self.span.basis(self.t) @ waypoints
 
+    def at_instants(self, waypoints: Tensor) -> Tensor:
+        """[N, C] of ``span.instants`` with these [K, C] added."""
+        at = self.span.instants
+        return between(self.t, self.start, at) + self.span.basis(at) @ waypoints
+
     def bounds(self) -> Bounds:
         """Within the limits, or within what the recorded motion does where that is beyond them."""
-        at = self.span.instants
-        step = float(at[1] - at[0])
-        start = linear(self.t, self.start, at)
         least, largest, fastest, hardest = self._limits()
-        eye, parts = torch.eye(start.shape[1], dtype=torch.float64), []
+        eye, parts = torch.eye(self.start.shape[1], dtype=torch.float64), []
+        at, recorded = self.span.instants, lambda times: between(self.t, self.start, times)
         for order, ends in ((0, (least, largest)), (1, (-fastest, fastest)), (2, (-hardest, hardest))):
-            before, more = (_derivative(values, order, step) for values in (start, self.span.basis(at)))
+            before = _derivative(recorded, at, order, PERIOD if order < 2 else OVER * PERIOD)
+            more = _derivative(self.span.basis, at, order, NUDGE)
             low, high = (ends[0] - before).clamp(max=0.0), (ends[1] - before).clamp(min=0.0)
-            names = [f"{ORDERS[order]} of {label} of {self.name}" for label in self.labels] * len(before)
+            names = [f"{ORDERS[order]} of {label} of {self.name}" for label in self.labels] * len(at)
             parts.append((torch.kron(more, eye), low.flatten(), high.flatten(), names))
         rows, low, high, names = zip(*parts, strict=True)
         return Bounds(torch.cat(rows), torch.cat(low), torch.cat(high), [name for own in names for name in own])
@@ -213,7 +222,7 @@ def rotation(turn: Tensor) -> Tensor:
     return torch.linalg.matrix_exp(torch.stack(rows, -2))
 
 
-def highest_table(colliders: dict[str, Collider], place: Tensor) -> float:
+def highest_table(colliders: Mapping[str, Collider], place: Tensor) -> float:
     """m, of the highest plane that is about level, below places [N, 3] m; -inf where there is none."""
     heights = []
     for c in colliders.values():
@@ -223,16 +232,16 @@ def highest_table(colliders: dict[str, Collider], place: Tensor) -> float:
     return max(heights, default=-math.inf)
 
 
-def linear(t: Tensor, values: Tensor, times: Tensor) -> Tensor:
-    """[N, C] at ``times`` [N] of values [S, C] at ``t`` [S]; held beyond the ends."""
-    columns = [np.interp(times.numpy(), t.numpy(), own) for own in values.detach().double().T.numpy()]
-    return torch.as_tensor(np.stack(columns, 1))
+def between(t: Tensor, values: Tensor, times: Tensor) -> Tensor:
+    """[N, C] at ``times`` [N] of values [S, C] at ``t`` [S]: cubics without overshoot (C1), held beyond the ends."""
+    curve = PchipInterpolator(t.numpy(), values.detach().double().numpy(), axis=0)
+    return torch.as_tensor(curve(times.clamp(float(t[0]), float(t[-1])).numpy()))
 
 
-def _derivative(values: Tensor, order: int, step: float) -> Tensor:
-    """Differences of samples [N, C]: of neighbours for velocities, over ``OVER`` periods for accelerations."""
+def _derivative(function, times: Tensor, order: int, step: float) -> Tensor:
+    """[N, C] of a function of times, by differences."""
     if order == 0:
-        return values
+        return function(times)
     if order == 1:
-        return values.diff(dim=0) / step
-    return (values[2 * OVER :] - 2 * values[OVER:-OVER] + values[: -2 * OVER]) / (OVER * step) ** 2
+        return (function(times + step / 2) - function(times - step / 2)) / step
+    return (function(times + step) - 2 * function(times) + function(times - step)) / step**2

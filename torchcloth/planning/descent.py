@@ -10,16 +10,18 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..errors import SimulationDiverged
+from ..diagnosis.worlds import IMPOSSIBLE
 from .courses import Bounds
 from .feasible import step_within
 from .goal import Pull
 
 HALVINGS = 6  # of a step that leads into something
-FIRST, LEAST, MOST = 0.1, 1e-4, 1e4  # of the damping: a path's mean square beside the cloth's
+FIRST, LEAST = 0.1, 1e-4  # of the damping: a path's mean square beside the cloth's
 EASIER, HARDER = 0.2, 4.0  # times the damping, after a step that did what was expected, and after one that did not
 GOOD, POOR = 0.7, 0.2  # of what was expected
 ENOUGH = 0.005  # of the mean square distance, that a further step should gain
+GAIN = f"{100 * ENOUGH:g} % of the mean square distance"
+BLOCKED = "every step that slopes ask for is blocked by a limit or by what is in the arms' way"
 LAST = 0.05  # of Adam's rate, at the end
 PATIENCE = 20  # of Adam's steps
 
@@ -78,7 +80,7 @@ def gauss_newton(problem: Problem, start: Tensor, iterations: int, on_look: OnLo
     def look(at: Tensor) -> float:
         try:
             distance, square = problem.look(at)
-        except SimulationDiverged:
+        except IMPOSSIBLE:
             if not history:
                 raise
             distance = square = math.inf
@@ -89,24 +91,31 @@ def gauss_newton(problem: Problem, start: Tensor, iterations: int, on_look: OnLo
     at, damping = start, FIRST
     value, pull = look(at), None
     for _ in range(iterations):
-        pull = problem.pull(at) if pull is None else pull
-        while True:
-            step = _clear(problem, at, partial(_damped, problem, at, pull, damping))
-            expected = -float(pull.gradient @ step + 0.5 * step @ pull.curvature @ step)
-            if expected > ENOUGH * value or damping <= LEAST or not bool(step.any()):
-                break
+        fresh = pull is None
+        if pull is None:
+            pull = problem.pull(at)
+            if not all(bool(part.isfinite().all()) for part in pull):
+                return Found(at, history, "the cloth is so chaotic there that slopes say nothing")
+        step, expected = _promised(problem, at, pull, damping)
+        while fresh and expected <= ENOUGH * value and damping > LEAST and bool(step.any()):
             damping = max(EASIER * damping, LEAST)
+            step, expected = _promised(problem, at, pull, damping)
         if expected <= ENOUGH * value:
-            return Found(at, history, f"a further step would gain less than {100 * ENOUGH:g} %")
+            if bool(pull.gradient.any()) and not bool(step.any()):
+                return Found(at, history, BLOCKED)
+            return Found(at, history, f"{'no further' if fresh else 'no smaller'} step would gain more than {GAIN}")
         there = look(at + step)
         gained = (value - there) / expected
-        damping *= EASIER if gained > GOOD else HARDER if gained < POOR else 1.0
-        damping = max(damping, LEAST)
+        damping = max(damping * (EASIER if gained > GOOD else HARDER if gained < POOR else 1.0), LEAST)
         if there < value:
             at, value, pull = at + step, there, None
-        elif damping > MOST:
-            return Found(at, history, "no smaller step led nearer")
     return Found(at, history, f"after {iterations} iterations")
+
+
+def _promised(problem: Problem, at: Tensor, pull: Pull, damping: float) -> tuple[Tensor, float]:
+    """(step [N], by how much the mean square distance should fall [m^2])."""
+    step = _clear(problem, at, partial(_damped, problem, at, pull, damping))
+    return step, -float(pull.gradient @ step + 0.5 * step @ pull.curvature @ step)
 
 
 def _damped(problem: Problem, at: Tensor, pull: Pull, damping: float, share: float) -> Tensor:
@@ -135,7 +144,7 @@ def adam(problem: Problem, start: Tensor, iterations: int, rate: float, on_look:
         before = at.detach().clone()
         try:
             value, _, gradient = problem.slope(before)
-        except SimulationDiverged:
+        except IMPOSSIBLE:
             if not history:
                 raise
             value, gradient = math.inf, None
@@ -149,7 +158,7 @@ def adam(problem: Problem, start: Tensor, iterations: int, rate: float, on_look:
         if len(bests) > PATIENCE and bests[-1 - PATIENCE] - bests[-1] < ENOUGH * bests[-1]:
             return Found(best, history, f"the last {PATIENCE} steps gained less than {100 * ENOUGH:g} %")
         if gradient is None:
-            step = 0.5 * (best - before)
+            step = _clear(problem, before, lambda share, b=before, t=best: (1 - 0.5 * share) * (t - b))
         else:
             at.grad = gradient
             optimiser.step()

@@ -9,7 +9,7 @@ from .courses import Bounds
 
 ROUNDS = 1000  # of the dual's accelerated ascent
 ROUNDING = 1e-10  # of the largest curvature: where cloth is chaotic, others are lost beside it
-SLACK = 1e-5  # rad, rad/s, rad/s^2 (or with m): where there is no room left, it is sought so exactly
+SLACK = 1e-5  # rad, rad/s, rad/s^2 (or with m), that may lie beyond a bound: where no room is left nothing is exact
 
 
 def step_within(at: Tensor, gradient: Tensor, curvature: Tensor, bounds: Bounds) -> Tensor:
@@ -34,22 +34,23 @@ def step_within(at: Tensor, gradient: Tensor, curvature: Tensor, bounds: Bounds)
         return free
     give = torch.cholesky_solve(bounds.rows.mT, root)  # [N, R]
     size = (bounds.rows * give.mT).sum(1).clamp(min=1e-30).sqrt()
-    rows, give, low, high = bounds.rows / size[:, None], give / size, low / size, high / size
-    slack = SLACK / size
+    rows, give, low, high, slack = bounds.rows / size[:, None], give / size, low / size, high / size, SLACK / size
     pace = float(torch.linalg.matrix_norm(torch.linalg.solve_triangular(root, rows.mT, upper=False), 2)) ** 2
     push = ahead = torch.zeros_like(low)
     speed = 1.0
     for k in range(ROUNDS):
         there = rows @ (free - give @ ahead)
-        if k % 50 == 49 and bool((there >= low - slack).all() & (there <= high + slack).all()):
-            break
         new = ahead + (there - (there + pace * ahead).clamp(low, high)) / pace
         if float((ahead - new) @ (new - push)) > 0:  # it has gone too far (O'Donoghue and Candes 2015)
             speed = 1.0
         faster = 0.5 * (1 + (1 + 4 * speed**2) ** 0.5)
         ahead = new + (speed - 1) / faster * (new - push)
         push, speed = new, faster
+        if k % 50 == 49:
+            there = rows @ (free - give @ push)
+            if bool((there >= low - slack).all() & (there <= high + slack).all()):
+                break
     step = free - give @ push
-    reached = rows @ step
-    room = high.where(reached > 0, -low) + slack
-    return step * float((room / reached.abs().clamp(min=1e-300)).min().clamp(max=1.0))
+    reached = bounds.rows @ step
+    room = torch.where(reached > 0, bounds.high - before, before - bounds.low) + SLACK
+    return step * float((room.clamp(min=0.0) / reached.abs().clamp(min=1e-300)).min().clamp(max=1.0))

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from ..errors import InvalidInput
 from ..losses import Hits, chamfer_to_surface, closest
+from ..losses.shapes import check_triangles
 from ..meshes import load
 from ..recordings import read
 
 EXPECTED = "an episode (its last points), .npy [N, 3] of points, .obj or .ply of a mesh, or pose.npz"
 ALONG = 0.1  # of the stiffness across a surface, that a place on it is asked for along it: cloth may slide there
-DAMAGED = (OSError, ValueError, KeyError, IndexError, EOFError)  # numpy's, of what is no such file
 
 
 class Pull(NamedTuple):
@@ -50,13 +50,22 @@ class Goal:
     faces: Tensor | None = None
 
     def __post_init__(self) -> None:
-        points = torch.as_tensor(self.points, dtype=torch.get_default_dtype()).detach()
+        try:
+            points = torch.as_tensor(self.points, dtype=torch.get_default_dtype()).detach()
+            faces = None if self.faces is None else torch.as_tensor(self.faces).long()
+        except (TypeError, ValueError, RuntimeError):
+            expected, remedy = (
+                "[N, 3] metres, a tensor or an array",
+                "of a file or an episode: planning.read_goal(path)",
+            )
+            raise InvalidInput("goal", got=f"{self.points!r:.60}", expected=expected, remedy=remedy) from None
         if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not bool(points.isfinite().all()):
             got = f"shape {tuple(points.shape)}" + ("" if bool(points.isfinite().all()) else ", not all finite")
             raise InvalidInput("points of the goal", got=got, expected="[N, 3] finite metres, N >= 1")
+        if faces is not None:
+            check_triangles(faces, len(points))
         object.__setattr__(self, "points", points)
-        if self.faces is not None:
-            object.__setattr__(self, "faces", torch.as_tensor(self.faces).long())
+        object.__setattr__(self, "faces", faces)
 
     def distance(self, x: Tensor, faces: Tensor) -> Tensor:
         """m, between the goal and a cloth [V, 3] m with triangles [F, 3]; differentiable in ``x``.
@@ -136,5 +145,7 @@ def read_goal(path: str | Path) -> Goal:
         if path.suffix.lower() == ".npy":
             return Goal(torch.as_tensor(np.asarray(found, dtype=float)))
         return Goal(torch.as_tensor(np.asarray(found["x"][-1], dtype=float)), torch.as_tensor(found["faces"]))
-    except DAMAGED as error:
-        raise InvalidInput("goal", got=f"{path} ({error})", expected=EXPECTED) from None
+    except InvalidInput:
+        raise
+    except Exception as error:  # a damaged archive can raise almost anything
+        raise InvalidInput("goal", got=f"{path} ({type(error).__name__})", expected=EXPECTED) from None

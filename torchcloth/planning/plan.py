@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from torch import Tensor
 
 from ..cloth import Cloth
-from ..diagnosis.world import World, copied
+from ..diagnosis.world import Model
 from ..errors import InvalidInput
+from ..identification.episodes import on_cpu
 from ..identification.journal import Journal, facts_of
 from ..recordings import Recording
 from ..recordings.together import check_recording
@@ -21,21 +21,21 @@ from ..robots import ACCELERATION  # pyright: ignore[reportMissingImports] - map
 from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
 from .clearance import clearance_of
-from .courses import ArmCourse, Course
+from .courses import Course
 from .descent import OnLook, adam, gauss_newton
 from .goal import Goal
-from .rehearsal import Rehearsal
+from .rehearsal import Rehearsal, plain
 from .result import MotionPlan
-from .staging import as_episode, courses_of
+from .staging import as_episode, courses_of, doubts
 from .task import Task
 
 METHODS = ("gauss-newton", "adam")
 LARGE = 3.0  # times the cloth's extent: no goal of it in metres
-Model = Cloth | World
+Believed = Cloth | Model
 
 
 def plan(
-    model: Model | Sequence[Model],
+    model: Believed | Sequence[Believed],
     recording: Recording,
     goal: Goal | Tensor,
     *,
@@ -61,8 +61,8 @@ def plan(
     recorded motion does where that is beyond them.
 
     Args:
-        model: the cloth, e.g. ``fitted(...)`` or ``load_world(...)``, whose robot may err; several, e.g. drawn from
-            what a fit leaves open: the mean distance is descended.
+        model: the cloth, or a model of a diagnosis (``diagnosis.load_model``), whose robot and observer may err;
+            several, e.g. drawn from what a fit leaves open: the mean distance is descended.
         recording: where the cloth is, who holds it, which arms these are, and the motion to begin with.
         goal: where the cloth shall be after the motion and the wait, as the observer of the recording would see it.
         waypoints: of each gripper.
@@ -92,14 +92,13 @@ def plan(
     _check(clearance=clearance, speed=limits.speed, hardest=limits.acceleration)
     if not (math.isfinite(wait) and wait >= 0):
         raise InvalidInput("wait", got=wait, expected="seconds, 0 or more")
-    worlds = _worlds(model)
+    models = _models(model)
     aim = goal if isinstance(goal, Goal) else Goal(goal)
-    _check_goal(aim, worlds[0])
-    courses = courses_of(worlds[0].cloth, recording, waypoints, wait, acceleration, limits)
-    rehearsals = [Rehearsal(world, recording, courses, dt) for world in worlds]
-    angles = {c.name: c.q for c in courses if isinstance(c, ArmCourse)}
-    judge, doubt = clearance_of(recording, courses[0].t, angles, clearance)
-    kept = None if journal is None else Journal(journal, _problem(worlds, rehearsals, aim, courses), resume)
+    courses = courses_of(models[0].base.cloth, recording, waypoints, wait, acceleration, limits)
+    rehearsals = [Rehearsal(m, recording, courses, dt) for m in models]
+    warnings = [*doubts(recording, courses), *_check_goal(aim, rehearsals[0])]
+    judge, doubt = clearance_of(recording, courses, aim.points, clearance)
+    kept = None if journal is None else Journal(journal, _problem(rehearsals, aim, courses), resume)
     task = Task(rehearsals, courses, aim, judge, kept)
     if method == "adam":
         found = adam(task, task.start, iterations, rate, on_progress)
@@ -107,7 +106,7 @@ def plan(
         found = gauss_newton(task, task.start, iterations, on_progress)
     (before, frames_before), (after, frames) = task.each(task.start), task.each(found.best)
     first, last = task.motion(task.start), task.motion(found.best)
-    gap = None if judge is None else judge.nearest(courses[0].t, task.angles(found.best))[0]
+    gap = None if judge is None else judge.nearest(task.angles(found.best))[0]
     return MotionPlan(
         recording=as_episode(recording, courses, task.split(found.best)),
         motion=last,
@@ -123,7 +122,7 @@ def plan(
         nearest="" if gap is None or not gap.first else f"{gap.first} to {gap.second}, {1e3 * gap.distance:.0f} mm",
         ended=found.ended,
         seconds=time.monotonic() - began,
-        warnings=[doubt] if doubt else [],
+        warnings=[*warnings, *([doubt] if doubt else [])],
     )
 
 
@@ -132,23 +131,22 @@ def _apart(first: Trajectory, last: Trajectory) -> float:
     return float((last.pose[:, :3, 3] - first.pose[:, :3, 3]).norm(dim=-1).max())
 
 
-def _worlds(model: Model | Sequence[Model]) -> list[World]:
-    models = list(model) if isinstance(model, Sequence) else [model]
-    if not models or not all(isinstance(m, Cloth | World) for m in models):
-        got = "none" if not models else ", ".join(sorted({type(m).__name__ for m in models}))
-        raise InvalidInput("model", got=got, expected="a Cloth or a World, or several")
-    plain = [World(m) if isinstance(m, Cloth) else m for m in models]
-    return [replace(w, cloth=copied(w.cloth).requires_grad_(False)) for w in plain]
+def _models(model: Believed | Sequence[Believed]) -> list[Model]:
+    given = list(model) if isinstance(model, Sequence) else [model]
+    if not given or not all(isinstance(m, Cloth | Model) for m in given):
+        got = "none" if not given else ", ".join(sorted({type(m).__name__ for m in given}))
+        raise InvalidInput("model", got=got, expected="a Cloth or a diagnosis.Model, or several")
+    found = [m if isinstance(m, Model) else plain(m) for m in given]
+    for m in found:
+        on_cpu(m.base.cloth)
+    return found
 
 
-def _problem(
-    worlds: Sequence[World], rehearsals: Sequence[Rehearsal], goal: Goal, courses: Sequence[Course]
-) -> list[object]:
+def _problem(rehearsals: Sequence[Rehearsal], goal: Goal, courses: Sequence[Course]) -> list[object]:
     """What slopes depend on beside the point."""
-    own = [part for w in worlds for part in facts_of(w.cloth)]
-    data = [part for r in rehearsals for part in r.identity()]
+    own = [part for r in rehearsals for part in (*facts_of(r.world.cloth), *r.identity())]
     ways = [part for c in courses for part in (c.name, c.span, c.start, c.trajectory(c.nothing).pose)]
-    return [*own, *data, goal.points, goal.faces, *ways]
+    return [*own, goal.points, goal.faces, *ways]
 
 
 def _check(**numbers: float) -> None:
@@ -158,9 +156,14 @@ def _check(**numbers: float) -> None:
             raise InvalidInput(name, got=value, expected="a whole number > 0" if whole else "a finite value > 0")
 
 
-def _check_goal(goal: Goal, world: World) -> None:
-    """In millimetres it would be a thousand times as large."""
-    size, own = float((goal.points.amax(0) - goal.points.amin(0)).norm()), world.cloth.mesh.extent
+def _check_goal(goal: Goal, run: Rehearsal) -> list[str]:
+    """In millimetres it would be a thousand times as large; a doubt about one that is far away."""
+    x = run.state.x
+    size, own = float((goal.points.amax(0) - goal.points.amin(0)).norm()), run.world.cloth.mesh.extent
     if size > LARGE * own:
         got = f"points over {size:.3g} m, of a cloth of {own:.3g} m"
         raise InvalidInput("goal", got=got, expected="the cloth where it shall be, in metres")
+    away = float((goal.points.mean(0).to(x) - x.mean(0)).norm())
+    if away < LARGE * own:
+        return []
+    return [f"the goal is {away:.2f} m from where the cloth is at first: are both in one world?"]

@@ -8,7 +8,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..diagnosis.world import World
+from ..cloth import Cloth
+from ..diagnosis.setting import LATE
+from ..diagnosis.world import Model, World
 from ..identification.episodes import RATE, Episode, episode
 from ..identification.replays import SETTLING, Frames, frames_of
 from ..recordings import Recording
@@ -24,36 +26,40 @@ class Rehearsal:
     """One model, ready to be run under any motion of the courses.
 
     Args:
-        world: the cloth, what robots do other than they say, and how it is seen.
+        model: the cloth, what robots do other than they say, and how it is seen.
         recording: where the cloth is at first.
         courses: of the grippers that are planned for; all others move as recorded.
         dt: s, largest substep.
     """
 
-    def __init__(self, world: World, recording: Recording, courses: Sequence[Course], dt: float | None) -> None:
-        self.world, self.dt = world, dt
-        self.faces = torch.as_tensor(world.cloth.mesh.faces)
-        seen = episode(world.cloth, recording, RATE)
+    def __init__(self, model: Model, recording: Recording, courses: Sequence[Course], dt: float | None) -> None:
+        self.world, self.dt = model.world(), dt
+        self.world.cloth.requires_grad_(False)
+        self.faces = torch.as_tensor(self.world.cloth.mesh.faces)
+        seen = episode(model.base.cloth, recording, RATE)  # which a world may carry over to a mesh of its own
         span, last = courses[0].span, float(courses[0].t[-1])
         count = max(1, round((last - span.begin) * RATE))
         self.times = torch.linspace(span.begin, last, count + 1, dtype=torch.float64)
-        nothing = [seen.initial.new_zeros(0, 3)] * len(self.times)
-        others = {name: held_until(path, last) for name, path in seen.motion.items()}
+        late = [last + LATE] if self.world.views else []  # what a late clock sees
+        times = torch.cat([self.times, self.times.new_tensor(late)])
+        nothing = [seen.initial.new_zeros(0, 3)] * len(times)
+        others = {name: held_until(path, float(times[-1])) for name, path in seen.motion.items()}
         self.blank: Episode = replace(
-            seen, motion=others, times=self.times, clouds=nothing, markers=None, places=None, wrenches={}, unseen=0
+            seen, motion=others, times=times, clouds=nothing, markers=None, places=None, wrenches={}, unseen=0
         )
         with torch.no_grad():
             self._first = self._moved({c.name: c.trajectory(c.nothing) for c in courses})
-            driven = world.driven(self._first)
-            state = world.cloth.state(driven.initial)
+            driven = self.world.driven(self._first)
+            state = self.world.cloth.state(driven.initial)
             if driven.settles:  # nothing is added to where grippers are at first, so it is the same under all motions
-                state = world.cloth.settle(state, driven.motion, start=span.begin, duration=SETTLING)
+                state = self.world.cloth.settle(state, driven.motion, start=span.begin, duration=SETTLING)
             self.state = state
 
     def run(self, motion: Mapping[str, Trajectory]) -> Tensor:
         """[T, V, 3] m, what an observer has of the cloth under these motions; differentiable in their poses."""
         driven = self._driven(motion)
-        return self._seen(frames_of(self.world.cloth(self.state, driven.motion, self.times, dt=self.dt)), driven)
+        rollout = self.world.cloth(self.state, driven.motion, self.blank.times, dt=self.dt)
+        return self._seen(frames_of(rollout), driven)
 
     def go_on(self, state: ClothState, motion: Mapping[str, Trajectory], begin: float, end: float) -> ClothState:
         """The cloth itself at ``end`` [s] under these motions, from what it is at ``begin``."""
@@ -63,7 +69,7 @@ class Rehearsal:
         """([V, 3] m at the end, its derivatives [N, V, 3] where poses change by ``moved`` [N, K, 4, 4])."""
         driven, along = self._driven(motion), self._tangents(motion, moved)
         out, way = self.world.cloth.sensitivities(
-            self.state, driven.motion, self.times, along=Directions(motion=along), dt=self.dt
+            self.state, driven.motion, self.blank.times, along=Directions(motion=along), dt=self.dt
         )
         plain, moves = frames_of(out), frames_of(way)
         x = self._seen(plain, driven)[-1]
@@ -80,14 +86,17 @@ class Rehearsal:
         return self.world.driven(self._moved(motion))
 
     def _moved(self, motion: Mapping[str, Trajectory]) -> Episode:
-        as_cloth = {name: m._replace(pose=m.pose.to(self.blank.initial)) for name, m in motion.items()}
+        still = {name: held_until(m, float(self.blank.times[-1])) for name, m in motion.items()}
+        as_cloth = {name: m._replace(pose=m.pose.to(self.blank.initial)) for name, m in still.items()}
         return replace(self.blank, motion={**self.blank.motion, **as_cloth})
 
     def _tangents(self, motion: Mapping[str, Trajectory], moved: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Of what robots really do: their errors are not known as formulas, so by small steps where they have any."""
-        if not self.world.motions:
-            return {name: tangent.to(self.state.x) for name, tangent in moved.items()}
         plain, count = self._driven(motion).motion, len(next(iter(moved.values())))
+        if not self.world.motions:
+            longer = lambda name: len(plain[name].t) - moved[name].shape[1]  # noqa: E731 - where it stands still
+            held = {name: [own, own[:, -1:].expand(-1, longer(name), 4, 4)] for name, own in moved.items()}
+            return {name: torch.cat(parts, 1).to(self.state.x) for name, parts in held.items()}
         steps = []
         for k in range(count):
             nudged = {name: m._replace(pose=m.pose + NUDGE * moved[name][k]) for name, m in motion.items()}
@@ -95,7 +104,12 @@ class Rehearsal:
         return {name: torch.stack([(s[name].pose - plain[name].pose) / NUDGE for s in steps]) for name in moved}
 
     def _seen(self, frames: Frames, driven: Episode) -> Tensor:
-        return self.world.seen(frames, driven).x
+        return self.world.seen(frames, driven).x[: len(self.times)]
+
+
+def plain(cloth: Cloth) -> Model:
+    """A cloth as a model whose robot and observer do as they say; it stays the user's."""
+    return Model(World(cloth), (), torch.zeros(0))
 
 
 def _nudged(plain: Frames, moves: Frames, k: int) -> Frames:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,9 @@ from typing import Any
 from torch import Tensor
 
 from .._files import as_json, write_text
-from ..errors import InvalidInput, TorchclothError
-from ..recordings import Recording, read, write
+from ..errors import InvalidInput
+from ..recordings import Recording, write
+from ..recordings.proposed import is_undone
 from ..types import Trajectory
 
 RESULT, EPISODE = "plan.json", "episode"  # in the result's folder
@@ -86,6 +88,7 @@ class MotionPlan:
         """
         folder = Path(folder)
         check_place(folder)
+        (folder / RESULT).unlink(missing_ok=True)  # of an earlier plan, beside whose episode it would stand
         episode = write(self.recording, folder / EPISODE, overwrite=True)
         return episode, write_text(folder / RESULT, as_json(self.as_dict()))
 
@@ -97,13 +100,6 @@ def check_place(folder: Path) -> None:
         InvalidInput: it is.
     """
     target = folder / EPISODE
-    if not target.exists() and not target.is_symlink():
-        return
-    try:
-        found = read(target)
-        ours = found.provenance == PLANNED and found.points is None and found.markers is None
-    except TorchclothError:
-        ours = False
-    if not ours:
+    if os.path.lexists(target) and not is_undone(target, PLANNED):
         got = f"{target}, which is no earlier plan, or holds more than one"
-        raise InvalidInput("--out", got=got, expected="a folder without it", remedy="choose another folder")
+        raise InvalidInput("folder of the plan", got=got, expected="one without it", remedy="choose another folder")

@@ -11,18 +11,22 @@ from torch import Tensor
 from .._math import last_knot
 from ..boundaries.motion import interpolate
 from ..cloth import Cloth
-from ..errors import InvalidInput, RecordingError
+from ..errors import InvalidInput
 from ..identification.episodes import RATE, episode
 from ..recordings import Recording
+from ..recordings.proposed import undone
 from ..robots import arm_of, gripper_motion, replay  # pyright: ignore[reportMissingImports] - mapped from robots/
 from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
 from ..robots.replay import model_of  # pyright: ignore[reportMissingImports]
+from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
-from .courses import ArmCourse, Course, HandCourse, Span, highest_table, linear
+from .courses import PERIOD, ArmCourse, Course, HandCourse, Span, between, highest_table
 from .result import PLANNED
 
-SHORTEST = 0.1  # s, of a motion to which something can be added
+NEAREST = 0.1  # s, between waypoints: nearer ones tremble
 SAME = 1e-6  # s
+STOP = 0.01  # s after the end, in which what still moves is stopped
+MOVING = 0.02  # m/s
 
 
 def courses_of(
@@ -31,32 +35,32 @@ def courses_of(
     """Of every gripper that holds the cloth, from the first frame to the end of the motion and a wait.
 
     Raises:
-        InvalidInput: a motion that is too short, or grippers of nothing.
+        InvalidInput: grippers of nothing, one that takes hold on the way, or waypoints that are too near each other.
         RecordingError: no motion for one of the cloth's grasps.
     """
-    seen = episode(cloth, recording, RATE)
-    every = replay(recording)
-    names = [name for name in seen.motion if name in recording.grasps]
+    seen, every = episode(cloth, recording, RATE), replay(recording)
+    names = [name for name in seen.motion if name in recording.grasps and bool(every[name].closed.any())]
     if not names:
-        raise InvalidInput(
-            "recording", got="no grasp", expected="a gripper that holds the cloth, whose motion to change"
-        )
+        expected = "a gripper that holds the cloth, whose motion to change"
+        raise InvalidInput("recording", got="no grasp that is ever closed", expected=expected)
     begin = float(seen.times[0])
     end = min(float(every[name].t[-1]) for name in names)
-    if end - begin < SHORTEST:
-        got = f"{end - begin:.3g} s of motion after the first frame"
-        raise RecordingError("motion", got=got, expected=f"{SHORTEST:g} s or more, all of it")
+    if end - begin < waypoints * NEAREST:
+        got = f"{waypoints} of {max(end - begin, 0):.3g} s of motion after the first frame"
+        remedy = "ask for fewer, or begin with a longer motion"
+        raise InvalidInput("waypoints", got=got, expected=f"{NEAREST:g} s or more for each", remedy=remedy)
     span = Span(begin, end, waypoints)
     knots = _knots([every[name].t for name in names], span, wait)
     out: list[Course] = []
     for name in names:
         path = every[name]
         closed = path.closed[last_knot(path.t, knots).clamp(min=0)]
+        _check_hold(name, closed)
         if name in recording.joints and name in recording.robots:
-            q = linear(path.t, torch.as_tensor(recording.joints[name].q), knots)
+            q = between(path.t, torch.as_tensor(recording.joints[name].q), knots)
             out.append(ArmCourse(name, knots, closed, span, arm_of(recording, name), q, acceleration))
         else:
-            pose = interpolate(path, knots.clamp(max=float(path.t[-1])))
+            pose = interpolate(path._replace(pose=path.pose.double()), knots.clamp(max=float(path.t[-1])))
             table = highest_table(recording.colliders, pose[:, :3, 3])
             lowest = min(table, float(pose[:, 2, 3].min()))
             out.append(HandCourse(name, knots, closed, span, pose, limits, lowest))
@@ -67,40 +71,68 @@ def as_episode(recording: Recording, courses: Sequence[Course], waypoints: Seque
     """The episode with the planned motions in it, and nothing that was seen or felt."""
     planned = list(zip(courses, waypoints, strict=True))
     grippers = {c.name: gripper_motion(_detached(c.trajectory(z))) for c, z in planned}
-    joints = {c.name: c.joints(z) for c, z in planned if isinstance(c, ArmCourse)}
+    joints = {name: own for name, own in recording.joints.items() if name not in grippers}  # others would be old ones
+    joints |= {c.name: c.joints(z) for c, z in planned if isinstance(c, ArmCourse)}
     robots = {name: replace(robot, model=model_of(recording, name)) for name, robot in recording.robots.items()}
+    bare = undone(recording, PLANNED)
     return replace(
-        recording,
-        grippers={**recording.grippers, **grippers},
-        joints={**recording.joints, **joints},
+        bare,
+        grippers={**bare.grippers, **grippers},
+        joints=joints,
         robots=robots,
-        cameras={name: replace(c, depth=None, color=None, mask=None) for name, c in recording.cameras.items()},
-        points=None,
-        markers=None,
-        truth=None,
         clock_offset=0.0,
         split={**recording.split, "motion": "planned", "replicate_of": None},
-        provenance=PLANNED,
         path=None,
     )
 
 
+def doubts(recording: Recording, courses: Sequence[Course]) -> list[str]:
+    """What a reader should know of what was planned from, in sentences."""
+    out, every, begin = [], replay(recording), courses[0].span.begin
+    for course in courses:
+        path = every[course.name]
+        speed = (path.pose[1:, :3, 3] - path.pose[:-1, :3, 3]).norm(dim=-1) / path.t.diff()
+        if begin > float(path.t[0]) + SAME and float(speed[last_knot(path.t, torch.tensor([begin]))[0]]) > MOVING:
+            out.append(
+                f"{course.name}: the planned motion begins at the first frame, {begin - float(path.t[0]):.2f} s after "
+                "the recorded one, which is under way there: bring the arm there as recorded"
+            )
+    if bare := [c.name for c in courses if isinstance(c, HandCourse) and c.name in recording.robots]:
+        names = ", ".join(bare)
+        out.append(f"{names}: an arm is named, but its joints were not recorded: no limit of a joint is kept")
+    return out
+
+
 def held_until(path: Trajectory, last: float) -> Trajectory:
     """A path that stands still where it ends, until ``last`` [s] at least."""
-    if float(path.t[-1]) >= last:
+    end = float(path.t[-1])
+    if end >= last:
         return path
-    t = torch.cat([path.t, path.t.new_tensor([last])])
-    pose = torch.cat([path.pose, path.pose[-1:]])
-    return Trajectory(t, pose, torch.cat([path.closed, path.closed[-1:]]))
+    more = path.t.new_tensor([last] if last - end < 2 * STOP else [end + STOP, last])
+    still = lambda field: torch.cat([field, field[-1:].expand(len(more), *field.shape[1:])])  # noqa: E731
+    return Trajectory(torch.cat([path.t, more]), still(path.pose), still(path.closed))
+
+
+def _check_hold(name: str, closed: Tensor) -> None:
+    """Only increments of a gripper's motion move what it holds: taking hold elsewhere would go unnoticed."""
+    if not bool(closed[0]) or bool((closed[1:] & ~closed[:-1]).any()):
+        when = "after the first frame" if not bool(closed[0]) else "again"
+        raise InvalidInput(
+            f"gripper {name!r}",
+            got=f"one that takes hold {when}",
+            expected="grippers that hold the cloth from the first frame until they let go",
+            remedy="plan from an episode that begins when it has closed",
+        )
 
 
 def _knots(times: Sequence[Tensor], span: Span, wait: float) -> Tensor:
-    """[S] s, all recorded ones within the span, its ends, and those of the wait."""
-    every = torch.cat(list(times))
-    inner = every[(every > span.begin + SAME) & (every < span.end - SAME)].unique()
-    inner = inner[torch.cat([inner.new_ones(1), inner.diff()])[: len(inner)] > SAME]
-    after = [span.end] if wait == 0 else [span.end, span.end + 0.5 * wait, span.end + wait]
-    return torch.cat([inner.new_tensor([span.begin]), inner, inner.new_tensor(after)])
+    """[S] s: all recorded ones within the span, more where these are far apart, its ends, and those of the wait."""
+    every = torch.cat([*times, torch.tensor([span.begin, span.end])])
+    inner = every[(every >= span.begin) & (every <= span.end)].unique()
+    inner = inner[torch.cat([inner.new_ones(1), inner.diff()]) > SAME]
+    inner = Spline(inner, inner[:, None], inner[:, None]).finer(PERIOD)
+    after = [] if wait == 0 else [wait] if wait < 2 * STOP else [STOP, wait]
+    return torch.cat([inner, span.end + inner.new_tensor(after)])
 
 
 def _detached(path: Trajectory) -> Trajectory:

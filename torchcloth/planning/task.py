@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -11,11 +12,12 @@ from torch.func import jacfwd
 from ..identification.journal import Journal
 from ..types import Trajectory
 from .clearance import Clearance
-from .courses import ArmCourse, Bounds, Course
+from .courses import Bounds, Course
 from .goal import Goal, Pull, mean
 from .rehearsal import Rehearsal
 
 LEVER = 0.1  # m, at which a gripper's turns count as shifts
+T = TypeVar("T", bound=Sequence)
 STIFF = 1e-3  # m^2, of unknowns that move no gripper
 
 
@@ -59,8 +61,8 @@ class Task:
         return float(distance), float(square)
 
     def pull(self, at: Tensor) -> Pull:
-        """What the unknowns do to the mean square distance: by forward mode, in constant memory."""
-        return Pull(*self._ask("pull", at, lambda: self._pull(at)))
+        """What the unknowns do to the mean square distance: by forward mode, in constant memory; float64."""
+        return Pull(*(part.double() for part in self._ask("pull", at, lambda: self._pull(at))))
 
     def slope(self, at: Tensor) -> tuple[float, float, Tensor]:
         """(distance [m], mean square distance [m^2], gradient [N] of the distance), by reverse mode."""
@@ -69,27 +71,27 @@ class Task:
 
     def clear(self, at: Tensor) -> bool:
         """Whether the arms are, where anything is known of that."""
-        return self._clearance is None or self._clearance.nearest(self.courses[0].t, self.angles(at))[1] is None
+        return self._clearance is None or self._clearance.nearest(self.angles(at))[1] is None
 
     def angles(self, at: Tensor) -> dict[str, Tensor]:
-        """[S, J] rad, by arm."""
-        pairs = zip(self.courses, self.split(at), strict=True)
-        return {c.name: c.coordinates(z) for c, z in pairs if isinstance(c, ArmCourse)}
+        """[N, J] rad, by arm, at the instants of ``Span``."""
+        return {c.name: c.at_instants(z) for c, z in zip(self.courses, self.split(at), strict=True)}
 
     def each(self, at: Tensor) -> tuple[list[float], Tensor]:
         """(distance [m] of every model, [T, V, 3] m of the first one's cloth)."""
         with torch.no_grad():
             runs = [r.run(self.motion(at)) for r in self.rehearsals]
-            return [float(self.goal.distance(x[-1], self.rehearsals[0].faces)) for x in runs], runs[0]
+        pairs = zip(self.rehearsals, runs, strict=True)
+        return [float(self.goal.distance(x[-1], r.faces)) for r, x in pairs], runs[0]
 
-    def _ask(self, question, at: Tensor, work):
+    def _ask(self, question: str, at: Tensor, work: Callable[[], T]) -> T:
         return work() if self._journal is None else self._journal.ask(question, at, work)
 
     def _look(self, at: Tensor) -> tuple[Tensor, Tensor]:
-        motion, faces = self.motion(at), self.rehearsals[0].faces
-        ends = [r.run(motion)[-1] for r in self.rehearsals]
-        distance = torch.stack([self.goal.distance(x, faces) for x in ends]).mean()
-        return distance, torch.tensor([self.goal.square(x, faces) for x in ends]).mean()
+        motion = self.motion(at)
+        ends = [(r.run(motion)[-1], r.faces) for r in self.rehearsals]
+        distance = torch.stack([self.goal.distance(*end) for end in ends]).mean()
+        return distance, torch.tensor([self.goal.square(*end) for end in ends]).mean()
 
     def _pull(self, at: Tensor) -> Pull:
         motion, moved = self.motion(at), self._moved(at)
@@ -107,7 +109,7 @@ class Task:
                 free = at.clone().requires_grad_()
                 x = r.run(self.motion(free))[-1]
                 distance = self.goal.distance(x, r.faces)
-                gradient += torch.autograd.grad(distance, free)[0] / len(self.rehearsals)
+                gradient += torch.autograd.grad(distance, free)[0].to(gradient) / len(self.rehearsals)
             values.append(distance.detach())
             squares.append(self.goal.square(x.detach(), r.faces))
         return torch.stack(values).mean(), torch.tensor(squares).mean(), gradient

@@ -93,7 +93,9 @@ class ReachEnv(gymnasium.Env):
     def step(self, action: np.ndarray):
         """One stretch of time; the last one with the wait."""
         k = self.done
-        wanted = torch.as_tensor(np.asarray(action, dtype=np.float64)).clamp(-1.0, 1.0) * self.reach[self.own[k]]
+        share = torch.as_tensor(np.asarray(action, dtype=np.float64)).clamp(-1.0, 1.0)
+        up, down = (reach[self.own[k]] for reach in self.reach)
+        wanted = share * torch.where(share > 0, up, down)
         after = self.at.clone()
         after[self.own[k]] = self._allowed(k, wanted)
         if self.task.clear(after):
@@ -125,10 +127,13 @@ class ReachEnv(gymnasium.Env):
         return torch.cat(parts).numpy().astype(np.float32)
 
 
-def _reach(task: Task) -> Tensor:
-    """[N], the largest step of each coordinate alone that the limits allow either way."""
-    rows, room = task.bounds.rows.abs(), torch.minimum(task.bounds.high, -task.bounds.low)
-    return (room[:, None] / rows.clamp(min=1e-12)).where(rows > 1e-12, torch.inf).amin(0)
+def _reach(task: Task) -> tuple[Tensor, Tensor]:
+    """[N] each, the largest step of each coordinate alone that the limits allow, up and down."""
+    rows, high, low = task.bounds.rows, task.bounds.high[:, None], task.bounds.low[:, None]
+    most = lambda way: torch.where(  # noqa: E731
+        way * rows > 1e-12, high / (way * rows), torch.where(way * rows < -1e-12, low / (way * rows), torch.inf)
+    ).amin(0)
+    return most(1.0), most(-1.0)
 
 
 def _far_apart(x: Tensor, count: int) -> Tensor:

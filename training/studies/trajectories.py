@@ -21,12 +21,11 @@ from torch import Tensor
 
 from torchcloth import planning
 from torchcloth.cloth import Cloth
-from torchcloth.diagnosis import World
 from torchcloth.errors import InvalidInput
 from torchcloth.planning import Goal
 from torchcloth.planning.courses import Course
 from torchcloth.planning.feasible import step_within
-from torchcloth.planning.rehearsal import Rehearsal
+from torchcloth.planning.rehearsal import Rehearsal, plain
 from torchcloth.planning.staging import courses_of
 from torchcloth.planning.task import Task
 from torchcloth.recordings import ClothInfo, Collider, GraspInfo, Recording
@@ -94,7 +93,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--garments", nargs="+", choices=names, default=names, metavar="NAME", help="some of them")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), metavar="NAME")
     parser.add_argument("--sac", type=int, metavar="N", help="motions that the learner tries (300)")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="cases at a time (1)")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -105,14 +103,13 @@ def run(options: argparse.Namespace) -> None:
             raise InvalidInput("--sac", got=options.sac, expected="1 or more")
         scale = Scale(**(asdict(scale) | {"sac": options.sac}))
     kept = Kept(options.out, {"study": "trajectories", **asdict(scale)})
-    chosen = [case for case in CASES if case[0] in options.garments]
     found = kept.run(
         {
             f"{garment}-{method}": partial(sought, scale, k, garment, motion, method)
-            for k, (garment, motion) in enumerate(chosen)
+            for k, (garment, motion) in enumerate(CASES)
             for method in options.methods
-        },
-        options.jobs,
+            if garment in options.garments
+        }
     )
     show(_table(found), NOTE)
     write(options.out / "trajectories.json", found)
@@ -125,7 +122,7 @@ def sought(scale: Scale, number: int, garment: str, motion: str, method: str) ->
     coarse, fine = (set_up(garment, motion, mesh, scale.waypoints) for mesh in (scale.coarse, scale.fine))
     goal = hidden_goal(fine, np.random.default_rng([11, number]))
     began = time.perf_counter()
-    moved, history, more = found_by(method, scale, coarse, goal)
+    moved, expected, history, more = found_by(method, scale, coarse, goal)
     seconds = time.perf_counter() - began
     with torch.no_grad():
         first, done = (fine.run.run(m)[-1] for m in ({c.name: c.trajectory(c.nothing) for c in fine.courses}, moved))
@@ -133,15 +130,17 @@ def sought(scale: Scale, number: int, garment: str, motion: str, method: str) ->
     return {
         "recorded": distance(first),
         "done": distance(done),
-        "expected": min(history),
+        "expected": expected,
         "history": history,
         "seconds": seconds,
         **more,
     }
 
 
-def found_by(method: str, scale: Scale, scene: Scene, goal: Goal) -> tuple[dict[str, Trajectory], list[float], dict]:
-    """(motion, distance [m] of every one that was tried, what else is known)."""
+def found_by(
+    method: str, scale: Scale, scene: Scene, goal: Goal
+) -> tuple[dict[str, Trajectory], float, list[float], dict[str, Any]]:
+    """(motion, its distance [m], that of every one that was tried, what else is known)."""
     if method != "sac":
         plan = planning.plan(
             scene.cloth,
@@ -152,14 +151,14 @@ def found_by(method: str, scale: Scale, scene: Scene, goal: Goal) -> tuple[dict[
             method=method,  # type: ignore[arg-type] - one of two words
             wait=WAIT,
         )
-        return plan.motion, plan.history, {"ended": plan.ended, "warnings": plan.warnings}
+        return plan.motion, plan.after[0], plan.history, {"ended": plan.ended, "warnings": plan.warnings}
     from ..rl import learn
     from ..rl.env import stepwise
 
     courses = [stepwise(c) for c in scene.courses]
     task = Task([scene.run], courses, goal, None, None)
     found = learn(task, scale.sac)
-    return task.motion(found.best), found.history, {"policy": found.policy}
+    return task.motion(found.best), min(found.history), found.history, {"policy": found.policy}
 
 
 def set_up(garment: str, motion: str, fine: Discretisation, waypoints: int) -> Scene:
@@ -180,7 +179,7 @@ def set_up(garment: str, motion: str, fine: Discretisation, waypoints: int) -> S
         colliders={"table": Collider(np.array([0.0, 0.0, LAYERS / 2]), np.array([0.0, 0.0, 1.0]), FRICTION)},
     )
     courses = courses_of(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())
-    return Scene(cloth, recording, courses, Rehearsal(World(cloth), recording, courses, None))
+    return Scene(cloth, recording, courses, Rehearsal(plain(cloth), recording, courses, None))
 
 
 def hidden_goal(scene: Scene, rng: np.random.Generator) -> Goal:
