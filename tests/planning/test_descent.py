@@ -20,7 +20,8 @@ class Bowl:
     metric = torch.eye(2, dtype=torch.float64)
 
     def __init__(self, most=10.0, blocked=lambda at: False, diverges=lambda at: False):
-        self.bounds = Bounds(torch.eye(2), torch.full((2,), -most), torch.full((2,), most), ["x", "y"])
+        ends, one = torch.full((2,), most), torch.arange(2)
+        self.bounds = Bounds(torch.eye(2), -ends, ends, ["x", "y"], one, one)
         self.blocked, self.diverges, self.seen = blocked, diverges, []
 
     def look(self, at):

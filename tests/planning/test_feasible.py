@@ -7,12 +7,18 @@ from torchcloth.planning.courses import Bounds
 from torchcloth.planning.feasible import step_within
 
 
+def all_of_one(rows, low, high):
+    """Rows that are about all unknowns together."""
+    one = [torch.zeros(n, dtype=torch.long) for n in rows.shape]
+    return Bounds(rows, low, high, [""] * len(rows), *one)
+
+
 def problem(n=6, rows=40, seed=0):
     rng = torch.Generator().manual_seed(seed)
     root = torch.randn(n, n, generator=rng)
     curvature, gradient = root @ root.mT + 0.1 * torch.eye(n), 3 * torch.randn(n, generator=rng)
     a = torch.randn(rows, n, generator=rng)
-    return gradient, curvature, Bounds(a, -torch.ones(rows), torch.ones(rows), [""] * rows)
+    return gradient, curvature, all_of_one(a, -torch.ones(rows), torch.ones(rows))
 
 
 def cost(step, gradient, curvature):
@@ -43,19 +49,19 @@ def test_nothing_within_the_bounds_is_better():
 def test_bounds_of_each_unknown_alone_are_those_of_the_active_set():
     gradient, curvature, _ = problem()
     low, high = torch.full((6,), -0.1), torch.full((6,), 0.2)
-    step = step_within(torch.zeros(6), gradient, curvature, Bounds(torch.eye(6), low, high, [""] * 6))
+    step = step_within(torch.zeros(6), gradient, curvature, all_of_one(torch.eye(6), low, high))
     assert torch.allclose(step, bounded(curvature, -gradient, low, high), atol=1e-4)
 
 
 def test_a_bound_that_is_met_stops_what_goes_beyond_it_and_nothing_else():
-    bounds = Bounds(torch.eye(2), torch.tensor([-1.0, -1.0]), torch.tensor([0.0, 1.0]), ["", ""])
+    bounds = all_of_one(torch.eye(2), torch.tensor([-1.0, -1.0]), torch.tensor([0.0, 1.0]))
     step = step_within(torch.zeros(2), torch.tensor([-1.0, -0.5]), torch.eye(2), bounds)
     assert torch.allclose(step, torch.tensor([0.0, 0.5]), atol=1e-4)
 
 
 def test_curvatures_of_which_most_are_lost_in_rounding_give_a_step():
     stiff = 1e12 * torch.outer(torch.ones(6), torch.ones(6)) + 1e-6 * torch.eye(6)
-    bounds = Bounds(torch.eye(6), -torch.ones(6), torch.ones(6), [""] * 6)
+    bounds = all_of_one(torch.eye(6), -torch.ones(6), torch.ones(6))
     step = step_within(torch.zeros(6), torch.randn(6), stiff, bounds)
     assert bool(step.isfinite().all())
     assert float(step.abs().max()) <= 1.0001

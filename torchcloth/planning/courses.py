@@ -64,6 +64,8 @@ class Bounds(NamedTuple):
     low: Tensor  # [R]
     high: Tensor  # [R]
     names: list[str]  # [R], what each is about
+    group: Tensor  # [R] int64, which coordinate of which gripper a row is about,
+    groups: Tensor  # [N] int64, and an unknown belongs to: no row is about two of them
 
     @staticmethod
     def of(courses: Sequence[Course]) -> Bounds:
@@ -71,7 +73,11 @@ class Bounds(NamedTuple):
         every = [course.bounds() for course in courses]
         rows = torch.block_diag(*(b.rows for b in every))
         low, high = (torch.cat([getattr(b, end) for b in every]) for end in ("low", "high"))
-        return Bounds(rows, low, high, [name for b in every for name in b.names])
+        first = np.cumsum([0, *(int(b.groups.max()) + 1 for b in every)]).tolist()
+        group, groups = (
+            torch.cat([k + getattr(b, end) for k, b in zip(first, every, strict=False)]) for end in ("group", "groups")
+        )
+        return Bounds(rows, low, high, [name for b in every for name in b.names], group, groups)
 
     def nearest(self, at: Tensor) -> tuple[float, str]:
         """(share of the way to the first limit, from where nothing is added; whose limit of what)."""
@@ -142,7 +148,10 @@ class Course(ABC):
             names = [f"{ORDERS[order]} of {label} of {self.name}" for label in self.labels] * len(at)
             parts.append((torch.kron(more, eye), low.flatten(), high.flatten(), names))
         rows, low, high, names = zip(*parts, strict=True)
-        return Bounds(torch.cat(rows), torch.cat(low), torch.cat(high), [name for own in names for name in own])
+        numbers = torch.arange(len(eye))
+        group, groups = numbers.repeat(len(ORDERS) * len(at)), numbers.repeat(self.span.waypoints)
+        every = [name for own in names for name in own]
+        return Bounds(torch.cat(rows), torch.cat(low), torch.cat(high), every, group, groups)
 
 
 @dataclass(frozen=True, eq=False)

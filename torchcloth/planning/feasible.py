@@ -7,7 +7,7 @@ from torch import Tensor
 
 from .courses import Bounds
 
-ROUNDS = 1000  # of the dual's accelerated ascent
+ROUNDS = 2000  # of the dual's accelerated ascent
 ROUNDING = 1e-10  # of the largest curvature: where cloth is chaotic, others are lost beside it
 SLACK = 1e-5  # rad, rad/s, rad/s^2 (or with m), that may lie beyond a bound: where no room is left nothing is exact
 
@@ -16,7 +16,8 @@ def step_within(at: Tensor, gradient: Tensor, curvature: Tensor, bounds: Bounds)
     """The step [N] that minimises gradient s + 1/2 s curvature s while the bounds are kept at ``at + s``.
 
     Accelerated ascent of the dual (Beck and Teboulle 2009) with restarts, s = -curvature^-1 (gradient + rows^T push).
-    What that leaves beyond a bound is drawn straight towards ``at``, which is within: bounds are kept to ``SLACK``.
+    What that leaves beyond a bound is drawn towards ``at``, which is within, coordinate by coordinate: bounds are kept
+    to ``SLACK``.
 
     Args:
         at: [N], within the bounds.
@@ -52,5 +53,7 @@ def step_within(at: Tensor, gradient: Tensor, curvature: Tensor, bounds: Bounds)
                 break
     step = free - give @ push
     reached = bounds.rows @ step
-    room = torch.where(reached > 0, bounds.high - before, before - bounds.low) + SLACK
-    return step * float((room.clamp(min=0.0) / reached.abs().clamp(min=1e-300)).min().clamp(max=1.0))
+    room = (torch.where(reached > 0, bounds.high - before, before - bounds.low) + SLACK).clamp(min=0.0)
+    share = torch.ones(int(bounds.groups.max()) + 1).to(step)
+    share = share.scatter_reduce(0, bounds.group, room / reached.abs().clamp(min=1e-300), "amin")
+    return step * share[bounds.groups]

@@ -117,7 +117,10 @@ class ReachEnv(gymnasium.Env):
     def _allowed(self, k: int, wanted: Tensor) -> Tensor:
         """The steps of stretch ``k`` nearest to these that keep the limits after what has been done."""
         bounds, done = self.task.bounds, self.task.bounds.rows @ self.at
-        left = bounds._replace(rows=bounds.rows[:, self.own[k]], low=bounds.low - done, high=bounds.high - done)
+        own = self.own[k]
+        left = bounds._replace(
+            rows=bounds.rows[:, own], low=bounds.low - done, high=bounds.high - done, groups=bounds.groups[own]
+        )
         return step_within(torch.zeros_like(wanted), -wanted, torch.eye(len(wanted)).to(wanted), left)
 
     def _seen(self) -> np.ndarray:
