@@ -17,6 +17,7 @@ from torchcloth.diagnosis.trials import (
     TRIED,
     Candidate,
     _agreed,
+    _bent,
     _ranked,
     known,
     standard_errors,
@@ -135,6 +136,25 @@ def test_halves_of_one_motion_need_not_agree_about_the_size_of_what_is_overwhelm
     assert not known(tried.fitted, "cause", list("abcd"), replace(tried, disturbs=True))
     nothing = replace(model, amplitudes=(0.0,))
     assert not known(replace(tried.fitted, model=nothing), "cause", list("abcd"), tried)
+
+
+def test_motions_need_not_agree_about_a_number_that_nothing_else_has_bent_so_far():
+    """Stiffening, 6.6 prior standard deviations from its sheet: a stretch tells of it, and a drag says otherwise."""
+    tried = replace(candidate(0.1, 0.0), sure=1e3)
+    cells = tried.fitted.evidence.cells
+    for k, c in enumerate(cells):
+        cells[k] = c._replace(value=c.value - (0.3, -0.3, 0.2, -0.2)[k] * c.jacobian[:, 1])
+    tried = replace(tried, fitted=replace(toys.fitted(tried.fitted.evidence), model=tried.fitted.model))
+    assert not known(tried.fitted, "cause", list("abcd"), tried)
+    assert not known(tried.fitted, "cause", list("abcd"), replace(tried, bent=4.9))
+    assert known(tried.fitted, "cause", list("abcd"), replace(tried, bent=5.1))
+
+
+def test_how_far_a_twin_has_left_its_sheet_is_in_standard_deviations_of_its_prior():
+    model = Model(None, (toys.parameter("p", 0.5), toys.parameter("q", 2.0)), torch.tensor([-3.0, 5.0]))  # type: ignore[arg-type]
+    assert _bent(model, "p") == 6.0
+    assert _bent(model, "q") == 2.5
+    assert _bent(model, "") == 0.0
 
 
 def test_as_many_tell_as_would_say_as_much():

@@ -86,6 +86,7 @@ def _tilt(axis: int, world: World, angle: float) -> World:
 
 
 OF_BENDING = ("damp.bend", "plast.crease", "bend.aniso", "rest.curl")  # effects that change a cloth's bending
+OF_MEMBRANE = ("elas.ortho", "elas.shear", "damp.kv", "fric.internal_shear")  # and its stretching
 HYPOTHESES = (
     Hypothesis("damp.bend", "s", 0.05, lambda w, a: _bending(w, damping_time=a)),
     Hypothesis("plast.crease", "1/s", 5.0, lambda w, a: _bending(w, mobility=a), finer=True),

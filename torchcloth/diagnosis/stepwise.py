@@ -11,6 +11,7 @@ from .approaching import approach
 from .branches import unstable, without
 from .classes import alike
 from .comparison import Gain, Predicted, compare, heard, predict
+from .disputed import disputed
 from .doubts import mended, plainer, predicts_better, pruned, unheard
 from .fitting import Fitted, fit, weighed_alike
 from .lacking import is_lacking
@@ -130,6 +131,8 @@ def search(
     current, steps, left = _chain(start, setting, hypotheses, progress, TRIED)
     if not steps:
         current, steps, left = _anew(start, setting, hypotheses, progress)
+    if not steps:
+        current, steps, left = _of_disputed(start, setting, hypotheses, progress)
     impossible = (*_impossible(start, hypotheses), *(_impossible(current, hypotheses) if steps else ()))
     return replace(_found(start, current, steps, left), impossible=tuple(dict.fromkeys(impossible)))
 
@@ -157,6 +160,15 @@ def _anew(start: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], pro
     if first is None or not (lacking or first.best.gain.least > SURELY):
         return Chain(start, [], setting)
     return _chain(start, setting, hypotheses, progress, TRIED, first)
+
+
+def _of_disputed(start: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress) -> Chain:
+    """As ``_chain``, with a first cause of a law about whose number motions disagree."""
+    begun, screened = disputed(start, setting.names, hypotheses), screen(start)
+    rows = {row.hypothesis.name: row for row in screened if row.sight}
+    likely = [(rows[h.name], model) for h, model in begun if h.name in rows]
+    first = one_step(start, setting, likely, screened, staged(progress, "disputed"), ()) if likely else None
+    return Chain(start, [], setting) if first is None else _chain(start, setting, hypotheses, progress, TRIED, first)
 
 
 def extend(
