@@ -314,8 +314,9 @@ def worth_naming(c: Candidate, gain: Gain) -> bool:
 
 def far_from_sheet(c: Candidate, gain: Gain) -> bool:
     """A twin of a number that is surely far off: with that number bent it predicts as well, and need not gain more."""
-    surely = c.bent > BENT or (c.row.decision == "present" and c.row.worth > VERY_MUCH)
-    return _twin(c) and surely and gain.density > CLEAR
+    if not _twin(c) or gain.density <= CLEAR:
+        return False
+    return c.bent > BENT or (c.row.decision == "present" and c.row.worth > VERY_MUCH)
 
 
 def _twin(c: Candidate) -> bool:
