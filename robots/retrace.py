@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchcloth.errors import InvalidInput
-from torchcloth.recordings import Recording
+from torchcloth.recordings import Collider, Recording
 from torchcloth.types import Trajectory
 
 from .paths import holding
@@ -70,13 +72,18 @@ def _turns(path: Trajectory) -> Trajectory:
 
 
 def _table(recording: Recording) -> Table | None:
-    planes = [c for c in recording.colliders.values() if c.normal[2] > LEVEL]
-    if not planes:
+    if not any(c.normal[2] > LEVEL for c in recording.colliders.values()):
         return None
     places = [torch.cat([path.pose[:, :2, 3] for path in replay(recording).values()]).numpy()]
     if recording.cloth.initial_vertices is not None:
         places.append(recording.cloth.initial_vertices.reshape(-1, 3)[:, :2])
     low, high = (f(np.concatenate(places), axis=0) + way for f, way in ((np.min, -AROUND), (np.max, AROUND)))
     corners = np.array([(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])])
-    heights = [p.point[2] - (corners - p.point[:2]) @ p.normal[:2] / p.normal[2] for p in planes]
-    return Table((low[0], high[0]), (low[1], high[1]), float(np.max(heights)))
+    return Table((low[0], high[0]), (low[1], high[1]), highest(recording.colliders, corners))
+
+
+def highest(colliders: Mapping[str, Collider], places: np.ndarray) -> float:
+    """m, of the highest plane that is about level, at places [N, 2] m; -inf where there is none."""
+    planes = [c for c in colliders.values() if c.normal[2] > LEVEL]
+    heights = [p.point[2] - (places - p.point[:2]) @ p.normal[:2] / p.normal[2] for p in planes]
+    return float(np.max(heights)) if heights else -np.inf

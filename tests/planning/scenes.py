@@ -15,7 +15,7 @@ EDGE = np.stack([np.linspace(0.0, SIDE, 7), np.full(7, SIDE)], axis=-1)  # m
 NOMINAL = {"membrane_stiffness": 50.0, "poisson_ratio": 0.3, "bending_stiffness": 3e-5}
 
 
-def _cloth(x: np.ndarray, mesh: tc.meshes.Mesh) -> rec.ClothInfo:
+def sheet_of(x: np.ndarray, mesh: tc.meshes.Mesh) -> rec.ClothInfo:
     return rec.ClothInfo(
         areal_density=0.3,
         thickness=1e-3,
@@ -42,7 +42,7 @@ def by_hand(table: float | None = None) -> rec.Recording:
     place = np.array([0.0, 0.0, 0.5]) + np.stack([0.03 * (3 * s**2 - 2 * s**3), 0 * t, 0 * t], axis=-1)
     colliders = {} if table is None else {"table": rec.Collider(np.array([0, 0, table]), np.array([0.0, 0, 1]), 0.4)}
     return rec.Recording(
-        cloth=_cloth(x, mesh),
+        cloth=sheet_of(x, mesh),
         grasps={"hand": rec.GraspInfo(uv=EDGE, radius=0.02)},
         grippers={"hand": rec.GripperMotion(t, place, np.tile([1.0, 0, 0, 0], (41, 1)), np.ones(41, bool))},
         colliders=colliders,
@@ -60,7 +60,7 @@ def by_arm() -> rec.Recording:
     corner = arm(arm.home)[:3, 3].numpy()
     x, mesh = _hung(corner)
     return rec.Recording(
-        cloth=_cloth(x, mesh),
+        cloth=sheet_of(x, mesh),
         grasps={"arm": rec.GraspInfo(uv=EDGE, radius=0.02)},
         joints={"arm": rec.JointMotion(t.numpy(), q.numpy(), closed=np.ones(41, bool))},
         robots={"arm": rec.RobotInfo("rizon4", np.eye(4), "tcp_closed")},

@@ -36,7 +36,7 @@ class Bowl:
         return Pull(off.square().sum(), 2 * off, 2 * torch.eye(2))
 
     def slope(self, at):
-        return *self.look(at), (at - GOAL) / (at - GOAL).norm()
+        return self.look(at)[0], (at - GOAL) / (at - GOAL).norm()
 
     def clear(self, at):
         return not self.blocked(at)

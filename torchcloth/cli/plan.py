@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .._files import PROGRESS
 from ..errors import InvalidInput
-from .folders import check_apart, check_folder, how_to_go_on, place, replaces, say
+from .diagnose import progress_line
+from .folders import check_apart, check_folder, how_to_go_on, place, replaces
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -74,7 +72,7 @@ def _plan(options: argparse.Namespace) -> int:
     check_place(options.out)
     recording, goal = recordings.read(options.episode), planning.read_goal(options.goal)
     models = _models(options, recording)
-    with _progress() as progress:
+    with progress_line() as progress:
         found = planning.plan(
             models,
             recording,
@@ -87,7 +85,7 @@ def _plan(options: argparse.Namespace) -> int:
             acceleration=ACCELERATION if options.acceleration is None else options.acceleration,
             clearance=options.clearance,
             dt=options.dt,
-            on_progress=progress,
+            on_progress=lambda *numbers: progress(_words(*numbers)),
             journal=options.out / PROGRESS,
             resume=options.resume or None,
         )
@@ -116,16 +114,5 @@ def _models(options: argparse.Namespace, recording: Recording) -> list[Cloth] | 
     return drawn(options.fit, recording, options.draws)
 
 
-@contextmanager
-def _progress() -> Iterator[Callable[[int, float, float], None]]:
-    """One line that changes on a terminal; in a log, a line for every motion that was looked at."""
-    text = lambda number, distance, best: (  # noqa: E731
-        f"motion {number}: {1e3 * distance:.2f} mm from the goal, the best so far {1e3 * best:.2f} mm"
-    )
-    if not sys.stderr.isatty():
-        yield lambda *numbers: say(text(*numbers))
-        return
-    from rich.console import Console
-
-    with Console(stderr=True).status("the recorded motion") as status:
-        yield lambda *numbers: status.update(text(*numbers))
+def _words(number: int, distance: float, best: float) -> str:
+    return f"motion {number}: {1e3 * distance:.2f} mm from the goal, the best so far {1e3 * best:.2f} mm"

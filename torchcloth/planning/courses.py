@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ import torch
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
-from ..recordings import Collider, JointMotion
+from ..recordings import JointMotion
 from ..robots import Arm  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
 from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
@@ -27,7 +27,6 @@ PERIOD = 0.02  # s, between the instants at which limits are held
 OVER = 3  # periods to either side, over which a recorded motion's accelerations are taken: measured joints tremble
 NUDGE = 1e-4  # s, by which what is added, which is smooth, is differentiated
 TURNING = Limits(speed=2.0, acceleration=10.0)  # rad/s and rad/s^2, of what a hand that no arm moves is turned more
-LEVEL = 0.97  # upward part of a table's normal
 ORDERS = ("position", "velocity", "acceleration")
 MET = 1e-12  # of room: there is none
 
@@ -229,16 +228,6 @@ def rotation(turn: Tensor) -> Tensor:
     zero = torch.zeros_like(x)
     rows = [torch.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
     return torch.linalg.matrix_exp(torch.stack(rows, -2))
-
-
-def highest_table(colliders: Mapping[str, Collider], place: Tensor) -> float:
-    """m, of the highest plane that is about level, below places [N, 3] m; -inf where there is none."""
-    heights = []
-    for c in colliders.values():
-        if c.normal[2] > LEVEL:
-            xy = place[:, :2].numpy() - c.point[:2]
-            heights.append(float(np.max(c.point[2] - xy @ c.normal[:2] / c.normal[2])))
-    return max(heights, default=-math.inf)
 
 
 def between(t: Tensor, values: Tensor, times: Tensor) -> Tensor:

@@ -40,8 +40,8 @@ class Problem(Protocol):
         """What unknowns do to the mean square distance."""
         ...
 
-    def slope(self, at: Tensor) -> tuple[float, float, Tensor]:
-        """As ``look``, and the gradient [N] of the distance."""
+    def slope(self, at: Tensor) -> tuple[float, Tensor]:
+        """(distance [m], its gradient [N])."""
         ...
 
     def clear(self, at: Tensor) -> bool:
@@ -143,7 +143,7 @@ def adam(problem: Problem, start: Tensor, iterations: int, rate: float, on_look:
     for k in range(iterations + 1):
         before = at.detach().clone()
         try:
-            value, _, gradient = problem.slope(before)
+            value, gradient = problem.slope(before)
         except IMPOSSIBLE:
             if not history:
                 raise

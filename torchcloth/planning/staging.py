@@ -18,9 +18,10 @@ from ..recordings.proposed import undone
 from ..robots import arm_of, gripper_motion, replay  # pyright: ignore[reportMissingImports] - mapped from robots/
 from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
 from ..robots.replay import model_of  # pyright: ignore[reportMissingImports]
+from ..robots.retrace import highest  # pyright: ignore[reportMissingImports]
 from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
-from .courses import PERIOD, ArmCourse, Course, HandCourse, Span, between, highest_table
+from .courses import PERIOD, ArmCourse, Course, HandCourse, Span, between
 from .result import PLANNED
 
 NEAREST = 0.1  # s, between waypoints: nearer ones tremble
@@ -61,7 +62,7 @@ def courses_of(
             out.append(ArmCourse(name, knots, closed, span, arm_of(recording, name), q, acceleration))
         else:
             pose = interpolate(path._replace(pose=path.pose.double()), knots.clamp(max=float(path.t[-1])))
-            table = highest_table(recording.colliders, pose[:, :3, 3])
+            table = highest(recording.colliders, pose[:, :2, 3].numpy())
             lowest = min(table, float(pose[:, 2, 3].min()))
             out.append(HandCourse(name, knots, closed, span, pose, limits, lowest))
     return out

@@ -64,10 +64,10 @@ class Task:
         """What the unknowns do to the mean square distance: by forward mode, in constant memory; float64."""
         return Pull(*(part.double() for part in self._ask("pull", at, lambda: self._pull(at))))
 
-    def slope(self, at: Tensor) -> tuple[float, float, Tensor]:
-        """(distance [m], mean square distance [m^2], gradient [N] of the distance), by reverse mode."""
-        distance, square, gradient = self._ask("slope", at, lambda: self._slope(at))
-        return float(distance), float(square), gradient
+    def slope(self, at: Tensor) -> tuple[float, Tensor]:
+        """(distance [m], its gradient [N]), by reverse mode."""
+        distance, gradient = self._ask("slope", at, lambda: self._slope(at))
+        return float(distance), gradient
 
     def clear(self, at: Tensor) -> bool:
         """Whether the arms are, where anything is known of that."""
@@ -101,18 +101,16 @@ class Task:
             parts.append(self.goal.pull(x, r.faces, moves))
         return mean(parts)
 
-    def _slope(self, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _slope(self, at: Tensor) -> tuple[Tensor, Tensor]:
         """One model after the other: the graph of one is all that is in memory at once."""
-        values, squares, gradient = [], [], torch.zeros_like(at)
+        values, gradient = [], torch.zeros_like(at)
         for r in self.rehearsals:
             with torch.enable_grad():
                 free = at.clone().requires_grad_()
-                x = r.run(self.motion(free))[-1]
-                distance = self.goal.distance(x, r.faces)
+                distance = self.goal.distance(r.run(self.motion(free))[-1], r.faces)
                 gradient += torch.autograd.grad(distance, free)[0].to(gradient) / len(self.rehearsals)
             values.append(distance.detach())
-            squares.append(self.goal.square(x.detach(), r.faces))
-        return torch.stack(values).mean(), torch.tensor(squares).mean(), gradient
+        return torch.stack(values).mean(), gradient
 
     def _moved(self, at: Tensor) -> dict[str, Tensor]:
         """[N, S, 4, 4] by gripper: what each unknown does to its poses."""
