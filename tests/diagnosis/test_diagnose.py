@@ -43,7 +43,9 @@ def test_hidden_drag_is_named(with_drag):
     (cause,) = answer.content["causes"]
     assert cause["effect"] == "air.drag_n"
     assert cause["amplitude"] == pytest.approx(1.5, rel=0.15)
-    assert cause["ci95"][0] < cause["amplitude"] < cause["ci95"][1]
+    low, high = cause["noise_ci95"]
+    assert cause["ci95"][0] <= low < cause["amplitude"] < high <= cause["ci95"][1]
+    assert 1.0 <= cause["told_by"] <= len(sheets.MOTIONS)
     gain = answer.content["gain"]
     assert gain["rms_after"] < 0.5 * gain["rms_before"]
     assert gain["explained_fraction"] > 0.9

@@ -103,12 +103,23 @@ def test_numbers_without_a_unit_have_none():
     }
     cause |= {"where": {"at": [0.1, 0.25]}}
     said = summary("identified", causes=[cause], motions=["swing"])
+    assert not any("By noise" in line for line in said)
     assert "Cause: air.drag_n = 1.19 (95 %: 1.05 to 1.32); 1.2 is typical." in said
     beyond = "beyond what fitted numbers could do instead"
     assert f"  Surest in swing from 0.4 to 0.6 s, at (100, 250) mm of the pattern: 12.3 mm {beyond}." in said
     felt = cause | {"where": {"gripper": "left"}, "moves": {"value": 0.035, "unit": "N"}}
     said = summary("identified", causes=[felt], motions=["swing"])
     assert f"  Surest in swing from 0.4 to 0.6 s, in what gripper left feels: 35 mN {beyond}." in said
+
+
+@pytest.mark.parametrize("low", [-17.0, 2.0])
+def test_a_cause_whose_interval_holds_zero_says_what_is_known_of_its_size(low):
+    cause = {"effect": "elas.stiffen", "amplitude": 13.5, "unit": "-", "ci95": [low, 44.0], "typical": 10.0}
+    cause |= {"class": [], "rivals": [], "noise_ci95": [12.4, 14.6], "told_by": 1.96}
+    cause |= {"when": {"episode": 0, "from": 0.4, "to": 0.6}, "moves": {"value": 0.035, "unit": "N"}}
+    said = summary("identified", causes=[cause | {"where": {"gripper": "left"}}], motions=["stretch"])
+    told = [line for line in said if "2.0 motions' worth" in line and "would be 12.4 to 14.6" in line]
+    assert bool(told) == (low < 0)
 
 
 def test_what_would_have_the_wrong_sign_is_told_from_what_is_small():

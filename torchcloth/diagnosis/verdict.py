@@ -168,13 +168,16 @@ def _given(found: Found, names: Sequence[str]) -> list[dict[str, Any]]:
 def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     best, h, count = step.best, step.best.hypothesis, len(found.end.model.parameters)
     place, amplitude = found.end.model.place(h.name), found.amplitude(step)
-    std = (_error(found, count + place, names, best.alone) ** 2 + best.row.bias**2) ** 0.5
+    noise, std, told = _error(found, count + place, names, best.alone)
+    noise, std = ((error**2 + best.row.bias**2) ** 0.5 for error in (noise, std))
     kin = [r.hypothesis.name for r in found.unseen(step)]
     rivals = found.rivals(step)
     kin += [c.hypothesis.name for c in rivals if fitted_alike(best.fitted, c.fitted, step.noise)]
     return {
         **_told(h, amplitude),
         "ci95": [amplitude - NORMAL * std, amplitude + NORMAL * std],
+        "noise_ci95": [amplitude - NORMAL * noise, amplitude + NORMAL * noise],
+        "told_by": told,
         "typical": h.typical,
         "class": sorted({h.name, *kin, *h.kin}),
         "rivals": [_told(c.hypothesis, c.amplitude) for c in rivals],
@@ -195,14 +198,17 @@ def _errors(found: Found, names: Sequence[str]) -> Tensor:
     return torch.maximum(own, wider * spread(found.end, names)[1]) if wider < math.inf else own
 
 
-def _error(found: Found, place: int, names: Sequence[str], alone: Collection[str]) -> float:
-    """As ``_errors``, of one coordinate, by as many motions as tell of it: where one alone does, little is known."""
+def _error(found: Found, place: int, names: Sequence[str], alone: Collection[str]) -> tuple[float, float, float]:
+    """Of one coordinate: (standard error by noise alone, as ``_errors``, how many motions tell of it).
+
+    Where hardly more than one does, little is known of what motions disagree by.
+    """
     own = float(found.end.covariance[place, place]) ** 0.5
     count = told_by(found.end, place, names, alone)
     if count <= 1.0:
-        return own
+        return own, own, count
     wider = float(stdtrit(max(count - 1.0, 1.0), 0.975)) / NORMAL
-    return max(own, wider * float(spread(found.end, names, alone)[1][place]))
+    return own, max(own, wider * float(spread(found.end, names, alone)[1][place])), count
 
 
 def _share(found: Found, gain: Gain) -> float | None:

@@ -51,6 +51,7 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
         others = [name for name in c["class"] if name != c["effect"]] + [r["effect"] for r in c["rivals"]]
         out += [f"  {said}" for said in (GLOSSARY.get(c["effect"].partition("[")[0]),) if said]
         out.append(f"  {_shown(c, content)}")
+        out += _hardly_sized(c)
         if others:
             out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
     if content["causes"]:
@@ -127,6 +128,17 @@ def _massless(content: dict[str, Any]) -> bool:
 def _sized(row: dict[str, Any]) -> str:
     low, high = row["ci95"]
     return f"{_size(row)} (95 %: {low:.4g} to {high:.4g})"
+
+
+def _hardly_sized(c: dict[str, Any]) -> list[str]:
+    """Where the interval of what is surely there holds 0."""
+    if c["ci95"][0] * c["ci95"][1] > 0:
+        return []
+    low, high = c["noise_ci95"]
+    return [
+        f"  That it is there is surer than how large it is: {c['told_by']:.1f} motions' worth of data tell of it, "
+        f"and parts of these disagree about its size. By noise and meshes alone it would be {low:.4g} to {high:.4g}."
+    ]
 
 
 def _shown(c: dict[str, Any], content: dict[str, Any]) -> str:
