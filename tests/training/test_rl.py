@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "planning"))
 
 from scenes import by_arm, by_hand, cloth_of
 
-from torchcloth.errors import SimulationDiverged
+from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.planning import Goal
 from torchcloth.planning.rehearsal import Rehearsal, plain
 from torchcloth.planning.staging import courses_of
@@ -50,6 +50,16 @@ def test_it_is_an_environment(scene):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of observations without ends
         check_env(ReachEnv(task_of(scene())), skip_render_check=True)
+
+
+def test_of_an_episode_it_is_what_is_planned_in():
+    recording, wanted = by_arm(), task_of(by_arm(), waypoints=3)
+    cloth = cloth_of(recording).requires_grad_(False)
+    env = ReachEnv.of(cloth, recording, wanted.goal, waypoints=3, wait=WAIT)
+    assert env.stretches == 3
+    assert env.task.look(env.task.start) == wanted.look(wanted.start)
+    with pytest.raises(InvalidInput, match="waypoints"):
+        ReachEnv.of(cloth, recording, wanted.goal, waypoints=0)
 
 
 def test_step_by_step_the_cloth_goes_where_the_whole_motion_brings_it():

@@ -17,6 +17,8 @@ PACKAGES = {
     "viser": "viz",
     "rerun": "viz",
     "lightning": "training",
+    "gymnasium": "rl",
+    "stable_baselines3": "rl",
 }
 
 

@@ -39,7 +39,13 @@ def add(verbs: Any) -> None:
     option("--fit", type=Path, metavar="RESULT", help="identification.json, its folder or a .tcm file: take its values")
     option("--draws", type=int, default=1, metavar="N", help="plan for N models, drawn from what the fit leaves open")
     option("--waypoints", type=int, default=4, metavar="N", help="of what is added to each gripper's motion (4)")
-    option("--iterations", type=int, default=15, metavar="N", help="at most (15; several times as many for adam)")
+    option(
+        "--iterations",
+        type=int,
+        default=15,
+        metavar="N",
+        help="at most (15; adam needs several times as many: 60, say)",
+    )
     option(
         "--method",
         choices=["gauss-newton", "adam"],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,28 +9,18 @@ from typing import Literal
 
 from torch import Tensor
 
-from ..cloth import Cloth
-from ..diagnosis.world import Model
 from ..errors import InvalidInput
-from ..identification.episodes import on_cpu
-from ..identification.journal import Journal, facts_of
 from ..recordings import Recording
-from ..recordings.together import check_recording
 from ..robots import ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
-from .clearance import clearance_of
-from .courses import Course
 from .descent import OnLook, adam, gauss_newton
 from .goal import Goal
-from .rehearsal import Rehearsal, plain
+from .posing import Asked, Believed, check_positive, posed
 from .result import MotionPlan
-from .staging import as_episode, courses_of, doubts
-from .task import Task
+from .staging import as_episode
 
 METHODS = ("gauss-newton", "adam")
-LARGE = 3.0  # times the cloth's extent: no goal of it in metres
-Believed = Cloth | Model
 
 
 def plan(
@@ -85,85 +74,37 @@ def plan(
         SimulationDiverged: already under the recorded motion.
     """
     began = time.monotonic()
-    check_recording(recording)
     if method not in METHODS:
         raise InvalidInput("method", got=repr(method), expected=f"one of {', '.join(METHODS)}")
-    _check(waypoints=waypoints, iterations=iterations, rate=rate, acceleration=acceleration)
-    _check(clearance=clearance, speed=limits.speed, hardest=limits.acceleration)
-    if not (math.isfinite(wait) and wait >= 0):
-        raise InvalidInput("wait", got=wait, expected="seconds, 0 or more")
-    models = _models(model)
-    aim = goal if isinstance(goal, Goal) else Goal(goal)
-    courses = courses_of(models[0].base.cloth, recording, waypoints, wait, acceleration, limits)
-    rehearsals = [Rehearsal(m, recording, courses, dt) for m in models]
-    warnings = [*doubts(recording, courses), *_check_goal(aim, rehearsals[0])]
-    judge, doubt = clearance_of(recording, courses, aim.points, clearance)
-    kept = None if journal is None else Journal(journal, _problem(rehearsals, aim, courses), resume)
-    task = Task(rehearsals, courses, aim, judge, kept)
+    check_positive(iterations=iterations, rate=rate)
+    asked = Asked(waypoints, wait, acceleration, limits, clearance, dt)
+    task, warnings = posed(model, recording, goal, asked, journal, resume)
     if method == "adam":
         found = adam(task, task.start, iterations, rate, on_progress)
     else:
         found = gauss_newton(task, task.start, iterations, on_progress)
     (before, frames_before), (after, frames) = task.each(task.start), task.each(found.best)
     first, last = task.motion(task.start), task.motion(found.best)
-    gap = None if judge is None else judge.nearest(task.angles(found.best))[0]
+    gap = task.nearest(found.best)
     return MotionPlan(
-        recording=as_episode(recording, courses, task.split(found.best)),
+        recording=as_episode(recording, task.courses, task.split(found.best)),
         motion=last,
         before=before,
         after=after,
         history=found.history,
-        times=rehearsals[0].times,
+        times=task.rehearsals[0].times,
         frames=frames,
         frames_before=frames_before,
-        faces=rehearsals[0].faces,
+        faces=task.rehearsals[0].faces,
         moved={name: _apart(first[name], last[name]) for name in last},
         limit=task.bounds.nearest(found.best),
         nearest="" if gap is None or not gap.first else f"{gap.first} to {gap.second}, {1e3 * gap.distance:.0f} mm",
         ended=found.ended,
         seconds=time.monotonic() - began,
-        warnings=[*warnings, *([doubt] if doubt else [])],
+        warnings=warnings,
     )
 
 
 def _apart(first: Trajectory, last: Trajectory) -> float:
     """m, the greatest distance of two paths at one time."""
     return float((last.pose[:, :3, 3] - first.pose[:, :3, 3]).norm(dim=-1).max())
-
-
-def _models(model: Believed | Sequence[Believed]) -> list[Model]:
-    given = list(model) if isinstance(model, Sequence) else [model]
-    if not given or not all(isinstance(m, Cloth | Model) for m in given):
-        got = "none" if not given else ", ".join(sorted({type(m).__name__ for m in given}))
-        raise InvalidInput("model", got=got, expected="a Cloth or a diagnosis.Model, or several")
-    found = [m if isinstance(m, Model) else plain(m) for m in given]
-    for m in found:
-        on_cpu(m.base.cloth)
-    return found
-
-
-def _problem(rehearsals: Sequence[Rehearsal], goal: Goal, courses: Sequence[Course]) -> list[object]:
-    """What slopes depend on beside the point."""
-    own = [part for r in rehearsals for part in (*facts_of(r.world.cloth), *r.identity())]
-    ways = [part for c in courses for part in (c.name, c.span, c.start, c.trajectory(c.nothing).pose)]
-    return [*own, goal.points, goal.faces, *ways]
-
-
-def _check(**numbers: float) -> None:
-    for name, value in numbers.items():
-        whole = name in ("waypoints", "iterations")
-        if not math.isfinite(value) or value <= 0 or (whole and value != int(value)):
-            raise InvalidInput(name, got=value, expected="a whole number > 0" if whole else "a finite value > 0")
-
-
-def _check_goal(goal: Goal, run: Rehearsal) -> list[str]:
-    """In millimetres it would be a thousand times as large; a doubt about one that is far away."""
-    x = run.state.x
-    size, own = float((goal.points.amax(0) - goal.points.amin(0)).norm()), run.world.cloth.mesh.extent
-    if size > LARGE * own:
-        got = f"points over {size:.3g} m, of a cloth of {own:.3g} m"
-        raise InvalidInput("goal", got=got, expected="the cloth where it shall be, in metres")
-    away = float((goal.points.mean(0).to(x) - x.mean(0)).norm())
-    if away < LARGE * own:
-        return []
-    return [f"the goal is {away:.2f} m from where the cloth is at first: are both in one world?"]

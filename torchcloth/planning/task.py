@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.func import jacfwd
 
 from ..identification.journal import Journal
+from ..robots.clearance import Gap  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..types import Trajectory
 from .clearance import Clearance
 from .courses import Bounds, Course
@@ -72,6 +73,10 @@ class Task:
     def clear(self, at: Tensor) -> bool:
         """Whether the arms are, where anything is known of that."""
         return self._clearance is None or self._clearance.nearest(self.angles(at))[1] is None
+
+    def nearest(self, at: Tensor) -> Gap | None:
+        """The smallest distance between solids on the way; None: nothing is known of that."""
+        return None if self._clearance is None else self._clearance.nearest(self.angles(at))[0]
 
     def angles(self, at: Tensor) -> dict[str, Tensor]:
         """[N, J] rad, by arm, at the instants of ``Span``."""

@@ -15,10 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcloth.cloth import Cloth
 from torchcloth.errors import MissingDependency, SimulationDiverged
+from torchcloth.planning import Goal
 from torchcloth.planning.courses import Course, Span
 from torchcloth.planning.feasible import step_within
+from torchcloth.planning.posing import Asked, posed
 from torchcloth.planning.task import Task
+from torchcloth.recordings import Recording
 
 try:
     import gymnasium
@@ -83,6 +87,18 @@ class ReachEnv(gymnasium.Env):
         size = 6 * len(self.vertices) + self.count + 1
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.count,), np.float32)
+
+    @classmethod
+    def of(cls, cloth: Cloth, recording: Recording, goal: Goal | Tensor, **asked: Any) -> ReachEnv:
+        """The scene of ``tc.plan(cloth, recording, goal, ...)``, with one decision for each waypoint.
+
+        Args:
+            asked: ``waypoints``, ``wait``, ``acceleration``, ``limits``, ``clearance`` and ``dt``, as there.
+
+        Raises:
+            InvalidInput, RecordingError: as there.
+        """
+        return cls(posed(cloth, recording, goal, Asked(**asked), course=stepwise)[0])
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None):
         """The cloth at rest where it is first."""
