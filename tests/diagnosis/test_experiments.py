@@ -20,6 +20,7 @@ from torchcloth.diagnosis.experiments import LIBRARY, PLANS, Experiment, heading
 from torchcloth.diagnosis.fitting import renoised
 from torchcloth.diagnosis.next_experiment import (
     Question,
+    as_seen,
     distances,
     information,
     propose,
@@ -27,7 +28,9 @@ from torchcloth.diagnosis.next_experiment import (
     whitened_slopes,
 )
 from torchcloth.diagnosis.noise import FLOOR, Noise
+from torchcloth.diagnosis.setting import foreseen
 from torchcloth.diagnosis.trials import HARDLY
+from torchcloth.identification.episodes import episode
 from torchcloth.recordings import Collider
 
 INDEPENDENT = Path(__file__).parents[1] / "independent"
@@ -184,3 +187,16 @@ def test_what_does_the_same_as_a_fitted_number_is_not_waited_for():
     assert question_of(found, none).amplitudes.keys() == {"b"}
     found.screened = rows[:1]
     assert question_of(found, none) is None
+
+
+def test_an_experiment_feels_what_the_data_felt():
+    """Forces without torques are no torques that would be felt."""
+    seen = sheets.recorded("slow", lambda world: world, 0)
+    pulled = {name: replace(g, force=np.tile([0, 0, -0.04], (len(g.t), 1))) for name, g in seen.grippers.items()}
+    seen = replace(seen, grippers=pulled)
+    model = base_model(seen)
+    setting = setting_of(model, [seen])
+    blank = foreseen(episode(model.base.cloth, replace(planned(Experiment("hang"), seen), joints={})))
+    felt = as_seen(model.world().frames(blank), blank, setting).wrenches["left"]
+    assert felt[1:, :3].isfinite().all()
+    assert felt[:, 3:].isnan().all()

@@ -92,6 +92,13 @@ def test_another_scene_keeps_the_fabric_and_another_fabric_is_refused(made):
         dx.cloth_for(folder / "extended.tcm", heavy)
 
 
+def test_a_model_makes_no_two_cloths_one(made):
+    folder, seen, blank = made
+    other = replace(seen.cloth, nominal=seen.cloth.nominal | {"membrane_stiffness": 1.0})
+    with pytest.raises(InvalidInput, match="another data sheet"):
+        dx.begin_with(folder / "extended.tcm", [blank, replace(seen, cloth=other)])
+
+
 def test_a_diagnosis_begins_with_a_models_fabric_in_the_scene_of_its_episodes(made):
     """And writes what it finds beside the data sheet that the numbers are relative to."""
     folder, seen, blank = made

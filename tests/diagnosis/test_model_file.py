@@ -145,3 +145,16 @@ def test_verbs_say_it_in_one_line(sound, tmp_path, capsys):
         assert said.startswith(f"torchcloth: {path}/model.json: parameters is not an object")
         assert said.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_plain_number_may_be_as_large_as_it_was_fitted(tmp_path):
+    base = base_model(RECORDING)
+    k = [p.name for p in base.parameters].index("stiffening")
+    values = base.values.clone()
+    values[k] = 15.0
+    path = save_model(tmp_path / "m.tcm", replace(base, values=values), RECORDING)
+    assert read_model(path).model.values[k] == 15.0
+    values[0] = 15.0  # a logarithm
+    path = save_model(tmp_path / "m.tcm", replace(base, values=values), RECORDING)
+    with pytest.raises(RecordingError, match="within 14"):
+        read_model(path)

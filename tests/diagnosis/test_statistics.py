@@ -259,7 +259,9 @@ def test_what_would_need_a_sign_that_it_cannot_have_is_no_twin():
     rows = {r.hypothesis.name: r for r in screen(found)}
     other = rows["b"]._replace(hypothesis=replace(rows["b"].hypothesis, signed=False))
     assert alike(found, rows["a"], 1.0, [other]) == []
-    assert alike(found, rows["a"], -1.0, [other]) == [other]
+    (instead,) = alike(found, rows["a"], -1.0, [other])  # slopes ask for less than none of it
+    assert other.amplitude == pytest.approx(-1 / 1.5, rel=0.1)
+    assert instead.amplitude == pytest.approx(1 / 1.5, rel=0.01)
     assert alike(found, rows["a"], 1.0, [rows["b"]]) == [rows["b"]]
 
 
@@ -275,7 +277,10 @@ def test_what_a_fit_finds_tells_it_from_strangers_though_a_score_found_little():
 def test_more_scatter_within_cells_is_no_gain():
     """Of two models that leave the same residuals neither is the likelier, however their points scatter."""
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
-    cells = [c._replace(spread=1.1 * c.spread, count=c.count - 1, rough=c.rough + 1e-4) for c in ev.cells]
+    cells = [
+        c._replace(spread=1.1 * c.spread, count=c.count - 1, rough=c.rough + 1e-4, ray=c.ray + 0.2, time=c.time + 0.01)
+        for c in ev.cells
+    ]
     groups, one, other = ["x", "y", "x", "y"], toys.fitted(ev), toys.fitted(replace(ev, cells=cells))
     like = [renoised(found, one.noise, one.evidence) for found in (one, other)]
     first, same, more = (predict(found, groups) for found in (*like, renoised(other, one.noise, other.evidence)))
@@ -420,3 +425,14 @@ def test_a_single_stretch_of_time_confirms_nothing():
     assert gain.density > 0
     assert gain.ci95[0] == gain.ci95[1]
     assert not Confirmation(gain, {}, 0.0, "the model").confirmed
+
+
+def test_what_is_surely_there_is_present_though_a_usual_amount_of_it_could_not_be_seen():
+    ev = toys.evidence(toys.smooth(5, 4), 2, ["X"], torch.tensor([0.0, 0.0, 0.3]), 0)
+    small = replace(ev, hypotheses=[replace(ev.hypotheses[0], typical=0.06)])
+    (row,) = screen(toys.fitted(small))
+    assert row.sight < 1 < row.sight * row.amplitude / 0.06
+    assert row.decision == "present"
+    less = toys.evidence(toys.smooth(5, 4), 2, ["X"], torch.tensor([0.0, 0.0, 0.03]), 0)
+    (row,) = screen(toys.fitted(replace(less, hypotheses=small.hypotheses)))
+    assert row.decision == "unresolvable"

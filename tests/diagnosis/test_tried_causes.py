@@ -104,3 +104,16 @@ def test_no_effect_may_take_the_place_of_the_catalogues(world):
 def test_what_cannot_be_registered(given, said):
     with pytest.raises(InvalidInput, match=said):
         register(Hypothesis(**{"name": "my.own", "unit": "-", "typical": 1.0, "apply": lambda w, a: w, **given}))
+
+
+def test_a_signed_cause_is_tried_both_ways(world):
+    """A search asks the other way as well, as far as the cause says that a world can have it."""
+    _, model, setting = world
+    braked = lambda w, a: w.with_cloth({"my": effects.MassDamping(math.sqrt(1 + 2 * a) - 1 if a else 0.0)})  # noqa: E731
+    own = Hypothesis("my.own", "-", 0.8, braked, signed=True)
+    with pytest.raises(InvalidInput, match=r"hypothesis 'my.own'; got ValueError"):
+        check_own([own], model.base, setting.episodes)
+    ends = replace(own, low=0.0)
+    assert not ends.reverses
+    check_own([ends], model.base, setting.episodes)
+    assert replace(own, low=-0.3).opposite.typical == -0.3

@@ -36,7 +36,7 @@ def afresh(
     Without those that promise little beside the best, or at most ``least`` in log density.
     """
     sheet = replace(start.model, values=torch.zeros_like(start.model.values))
-    away = [h.opposite for h in hypotheses if h.signed]
+    away = [h.opposite for h in hypotheses if h.reverses]
     about = staged(progress, "from the data sheet, causes")
     there = fit(sheet, setting, hypotheses, 0, about, before=start.evidence)
     back = asked_about(there.evidence, sheet, setting, away, staged(progress, "from the data sheet, the other way"))

@@ -30,7 +30,8 @@ def correlations(found: Fitted) -> Tensor:
 def alike(found: Fitted, row: Row, amplitude: float, others: Sequence[Row]) -> list[Row]:
     """Those of ``others`` that cannot be told from ``row`` at this amplitude or the one that was asked for.
 
-    Directions of the same effect are none, nor is what would have to have a sign that it cannot have.
+    Directions of the same effect are none, nor is what would have to have a sign that it cannot have. Where slopes ask
+    for one the other way round, its amplitude is what would stand in for the cause.
     """
     if not others:
         return []
@@ -46,7 +47,8 @@ def alike(found: Fitted, row: Row, amplitude: float, others: Sequence[Row]) -> l
             r = 0.0
         told = square * (1 - r * r)
         if other.hypothesis.effect != row.hypothesis.effect and (abs(r) > ALIKE or told < TOLD):
-            out.append(other)
+            instead = r * amplitude * other.std / row.std
+            out.append(other if other.amplitude * instead >= 0 else other._replace(amplitude=instead))
     return out
 
 

@@ -211,12 +211,14 @@ def shared(like: Evidence, others: Sequence[Evidence]) -> Evidence:
 
 
 def as_rough(evidence: Evidence, like: Evidence) -> Evidence:
-    """With another's scatter, roughness and numerics, on its cells: by the same covariance alone densities compare."""
+    """With all of another's that makes the noise, on its cells: by the same covariance alone densities compare."""
     cells, numerics = [], []
     for own, other, difference in zip(shared(evidence, [like]).cells, like.cells, like.numerics, strict=True):
-        columns = torch.stack([other.count, other.spread, other.rough, difference], 1)
-        count, spread, rough, difference = aligned(own.key, other.key, columns).unbind(1)
-        cells.append(own._replace(count=count, spread=spread, rough=rough))
+        columns = torch.stack([other.count, other.spread, other.rough, other.ray, other.time, difference], 1)
+        columns = torch.cat([columns, other.place], 1)
+        count, spread, rough, ray, time, difference, *place = aligned(own.key, other.key, columns).unbind(1)
+        same = own._replace(count=count, spread=spread, rough=rough, ray=ray, time=time, place=torch.stack(place, 1))
+        cells.append(same)
         numerics.append(difference)
     return replace(evidence, cells=cells, numerics=numerics)
 

@@ -17,7 +17,7 @@ from ..identification.replays import Frames, each
 from ..recordings import Recording
 from ..recordings.extents import check_size
 from ..recordings.marks import alike, mark
-from ..recordings.together import together
+from ..recordings.together import same_cloth, together
 from .cells import directions
 from .model_file import ModelFile, load_model, of_fabric, read_model
 from .pieces import side_by_side
@@ -118,6 +118,7 @@ def begin_with(path: str | Path, recordings: Sequence[Recording]) -> tuple[Model
     Without its residual force, which is no cause. The episodes come back with the data sheet that the model's numbers
     are relative to. Raises as ``read_model``, or InvalidInput for episodes of two scenes.
     """
+    same_cloth(recordings)
     own = read_model(path).scene
     told = [of_fabric(path, own, r) for r in recordings]
     file = read_model(path, together(told), residual=False)

@@ -23,7 +23,7 @@ from .world import Parameter
 FORMAT = 2  # 1: of base models without stiffening
 CONTENT, ARRAYS = "model.json", "mesh.npz"
 EXPECTED, AGAIN = "a .tcm file of `torchcloth diagnose`", "run `torchcloth diagnose` again, or restore the file"
-FARTHEST = 14.0  # coordinates are logarithms or small shares: no fabric is a million times what its data sheet says
+FARTHEST = 14.0  # of logarithms and small shares: no fabric is a million times what its data sheet says
 
 
 @contextmanager
@@ -54,8 +54,9 @@ class Numbers(NamedTuple):
         if other := self.coordinates.keys() ^ set(names):
             got = f"{', '.join(sorted(other))} in only one of the file and its cloth"
             raise RecordingError(self.place, got=got, expected=", ".join(names))
+        plain = {p.name for p in parameters if not p.value(0.0)}
         for name, value in self.coordinates.items():
-            if abs(value) > FARTHEST:
+            if abs(value) > FARTHEST and name not in plain:
                 got, expected = f"a coordinate of {value:g}", f"within {FARTHEST:g} of the data sheet's 0"
                 raise RecordingError(f"{self.place}.{name}", got=got, expected=expected)
         return torch.tensor([self.coordinates[name] for name in names], dtype=torch.float64)

@@ -137,6 +137,8 @@ def question_of(found: Found, content: Mapping[str, Any]) -> Question | None:
         rows = {r.hypothesis.name: r.amplitude for r in step.screened if not r.wrong_sign}
         more = known & rows.keys() & set(cause.get("class", ()))
         amplitudes |= {name: rows[name] for name in sorted(more - amplitudes.keys())}
+        signed = {h.name for h in step.before.evidence.hypotheses if h.signed}
+        amplitudes = {name: a for name, a in amplitudes.items() if name in signed or a >= 0}
         best = step.best.hypothesis.name
         pairs = tuple((best, other) for other in amplitudes if other != best)
         if best in amplitudes and pairs:
@@ -219,7 +221,8 @@ def as_seen(frames: Frames, blank: Episode, setting: Setting, seed: int = 0) -> 
         weight = (weight / weight.sum(1, keepdim=True)).to(x)
         on = (weight[..., None] * x[face]).sum(1)
         clouds.append(on + noise * torch.randn(many, 3, generator=rng).to(x))
-    wrenches = {name: frames.wrench[name] for name in blank.wrenches}
+    felt = lambda w: w.isfinite().any(0)  # noqa: E731 - a force without a torque, or the other way round
+    wrenches = {name: torch.where(felt(w), frames.wrench[name], w) for name, w in blank.wrenches.items()}
     return surely_seen(replace(blank, clouds=clouds, wrenches=wrenches))
 
 

@@ -144,6 +144,8 @@ def projection(found: Fitted):
 
 
 def _decided(row: Row) -> Decision:
+    if row.shows and row.excess > PRESENT:
+        return "present"
     if row.sight < 1.0 or row.detectable > 1.0 * abs(row.hypothesis.typical) + abs(row.hypothesis.smallest):
         return "unresolvable"
     if row.excess > PRESENT:

@@ -35,6 +35,8 @@ def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode
             for amplitude in (NEAR * hypothesis.typical, hypothesis.typical):
                 world = applied(hypothesis, base, amplitude)
                 moved.append(float((world.frames(early).x - plain).square().mean().sqrt()))
+            if hypothesis.reverses:
+                applied(hypothesis, base, hypothesis.opposite.typical).frames(early)
             for k, episode in enumerate(episodes):
                 world.driven(episode)
                 if k:

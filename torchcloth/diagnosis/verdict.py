@@ -204,11 +204,11 @@ def _error(found: Found, place: int, names: Sequence[str], alone: Collection[str
     Where hardly more than one does, little is known of what motions disagree by.
     """
     own = float(found.end.covariance[place, place]) ** 0.5
-    count = told_by(found.end, place, names, alone)
+    motions, count = (told_by(found.end, place, names, halved) for halved in ((), alone))
     if count <= 1.0:
-        return own, own, count
+        return own, own, motions
     wider = float(stdtrit(max(count - 1.0, 1.0), 0.975)) / NORMAL
-    return own, max(own, wider * float(spread(found.end, names, alone)[1][place])), count
+    return own, max(own, wider * float(spread(found.end, names, alone)[1][place])), motions
 
 
 def _share(found: Found, gain: Gain) -> float | None:

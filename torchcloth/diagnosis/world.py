@@ -169,8 +169,13 @@ class Hypothesis:
 
     @property
     def opposite(self) -> Hypothesis:
-        """The same, asked about the other way."""
-        return replace(self, typical=-self.typical)
+        """The same, asked about the other way, as far as a world can have it."""
+        return replace(self, typical=min(max(-self.typical, self.low), self.high))
+
+    @property
+    def reverses(self) -> bool:
+        """Asking the other way makes sense: there is more than a step to go."""
+        return self.signed and abs(self.opposite.typical) > abs(self.step * self.typical)
 
     def matters(self, amplitude: float) -> bool:
         """Large enough to be named."""
