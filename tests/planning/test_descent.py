@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from torchcloth.errors import SimulationDiverged
+from torchcloth.planning.aim import Pull
 from torchcloth.planning.courses import Bounds
 from torchcloth.planning.descent import adam, gauss_newton
-from torchcloth.planning.goal import Pull
 
 GOAL = torch.tensor([0.3, -0.2], dtype=torch.float64)
 

@@ -1,5 +1,7 @@
 """Goals: distances, what pulls towards them, and files that hold them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.planning import Goal, read_goal
+from torchcloth.planning.aim import aim_at
 
 MESH = meshes.rectangle(0.2, 0.2, triangles=72)
 FACES = torch.as_tensor(MESH.faces)
@@ -23,26 +26,37 @@ def bent(height: float = 0.03) -> torch.Tensor:
 
 def test_a_cloud_is_asked_for_one_way_and_a_surface_both_ways():
     half = FLAT[FLAT[:, 0] < 0.11] + torch.tensor([0.0, 0.0, 0.02])
-    assert float(Goal(half).distance(FLAT, FACES)) == pytest.approx(0.02)  # what lies beyond the cloud is not seen
+    assert float(aim_at(Goal(half), MESH).distance(FLAT)) == pytest.approx(
+        0.02
+    )  # what lies beyond the cloud is not seen
     small = meshes.rectangle(0.1, 0.2, triangles=36)
     known = Goal(torch.as_tensor(small.vertices), torch.as_tensor(small.faces))
     there = float(chamfer_to_surface(known.points, FLAT, FACES))
     back = float(chamfer_to_surface(FLAT, known.points, known.faces))
     assert there == pytest.approx(0.0, abs=1e-12)
-    assert float(known.distance(FLAT, FACES)) == pytest.approx(back / 2)
+    assert float(aim_at(known, MESH).distance(FLAT)) == pytest.approx(back / 2)
     assert back > 0.02
 
 
-@pytest.mark.parametrize("faces", [None, FACES], ids=["cloud", "surface"])
-def test_the_pull_is_the_derivative_of_the_mean_square(faces):
-    goal, x = Goal(bent(), faces), bent(0.01) + 0.003 * torch.randn(len(FLAT), 3)
+GOALS = {
+    "cloud": Goal(bent()),
+    "surface": Goal(bent(), FACES),
+    "vertices": Goal(bent(), FACES, vertices=torch.arange(len(FLAT))),
+    "pattern": Goal(torch.rand(4, 3), uv=torch.tensor([[0.0, 0.0], [0.2, 0.0], [0.0, 0.2], [0.05, 0.13]])),
+}
+
+
+@pytest.mark.parametrize("kind", GOALS)
+def test_the_pull_is_the_derivative_of_the_mean_square(kind):
+    aim, x = aim_at(GOALS[kind], MESH), bent(0.01) + 0.003 * torch.randn(len(FLAT), 3)
     ways = torch.randn(3, len(FLAT), 3)
-    pull = goal.pull(x, FACES, ways)
-    assert float(pull.value) == pytest.approx(goal.square(x, FACES))
+    pull = aim.pull(x, ways)
+    assert float(pull.value) == pytest.approx(aim.square(x))
+    assert float(aim.distance(x)) ** 2 <= aim.square(x)
     for way, slope in zip(ways, pull.gradient.tolist(), strict=True):
         errors = []
         for h in (1e-4, 1e-5, 1e-6):
-            up, down = (goal.square(x + sign * h * way, FACES) for sign in (1, -1))
+            up, down = (aim.square(x + sign * h * way) for sign in (1, -1))
             errors.append(abs((up - down) / (2 * h) - slope))
         assert min(errors) < 1e-6 * abs(slope)
     assert float(torch.linalg.eigvalsh(pull.curvature).min()) > 0
@@ -51,10 +65,49 @@ def test_the_pull_is_the_derivative_of_the_mean_square(faces):
 def test_the_curvature_lets_cloth_slide_along_the_goal():
     goal, middle = Goal(FLAT[(FLAT[:, :2] - 0.1).abs().amax(1) < 0.04]), torch.eye(3)[:, None, :]
     ways = middle.expand(3, len(FLAT), 3)
-    along, aside, across = goal.pull(FLAT, FACES, ways).curvature.diagonal().tolist()
+    along, aside, across = aim_at(goal, MESH).pull(FLAT, ways).curvature.diagonal().tolist()
     assert across == pytest.approx(2.0)
     assert along == pytest.approx(0.2)
     assert aside == pytest.approx(0.2)
+
+
+def test_of_pieces_it_counts_which_is_where():
+    """Cloth that was turned over lies on itself, and each of its pieces somewhere else."""
+    over = FLAT * torch.tensor([-1.0, 1.0, -1.0]) + torch.tensor([0.2, 0.0, 0.0])
+    surface, pieces = Goal(FLAT, FACES), Goal(FLAT, FACES, vertices=torch.arange(len(FLAT)))
+    assert float(aim_at(surface, MESH).distance(over)) == pytest.approx(0.0, abs=1e-9)
+    assert float(aim_at(pieces, MESH).distance(over)) == pytest.approx(float((FLAT - over).norm(dim=1).mean()))
+    ways = torch.eye(3)[:, None, :].expand(3, len(FLAT), 3)
+    assert aim_at(pieces, MESH).pull(over, ways).curvature.diagonal().tolist() == pytest.approx([2.0, 2.0, 2.0])
+    corner = Goal(torch.tensor([[0.3, 0.1, 0.0]]), uv=torch.tensor([[0.2, 0.1]]))
+    assert float(aim_at(corner, MESH).distance(FLAT)) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("goal", "said"),
+    [
+        (Goal(torch.zeros(1, 3), uv=torch.tensor([[0.3, 0.0]])), r"uv of the goal\[0\].*off the cloth"),
+        (Goal(torch.zeros(1, 3), vertices=torch.tensor([len(FLAT)])), "vertices of the goal"),
+        (Goal(torch.zeros(3, 3), torch.tensor([[0, 1, 2]]), vertices=torch.arange(3)), "not the cloth's"),
+    ],
+    ids=["beyond the pattern", "beyond the mesh", "another mesh"],
+)
+def test_pieces_that_the_cloth_has_not_are_refused(goal, said):
+    with pytest.raises(InvalidInput, match=said):
+        aim_at(goal, MESH)
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ({"uv": torch.zeros(2, 2), "vertices": torch.zeros(2)}, "uv and vertices"),
+        ({"uv": torch.zeros(3, 2)}, r"uv of the goal.*\[2, 2\]"),
+        ({"vertices": torch.zeros(3)}, "vertices of the goal"),
+    ],
+)
+def test_pieces_that_are_none_are_refused(how, said):
+    with pytest.raises(InvalidInput, match=said):
+        Goal(torch.zeros(2, 3), **how)
 
 
 @pytest.mark.parametrize(
@@ -76,6 +129,37 @@ def test_files(tmp_path):
     lines = [f"v {x} {y} {z}" for x, y, z in MESH.vertices] + [f"f {a} {b} {c}" for a, b, c in MESH.faces + 1]
     (tmp_path / "mesh.obj").write_text("\n".join(lines) + "\n")
     assert read_goal(tmp_path / "mesh.obj").faces.shape == FACES.shape
+    assert not read_goal(tmp_path / "mesh.obj").of_pieces
+
+
+def test_files_of_pieces(tmp_path):
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    np.savez(tmp_path / "pose.npz", x=np.stack([points, points + 1]), faces=np.array([[0, 1, 2]]))
+    assert read_goal(tmp_path / "pose.npz", pieces=True).vertices.tolist() == [0, 1, 2, 3, 4]
+    np.savez(tmp_path / "pieces.npz", x=points, uv=points[:, :2])
+    for pieces in (False, True):
+        found = read_goal(tmp_path / "pieces.npz", pieces)
+        assert np.allclose(found.points, points)
+        assert np.allclose(found.uv, points[:, :2])
+    np.save(tmp_path / "cloud.npy", points)
+    with pytest.raises(InvalidInput, match="nobody knows the piece"):
+        read_goal(tmp_path / "cloud.npy", pieces=True)
+
+
+def test_markers_are_pieces_where_the_last_frame_has_them(tmp_path):
+    from scenes import by_hand
+
+    uv, xyz = np.array([[0.0, 0.0], [0.1, 0.1]]), np.zeros((3, 2, 3))
+    xyz[-1] = [[np.nan] * 3, [0.1, 0.2, 0.3]]
+    markers = rec.Markers(np.linspace(0, 0.2, 3), xyz, uv)
+    found = read_goal(rec.write(replace(by_hand(), markers=markers), tmp_path / "seen"), pieces=True)
+    assert found.points.tolist() == [[0.1, 0.2, 0.3]]
+    assert found.uv.tolist() == [[0.1, 0.1]]
+    unknown = rec.write(replace(by_hand(), markers=replace(markers, uv=None)), tmp_path / "unknown")
+    with pytest.raises(InvalidInput, match="nobody knows the piece"):
+        read_goal(unknown, pieces=True)
+    with pytest.raises(RecordingError, match="markers"):
+        read_goal(rec.write(by_hand(), tmp_path / "blind"), pieces=True)
 
 
 def test_triangles_of_other_points_are_refused():

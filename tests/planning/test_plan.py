@@ -76,6 +76,20 @@ def test_the_cloth_ends_at_a_goal_that_another_mesh_and_another_motion_made():
     assert 0.03 < found.moved["hand"] < 0.1
 
 
+def test_each_piece_comes_to_where_it_shall_be():
+    recording = by_hand()
+    x, faces = end_of(recording)
+    path = recording.grippers["hand"]
+    s = (path.t / LASTS)[:, None]
+    moved = replace(path, position=path.position + (10 * s**3 - 15 * s**4 + 6 * s**5) * AWAY.numpy())
+    wanted, _ = end_of(replace(recording, grippers={"hand": moved}))
+    goal = Goal(wanted, faces, vertices=torch.arange(len(x)))
+    found = tc.plan(cloth_of(recording), recording, goal, **QUICK)
+    assert found.before[0] == pytest.approx(float((x - wanted).norm(dim=1).mean()), rel=1e-6)
+    assert found.after[0] < 0.15 * found.before[0]
+    assert found.after[0] == pytest.approx(float((found.frames[-1] - wanted).norm(dim=1).mean()), rel=1e-6)
+
+
 def test_the_planned_episode_does_what_was_expected(tmp_path):
     recording = by_arm()
     found = tc.plan(cloth_of(recording), recording, shifted_goal(recording), **QUICK)

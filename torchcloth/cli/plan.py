@@ -34,7 +34,13 @@ def add(verbs: Any) -> None:
         "--goal",
         required=True,
         metavar="GOAL",
-        help="an episode (its last points), .npy [N, 3] of points, .obj or .ply of a mesh, or pose.npz",
+        help="an episode (its last points), .npy [N, 3] of points, .obj or .ply of a mesh, pose.npz, or "
+        ".npz with x [N, 3] and uv [N, 2] of pieces",
+    )
+    option(
+        "--pieces",
+        action="store_true",
+        help="the goal tells each piece's place: a mesh or pose.npz by the cloth's vertices, an episode by its markers",
     )
     option("--fit", type=Path, metavar="RESULT", help="identification.json, its folder or a .tcm file: take its values")
     option("--draws", type=int, default=1, metavar="N", help="plan for N models, drawn from what the fit leaves open")
@@ -76,7 +82,7 @@ def _plan(options: argparse.Namespace) -> int:
         check_apart(path, options.episode, options.goal)
     check_folder(options.out)
     check_place(options.out)
-    recording, goal = recordings.read(options.episode), planning.read_goal(options.goal)
+    recording, goal = recordings.read(options.episode), planning.read_goal(options.goal, options.pieces)
     models = _models(options, recording)
     with progress_line() as progress:
         found = planning.plan(

@@ -75,14 +75,14 @@ def markers(recording: Recording, frames: np.ndarray, dtype: torch.dtype) -> Ten
     return out
 
 
-def on_pattern(mesh: Mesh, uv: np.ndarray) -> Hits:
-    """Where pattern points [M, 2] m lie on a mesh.
+def on_pattern(mesh: Mesh, uv: np.ndarray, name: str = "markers.uv") -> Hits:
+    """Where pattern points [M, 2] m lie on a mesh; ``name`` is what messages call them.
 
     Raises:
         InvalidInput: a point that is not on the pattern, or a mesh without pattern coordinates.
     """
     if mesh.pattern is None:
-        raise InvalidInput("markers.uv", got="a mesh without pattern coordinates", expected="cloth.obj with vt")
+        raise InvalidInput(name, got="a mesh without pattern coordinates", expected="cloth.obj with vt")
     corners = torch.as_tensor(mesh.pattern, dtype=torch.float64).reshape(-1, 2)
     flat = torch.nn.functional.pad(corners, (0, 1))
     points = torch.nn.functional.pad(torch.as_tensor(uv, dtype=torch.float64), (0, 1))
@@ -90,7 +90,7 @@ def on_pattern(mesh: Mesh, uv: np.ndarray) -> Hits:
     off = (points - hits.on(flat)).norm(dim=-1)
     if float(off.max()) > OFF_PATTERN:
         raise InvalidInput(
-            f"markers.uv[{int(off.argmax())}]", got=f"{float(off.max()):.3f} m off the cloth", expected="on its pattern"
+            f"{name}[{int(off.argmax())}]", got=f"{float(off.max()):.3f} m off the cloth", expected="on its pattern"
         )
     return hits._replace(corners=torch.as_tensor(mesh.faces).reshape(-1)[hits.corners])
 

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from ..diagnosis.worlds import IMPOSSIBLE
+from .aim import Pull
 from .courses import Bounds
 from .feasible import step_within
-from .goal import Pull
 
 HALVINGS = 6  # of a step that leads into something
 FIRST, LEAST = 0.1, 1e-4  # of the damping: a path's mean square beside the cloth's

@@ -90,7 +90,7 @@ def _problem(rehearsals: Sequence[Rehearsal], goal: Goal, courses: Sequence[Cour
     """What slopes depend on beside the point."""
     own = [part for r in rehearsals for part in (*facts_of(r.world.cloth), *r.identity())]
     ways = [part for c in courses for part in (c.name, c.span, c.start, c.trajectory(c.nothing).pose)]
-    return [*own, goal.points, goal.faces, *ways]
+    return [*own, goal.points, goal.faces, goal.uv, goal.vertices, *ways]
 
 
 def check_positive(**numbers: float) -> None:

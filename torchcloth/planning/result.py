@@ -19,7 +19,8 @@ RESULT, EPISODE = "plan.json", "episode"  # in the result's folder
 PLANNED = "synthetic: a motion that torchcloth plan proposes"
 CONVENTION = (
     "SI units. distance: mean distance of the goal's points from the cloth's surface at the last frame (one-sided "
-    "Chamfer); of a goal with triangles the mean of that and of the cloth's vertices from the goal's surface. before: "
+    "Chamfer); of a goal with triangles the mean of that and of the cloth's vertices from the goal's surface; of "
+    "pieces their mean distance from where they shall be. before: "
     "the recorded motion, simulated; after: the planned one; several numbers: one for each model that was planned for. "
     "history: mean over the models at every motion that was looked at. limit.share: of the way "
     "to the first limit, from the recorded motion."

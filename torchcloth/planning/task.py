@@ -12,9 +12,10 @@ from torch.func import jacfwd
 from ..identification.journal import Journal
 from ..robots.clearance import Gap  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..types import Trajectory
+from .aim import Pull, aim_at, mean
 from .clearance import Clearance
 from .courses import Bounds, Course
-from .goal import Goal, Pull, mean
+from .goal import Goal
 from .rehearsal import Rehearsal
 
 LEVER = 0.1  # m, at which a gripper's turns count as shifts
@@ -43,6 +44,7 @@ class Task:
     ) -> None:
         self.rehearsals, self.courses, self.goal = rehearsals, courses, goal
         self.bounds, self._clearance, self._journal = Bounds.of(courses), clearance, journal
+        self.aims = [aim_at(goal, r.world.cloth.mesh) for r in rehearsals]
         self.start = torch.cat([c.nothing.flatten() for c in courses])
         self.metric = self._metric()
 
@@ -86,33 +88,31 @@ class Task:
         """(distance [m] of every model, [T, V, 3] m of the first one's cloth)."""
         with torch.no_grad():
             runs = [r.run(self.motion(at)) for r in self.rehearsals]
-        pairs = zip(self.rehearsals, runs, strict=True)
-        return [float(self.goal.distance(x[-1], r.faces)) for r, x in pairs], runs[0]
+        return [float(aim.distance(x[-1])) for aim, x in zip(self.aims, runs, strict=True)], runs[0]
 
     def _ask(self, question: str, at: Tensor, work: Callable[[], T]) -> T:
         return work() if self._journal is None else self._journal.ask(question, at, work)
 
     def _look(self, at: Tensor) -> tuple[Tensor, Tensor]:
         motion = self.motion(at)
-        ends = [(r.run(motion)[-1], r.faces) for r in self.rehearsals]
-        distance = torch.stack([self.goal.distance(*end) for end in ends]).mean()
-        return distance, torch.tensor([self.goal.square(*end) for end in ends]).mean()
+        ends = [(aim, r.run(motion)[-1]) for aim, r in zip(self.aims, self.rehearsals, strict=True)]
+        distance = torch.stack([aim.distance(x) for aim, x in ends]).mean()
+        return distance, torch.tensor([aim.square(x) for aim, x in ends]).mean()
 
     def _pull(self, at: Tensor) -> Pull:
         motion, moved = self.motion(at), self._moved(at)
         parts = []
-        for r in self.rehearsals:
-            x, moves = r.last(motion, moved)
-            parts.append(self.goal.pull(x, r.faces, moves))
+        for aim, r in zip(self.aims, self.rehearsals, strict=True):
+            parts.append(aim.pull(*r.last(motion, moved)))
         return mean(parts)
 
     def _slope(self, at: Tensor) -> tuple[Tensor, Tensor]:
         """One model after the other: the graph of one is all that is in memory at once."""
         values, gradient = [], torch.zeros_like(at)
-        for r in self.rehearsals:
+        for aim, r in zip(self.aims, self.rehearsals, strict=True):
             with torch.enable_grad():
                 free = at.clone().requires_grad_()
-                distance = self.goal.distance(r.run(self.motion(free))[-1], r.faces)
+                distance = aim.distance(r.run(self.motion(free))[-1])
                 gradient += torch.autograd.grad(distance, free)[0].to(gradient) / len(self.rehearsals)
             values.append(distance.detach())
         return torch.stack(values).mean(), gradient

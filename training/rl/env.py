@@ -122,7 +122,7 @@ class ReachEnv(gymnasium.Env):
         try:
             with torch.no_grad():
                 self.state = self.run.go_on(self.state, self.task.motion(self.at), float(self.ends[k]), end)
-            distance = float(self.task.goal.distance(self.state.x, self.run.faces))
+            distance = float(self.task.aims[0].distance(self.state.x))
             reward = -distance / self.first
         except SimulationDiverged:  # cloth that is torn: the motion ends
             distance, reward, over = math.inf, -TORN, True

@@ -23,6 +23,7 @@ from torchcloth import planning
 from torchcloth.cloth import Cloth
 from torchcloth.errors import InvalidInput
 from torchcloth.planning import Goal
+from torchcloth.planning.aim import aim_at
 from torchcloth.planning.courses import Course
 from torchcloth.planning.feasible import step_within
 from torchcloth.planning.rehearsal import Rehearsal, plain
@@ -126,7 +127,7 @@ def sought(scale: Scale, number: int, garment: str, motion: str, method: str) ->
     seconds = time.perf_counter() - began
     with torch.no_grad():
         first, done = (fine.run.run(m)[-1] for m in ({c.name: c.trajectory(c.nothing) for c in fine.courses}, moved))
-    distance = lambda x: float(goal.distance(x, fine.run.faces))  # noqa: E731
+    distance = lambda x: float(aim_at(goal, fine.cloth.mesh).distance(x))  # noqa: E731
     return {
         "recorded": distance(first),
         "done": distance(done),
