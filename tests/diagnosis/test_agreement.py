@@ -1,5 +1,6 @@
 """How far motions must agree about a cause."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -192,6 +193,7 @@ def test_a_numbers_interval_knows_of_what_motions_disagree_by():
         for name, row in _parameters(SimpleNamespace(end=found), list("abcd")).items()  # type: ignore[arg-type]
     }
     noise, motions = found.covariance.diagonal().sqrt(), spread(found, list("abcd"))[1]
-    assert width["p1"] == pytest.approx(float(motions[1]) * 3.18 / 1.96)  # Student's, of four
+    student, values = float(motions[1]) * 3.18 / 1.96, found.model.values.tolist()  # of four
+    assert width["p1"] == pytest.approx(math.hypot(student, 0.03 * values[1]))
     assert width["p1"] > 3 * float(noise[1])
     assert all(width[f"p{k}"] >= float(noise[k]) - 1e-12 for k in range(2))

@@ -8,7 +8,9 @@ ROOT = Path(__file__).parents[2]
 
 def test_the_example_of_the_page(monkeypatch):
     monkeypatch.chdir(ROOT)
-    plan, pieces, learning = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "planning.md").read_text(), flags=re.DOTALL)
+    plan, pieces, learning = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "planning.md").read_text(), flags=re.DOTALL
+    )
     learning = learning.replace("waypoints=4", "waypoints=2").replace("motions=300", "motions=3")
     scope: dict = {}
     exec(compile(plan, "docs/planning.md", "exec"), scope)

@@ -28,6 +28,11 @@ from .trials import NORMAL, Step, between_motions
 from .wording import sentences, warnings_of
 from .world import Hypothesis, Model
 
+ALIKE = (
+    0.03  # of a number, standard deviation: what is wrong in all motions alike, by sealed answers about another engine
+)
+NEAR = 1e-4  # of a coordinate, for its value's slope
+
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 
 
@@ -160,7 +165,8 @@ def _given(found: Found, names: Sequence[str]) -> list[dict[str, Any]]:
     out = []
     for h in given:
         place = model.place(h.name)
-        amplitude, error = model.amplitudes[place], NORMAL * std[first + place]
+        amplitude = model.amplitudes[place]
+        error = NORMAL * math.hypot(std[first + place], ALIKE * amplitude)
         out.append({**_told(h, amplitude), "ci95": [amplitude - error, amplitude + error]})
     return out
 
@@ -169,7 +175,8 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     best, h, count = step.best, step.best.hypothesis, len(found.end.model.parameters)
     place, amplitude = found.end.model.place(h.name), found.amplitude(step)
     noise, std, told = _error(found, count + place, names, best.alone)
-    noise, std = ((error**2 + best.row.bias**2) ** 0.5 for error in (noise, std))
+    noise, std = (math.hypot(error, best.row.bias) for error in (noise, std))
+    std = math.hypot(std, ALIKE * amplitude)
     kin = [r.hypothesis.name for r in found.unseen(step)]
     rivals = found.rivals(step)
     kin += [c.hypothesis.name for c in rivals if fitted_alike(best.fitted, c.fitted, step.noise)]
@@ -256,15 +263,13 @@ def _floor(found: Found) -> dict[str, Any]:
 
 
 def _parameters(found: Found, names: Sequence[str]) -> dict[str, Any]:
-    model, std = found.end.model, _errors(found, names).tolist()
-    return {
-        p.name: {
-            "value": p.value(c),
-            "ci95": sorted(p.value(min(max(end, p.low), p.high)) for end in (c - NORMAL * s, c + NORMAL * s)),
-            "unit": p.unit,
-        }
-        for p, c, s in zip(model.parameters, model.values.tolist(), std, strict=False)
-    }
+    model, out = found.end.model, {}
+    for p, c, s in zip(model.parameters, model.values.tolist(), _errors(found, names).tolist(), strict=False):
+        value, slope = p.value(c), (p.value(c + NEAR) - p.value(c - NEAR)) / (2 * NEAR)
+        wide = NORMAL * math.hypot(s, ALIKE * value / slope)
+        ends = (p.value(min(max(end, p.low), p.high)) for end in (c - wide, c + wide))
+        out[p.name] = {"value": value, "ci95": sorted(ends), "unit": p.unit}
+    return out
 
 
 def _finite(value: float) -> float | None:

@@ -1,0 +1,71 @@
+"""How often the intervals of kept answers hold the truth, and how often with a share of the number in quadrature.
+
+python tests/hidden/intervals.py docs/hidden/*/     # answers as `studies hidden` keeps them, one folder a round
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import beside  # noqa: F401
+
+from torchcloth.training.studies import hidden_scores as scores
+
+SHARES = (0.0, 0.02, 0.03, 0.04)  # of the number, standard deviations
+FABRIC = {"youngs_modulus": "membrane_stiffness", "bending.stiffness": "bending_stiffness", "areal_density": None}
+THICK = 1e-3  # m, of all sheets
+NORMAL = 1.96
+
+
+def amplitudes(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
+    """("amplitude", error, standard error) of each that is named outright, over what is hidden."""
+    asked = scores.wanted(truth)
+    for cause, wanted in zip(scores._matched(scores.named(answer), asked), asked, strict=True):
+        if cause is not None and cause.best in wanted.names and wanted.comparable:
+            low, high = cause.ci95
+            yield (
+                "amplitudes",
+                cause.amplitude / wanted.amplitude - 1,
+                (high - low) / (2 * NORMAL * abs(wanted.amplitude)),
+            )
+
+
+def numbers(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
+    """(name, error of the logarithm, standard error) of the fabric's numbers, of a null."""
+    if truth["family"] not in scores.NULLS:
+        return
+    for name, own in FABRIC.items():
+        if (row := answer.get("parameters", {}).get(name)) is not None:
+            true = truth["fabric"][own or name] / (THICK if name == "youngs_modulus" else 1.0)
+            low, high = row["ci95"]
+            yield f"{name} of nulls", math.log(row["value"] / true), math.log(high / low) / (2 * NORMAL)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("rounds", nargs="+", type=Path, metavar="DIR")
+    rows: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    for path in (p for folder in parser.parse_args(arguments).rounds for p in sorted(folder.glob("cases/*.json"))):
+        case = json.loads(path.read_text())
+        for found in (amplitudes, numbers):
+            for name, error, std in found(case["truth"], case["answer"]):
+                rows[name].append((error, std))
+    print("| of | number | mean error |" + "".join(f" held, with {100 * s:.0f} % |" for s in SHARES))
+    print("| --- |" + " --- |" * (2 + len(SHARES)))
+    for name, each in rows.items():
+        held = [sum(abs(e) < NORMAL * math.hypot(s, share) for e, s in each) / len(each) for share in SHARES]
+        mean = sum(e for e, _ in each) / len(each)
+        print(f"| {name} | {len(each)} | {100 * mean:+.1f} % |" + "".join(f" {100 * h:.0f} % |" for h in held))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
