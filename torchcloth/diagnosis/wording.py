@@ -56,8 +56,8 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
             out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
     if content["causes"]:
         out.append(
-            "These intervals know of noise, meshes, how far motions disagree, and 3 % that may be wrong in all alike, as "
-            "of another engine's cloth; of a real one that may be more."
+            "These intervals know of noise, meshes, how far motions disagree, and 3 % for what is wrong in all alike, "
+            "as between two engines: of real cloth that may be more."
         )
     words = {
         "identified": "Each cause that is named stands alone: nothing else that was asked about does the same.",
