@@ -23,7 +23,7 @@ from torchcloth.diagnosis.trials import (
     known,
     standard_errors,
 )
-from torchcloth.diagnosis.verdict import _parameters
+from torchcloth.diagnosis.verdict import _error, _parameters
 from torchcloth.diagnosis.world import Model
 
 
@@ -197,3 +197,17 @@ def test_a_numbers_interval_knows_of_what_motions_disagree_by():
     assert width["p1"] == pytest.approx(math.hypot(student, 0.03 * values[1]))
     assert width["p1"] > 3 * float(noise[1])
     assert all(width[f"p{k}"] >= float(noise[k]) - 1e-12 for k in range(2))
+
+
+def test_an_error_is_the_noises_where_motions_agree_and_says_how_many_tell():
+    ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.zeros(2).double(), 0)
+    share = (1.0, 1.0, 0.0, 0.0)  # two of four motions tell of the second number, all of the first
+    scale = lambda c, s: torch.stack([c.jacobian[:, 0], s * c.jacobian[:, 1]], 1)  # noqa: E731
+    cells = [c._replace(jacobian=scale(c, s), value=0 * c.value) for c, s in zip(ev.cells, share, strict=True)]
+    found = toys.fitted(replace(ev, cells=cells))
+    noise = found.covariance.diagonal().sqrt()
+    for place, few in ((0, False), (1, True)):
+        own, both, told = _error(SimpleNamespace(end=found), place, list("abcd"), ())  # type: ignore[arg-type]
+        assert own == pytest.approx(float(noise[place]))
+        assert both == pytest.approx(own, rel=0.3)
+        assert (told < 2.2) == few

@@ -278,7 +278,14 @@ def test_more_scatter_within_cells_is_no_gain():
     """Of two models that leave the same residuals neither is the likelier, however their points scatter."""
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
     cells = [
-        c._replace(spread=1.1 * c.spread, count=c.count - 1, rough=c.rough + 1e-4, ray=c.ray + 0.2, time=c.time + 0.01)
+        c._replace(
+            spread=1.1 * c.spread,
+            count=c.count - 1,
+            rough=c.rough + 1e-4,
+            ray=c.ray + 0.2,
+            time=c.time + 0.01,
+            place=1.1 * c.place,
+        )
         for c in ev.cells
     ]
     groups, one, other = ["x", "y", "x", "y"], toys.fitted(ev), toys.fitted(replace(ev, cells=cells))

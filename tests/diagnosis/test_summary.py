@@ -120,6 +120,10 @@ def test_a_cause_whose_interval_holds_zero_says_what_is_known_of_its_size(low):
     said = summary("identified", causes=[cause | {"where": {"gripper": "left"}}], motions=["stretch"])
     told = [line for line in said if "2.0 motions' worth" in line and "would be 12.4 to 14.6" in line]
     assert bool(told) == (low < 0)
+    cause |= {"where": {"gripper": "left"}, "noise_ci95": [-1.0, 28.0]}
+    said = summary("identified", causes=[cause], motions=["stretch"])
+    assert any("leave its size open" in line for line in said) == (low < 0)
+    assert not any("disagree about its size" in line for line in said)
 
 
 def test_what_would_have_the_wrong_sign_is_told_from_what_is_small():

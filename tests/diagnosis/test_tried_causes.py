@@ -117,3 +117,12 @@ def test_a_signed_cause_is_tried_both_ways(world):
     assert not ends.reverses
     check_own([ends], model.base, setting.episodes)
     assert replace(own, low=-0.3).opposite.typical == -0.3
+
+
+def test_a_way_that_no_world_has_hides_nothing_of_the_other(world):
+    """A damping less than none is refused by the library; a factor is none of a cause all the same."""
+    _, model, setting = world
+    apply, said = WRONG["a factor"]
+    for signed in (False, True):
+        with pytest.raises(InvalidInput, match=said):
+            check_own([Hypothesis("my.own", "-", 2.0, apply, signed=signed)], model.base, setting.episodes)

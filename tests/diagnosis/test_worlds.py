@@ -211,6 +211,10 @@ def test_slopes_along_wind_know_nothing_of_the_drag_that_it_brings(made):
     torch.testing.assert_close(slope(wind), 0.5 * (there + back), rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(slope(wind.opposite), slope(wind), rtol=1e-9, atol=1e-12)
     assert (there - back).norm() > 0.1 * (there + back).norm()
+    ends = replace(wind, low=-0.5 * wind.typical)  # what cannot be reversed as a whole is asked about as it is
+    torch.testing.assert_close(
+        gather(model, setting, [ends]).cells[0].jacobian[:, known.own], there, rtol=1e-9, atol=1e-12
+    )
 
 
 def test_steps_end_at_bounds_and_slopes_know_it(made):

@@ -10,7 +10,7 @@ import json
 import math
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +24,19 @@ THICK = 1e-3  # m, of all sheets
 NORMAL = 1.96
 
 
+def apart(answer: dict[str, Any], ends: Sequence[float], number: float) -> float:
+    """The standard error without the share that answers have had since they have one."""
+    low, high = ends
+    return max(((high - low) / (2 * NORMAL)) ** 2 - (answer.get("common_error", 0.0) * number) ** 2, 0.0) ** 0.5
+
+
 def amplitudes(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
     """("amplitude", error, standard error) of each that is named outright, over what is hidden."""
     asked = scores.wanted(truth)
     for cause, wanted in zip(scores._matched(scores.named(answer), asked), asked, strict=True):
         if cause is not None and cause.best in wanted.names and wanted.comparable:
-            low, high = cause.ci95
-            yield (
-                "amplitudes",
-                cause.amplitude / wanted.amplitude - 1,
-                (high - low) / (2 * NORMAL * abs(wanted.amplitude)),
-            )
+            std = apart(answer, cause.ci95, cause.amplitude) / abs(wanted.amplitude)
+            yield "amplitudes", cause.amplitude / wanted.amplitude - 1, std
 
 
 def numbers(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
@@ -44,8 +46,8 @@ def numbers(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str
     for name, own in FABRIC.items():
         if (row := answer.get("parameters", {}).get(name)) is not None:
             true = truth["fabric"][own or name] / (THICK if name == "youngs_modulus" else 1.0)
-            low, high = row["ci95"]
-            yield f"{name} of nulls", math.log(row["value"] / true), math.log(high / low) / (2 * NORMAL)
+            ends = [math.log(end) for end in row["ci95"]]
+            yield f"{name} of nulls", math.log(row["value"] / true), apart(answer, ends, 1.0)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -58,6 +60,9 @@ def main(arguments: list[str] | None = None) -> int:
         for found in (amplitudes, numbers):
             for name, error, std in found(case["truth"], case["answer"]):
                 rows[name].append((error, std))
+    if not rows:
+        print("no answer to be compared in any cases/*.json of these folders", file=sys.stderr)
+        return 2
     print("| of | number | mean error |" + "".join(f" held, with {100 * s:.0f} % |" for s in SHARES))
     print("| --- |" + " --- |" * (2 + len(SHARES)))
     for name, each in rows.items():

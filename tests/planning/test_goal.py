@@ -100,9 +100,12 @@ def test_pieces_that_the_cloth_has_not_are_refused(goal, said):
 @pytest.mark.parametrize(
     ("how", "said"),
     [
-        ({"uv": torch.zeros(2, 2), "vertices": torch.zeros(2)}, "uv and vertices"),
+        ({"uv": torch.zeros(2, 2), "vertices": torch.arange(2)}, "uv and vertices"),
         ({"uv": torch.zeros(3, 2)}, r"uv of the goal.*\[2, 2\]"),
-        ({"vertices": torch.zeros(3)}, "vertices of the goal"),
+        ({"vertices": torch.zeros(3, dtype=torch.int64)}, "vertices of the goal"),
+        ({"vertices": torch.zeros(2)}, "vertices of the goal.*whole"),
+        ({"vertices": torch.tensor([True, False])}, "vertices of the goal.*whole"),
+        ({"uv": "corners"}, "uv of the goal"),
     ],
 )
 def test_pieces_that_are_none_are_refused(how, said):
@@ -129,7 +132,7 @@ def test_files(tmp_path):
     lines = [f"v {x} {y} {z}" for x, y, z in MESH.vertices] + [f"f {a} {b} {c}" for a, b, c in MESH.faces + 1]
     (tmp_path / "mesh.obj").write_text("\n".join(lines) + "\n")
     assert read_goal(tmp_path / "mesh.obj").faces.shape == FACES.shape
-    assert not read_goal(tmp_path / "mesh.obj").of_pieces
+    assert read_goal(tmp_path / "mesh.obj").vertices is None
 
 
 def test_files_of_pieces(tmp_path):
@@ -141,7 +144,15 @@ def test_files_of_pieces(tmp_path):
         found = read_goal(tmp_path / "pieces.npz", pieces)
         assert np.allclose(found.points, points)
         assert np.allclose(found.uv, points[:, :2])
-    np.save(tmp_path / "cloud.npy", points)
+    np.savez(tmp_path / "both.npz", x=np.stack([points, points + 1]), uv=points[:, :2], faces=np.array([[0, 1, 2]]))
+    assert np.allclose(read_goal(tmp_path / "both.npz").uv, points[:, :2])
+    assert np.allclose(read_goal(tmp_path / "both.npz").points, points + 1)
+    lines = [f"v {x} {y} {z}" for x, y, z in MESH.vertices] + [f"vt {u} {v}" for u, v in MESH.uv]
+    lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in MESH.faces + 1]
+    (tmp_path / "mesh.obj").write_text("\n".join(lines) + "\n")
+    assert np.allclose(read_goal(tmp_path / "mesh.obj", pieces=True).uv, MESH.uv)
+    np.save(tmp_path / "cloud.npy", points[::-1])
+    assert np.allclose(Goal(points[::-1]).points, points[::-1])
     with pytest.raises(InvalidInput, match="nobody knows the piece"):
         read_goal(tmp_path / "cloud.npy", pieces=True)
 

@@ -14,6 +14,7 @@ from torchcloth.diagnosis.hypotheses import known
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import cloth_from, episode
 from torchcloth.identification.replays import Replay
+from torchcloth.identification.streams import on_pattern
 from torchcloth.planning import Goal
 from torchcloth.planning.rehearsal import Rehearsal, plain
 from torchcloth.planning.staging import courses_of
@@ -241,6 +242,32 @@ def test_a_patch_that_a_diagnosis_moved_is_carried_over_once():
         data = replace(episode(model.base.cloth, recording, 20.0), times=run.times)
         plain_world = model.world().frames(data).x
         assert torch.allclose(seen[:-1], plain_world[:-1], atol=1e-4)
+
+
+def test_pieces_are_those_of_the_cloth_whatever_a_grip_really_holds():
+    """A patch that a diagnosis moved stretches the world's pattern there, and nothing that is seen."""
+    recording = by_hand()
+    named = {h.name: h for h in known()}
+    models = [base_model(recording), base_model(recording).plus(named["robot.regrasp"], 0.012)]
+    uv = recording.cloth.uv[::7]
+    courses = courses_of(models[0].base.cloth, recording, 2, 0.0, ACCELERATION, Limits())
+    for model in models:
+        run = Rehearsal(model, recording, courses, None)
+        x = run.run({c.name: c.trajectory(c.nothing) for c in courses})[-1]
+        own = on_pattern(cloth_from(recording).mesh, uv).on(x)
+        task = Task([run], courses, Goal(own, uv=torch.as_tensor(uv)), None, None)
+        assert float(task.aims[0].distance(x)) < 1e-9
+
+
+def test_a_goal_of_another_cloth_leaves_the_journal_of_this_one(tmp_path):
+    recording = by_hand()
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "own.txt").write_text("stays")
+    before = sorted(tmp_path.rglob("*"))
+    beyond = Goal(torch.zeros(1, 3), uv=torch.tensor([[9.0, 0.0]]))
+    with pytest.raises(InvalidInput, match="off the cloth"):
+        tc.plan(cloth_of(recording), recording, beyond, journal=tmp_path / "kept", resume=False)
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_in_float32_too():

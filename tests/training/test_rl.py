@@ -60,6 +60,10 @@ def test_of_an_episode_it_is_what_is_planned_in():
     assert env.task.look(env.task.start) == wanted.look(wanted.start)
     with pytest.raises(InvalidInput, match="waypoints"):
         ReachEnv.of(cloth, recording, wanted.goal, waypoints=0)
+    with pytest.raises(InvalidInput, match="one Cloth"):
+        ReachEnv.of([cloth, cloth], recording, wanted.goal)
+    with pytest.warns(UserWarning, match="in one world"):
+        ReachEnv.of(cloth, recording, Goal(wanted.goal.points + 30.0))
 
 
 def test_step_by_step_the_cloth_goes_where_the_whole_motion_brings_it():

@@ -114,7 +114,8 @@ def _of_their_own(model: Model, hypotheses: Sequence[Hypothesis]) -> list[Hypoth
 
 def _with_opposites(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Asked about both ways where a cause brings another one along, which is the same either way."""
-    return [*hypotheses, *(h.opposite for h in hypotheses if h.brings and h.opposite not in hypotheses)]
+    both = [h for h in hypotheses if h.brings and h.opposite.typical == -h.typical]
+    return [*hypotheses, *(h.opposite for h in both if h.opposite not in hypotheses)]
 
 
 def _odd(evidence: Evidence, asked: Sequence[Hypothesis]) -> Evidence:

@@ -28,10 +28,10 @@ from .trials import NORMAL, Step, between_motions
 from .wording import sentences, warnings_of
 from .world import Hypothesis, Model
 
-ALIKE = (
-    0.03  # of a number, standard deviation: what is wrong in all motions alike, by sealed answers about another engine
+COMMON = (
+    0.03  # of a number, standard deviation: what is wrong in all motions alike, by sealed answers on another engine
 )
-NEAR = 1e-4  # of a coordinate, for its value's slope
+NUDGE = 1e-4  # of a coordinate, for its value's slope
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 
@@ -119,6 +119,7 @@ def judge(
         "residual": None if residual is None else residual.as_dict(),
         "next_experiment": None,
         "parameters": _parameters(found, names),
+        "common_error": COMMON,
         "warnings": warnings_of(found, names, left),
         "motions": list(names),
     }
@@ -166,7 +167,7 @@ def _given(found: Found, names: Sequence[str]) -> list[dict[str, Any]]:
     for h in given:
         place = model.place(h.name)
         amplitude = model.amplitudes[place]
-        error = NORMAL * math.hypot(std[first + place], ALIKE * amplitude)
+        error = NORMAL * _with_common(std[first + place], amplitude)
         out.append({**_told(h, amplitude), "ci95": [amplitude - error, amplitude + error]})
     return out
 
@@ -176,7 +177,7 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
     place, amplitude = found.end.model.place(h.name), found.amplitude(step)
     noise, std, told = _error(found, count + place, names, best.alone)
     noise, std = (math.hypot(error, best.row.bias) for error in (noise, std))
-    std = math.hypot(std, ALIKE * amplitude)
+    std = _with_common(std, amplitude)
     kin = [r.hypothesis.name for r in found.unseen(step)]
     rivals = found.rivals(step)
     kin += [c.hypothesis.name for c in rivals if fitted_alike(best.fitted, c.fitted, step.noise)]
@@ -216,6 +217,10 @@ def _error(found: Found, place: int, names: Sequence[str], alone: Collection[str
         return own, own, motions
     wider = float(stdtrit(max(count - 1.0, 1.0), 0.975)) / NORMAL
     return own, max(own, wider * float(spread(found.end, names, alone)[1][place])), motions
+
+
+def _with_common(std: float, number: float) -> float:
+    return math.hypot(std, COMMON * number)
 
 
 def _share(found: Found, gain: Gain) -> float | None:
@@ -265,8 +270,8 @@ def _floor(found: Found) -> dict[str, Any]:
 def _parameters(found: Found, names: Sequence[str]) -> dict[str, Any]:
     model, out = found.end.model, {}
     for p, c, s in zip(model.parameters, model.values.tolist(), _errors(found, names).tolist(), strict=False):
-        value, slope = p.value(c), (p.value(c + NEAR) - p.value(c - NEAR)) / (2 * NEAR)
-        wide = NORMAL * math.hypot(s, ALIKE * value / slope)
+        value, slope = p.value(c), (p.value(c + NUDGE) - p.value(c - NUDGE)) / (2 * NUDGE)
+        wide = NORMAL * _with_common(s, value / slope)
         ends = (p.value(min(max(end, p.low), p.high)) for end in (c - wide, c + wide))
         out[p.name] = {"value": value, "ci95": sorted(ends), "unit": p.unit}
     return out

@@ -136,6 +136,8 @@ def _hardly_sized(c: dict[str, Any]) -> list[str]:
     if c["ci95"][0] * c["ci95"][1] > 0:
         return []
     low, high = c["noise_ci95"]
+    if low * high <= 0:
+        return ["  That it is there is surer than how large it is: noise and meshes leave its size open."]
     return [
         f"  That it is there is surer than how large it is: {c['told_by']:.1f} motions' worth of data tell of it, "
         f"and parts of these disagree about its size. By noise and meshes alone it would be {low:.4g} to {high:.4g}."

@@ -41,9 +41,9 @@ class Goal:
     vertices: Tensor | None = None
 
     def __post_init__(self) -> None:
-        kind = torch.get_default_dtype()
-        points, uv = _numbers(self.points, kind), _numbers(self.uv, kind)
-        faces, vertices = _numbers(self.faces, torch.int64), _numbers(self.vertices, torch.int64)
+        points, uv = _numbers(self.points, "points of the goal"), _numbers(self.uv, "uv of the goal")
+        faces = _numbers(self.faces, "faces of the goal", whole=True)
+        vertices = _numbers(self.vertices, "vertices of the goal", whole=True)
         if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points) or not _finite(points):
             got = (
                 "none"
@@ -64,18 +64,22 @@ class Goal:
         for name, value in (("points", points), ("faces", faces), ("uv", uv), ("vertices", vertices)):
             object.__setattr__(self, name, value)
 
-    @property
-    def of_pieces(self) -> bool:
-        """It says where each of some pieces shall be."""
-        return self.uv is not None or self.vertices is not None
 
-
-def _numbers(given: Any, kind: torch.dtype) -> Tensor | None:
+def _numbers(given: Any, name: str, whole: bool = False) -> Tensor | None:
+    """Tensor of the default dtype, or of int64 of what is ``whole``."""
     try:
-        return None if given is None else torch.as_tensor(given).detach().to(kind)
+        if given is None:
+            return None
+        found = torch.as_tensor(given if isinstance(given, Tensor) else np.array(given)).detach()
+        if whole and (found.is_floating_point() or found.dtype == torch.bool):
+            raise TypeError
+        return found.to(torch.int64 if whole else torch.get_default_dtype())
     except (TypeError, ValueError, RuntimeError):
-        expected, remedy = "[N, 3] metres, a tensor or an array", "of a file or an episode: planning.read_goal(path)"
-        raise InvalidInput("goal", got=f"{given!r:.60}", expected=expected, remedy=remedy) from None
+        expected = "whole numbers" if whole else "numbers in metres"
+        remedy = "of a file or an episode: planning.read_goal(path)"
+        raise InvalidInput(
+            name, got=f"{given!r:.60}", expected=f"{expected}, a tensor or an array", remedy=remedy
+        ) from None
 
 
 def _finite(numbers: Tensor) -> bool:
@@ -87,8 +91,9 @@ def read_goal(path: str | Path, pieces: bool = False) -> Goal:
 
     Args:
         path: see ``EXPECTED``.
-        pieces: it says where each piece of the cloth shall be: a mesh or a pose by its vertices, which are those of the
-            cloth's mesh; an episode by its last markers. Of ``.npz`` files with ``uv`` always.
+        pieces: it says where each piece of the cloth shall be: a mesh by its pattern coordinates, one without and a
+            pose by vertices, which are those of the cloth's mesh; an episode by its last markers. Of ``.npz`` files
+            with ``uv`` always.
 
     Raises:
         InvalidInput: nothing that shows where a cloth, or each piece of it, is.
@@ -110,15 +115,18 @@ def read_goal(path: str | Path, pieces: bool = False) -> Goal:
     own = lambda x: torch.arange(len(x)) if pieces else None  # noqa: E731
     if kind in (".obj", ".ply"):
         mesh = load(path)
+        if pieces and mesh.uv is not None:  # vertices of the cloth's mesh may have been moved to where a grasp ends
+            return Goal(torch.as_tensor(mesh.vertices), uv=torch.as_tensor(mesh.uv))
         return Goal(torch.as_tensor(mesh.vertices), torch.as_tensor(mesh.faces), vertices=own(mesh.vertices))
     try:
         found = np.load(path, allow_pickle=False)
         if kind == ".npy":
             return Goal(torch.as_tensor(np.asarray(found, dtype=float)))
         x = np.asarray(found["x"], dtype=float)
-        if "faces" not in found:
+        x = x[-1] if x.ndim == 3 else x
+        if "uv" in found:
             return Goal(torch.as_tensor(x), uv=torch.as_tensor(np.asarray(found["uv"], dtype=float)))
-        return Goal(torch.as_tensor(x[-1]), torch.as_tensor(found["faces"]), vertices=own(x[-1]))
+        return Goal(torch.as_tensor(x), torch.as_tensor(found["faces"]), vertices=own(x))
     except InvalidInput:
         raise
     except Exception as error:  # a damaged archive can raise almost anything

@@ -18,6 +18,7 @@ from ..recordings import Recording
 from ..recordings.together import check_recording
 from ..robots import ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
+from .aim import aim_at
 from .clearance import clearance_of
 from .courses import Course
 from .goal import Goal
@@ -57,15 +58,17 @@ def posed(
     check_recording(recording)
     _check(asked)
     models = _models(model)
-    aim = goal if isinstance(goal, Goal) else Goal(goal)
+    wanted = goal if isinstance(goal, Goal) else Goal(goal)
+    for m in models:
+        aim_at(wanted, m.base.cloth.mesh)  # refuses what is not of this cloth before anything is simulated
     cloth = models[0].base.cloth
     courses = courses_of(cloth, recording, asked.waypoints, asked.wait, asked.acceleration, asked.limits)
     courses = [course(c) for c in courses]
     rehearsals = [Rehearsal(m, recording, courses, asked.dt) for m in models]
-    warnings = [*doubts(recording, courses), *_check_goal(aim, rehearsals[0])]
-    judge, doubt = clearance_of(recording, courses, aim.points, asked.clearance)
-    kept = None if journal is None else Journal(journal, _problem(rehearsals, aim, courses), resume)
-    return Task(rehearsals, courses, aim, judge, kept), [*warnings, *([doubt] if doubt else [])]
+    warnings = [*doubts(recording, courses), *_check_goal(wanted, rehearsals[0])]
+    judge, doubt = clearance_of(recording, courses, wanted.points, asked.clearance)
+    kept = None if journal is None else Journal(journal, _problem(rehearsals, wanted, courses), resume)
+    return Task(rehearsals, courses, wanted, judge, kept), [*warnings, *([doubt] if doubt else [])]
 
 
 def _check(asked: Asked) -> None:

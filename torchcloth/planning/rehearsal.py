@@ -35,7 +35,8 @@ class Rehearsal:
     def __init__(self, model: Model, recording: Recording, courses: Sequence[Course], dt: float | None) -> None:
         self.world, self.dt = model.world(), dt
         self.world.cloth.requires_grad_(False)
-        self.faces = torch.as_tensor(self.world.cloth.mesh.faces)
+        self.mesh = model.base.cloth.mesh  # on which an observer has it, whatever patches a grip really holds
+        self.faces = torch.as_tensor(self.mesh.faces)
         seen = episode(model.base.cloth, recording, RATE)  # which a world may carry over to a mesh of its own
         span, last = courses[0].span, float(courses[0].t[-1])
         count = max(1, round((last - span.begin) * RATE))

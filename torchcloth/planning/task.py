@@ -44,7 +44,7 @@ class Task:
     ) -> None:
         self.rehearsals, self.courses, self.goal = rehearsals, courses, goal
         self.bounds, self._clearance, self._journal = Bounds.of(courses), clearance, journal
-        self.aims = [aim_at(goal, r.world.cloth.mesh) for r in rehearsals]
+        self.aims = [aim_at(goal, r.mesh) for r in rehearsals]
         self.start = torch.cat([c.nothing.flatten() for c in courses])
         self.metric = self._metric()
 

@@ -7,6 +7,7 @@ step (quintic, at rest at both ends) within its own stretch of time.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -16,13 +17,15 @@ import torch
 from torch import Tensor
 
 from torchcloth.cloth import Cloth
-from torchcloth.errors import MissingDependency, SimulationDiverged
+from torchcloth.errors import InvalidInput, MissingDependency, SimulationDiverged
 from torchcloth.planning import Goal
 from torchcloth.planning.courses import Course, Span
 from torchcloth.planning.feasible import step_within
 from torchcloth.planning.posing import Asked, posed
 from torchcloth.planning.task import Task
 from torchcloth.recordings import Recording
+from torchcloth.robots import ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/
+from torchcloth.robots.primitives import Limits  # pyright: ignore[reportMissingImports]
 
 try:
     import gymnasium
@@ -89,16 +92,32 @@ class ReachEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.count,), np.float32)
 
     @classmethod
-    def of(cls, cloth: Cloth, recording: Recording, goal: Goal | Tensor, **asked: Any) -> ReachEnv:
-        """The scene of ``tc.plan(cloth, recording, goal, ...)``, with one decision for each waypoint.
-
-        Args:
-            asked: ``waypoints``, ``wait``, ``acceleration``, ``limits``, ``clearance`` and ``dt``, as there.
+    def of(
+        cls,
+        cloth: Cloth,
+        recording: Recording,
+        goal: Goal | Tensor,
+        *,
+        waypoints: int = 4,
+        wait: float = 0.3,
+        acceleration: float = ACCELERATION,
+        limits: Limits = Limits(),  # noqa: B008 - a tuple
+        clearance: float = 0.02,
+        dt: float | None = None,
+    ) -> ReachEnv:
+        """The scene of ``tc.plan`` with the same arguments, with one decision for each waypoint; doubts are warnings.
 
         Raises:
-            InvalidInput, RecordingError: as there.
+            InvalidInput: no cloth, or as ``tc.plan``.
+            RecordingError: as there.
         """
-        return cls(posed(cloth, recording, goal, Asked(**asked), course=stepwise)[0])
+        if not isinstance(cloth, Cloth):
+            raise InvalidInput("cloth", got=type(cloth).__name__, expected="one Cloth")
+        asked = Asked(waypoints, wait, acceleration, limits, clearance, dt)
+        task, doubts = posed(cloth, recording, goal, asked, course=stepwise)
+        for doubt in doubts:
+            warnings.warn(doubt, stacklevel=2)
+        return cls(task)
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None):
         """The cloth at rest where it is first."""
