@@ -28,9 +28,7 @@ from .trials import NORMAL, Step, between_motions
 from .wording import sentences, warnings_of
 from .world import Hypothesis, Model
 
-COMMON = (
-    0.03  # of a number, standard deviation: what is wrong in all motions alike, by sealed answers on another engine
-)
+COMMON = 0.03  # of a number, standard deviation: what is wrong in all motions alike, by sealed answers
 NUDGE = 1e-4  # of a coordinate, for its value's slope
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]

@@ -119,7 +119,7 @@ def aim_at(goal: Goal, mesh: Mesh) -> AbstractAim:
         InvalidInput: pieces that this cloth has not.
     """
     if goal.uv is not None:
-        return PiecesAim(goal.points, on_pattern(mesh, goal.uv.numpy(), "uv of the goal"))
+        return PiecesAim(goal.points, on_pattern(mesh, goal.uv.cpu().numpy(), "uv of the goal"))
     if goal.vertices is None:
         return SurfaceAim(goal.points, goal.faces, torch.as_tensor(mesh.faces))
     if goal.faces is not None and not torch.equal(goal.faces, torch.as_tensor(mesh.faces).long()):

@@ -45,22 +45,19 @@ class Goal:
         faces = _numbers(self.faces, "faces of the goal", whole=True)
         vertices = _numbers(self.vertices, "vertices of the goal", whole=True)
         if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points) or not _finite(points):
-            got = (
-                "none"
-                if points is None
-                else f"shape {tuple(points.shape)}" + ("" if _finite(points) else ", not all finite")
-            )
-            raise InvalidInput("points of the goal", got=got, expected="[N, 3] finite metres, N >= 1")
+            raise InvalidInput("points of the goal", got=_told(points), expected="[N, 3] finite metres, N >= 1")
         if faces is not None:
             check_triangles(faces, len(points))
         if uv is not None and vertices is not None:
             raise InvalidInput("goal", got="uv and vertices", expected="one of them")
         if uv is not None and (uv.shape != (len(points), 2) or not _finite(uv)):
-            got = f"shape {tuple(uv.shape)}" + ("" if _finite(uv) else ", not all finite")
-            raise InvalidInput("uv of the goal", got=got, expected=f"[{len(points)}, 2] finite metres on the pattern")
+            raise InvalidInput(
+                "uv of the goal", got=_told(uv), expected=f"[{len(points)}, 2] finite metres on the pattern"
+            )
         if vertices is not None and vertices.shape != (len(points),):
-            got, expected = f"shape {tuple(vertices.shape)}", f"[{len(points)}], one for each point"
-            raise InvalidInput("vertices of the goal", got=got, expected=expected)
+            raise InvalidInput(
+                "vertices of the goal", got=_told(vertices), expected=f"[{len(points)}], one for each point"
+            )
         for name, value in (("points", points), ("faces", faces), ("uv", uv), ("vertices", vertices)):
             object.__setattr__(self, name, value)
 
@@ -80,6 +77,12 @@ def _numbers(given: Any, name: str, whole: bool = False) -> Tensor | None:
         raise InvalidInput(
             name, got=f"{given!r:.60}", expected=f"{expected}, a tensor or an array", remedy=remedy
         ) from None
+
+
+def _told(numbers: Tensor | None) -> str:
+    if numbers is None:
+        return "none"
+    return f"shape {tuple(numbers.shape)}" + ("" if _finite(numbers) else ", not all finite")
 
 
 def _finite(numbers: Tensor) -> bool:
