@@ -13,12 +13,10 @@ from torchcloth.diagnosis import air, fabric, grip, observer
 from torchcloth.diagnosis.base_model import SILENT, base_model
 from torchcloth.diagnosis.cells import NAMES as NAMES_OF_DATA
 from torchcloth.diagnosis.cells import SEEN, _averaged, _places, cells_of
-from torchcloth.diagnosis.evidence import asked_about, gather
 from torchcloth.diagnosis.hypotheses import catalogue, forget, register
 from torchcloth.diagnosis.model_file import load_model, save_model
 from torchcloth.diagnosis.refined import refined
 from torchcloth.diagnosis.setting import LATE, MOST, motions_of, setting_of
-from torchcloth.diagnosis.steps import one_way, step_sizes
 from torchcloth.diagnosis.wording import on_top
 from torchcloth.diagnosis.world import Hypothesis
 from torchcloth.effects import AirDrag
@@ -152,88 +150,6 @@ def test_a_repetition_is_of_the_motion_that_it_repeats(tmp_path):
     assert motions_of(every) == ["a", "a", "swing", "swing", "episode 4"]
 
 
-def test_what_a_parameter_does_already_has_its_slopes(made):
-    """By the share of its value, wherever that is; it is not simulated."""
-    model, setting = made
-    by, place = {h.name: h for h in catalogue(model, [RECORDING])}, [p.name for p in model.parameters]
-    there = model.at(torch.full_like(model.point, 0.1))
-    asked = [by["mass.density"], by["air.drag_n"]]
-    at_once, before = gather(there, setting, asked), gather(there, setting)
-    later = asked_about(before, there, setting, asked)
-    for found in (at_once, later):
-        assert [h.name for h in found.hypotheses] == ["air.drag_n", "mass.density"]
-        slopes = found.cells[0].jacobian
-        own = slopes[:, place.index("areal_density")]
-        torch.testing.assert_close(slopes[:, found.own + 1], own, rtol=2e-3, atol=0)  # of a logarithm, by differences
-        assert float(own.abs().max()) > 0
-
-
-def test_what_no_world_can_have_is_not_asked_about(made):
-    """A patch of 15 mm that is 17 mm further along holds nothing at the edge."""
-    model, setting = made
-    (drag,) = (h for h in catalogue(model, [RECORDING]) if h.name == "air.drag_n")
-
-    def nowhere(world, amplitude):
-        raise InvalidInput("grasp", got="no vertex", expected="a patch with vertices")
-
-    far, unseen = (replace(drag, name=name, apply=nowhere) for name in ("user.far", "user.unseen"))
-    found = gather(model, setting, [far, drag, unseen])
-    assert [h.name for h in found.hypotheses] == ["air.drag_n"]
-    assert torch.equal(found.cells[0].jacobian, gather(model, setting, [drag]).cells[0].jacobian)
-
-
-def test_who_asks_later_is_told_the_same(made):
-    model, setting = made
-    asked = [
-        h for h in catalogue(model, [RECORDING]) if h.name in ("bend.aniso", "air.drag_n", "obs.clock", "mass.hem")
-    ]
-    at_once, known = gather(model, setting, asked), gather(model, setting, asked[:1])
-    later = asked_about(known, model, setting, asked)
-    assert [h.name for h in later.hypotheses] == [h.name for h in at_once.hypotheses]
-    for a, b in zip(at_once.cells[0], later.cells[0], strict=True):
-        assert torch.equal(a, b)
-
-
-def test_slopes_along_wind_know_nothing_of_the_drag_that_it_brings(made):
-    """It brakes whichever way the wind blows: of one sign it would be in the slope, of the other against it."""
-    model, setting = made
-    (wind,) = (h for h in catalogue(model, [RECORDING]) if h.name == "air.wind[x]")
-    alone, known = replace(wind, brings=""), gather(model, setting)
-
-    def slope(h):
-        found = gather(model, setting, [h])
-        assert found.hypotheses == [h]
-        later = asked_about(known, model, setting, [h])
-        torch.testing.assert_close(later.cells[0].jacobian, found.cells[0].jacobian, rtol=1e-9, atol=1e-12)
-        return found.cells[0].jacobian[:, found.own]
-
-    there, back = slope(alone), slope(alone.opposite)
-    torch.testing.assert_close(slope(wind), 0.5 * (there + back), rtol=1e-9, atol=1e-12)
-    torch.testing.assert_close(slope(wind.opposite), slope(wind), rtol=1e-9, atol=1e-12)
-    assert (there - back).norm() > 0.1 * (there + back).norm()
-    ends = replace(wind, low=-0.5 * wind.typical)  # what cannot be reversed as a whole is asked about as it is
-    torch.testing.assert_close(
-        gather(model, setting, [ends]).cells[0].jacobian[:, known.own], there, rtol=1e-9, atol=1e-12
-    )
-
-
-def test_steps_end_at_bounds_and_slopes_know_it(made):
-    """Poisson's ratio at its largest value: a step on from there is none, one back tells."""
-    model, setting = made
-    place = [p.name for p in model.parameters].index("poisson_ratio")
-    end = model.at(model.point + 9.0 * torch.eye(len(model.point)).double()[place])
-    step = model.parameters[place].step
-    assert one_way(end) == [(k, -s if k == place else s) for k, s in step_sizes(end)]
-    near, _, back = (
-        gather(end, setting, (), shifts=[(place, s * step)]).cells[0].jacobian[:, 0] for s in (0.5, 1.0, -1.0)
-    )
-    assert not near.any()
-    assert back.any()
-    short = end.at(end.point - 0.25 * step * torch.eye(len(end.point)).double()[place])
-    on, off = (gather(short, setting, (), shifts=[(place, s * step)]).cells[0].jacobian[:, 0] for s in (1.0, 0.25))
-    assert torch.allclose(on, off, rtol=1e-9, atol=0.0)  # both end at the bound, and are divided by the way to there
-
-
 def test_a_data_sheet_without_bending_is_asked_nothing_about_it():
     sheet = {k: v for k, v in RECORDING.cloth.nominal.items() if not k.startswith("bending")}
     bare = replace(RECORDING, cloth=replace(RECORDING.cloth, nominal=sheet))
@@ -362,37 +278,6 @@ def test_a_finer_mesh_is_the_same_cloth(made):
     assert recording.cloth.initial_vertices[25:].mean(0) == pytest.approx(
         RECORDING.cloth.initial_vertices.mean(0), abs=0.01
     )
-
-
-def test_slopes_are_those_of_finite_steps(made):
-    model, setting = made
-    found = gather(model, setting, [h for h in catalogue(model, [RECORDING]) if h.name == "obs.extrinsic[y]"])
-    points = found.cells[0].block == 0
-    slope = found.cells[0].jacobian[points, found.own]
-    assert float(slope.abs().median()) == pytest.approx(1.0, abs=0.05)  # the sheet faces y
-
-
-def test_slopes_along_parameters_are_central_and_their_disagreement_is_rough(made):
-    """At the end of a coordinate one side is all there is, and says nothing of roughness."""
-    model, setting = made
-    steps, last = [p.step for p in model.parameters], len(model.parameters) - 1
-    model = model.at(model.point + 2 * steps[last] * torch.eye(last + 1)[last])  # stiffening, off its end
-    shifts = [(k, sign * step) for k, step in enumerate(steps) for sign in (1.0, -1.0)]
-    raw, found = gather(model, setting, shifts=shifts), gather(model, setting)
-    (one,), (cells,) = raw.cells, found.cells
-    up, down = one.jacobian[:, 0 : raw.own : 2], one.jacobian[:, 1 : raw.own : 2]
-    assert (raw.own, found.own) == (2 * len(steps), len(steps))
-    shrunk, central = cells.jacobian[:, : found.own].abs(), 0.5 * (up + down).abs()
-    assert (shrunk <= central).all()
-    assert (shrunk >= 0.9 * central).all(), "this sheet hardly ripples"
-    torch.testing.assert_close(cells.rough, (0.5 * torch.tensor(steps) * (up - down)).norm(dim=1))
-    assert not one.rough.any()
-    ended = replace(
-        model, parameters=(*model.parameters[:-1], replace(model.parameters[-1], low=float(model.values[-1])))
-    )
-    (sided,) = gather(ended, setting).cells
-    torch.testing.assert_close(sided.jacobian[:, last], up[:, last])
-    assert (sided.rough <= cells.rough + 1e-15).all()
 
 
 def test_a_hypothesis_of_ones_own_joins_the_search(made):

@@ -18,18 +18,13 @@ import beside  # noqa: F401
 import make
 import torch
 from drawn import DEVELOPMENT, REDUCED, SMALL, case
+from partners import NUMBERS
 
 from torchcloth import diagnosis, recordings
 from torchcloth.diagnosis import trials
 from torchcloth.diagnosis.comparison import spread
 from torchcloth.diagnosis.trials import Candidate
 from torchcloth.identification import journal as kept
-
-NUMBERS = {
-    "youngs_modulus": "membrane_stiffness",
-    "bending.stiffness": "bending_stiffness",
-    "areal_density": "areal_density",
-}  # coordinates of the base model whose truth is a factor of the data sheet's values; Poisson's ratio is 0.3
 
 
 def said(c: Candidate, names: list[str]) -> str:

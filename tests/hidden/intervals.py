@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import beside  # noqa: F401
+from partners import NUMBERS
 
 from torchcloth.training.studies import hidden_scores as scores
 
 SHARES = (0.0, 0.02, 0.03, 0.04)  # of the number, standard deviations
-FABRIC = {"youngs_modulus": "membrane_stiffness", "bending.stiffness": "bending_stiffness", "areal_density": None}
 THICK = 1e-3  # m, of all sheets
 NORMAL = 1.96
 
@@ -43,9 +43,9 @@ def numbers(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str
     """(name, error of the logarithm, standard error) of the fabric's numbers, of a null."""
     if truth["family"] not in scores.NULLS:
         return
-    for name, own in FABRIC.items():
+    for name, own in NUMBERS.items():
         if (row := answer.get("parameters", {}).get(name)) is not None:
-            true = truth["fabric"][own or name] / (THICK if name == "youngs_modulus" else 1.0)
+            true = truth["fabric"][own] / (THICK if name == "youngs_modulus" else 1.0)
             ends = [math.log(end) for end in row["ci95"]]
             yield f"{name} of nulls", math.log(row["value"] / true), apart(answer, ends, 1.0)
 

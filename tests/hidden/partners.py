@@ -35,6 +35,11 @@ class Partner:
     beside: tuple[tuple[str, float], ...] = ()
 
 
+NUMBERS = {
+    "youngs_modulus": "membrane_stiffness",
+    "bending.stiffness": "bending_stiffness",
+    "areal_density": "areal_density",
+}  # coordinates of the base model whose truth is a factor of the data sheet's values; Poisson's ratio is 0.3
 BOTH = (1, -1)
 DRAG = (("air.drag_n", 1.2),)
 DRAGGED = (("drag", 90.0, 1.0), ("drag-fast", 0.0, 1.0))  # once, friction hides behind the density

@@ -16,8 +16,7 @@ from ..identification.episodes import on_cpu
 from ..identification.journal import Journal, facts_of
 from ..recordings import Recording
 from ..recordings.together import check_recording
-from ..robots import ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
+from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from .aim import aim_at
 from .clearance import clearance_of
 from .courses import Course
@@ -33,19 +32,19 @@ Believed = Cloth | Model
 class Asked(NamedTuple):
     """Of ``plan``, see there."""
 
-    waypoints: int = 4
-    wait: float = 0.3
-    acceleration: float = ACCELERATION
-    limits: Limits = Limits()
-    clearance: float = 0.02
-    dt: float | None = None
+    waypoints: int
+    wait: float
+    acceleration: float
+    limits: Limits
+    clearance: float
+    dt: float | None
 
 
 def posed(
     model: Believed | Sequence[Believed],
     recording: Recording,
     goal: Goal | Tensor,
-    asked: Asked = Asked(),  # noqa: B008 - a tuple
+    asked: Asked,
     journal: str | Path | None = None,
     resume: bool | None = None,
     course: Callable[[Course], Course] = lambda course: course,
