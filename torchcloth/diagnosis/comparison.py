@@ -17,7 +17,7 @@ from torch import Tensor
 
 from .bursts import densities, unweighted, weights
 from .cells import SEEN, aligned
-from .fitting import Fitted, curvature, prior_precision, step_of
+from .fitting import Fitted, curvature, step_of
 from .noise import Whitened
 
 ALONE = 0.7  # share of the information, of a motion without which a cause cannot be sized
@@ -185,13 +185,13 @@ def told_by(found: Fitted, place: int, groups: Sequence[str], halved: Collection
 
 
 def _informed(found: Fitted, place: int) -> Tensor:
-    """[C] information on a coordinate beside the others, within their priors."""
-    count = found.evidence.own
-    own, prior = found.white.jacobian[:, :count], prior_precision(found.model)
-    rest = [k for k in range(count) if k != place]
-    others = torch.cat([own[:, rest], torch.diag(prior[rest].sqrt())])
-    asked = torch.cat([own[:, place], own.new_zeros(count - 1)])
-    return (asked - others @ torch.linalg.lstsq(others, asked[:, None]).solution[:, 0])[: len(own)].square()
+    """[C] information on a coordinate beside the others, within their priors.
+
+    What its slopes have that the others' have not, by a column of the covariance. Least squares on the rows say the
+    same but for their last bits, which LAPACK rounds as memory happens to lie: a resumed answer would be another.
+    """
+    column = torch.linalg.inv(curvature(found.white, found.model))[:, place]
+    return (found.white.jacobian[:, : len(column)] @ (column / column[place])).square()
 
 
 def _adjusted(found: Fitted, k: int, likely: Tensor) -> Tensor:
