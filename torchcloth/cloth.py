@@ -108,7 +108,7 @@ class Cloth(nn.Module):
         self.areal_density = PhysicalParameter(areal_density, "kg/m^2", name="areal_density")
         check_field("areal_density", self.areal_density.raw, len(mesh.faces))
         check_fields(effects, len(mesh.faces))
-        check_axes(mesh, {"material": material, **effects})
+        check_axes(mesh, {"material": material, **{f"effects.{name}": effect for name, effect in effects.items()}})
         check_free(mesh, [*effects.items(), *boundaries.items()])
         self.effects, self.boundaries = Parts("effects", mesh), Parts("boundaries", mesh)
         self.effects.update(effects)
@@ -227,9 +227,7 @@ class Cloth(nn.Module):
         if speed > STILL:
             text = f"settle: after {duration:g} s the cloth still moves at {speed:.2g} m/s (rms), and is stopped there"
             warnings.warn(text, stacklevel=3)
-        moves = ("apic", "contact")  # velocities, which rest has none of
-        memory = {name: torch.zeros_like(own) if name in moves else own for name, own in settled.memory.items()}
-        return settled._replace(v=torch.zeros_like(settled.v), memory=memory)
+        return settled.stopped()
 
     def sensitivities(
         self,

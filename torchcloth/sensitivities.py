@@ -46,8 +46,8 @@ def sensitivities(
 ) -> tuple[Rollout, Rollout]:  # a cloth is Any here: the layer stands above this file
     """See ``Cloth.sensitivities``."""
     cloth = kept(cloth)  # parameters are replaced meanwhile, and others may simulate the same cloth
+    plan = cloth.plan(state, motion, times, dt)  # which refuses other states and motions first
     count = _check(along, cloth, state, motion)
-    plan = cloth.plan(state, motion, times, dt)
     fused = plan.choice.fused
     if fused is None or not fused.has_tangents:
         return _by_copies(cloth, plan, motion, along, count, dt, settle)
@@ -58,7 +58,7 @@ def sensitivities(
         walk = _Walk(cloth, rest, lambda: damped(cloth.model(), RATE), along, count)
         poses = _Poses(motion, along, count, lambda m: held(m, rest.frames[0], rest.frames[-1]))
         (states, _), (shifts, _) = walk.run(state, moved, poses)
-        state, moved = (s[-1]._replace(v=torch.zeros_like(s[-1].v)) for s in (states, shifts))
+        state, moved = (s[-1].stopped() for s in (states, shifts))
     found = _Walk(cloth, plan, cloth.model, along, count).run(state, moved, _Poses(motion, along, count))
     values, tangents = (collect(plan, states, impulses) for states, impulses in found)
     return values, tangents

@@ -8,8 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
+RATES = ("apic", "contact")  # internal variables that are velocities
 Memory = dict[str, Tensor]  # internal variables by owner, "material" or "effects.NAME": [..., N, K] each
 
 
@@ -28,6 +30,11 @@ class ClothState(NamedTuple):
         """The state with ``function`` applied to every tensor."""
         memory = {name: function(value) for name, value in self.memory.items()}
         return ClothState(function(self.x), function(self.v), function(self.d3), memory)
+
+    def stopped(self) -> ClothState:
+        """The state without any velocity, of which rest has none."""
+        memory = {name: torch.zeros_like(own) if name in RATES else own for name, own in self.memory.items()}
+        return self._replace(v=torch.zeros_like(self.v), memory=memory)
 
 
 class Surface(NamedTuple):

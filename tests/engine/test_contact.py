@@ -11,6 +11,7 @@ from agreement import agree, difference, held, noise, outcome
 import torchcloth as tc
 from torchcloth import functional, self_contact
 from torchcloth.engine import fused, running
+from torchcloth.sensitivities import RATE, Directions
 
 SPACING, PLAY = 0.012, 0.25
 
@@ -191,3 +192,15 @@ def test_single_precision():
         print(name, error, 1 - cosine)
         assert error < 1e-3, name
         assert cosine > 0.9999, name
+
+
+def test_layers_that_pressed_on_each_other_while_they_settled_have_stopped():
+    """The rate at which they closed damps contact; of rest there is none."""
+    cloth, count = layers(tc.Contact(spacing=SPACING))
+    state = pressed(cloth, count)
+    along = Directions(parameters={"areal_density.raw": torch.ones(1, *cloth.areal_density.raw.shape)})
+    value, _ = cloth.sensitivities(state, {}, (0.0, 0.002), along=along, settle=0.01)
+    with torch.no_grad():
+        settled = cloth.settle(state, duration=0.01, rate=RATE)
+        expected = cloth(settled, times=(0.0, 0.002))
+    assert difference(value.v, expected.v) < 1e-10

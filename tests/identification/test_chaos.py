@@ -200,3 +200,14 @@ def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
     assert starts == pytest.approx([0.0, 0.0, 0.15, 0.22, 0.33, 0.33, 0.415, 0.415])
     assert tolerances == (*[1.0] * 7, 0.1)
     assert "42 of 100, were used" in found.checked.warnings[0]
+
+
+def test_of_the_beginning_combinations_are_known_as_such():
+    """Of two unknowns with their sum well known, each alone is not; as two priors they said sqrt(1/2) of that."""
+    told, known = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
+    known[0, 1] = known[1, 0] = -0.95
+    known[2, 2] = 1e6  # less than the fit's own prior
+    problem = ensemble._after(Rippling(0).problem(), told, 0.01 * known)
+    torch.testing.assert_close(torch.linalg.inv(problem.precision)[:2, :2], 0.01 * known[:2, :2])
+    assert float(problem.prior_std[2]) == float(Rippling(0).problem().prior_std[2])
+    assert float(problem.precision[2, 2]) == pytest.approx(float(problem.prior_std[2]) ** -2)

@@ -9,6 +9,7 @@ from torchcloth.identification.episodes import Episode
 from torchcloth.identification.replays import Frames
 from torchcloth.identification.rows import scene_of
 from torchcloth.identification.sheet import BAND, sheet_of
+from torchcloth.training.fit.losses import Loss
 
 SIDE = 0.3
 MESH = tc.meshes.rectangle(SIDE, SIDE, resolution=(7, 7))
@@ -105,3 +106,12 @@ def test_another_layer_is_not_beyond_the_rim():
     rows = edge_rows(scene_of(given.seen._replace(x=x.expand(FRAMES, -1, -1)), None, given.episode, given.sheet))
     seen = rows.value[rows.value != 0]
     assert abs(float(seen.mean())) < 1.5e-3
+
+
+def test_a_loss_is_a_mean_over_pieces_that_were_seen():
+    whole, half = (
+        scene(clouds(2e-3, torch.Generator().manual_seed(0), hidden=hidden))
+        for hidden in (None, lambda uv: uv[:, 0] < 0.2)
+    )
+    of = Loss({"edges": 1e-3})
+    assert float(of(half)) == pytest.approx(float(of(whole)), rel=0.2)  # half of it, when those unseen counted

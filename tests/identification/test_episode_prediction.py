@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,11 +11,11 @@ import twins
 
 import torchcloth as tc
 from torchcloth import recordings as rec
-from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import cloth_from, episode, predict_episode
+from torchcloth.errors import InvalidInput, RecordingError, UnstableStep
+from torchcloth.identification import cloth_from, episode, episode_prediction, predict_episode
 from torchcloth.identification.episode_prediction import _held_to_steps, with_errors
 from torchcloth.identification.prediction_report import print_predicted
-from torchcloth.identification.replays import simulate, tangents
+from torchcloth.identification.replays import Frames, simulate, tangents
 from torchcloth.identification.unknowns import collect
 
 
@@ -136,8 +137,31 @@ def test_tangents_of_an_unstable_motion_are_held_to_steps():
         data, unknowns = episode(cloth, swing), collect(cloth, ["youngs_modulus", "air.normal"], None)
         raw, covariance = torch.tensor([u.start for u in unknowns]), torch.diag(torch.tensor([0.02, 0.03]) ** 2)
         both = tangents(cloth, unknowns, raw, data)
-        moved, lost = _held_to_steps(cloth, unknowns, raw, data, None, both, covariance)
+        moved, lost, untried = _held_to_steps(cloth, unknowns, raw, data, None, both, covariance)
         before, after = (with_errors(cloth, data, both[0], m, covariance, 1e-3).std for m in (both[1], moved))
     assert lost
+    assert not untried
     assert float(after.max()) < 0.2
     assert float(before[-1].square().mean()) > 100 * float(after[-1].square().mean())
+
+
+@pytest.mark.parametrize("possible", [(-1,), ()])
+def test_a_standard_error_more_that_cannot_be_simulated_is_tried_as_one_less(monkeypatch, possible):
+    tried, std = [], 0.1
+    still = Frames(torch.zeros(2, 3, 3), torch.zeros(2, 3, 3), {}, torch.zeros(2))
+    unknown = SimpleNamespace(name="stiffness", clip=lambda raw: raw)
+
+    def simulate(cloth, unknowns, raw, data, dt):
+        tried.append(round(float(raw[0]) / std))
+        if tried[-1] not in possible:
+            raise UnstableStep("too large a step")
+        return still._replace(x=still.x + 2 * raw[0])
+
+    monkeypatch.setattr(episode_prediction, "simulate", simulate)
+    slopes = Frames(*(torch.zeros(1, *part.shape) for part in still[:2]), {}, torch.zeros(1, 2))
+    moved, lost, untried = _held_to_steps(
+        None, [unknown], torch.zeros(1), None, None, (still, slopes), torch.eye(1) * std**2
+    )
+    assert tried == [1, -1]
+    assert (lost, untried) == ((["stiffness"], []) if possible else ([], ["stiffness"]))
+    assert float(moved.x.mean()) == pytest.approx(2.0 if possible else 0.0)

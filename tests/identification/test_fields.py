@@ -166,3 +166,22 @@ def test_pieces_of_cloth_that_do_not_touch_have_a_prior_each():
     count = len(one.faces)
     assert float(covariance[:count, :count].mean()) == pytest.approx(math.log(10) ** 2)
     assert float(covariance[:count, count:].abs().max()) < 1e-9
+
+
+def test_where_clouds_end_is_no_datum_of_a_field(striped, monkeypatch):
+    """No camera sees an edge where it is; how far off it is would be the fabric's."""
+    seen = []
+
+    class Stop(Exception):
+        pass
+
+    def made(cloth, own, episodes, dt, blocks, contrast):
+        seen.append([block.name for block in blocks])
+        raise Stop
+
+    monkeypatch.setattr(fields, "_Fields", made)
+    recording = striped(frames=2, points=20)
+    for use in (None, "points"):
+        with pytest.raises(Stop):
+            fit_fields(start(recording), recording, ["youngs_modulus"], use=use)
+    assert seen == [["points", "markers", "force", "torque"], ["points"]]

@@ -12,6 +12,8 @@ from torchcloth.boundaries import Grasp
 from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.identification import fit, identify
 from torchcloth.identification.finer import finer_cloth, finer_recording
+from torchcloth.identification.objective import Objective
+from torchcloth.identification.unknowns import collect
 
 PAIR = ["youngs_modulus", "air.normal"]
 
@@ -155,3 +157,29 @@ def _later(g, by):
     parts = "position", "quat_wxyz", "closed"
     ahead = {name: np.concatenate([getattr(g, name)[:1], getattr(g, name)]) for name in parts}
     return replace(g, t=np.concatenate([g.t[:1], g.t + by]), **ahead)
+
+
+@pytest.mark.parametrize("asked", [0.1, 1.0])
+def test_a_correction_that_cannot_be_simulated_is_none(model, brief, monkeypatch, asked):
+    """A tenth of the longest step to where nothing can be simulated, and farther than slopes can tell."""
+    plain = identify(model, brief, ["youngs_modulus"], iterations=1)
+    seen, longest = Objective.seen, collect(model, ["youngs_modulus"], None)[0].longest_step
+
+    def torn_elsewhere(self, raw):
+        if float(raw[0] - ended[0]) > 0.05 * longest:
+            raise SimulationDiverged("the cloth is torn apart")
+        return seen(self, raw)
+
+    def step(objective, final, recordings):
+        ended.append(float(final.raw[0]))
+        moved = torch.zeros_like(final.raw)
+        moved[0] = asked * longest
+        monkeypatch.setattr(Objective, "seen", torn_elsewhere)
+        return moved
+
+    ended = []
+    monkeypatch.setattr(fit, "mesh_step", step)
+    found = identify(model, brief, ["youngs_modulus"], iterations=1, refine=True)
+    assert found.parameters == plain.parameters
+    why = "on a finer one, the cloth is torn" if asked < 1 else "a finer one asks for more than slopes can tell"
+    assert any(f"not corrected for the coarseness of the mesh: {why}" in w for w in found.warnings)

@@ -11,7 +11,7 @@ from toys import TRUE, curved, linear
 from torchcloth.errors import SimulationDiverged, UnstableStep
 from torchcloth.identification import gauss_newton
 from torchcloth.identification.bounds import bounded
-from torchcloth.identification.gauss_newton import covariance, minimise
+from torchcloth.identification.gauss_newton import Linearised, covariance, minimise
 from torchcloth.identification.misfit import huber
 from torchcloth.identification.unfinished import way_left
 
@@ -346,3 +346,18 @@ def test_a_step_that_is_short_for_its_damping_is_no_convergence():
         away += final.converged and float(gradient @ torch.linalg.solve(hessian, gradient)) > 0.5**2
     assert away == 0
     assert ended > 55  # of 60
+
+
+def test_what_was_not_seen_is_no_observation():
+    """Pieces of the rim that no camera saw are rows of zeros: fifty made the errors of four rows half as large."""
+    toy, jacobian = linear(0)
+    for few in (slice(0, 8), slice(None)):
+        own = Linearised(toy.data[few], jacobian[few], torch.ones(len(toy.data[few])), toy.frame[few], toy.patch[few])
+        unseen = Linearised(
+            *(row.new_zeros(50, *row.shape[1:]) for row in own[:2]), torch.ones(50), *(toy.frame[:50], toy.patch[:50])
+        )
+        both = Linearised(*(torch.cat(rows) for rows in zip(own[:5], unseen[:5], strict=True)))
+        alone, among = (
+            covariance(toy.problem(), gauss_newton.judged(toy.problem(), TRUE, rows)) for rows in (own, both)
+        )
+        torch.testing.assert_close(alone, among, rtol=1e-12, atol=0.0)

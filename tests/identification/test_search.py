@@ -171,3 +171,10 @@ def test_what_counts_as_large_does_not_depend_on_how_vague_a_prior_is(model):
 def test_wrong_priors_are_named(model, priors, said):
     with pytest.raises(InvalidInput, match=said):
         with_priors(collect(model, ["youngs_modulus"], None), priors)
+
+
+@pytest.mark.parametrize("method", ["adam", "gradient-descent"])
+def test_a_method_that_follows_the_distance_alone_has_one_start(model, brief, method):
+    """Several are compared by Gauss-Newton's cost, with its priors."""
+    with pytest.raises(InvalidInput, match=rf"starts; got 2 with method '{method}'; expected 1"):
+        identify(model, brief, ["youngs_modulus"], method=method, starts=2)

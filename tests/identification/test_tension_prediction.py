@@ -194,6 +194,9 @@ def test_files_that_are_no_fit(fit, tmp_path):
         model | {"tables": [table | {"length": "x"}, *others]},
         model | {"tables": [table | {"width": 0}, *others]},
         model | {"tables": [table | {"missed": {"force": -1.0}}, *others]},
+        model | {"tables": [table | {"missed": {"force": 0.02}}, *others]},
+        model | {"tables": [table | {"missed": None}, *others]},
+        model | {"tables": [table | {"left_out": {"lateral": 0.02}}, *others]},
         model | {"material": []},
     ]
     for damage in ({}, *({**content, "model": m} for m in models)):

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from pathlib import Path
 from typing import Any
 
-from .._files import write_text
+from .._files import as_json, write_text
 from ..errors import InvalidInput
 from .folders import check_apart, check_folder, place, replaces
 
@@ -127,4 +126,4 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
 
 
 def _write(out: Path, content: dict[str, Any]) -> Path:
-    return write_text(out / RESULT, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    return write_text(out / RESULT, as_json(content))

@@ -34,6 +34,7 @@ NEAR = 2.5  # of those within which simulations of earlier rounds count
 SETTLED = 0.5  # standard errors of a step that ends the search
 WORSE, HALVINGS = 1.25, 4  # a step that makes the distance larger by more is halved, at most so often
 SEEN = 1.5  # mean square of a slope over that of its errors, from which it is one
+SHARP = 1e-6  # least variance of a combination that the beginning told, in units of each unknown's own
 SPARE = 4  # pairs of simulations beyond those that the slopes need
 
 
@@ -84,9 +85,8 @@ def resolved(
     before, problem = objective.simulations, objective.problem()
     raw, mask, note = failed.final.raw, None, ""
     if known is not None:
-        own = covariance_of(known.objective, known.checked, strata).diagonal().sqrt()
         told, mask = known.checked.final.raw, later(objective, known.objective)
-        problem = problem._replace(prior_mean=told, prior_std=torch.minimum(own, problem.prior_std))
+        problem = _after(problem, told, covariance_of(known.objective, known.checked, strata))
         raw = _nearer(objective, told, raw)
         note = f" after the first {known.until:.2f} s"
     try:
@@ -99,6 +99,15 @@ def resolved(
         "solution, and what moves the cloth less than its ripples do is not identifiable"
     )
     return Checked(found.final, found.reach, [warning], [], covariance=found.covariance)
+
+
+def _after(problem: gauss_newton.Problem, told: Tensor, covariance: Tensor) -> gauss_newton.Problem:
+    """With what is known already as the prior: of two unknowns that only their sum is known of, as that."""
+    own = covariance.diagonal().sqrt()
+    std = torch.minimum(own, problem.prior_std)
+    values, vectors = torch.linalg.eigh(covariance / own[:, None] / own)
+    inverse = (vectors / values.clamp(min=SHARP)) @ vectors.mT
+    return problem._replace(prior_mean=told, prior_std=std, correlated=inverse / std[:, None] / std)
 
 
 def _nearer(objective: Objective, told: Tensor, raw: Tensor) -> Tensor:
@@ -285,7 +294,7 @@ def _by_ripples(problem: gauss_newton.Problem, at: Iterate, found: Line) -> Tens
     inverse = torch.linalg.inv(gauss_newton.information(problem, at))
     moved = found.scatter @ (at.influence()[0][:, None] * at.linear.jacobian) @ inverse
     student = gauss_newton.student(found.freedom) / gauss_newton.NORMAL
-    return student**2 * moved.mT @ moved / found.freedom + inverse @ torch.diag(problem.prior_std**-2) @ inverse
+    return student**2 * moved.mT @ moved / found.freedom + inverse @ problem.precision @ inverse
 
 
 def _reach(objective: Objective, near: Sequence[Sample], raw: Tensor) -> Reach:

@@ -110,16 +110,20 @@ def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction
     raw = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
     with step_of(path):
         frames, moved = tangents(cloth, unknowns, raw, data, model.dt)
-        moved, lost = _held_to_steps(cloth, unknowns, raw, data, model.dt, (frames, moved), covariance)
+        moved, lost, untried = _held_to_steps(cloth, unknowns, raw, data, model.dt, (frames, moved), covariance)
     found = with_errors(cloth, data, frames, moved, covariance, model.left)
-    found = replace(found, warnings=tuple(data.doubts()))
-    if not lost:
-        return found
-    text = (
-        f"the motion is unstable or strongly nonlinear: tangents of {', '.join(lost)} miss what a standard error does, "
-        "and were replaced by it; errors are no better than such a step"
-    )
-    return replace(found, warnings=(*found.warnings, text))
+    warnings = list(data.doubts())
+    if lost:
+        warnings.append(
+            f"the motion is unstable or strongly nonlinear: tangents of {', '.join(lost)} miss what a standard error "
+            "does, and were replaced by it; errors are no better than such a step"
+        )
+    if untried:
+        warnings.append(
+            f"a standard error of {', '.join(untried)} cannot be simulated, neither more nor less: whether tangents "
+            "say what it does was not tried"
+        )
+    return replace(found, warnings=tuple(warnings))
 
 
 @torch.no_grad()
@@ -131,28 +135,46 @@ def _held_to_steps(
     dt: float | None,
     both: tuple[Frames, Frames],
     covariance: Tensor,
-) -> tuple[Frames, list[str]]:
-    """(slopes, names of those that tangents miss): of unstable motion they describe what is too small to matter."""
+) -> tuple[Frames, list[str], list[str]]:
+    """(slopes, names of those that tangents miss, of those that were not tried).
+
+    Tangents of unstable motion describe what is too small to matter.
+    """
     frames, moved = both
-    moved, lost = each(moved, torch.clone), []
+    moved, lost, untried = each(moved, torch.clone), [], []
     for k, (unknown, std) in enumerate(zip(unknowns, covariance.diagonal().sqrt().tolist(), strict=True)):
         if not std > 0:
             continue
-        there = raw.clone()
-        there[k] = unknown.clip(float(raw[k]) + std)
-        try:
-            step = simulate(cloth, unknowns, there, data, dt)
-        except (SimulationDiverged, UnstableStep):  # as far as a longer step of the same cloth tells
+        found = _a_step_aside(cloth, unknowns, raw, data, dt, k, std)
+        if found is None:
+            untried.append(unknown.name)
             continue
-        secant = (step.x - frames.x) / std
+        step, length = found
+        secant = (step.x - frames.x) / length
         off = float((secant - moved.x[k]).norm() / secant.norm().clamp(min=1e-30))
         most = max(float(s.square().sum(-1).mean().sqrt()) for s in (secant, moved.x[k]))
         if std * most > NOTICED and not off < NONLINEAR:
             lost.append(unknown.name)
-            moved.x[k], moved.v[k] = secant, (step.v - frames.v) / std
+            moved.x[k], moved.v[k] = secant, (step.v - frames.v) / length
             for name, wrench in moved.wrench.items():
-                wrench[k] = (step.wrench[name] - frames.wrench[name]) / std
-    return moved, lost
+                wrench[k] = (step.wrench[name] - frames.wrench[name]) / length
+    return moved, lost, untried
+
+
+def _a_step_aside(
+    cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, data: Episode, dt: float | None, k: int, std: float
+) -> tuple[Frames, float] | None:
+    """(what a standard deviation more of the k-th changes, or one less, that step); None: neither can be simulated."""
+    for way in (std, -std):
+        there = raw.clone()
+        there[k] = unknowns[k].clip(float(raw[k]) + way)
+        if float((there[k] - raw[k]).abs()) < 0.5 * std:  # at an end of what is legal
+            continue
+        try:
+            return simulate(cloth, unknowns, there, data, dt), float(there[k] - raw[k])
+        except (SimulationDiverged, UnstableStep):
+            continue
+    return None
 
 
 def with_errors(

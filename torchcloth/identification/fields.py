@@ -22,7 +22,7 @@ from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter, called, to_value
 from ..recordings import Recording
-from .blocks import blocks_for
+from .blocks import Block, blocks_for
 from .descent import quasi_newton
 from .episodes import Episode, episode, on_cpu
 from .given import given
@@ -102,7 +102,8 @@ def fit_fields(
         parameters: names of the material's fields, e.g. ["youngs_modulus"].
         contrast: how much a field may vary: 1 is a factor of some 2.7 between one side of a square and the other.
         iterations: at most.
-        dt, use, journal, resume, on_progress: as of ``identify``.
+        dt, use, journal, resume, on_progress: as of ``identify``; but where clouds end is left out, for no camera sees
+            an edge where it is, and how far off it is is not among the unknowns here.
 
     Raises:
         InvalidInput: names that are no fields of the material, numbers out of range, or one episode twice.
@@ -119,7 +120,7 @@ def fit_fields(
         raise InvalidInput("parameters", got="none", expected="at least one name")
     every = given(recordings)
     own = {name: _field(cloth, name) for name in parameters}
-    objective = _Fields(cloth, own, [episode(cloth, r) for r in every], dt, blocks_for(use), contrast)
+    objective = _Fields(cloth, own, [episode(cloth, r) for r in every], dt, _without_rim(use), contrast)
     if journal is not None:
         objective.journal = Journal(journal, ["fields", *objective.identity()], resume)
     search = Search(objective, "converged", on_progress)
@@ -137,6 +138,10 @@ def fit_fields(
     warnings = [f"{', '.join(own)}: {NO_ERROR}; where the data say little, neighbours' values and the start are shown"]
     warnings += [] if done else [f"stopped after {iterations} iterations before converging"]
     return FieldFit(objective.fields(raw), contrast, fit, warnings, search.history, before, after)
+
+
+def _without_rim(use: Sequence[str] | str | None) -> tuple[Block, ...]:
+    return tuple(block for block in blocks_for(use) if block.name != "edges")
 
 
 def _field(cloth: Cloth, name: str) -> PhysicalParameter:

@@ -42,6 +42,7 @@ from .unknowns import collect, with_priors
 PAPER_ITERATIONS = 35  # of the DiffCP paper's stop rule
 MOST_STARTS = 1000
 UNSURE = "the motion can be predicted for a while only, or by simulations spread around the solution"
+UNCORRECTED = "not corrected for the coarseness of the mesh"
 ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
 
 
@@ -158,6 +159,13 @@ def _check(method: str, stop: str, iterations: int, starts: int) -> None:
             raise InvalidInput(name, got=number, expected="at least 1, and whole")
     if starts > MOST_STARTS:
         raise InvalidInput("starts", got=starts, expected=f"at most {MOST_STARTS}")
+    if starts > 1 and method in CHAMFER:
+        raise InvalidInput(
+            "starts",
+            got=f"{starts} with method {method!r}",
+            expected="1: several are compared by Gauss-Newton, with its priors, and not by the Chamfer distance alone",
+            remedy='method "gauss-newton" or "lbfgs"',
+        )
 
 
 def _check_priors(method: str, priors: Mapping[str, Any] | None, nuisances: Mapping[str, Any] | Sequence[str]) -> None:
@@ -256,8 +264,10 @@ def _concluded(
     warnings += [outcome.unfinished] if outcome.unfinished else []
     warnings += skewed(found, [name for name in checked.curved if name not in profiled])
     used = [x[: len(e.times)] for x, e in zip(after, told.episodes, strict=True)]
-    rms = figures(used, told.episodes, full.faces).rms
-    warnings += warnings_of(full.cloth, full.episodes, found, {**fit, "rms_after": rms}, after, full.faces, null_of)
+    judged = {**fit, "rms_after": figures(used, told.episodes, full.faces).rms}
+    if not full.uses("points", "markers"):  # what was seen beside is reported, and no verdict
+        judged |= {"rms_after": math.nan, "chamfer_after": math.nan}
+    warnings += warnings_of(full.cloth, full.episodes, found, judged, after, full.faces, null_of)
     keys = {u.name: u.key.removesuffix(".raw") for u in full.unknowns}
     nuisances = nuisance_estimates(full.episodes, full.placed, final.raw, covariance, withdrawn)
     return Identification(
@@ -287,10 +297,13 @@ def _refined(
         return final, covariance, {}, []
     try:
         step = mesh_step(full, final, recordings)
+        moved = final._replace(raw=full.clip(final.raw + LIMIT * step))
+        if bool((LIMIT * step.abs() > full.problem().longest)[: len(full.unknowns)].any()):
+            return final, covariance, {}, [f"{UNCORRECTED}: a finer one asks for more than slopes can tell"]
+        full.seen(moved.raw)  # so that what cannot be simulated shows here; it is asked for again, and remembered
     except (SimulationDiverged, UnstableStep) as error:
-        return final, covariance, {}, [f"not corrected for the coarseness of the mesh: on a finer one, {error}"]
+        return final, covariance, {}, [f"{UNCORRECTED}: on a finer one, {error}"]
     far = float((LIMIT * step.abs() / covariance.diagonal().sqrt())[: len(full.unknowns)].max())
-    moved = final._replace(raw=full.clip(final.raw + LIMIT * step))
     return moved, covariance + OPEN**2 * torch.outer(step, step), {"mesh_step": far}, []
 
 

@@ -50,6 +50,12 @@ class Problem(NamedTuple):
     noise: Tensor | float | None  # least standard deviation of a residual, for each block [B]
     gate: Tensor | None = None  # [B] residuals beyond it and five standard deviations do not count; None: all do
     scales: tuple[Tensor, Tensor, Tensor] | None = None  # scale, share and gate of every iterate; None: its own
+    correlated: Tensor | None = None  # [K, K] precision of what is known before; None: of the deviations alone
+
+    @property
+    def precision(self) -> Tensor:
+        """[K, K] of what is known before."""
+        return torch.diag(self.prior_std**-2) if self.correlated is None else self.correlated
 
 
 class Iterate(NamedTuple):
@@ -206,7 +212,8 @@ def _groups(linear: Linearised) -> Tensor:
 
 def cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
     """Robust cost with the scales of ``at``, so that points can be compared."""
-    prior = ((raw - problem.prior_mean) / problem.prior_std).square().sum()
+    off = raw - problem.prior_mean
+    prior = off @ problem.precision @ off
     scale, factor, gate = at.rows
     return float((factor * huber(value / scale, gate)[0]).sum() + 0.5 * prior)
 
@@ -214,8 +221,8 @@ def cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
 def normal_equations(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
     """(gradient [K], approximate Hessian [K, K]) of the robust cost with its priors."""
     weighted = at.influence()[0][:, None] * at.linear.jacobian
-    gradient = weighted.mT @ at.linear.value + (at.raw - problem.prior_mean) / problem.prior_std**2
-    return gradient, _told(at, weighted) + torch.diag(problem.prior_std**-2)
+    gradient = weighted.mT @ at.linear.value + problem.precision @ (at.raw - problem.prior_mean)
+    return gradient, _told(at, weighted) + problem.precision
 
 
 def _told(at: Iterate, weighted: Tensor) -> Tensor:
@@ -239,7 +246,7 @@ def curvature(problem: Problem, at: Iterate) -> Tensor:
     """[K, K] of the robust cost itself: beyond the Huber bound residuals have a slope and no curvature."""
     scale, factor, _ = at.rows
     weight = factor * ((at.linear.value / scale).abs() <= HUBER) / scale**2
-    return (weight[:, None] * at.linear.jacobian).mT @ at.linear.jacobian + torch.diag(problem.prior_std**-2)
+    return (weight[:, None] * at.linear.jacobian).mT @ at.linear.jacobian + problem.precision
 
 
 def _is_small(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> bool:
@@ -261,6 +268,7 @@ def covariance(problem: Problem, at: Iterate) -> Tensor:
     fitting took out of the residuals is put back, and few observations widen it as Student's distribution does, so that
     the interval of 1.96 deviations holds the truth.
     """
+    at = at._replace(linear=_seen(at.linear))
     at = at._replace(scale=_of_few(at))
     rows, groups = _left(problem, at)
     share = _independent_share(at.linear, at.scale, at.gate) if problem.scales is None else at.share
@@ -275,8 +283,16 @@ def covariance(problem: Problem, at: Iterate) -> Tensor:
     summed = torch.zeros(count, scores.shape[1], dtype=scores.dtype).index_add(0, at.linear.frame, scores)
     summed = summed[summed.abs().sum(1) > 0]
     meat = _long_run(summed) * len(summed) / max(1, len(summed) - 1)
-    robust = inverse @ (meat + torch.diag(problem.prior_std**-2)) @ inverse
+    robust = inverse @ (meat + problem.precision) @ inverse
     return at_least(robust, inverse.diagonal())
+
+
+def _seen(linear: Linearised) -> Linearised:
+    """Without rows of what was not seen, which are zero and have no slopes: no observations, however many they are."""
+    seen = (linear.value != 0) | (linear.jacobian != 0).any(1)
+    rows = ("value", "jacobian", "factor", "frame", "patch", "block", "wobble")
+    own = {name: row[seen] for name in rows if (row := getattr(linear, name)) is not None}
+    return linear._replace(**own) if bool(seen.any()) else linear
 
 
 def _of_few(at: Iterate) -> Tensor:

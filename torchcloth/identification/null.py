@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from ..boundaries.motion import interpolate
-from .blocks import USES
 from .episodes import Episode
 from .misfit import figures, forces_rms
 from .objective import Objective
@@ -47,8 +46,7 @@ def no_better_than(objective: Objective, frames: Sequence[Frames]) -> str:
     By distance to what was seen while grippers moved, else by force. Cloth that hangs still lies where it lay at first,
     whatever it is made of; but not far from there.
     """
-    used = {block.name for block in objective.blocks}
-    if used & {*USES["points"], *USES["markers"]}:
+    if objective.uses("points", "markers"):
         rigid = [rigid_carry(e) for e in objective.episodes]
         moved = [k for k, x in enumerate(rigid) if float((x - x[:1]).abs().max()) > STILL]
         seen = [objective.episodes[k] for k in moved]
@@ -59,7 +57,7 @@ def no_better_than(objective: Objective, frames: Sequence[Frames]) -> str:
             own, null = (figures(x, objective.episodes, objective.faces) for x in ([f.x for f in frames], rigid))
             if own.chamfer > WORSE * null.chamfer:
                 return STAYS
-    if used & {*USES["force"]} and any(e.wrenches for e in objective.episodes):
+    if objective.uses("force") and any(e.wrenches for e in objective.episodes):
         felt = forces_rms([f.wrench for f in frames], objective.episodes)
         return UNFELT if felt >= forces_rms([no_force(e) for e in objective.episodes], objective.episodes) else ""
     return ""

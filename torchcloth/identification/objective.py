@@ -71,8 +71,11 @@ class Objective:
             "markers": lambda e: e.markers is not None and bool(e.markers[1:].isfinite().any()),
             "force": lambda e: any(bool(w[1:].isfinite().any()) for w in e.wrenches.values()),
         }
-        names = {block.name for block in self.blocks}
-        return any(there(e) for kind, there in of.items() if names & {*USES[kind]} for e in self.episodes)
+        return any(there(e) for kind, there in of.items() if self.uses(kind) for e in self.episodes)
+
+    def uses(self, *kinds: str) -> bool:
+        """Whether data of one of these kinds (of ``USES``) are asked for."""
+        return not {block.name for block in self.blocks}.isdisjoint(name for kind in kinds for name in USES[kind])
 
     def beside(self, nuisances: Sequence[AbstractNuisance]) -> Objective:
         """The same with other nuisances."""

@@ -188,10 +188,11 @@ def _pulled(kept: dict[str, Any]) -> Pulled:
     number(kept["angle"], name="angle")
     for name, least in {"length": SHORTEST, "width": SHORTEST, "preload": 0.0, "strain": 0.0}.items():
         number(kept[name], least, name)
-    for missed in filter(None, (kept["missed"], kept.get("left_out"))):
-        for name, value in missed.items():
-            if value is not None:
-                number(value, 0.0, f"missed {name}")
+    left_out = kept.get("left_out")
+    for missed in (kept["missed"], *([] if left_out is None else [left_out])):
+        for name in ("force", "lateral"):
+            if missed[name] is not None:
+                number(missed[name], 0.0, f"missed {name}")
     return Pulled(**kept)
 
 

@@ -216,7 +216,8 @@ def cross_validated(
 
     Args:
         fit: of all tables.
-        cloth, tables, options: as given to ``fit_tension``; three directions or more.
+        cloth, tables, options: as given to ``fit_tension``, but without ``parameters``: those of ``fit``; three
+            directions or more.
 
     Raises:
         InvalidInput: fewer than three directions.

@@ -21,13 +21,14 @@ LOST = 10.0  # standard errors: likewise 0.1 to 4, seldom up to 17, or 12 to 100
 def astray(objective: Objective, checked: Checked) -> str:
     """Why the end of an unfinished search is no estimate; empty where it may be one.
 
-    By the residual where the noise is known, else by how far the slopes would go on.
+    By the residual where the noise of what was used is known, else by how far the slopes would go on.
 
     Args:
         objective: of the frames that told it.
         checked: where it ended.
     """
-    noise = max((e.noise for e in objective.episodes if e.noise), default=math.nan)
+    seen = objective.episodes if objective.uses("points", "markers") else []
+    noise = max((e.noise for e in seen if e.noise), default=math.nan)
     times = objective.figures(checked.final.raw).rms / noise
     if math.isfinite(times):
         return f"the residual is {times:.1f} times the sensor noise" if times > OFF else ""

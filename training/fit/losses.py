@@ -67,7 +67,8 @@ def _to_vertices(scene: Scene) -> Tensor | None:
 def _residuals(rows: Callable) -> Callable[[Scene, float], Tensor | None]:
     def loss(scene: Scene, scale: float) -> Tensor | None:
         found = rows(scene)
-        return None if found is None else huber(found.value / scale)[0].mean()
+        seen = None if found is None else found.value[found.value != 0]  # zero: a piece of the rim that was not seen
+        return None if seen is None or not len(seen) else huber(seen / scale)[0].mean()
 
     return loss
 
