@@ -33,22 +33,22 @@ class Parts(nn.ModuleDict):
         check_free(self._mesh, [(key, module)])
         if isinstance(module, AbstractEffect):
             check_fields({key: module}, len(self._mesh.faces))
-            check_axes(self._mesh, {key: module})
+            check_axes(self._mesh, {f"effects.{key}": module})
         super().__setitem__(key, module.bind(self._mesh).to(self._like))
-        _OWNERS[module] = ref(self)
+        _OWNERS[module] = (*_owners(module), ref(self))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """A copy owns its parts, too."""
+        """A copy owns its parts, too, if these were copied as well."""
         super().__setstate__(state)
         for part in self.values():
-            _OWNERS[part] = ref(self)
+            if not _owners(part):
+                _OWNERS[part] = (ref(self),)
 
 
 def check_free(mesh: Mesh, parts: Iterable[tuple[str, AbstractEffect | AbstractBoundary]]) -> None:
     """Refuse what is bound to another cloth's mesh: it would be bound anew under that one's feet."""
     for name, part in parts:
-        owner = None if (known := _OWNERS.get(part)) is None else known()
-        if owner is not None and not owner._mesh.same(mesh):
+        if any((owner := known()) is not None and not owner._mesh.same(mesh) for known in _owners(part)):
             raise InvalidInput(
                 name,
                 got="an effect or boundary of another cloth, bound to its mesh",
@@ -76,4 +76,9 @@ def loose(cloth: Any) -> Loose:
     return Loose(copy.deepcopy(cloth.material, memo), density, effects, boundaries)
 
 
-_OWNERS: WeakKeyDictionary[nn.Module, ref[Parts]] = WeakKeyDictionary()
+def _owners(part: nn.Module) -> tuple[ref[Parts], ...]:
+    """Those that live."""
+    return tuple(owner for owner in _OWNERS.get(part, ()) if owner() is not None)
+
+
+_OWNERS: WeakKeyDictionary[nn.Module, tuple[ref[Parts], ...]] = WeakKeyDictionary()

@@ -72,7 +72,7 @@ def first_directors(model: Model, grid: Grid, x: Tensor) -> Tensor:
     """
     d3 = n = surface(model.geometry, x, x).n
     if grid.apart is not None and grid.play > 0:
-        d3 = (1 - _unpressed(grid, grid.apart, centroids(model.geometry, x.detach()), n.detach())) * n
+        d3 = (1 - _unpressed(grid, grid.apart, centroids(model.geometry, x), n)) * n
     return d3.repeat_interleave(grid.points.shape[0], dim=-2)
 
 
@@ -82,7 +82,8 @@ def _unpressed(grid: Grid, apart: Tensor, centre: Tensor, n: Tensor) -> Tensor:
     farthest = TOUCH * grid.spacing + side  # pairs beyond do not press, whatever their direction
     found = []
     for points, normals in zip(centre.reshape(-1, *n.shape[-2:]), n.reshape(-1, *n.shape[-2:]), strict=True):
-        over, under = ((torch.cdist(points, points, compute_mode=EXACT) <= farthest) & apart).nonzero(as_tuple=True)
+        fixed = points.detach()  # which pairs; how near they are has derivatives
+        over, under = ((torch.cdist(fixed, fixed, compute_mode=EXACT) <= farthest) & apart).nonzero(as_tuple=True)
         between = points[over] - points[under]
         height = dot(between, normals[under]).abs()
         beside = (dot(between, between) - height**2).clamp(min=0).sqrt() > side

@@ -16,7 +16,7 @@ from .errors import InvalidInput, SimulationDiverged, UnstableStep
 from .materials import AbstractMaterial
 from .meshes import Mesh
 from .meshes.mesh import HEAVIEST, LARGEST
-from .model import Model
+from .model import Model, mapped
 from .parameters import PhysicalParameter
 from .transfer import Contact
 from .types import ClothState, Trajectory
@@ -45,8 +45,8 @@ def check_parts(
 
 def check_part(what: str, name: object, part: object) -> None:
     """One of the "effects" or "boundaries"."""
-    if not isinstance(name, str) or not name or "." in name or hasattr(nn.ModuleDict, name):
-        expected = "a name without dots that is no method of torch's ModuleDict"
+    if not isinstance(name, str) or not name or "." in name or name.startswith("_") or hasattr(nn.ModuleDict(), name):
+        expected = "a name without dots or a leading underscore that torch's ModuleDict has not"
         raise InvalidInput("name of an effect or boundary", got=repr(name), expected=expected)
     kind = {"effects": AbstractEffect, "boundaries": AbstractBoundary}[what]
     _check_kind(f"{what}: {name}", part, kind, f"an {kind.__name__}, as those of torchcloth.{what}")
@@ -268,8 +268,9 @@ def expand_state(state: ClothState, model: Model, motion: Mapping[str, Trajector
     Raises:
         InvalidInput: batch dimensions that do not go together, or none is left.
     """
-    coefficients = [model.coefficients, (model.areal_density, model.mass), *(c for _, c in model.effects.values())]
-    tensors = [t for c in coefficients for t in (c if isinstance(c, tuple) else (c,)) if isinstance(t, Tensor)]
+    tensors: list[Tensor] = []
+    coefficients = (model.coefficients, model.areal_density, model.mass, *(c for _, c in model.effects.values()))
+    mapped(coefficients, lambda t: tensors.append(t) or t)
     found = {
         **{f"state.{name}": field.shape[:-2] for name, field in _named(state).items()},
         **{f"motion[{name!r}].pose": trajectory.pose.shape[:-3] for name, trajectory in motion.items()},

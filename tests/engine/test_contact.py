@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+import torch.autograd.forward_ad as forward_ad
 from agreement import agree, difference, held, noise, outcome
 
 import torchcloth as tc
@@ -204,3 +205,19 @@ def test_layers_that_pressed_on_each_other_while_they_settled_have_stopped():
         settled = cloth.settle(state, duration=0.01, rate=RATE)
         expected = cloth(settled, times=(0.0, 0.002))
     assert difference(value.v, expected.v) < 1e-10
+
+
+def test_first_directors_know_how_near_layers_are():
+    """How far they start compressed is a function of the gap; its derivative was left out, for one of some hundreds."""
+    cloth, count = layers(tc.Contact(spacing=SPACING))
+    rest, up = cloth.rest_state().x, torch.zeros_like(cloth.rest_state().x)
+    up[count:, 2] = 1.0
+    height = lambda gap: cloth.state(rest + gap * up).d3.sum()  # noqa: E731
+    gap = torch.tensor(1e-5, requires_grad=True)
+    (slope,) = torch.autograd.grad(height(gap), gap)
+    with forward_ad.dual_level():
+        along = forward_ad.unpack_dual(height(forward_ad.make_dual(gap.detach(), torch.tensor(1.0)))).tangent
+    numerical = (height(gap.detach() + 1e-7) - height(gap.detach() - 1e-7)) / 2e-7
+    assert abs(float(numerical)) > 100
+    assert float(slope) == pytest.approx(float(numerical), rel=1e-6)
+    assert float(along) == pytest.approx(float(numerical), rel=1e-6)

@@ -162,7 +162,7 @@ def test_one_hand_of_two():
 def test_refusals(engine, along, message):
     cloth = sheet(engine)
     with pytest.raises(InvalidInput, match=message):
-        cloth.sensitivities(cloth.rest_state(), opening(END), along=along)
+        cloth.sensitivities(cloth.rest_state(), opening(END), (0.0, END), along=along)
 
 
 def test_without_gradients_and_graph():
@@ -179,3 +179,14 @@ def test_all_directions_share_one_look_at_the_parts(monkeypatch):
     monkeypatch.setattr(tangents, "lower", lambda *parts: asked.append(parts) or lower(*parts))
     both(count=7)
     assert len(asked) == 1
+
+
+def test_what_is_refused_is_the_simulations_business_first():
+    cloth = sheet("fused")
+    along = Directions({"areal_density.raw": torch.ones(1)}, state=start(cloth))
+    for state, motion, message in (
+        (start(cloth), [opening(END)], "motion; got list; expected a dict"),
+        (start(cloth).x, opening(END), "state; got Tensor; expected a ClothState"),
+    ):
+        with pytest.raises(InvalidInput, match=message):
+            cloth.sensitivities(state, motion, (0.0, END), along=along)

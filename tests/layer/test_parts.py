@@ -10,6 +10,7 @@ from torch.func import functional_call
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
+from torchcloth.model import kept
 
 
 @pytest.mark.parametrize("engine", ["reference", "fused"])
@@ -28,6 +29,8 @@ from torchcloth.errors import InvalidInput
         (lambda e, v: {"boundaries": {"part": tc.boundaries.Plane(friction=torch.ones(2))}}, "friction; got shape"),
         (lambda e, v: {"effects": {"a.b": tc.effects.Gravity()}}, "name of an effect or boundary; got 'a.b'"),
         (lambda e, v: {"boundaries": {"keys": tc.boundaries.Plane()}}, "name of an effect or boundary; got 'keys'"),
+        (lambda e, v: {"effects": {"training": tc.effects.Gravity()}}, "name of an effect or boundary; got 'training'"),
+        (lambda e, v: {"effects": {"_mesh": tc.effects.Gravity()}}, "name of an effect or boundary; got '_mesh'"),
     ],
 )
 def test_parts_whose_numbers_do_not_fit_the_mesh_are_refused(engine, parts, message):
@@ -200,3 +203,50 @@ def test_what_is_no_part_is_refused(what, given, got):
 def test_no_scenes_are_no_state():
     with pytest.raises(InvalidInput, match=r"^x; got shape \(0, 9, 3\)"):
         sheet(3).state(torch.zeros(0, 9, 3))
+
+
+def test_a_copy_that_a_simulation_works_with_owns_nothing():
+    hand = tc.boundaries.Grasp.corner("upper-right", radius=1e-3)
+    cloth = sheet(boundaries={"hand": hand})
+    kept(cloth)
+    gc.collect()
+    with pytest.raises(InvalidInput, match="an effect or boundary of another cloth"):
+        sheet(7, boundaries={"hand": hand})
+
+
+def test_what_two_cloths_share_is_of_both():
+    hand = tc.boundaries.Grasp.corner("upper-right", radius=1e-3)
+    first, second = (sheet(boundaries={"hand": hand}) for _ in range(2))
+    del second
+    gc.collect()
+    with pytest.raises(InvalidInput, match="an effect or boundary of another cloth"):
+        sheet(7, boundaries={"hand": hand})
+    assert first.boundaries["hand"] is hand
+
+
+def test_an_effect_by_the_name_of_material_hides_no_law_with_axes():
+    mesh = tc.meshes.Mesh.build([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    law = tc.materials.OrthotropicAEP(2e5, 1e5, 1e4)
+    with pytest.raises(InvalidInput, match=r"no pattern coordinates.*for 'material'"):
+        tc.Cloth(mesh, law, 0.2, {"material": tc.effects.MassDamping(1.0)}, contact=None)
+
+
+class Named(Pull):
+    """With coefficients that have names."""
+
+    def coefficients(self):
+        return {"k": self.strength.field}
+
+    def force(self, c, now):
+        return super().force(c["k"], now)
+
+
+@pytest.mark.parametrize("kind", [Pull, Named])
+def test_scenes_differ_in_a_users_own_coefficients(kind):
+    pull = kind()
+    pull.strength = tc.PhysicalParameter([[0.05], [0.1]], "N", "nonnegative", name="pull")
+    cloth = sheet(effects={"pull": pull})
+    v = torch.tensor([0.3, 0.1, -0.1]).expand(16, 3)
+    found = cloth(cloth.state(cloth.rest_state().x, v), times=(0.0, 0.01)).x
+    assert found.shape == (2, 2, 16, 3)
+    assert not torch.equal(found[0], found[1])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth.boundaries.motion import interpolate
+from torchcloth.boundaries.motion import drive, interpolate
 
 
 def sheet(size=0.3, n=8, *, effects=None, boundaries=None, contact=tc.Contact(), Y=300.0, density=0.15):  # noqa: B008
@@ -150,3 +150,12 @@ def test_float32_has_room_for_substeps_whatever_the_clock_says(origin):
 def test_a_path_of_one_knot_stands_still():
     still = tc.Trajectory(torch.zeros(1), torch.eye(4)[None], torch.ones(1, dtype=torch.bool))
     torch.testing.assert_close(interpolate(still, torch.tensor([-1.0, 0.0, 2.0])), torch.eye(4).expand(3, 4, 4))
+
+
+def test_a_hand_that_closes_at_a_knot_of_single_precision_is_closed_there():
+    """0.3 s is 0.30000001 in float32: cloth that settles from then was not held."""
+    t = torch.linspace(0.0, 1.0, 11, dtype=torch.float32)
+    motion = tc.Trajectory(t, torch.eye(4).repeat(11, 1, 1), torch.arange(11) >= 3)
+    for start, closed in ((0.3, True), (0.2999, False), (0.0, False)):
+        times = torch.tensor([start, start + 1e-3], dtype=torch.float64)
+        assert drive(motion, times).closed == (closed,), start

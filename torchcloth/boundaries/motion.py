@@ -120,9 +120,17 @@ def drive(trajectory: Trajectory, times: Tensor) -> Drive:
     turn = after[..., :3, :3] @ before[..., :3, :3].mT
     shift = after[..., :3, 3:] - turn @ before[..., :3, 3:]
     increment = torch.cat([torch.cat([turn, shift], dim=-1), after[..., 3:, :]], dim=-2)
-    knot = last_knot(trajectory.t.to(times), times[:-1] + 1e-9).clamp(min=0)
+    t = trajectory.t.to(times)
+    knot = last_knot(t, times[:-1] + _slack(trajectory.t)).clamp(min=0)
     closed = trajectory.closed.cpu()[knot.cpu()]
     return Drive(increment.to(given), after.to(given), tuple(closed.tolist()))
+
+
+def _slack(t: Tensor) -> float:
+    """s, by which a knot [K] may seem to be later than it is: 0.3 is 0.30000001 in float32."""
+    own = t.detach()
+    rounding = 4 * torch.finfo(own.dtype).eps * float(own.abs().max())
+    return max(1e-9, min(rounding, 0.5 * float(own.diff().min()))) if len(own) > 1 else max(1e-9, rounding)
 
 
 def _slopes(t: Tensor, value: Tensor) -> Tensor:

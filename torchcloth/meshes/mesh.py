@@ -296,6 +296,10 @@ def _check_triangles(x: np.ndarray, f: np.ndarray) -> None:
         raise InvalidInput(
             "faces", got=f"indices {f.min()}..{f.max()}", expected=f"0..{len(x) - 1}, one per row of vertices"
         )
+    folded = np.flatnonzero((f == np.roll(f, 1, axis=1)).any(1))
+    if len(folded):
+        got = f"{len(folded)} with a vertex twice (first: {folded[0]}: {f[folded[0]].tolist()})"
+        raise InvalidInput("faces", got=got, expected="three different vertices each", remedy="remove them")
     unused = np.setdiff1d(np.arange(len(x)), f)
     if len(unused):
         raise InvalidInput(
