@@ -8,7 +8,7 @@ from .arm import Arm, Limits, Primitive, load
 from .description import models
 from .holds import Hold
 from .plan import ACCELERATION, Plan, plan
-from .replay import arm_of, gripper_motion, replay
+from .replay import arm_of, closing, gripper_motion, replay
 from .retrace import retrace
 from .scene import Scene, Table, bimanual_rig
 
@@ -23,6 +23,7 @@ __all__ = [
     "Table",
     "arm_of",
     "bimanual_rig",
+    "closing",
     "gripper_motion",
     "load",
     "models",

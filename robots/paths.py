@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,12 +43,11 @@ class Path:
 
 def holding(recording: Recording) -> dict[str, Path]:
     """Those of the grippers that hold the cloth, of all where nothing says so: others stand by. Raises as ``paths``."""
-    every = paths(recording)
-    return {name: path for name, path in every.items() if not recording.grasps or name in recording.grasps}
+    return paths(recording, recording.grasps or None)
 
 
-def paths(recording: Recording) -> dict[str, Path]:
-    """The grippers' paths by name; of an arm through its kinematics. Empty where no motion was recorded.
+def paths(recording: Recording, names: Collection[str] | None = None) -> dict[str, Path]:
+    """The grippers' paths by name, of these or of all; of an arm through its kinematics. Empty without motion.
 
     Raises:
         MissingDependency: joints were recorded, and the packages for kinematics are not installed.
@@ -56,7 +56,7 @@ def paths(recording: Recording) -> dict[str, Path]:
     if not recording.grippers and not recording.joints:
         return {}
     found = {}
-    for name, motion in replay(recording).items():
+    for name, motion in replay(recording, names=names).items():
         pose = motion.pose.detach().numpy()
         found[name] = Path(motion.t.numpy(), pose[:, :3, 3], pose[:, :3, :3])
     return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -16,7 +18,9 @@ from .arm import Arm, load
 HOLDING_WIDTH = 0.02  # m, fingers opened less than this hold the cloth, when only the width was recorded
 
 
-def replay(recording: Recording, dtype: torch.dtype = torch.float64) -> dict[str, Trajectory]:
+def replay(
+    recording: Recording, dtype: torch.dtype = torch.float64, names: Collection[str] | None = None
+) -> dict[str, Trajectory]:
     """The world poses of every gripper of an episode, by name.
 
     Joint trajectories go through the arm's own kinematics; where an episode has joints and poses, the joints win:
@@ -25,6 +29,7 @@ def replay(recording: Recording, dtype: torch.dtype = torch.float64) -> dict[str
     Args:
         recording: an episode.
         dtype: of the poses.
+        names: only these, of those that there are: an arm that stands by may be one that nobody knows.
 
     Raises:
         RecordingError: joints without an arm to replay them on, or no motion at all.
@@ -32,17 +37,27 @@ def replay(recording: Recording, dtype: torch.dtype = torch.float64) -> dict[str
     """
     check_recording(recording)
     out = {}
+    wanted = lambda name: names is None or name in names  # noqa: E731
     for name, motion in recording.grippers.items():
+        if not wanted(name):
+            continue
         pose = _poses(motion.position, motion.quat_wxyz)
         out[name] = Trajectory(_tensor(motion.t), pose.to(dtype), torch.as_tensor(motion.closed, dtype=torch.bool))
     for name, joints in recording.joints.items():
-        if name in out and name not in recording.robots:
+        if not wanted(name) or (name in out and name not in recording.robots):
             continue
         pose = arm_of(recording, name)(_tensor(joints.q))
         out[name] = Trajectory(_tensor(joints.t), pose.to(dtype), _closed(joints))
-    if not out:
+    if not recording.grippers and not recording.joints:
         raise RecordingError(f"{recording.path}: no motion", expected="grippers or joints in motion.npz")
     return out
+
+
+def closing(recording: Recording) -> list[str]:
+    """The grippers that are closed at some time, also of arms that nobody knows."""
+    of_joints = {name: bool(_closed(joints).any()) for name, joints in recording.joints.items()}
+    own = {**of_joints, **{name: bool(motion.closed.any()) for name, motion in recording.grippers.items()}}
+    return [name for name, closes in own.items() if closes]
 
 
 def gripper_motion(path: Trajectory) -> GripperMotion:

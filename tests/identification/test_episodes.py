@@ -359,3 +359,10 @@ def test_the_frame_of_a_time_is_the_nearest_one_that_is_the_same():
     assert streams.places(times[:2], frames[3:]).tolist() == [0, -1]
     many = np.arange(200_000) / 30  # two hours: a table of all pairs would have 320 GB
     assert np.array_equal(streams.places(many, many), np.arange(200_000))
+
+
+def test_an_arm_that_stands_by_need_not_be_known(recording, model):
+    beside = replace(recording, joints={"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))})
+    seen, alone = (episode(model, r) for r in (beside, recording))
+    assert set(seen.motion) == {"left", "right"}
+    assert torch.equal(seen.motion["left"].pose, alone.motion["left"].pose)

@@ -290,3 +290,17 @@ def test_coverage_and_what_was_removed_are_explained(capsys, monkeypatch, needs_
     monkeypatch.setitem(sys.modules, "open3d", None)
     show(inspect(recording))
     assert "outliers not removed" in " ".join(capsys.readouterr().out.split())
+
+
+def test_an_unknown_arm_that_stands_by_takes_nothing_away():
+    recording = episode(markers=markers(lag=0.1, **GRID))
+    grasp = rec.GraspInfo(uv=np.array([[0.15, 0.3]]), radius=0.02)
+    held = replace(recording, grasps={"hand": grasp})
+    beside = replace(held, joints={"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))})
+    alone, found = inspect(held), inspect(beside)
+    assert set(found.paths) == {"hand"}
+    assert (found.lag.value, found.noise["markers"]) == (alone.lag.value, alone.noise["markers"])
+    assert [note for note in found.notes if note not in alone.notes] == [
+        note for note in found.notes if "'spare' stands by and has no path: " in note
+    ]
+    assert len(found.notes) == len(alone.notes) + 1

@@ -350,6 +350,7 @@ FILES = [
     ("episode.json", b"[1]", "episode.json is not an object of named values"),
     ("episode.json", b"\xff\xfe", "episode.json is not UTF-8 text"),
     ("episode.json", b'{"format": NaN}', "NaN is no JSON number"),
+    ("episode.json", b'{"clock_offset": 0.1, "cloth": {}, "clock_offset": 0}', "'clock_offset' twice in an object"),
     ("episode.json", b"[" * 100_000, "episode.json is not valid JSON"),
     ("motion.npz", None, r"grasps.left has no motion; got \[\]"),
     ("motion.npz", b"", "motion.npz is truncated, corrupt"),

@@ -332,3 +332,25 @@ def test_frames_are_chosen_by_mask_number_or_slice(recording):
     for frames in (mask, [0, 1], slice(0, 2), np.array([1, 0])):
         assert points.only(frames).t.tolist() == points.t[:2].tolist()
         assert np.array_equal(points.only(frames).xyz, points.xyz[: points.counts[:2].sum()])
+
+
+def test_a_mask_of_indexed_colours_is_what_is_painted(tmp_path):
+    """Whatever their numbers are: a palette may begin with white."""
+    painted = np.zeros((6, 8), bool)
+    painted[1:3, 2:5] = True
+    for first, numbers in (("white", ~painted), ("black", painted)):
+        image = Image.fromarray(numbers.astype(np.uint8), "P")
+        image.putpalette([255] * 3 + [0] * 3 if first == "white" else [0] * 3 + [255] * 3)
+        path = tmp_path / f"{first}.png"
+        image.save(path)
+        stream = rec.ImageStream("mask", np.arange(1), np.zeros(1), (path,), (8, 6))
+        np.testing.assert_array_equal(stream.load(0), painted)
+
+
+def test_a_users_file_may_have_any_name(episode):
+    """Only the arms that are shipped are known to have seven joints."""
+    path = episode / "episode.json"
+    content = json.loads(path.read_text())
+    content["robots"]["spare"]["model"] = "rizon4_on_rail.urdf"
+    path.write_text(json.dumps(content))
+    assert rec.read(episode).joints["spare"].q.shape == (3, 6)

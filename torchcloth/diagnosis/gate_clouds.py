@@ -77,7 +77,7 @@ class Seen:
     @cached_property
     def moved(self) -> dict[str, Trajectory]:
         """How, by name."""
-        return replay(self.recording)
+        return replay(self.recording, names=self.paths)
 
     @cached_property
     def holding(self) -> np.ndarray:

@@ -22,7 +22,7 @@ from ..meshes import Mesh, rectangle
 from ..meshes.patches import Patch
 from ..recordings import Camera, Recording
 from ..recordings.scene import THICKNESS
-from ..robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..robots import closing, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..transfer import Contact
 from ..types import Trajectory
 from . import streams
@@ -261,11 +261,12 @@ def episode(cloth: Cloth, recording: Recording, rate: float | None = None) -> Ep
     recording = streams.without_doubles(recording)
     name = recording.path.name if recording.path else "recording"
     dtype = cloth.state(torch.as_tensor(cloth.mesh.vertices)).x.dtype
-    motion = replay(recording, dtype)
     needed = [key for key, boundary in cloth.boundaries.items() if boundary.driven]
+    motion = replay(recording, dtype, needed)
     missing = [key for key in needed if key not in motion]
     if missing:
-        raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=f"motion of {sorted(motion)}")
+        got = f"motion of {sorted({*recording.grippers, *recording.joints})}"
+        raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=got)
     times, dropped = _frame_times(name, recording, motion, needed, rate)
     initial = first_shape(name, cloth, recording).to(dtype)
     _check_place(name, cloth, motion, initial, times[0])
@@ -284,7 +285,7 @@ def episode(cloth: Cloth, recording: Recording, rate: float | None = None) -> Ep
         wrenches=streams.wrenches(recording, needed, times, dtype),
         eye=_eye(recording, dtype),
         dropped=dropped,
-        idle=tuple(key for key in motion if key not in needed and bool(motion[key].closed.any())),
+        idle=tuple(key for key in closing(recording) if key not in needed),
         unused=int((felt > times[-1] + float(np.diff(times).max())).sum()),
     )
 

@@ -68,6 +68,17 @@ class Inspection:
         return _plain(whole)
 
 
+def _moved(recording: Recording, holds: dict[str, Path]) -> tuple[dict[str, Path], list[str]]:
+    """(the paths of those that hold the cloth and of others that are known, why others are not there)."""
+    found, notes = dict(holds), []
+    for name in sorted({*recording.grippers, *recording.joints} - holds.keys()) if holds else []:
+        try:
+            found |= paths(recording, [name])
+        except TorchclothError as error:
+            notes.append(f"{name!r} stands by and has no path: {error}")
+    return found, notes
+
+
 def inspect(recording: Recording) -> Inspection:
     """Look at an episode.
 
@@ -79,10 +90,12 @@ def inspect(recording: Recording) -> Inspection:
     """
     notes: list[str] = []
     try:
-        moved, holds = paths(recording), holding(recording)  # an arm that stands by tells nothing of the cloth
+        holds = holding(recording)  # an arm that stands by tells nothing of the cloth
     except TorchclothError as error:  # joints without an arm that is known here: all else can still be looked at
-        moved = holds = {}
+        holds = {}
         notes.append(f"no gripper paths, so no lag: {error}")
+    moved, more = _moved(recording, holds)
+    notes += more
     seen: dict[str, Frames] = {}
     if recording.markers is not None:
         seen["markers"] = frames.of_markers(recording.markers, recording.cloth)

@@ -22,7 +22,8 @@ CONVENTION = (
     "SI units, world frame, as the observer of the recording sees it. chamfer, rms: one-sided, cloud to surface, as in "
     "identification.json; null: carried rigidly; alone: simulated without corrective force; after: the estimate. "
     "force_share: root mean square over cloth and time of the corrective force over the weight. std in pose.npz: "
-    "standard error of a coordinate; 95 % within 1.96 of them. seen: a measured point lies on a triangle of the vertex."
+    "standard error of a coordinate; 95 % within 1.96 of them. seen: a point within 2 cm or a marker lies on a "
+    "triangle of the vertex; where points are sparser than vertices, as many edges away as the points are apart."
 )
 
 
@@ -35,7 +36,8 @@ class PoseEstimate:
         x: [T, V, 3] m.
         v: [T, V, 3] m/s.
         std: [T, V, 3] m, standard error of every coordinate.
-        seen: [T, V] bool; False: hidden, so that only the dynamics and what was seen elsewhere tell where it is.
+        seen: [T, V] bool, as of ``seen_vertices``; False: hidden, so that only the dynamics and what was seen elsewhere
+            tell where it is.
         faces: [F, 3].
         windows: [W, 2] s, in each of which the corrective force is constant.
         acceleration: [W, V, 3] m/s^2, corrective force over mass.

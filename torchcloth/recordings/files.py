@@ -64,7 +64,7 @@ class Folder:
     def json(self, name: str) -> checks.Fields:
         """The JSON object in a file."""
         try:
-            value = json.loads(self.text(name), parse_constant=_no_constant)
+            value = json.loads(self.text(name), parse_constant=_no_constant, object_pairs_hook=_once)
         except RecordingError:
             raise
         except (ValueError, RecursionError) as error:
@@ -115,6 +115,15 @@ def save_npz(file: Path | BinaryIO, arrays: Mapping[str, Any]) -> None:
             member.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(member, "w", force_zip64=True) as opened:
                 np.lib.format.write_array(opened, np.asarray(value), allow_pickle=False)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of a file that someone edited: of a key that stands there twice, one would be ignored."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"{next(key for key in keys if keys.count(key) > 1)!r} twice in an object")
+    return found
 
 
 def _no_constant(text: str) -> NoReturn:

@@ -140,7 +140,9 @@ def _decode(image: Path | bytes, place: str, *, rgb: bool) -> np.ndarray:
         if data.startswith(PNG):
             reader.open(io.BytesIO(data)).verify()  # checksums, which decoding does not look at
         with reader.open(io.BytesIO(data)) as opened:
-            return np.asarray(opened.convert("RGB") if rgb else opened)
+            indexed = "RGBA" if opened.mode in ("P", "PA") else None  # of a palette's colours, not its numbers
+            mode = "RGB" if rgb else indexed
+            return np.asarray(opened if mode is None else opened.convert(mode))
     except Exception as error:  # a damaged image raises whatever its decoder pleases
         raise RecordingError(f"{place} cannot be decoded", got=type(error).__name__, remedy="restore it") from error
 

@@ -238,7 +238,12 @@ def _check_robots(recording: Recording, told: str, folder: Folder) -> None:
             got = sorted({*recording.grippers, *recording.joints})
             raise RecordingError(f"{told}: robots.{name} is an unknown arm", got=got, expected="a name in motion.npz")
         arm = recording.joints.get(name)
-        if arm is not None and robot.model.startswith("rizon") and arm.q.shape[1] != RIZON_JOINTS:
+        if (
+            arm is not None
+            and robot.model.startswith("rizon")
+            and not robot.model.endswith(".urdf")
+            and arm.q.shape[1] != RIZON_JOINTS
+        ):
             place = f"{folder.place(streams.MOTION)}: {name}/q"
             raise RecordingError(
                 f"{place} is not a {robot.model}'s", got=list(arm.q.shape), expected=f"[K, {RIZON_JOINTS}]"

@@ -10,8 +10,8 @@ import torch
 from ..boundaries.motion import interpolate
 from ..errors import InvalidInput, RecordingError, TorchclothError
 from ..observe import DepthCamera, decode, solid_mesh, to_points
-from ..recordings import Collider, Recording
-from ..robots import arm_of, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..recordings import Collider, JointMotion, Recording
+from ..robots import Arm, arm_of, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..types import Trajectory
 from .film import (
     MARKERS,
@@ -122,25 +122,24 @@ def _depths(recording: Recording, views: dict[str, View], times: Array) -> tuple
             notes.append(f"depth of {name!r} is not drawn: {error}")
             continue
         if view.camera.depth is not None and (scale := view.camera.depth_scale) is not None:
-            clouds[f"depth/{name}"] = _from_depth(recording, view, camera, scale, times)
+            clouds[f"depth/{name}"] = _from_depth(view, camera, scale, times)
     if not clouds:
         found = "images are not drawn" if views else "no images"
         notes.append(f"nothing that was seen of the cloth is drawn: no points, no markers, {found}")
     return clouds, notes
 
 
-def _from_depth(recording: Recording, view: View, camera: DepthCamera, scale: float, times: Array) -> Cloud:
+def _from_depth(view: View, camera: DepthCamera, scale: float, times: Array) -> Cloud:
     """A camera's depth images as points, thinned."""
-    recorded, masks = view.camera, np.full(len(times), -1)
-    if recorded.mask is not None:
-        masks = _seen(recorded.mask.t + recording.clock_offset, times)
-    frames = []
-    for frame, mask in enumerate(masks):
+    depth, mask, frames = view.camera.depth, view.camera.mask, []
+    place = {} if mask is None else {number: k for k, number in enumerate(mask.frames.tolist())}
+    for frame in range(len(times)):
         raw = view.raw(frame)
-        if raw is None:
+        if raw is None or depth is None:
             frames.append(np.zeros((0, 3), np.float32))
             continue
-        inside = None if mask < 0 or recorded.mask is None else recorded.mask.load(int(mask)) > 0
+        own = place.get(int(depth.frames[view.index[frame]]))  # another image's would cut off what has moved
+        inside = None if own is None or mask is None else mask.load(own) > 0
         points = to_points(camera, decode(raw, scale), inside)
         frames.append(points[:: max(1, -(-len(points) // FROM_DEPTH))].astype(np.float32))
     return Cloud(tuple(frames))
@@ -162,9 +161,11 @@ def _arms(recording: Recording, times: Array) -> tuple[dict[str, Solid], dict[st
     for name, motion in recording.joints.items():
         try:
             arm = arm_of(recording, name)
-            q = np.stack([np.interp(times, motion.t, column) for column in motion.q.T], axis=-1)
+            q = _between(motion, arm, times)
             shapes = arm.geometry(torch.as_tensor(q, dtype=arm.base.dtype))
             paths |= replay(replace(recording, grippers={}, joints={name: motion}))
+            if arm.unshaped:
+                notes.append(f"of arm {name!r} links that are meshes alone are not drawn: {', '.join(arm.unshaped)}")
         except ImportError:
             raise
         except TorchclothError as error:
@@ -174,6 +175,13 @@ def _arms(recording: Recording, times: Array) -> tuple[dict[str, Solid], dict[st
             vertices, faces = solid_mesh(shape.kind, shape.size, np.eye(4), segments=16)
             solids[f"arms/{name}/{number}-{shape.link}"] = Solid(vertices, faces, _poses(shape.pose, len(times)))
     return solids, paths, notes
+
+
+def _between(motion: JointMotion, arm: Arm, times: Array) -> Array:
+    """[T, J], linear; joints that turn without end go the short way round from one knot to the next."""
+    columns = zip(motion.q.T, arm.joint_types, strict=True)
+    turned = [np.unwrap(column) if kind == "continuous" else column for column, kind in columns]
+    return np.stack([np.interp(times, motion.t, column) for column in turned], axis=-1)
 
 
 def _poses(pose: torch.Tensor, count: int) -> Array:
