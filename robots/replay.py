@@ -53,6 +53,12 @@ def replay(
     return out
 
 
+def unwound(arm: Arm, q: np.ndarray) -> np.ndarray:
+    """Recorded joints [K, J] without the jumps of those that turn without end: encoders say +-pi for the same angle."""
+    columns = zip(q.T, arm.joint_types, strict=True)
+    return np.stack([np.unwrap(own) if kind == "continuous" else own for own, kind in columns], axis=-1)
+
+
 def closing(recording: Recording) -> list[str]:
     """The grippers that are closed at some time, also of arms that nobody knows."""
     of_joints = {name: bool(_closed(joints).any()) for name, joints in recording.joints.items()}

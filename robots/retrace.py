@@ -35,7 +35,7 @@ def scene_of(recording: Recording) -> Scene | None:
     names = list(holding(recording))
     if not names or any(name not in recording.robots for name in names):
         return None
-    return Scene({name: arm_of(recording, name) for name in names}, _table(recording))
+    return Scene({name: arm_of(recording, name) for name in names}, table_of(recording))
 
 
 def retrace(recording: Recording, scene: Scene | None = None) -> Plan | None:
@@ -58,7 +58,7 @@ def retrace(recording: Recording, scene: Scene | None = None) -> Plan | None:
     if other := held.symmetric_difference(scene.arms):
         got = f"{sorted(other)}, with an arm or held and not both"
         raise InvalidInput("scene", got=got, expected=f"an arm for each of {sorted(held)}")
-    every = replay(recording)
+    every = replay(recording, names=list(scene.arms))
     motion = {name: _turns(every[name]) for name in scene.arms}
     end = max(float(path.t[-1]) for path in motion.values())
     return plan(scene, Action(motion, end, end))
@@ -71,10 +71,13 @@ def _turns(path: Trajectory) -> Trajectory:
     return path._replace(pose=pose)
 
 
-def _table(recording: Recording) -> Table | None:
+def table_of(recording: Recording) -> Table | None:
+    """As of ``scene_of``."""
     if not any(c.normal[2] > LEVEL for c in recording.colliders.values()):
         return None
-    places = [torch.cat([path.pose[:, :2, 3] for path in replay(recording).values()]).numpy()]
+    places = [
+        torch.cat([path.pose[:, :2, 3] for path in replay(recording, names=recording.grasps or None).values()]).numpy()
+    ]
     if recording.cloth.initial_vertices is not None:
         places.append(recording.cloth.initial_vertices.reshape(-1, 3)[:, :2])
     low, high = (f(np.concatenate(places), axis=0) + way for f, way in ((np.min, -AROUND), (np.max, AROUND)))

@@ -58,3 +58,11 @@ def test_of_a_hand_without_an_arm_nothing_is_known():
     _, judge, doubt = looked_at(by_hand(), 0.02)
     assert judge is None
     assert "not every gripper" in doubt
+
+
+def test_a_named_arm_without_joints_need_not_be_known():
+    """No arm moves what it holds: that nothing is kept clear is all that there is to say."""
+    unknown = replace(by_hand(), robots={"hand": rec.RobotInfo("ur5e", np.eye(4))})
+    _, judge, doubt = looked_at(unknown, 0.05)
+    assert judge is None
+    assert "not every gripper that holds the cloth is moved by an arm" in doubt

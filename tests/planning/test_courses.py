@@ -1,12 +1,17 @@
 """What is added to a motion, and its limits."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
-from scenes import LASTS, by_arm, by_hand, cloth_of
+from scenes import EDGE, LASTS, by_arm, by_hand, cloth_of
 
+from torchcloth import recordings as rec
+from torchcloth.planning import staging
 from torchcloth.planning.courses import Bounds, Span, rotation
 from torchcloth.planning.feasible import step_within
-from torchcloth.planning.staging import as_episode, courses_of
+from torchcloth.planning.staging import as_episode, courses_of, doubts
 from torchcloth.robots import ACCELERATION, arm_of, replay
 from torchcloth.robots.primitives import Limits
 
@@ -76,8 +81,6 @@ def test_a_hand_stays_above_the_table():
 
 
 def test_the_planned_episode_says_what_was_planned(tmp_path):
-    from torchcloth import recordings as rec
-
     for recording in (by_hand(), by_arm()):
         (course,) = courses(recording)
         z = 0.01 * torch.randn(course.nothing.shape)
@@ -85,3 +88,88 @@ def test_the_planned_episode_says_what_was_planned(tmp_path):
         (again,) = replay(rec.read(path)).values()
         assert torch.allclose(again.pose, course.trajectory(z).pose, atol=1e-9)
         assert again.closed.tolist() == course.closed.tolist()
+
+
+def two_hands(longer, opens=None):
+    """The sheet's edge held by two hands; the right one is recorded ``longer`` [s], and may open at a time."""
+    recording = by_hand()
+    hand = recording.grippers["hand"]
+    t = np.linspace(0.0, LASTS + longer, round((LASTS + longer) / 0.01) + 1)
+    place = hand.position[:1] + np.stack([0.1 * t, 0 * t, 0 * t], -1)
+    closed = np.ones(len(t), bool) if opens is None else t < opens - 1e-9
+    right = rec.GripperMotion(t, place, np.tile([1.0, 0, 0, 0], (len(t), 1)), closed)
+    grasps = {"hand": rec.GraspInfo(EDGE[:3], 0.02), "right": rec.GraspInfo(EDGE[4:], 0.02)}
+    return replace(recording, grasps=grasps, grippers={"hand": hand, "right": right})
+
+
+def test_what_was_recorded_longer_waits_as_well():
+    """It had driven on through the wait, where no limit is looked at."""
+    for course in courses(two_hands(longer=0.3), wait=0.2):
+        pose = course.trajectory(course.nothing).pose
+        after = course.t > LASTS + 1e-9
+        assert int(after.sum()) == 2
+        assert torch.equal(pose[after], pose[~after][-1:].expand(2, 4, 4))
+
+
+def test_a_hand_lets_go_when_it_did():
+    """At 0.1 * 3, which is later than the other's knot at 0.3 by one bit."""
+    recording = two_hands(longer=0.0, opens=0.1 * 3)
+    t = recording.grippers["right"].t.copy()
+    t[30] = 0.1 * 3
+    assert t[30] > 0.3 == recording.grippers["hand"].t[30]
+    right = replace(recording.grippers["right"], t=t, closed=t < 0.1 * 3)
+    _, course = courses(replace(recording, grippers={**recording.grippers, "right": right}))
+    assert float(course.t[~course.closed][0]) == pytest.approx(0.3, abs=1e-6)
+
+
+def test_accelerations_are_bounded_where_they_are_greatest():
+    """At the ends of what is added; there half of them was looked at."""
+    (course,) = courses(by_hand(), waypoints=4)
+    bounds = Bounds.of([course])
+    added = torch.zeros(4, 6)
+    added[0, 0] = 1.0
+    of_x = [k for k, name in enumerate(bounds.names) if name == "acceleration of x of hand"]
+    found = (bounds.rows @ added.flatten())[of_x]
+    fine = torch.linspace(0.0, LASTS, 4001)
+    curve = course.span.basis(fine)[:, 0]
+    true = (curve[2:] - 2 * curve[1:-1] + curve[:-2]) / float(fine[1]) ** 2
+    assert float(found[0]) == pytest.approx(float(true[0]), rel=0.01)
+    assert float(found.abs().max()) == pytest.approx(float(true.abs().max()), rel=0.01)
+
+
+def test_a_recorded_motion_that_is_under_way_is_no_acceleration():
+    recording = two_hands(longer=0.0)
+    late = replace(recording, points=rec.PointClouds(np.array([0.1, 0.2]), np.zeros((2, 3)), np.ones(2, int)))
+    _, course = courses(late, waypoints=2)  # 0.1 m/s all the time
+    bounds = Bounds.of([course])
+    first = bounds.names.index("acceleration of x of right")
+    assert course.span.begin == pytest.approx(0.1)
+    assert float(bounds.high[first]) == pytest.approx(course.limits.acceleration, rel=1e-3)
+    assert float(bounds.low[first]) == pytest.approx(-course.limits.acceleration, rel=1e-3)
+
+
+def test_joints_that_turn_without_end_go_the_short_way(monkeypatch):
+    recording, arm = by_arm(), arm_of(by_arm(), "arm")
+    joints = recording.joints["arm"]
+    turned = joints.q.copy()
+    turned[20:, 6] -= 2 * np.pi  # as encoders say it
+    monkeypatch.setattr(staging, "arm_of", lambda *_: arm)
+    arm.joint_types = (*arm.joint_types[:6], "continuous")
+    wrapped = replace(recording, joints={"arm": replace(joints, q=turned)})
+    (course,), (plain,) = courses(wrapped), courses(recording)
+    np.testing.assert_allclose(course.q, plain.q, atol=1e-12)
+
+
+def test_an_arm_that_stands_by_need_not_be_known():
+    beside = {"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))}
+    (course,) = courses(replace(by_hand(), joints=beside))
+    assert course.name == "hand"
+    assert not doubts(replace(by_hand(), joints=beside), [course])
+
+
+def test_of_a_table_that_leans_its_height_below_the_path_is_kept():
+    recording = by_hand(table=0.1)
+    table = replace(recording.colliders["table"], normal=np.array([0.2, 0.0, 0.98]))
+    leaning = replace(recording, colliders={"table": table})
+    assert not doubts(recording, courses(recording))
+    assert any("hand: table leans" in doubt for doubt in doubts(leaning, courses(leaning)))

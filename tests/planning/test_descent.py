@@ -114,3 +114,14 @@ def test_slopes_that_are_lost_end_the_search():
             return Pull(torch.tensor(1.0), torch.full((2,), torch.nan), torch.eye(2))
 
     assert "chaotic" in search(Lost(), "gauss-newton").ended
+
+
+@pytest.mark.parametrize("method", ["gauss-newton", "adam"])
+def test_slopes_of_chaos_end_the_search(method):
+    problem, nothing = Bowl(), torch.full((2,), math.nan)
+    problem.slope = lambda at: (problem.look(at)[0], nothing)
+    problem.pull = lambda at: Pull(torch.tensor(1.0), nothing, torch.eye(2))
+    found = search(problem, method)
+    assert torch.equal(found.best, torch.zeros(2))
+    assert len(found.history) == 1
+    assert "slopes say nothing" in found.ended

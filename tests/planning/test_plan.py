@@ -280,6 +280,19 @@ def test_in_float32_too():
     assert found.after[0] < 0.5 * found.before[0]
 
 
+def test_in_float32_too_where_the_first_frame_is_between_knots():
+    """Whole numbers may come from JSON, as 2.0."""
+    torch.set_default_dtype(torch.float32)
+    seen = rec.PointClouds(np.array([0.0, 0.1, 0.2]), np.tile([0.0, 0.1, 0.45], (3, 1)), np.ones(3, int))
+    recording = replace(by_hand(), points=seen, clock_offset=0.105)  # 0.105 is less in float32
+    cloth = cloth_of(recording)
+    x = episode(cloth, recording, 20.0).initial
+    found = tc.plan(
+        cloth, recording, Goal(x + torch.tensor([0.03, 0.0, 0.0])), wait=WAIT, waypoints=2.0, iterations=1.0
+    )
+    assert found.after[0] < found.before[0]
+
+
 def test_two_hands_with_knots_of_their_own():
     recording = by_hand()
     one = recording.grippers["hand"]

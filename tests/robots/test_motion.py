@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 import torchcloth.robots as robots
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.robots.replay import unwound
 from torchcloth.types import Trajectory
 
 
@@ -173,3 +175,9 @@ def test_a_pose_is_enough_where_no_arm_is_named(random_q):
     assert robots.replay(episode)["hand"].pose[-1, :3, 3].tolist() == [0.1, 0.0, 0.0]
     with pytest.raises(RecordingError, match="no robot"):
         robots.replay(replace(episode, grippers={}))
+
+
+def test_joints_that_turn_without_end_are_recorded_without_jumps():
+    arm = SimpleNamespace(joint_types=("continuous", "revolute"))
+    q = unwound(arm, np.array([[3.1, 3.1], [-3.1, -3.1], [3.1, 3.1]]))
+    np.testing.assert_allclose(q, [[3.1, 3.1], [2 * np.pi - 3.1, -3.1], [3.1, 3.1]])

@@ -3,7 +3,6 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from PIL import Image
 from torchcloth import recordings as rec
 from torchcloth import robots
 from torchcloth.errors import RecordingError
-from torchcloth.viewing import episodes, film_of
+from torchcloth.viewing import film_of
 from torchcloth.viewing.film import placed
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recordings"))
@@ -182,14 +181,6 @@ def test_a_mask_is_that_of_its_own_image(rich, tmp_path):
     film = film_of(replace(seldom, cameras={"cam0": replace(camera, mask=second)}))
     (cloud,) = film.clouds.values()
     assert [bool((frame[:, 0] < 0).any()) for frame in cloud.frames] == [True, False]
-
-
-def test_joints_that_turn_without_end_go_the_short_way(rich):
-    motion = rec.JointMotion(np.array([0.0, 1.0]), np.array([[3.1, 3.1], [-3.1, -3.1]]))
-    arm = SimpleNamespace(joint_types=("continuous", "revolute"))
-    q = episodes._between(motion, arm, np.array([0.0, 0.5, 1.0]))
-    np.testing.assert_allclose(q[:, 0], [3.1, np.pi, 2 * np.pi - 3.1])
-    np.testing.assert_allclose(q[:, 1], [3.1, 0.0, -3.1], atol=1e-12)
 
 
 def test_links_that_cannot_be_drawn_are_named(example, monkeypatch):

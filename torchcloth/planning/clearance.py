@@ -10,7 +10,7 @@ from ..errors import InvalidInput
 from ..recordings import Recording
 from ..robots.clearance import Gap  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..robots.crowd import between_arms, within_arm  # pyright: ignore[reportMissingImports]
-from ..robots.retrace import scene_of  # pyright: ignore[reportMissingImports]
+from ..robots.retrace import table_of  # pyright: ignore[reportMissingImports]
 from ..robots.scene import Scene, Table  # pyright: ignore[reportMissingImports]
 from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
 from .courses import ArmCourse, Course
@@ -50,14 +50,14 @@ def clearance_of(
 
     A recorded motion that comes nearer by our solids was done all the same: then they are no judges.
     """
-    scene = scene_of(recording)
-    if scene is None or not all(isinstance(c, ArmCourse) for c in courses):
+    arms = {c.name: c.arm for c in courses if isinstance(c, ArmCourse)}
+    if len(arms) < len(courses):
         return None, "not every gripper that holds the cloth is moved by an arm: whether arms stay clear is not known"
-    if bare := [name for name in scene.arms if scene[name].unshaped]:
+    if bare := [name for name, arm in arms.items() if arm.unshaped]:
         return None, f"solids of {bare[0]!r} are meshes: whether the arms stay clear was not looked at"
-    table = None if scene.table is None else _reaching(scene.table, goal)
-    arms = Scene({c.name: scene[c.name] for c in courses}, table)
-    found = Clearance(arms, least, courses[0].span.instants)
+    table = table_of(recording)
+    scene = Scene(arms, None if table is None else _reaching(table, goal))
+    found = Clearance(scene, least, courses[0].span.instants)
     _, refusal = found.nearest({c.name: c.at_instants(c.nothing) for c in courses})
     if refusal is not None:
         return (

@@ -141,8 +141,11 @@ class Course(ABC):
         eye, parts = torch.eye(self.start.shape[1], dtype=torch.float64), []
         at, recorded = self.span.instants, lambda times: between(self.t, self.start, times)
         for order, ends in ((0, (least, largest)), (1, (-fastest, fastest)), (2, (-hardest, hardest))):
-            before = _derivative(recorded, at, order, PERIOD if order < 2 else OVER * PERIOD)
-            more = _derivative(self.span.basis, at, order, NUDGE)
+            step = PERIOD if order < 2 else OVER * PERIOD
+            since = at if order == 0 else at.clamp(min=self.span.begin + step)  # what came before is no part of it
+            before = _derivative(recorded, since, order, step)
+            inside = at.clamp(self.span.begin + NUDGE, self.span.end - NUDGE)  # at its ends accelerations are greatest
+            more = _derivative(self.span.basis, inside if order == 2 else at, order, NUDGE)
             low, high = (ends[0] - before).clamp(max=0.0), (ends[1] - before).clamp(min=0.0)
             names = [f"{ORDERS[order]} of {label} of {self.name}" for label in self.labels] * len(at)
             parts.append((torch.kron(more, eye), low.flatten(), high.flatten(), names))

@@ -22,6 +22,7 @@ GOOD, POOR = 0.7, 0.2  # of what was expected
 ENOUGH = 0.005  # of the mean square distance, that a further step should gain
 GAIN = f"{100 * ENOUGH:g} % of the mean square distance"
 BLOCKED = "every step that slopes ask for is blocked by a limit or by what is in the arms' way"
+CHAOTIC = "the cloth is so chaotic there that slopes say nothing"
 LAST = 0.05  # of Adam's rate, at the end
 PATIENCE = 20  # of Adam's steps
 
@@ -95,7 +96,7 @@ def gauss_newton(problem: Problem, start: Tensor, iterations: int, on_look: OnLo
         if pull is None:
             pull = problem.pull(at)
             if not all(bool(part.isfinite().all()) for part in pull):
-                return Found(at, history, "the cloth is so chaotic there that slopes say nothing")
+                return Found(at, history, CHAOTIC)
         step, expected = _promised(problem, at, pull, damping)
         while fresh and expected <= ENOUGH * value and damping > LEAST and bool(step.any()):
             damping = max(EASIER * damping, LEAST)
@@ -153,6 +154,8 @@ def adam(problem: Problem, start: Tensor, iterations: int, rate: float, on_look:
         history.append(value)
         bests.append(min(history))
         on_look(len(history), value, bests[-1])
+        if gradient is not None and not bool(gradient.isfinite().all()):
+            return Found(best, history, CHAOTIC)
         if k == iterations:
             break
         if len(bests) > PATIENCE and bests[-1 - PATIENCE] - bests[-1] < ENOUGH * bests[-1]:

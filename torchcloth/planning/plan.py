@@ -77,6 +77,7 @@ def plan(
     if method not in METHODS:
         raise InvalidInput("method", got=repr(method), expected=f"one of {', '.join(METHODS)}")
     check_positive(iterations=iterations, rate=rate)
+    iterations = int(iterations)
     asked = Asked(waypoints, wait, acceleration, limits, clearance, dt)
     task, warnings = posed(model, recording, goal, asked, journal, resume)
     if method == "adam":

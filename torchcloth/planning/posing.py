@@ -61,7 +61,7 @@ def posed(
     for m in models:
         aim_at(wanted, m.base.cloth.mesh)  # refuses what is not of this cloth before anything is simulated
     cloth = models[0].base.cloth
-    courses = courses_of(cloth, recording, asked.waypoints, asked.wait, asked.acceleration, asked.limits)
+    courses = courses_of(cloth, recording, int(asked.waypoints), asked.wait, asked.acceleration, asked.limits)
     courses = [course(c) for c in courses]
     rehearsals = [Rehearsal(m, recording, courses, asked.dt) for m in models]
     warnings = [*doubts(recording, courses), *_check_goal(wanted, rehearsals[0])]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +18,7 @@ from ..recordings import Recording
 from ..recordings.proposed import undone
 from ..robots import arm_of, gripper_motion, replay  # pyright: ignore[reportMissingImports] - mapped from robots/
 from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
-from ..robots.replay import model_of  # pyright: ignore[reportMissingImports]
+from ..robots.replay import model_of, unwound  # pyright: ignore[reportMissingImports]
 from ..robots.retrace import highest  # pyright: ignore[reportMissingImports]
 from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
@@ -28,6 +29,7 @@ NEAREST = 0.1  # s, between waypoints: nearer ones tremble
 SAME = 1e-6  # s
 STOP = 0.01  # s after the end, in which what still moves is stopped
 MOVING = 0.02  # m/s
+STRAIGHT = 0.9999  # upward part of a plane's normal
 
 
 def courses_of(
@@ -39,7 +41,8 @@ def courses_of(
         InvalidInput: grippers of nothing, one that takes hold on the way, or waypoints that are too near each other.
         RecordingError: no motion for one of the cloth's grasps.
     """
-    seen, every = episode(cloth, recording, RATE), replay(recording)
+    seen = episode(cloth, recording, RATE)
+    every = replay(recording, names=seen.motion)
     names = [name for name in seen.motion if name in recording.grasps and bool(every[name].closed.any())]
     if not names:
         expected = "a gripper that holds the cloth, whose motion to change"
@@ -52,16 +55,18 @@ def courses_of(
         raise InvalidInput("waypoints", got=got, expected=f"{NEAREST:g} s or more for each", remedy=remedy)
     span = Span(begin, end, waypoints)
     knots = _knots([every[name].t for name in names], span, wait)
+    at = knots.clamp(max=end)  # then all wait, and what was recorded longer as well
     out: list[Course] = []
     for name in names:
         path = every[name]
-        closed = path.closed[last_knot(path.t, knots).clamp(min=0)]
+        closed = path.closed[last_knot(path.t, knots + SAME).clamp(min=0)]
         _check_hold(name, closed)
         if name in recording.joints and name in recording.robots:
-            q = between(path.t, torch.as_tensor(recording.joints[name].q), knots)
-            out.append(ArmCourse(name, knots, closed, span, arm_of(recording, name), q, acceleration))
+            arm = arm_of(recording, name)
+            q = between(path.t, torch.as_tensor(unwound(arm, recording.joints[name].q)), at)
+            out.append(ArmCourse(name, knots, closed, span, arm, q, acceleration))
         else:
-            pose = interpolate(path._replace(pose=path.pose.double()), knots.clamp(max=float(path.t[-1])))
+            pose = interpolate(path._replace(pose=path.pose.double()), at)
             table = highest(recording.colliders, pose[:, :2, 3].numpy())
             lowest = min(table, float(pose[:, 2, 3].min()))
             out.append(HandCourse(name, knots, closed, span, pose, limits, lowest))
@@ -89,15 +94,24 @@ def as_episode(recording: Recording, courses: Sequence[Course], waypoints: Seque
 
 def doubts(recording: Recording, courses: Sequence[Course]) -> list[str]:
     """What a reader should know of what was planned from, in sentences."""
-    out, every, begin = [], replay(recording), courses[0].span.begin
+    out, begin = [], courses[0].span.begin
+    every = replay(recording, names=[course.name for course in courses])
     for course in courses:
         path = every[course.name]
         speed = (path.pose[1:, :3, 3] - path.pose[:-1, :3, 3]).norm(dim=-1) / path.t.diff()
-        if begin > float(path.t[0]) + SAME and float(speed[last_knot(path.t, torch.tensor([begin]))[0]]) > MOVING:
+        if begin > float(path.t[0]) + SAME and float(speed[last_knot(path.t, path.t.new_tensor([begin]))[0]]) > MOVING:
             out.append(
                 f"{course.name}: the planned motion begins at the first frame, {begin - float(path.t[0]):.2f} s after "
                 "the recorded one, which is under way there: bring the arm there as recorded"
             )
+    hands = ", ".join(c.name for c in courses if isinstance(c, HandCourse))
+    leaning = [
+        name for name, c in recording.colliders.items() if abs(c.normal[2]) < STRAIGHT * np.linalg.norm(c.normal)
+    ]
+    if hands and leaning:
+        out.append(
+            f"{hands}: {', '.join(leaning)} leans: kept is its height below the recorded path, and not beside it"
+        )
     if bare := [c.name for c in courses if isinstance(c, HandCourse) and c.name in recording.robots]:
         names = ", ".join(bare)
         out.append(f"{names}: an arm is named, but its joints were not recorded: no limit of a joint is kept")
@@ -128,7 +142,7 @@ def _check_hold(name: str, closed: Tensor) -> None:
 
 def _knots(times: Sequence[Tensor], span: Span, wait: float) -> Tensor:
     """[S] s: all recorded ones within the span, more where these are far apart, its ends, and those of the wait."""
-    every = torch.cat([*times, torch.tensor([span.begin, span.end])])
+    every = torch.cat([*times, times[0].new_tensor([span.begin, span.end])])
     inner = every[(every >= span.begin) & (every <= span.end)].unique()
     inner = inner[torch.cat([inner.new_ones(1), inner.diff()]) > SAME]
     inner = Spline(inner, inner[:, None], inner[:, None]).finer(PERIOD)

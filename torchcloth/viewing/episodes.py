@@ -10,8 +10,9 @@ import torch
 from ..boundaries.motion import interpolate
 from ..errors import InvalidInput, RecordingError, TorchclothError
 from ..observe import DepthCamera, decode, solid_mesh, to_points
-from ..recordings import Collider, JointMotion, Recording
-from ..robots import Arm, arm_of, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..recordings import Collider, Recording
+from ..robots import arm_of, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..robots.replay import unwound  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
 from .film import (
     MARKERS,
@@ -161,7 +162,7 @@ def _arms(recording: Recording, times: Array) -> tuple[dict[str, Solid], dict[st
     for name, motion in recording.joints.items():
         try:
             arm = arm_of(recording, name)
-            q = _between(motion, arm, times)
+            q = np.stack([np.interp(times, motion.t, own) for own in unwound(arm, motion.q).T], axis=-1)
             shapes = arm.geometry(torch.as_tensor(q, dtype=arm.base.dtype))
             paths |= replay(replace(recording, grippers={}, joints={name: motion}))
             if arm.unshaped:
@@ -175,13 +176,6 @@ def _arms(recording: Recording, times: Array) -> tuple[dict[str, Solid], dict[st
             vertices, faces = solid_mesh(shape.kind, shape.size, np.eye(4), segments=16)
             solids[f"arms/{name}/{number}-{shape.link}"] = Solid(vertices, faces, _poses(shape.pose, len(times)))
     return solids, paths, notes
-
-
-def _between(motion: JointMotion, arm: Arm, times: Array) -> Array:
-    """[T, J], linear; joints that turn without end go the short way round from one knot to the next."""
-    columns = zip(motion.q.T, arm.joint_types, strict=True)
-    turned = [np.unwrap(column) if kind == "continuous" else column for column, kind in columns]
-    return np.stack([np.interp(times, motion.t, column) for column in turned], axis=-1)
 
 
 def _poses(pose: torch.Tensor, count: int) -> Array:
