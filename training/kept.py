@@ -122,6 +122,12 @@ def guarded(name: str, what: str, work: Callable[[], object]) -> int:
         return 130
 
 
+def check_jobs(jobs: int) -> None:
+    """Raises InvalidInput for cases at a time that are none."""
+    if jobs < 1:
+        raise InvalidInput("--jobs", got=jobs, expected="1 or more")
+
+
 def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
     """Raises InvalidInput where the folder cannot hold a study of these settings, or has one by other code."""
     check_folder(folder)
@@ -154,7 +160,8 @@ def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
 def _of_this_code(settings: Mapping[str, Any]) -> dict[str, Any]:
     """With a fingerprint of the code that makes data and studies them: results of two versions are no study."""
     here = Path(__file__).resolve().parent
-    return {**settings, "code": program(here, *(here.parent / "tests" / name for name in MAKERS))}
+    code = program(here, *(here.parent / "tests" / name for name in MAKERS))
+    return json.loads(json.dumps({**settings, "code": code}))  # as they are read again: a tuple is a list
 
 
 def unreadable(path: Path) -> RecordingError:

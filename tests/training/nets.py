@@ -25,3 +25,10 @@ class Spoilt(Small):
     def forward(self, places):
         moved = (self.layers[0].weight - self.begun).square().sum()
         return super().forward(places) + (0.0 if moved == 0 else 0.0 * (moved - moved.detach()).sqrt())
+
+
+class Counting(torch.nn.Sequential):
+    """It remembers what it has seen."""
+
+    def __init__(self):
+        super().__init__(torch.nn.Linear(2, 3), torch.nn.BatchNorm1d(3), torch.nn.Linear(3, 1))

@@ -1,6 +1,8 @@
 """Runs of the fit: what they learn, and that they go on bit for bit."""
 
+import csv
 import json
+import shutil
 import signal
 import sys
 from dataclasses import replace
@@ -256,3 +258,40 @@ def test_a_network_cannot_make_a_cone_negative():
         learned.network.weight.zero_()
         learned.network.bias.fill_(-1.0)
     assert float(learned.values()["cone"].max()) == 0.0
+
+
+def test_what_is_left_is_no_validation(config, episodes, tmp_path):
+    """A log of validation ends with the last step's; the training set's figures stood there."""
+    data = {"train": [str(episodes / "ep_0")], "val": [str(episodes / "ep_1")]}
+    for name, own in (("with", data), ("without", {**data, "val": []})):
+        path = config(data=own, optimizer={"steps": 2}, run={"loggers": ["csv"]})
+        assert main(["--config", path, f"out={tmp_path / name}"]) == 0
+        (log,) = (tmp_path / name).rglob("metrics.csv")
+        with log.open() as file:
+            seen = [row["val/loss"] for row in csv.DictReader(file) if row.get("val/loss")]
+        assert len(seen) == (2 if own["val"] else 0)
+        found = json.loads((tmp_path / name / "fit.json").read_text())
+        assert found["train"]["loss_after"] > 0
+
+
+def test_the_command_for_errors_takes_the_same_steps(config, tmp_path):
+    path = config(learn={"parameters": ["youngs_modulus"]}, optimizer={"steps": 1}, model={"dt": 2e-4})
+    assert main(["--config", path]) == 0
+    assert json.loads((tmp_path / "out" / "fit.json").read_text())["identify"].endswith("--dt 0.0002")
+
+
+def test_globs_find_folders(config, episodes, tmp_path):
+    """``simulate`` leaves pictures beside its episodes."""
+    shutil.copytree(episodes / "ep_0", tmp_path / "own" / "ep_0")
+    (tmp_path / "own" / "ep_0.gif").write_bytes(b"GIF89a")
+    assert main(["--config", config(data={"train": [f"{tmp_path}/own/*"]}, optimizer={"steps": 1})]) == 0
+
+
+def test_a_stopped_run_promises_only_its_own_checkpoint(config, monkeypatch, capsys):
+    path = config(optimizer={"steps": 1})
+    assert main(["--config", path]) == 0
+    stopped = lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)  # noqa: E731
+    monkeypatch.setattr(run, "fit", stopped)
+    for options, promised in ((["--resume"], True), (["optimizer.rate=0.2"], False)):
+        assert main(["--config", path, *options]) == 130
+        assert ("goes on after" in capsys.readouterr().err) == promised

@@ -55,6 +55,18 @@ LESS = "{in_features: -2, out_features: 1}"
         (["loss.points=0"], "config: loss.points; got 0.0; expected a scale > 0"),
         (["loss={markers: 0.001}"], "nothing to compare with"),
         (["learn.network={module: no.Net, gives: [poisson_ratio]}"], "config: learn.network; got no.Net (No module"),
+        (
+            [
+                "learn.network={module: torch.nn.Identity, gives: [youngs_modulus, poisson_ratio]}",
+                "learn.parameters=[]",
+            ],
+            "config: learn.network; got a network without any; expected some parameter that may change",
+        ),
+        (
+            ["learn.network={module: nets.Counting, gives: [poisson_ratio]}", "run.processes=2"],
+            "config: learn.network; got layers with running statistics, on several processes",
+        ),
+        (["out=~nosuchuser/x"], "config: out; got ~nosuchuser/x"),
         (["learn.network={module: torch.nn.Softmax, gives: [poisson_ratio]}"], "torch.nn.Softmax: output; got ["),
         (
             [f"learn.network={{module: torch.nn.Linear, arguments: {SEVEN}, gives: [poisson_ratio]}}"],
@@ -93,7 +105,7 @@ def test_one_line(config, episodes, tmp_path, capsys, options, words):
     assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize("content", [None, "a: [", "3", "learn: 3", "out: x"])
+@pytest.mark.parametrize("content", [None, "a: [", "3", "learn: 3", "out: x", "out: x\nout: y"])
 def test_a_file_that_is_no_config(tmp_path, capsys, content):
     path = tmp_path / "config.yaml"
     if content is not None:

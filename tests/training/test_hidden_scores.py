@@ -4,7 +4,7 @@ import pytest
 
 from torchcloth.training.studies import hidden_rates as rates
 from torchcloth.training.studies.hidden_scores import judged, shows
-from torchcloth.training.studies.hidden_tables import markdown
+from torchcloth.training.studies.hidden_tables import markdown, seconds
 
 
 def hidden(family, *effects, kind="1", **more):
@@ -266,3 +266,11 @@ def test_singles_are_counted_by_effect():
     assert list(found) == ["drag", "hem"]
     assert [tuple(rate) for rate in found["hem"]] == [(1, 2), (1, 1), (0, 0), (2, 2)]
     assert [tuple(rate) for rate in found["drag"]] == [(0, 0), (0, 0), (0, 1), (0, 1)]
+
+
+def test_what_a_stopped_diagnosis_took_is_not_known():
+    cases = [{"seconds": s, "sealed": True} for s in (100.0, None, 300.0)]
+    assert seconds(cases).startswith("200 s a diagnosis (median; longest 300 s; 1 of 2 within 4 minutes")
+    assert "3 cases" in seconds(cases)
+    assert "is not known, 1 cases" in seconds(cases[1:2])
+    assert seconds([]) == "no case is finished"

@@ -87,3 +87,11 @@ def test_what_is_not_a_number_does_not_lose_a_case(tmp_path):
     kept = Kept(tmp_path, {"study": "s"})
     found = kept.run({"a": lambda: {"seen": math.nan, "all": [1.0, math.inf]}})
     assert found == {"a": {"seen": None, "all": [1.0, None]}}
+
+
+def test_settings_are_those_that_are_read_again(tmp_path):
+    """JSON makes lists of tuples: a study of several motions could not go on."""
+    for _ in range(2):
+        assert Kept(tmp_path, {"motions": ("swing", "fold")}).run({"a": lambda: {"x": 1}}) == {"a": {"x": 1}}
+    with pytest.raises(InvalidInput, match="which holds a study with motions"):
+        Kept(tmp_path, {"motions": ("swing",)})

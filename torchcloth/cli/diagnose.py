@@ -56,8 +56,8 @@ def _diagnose(options: argparse.Namespace) -> int:
         seen = [float(s.t[-1] - s.t[0]) for s in streams if s is not None]
         seconds, longest = sum(seen), max(seen, default=0.0)
         print(
-            f"{len(episodes)} episodes, seen for {seconds:.0f} s: some {max(1, round(seconds / 3)):.0f} minutes of a "
-            "core, up to four times as many where causes are found",
+            f"{len(episodes)} episodes, seen for {seconds:.0f} s: some {max(1, round(seconds / 1.5)):.0f} minutes of "
+            "a core, up to three times as many where causes are found",
             flush=True,
         )
         if longest > LONG:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Sequence
 from importlib.util import find_spec
+from pathlib import Path
 
 from torchcloth.errors import MissingDependency, TorchclothError
 
@@ -16,7 +18,7 @@ NAME = "torchcloth.training.fit"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
-    options, config = _parser().parse_intermixed_args(arguments), None
+    options, config, began = _parser().parse_intermixed_args(arguments), None, time.time()
     try:
         if find_spec("lightning") is None:  # which brings YAML
             raise MissingDependency("lightning is not installed", remedy='run: pip install "torchcloth[training]"')
@@ -34,10 +36,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("fit: another process ended; see its own line", file=sys.stderr)
         return 2
     except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
-        kept = config is not None and (config.folder / CHECKPOINT).is_file()
+        kept = config is not None and _kept(config.folder / CHECKPOINT, since=0.0 if options.resume else began)
         further = "; the same command with --resume goes on after the last whole step" if kept else ""
         print(f"fit: stopped{further}", file=sys.stderr)
         return 130
+
+
+def _kept(checkpoint: Path, since: float) -> bool:
+    """Whether a checkpoint is there, and not of an earlier run."""
+    return checkpoint.is_file() and checkpoint.stat().st_mtime >= since
 
 
 def _left_alone(error: RuntimeError) -> bool:

@@ -123,6 +123,10 @@ def from_dict(content: Mapping[str, Any]) -> Config:
         InvalidInput: an unknown key, a value of the wrong kind.
     """
     config = _build(Config, content, "")
+    try:
+        config.folder  # noqa: B018 - of a user whom this machine has
+    except RuntimeError as error:
+        raise InvalidInput("config: out", got=f"{config.out} ({error})", expected="a folder") from None
     for key, legal in {**CHOICES, **AT_LEAST}.items():
         section, _, name = key.partition(".")
         value = getattr(getattr(config, section), name)
@@ -155,8 +159,19 @@ def _text(path: str) -> str:
 def _parsed(what: str, text: str) -> Any:
     import yaml
 
+    class Loader(yaml.SafeLoader):
+        """Of a key that stands there twice, one would be ignored."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+            own = (key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge")
+            keys = [self.construct_object(key, deep=True) for key in own]
+            for k, key in enumerate(keys):
+                if key in keys[:k]:
+                    raise ValueError(f"{key!r} twice{node.start_mark}")
+            return super().construct_mapping(node, deep)
+
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, Loader)
     except (yaml.YAMLError, ValueError) as error:  # a day that no month has
         raise InvalidInput(what, got=str(error), expected="YAML") from None
 

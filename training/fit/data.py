@@ -63,7 +63,8 @@ def _folders(patterns: Sequence[str], key: str) -> dict[Path, Path]:
             shipped = resources.files("torchcloth") / "examples" / pattern.removeprefix(EXAMPLE)
             matches = [str(shipped)]
         else:
-            matches = sorted(glob(pattern)) if any(c in pattern for c in "*?[") else [pattern]
+            found = (m for m in sorted(glob(pattern)) if Path(m).is_dir())  # pictures may lie beside episodes
+            matches = list(found) if any(c in pattern for c in "*?[") else [pattern]
         if not matches:
             raise InvalidInput(f"config: {key}", got=f"no folder that matches {pattern}", expected="episodes")
         for folder in map(Path, matches):

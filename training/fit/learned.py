@@ -53,6 +53,9 @@ class Learned(nn.Module):
         for name in (*what.parameters, *what.fields):
             self.parameter(name).raw.requires_grad_(True)
         self.network = None if what.network is None else _made(what.network).to(cloth.areal_density.raw)
+        if next(self.with_units(), None) is None:
+            expected = "some parameter that may change"
+            raise InvalidInput("config: learn.network", got="a network without any", expected=expected)
         self.register_buffer("_places", places(cloth.mesh).to(cloth.areal_density.raw), persistent=False)
         self.register_buffer("_pairs", neighbours(cloth.mesh), persistent=False)
 

@@ -68,7 +68,8 @@ def _command(config: Config, episodes: list[str], values: dict[str, float]) -> s
     starts = {**config.model.start, **values}
     words = ["torchcloth", "identify", *episodes, "--out", str(config.folder / "identify")]
     words += ["--start", *(f"{name}={value:.6g}" for name, value in starts.items()), "--fit", *values]
-    words += ["--contact", f"{config.model.contact:g}"] if config.model.contact else []
+    given = {"--contact": config.model.contact, "--dt": config.model.dt}
+    words += [word for option, value in given.items() if value for word in (option, f"{value:g}")]
     return shlex.join(words)
 
 

@@ -17,6 +17,7 @@ from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvir
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.strategies import DDPStrategy
+from torch import nn
 
 from torchcloth import Cloth
 from torchcloth.errors import InvalidInput, MissingDependency
@@ -95,9 +96,11 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
         raise InvalidInput("config: run.processes", got=got, expected=expected)
     _check_processes(config.run)
     module = FitModule(asdict(config), description, _problem(config, cloth, data))
+    _check_statistics(module.learned.network, config.run)
     initial = module.now()
     trainer = _trainer(config, folder, [] if checkpoint else [folder / name for name in result.RESULTS])
     trainer.fit(module, datamodule=data, ckpt_path=checkpoint)
+    trainer.loggers = []  # what is left is no step's validation, least of all of what was fitted
     figures = {
         "train": {"episodes": len(train), **_after(trainer, module, data, data.train)},
         "val": {"episodes": len(val), **(_after(trainer, module, data, data.val) if val else {})},
@@ -113,6 +116,17 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
         episodes = [str(r.path) for r in train]
         result.show(result.save(folder, config, module, initial, figures, episodes), folder)
     return module
+
+
+def _check_statistics(network: nn.Module | None, run: Run) -> None:
+    """Of a network that remembers what it has seen, each process would remember its own share of the episodes."""
+    own = () if network is None else network.modules()
+    if run.processes * run.nodes > 1 and any(getattr(m, "track_running_stats", False) for m in own):
+        raise InvalidInput(
+            "config: learn.network",
+            got="layers with running statistics, on several processes",
+            expected="one process, or layers without (track_running_stats=False, GroupNorm, LayerNorm)",
+        )
 
 
 def _check_processes(run: Run) -> None:

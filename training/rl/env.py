@@ -64,7 +64,8 @@ class ReachEnv(gymnasium.Env):
 
     Observation: places of some vertices from the goal's middle, their velocities, where the grippers' coordinates have
     gone, and how much of the motion is over. Action: the step of every coordinate, as a share of the largest that the
-    limits allow. Reward: minus the distance from the goal over that of the recorded motion's end, after every step.
+    limits allow. Reward: minus the distance from the goal over that of the recorded motion's end, after every step;
+    where cloth is torn, what ends the motion, for every step that is left as much as the last, and 5 at least.
 
     Args:
         task: with ``stepwise`` courses and one model.
@@ -123,6 +124,7 @@ class ReachEnv(gymnasium.Env):
         """The cloth at rest where it is first."""
         super().reset(seed=seed)
         self.at, self.done, self.state = self.task.start.clone(), 0, self.run.state
+        self.away = float(self.task.aims[0].distance(self.state.x))
         return self._seen(), {}
 
     def step(self, action: np.ndarray):
@@ -141,10 +143,11 @@ class ReachEnv(gymnasium.Env):
         try:
             with torch.no_grad():
                 self.state = self.run.go_on(self.state, self.task.motion(self.at), float(self.ends[k]), end)
-            distance = float(self.task.aims[0].distance(self.state.x))
+            distance = self.away = float(self.task.aims[0].distance(self.state.x))
             reward = -distance / self.first
-        except SimulationDiverged:  # cloth that is torn: the motion ends
-            distance, reward, over = math.inf, -TORN, True
+        except SimulationDiverged:  # cloth that is torn: the motion ends, and nothing is gained by ending it early
+            distance, over = math.inf, True
+            reward = -(self.stretches - k) * max(TORN, self.away / self.first)
         if over:
             self.on_motion(Tried(distance, self.at))
         return self._seen(), reward, over, False, {"distance": distance}

@@ -41,6 +41,7 @@ def learn(task: Task, motions: int, seed: int = 0, warm: int = 10) -> Learnt:
     """
     try:
         from stable_baselines3 import SAC
+        from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
     except ImportError as error:
         remedy = 'pip install "torchcloth[rl]"'
         raise MissingDependency("SAC needs stable-baselines3", remedy=remedy) from error
@@ -51,7 +52,7 @@ def learn(task: Task, motions: int, seed: int = 0, warm: int = 10) -> Learnt:
     torch.set_default_dtype(torch.float32)  # as its networks want; the cloth keeps its own
     try:
         model = SAC("MlpPolicy", env, seed=seed, learning_starts=warm * env.stretches, gradient_steps=1, device="cpu")
-        model.learn(motions * env.stretches)
+        model.learn(motions * env.stretches, StopTrainingOnMaxEpisodes(motions))  # torn cloth ends one early
         seen, over = env.reset()[0], False
         while not over:
             seen, _, over, _, _ = env.step(model.predict(seen, deterministic=True)[0])

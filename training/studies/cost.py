@@ -93,7 +93,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--triangles", type=int, metavar="N", help="of the shirt in the fit, about (1500)")
     option("--gap", type=float, metavar="M", help="between the shirt's layers [m] (0.035)")
     option("--length", type=float, metavar="SECONDS", help="of the shirt's motion (3)")
-    option("--descent", type=int, metavar="N", help="steps of gradient descent (10; the paper's: 35)")
+    option("--descent", type=int, metavar="N", help="steps of gradient descent and of Adam (10; the paper's: 35)")
 
 
 def run(chosen: argparse.Namespace) -> None:

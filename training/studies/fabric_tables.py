@@ -105,7 +105,8 @@ def _pressed(result: Mapping[str, Any]):
 
 def _place(result: Mapping[str, Any]) -> str:
     """What the error bars of the press do not know."""
-    worst = {s: max(abs(own[s]["elsewhere"]["worst"] or 0.0) for own in result["fabrics"].values()) for s in _LAYERS}
+    every = {s: [own[s]["elsewhere"]["worst"] for own in result["fabrics"].values()] for s in _LAYERS}
+    worst = {s: max((abs(x) for x in own if x is not None), default=None) for s, own in every.items()}
     off = ", ".join(f"{symbol} is off by up to {percent(share)}" for symbol, share in worst.items())
     return (
         "These errors know the sensors only. Pressed to the same distance elsewhere in the contact's grid, layers give "

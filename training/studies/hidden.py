@@ -160,11 +160,12 @@ def one(out: Path, name: str, seed: int, fast: bool) -> dict[str, Any]:
     make = partial(_script, "make.py", "--seed", str(seed), *(["--fast"] if fast else []))
     given = _made(make("--out", str(episodes)))
     begun = time.perf_counter()
+    stopped = (answer / PROGRESS).exists() or (answer / ANSWER).exists()  # and what it took before is not known
     found = answered(given, answer)
-    spent = time.perf_counter() - begun
+    spent = None if stopped else round(time.perf_counter() - begun, 1)
     # only now
     truth = json.loads(_script("reveal.py", "--seed", str(seed), *(["--fast"] if fast else [])))
-    case = {"truth": truth, "answer": found, "seconds": round(spent, 1), "gain": None}
+    case = {"truth": truth, "answer": found, "seconds": spent, "gain": None}
     if truth["family"] == "next experiment":
         case["next"] = experiments(out, name, make, given, found, seed)
     if truth["family"] in ("single", "double") and not fast:

@@ -66,13 +66,15 @@ def _figure(label: str, value: Rate | float | None) -> tuple[str, str]:
 
 def seconds(cases: Sequence[Mapping[str, Any]]) -> str:
     """What a case costs."""
-    spent = [c["seconds"] for c in cases]
-    if not spent:
+    spent = [c["seconds"] for c in cases if c["seconds"] is not None]
+    if not cases:
         return "no case is finished"
+    count = f"{len(cases)} cases, {sum(c['sealed'] for c in cases)} of them sealed"
+    if not spent:
+        return f"every diagnosis was stopped on its way, so that what it took is not known, {count}"
     return (
         f"{np.median(spent):.0f} s a diagnosis (median; longest {max(spent):.0f} s; {sum(t <= LONG for t in spent)} of "
-        f"{len(spent)} within {LONG / 60:.0f} minutes; cases that run beside it slow it down), {len(cases)} cases, "
-        f"{sum(c['sealed'] for c in cases)} of them sealed"
+        f"{len(spent)} within {LONG / 60:.0f} minutes; cases that run beside it slow it down), {count}"
     )
 
 
@@ -110,7 +112,7 @@ def _case(c: Mapping[str, Any]) -> tuple[str, ...]:
     said += ", false cause" if c["wrong"] and said != "alarm" else ""
     hidden = ", ".join(c["hidden"]) or NOTHING
     first = (c["name"], c["family"], c["kind"], hidden, c["verdict"], named, said)
-    return (*first, ", ".join(off), gain, f"{c['seconds']:.0f}")
+    return (*first, ", ".join(off), gain, NOTHING if c["seconds"] is None else f"{c['seconds']:.0f}")
 
 
 def _filled(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1):

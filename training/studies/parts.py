@@ -21,7 +21,7 @@ from torchcloth.errors import InvalidInput
 from torchcloth.recordings import read
 from torchcloth.recordings.together import together
 
-from ..kept import Kept
+from ..kept import Kept, check_jobs
 from .checkout import module
 from .fabric_tables import NOTHING, table
 from .left_out import WAYS, rigid, tangents
@@ -39,8 +39,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Compute what is missing, then print and write parts.json."""
-    if options.jobs < 1:
-        raise InvalidInput("--jobs", got=options.jobs, expected="1 or more")
+    check_jobs(options.jobs)
     seeds = (*NULLS[:1], *SINGLES[:1]) if options.fast else (*NULLS, *SINGLES)
     kept = Kept(options.out, {"study": "parts", "fast": options.fast})
     kept.begin()

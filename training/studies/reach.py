@@ -26,7 +26,7 @@ from torchcloth.planning import Goal
 from torchcloth.recordings import Recording
 from torchcloth.robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
-from ..kept import Kept
+from ..kept import Kept, check_jobs
 from .checkout import module
 from .manipulations.printing import heading_table, mm, show, write
 
@@ -70,6 +70,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Fit the fabric, then every case; print and write reach.json."""
+    check_jobs(options.jobs)
     scale = FAST if options.fast else Scale()
     kept = Kept(options.out, {"study": "reach", **asdict(scale)})
     folder = options.out / FIT
