@@ -37,6 +37,21 @@ def test_a_shirt_is_lifted():
     assert float(frames[..., 2].min()) > -0.0061
 
 
+def test_a_tension_machines_readings_are_fitted(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (block,) = (b for b in BLOCKS if "fit_tension" in b)
+    scope = run(block)
+    assert scope["fit"].parameters["shear_modulus"].identifiable
+    assert main(["predict", "nylon", "--angle", "30", "--out", "thirty"]) == 0
+    assert "30" in capsys.readouterr().out
+
+
+def test_every_block_is_run():
+    runs = Path(__file__).read_text()
+    chosen = re.findall(r'if "([^"]+)" in b\)', runs)
+    assert [sum(word in block for word in chosen) for block in BLOCKS] == [1] * len(BLOCKS)
+
+
 def test_the_own_recording_can_be_identified(tmp_path, monkeypatch, capsys):
     """What a reader does next: write it, then the command."""
     monkeypatch.chdir(tmp_path)

@@ -7,6 +7,7 @@ import ctypes
 import subprocess
 import tempfile
 from contextlib import contextmanager, nullcontext
+from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 from weakref import WeakKeyDictionary
@@ -89,17 +90,22 @@ extern "C" void launch_adjoint(int blocks, Port* p, R* d, int* t, R* w, unsigned
 FLAGS = ["-std=c++20", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-pthread", "-w"]
 
 
+@cache
+def compiled(text):
+    """Each once in a process."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "program.cpp"
+        file.write_text(text)
+        subprocess.run([*building.compiler(), *FLAGS, "-o", f"{file}.so", str(file)], check=True)
+        return ctypes.CDLL(f"{file}.so")
+
+
 class Host:
     """A text, compiled here."""
 
     def __init__(self, text, threads, reverse):
         self.threads = threads
-        text = HOST.format(threads=threads, reversed=str(reverse).lower()) + text + LAUNCH
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "program.cpp"
-            file.write_text(text)
-            subprocess.run([*building.compiler(), *FLAGS, "-o", f"{file}.so", str(file)], check=True)
-            self._library = ctypes.CDLL(f"{file}.so")
+        self._library = compiled(HOST.format(threads=threads, reversed=str(reverse).lower()) + text + LAUNCH)
 
     def launch(self, name, blocks, shared, arguments):
         assert shared <= 8 << 16

@@ -136,9 +136,17 @@ def test_one_state_with_batched_poses_or_parameters(request, scene_name, what):
     """One initial state, many motions or many fabrics: what planning and identification ask for."""
     scene = request.getfixturevalue(scene_name)
     leaves = leaves_of(scene)
-    keys = scene.motion if what == "poses" else parameters(scene.cloth)
-    many = batched({name: leaves[name] for name in keys}, 3, 0.0)
+    torch.manual_seed(0)
     if what == "poses":
-        many = {name: leaves[name].expand(3, *leaves[name].shape) for name in keys}
+        many = {name: leaves[name].repeat(3, 1, 1, 1) for name in scene.motion}
+        for poses in many.values():
+            poses[..., :3, 3] += 0.01 * torch.randn(3, 1, 3) * torch.linspace(0, 1, poses.shape[1])[:, None]
+        entries = [{name: poses[k] for name, poses in many.items()} for k in range(3)]
+    else:
+        names = parameters(scene.cloth)
+        many = batched(names, 3, spread=0.05)
+        entries = [single(many, names, k) for k in range(3)]
     together = evaluate(scene, {**leaves, **many})
-    close(together[1], evaluate(scene, leaves), 1e-12, "batch entry")
+    for k, entry in enumerate(entries):
+        close(together[k], evaluate(scene, {**leaves, **entry}), 1e-12, f"entry {k}")
+    assert not torch.allclose(together[0], together[1])

@@ -31,6 +31,20 @@ def model(recording):
 
 
 @pytest.fixture(scope="session")
+def one_step(recording, brief):
+    """A step of the brief episode's stiffness, from the data sheet's."""
+    with twins.doubles():
+        return identify(twins.at(recording), brief, ["youngs_modulus"], iterations=1)
+
+
+@pytest.fixture(scope="session")
+def plain(recording):
+    """Stiffness and air only, from the data sheet's values."""
+    with twins.doubles():
+        return identify(twins.at(recording), recording, ["youngs_modulus", "air.normal"])
+
+
+@pytest.fixture(scope="session")
 def fitted(recording):
     """(result, what on_progress was called with): everything the model contains, from the data sheet's values."""
     calls = []

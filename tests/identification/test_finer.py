@@ -89,21 +89,19 @@ def test_a_profile_is_that_of_the_given_mesh(model, recording):
         identify(model, recording, PAIR, refine=True, profile=PAIR[:1])
 
 
-def test_a_finer_mesh_that_cannot_be_simulated_leaves_the_fit_and_says_so(model, brief, monkeypatch):
+def test_a_finer_mesh_that_cannot_be_simulated_leaves_the_fit_and_says_so(model, brief, one_step, monkeypatch):
     def torn(*_):
         raise SimulationDiverged("the cloth is torn apart")
 
-    plain = identify(model, brief, ["youngs_modulus"], iterations=1)
     monkeypatch.setattr(fit, "mesh_step", torn)
     found = identify(model, brief, ["youngs_modulus"], iterations=1, refine=True)
-    assert found.parameters == plain.parameters
+    assert found.parameters == one_step.parameters
     assert "mesh_step" not in found.fit
     assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in found.warnings)
 
 
-def test_it_moves_towards_what_a_finer_mesh_finds(recording, model):
+def test_it_moves_towards_what_a_finer_mesh_finds(recording, model, plain):
     """The truth has 11 x 11 vertices, the model 7 x 7; a fit on 13 x 13, which costs eight times as much, judges."""
-    plain = identify(model, recording, PAIR)
     moved = identify(model, recording, PAIR, refine=True)
     fine = finer_cloth(model)
     judge = identify(fine, finer_recording(recording, model.mesh, fine.mesh), PAIR)
@@ -116,6 +114,7 @@ def test_it_moves_towards_what_a_finer_mesh_finds(recording, model):
     assert torch.equal(plain.frames_before[0], moved.frames_before[0])
 
 
+@pytest.mark.slow
 def test_a_mesh_that_is_fine_already_is_hardly_corrected(recording):
     """With the truth's own spacing halved the step is below a standard error."""
     fine = finer_cloth(twins.at(recording))
@@ -142,8 +141,8 @@ def test_a_sewn_mesh_keeps_its_pattern():
         assert other == pytest.approx(own, rel=1e-6)
 
 
-def test_a_late_clock_is_no_difference_between_meshes():
-    late = twins.twin()
+def test_a_late_clock_is_no_difference_between_meshes(recording):
+    late = recording
     moved = {n: _later(g, 0.03) for n, g in late.grippers.items()}  # frames were taken 30 ms after they say
     late = replace(late, grippers=moved)
     names, clock = ["youngs_modulus", "air.normal"], {"clock": 0.03}
@@ -160,9 +159,8 @@ def _later(g, by):
 
 
 @pytest.mark.parametrize("asked", [0.1, 1.0])
-def test_a_correction_that_cannot_be_simulated_is_none(model, brief, monkeypatch, asked):
+def test_a_correction_that_cannot_be_simulated_is_none(model, brief, one_step, monkeypatch, asked):
     """A tenth of the longest step to where nothing can be simulated, and farther than slopes can tell."""
-    plain = identify(model, brief, ["youngs_modulus"], iterations=1)
     seen, longest = Objective.seen, collect(model, ["youngs_modulus"], None)[0].longest_step
 
     def torn_elsewhere(self, raw):
@@ -180,6 +178,6 @@ def test_a_correction_that_cannot_be_simulated_is_none(model, brief, monkeypatch
     ended = []
     monkeypatch.setattr(fit, "mesh_step", step)
     found = identify(model, brief, ["youngs_modulus"], iterations=1, refine=True)
-    assert found.parameters == plain.parameters
+    assert found.parameters == one_step.parameters
     why = "on a finer one, the cloth is torn" if asked < 1 else "a finer one asks for more than slopes can tell"
     assert any(f"not corrected for the coarseness of the mesh: {why}" in w for w in found.warnings)

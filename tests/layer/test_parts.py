@@ -13,7 +13,6 @@ from torchcloth.errors import InvalidInput
 from torchcloth.model import kept
 
 
-@pytest.mark.parametrize("engine", ["reference", "fused"])
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
@@ -33,9 +32,9 @@ from torchcloth.model import kept
         (lambda e, v: {"effects": {"_mesh": tc.effects.Gravity()}}, "name of an effect or boundary; got '_mesh'"),
     ],
 )
-def test_parts_whose_numbers_do_not_fit_the_mesh_are_refused(engine, parts, message):
+def test_parts_whose_numbers_do_not_fit_the_mesh_are_refused(parts, message):
     with pytest.raises(InvalidInput, match=message):
-        sheet(**parts(18, 16)).engine = engine
+        sheet(**parts(18, 16))
 
 
 def test_coefficients_never_reach_beyond_their_rows():

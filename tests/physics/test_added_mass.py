@@ -222,5 +222,5 @@ def test_the_usual_scheme_knows_nothing_of_it():
 
 @pytest.mark.parametrize("options", [{"length": -0.1}, {"density": 0.0}, {"density": math.inf}])
 def test_refusals(options):
-    with pytest.raises(tc.errors.InvalidInput):
+    with pytest.raises(tc.errors.InvalidInput, match="depth" if "length" in options else "density"):
         tc.effects.AddedMass(**options)

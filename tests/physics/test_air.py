@@ -100,7 +100,7 @@ def test_a_strip_hangs_inclined_in_the_wind():
 
 @pytest.mark.parametrize("options", [{"tangential": -0.1}, {"wind": (1.0, 2.0)}, {"wind": (0.0, 0.0, math.nan)}])
 def test_refusals(options):
-    with pytest.raises(tc.errors.InvalidInput):
+    with pytest.raises(tc.errors.InvalidInput, match="|".join(options)):
         tc.effects.AirDrag(**options)
 
 

@@ -298,7 +298,7 @@ def test_derivatives_in_both_modes_and_in_batches():
     ],
 )
 def test_refusals(options):
-    with pytest.raises(tc.errors.InvalidInput):
+    with pytest.raises(tc.errors.InvalidInput, match="|".join(options)):
         tc.effects.Bending(**options).bind(irregular(4))
 
 

@@ -94,5 +94,5 @@ def test_gradients_through_the_crease():
 
 @pytest.mark.parametrize("options", [{"mobility": -1.0}, {"yield_curvature": 0.0}, {"poisson": 1.0}])
 def test_refusals(options):
-    with pytest.raises(tc.errors.InvalidInput):
+    with pytest.raises(tc.errors.InvalidInput, match="|".join(options)):
         tc.effects.CreasingBending(**options)

@@ -175,5 +175,5 @@ def test_gradients_through_a_reversal():
 @pytest.mark.parametrize("make", [tc.effects.BendingFriction, tc.effects.ShearFriction])
 @pytest.mark.parametrize("options", [{"threshold": 0.0}, {"threshold": math.nan}, {"amount": -1.0}])
 def test_refusals(make, options):
-    with pytest.raises(tc.errors.InvalidInput):
+    with pytest.raises(tc.errors.InvalidInput, match="moment|hysteresis" if "amount" in options else "threshold"):
         make(options.get("amount", 1.0), options.get("threshold", 1.0))

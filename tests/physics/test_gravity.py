@@ -59,5 +59,5 @@ def test_a_strip_hangs_along_the_tilted_plumb_line():
     "options", [{"acceleration": (0.0, 1.0)}, {"tilt": (0.0, 0.0, 0.0)}, {"tilt": (math.inf, 0.0)}]
 )
 def test_refusals(options):
-    with pytest.raises(tc.errors.InvalidInput):
+    with pytest.raises(tc.errors.InvalidInput, match="|".join(options)):
         tc.effects.Gravity(**options)

@@ -136,5 +136,5 @@ def test_a_batch_of_hems():
 )
 def test_refusals(options):
     mesh = tc.meshes.rectangle(0.3, 0.2, resolution=(4, 6))
-    with pytest.raises(tc.errors.InvalidInput):
+    with pytest.raises(tc.errors.InvalidInput, match="|".join(options).replace("_", " ")):
         tc.effects.LineMass(**options).bind(mesh)

@@ -5,7 +5,7 @@ import torch
 
 import torchcloth as tc
 from torchcloth import functional
-from torchcloth.effects import AirDrag, KelvinVoigt, MassDamping, ResidualForce
+from torchcloth.effects import AirDrag, Bending, KelvinVoigt, MassDamping, ResidualForce
 from torchcloth.effects.residual import LAWS, PLACES, describe
 from torchcloth.errors import InvalidInput
 from torchcloth.types import Moment
@@ -59,12 +59,20 @@ def test_laws_are_those_of_known_effects(terms, known):
     assert torch.allclose(force(own, x, v), force(other, x, v), rtol=1e-9, atol=1e-14)
 
 
+def normal(x):
+    """Of a sheet that lies flat."""
+    n = torch.linalg.cross(x[1] - x[0], x[-1] - x[0])
+    return n / n.norm()
+
+
 def test_across_and_along_make_up_linear_drag():
     """On a sheet that moves as a whole: the area's share of a triangle is the vertex's mass over the density."""
-    own, other = cloth_with(ResidualForce({"across": 0.4, "along": 0.4})), cloth_with(MassDamping(0.4 / DENSITY))
+    own, other = cloth_with(ResidualForce({"across": 0.4, "along": 0.1})), cloth_with(MassDamping(0.4 / DENSITY))
     x, _ = moving(own)
     v = torch.tensor([0.3, -0.2, 0.5]).expand_as(x)
-    assert torch.allclose(force(own, x, v), force(other, x, v), rtol=1e-9, atol=1e-14)
+    every, n = force(other, x, v), normal(x)
+    expected = 0.25 * every + 0.75 * (every @ n)[:, None] * n
+    assert torch.allclose(force(own, x, v), expected, rtol=1e-9, atol=1e-14)
 
 
 def test_mass_is_added_and_weighs():
@@ -113,6 +121,17 @@ def test_what_opposes_stretching_is_still_while_bent_cloth_turns_rigidly():
     x = x + 0.01 * torch.randn(x.shape)
     rigid = torch.linalg.cross(torch.tensor([0.4, -1.0, 2.0]).expand_as(x), x) + torch.tensor([0.1, 0.2, -0.3])
     assert float(force(cloth, x, rigid).abs().max()) < 1e-9 * float(force(cloth, x, v).abs().max())
+
+
+def test_what_opposes_bending_is_bending():
+    """Without a curvature that it prefers, and the same in all directions."""
+    own, other = cloth_with(ResidualForce({"bend": 0.7})), cloth_with(Bending(0.7, poisson=0.0))
+    x, _ = moving(own)
+    u, v = torch.as_tensor(own.mesh.uv).mT
+    bent = x + 0.005 * torch.sin(7 * u + 4 * v)[:, None] * normal(x)
+    found, expected = (force(cloth, bent, 0 * x) for cloth in (own, other))
+    assert float(expected.abs().max()) > 0
+    assert torch.allclose(found, expected, rtol=0.05, atol=0.02 * float(expected.abs().max()))
 
 
 def test_what_opposes_bending_leaves_flat_cloth_alone():

@@ -133,7 +133,7 @@ def test_stable_step_knows_the_true_shape(shape):
 
 @pytest.mark.parametrize("options", [{"shrink_warp": 1.0}, {"shrink_weft": math.nan}, {"skew": 1.6}])
 def test_refusals(options):
-    with pytest.raises(tc.errors.InvalidInput):
+    with pytest.raises(tc.errors.InvalidInput, match="|".join(options).replace("shrink_", "shrinkage along the ")):
         tc.effects.RestShape(**options)
 
 

@@ -47,5 +47,5 @@ def test_momentum_and_angular_momentum_are_kept():
 
 @pytest.mark.parametrize(("moment", "curvature"), [(-1.0, 1.0), (1.0, 0.0)])
 def test_refusals(moment, curvature):
-    with pytest.raises(tc.errors.InvalidInput):
+    with pytest.raises(tc.errors.InvalidInput, match="moment" if moment < 0 else "curvature"):
         tc.effects.SaturatingBending(moment, curvature)

@@ -135,7 +135,7 @@ def test_stable_step_is_obeyed(eta):
 
 
 def test_negative_viscosity_is_refused():
-    with pytest.raises(tc.errors.InvalidInput):
+    with pytest.raises(tc.errors.InvalidInput, match="viscosity"):
         tc.effects.KelvinVoigt(-1.0)
 
 

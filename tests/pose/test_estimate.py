@@ -206,8 +206,7 @@ def test_few_points_of_unknown_noise_are_not_taken_for_exact(scene):
     assert coverage(unknown, scene)[0] > 0.88
 
 
-@pytest.mark.parametrize("use", ["markers", "force"])
-@pytest.mark.parametrize("noise", [1e-3, None])
+@pytest.mark.parametrize(("use", "noise"), [("markers", 1e-3), ("force", None)])
 def test_what_is_not_used_was_not_seen(scene, use, noise):
     """The points are there, and tell of distances only: all else is as if they were not."""
     uv = np.array([[0.1, 0.1], [0.2, 0.2]])

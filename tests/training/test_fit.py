@@ -99,7 +99,7 @@ def test_what_was_before_is_told_of_all_episodes_or_not_at_all(config, episodes,
         assert ("loss_before" in json.loads((out / "fit.json").read_text())["train"]) == told
 
 
-@pytest.mark.parametrize("step", [1, 2, 3])
+@pytest.mark.parametrize("step", [1, 3])  # in the midst of a shuffle, and at the beginning of one
 def test_resuming_is_bit_for_bit(config, episodes, tmp_path, monkeypatch, step):
     """Stopped within any step: shuffled episodes, dropout, schedule, a scalar, a field and a network."""
     data = {"train": str(episodes / "ep_*"), "per_step": 2}
