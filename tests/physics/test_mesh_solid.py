@@ -60,7 +60,7 @@ def test_a_cloth_that_is_lost_beside_a_mesh_is_said_to_diverge(engine):
     cloth = tc.Cloth(tc.meshes.rectangle(0.1, 0.1, resolution=(4, 4)), tc.materials.AEP(1e4), 0.2, {}, {"body": solid})
     cloth.engine = engine
     x = cloth.rest_state().x
-    with pytest.raises((SimulationDiverged, InvalidInput)), torch.no_grad():
+    with pytest.raises(SimulationDiverged), torch.no_grad():
         cloth(cloth.state(x, torch.full_like(x, 1e200)), times=[0.0, 0.01])
 
 

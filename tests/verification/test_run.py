@@ -152,3 +152,13 @@ def test_every_line_of_the_design_has_a_case():
 def test_the_coarse_subset(tmp_path):
     """All marks hold there, too."""
     assert execute(tmp_path, None, "--fast") == 0
+
+
+@pytest.mark.slow
+def test_what_the_coarse_subset_leaves_out(tmp_path):
+    """Minutes; `make verify` alone had run these."""
+    from verification import themes  # noqa: F401
+
+    left_out = [name for name, case in CASES.items() if not case.fast]
+    assert len(left_out) > 3
+    assert execute(tmp_path, None, "--only", *left_out) == 0
