@@ -33,12 +33,19 @@ def test_a_number_is_strained_beyond_what_data_sheets_are_wrong_by():
 
 @pytest.mark.parametrize("ends", [0.3, OFTEN + 1])
 def test_it_begins_at_the_data_sheet_and_is_nothing_where_that_ends_as_far(monkeypatch, ends):
-    begun = []
+    begun, asked = [], []
+
+    def fit(model, setting, hypotheses=(), *_, **__):
+        asked.append(list(hypotheses))
+        return found(ends)
+
     monkeypatch.setattr(afresh, "approach", lambda model, setting, progress: (begun.append(model) or model, None))
-    monkeypatch.setattr(afresh, "fit", lambda *_, **__: found(ends))
+    monkeypatch.setattr(afresh, "fit", fit)
     again = resettled(found(OFTEN + 1), None, [CAUSE])  # type: ignore[arg-type]
     assert begun[0].point.tolist() == [0.0, 1.5]
     assert (again is None) == (ends > OFTEN)
+    assert len(asked) == (1 if again is None else 2)  # what is not kept is asked about no others
+    assert asked[0] == []
 
 
 def test_causes_that_are_known_stay_where_others_are_tried_from_the_data_sheet(monkeypatch):

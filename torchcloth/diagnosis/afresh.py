@@ -62,10 +62,13 @@ def resettled(
     left = model.others(hypotheses)
     try:
         near, _ = approach(model, setting, staged(progress, "causes, from the data sheet"))
-        again = fit(near, setting, left, progress=staged(progress, "causes, anew"), before=found.evidence)
+        anew = staged(progress, "causes, anew")
+        again = fit(near, setting, progress=anew, before=found.evidence)
+        if again.model.strained:  # so that nobody asks what it says about the others
+            return None
+        return fit(again.model, setting, left, 0, anew, before=found.evidence, here=again.evidence)
     except IMPOSSIBLE:
         return None
-    return None if again.model.strained else again
 
 
 def _promises(found: Fitted) -> list[tuple[float, str, Fitted]]:

@@ -13,6 +13,7 @@ neighbours nor do they not.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -37,14 +38,14 @@ class Noise(NamedTuple):
     level: Tensor  # [blocks], in the data's units
     depth: float = 0.0  # m
 
-    def covariance(self, cells: Cells, nuisance: Tensor, std: Tensor) -> Tensor:
-        """[C, C] of one episode; ``nuisance`` [C, N] slopes, ``std`` [N]."""
-        moved = nuisance * std
-        rough = 0.5 * _rough(cells)
+    def covariance(self, cells: Cells, nuisance: Tensor, std: Tensor, parts: Parts | None = None) -> Tensor:
+        """[C, C] of one episode; ``nuisance`` [C, N] slopes, ``std`` [N], ``parts`` of these cells if known."""
+        moved, known = nuisance * std, parts or Parts.of(cells)
+        rough = 0.5 * known.rough
         slow = (self.level[cells.block] ** 2 + rough).sqrt()
         deep = self.depth * cells.ray
-        agreed = slow[:, None] * _together(cells) * slow + deep[:, None] * _fading(cells, ACROSS) * deep
-        return torch.diag(_white(cells) + rough) + agreed + moved @ moved.mT
+        agreed = slow[:, None] * known.together * slow + deep[:, None] * known.across * deep
+        return torch.diag(known.white + rough) + agreed + moved @ moved.mT
 
     def smooth(self, cells: Cells) -> Tensor:
         """[C] share of the variance that is no roughness."""
@@ -54,6 +55,20 @@ class Noise(NamedTuple):
     def plain(self, cells: Cells) -> Tensor:
         """[C] the other variance, but for what differs from episode to episode."""
         return _white(cells) + self.level[cells.block] ** 2 + (self.depth * cells.ray) ** 2
+
+
+class Parts(NamedTuple):
+    """Of one episode's covariance, what no level changes."""
+
+    white: Tensor  # [C]
+    rough: Tensor  # [C]
+    together: Tensor  # [C, C]
+    across: Tensor  # [C, C]
+
+    @staticmethod
+    def of(cells: Cells) -> Parts:
+        """Computed."""
+        return Parts(_white(cells), _rough(cells), _together(cells), _fading(cells, ACROSS))
 
 
 def least() -> Noise:
@@ -85,8 +100,8 @@ class Whitened(NamedTuple):
     share: Tensor  # [C] by which rows were multiplied beyond that
 
 
-def whitened(evidence: Evidence, noise: Noise) -> Whitened:
-    """Cells and slopes by the inverse Cholesky factor of every episode's covariance.
+def whitened(evidence: Evidence, noise: Noise, parts: Sequence[Parts | None] | None = None) -> Whitened:
+    """Cells and slopes by the inverse Cholesky factor of every episode's covariance; ``parts`` of it, if known.
 
     Raises:
         InvalidInput: no cell is left.
@@ -97,7 +112,8 @@ def whitened(evidence: Evidence, noise: Noise) -> Whitened:
     count = evidence.own + len(evidence.hypotheses)
     for k, (cells, std) in enumerate(zip(evidence.cells, evidence.stds, strict=True)):
         nuisance = torch.cat([cells.jacobian[:, count:], evidence.numerics[k][:, None]], 1)
-        root = torch.linalg.cholesky(noise.covariance(cells, nuisance, torch.cat([std, std.new_tensor([NUMERICS])])))
+        stds = torch.cat([std, std.new_tensor([NUMERICS])])
+        root = torch.linalg.cholesky(noise.covariance(cells, nuisance, stds, parts[k] if parts else None))
         both = torch.cat([cells.value[:, None], cells.jacobian[:, :count]], 1)
         both = torch.linalg.solve_triangular(root, both, upper=False)
         values.append(both[:, 0])
@@ -117,12 +133,13 @@ def fit_noise(evidence: Evidence, sweeps: int = 2) -> Noise:
         present.append(None)
     else:
         found = found._replace(depth=0.0)
+    parts = [Parts.of(cells) for cells in evidence.cells]
     factors = 10 ** torch.linspace(-0.5, 1.75, 10, dtype=torch.float64)
     for sweep in range(sweeps):
         for b in present:
             own = float(found.depth if b is None else found.level[b])
             tried = (own * (factors if sweep == 0 else factors[:5] ** 0.3)).tolist()
-            found = max((_with(found, b, v) for v in tried), key=lambda n: _likelihood(evidence, n))
+            found = max((_with(found, b, v) for v in tried), key=lambda n: _likelihood(evidence, n, parts))
     return found
 
 
@@ -135,9 +152,9 @@ def _with(noise: Noise, block: int | None, value: float) -> Noise:
     return noise._replace(level=level)
 
 
-def _likelihood(evidence: Evidence, noise: Noise) -> float:
+def _likelihood(evidence: Evidence, noise: Noise, parts: Sequence[Parts]) -> float:
     """Restricted log-likelihood, all that is asked about projected out."""
-    found = whitened(evidence, noise)
+    found = whitened(evidence, noise, parts)
     scale = found.jacobian.norm(dim=0).clamp(min=1e-12)
     u, s, _ = torch.linalg.svd(found.jacobian / scale, full_matrices=False)
     u, s = u[:, s > RANK * s[0]], s[s > RANK * s[0]]
