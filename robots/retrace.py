@@ -75,9 +75,8 @@ def table_of(recording: Recording) -> Table | None:
     """As of ``scene_of``."""
     if not any(c.normal[2] > LEVEL for c in recording.colliders.values()):
         return None
-    places = [
-        torch.cat([path.pose[:, :2, 3] for path in replay(recording, names=recording.grasps or None).values()]).numpy()
-    ]
+    held = replay(recording, names=recording.grasps or None).values()
+    places = [torch.cat([path.pose[:, :2, 3] for path in held]).numpy()]
     if recording.cloth.initial_vertices is not None:
         places.append(recording.cloth.initial_vertices.reshape(-1, 3)[:, :2])
     low, high = (f(np.concatenate(places), axis=0) + way for f, way in ((np.min, -AROUND), (np.max, AROUND)))

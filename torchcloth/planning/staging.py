@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +18,7 @@ from ..recordings.proposed import undone
 from ..robots import arm_of, gripper_motion, replay  # pyright: ignore[reportMissingImports] - mapped from robots/
 from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
 from ..robots.replay import model_of, unwound  # pyright: ignore[reportMissingImports]
-from ..robots.retrace import highest  # pyright: ignore[reportMissingImports]
+from ..robots.retrace import LEVEL, highest  # pyright: ignore[reportMissingImports]
 from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
 from .courses import PERIOD, ArmCourse, Course, HandCourse, Span, between
@@ -105,13 +104,11 @@ def doubts(recording: Recording, courses: Sequence[Course]) -> list[str]:
                 "the recorded one, which is under way there: bring the arm there as recorded"
             )
     hands = ", ".join(c.name for c in courses if isinstance(c, HandCourse))
-    leaning = [
-        name for name, c in recording.colliders.items() if abs(c.normal[2]) < STRAIGHT * np.linalg.norm(c.normal)
-    ]
-    if hands and leaning:
-        out.append(
-            f"{hands}: {', '.join(leaning)} leans: kept is its height below the recorded path, and not beside it"
-        )
+    for name, collider in recording.colliders.items() if hands else ():
+        if collider.normal[2] <= LEVEL:
+            out.append(f"{hands}: {name} stands too steep for a table: nothing is kept off it")
+        elif collider.normal[2] < STRAIGHT:
+            out.append(f"{hands}: {name} leans: kept is its height below the recorded path, and not beside it")
     if bare := [c.name for c in courses if isinstance(c, HandCourse) and c.name in recording.robots]:
         names = ", ".join(bare)
         out.append(f"{names}: an arm is named, but its joints were not recorded: no limit of a joint is kept")
