@@ -158,9 +158,7 @@ def _later(g, by):
     return replace(g, t=np.concatenate([g.t[:1], g.t + by]), **ahead)
 
 
-@pytest.mark.parametrize("asked", [0.1, 1.0])
-def test_a_correction_that_cannot_be_simulated_is_none(model, brief, one_step, monkeypatch, asked):
-    """A tenth of the longest step to where nothing can be simulated, and farther than slopes can tell."""
+def test_a_correction_that_cannot_be_simulated_is_none(model, brief, one_step, monkeypatch):
     seen, longest = Objective.seen, collect(model, ["youngs_modulus"], None)[0].longest_step
 
     def torn_elsewhere(self, raw):
@@ -171,7 +169,7 @@ def test_a_correction_that_cannot_be_simulated_is_none(model, brief, one_step, m
     def step(objective, final, recordings):
         ended.append(float(final.raw[0]))
         moved = torch.zeros_like(final.raw)
-        moved[0] = asked * longest
+        moved[0] = 0.1 * longest
         monkeypatch.setattr(Objective, "seen", torn_elsewhere)
         return moved
 
@@ -179,5 +177,4 @@ def test_a_correction_that_cannot_be_simulated_is_none(model, brief, one_step, m
     monkeypatch.setattr(fit, "mesh_step", step)
     found = identify(model, brief, ["youngs_modulus"], iterations=1, refine=True)
     assert found.parameters == one_step.parameters
-    why = "on a finer one, the cloth is torn" if asked < 1 else "a finer one asks for more than slopes can tell"
-    assert any(f"not corrected for the coarseness of the mesh: {why}" in w for w in found.warnings)
+    assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in found.warnings)

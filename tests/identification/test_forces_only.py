@@ -13,7 +13,6 @@ import twins
 
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import cloth_from, draw, episode, identify, print_fit, replayed, streams
-from torchcloth.identification.blocks import USES
 from torchcloth.identification.null import CARRIED, STAYS, UNFELT, no_better_than
 from torchcloth.identification.replays import Frames
 
@@ -97,9 +96,8 @@ def test_a_fit_is_held_against_the_null_of_the_data_that_tell(felt):
     moved = replace(own, clouds=[x + torch.tensor([0.0, 0.0, 0.1]) for x in here])
 
     def told(data, *kinds, force=1.0, shift=0.0):
-        names = [name for kind in kinds for name in USES[kind]]
-        blocks = [SimpleNamespace(name=name) for name in names]
-        scene = SimpleNamespace(blocks=blocks, episodes=[data], faces=torch.as_tensor(model.mesh.faces))
+        uses = lambda *asked: not set(asked).isdisjoint(kinds)  # noqa: E731
+        scene = SimpleNamespace(uses=uses, episodes=[data], faces=torch.as_tensor(model.mesh.faces))
         x = torch.stack(list(data.clouds)) + shift
         wrench = {n: force * w.nan_to_num() for n, w in data.wrenches.items()}
         return no_better_than(scene, [Frames(x, 0 * x, wrench, torch.zeros(len(x), 0))])

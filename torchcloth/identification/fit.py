@@ -42,7 +42,6 @@ from .unknowns import collect, with_priors
 PAPER_ITERATIONS = 35  # of the DiffCP paper's stop rule
 MOST_STARTS = 1000
 UNSURE = "the motion can be predicted for a while only, or by simulations spread around the solution"
-UNCORRECTED = "not corrected for the coarseness of the mesh"
 ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
 
 
@@ -298,11 +297,9 @@ def _refined(
     try:
         step = mesh_step(full, final, recordings)
         moved = final._replace(raw=full.clip(final.raw + LIMIT * step))
-        if bool((LIMIT * step.abs() > full.problem().longest)[: len(full.unknowns)].any()):
-            return final, covariance, {}, [f"{UNCORRECTED}: a finer one asks for more than slopes can tell"]
         full.seen(moved.raw)  # so that what cannot be simulated shows here; it is asked for again, and remembered
     except (SimulationDiverged, UnstableStep) as error:
-        return final, covariance, {}, [f"{UNCORRECTED}: on a finer one, {error}"]
+        return final, covariance, {}, [f"not corrected for the coarseness of the mesh: on a finer one, {error}"]
     far = float((LIMIT * step.abs() / covariance.diagonal().sqrt())[: len(full.unknowns)].max())
     return moved, covariance + OPEN**2 * torch.outer(step, step), {"mesh_step": far}, []
 

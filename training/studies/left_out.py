@@ -14,7 +14,7 @@ from torch import Tensor
 from torchcloth.diagnosis import Fitted, fit, fit_noise
 from torchcloth.diagnosis.cells import Cells
 from torchcloth.diagnosis.fitting import weighed
-from torchcloth.diagnosis.noise import Noise
+from torchcloth.diagnosis.noise import Noise, Parts
 from torchcloth.diagnosis.setting import Setting
 
 NONE = 1e-9  # nearly, of a standard deviation
@@ -24,10 +24,10 @@ SMALL = 1e-2  # of a typical amplitude: a tangent at zero
 class Independent(Noise):
     """Slow errors are as large as they are, and agree with no neighbour."""
 
-    def covariance(self, cells: Cells, nuisance: Tensor, std: Tensor) -> Tensor:
+    def covariance(self, cells: Cells, nuisance: Tensor, std: Tensor, parts: Parts | None = None) -> Tensor:
         """Their variances alone, and what differs from episode to episode."""
         moved = nuisance * std
-        return torch.diag(super().covariance(cells, nuisance[:, :0], std[:0]).diagonal()) + moved @ moved.mT
+        return torch.diag(super().covariance(cells, nuisance[:, :0], std[:0], parts).diagonal()) + moved @ moved.mT
 
 
 def independent(found: Fitted) -> Fitted:
