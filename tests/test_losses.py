@@ -98,11 +98,10 @@ def test_weights_are_barycentric_and_chunks_change_nothing(vertices, points):
         assert all(torch.equal(a, b) for a, b in zip(again, hits, strict=True))
 
 
+@pytest.mark.parametrize("searched_by", ["compiled"], indirect=True)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_both_searches_find_the_same_places(vertices, points, dtype):
     """Of two triangles that share the place, rounding decides."""
-    if search.at_hand() is None:
-        pytest.skip("the compiled search is not at hand")
     points, corners = points.to(dtype), vertices.to(dtype)[FACES]
     found = search.nearest(points, corners, 10**6), search._closest(points, corners)
     one, other = ((weights[..., None] * corners[face]).sum(1) for face, weights in found)

@@ -100,7 +100,7 @@ class Whitened(NamedTuple):
     share: Tensor  # [C] by which rows were multiplied beyond that
 
 
-def whitened(evidence: Evidence, noise: Noise, parts: Sequence[Parts | None] | None = None) -> Whitened:
+def whitened(evidence: Evidence, noise: Noise, parts: Sequence[Parts] | None = None) -> Whitened:
     """Cells and slopes by the inverse Cholesky factor of every episode's covariance; ``parts`` of it, if known.
 
     Raises:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -165,15 +166,14 @@ def _a_step_aside(
     cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, data: Episode, dt: float | None, k: int, std: float
 ) -> tuple[Frames, float] | None:
     """(what a standard deviation more of the k-th changes, or one less, that step); None: neither can be simulated."""
-    for way in (std, -std):
+    here, clip = float(raw[k]), unknowns[k].clip
+    for way in (clip(here + std) - here, clip(here - std) - here):
+        if abs(way) < 0.5 * std:  # at an end of what is legal
+            continue
         there = raw.clone()
-        there[k] = unknowns[k].clip(float(raw[k]) + way)
-        if float((there[k] - raw[k]).abs()) < 0.5 * std:  # at an end of what is legal
-            continue
-        try:
-            return simulate(cloth, unknowns, there, data, dt), float(there[k] - raw[k])
-        except (SimulationDiverged, UnstableStep):
-            continue
+        there[k] += way
+        with suppress(SimulationDiverged, UnstableStep):
+            return simulate(cloth, unknowns, there, data, dt), way
     return None
 
 
