@@ -15,8 +15,8 @@ ROOT = Path(__file__).resolve().parents[1]
 COMPANIONS = ("benchmarks", "robots", "training")  # folders of their own, installed as torchcloth.robots, ...
 
 FLOORS = (
-    ("errors", "_math", "_remembered", "_surroundings", "forward_mode"),
-    ("_files",),
+    ("errors", "_math", "_surroundings", "forward_mode"),
+    ("_files", "_remembered"),
     ("_vectors",),
     ("types", "parameters"),
     ("meshes",),

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 import torch
+import torch.autograd.forward_ad as forward_ad
 
 DEVICES = ("cpu", "cuda")
 
@@ -30,3 +31,9 @@ def own_gradients() -> Iterator[None]:
     """With gradients, whatever the caller wants of his own tensors, and undisturbed."""
     with torch.inference_mode(False), torch.enable_grad(), undisturbed():
         yield
+
+
+def transformed() -> bool:
+    """Whether something goes along with numbers, or looks at what is done to them, other than a backward pass."""
+    watched = torch._C._are_functorch_transforms_active() or torch._C._len_torch_dispatch_stack() > 0
+    return watched or forward_ad._current_level >= 0 or torch.compiler.is_compiling()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from ._remembered import Recent, content, size_of
 from .boundaries import drive
 from .boundaries.motion import check, check_cover, interpolate
 from .effects import MassDamping
@@ -81,10 +83,19 @@ def held(motion: Mapping[str, Trajectory], start: float, end: float) -> dict[str
     for name, trajectory in motion.items():
         check(trajectory, name)
         check_cover(trajectory, name, start, start)
-        pose = interpolate(trajectory, span[:1])
-        closed = drive(trajectory, span[:1].repeat(2)).closed[0]
-        found[name] = Trajectory(span, pose.expand(*pose.shape[:-3], 2, 4, 4), torch.tensor([closed, closed]))
+        given = content(*trajectory, span)
+        stand = partial(_stood, trajectory, span)
+        found[name] = stand() if given is None else _STOOD.of(given, stand)
     return found
+
+
+_STOOD: Recent[Trajectory] = Recent(16 * 2**20, lambda t: size_of(*t))
+
+
+def _stood(trajectory: Trajectory, span: Tensor) -> Trajectory:
+    pose = interpolate(trajectory, span[:1])
+    closed = drive(trajectory, span[:1].repeat(2)).closed[0]
+    return Trajectory(span, pose.expand(*pose.shape[:-3], 2, 4, 4), torch.tensor([closed, closed]))
 
 
 def _virgin(model: Model, x: Tensor) -> Memory:

@@ -13,11 +13,12 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint as recompute
 
 from . import functional
+from ._surroundings import transformed
 from .boundaries import Drive, drive
 from .captured import Graphs, unit_of
 from .dynamics import Impulses, added
 from .engine.choice import Choice
-from .engine.fused import Fused, recomputes, transformed
+from .engine.fused import Fused, recomputes
 from .errors import SimulationDiverged
 from .model import as_it_is
 from .self_contact import CHUNK

@@ -6,12 +6,14 @@ import pytest
 import sheets
 import torch
 
+from torchcloth._remembered import Recent
 from torchcloth.diagnosis.base_model import base_model
 from torchcloth.diagnosis.cells import aligned, cells_of, directions
 from torchcloth.diagnosis.evidence import asked_about, gather
 from torchcloth.diagnosis.hypotheses import catalogue
 from torchcloth.diagnosis.pieces import runs
 from torchcloth.diagnosis.refined import refined
+from torchcloth.diagnosis.world import World
 from torchcloth.diagnosis.worlds import Worlds
 from torchcloth.identification.nuisances import Held
 
@@ -56,6 +58,22 @@ def test_who_asks_later_is_told_the_same(made, asked):
     at_once, known = gather(model, setting, asked), gather(model, setting, asked[:1])
     later = asked_about(known, model, setting, asked)
     assert torch.equal(at_once.cells[0].jacobian, later.cells[0].jacobian)
+
+
+@pytest.mark.parametrize(("memory", "again"), [(2**30, 0), (0, 2)])
+def test_the_point_itself_is_simulated_once(made, asked, monkeypatch, memory, again):
+    """On both meshes; beside it each of three causes, one of them on the finer mesh, too."""
+    model, setting = made[0], replace(made[1], recent=Recent(memory, lambda frames: 1))
+    known, simulate, simulated = gather(model, setting, asked[:1]), World.simulated, []
+
+    def counted(world, *arguments):
+        simulated.append(world)
+        return simulate(world, *arguments)
+
+    monkeypatch.setattr(World, "simulated", counted)
+    later = asked_about(known, model, setting, asked)
+    assert len(simulated) == 4 + again
+    assert torch.equal(later.cells[0].jacobian, asked_about(known, model, setting, asked).cells[0].jacobian)
 
 
 def test_an_accepted_one_keeps_its_mesh(made, asked):

@@ -58,7 +58,7 @@ def gather(
     """
     raw, shifts = shifts is not None, both_ways(model) if shifts is None else list(shifts)
     own = len(shifts)
-    worlds = Worlds(model, shifts, setting.finer and setting.finer.base)
+    worlds = Worlds(model, shifts, setting.finer and setting.finer.base, setting.recent)
 
     def ask(k: int, asked: list[Hypothesis]) -> Piece:
         slopes = None if before is None else _known_slopes(before, k)
@@ -89,7 +89,7 @@ def asked_about(
     progress: Progress = lambda _: None,
 ) -> Evidence:
     """``here``, the evidence at the model's point, with slopes along these hypotheses; only they are simulated."""
-    worlds = Worlds(model, (), setting.finer and setting.finer.base)
+    worlds = Worlds(model, (), setting.finer and setting.finer.base, setting.recent)
 
     def ask(k: int, asked: list[Hypothesis]) -> Piece:
         question = [k, "asked", [h.name for h in model.accepted], _told(asked)]

@@ -135,8 +135,8 @@ def runs(
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m), dt) for m in modes]
     changed = [worlds.changed(h) for h in hypotheses]
     moves = [c is not None and _moves(c, world) for c in changed]
-    first = [partial(worlds.finest.frames, *finer)] if with_fine and finer else []  # it takes longest
-    jobs = [*first, partial(world.simulated, e, dt), *beside, *held]
+    first = [partial(worlds.seen, *finer, finer=True)] if with_fine and finer else []  # it takes longest
+    jobs = [*first, partial(worlds.happens, e, dt), *beside, *held]
     tried = [
         partial(if_possible, partial(c.frames, *own)) for c, other in zip(changed, moves, strict=True) if c and other
     ]
@@ -162,7 +162,7 @@ def _refined(
     worlds: Worlds, hypotheses: Sequence[Hypothesis], finer: tuple[Episode, float | None], fine: Frames | None
 ) -> tuple[Frames, list[Frames | None]]:
     """On the finer mesh: (the episode, if it is not there yet, the episode with each hypothesis)."""
-    first = [] if fine else [partial(worlds.finest.frames, *finer)]
+    first = [] if fine else [partial(worlds.seen, *finer, finer=True)]
     changed = [worlds.changed(h, finer=True) for h in hypotheses]
     tried = [partial(if_possible, partial(c.frames, *finer)) if c else lambda: None for c in changed]
     done: list[Any] = side_by_side(lambda job: job(), [*first, *tried])

@@ -6,7 +6,7 @@ import base64
 import html
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,8 @@ def _evidence(answer: Diagnosis) -> list[str]:
     """Pictures and tables of a search."""
     found, content = answer.found, answer.content
     before, after = found.held_out
+    first = screen(found.start)
+    named = _named(content, [*first, *found.screened])
     instead = {n: c["effect"] for c in content["causes"] for n in (*c["class"], *(r["effect"] for r in c["rivals"]))}
     return [
         *_causes(content["causes"]),
@@ -75,7 +77,7 @@ def _evidence(answer: Diagnosis) -> list[str]:
         "<h2>What the residuals of the base model ask for</h2>",
         "<p>A first guess by slopes, which decides what is fitted, with 95 % intervals. The causes above are what fits "
         "ended with.</p>",
-        _image(pictures.screening(screen(found.start))),
+        _image(pictures.screening(first)),
         "<h2>What is left</h2>" if found.steps else "<h2>All hypotheses</h2>",
         _table(found.screened, instead),
         "<h2>Lack of fit</h2>",
@@ -90,14 +92,13 @@ def _evidence(answer: Diagnosis) -> list[str]:
         "<h2>Parameters of the model</h2>",
         _parameters(answer.content["parameters"]),
         "<h2>What the names mean</h2>",
-        *(f"<p><b>{n}</b>: {html.escape(said)}</p>" for n, said in (GLOSSARY | ALIKE).items() if n in _named(answer)),
+        *(f"<p><b>{n}</b>: {html.escape(said)}</p>" for n, said in (GLOSSARY | ALIKE).items() if n in named),
     ]
 
 
-def _named(answer: Diagnosis) -> set[str]:
+def _named(content: Mapping[str, Any], screened: Sequence[Row]) -> set[str]:
     """Effects that the report speaks of, without axes."""
-    content = answer.content
-    names = {r.hypothesis.name for r in (*answer.found.screened, *screen(answer.found.start))}
+    names = {r.hypothesis.name for r in screened}
     names |= {n for c in content["causes"] for n in (c["effect"], *c["class"], *(r["effect"] for r in c["rivals"]))}
     return {name.partition("[")[0] for name in names}
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
+from .._remembered import Recent, size_of
 from ..errors import InvalidInput
 from ..identification.episodes import Episode, episode
+from ..identification.replays import Frames
 from ..identification.replicates import keys_of
 from ..identification.sheet import Sheet, sheet_for
 from ..recordings import Recording
@@ -18,6 +20,7 @@ from .refined import refined
 from .world import Model, World
 
 MOST = 8000  # points of a frame
+REMEMBERED = 256 * 2**20  # bytes of frames, at points that a search comes back to
 LATE = 0.05  # s, by which a clock may be late and its last frames still be simulated
 MEANWHILE = f"after its first frame and before its last {LATE:g} s"
 Progress = Callable[[str], None]
@@ -43,6 +46,10 @@ def motions_of(recordings: Sequence[Recording]) -> list[str]:
     return out
 
 
+def _recent() -> Recent[Frames]:
+    return Recent(REMEMBERED, lambda f: size_of(f.x, f.v, *f.wrench.values(), f.edge))
+
+
 @dataclass(frozen=True, eq=False)
 class Setting:
     """Episodes as tensors, and the surface that their points are compared with."""
@@ -56,6 +63,7 @@ class Setting:
     finer: Setting | None = None
     unstable: tuple[Tensor, ...] = ()  # per episode, keys of cells that jump; empty: not looked for
     kept: Kept = simply  # where finished episodes are kept
+    recent: Recent[Frames] = field(default_factory=_recent)  # what was simulated last
 
     @property
     def names(self) -> list[str]:

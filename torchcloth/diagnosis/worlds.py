@@ -12,7 +12,10 @@ from functools import partial
 from threading import RLock
 from typing import Any, TypeVar
 
+from .._remembered import Recent
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
+from ..identification.episodes import Episode
+from ..identification.replays import Frames
 from .steps import shifted
 from .world import Hypothesis, Model, World
 
@@ -27,10 +30,18 @@ class Worlds:
         model: at its point.
         shifts: (coordinate, step) of the points beside.
         finer: the same base on a finer mesh.
+        recent: what has been simulated at this point and at others; None: nobody comes back to it.
     """
 
-    def __init__(self, model: Model, shifts: Sequence[tuple[int, float]] = (), finer: World | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        shifts: Sequence[tuple[int, float]] = (),
+        finer: World | None = None,
+        recent: Recent[Frames] | None = None,
+    ) -> None:
         self.model, self.shifts, self._finer = model, list(shifts), finer
+        self._recent = recent
         self._made: dict[object, Any] = {}
         self._making = RLock()
 
@@ -50,6 +61,18 @@ class Worlds:
     def finest(self) -> World:
         """At the point, on the finer mesh."""
         return self._once("finest", lambda: self._on_finer.world())
+
+    def happens(self, e: Episode, dt: float | None, finer: bool = False) -> Frames:
+        """An episode at the point, on the finer mesh if asked for, whoever looks on; nobody may write to it."""
+        model, world = (self._on_finer, self.finest) if finer else (self.model, self.plain)
+        if self._recent is None:
+            return world.simulated(e, dt)
+        point = (model.base, model.parameters, model.accepted, tuple(model.point.tolist()))
+        return self._recent.of((point, e, dt), lambda: world.simulated(e, dt))
+
+    def seen(self, e: Episode, dt: float | None, finer: bool = False) -> Frames:
+        """What an observer has of that."""
+        return (self.finest if finer else self.plain).seen(self.happens(e, dt, finer), e)
 
     def changed(self, hypothesis: Hypothesis, finer: bool = False) -> World | None:
         """With a hypothesis at its typical amplitude, on the finer mesh if asked for; None: no such world."""

@@ -9,12 +9,13 @@ from typing import Literal, NamedTuple, get_args
 
 import torch
 
+from .._surroundings import transformed
 from ..boundaries import Drive
 from ..errors import InvalidInput
 from ..model import Model
 from ..types import ClothState
 from . import devices
-from .fused import Fused, transformed
+from .fused import Fused
 from .library import Unbuilt, library
 from .lowering import Unfused
 from .running import Job

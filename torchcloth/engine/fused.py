@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from functools import partial
 
 import torch
-import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint as recompute
 
+from .._surroundings import transformed
 from ..boundaries import Drive
 from ..dynamics import Impulses, added
 from ..model import Model
@@ -219,12 +219,6 @@ def recomputes() -> bool:
 def _are_numbers(inputs: list[Tensor]) -> bool:
     """And nothing else: nobody needs to know of the operator, which costs as much as some tens of substeps."""
     return not transformed() and all(type(t) is Tensor for t in inputs) and not _needs_gradient(inputs)
-
-
-def transformed() -> bool:
-    """Whether something goes along with numbers, or looks at what is done to them, other than a backward pass."""
-    watched = torch._C._are_functorch_transforms_active() or torch._C._len_torch_dispatch_stack() > 0
-    return watched or forward_ad._current_level >= 0 or torch.compiler.is_compiling()
 
 
 def _needs_gradient(inputs: list[Tensor]) -> bool:

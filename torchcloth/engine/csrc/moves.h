@@ -87,25 +87,29 @@ struct Moves {
     template <class F>
     TC_INLINE void rows(const Instruction& i, int first, const Span& s, F f) const {
         const size_t step = pitch(i);
-        if (s.list && i.table != SHARED && step <= 4) {
-            const int* index = s.picked + i.slot * L;
-            if (step == 4) f([index](int lane) { return size_t(index[lane]) * 4; }, four);
-            else f([index](int lane) { return size_t(index[lane]); }, one);
-        } else if (count(first, s) < L || i.table == SHARED || step > 4)
-            f([this, &i, first, step, &s](int lane) { return row(i, first + lane, s) * step; }, step);
-        else if (i.table == OWN) {
+        const bool whole = count(first, s) == L;
+        if (i.table == OWN && whole && s.list == nullptr && step <= 4) {
             if (step == 4) f([first](int lane) { return size_t(first + lane) * 4; }, four);
             else f([first](int lane) { return size_t(first + lane); }, one);
-        } else {
-            const int* at = index(i, s) + first;
-            if (step == 4) f([at](int lane) { return size_t(at[lane]) * 4; }, four);
-            else f([at](int lane) { return size_t(at[lane]); }, one);
+            return;
         }
+        int each[L];
+        const int* at = each;
+        if (s.list && i.table != SHARED) at = s.picked + i.slot * L;
+        else if (whole && (i.table >= 0 || i.table <= VARYING)) at = index(i, s) + first;
+        else for (int lane = 0; lane < L; lane++) each[lane] = row(i, first + lane, s);
+        if (step == 4) f([at](int lane) { return size_t(at[lane]) * 4; }, four);
+        else if (step == 1) f([at](int lane) { return size_t(at[lane]); }, one);
+        else f([at, step](int lane) { return size_t(at[lane]) * step; }, step);
     }
     static constexpr std::integral_constant<size_t, 1> one{};
     static constexpr std::integral_constant<size_t, 4> four{};
-    template <class Step>
-    static int last_quad(Step step, int comps) { return std::is_integral_v<Step> ? (comps - 1) / 4 * 4 : 0; }
+    // f(components), with the frequent number as a constant.
+    template <class F>
+    static TC_INLINE void components(const Instruction& i, F f) {
+        if (i.comps == 3) f(std::integral_constant<int, 3>{});
+        else f(i.comps);
+    }
 
     // Where the numbers of a pack begin, in a field of points: [packs, comps, L].
     static size_t packed(const Instruction& i, int first) { return size_t(first) * i.comps; }
@@ -145,12 +149,13 @@ struct Moves {
         rows(i, first, s, [&](auto place, auto step) {
             if (step == 1)
                 for (int lane = 0; lane < L; lane++) to[i.reg].v[lane] = from[place(lane)];
-            else
-                for (int c = 0, end = last_quad(step, i.comps); c <= end; c += 4) {
+            else components(i, [&](auto comps) {
+                for (int c = 0; c < comps; c += 4) {
                     P quad[4];
                     gather_quads([&](int lane) { return from + place(lane) + c; }, quad);
-                    for (int k = 0; k < 4 && c + k < i.comps; k++) to[i.reg + c + k] = quad[k];
+                    for (int k = 0; k < 4 && c + k < comps; k++) to[i.reg + c + k] = quad[k];
                 }
+            });
         });
     }
     // change(where a number or four lie, what came from the lane) for all lanes that are items.
@@ -160,15 +165,15 @@ struct Moves {
         rows(i, first, s, [&](auto place, auto step) {
             if (step == 1)
                 for (int lane = 0; lane < lanes; lane++) change(to[place(lane)], from[i.reg].v[lane]);
-            else
-                for (int c = 0, end = last_quad(step, i.comps); c <= end; c += 4) {
+            else components(i, [&](auto comps) {
+                for (int c = 0; c < comps; c += 4) {
                     P quad[4];
-                    for (int k = 0; k < 4; k++) quad[k] = c + k < i.comps ? from[i.reg + c + k] : P(0.0);
-                    const bool whole = lanes == L;
-                    scatter_quads(quad, [&](int lane, Quad<R> numbers) {
-                        if (whole || lane < lanes) change(*reinterpret_cast<Quad<R>*>(to + place(lane) + c), numbers);
-                    });
+                    for (int k = 0; k < 4; k++) quad[k] = c + k < comps ? from[i.reg + c + k] : P(0.0);
+                    auto give = [&](int lane, Quad<R> numbers) { change(*reinterpret_cast<Quad<R>*>(to + place(lane) + c), numbers); };
+                    if (lanes == L) scatter_quads(quad, give);
+                    else scatter_quads(quad, [&](int lane, Quad<R> numbers) { if (lane < lanes) give(lane, numbers); });
                 }
+            });
         });
     }
     TC_APART void add(const Instruction& i, R* to, const P* from, int first, const Span& s) const {
@@ -208,7 +213,7 @@ struct Moves {
         const int lanes = count(first, s);
         const bool spent = i.code == Instruction::put;
         rows(i, first, s, [&](auto place, auto step) {
-            for (int c = 0, end = last_quad(step, i.comps); c <= end; c += 4) {
+            for (int c = 0; c < i.comps; c += 4) {
                 P seeds[4];
                 if (step == 1)
                     for (int lane = 0; lane < L; lane++) seeds[0].v[lane] = from[place(lane)];
@@ -223,12 +228,6 @@ struct Moves {
         });
     }
 
-    // f(components), with the frequent number as a constant.
-    template <class F>
-    static TC_INLINE void components(const Instruction& i, F f) {
-        if (i.comps == 3) f(std::integral_constant<int, 3>{});
-        else f(i.comps);
-    }
     template <class D>
     TC_APART void gather_along(const Instruction& i, const R* from, D* dots, int first, const Span& s) const {
         if (from == nullptr) return;

@@ -129,7 +129,12 @@ struct Stencil : Stage<R> {
                 const Quad<R> step = quad(from, index[4 * n + i]) - own[i].part[0];
                 sum[i].part[0] = sum[i].part[0] + all<Quad<R>>(weights[4 * n + i]) * step;
             }
-        for (int i = 0; i < 4; i++) add<1>(to, c, v + i, sum[i], sign);
+        if (pitch() == 4)  // alone in its row, whose fourth number stays zero
+            for (int i = 0; i < 4; i++) {
+                Part<1>& row = vector<1>(to, v + i).part[0];
+                row = row + all<Part<1>>(sign) * sum[i].part[0];
+            }
+        else for (int i = 0; i < 4; i++) add<1>(to, c, v + i, sum[i], sign);
     }
 
     template <int K>
