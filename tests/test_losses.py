@@ -110,10 +110,12 @@ def test_both_searches_find_the_same_places(vertices, points, dtype):
 
 
 def test_no_place_is_near_to_what_is_not_finite(vertices, points):
-    for where in (points, vertices):
-        where[0] = torch.nan
-        with pytest.raises(InvalidInput, match="points or vertices; got NaN"):
-            closest(points, vertices, FACES)
+    for number in (torch.nan, torch.inf):
+        for which in (0, 1):
+            given = [points.clone(), vertices.clone()]
+            given[which][0, 1] = number
+            with pytest.raises(InvalidInput, match="points or vertices; got NaN"):
+                closest(*given, FACES)
 
 
 def test_two_precisions_are_refused(vertices, points):

@@ -71,4 +71,7 @@ def test_an_impossible_camera_is_refused(change, message):
 def test_looking_along_up_is_refused():
     with pytest.raises(InvalidInput, match="target"):
         look_at([0, 0, 1], [0, 0, 0])
+    for eye in ([np.nan, 0, 1], [np.inf, 0, 1]):
+        with pytest.raises(InvalidInput, match="target"):
+            look_at(eye, [0, 0, 0])
     assert look_at([0, 0, 1], [0, 0, 0], up=[1, 0, 0])[2, 2] == -1

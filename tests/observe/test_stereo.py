@@ -87,6 +87,11 @@ def test_the_bias_of_a_device_is_its_scale_and_its_warp():
 
 def test_what_is_not_seen_stays_unseen_and_parameters_are_checked():
     assert not StereoNoise().apply(np.zeros((20, 30)), np.random.default_rng(0)).any()
+    far = np.zeros((60, 80))
+    far[:, 40:] = 6.0  # less than a pixel of disparity: nothing beside it is fattened
+    seen = StereoNoise(focal=100.0, baseline=0.05, holes=0.0).apply(far, np.random.default_rng(0))
+    assert not seen[:, :40].any()
+    assert seen[:, 40:].any()
     for bad in ({"focal": 0.0}, {"baseline": -1.0}, {"holes": 1.0}, {"bias_length": 0.1}, {"subpixel": np.nan}):
         with pytest.raises(InvalidInput, match=next(iter(bad))):
             StereoNoise(**bad)

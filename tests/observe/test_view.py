@@ -81,3 +81,5 @@ def test_stored_and_read_again():
     np.testing.assert_allclose(decode(encode(depth, 1e-4), 1e-4)[0], [0, 0.5004, 1.2345], atol=6e-5)
     with pytest.raises(InvalidInput, match="depth_scale"):
         encode(depth, 0.0)
+    with pytest.raises(InvalidInput, match="whole numbers"):
+        encode(np.full((4, 4), 800, np.uint16))

@@ -77,7 +77,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="NAME[=STD]",
-        help="of each episode: clock, camera, grasp, shape, tare, rim; with the prior's deviation, e.g. clock=0.4",
+        help="of each episode: clock, camera, grasp, shape, tare, rim; with the prior's deviation, e.g. clock=0.02",
     )
     parser.add_argument(
         "--prior",

@@ -40,7 +40,8 @@ def _compiled(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor] | None:
     except RuntimeError:  # tensors of torch.func have no memory
         return None
     failed = getattr(lib, f"tc_nearest_{letter}")(own[0], len(points), own[1], len(corners), *into)
-    return None if failed or bool((face < 0).any()) else (face, weights)
+    finite = bool(points.isfinite().all() & corners.isfinite().all())  # it passes over triangles that are not
+    return (face, weights) if finite and not failed and bool((face >= 0).all()) else None
 
 
 def _closest(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:

@@ -192,16 +192,17 @@ def look_at(eye: Array, target: Array, up: Array = (0.0, 0.0, 1.0)) -> Array:  #
     in the image.
 
     Raises:
-        InvalidInput: the target is at the eye, or straight along ``up``.
+        InvalidInput: the target is at the eye, straight along ``up``, or not finite.
     """
     eye, target, up = (np.asarray(a, dtype=float) for a in (eye, target, up))
     forward = target - eye
     right = np.cross(forward, up)
-    if np.linalg.norm(forward) < 1e-9 or np.linalg.norm(right) < 1e-9 * np.linalg.norm(forward):
+    far = np.linalg.norm(forward)
+    if not (1e-9 <= far < np.inf and np.linalg.norm(right) >= 1e-9 * far):
         raise InvalidInput(
             "target",
             got=target.tolist(),
-            expected="a point away from the eye and not along up",
+            expected="a finite point away from the eye and not along up",
             remedy="give another up",
         )
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)

@@ -27,7 +27,8 @@ class Lens:
 
     followed by the homography of a sensor tilted by tx, ty (OpenCV documentation, "Camera Calibration and 3D
     Reconstruction"). The radial part g r is followed up to its first turning point (or pole): beyond it two rays share
-    a pixel, and the calibration says nothing. Such rays and pixels are NaN, never wrong.
+    a pixel, and the calibration says nothing. Such rays and pixels are NaN. (Tangential
+    and thin-prism terms fold the image a little earlier, at 97 % of that: there a pixel may still be of another ray.)
 
     Args:
         coefficients: none, (k1, k2, p1, p2), and further k3, (k4, k5, k6), (s1, s2, s3, s4), (tx, ty) rad.

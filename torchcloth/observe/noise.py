@@ -54,8 +54,10 @@ class AbstractNoise(ABC):
         """The image as float32.
 
         Raises:
-            InvalidInput: no image, or a bias that is missing or of another shape than ``bias_field`` draws.
+            InvalidInput: no image, whole numbers, which are no metres, or a bias that is missing or of another shape
+                than ``bias_field`` draws.
         """
+        has_reading(np.asarray(depth))
         depth = np.asarray(depth, np.float32)
         if depth.ndim != 2:
             raise InvalidInput("depth", got=f"shape {depth.shape}", expected="[H, W]")

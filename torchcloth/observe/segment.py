@@ -19,6 +19,8 @@ Mesh = tuple[Array, Array]
 LEVEL = np.cos(np.deg2rad(10.0))  # a table is level to 10 degrees
 TRIES, ROUNDS, REFITS = 4, 300, 20  # planes looked at, draws for each, and least squares after them
 UNDER = 0.01  # share of the points that may lie under a table
+NOISE = 2.5  # times ``flat``, that a table may scatter by
+FLANK = 8  # times ``flat`` around a plane, where one looks whether it is the flank of another
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -37,7 +39,8 @@ class Segmentation:
         above: the table is all that lies lower than this over its plane. Give three standard deviations of the sensor
             or more: at 1 m 6 mm suits an Azure Kinect, 15 mm a D435. Cloth lying flatter goes with the table: tell it
             apart by colour instead, and set ``above`` to -0.01.
-        flat: distance within which points count as the table's while it is searched for.
+        flat: distance within which points count as the table's while it is searched for: at least the sensor's standard
+            deviation there (8 mm of a D435 at 1.5 m), or the table may be found millimetres off, or not at all.
         neighbours, deviations: a point is an outlier where the mean distance to so many neighbours exceeds the cloud's
             mean by so many standard deviations.
         radius, company: and where fewer than ``company`` others lie within ``radius``.
@@ -112,7 +115,8 @@ class Segmented:
     Attributes:
         points: [N, 3] m.
         kept: [N] which of the points that came in.
-        removed: how many each stage took away, in order; stages that were left out are absent.
+        removed: how many each stage took away, in order; stages that were left out are absent. A table that was looked
+            for and not found took 0, and ``table`` is None: its points are still there.
         came: how many came in.
         table: [4] (a, b, c, d) of the plane that was removed, or None.
         normals: [N, 3] unit, towards the camera where it is known, or None.
@@ -196,12 +200,13 @@ def segment(
 
     Raises:
         MissingDependency: open3d cannot be imported.
-        InvalidInput: points that are not [N, 3] and finite, or no colours for ``how.hsv``, or
+        InvalidInput: points or grasps that are not [N, 3] and finite, or no colours for ``how.hsv``, or
             colours that are no whole numbers.
     """
     points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InvalidInput("points", got=f"shape {points.shape}", expected="[N, 3], finite, in m")
+    _check_grasps(grasps)
     if how.hsv is not None:
         _check_colors(np.asarray(colors), points.shape)
     cloud = _Cloud(points)
@@ -214,6 +219,8 @@ def segment(
     table = _table(cloud.points, how)
     if table is not None:
         cloud.keep("table", lambda p, _: p @ table[:3] + table[3] > how.above)
+    elif how.table is not None:
+        cloud.removed["table"] = 0  # looked for, and not found
     if how.neighbours:
         cloud.keep("outliers", lambda p, _: _sparse(p, how))
     if how.radius:
@@ -224,6 +231,14 @@ def segment(
         cloud.keep("thinned", lambda p, _: np.isin(np.arange(len(p)), spaced(p, spacing)))
     normals = _normals(cloud.points, how.normals, viewpoint) if how.normals else None
     return Segmented(cloud.points, cloud.kept, cloud.removed, len(points), table, normals)
+
+
+def _check_grasps(grasps: Array | None) -> None:
+    """The hand of a pose that was lost is nowhere, and no cluster near it."""
+    given = np.zeros((0, 3)) if grasps is None else np.asarray(grasps, dtype=float)
+    if given.size and (given.ndim != 2 or given.shape[1] != 3 or not np.isfinite(given).all()):
+        got = f"shape {given.shape}" if np.isfinite(given).all() else "NaN or infinite places"
+        raise InvalidInput("grasps", got=got, expected="[G, 3], finite, in m", remedy="leave out what is not known")
 
 
 def _check_colors(colors: Array, shape: tuple[int, ...]) -> None:
@@ -288,10 +303,29 @@ def _table(points: Array, how: Segmentation) -> Array | None:
         plane, inliers = _cloud(left).segment_plane(how.flat, 3, ROUNDS)
         plane = _refined(np.asarray(plane), left, 2 * how.flat)
         height = points @ plane[:3] + plane[3]
-        if plane[2] > LEVEL and (height < -3 * how.flat).mean() < UNDER:
+        scatter = _scatter(height, how.flat) if plane[2] > LEVEL else None
+        if scatter is not None and (height < -max(3 * how.flat, 4 * scatter)).mean() < UNDER:
             return plane
         left = np.delete(left, inliers, axis=0)
     return None
+
+
+def _scatter(height: Array, flat: float) -> float | None:
+    """Standard deviation of the heights about the one plane that there is at 0; None: there is none.
+
+    Noise of a sensor beyond ``flat`` leaves planes in the tails of the true one, above which points become more and
+    more; and below one through cloth points become fewer first and then more.
+    """
+    count = np.bincount(np.clip(np.rint(height / flat), -FLANK - 1, FLANK + 1).astype(int) + FLANK + 1)
+    count = np.pad(count, (0, 2 * FLANK + 3 - len(count)))[1:-1].astype(float)
+    below, above = count[FLANK::-1], count[FLANK:]  # from the plane on
+    more = lambda side: side[1:] > 1.3 * side[:-1] + 3 * np.sqrt(side[:-1] + 1)  # noqa: E731 - than by chance
+    rising = more(above)
+    if (rising[0] and rising[1]) or more(below).any():
+        return None
+    near = -height[(height < 0) & (height > -FLANK * flat)]
+    scatter = float(1.4826 * np.median(near)) if len(near) else 0.0
+    return scatter if scatter < NOISE * flat else None  # folds of cloth scatter more
 
 
 def _refined(plane: Array, points: Array, band: float) -> Array:

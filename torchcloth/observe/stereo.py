@@ -98,14 +98,14 @@ class StereoNoise(AbstractNoise):
         scale, warp = (0.0, 0.0) if bias is None else bias
         true = np.divide(self.focal * self.baseline, depth, out=np.zeros(depth.shape), where=depth > 0)
         nearest = _largest(true, self.fattening)
-        matched = np.where(nearest - true > self.edge, nearest, true)
-        matched = matched + warp + self.subpixel * patches(depth.shape, self.patch, rng)
+        surface = np.where(nearest - true > self.edge, nearest, true)
+        matched = surface + warp + self.subpixel * patches(depth.shape, self.patch, rng)
         if self.step:
             matched = np.rint(matched / self.step) * self.step
         lost = shadow(true, self.edge) & (matched - true < self.edge)
         if self.holes:
             lost |= patches(depth.shape, self.patch, rng) < NormalDist().inv_cdf(self.holes)
-        good = (matched > 0) & (nearest > 0) & ~lost
+        good = (matched > 0) & (surface > 0) & ~lost
         z = np.divide(self.focal * self.baseline, matched, out=np.zeros(depth.shape), where=good)
         return (z * (1 + scale)).astype(np.float32)
 

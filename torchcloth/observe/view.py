@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InvalidInput
 from .camera import DepthCamera
-from .cloud import erode, thin_to_count, to_points
+from .cloud import erode, has_reading, thin_to_count, to_points
 from .noise import AbstractNoise
 from .render import render_depth
 
@@ -84,9 +84,10 @@ def encode(depth: Array, depth_scale: float = 0.001) -> Array:
     A pixel without a reading (NaN), and what lies beyond the largest number, is invalid: 0 says so in this format.
 
     Raises:
-        InvalidInput: a scale that is not positive.
+        InvalidInput: a scale that is not positive, or whole numbers, which are no metres.
     """
     _check_scale(depth_scale)
+    has_reading(np.asarray(depth))
     units = np.rint(np.nan_to_num(np.asarray(depth, dtype=float), posinf=0.0, neginf=0.0) / depth_scale)
     return np.where((units > 0) & (units <= np.iinfo(np.uint16).max), units, 0).astype(np.uint16)
 

@@ -110,7 +110,7 @@ def estimate_pose(
 
     def tell(stage: str, raw: Tensor) -> None:
         if on_progress is not None:
-            on_progress(stage, float(_shares(objective, raw, always, gravity).square().mean().sqrt()))
+            on_progress(stage, _over_time(objective, _shares(objective, raw, always, gravity)))
 
     found = smooth(objective, tell)
     return _concluded(objective, found, fields, gravity, began)
@@ -130,7 +130,7 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
     seen, shares = seen_vertices(x, used, cloth.mesh), _shares(objective, raw, held.all(0), gravity)
     fit = _distances(data, objective.faces, {"after": x, "alone": alone, "null": null})
     fit |= {
-        "force_share": float(shares.square().mean().sqrt()),
+        "force_share": _over_time(objective, shares),
         "force_share_max": float(shares.max()),
         "seen_share": float(seen.double().mean()),
         "std_rms": float(std.square().sum(-1).mean().sqrt()),
@@ -206,6 +206,13 @@ def held_at(cloth: Cloth, data: Episode) -> Tensor:
             closed = motion.closed[last_knot(motion.t, data.times[: data.observed] + 1e-9).clamp(min=0)]
             out[:, part.index] |= closed[:, None]
     return out
+
+
+def _over_time(objective: Corrected, shares: Tensor) -> float:
+    """Root mean square of shares [W]: windows last as long as the gaps between frames make them."""
+    times = objective.episodes[0].times
+    lasts = torch.stack([times[last] - times[first] for first, last in objective.correction.windows]).to(shares)
+    return float(((shares.square() * lasts).sum() / lasts.sum()).sqrt())
 
 
 def _shares(objective: Corrected, raw: Tensor, held: Tensor, gravity: float) -> Tensor:

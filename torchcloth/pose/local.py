@@ -70,8 +70,11 @@ def _basis(modes: Modes, coarse: int, held: Tensor) -> Tensor:
     """[J, V] fields of a random field of unit mean square that vanishes where the cloth is held."""
     if coarse >= len(modes.wave):
         return modes.fields.new_zeros(0, modes.fields.shape[1])
-    first = modes.wave[coarse]
-    weight = torch.exp(-0.5 * ((modes.wave[coarse:] / first) ** 2 - 1))  # neighbours agree over half a coarse mode
+    wave = modes.wave[coarse:]
+    first = (
+        wave[wave > 0].min() if bool((wave > 0).any()) else wave.new_ones(())
+    )  # 0: constant fields of further pieces
+    weight = torch.exp(-0.5 * ((wave / first) ** 2 - 1))  # neighbours agree over half a coarse mode
     kept = weight > FAINT
     fields = modes.fields[coarse:][kept] * weight[kept].sqrt()[:, None]
     if len(held):

@@ -11,12 +11,13 @@ from ..errors import InvalidInput
 from ..meshes import Mesh
 
 EQUAL = 1e-6  # relative, wave numbers that symmetry makes equal
+NONE = 1e-12  # of the largest squared wave number, below which one is rounding's: each piece has one constant field
 
 
 class Modes(NamedTuple):
     """Vibration shapes of a membrane with a free rim, at rest."""
 
-    fields: Tensor  # [M, V] -, each of unit mean square over the area; the first is constant
+    fields: Tensor  # [M, V] -, each of unit mean square over the area; of one piece the first is constant
     wave: Tensor  # [M] 1/m, wave numbers, ascending
 
     def doubt(self, count: int) -> list[str]:
@@ -69,4 +70,5 @@ def modes_of(mesh: Mesh, count: int | None = None) -> Modes:
     squared, vectors = torch.linalg.eigh(stiffness / root[:, None] / root[None, :])
     fields = vectors[:, :count].mT / root * root.square().sum().sqrt()
     largest = fields.gather(1, fields.abs().argmax(1, keepdim=True))
-    return Modes(fields * largest.sign(), squared[:count].clamp(min=0).sqrt())  # eigh leaves the signs open
+    wave = torch.where(squared > NONE * squared[-1], squared, 0.0)[:count].sqrt()
+    return Modes(fields * largest.sign(), wave)  # eigh leaves the signs open

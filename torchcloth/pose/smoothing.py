@@ -100,7 +100,7 @@ def holds_for(objective: Corrected, raw: Tensor) -> int:
 
 def _window_by_window(objective: Corrected, raw: Tensor, tell: Tell) -> Tensor:
     """[K] from beginnings that grow by one window: a push far ahead has tangents that end in no motion."""
-    count = len(objective.episodes[0].times)
+    count = objective.episodes[0].observed
     rounds, steps = GROWING
     for _, last in objective.correction.windows[:-1]:
         part = cast("Corrected", objective.part((last + 1) / count))

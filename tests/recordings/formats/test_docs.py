@@ -13,6 +13,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import foreign
 
+import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.recordings import formats
 from torchcloth.recordings.formats import words
@@ -35,6 +36,20 @@ def test_the_episode_can_be_read(tmp_path):
     assert recording.cloth.sheet == (0.3, 0.3)
     np.testing.assert_array_equal(recording.cameras["cam0"].distortion, [0.2624, -0.9531, -0.0054, 0.0026, 1.1633])
     words.check(json.loads(text), "docs/episode.md")
+
+
+def test_an_arm_of_ones_own(tmp_path, monkeypatch):
+    """A Rizon's URDF under another name; the plan itself is tested elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    urdf = Path(tc.robots.__file__).parent / "urdf" / "rizon4.urdf"
+    (tmp_path / "my.urdf").write_text(urdf.read_text().replace('"tcp_closed"', '"tip"'))
+    monkeypatch.setattr(tc.robots, "plan", lambda rig, action: (rig, action))
+    (text,) = blocks("episode.md", "python")
+    own = {}
+    exec(compile(text, "docs/episode.md", "exec"), own)
+    rig, action = own["plan"]
+    assert rig["hand"].frame == "tip"
+    assert set(action.motion) == {"hand"}
 
 
 def test_every_word_is_explained():
