@@ -51,8 +51,16 @@ def absent() -> dict[str, str]:
     return {
         name: f"pip install {peer.distribution}, or all: pip install 'torchcloth[bench]'"
         for name, peer in PEERS.items()
-        if find_spec(peer.package) is None
+        if find_spec(peer.package) is None or not _is_known(peer.distribution)
     }
+
+
+def _is_known(distribution: str) -> bool:
+    """A folder of a package's name is none."""
+    try:
+        return bool(metadata.version(distribution))
+    except metadata.PackageNotFoundError:
+        return False
 
 
 def versions() -> dict[str, str]:

@@ -144,8 +144,11 @@ class Bench:
                 self.notes.setdefault(entry.key(name), f"{name} ended in another task of this round")
         for entry in entries:
             self._judge(entry, {n: turns[entry, n] for n in entry.names if entry.key(n) not in self.notes})
-        for worker in self._workers.values():
-            worker.forget()
+        for name, worker in [*self._workers.items()]:
+            try:
+                worker.forget()
+            except Failed:  # what it has measured counts
+                self._workers.pop(name).close()
 
     def _prepared(self, entry: Entry, name: str) -> Turn | None:
         """Built, compiled and run once; None if the contestant cannot do it."""
@@ -169,7 +172,13 @@ class Bench:
     def _judge(self, entry: Entry, turns: Mapping[str, Turn]) -> None:
         """Keep the timings whose physics holds."""
         case = entry.task.scene()
-        outcomes = {name: turn.worker.result(entry.task)[0] for name, turn in turns.items()}
+        outcomes: dict[str, Outcome] = {}
+        for name, turn in turns.items():
+            try:
+                outcomes[name] = turn.worker.result(entry.task)[0]
+            except Failed as error:
+                self._lose(entry, name, error)
+        turns = {name: turns[name] for name in outcomes}
         faults = {
             name: guards.problems(case, entry.task.substeps, found.x) + _derivatives(entry.task, found)
             for name, found in outcomes.items()

@@ -117,6 +117,28 @@ def test_who_ends_leaves_the_round_and_nobody_else_does():
     assert set(bench._workers) == {"reference"}
 
 
+@pytest.mark.parametrize("question", ["result", "forget"])
+def test_who_ends_after_its_last_sample_takes_nobody_along(question):
+    x = Task("standard", "forward", 20, small=True).scene().mesh.vertices + np.array([0.0, 0.0, -1e-4])
+    right = Outcome(x, 1.0, np.ones_like(x), 1.0)
+    bench, entry = (
+        Bench(Plan(("fused", "reference"))),
+        Entry(Task("standard", "forward", 20, small=True), ("fused", "reference")),
+    )
+    dying = Ready(right)
+
+    def ends(*task):
+        raise Failed("killed")
+
+    setattr(dying, question, ends)
+    bench._workers.update(fused=dying, reference=Ready(right))
+    bench.measure([entry])
+    lost = {entry.key("fused")} if question == "result" else set()
+    assert set(bench.notes) == lost
+    assert set(bench.records) == {entry.key(name) for name in entry.names} - lost
+    assert set(bench._workers) == {"reference"}
+
+
 @pytest.mark.parametrize(
     ("broken", "counted"), [("fused", {"reference"}), ("reference", {"fused"}), ("", {"fused", "reference"})]
 )

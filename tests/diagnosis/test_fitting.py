@@ -68,16 +68,37 @@ def test_a_step_into_the_impossible_is_not_taken(looks, iterations):
 
 
 @pytest.mark.parametrize(
-    ("promised", "steps", "tried"), [([9.0, 0.0, 0.0, 0.0], 2, 3), ([0.0], 0, 0), ([9.0, 9.0, 9.0], 2, 4)]
+    ("promised", "steps", "tried"), [([9.0, 0.0, 0.0, 0.0], 2, 3), ([0.0], 0, 0), ([9.0, 9.0, 9.0], 2.25, 5)]
 )
 def test_it_goes_on_while_steps_gain_whatever_slopes_promise(looks, monkeypatch, promised, steps, tried):
-    """From 0 to 0.4, where the data are, by 0.2 a step: the third loses and is not taken, nor is half of it."""
+    """From 0 to 0.4, where the data are, by 0.2 a step: the third loses, and half of it, where it promised much."""
     seen, model = looks
     ahead = iter(promised)
     monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.2]).double(), next(ahead, 0.0)))
     found = fit(model, None)  # type: ignore[arg-type]
     assert float(found.model.point[0]) == pytest.approx(0.2 * steps)
     assert len(seen) == tried + 1
+
+
+def test_causes_are_asked_about_where_it_ends_alone(looks, monkeypatch):
+    """Simulating all of them at a step that loses takes longer than the step."""
+    seen, model = looks
+    monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.9]).double(), 9.0))
+    found = fit(model, None, [toys.hypothesis("a")], 1)  # type: ignore[arg-type]
+    assert seen == [(0.0, 0), (0.9, 0), (0.0, 1)]
+    assert [h.name for h in found.evidence.hypotheses] == ["a"]
+
+
+def test_noise_is_estimated_once_where_a_step_loses(looks, monkeypatch):
+    """At 0, of which 0.9 and then 0.45 are tried, and at 0.45, where it ends."""
+    seen, model = looks
+    estimate, estimated = fitting.fit_noise, []
+    monkeypatch.setattr(fitting, "fit_noise", lambda evidence: estimated.append(evidence) or estimate(evidence))
+    monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.9]).double(), 9.0))
+    found = fit(model, None, iterations=2)  # type: ignore[arg-type]
+    assert [at for at, _ in seen] == [0.0, 0.9, 0.45]
+    assert len(estimated) == 2
+    assert estimated[-1] is found.evidence
 
 
 def test_what_only_the_later_point_meets_is_no_loss(looks, monkeypatch):

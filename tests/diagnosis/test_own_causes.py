@@ -76,6 +76,14 @@ def test_what_is_no_file_of_causes_is_one_line(file, content, said, capsys):
     assert capsys.readouterr().err.startswith("torchcloth: causes; got ")
 
 
+def test_kin_may_be_a_list():
+    """What was simulated is remembered by the causes of the world."""
+    given = {"name": "my.damping", "unit": "1/s", "typical": 2.0, "apply": lambda world, _: world}
+    listed, plain = (Hypothesis(**given, kin=kin) for kin in (["obs.clock"], ("obs.clock",)))
+    assert hash(listed) == hash(plain)
+    assert listed == plain
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

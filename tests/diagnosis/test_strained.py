@@ -51,11 +51,11 @@ def test_it_begins_at_the_data_sheet_and_is_nothing_where_that_ends_as_far(monke
 def test_causes_that_are_known_stay_where_others_are_tried_from_the_data_sheet(monkeypatch):
     asked = []
 
-    def fit(model, *_, **__):
+    def gather(model, *_):
         asked.append(model)
         raise SimulationDiverged("x", got="nan", expected="numbers")
 
-    monkeypatch.setattr(afresh, "fit", fit)
+    monkeypatch.setattr(afresh, "gather", gather)
     with pytest.raises(SimulationDiverged):
         afresh.afresh(found(OFTEN + 1), None, [], 4)  # type: ignore[arg-type]
     assert asked[0].point.tolist() == [0.0, 1.5]
@@ -166,7 +166,7 @@ def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(
 def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
     promised = [(10.0, "much", None), (5.0, "half", None), (1.0, "little", None)]
     causes = [toys.hypothesis(name, 2.0) for _, name, _ in promised]
-    monkeypatch.setattr(afresh, "fit", lambda *_, **__: found(0.0))
+    monkeypatch.setattr(afresh, "gather", lambda *_: found(0.0).evidence)
     monkeypatch.setattr(afresh, "asked_about", lambda here, *_: here)
     monkeypatch.setattr(afresh, "_promises", lambda _: promised)
     monkeypatch.setattr(afresh, "WORTH_TRYING", 0.4)

@@ -256,6 +256,19 @@ def test_without_motion_there_is_no_lag():
     assert report.noise == {}
 
 
+def test_without_motion_nobody_knows_which_frames_are_still(needs_open3d):
+    seen = clouds()
+    none, some = (inspect(replace(episode(points=seen), **change)) for change in ({"grippers": {}}, {}))
+    assert none.noise["points"].method.endswith("in all frames, as no gripper tells which are still")
+    assert "no gripper" not in some.noise["points"].method
+
+
+def test_names_are_no_formulas(tmp_path, needs_open3d):
+    given = episode(points=clouds())
+    odd = replace(given, grippers={"a $x_{$ b": given.grippers["hand"]}, cloth=replace(given.cloth), grasps={})
+    assert draw(inspect(odd), tmp_path).is_file()
+
+
 def test_the_report_is_json_and_a_picture(tmp_path, capsys, needs_open3d):
     report = inspect(episode(markers=markers(lag=0.1, **GRID), points=clouds(lag=0.1)))
     stored = json.loads(json.dumps(report.as_dict(), allow_nan=False))

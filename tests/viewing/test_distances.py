@@ -14,7 +14,7 @@ from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.recordings import PointClouds
 from torchcloth.viewing import Cloud, film_of_fit, with_cloth
-from torchcloth.viewing.distances import _when, _worst
+from torchcloth.viewing.distances import _beside, _when, _worst
 
 
 @pytest.fixture
@@ -63,6 +63,19 @@ def test_points_of_another_time_are_shown_and_not_measured(bare):
     assert np.array_equal(np.isfinite(shown.curves["distance"].values), told)
     assert np.isnan(shown.sheets["cloth"].values[~told]).all()
     assert shown.clouds["points"] is film.clouds["points"]
+
+
+def test_frames_between_those_of_the_points_are_left_out(bare):
+    """Else three of a picture's four moments are grey, and a curve with gaps has no line."""
+    film, cloth = bare
+    points = PointClouds(film.times[::2], np.zeros((3, 3)), np.ones(3, dtype=int))
+    recording = SimpleNamespace(points=points, clock_offset=0.0, observation_noise_std=None)
+    shown = _beside(film, recording, cloth.vertices, cloth.faces)
+    assert np.array_equal(shown.times, film.times[::2])
+    assert np.isfinite(shown.curves["distance"].values).all()
+    np.testing.assert_array_equal(shown.sheets["cloth"].vertices, cloth.vertices[::2])
+    none = _beside(film, SimpleNamespace(points=None, observation_noise_std=None), cloth.vertices, cloth.faces)
+    assert len(none) == len(film)
 
 
 def test_which_frames_have_points_of_their_own():

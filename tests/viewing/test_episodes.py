@@ -37,6 +37,14 @@ def test_markers_that_were_not_seen_are_not_shown(rich):
     np.testing.assert_allclose(shown[1][0], rich.markers.xyz[1, 1], atol=1e-6)
 
 
+def test_an_arm_with_other_joints_than_were_recorded_is_a_note(rich):
+    name = next(name for name in rich.joints if name in rich.robots)
+    fewer = replace(rich.joints[name], q=rich.joints[name].q[:, :-1])
+    film = film_of(replace(rich, joints={name: fewer}))
+    assert not any(part.startswith(f"arms/{name}") for part in film.solids)
+    assert any(f"arm {name!r} is not drawn: q; got shape" in note for note in film.notes)
+
+
 def test_what_was_seen_at_another_time_is_not_shown(rich):
     late = replace(rich, markers=replace(rich.markers, t=rich.markers.t + 5.0))
     assert [len(frame) for frame in film_of(late).clouds["markers"].frames] == [0, 0, 0]

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from torchcloth.errors import InvalidInput
-from torchcloth.viewing import Cloud, Curve, Sheet, animate, picture
+from torchcloth.viewing import Cloud, Curve, Plane, Sheet, animate, picture
 from torchcloth.viewing.pictures import _durations
 from torchcloth.viewing.projection import camera_for, polygons
 from torchcloth.viewing.stage import Stage
@@ -75,6 +75,16 @@ def test_lengths_are_equal_in_all_directions(film):
     origin, along, up = camera.project(np.array([[0.0, 0, 0.1], [0, 0.1, 0.1], [0, 0, 0.2]]))[0]
     assert np.linalg.norm(along - origin) == pytest.approx(np.linalg.norm(up - origin), rel=1e-6)
     assert up[1] < origin[1]  # z is up
+
+
+@pytest.mark.parametrize("size", [0.05, 0.4])
+def test_a_table_that_goes_on_behind_the_camera_is_under_the_cloth(film, size):
+    """Corners behind the camera fell on the picture upside down."""
+    colour, corners = (0, 200, 0), np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    table = Plane(0.6 * corners - [0, 0, 0.3 * size], colour)
+    stage = Stage(only(film, sheets={"cloth": square(0.0, RED, size / 2)}, planes={"table": table}), size=(300, 300))
+    beside = at(stage, [0.6 * size, -0.6 * size, -0.3 * size])
+    assert beside[1] > 0.6 > 0.3 > beside[0]
 
 
 def test_what_is_in_front_is_seen(film):

@@ -110,9 +110,11 @@ def test_messages_come_from_the_servers_thread(viewer, monkeypatch):
 
 def test_groups_are_switched(viewer):
     assert viewer.scene.groups == ["truth", "cloth", "points", "arms", "colliders", "grippers"]
-    viewer.scene.switch("arms", False)
-    assert not handle(viewer, "/arms").visible
-    assert handle(viewer, "/points").visible
+    for group in viewer.scene.groups:
+        viewer.scene.switch(group, False)
+        assert not handle(viewer, f"/{group}").visible
+        assert all(handle(viewer, f"/{other}").visible for other in viewer.scene.groups if other != group)
+        viewer.scene.switch(group, True)
 
 
 def test_it_plays_in_real_time_and_stops(viewer):

@@ -60,6 +60,8 @@ def _check_target(options: argparse.Namespace) -> None:
         raise InvalidInput("DST is SRC or holds it", got=target, expected="another name")
     if target.resolve().is_relative_to(source.resolve()):
         raise InvalidInput("DST is within SRC", got=target, expected="a place outside it")
+    if options.scene is not None and options.scene.resolve().is_relative_to(target.resolve()):
+        raise InvalidInput("--scene is in DST", got=options.scene, expected="a place outside it")
     if target.suffix != MCAP and target.suffix.lower() in FILES.split():
         expected = f"a folder's name, or a file ending {MCAP}"
         raise InvalidInput(f"DST cannot be a {target.suffix} file", got=target, expected=expected)

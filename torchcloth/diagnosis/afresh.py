@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 
 from .approaching import approach
-from .evidence import asked_about
+from .evidence import asked_about, gather
 from .fitting import Fitted, fit, leap, leap_with, with_cause
 from .noise import unfitted, whitened
 from .setting import Progress, Setting, staged
@@ -38,9 +38,9 @@ def afresh(
     sheet = replace(start.model, values=torch.zeros_like(start.model.values))
     away = [h.opposite for h in hypotheses if h.reverses]
     about = staged(progress, "from the data sheet, causes")
-    there = fit(sheet, setting, hypotheses, 0, about, before=start.evidence)
-    back = asked_about(there.evidence, sheet, setting, away, staged(progress, "from the data sheet, the other way"))
-    ways = [there, replace(there, evidence=back)]
+    there = gather(sheet, setting, hypotheses, about, start.evidence)
+    back = asked_about(there, sheet, setting, away, staged(progress, "from the data sheet, the other way"))
+    ways = [replace(start, model=sheet, evidence=evidence) for evidence in (there, back)]  # leaps ask for no more
     promised = sorted((pair for found in ways for pair in _promises(found)), key=lambda pair: -pair[0])
     likely: dict[str, Fitted] = {}
     for gained, name, found in promised:

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import InvalidInput
 from ..identification.blocks import BLOCKS
 from ..identification.episodes import Episode
 from ..identification.replays import Frames
@@ -146,10 +145,6 @@ def _averaged(rows: Rows, block: int, episode: Episode, sheet: Sheet, rest: Tens
     place = _places(NAMES[block], sheet, rest)[rows.patch // 3]
     times = episode.times.to(rows.value)
     window = ((times - times[0]) / STRETCH + 1e-6).floor().long()[rows.frame]  # stamps are rounded
-    if int(window.max()) >= WINDOWS:
-        raise InvalidInput(
-            "episode", got=f"{float(times[-1] - times[0]):.0f} s", expected=f"less than {WINDOWS * STRETCH:.0f} s"
-        )
     group, index = torch.unique(rows.patch * WINDOWS + window, return_inverse=True)
     size = len(group)
     add = lambda v: torch.zeros(size, *v.shape[1:], dtype=v.dtype).index_add(0, index, v)  # noqa: E731

@@ -69,17 +69,21 @@ def fit(
     about = f"{len(hypotheses)} causes" if hypotheses else "as fitted"
 
     def look(at: Model, steps: int) -> Evidence:
-        """After so many; once there are no more, at the hypotheses, too."""
-        if steps < iterations:
-            return gather(at, setting, (), staged(progress, f"fit {steps + 1}"), before)
-        return gather(at, setting, hypotheses, staged(progress, about), before)
+        """After so many."""
+        stage = f"fit {steps + 1}" if steps < iterations else "as fitted"
+        return gather(at, setting, (), staged(progress, stage), before)
 
     asked, share = here is None and not iterations, 1.0
     last: tuple[Noise, Model, Evidence] | None = None
+    if asked:
+        here = gather(model, setting, hypotheses, staged(progress, about), before)
     here = here or look(model, 0)
+    known: tuple[Evidence, Noise, Tensor, float] | None = None  # where the last step began, and what follows from it
     for taken in range(1, iterations + 1):
-        before, level = before or here, noise or fit_noise(here)
-        step, ahead = leap(whitened(here, level), model)
+        if known is None or known[0] is not here:
+            before, level = before or here, noise or fit_noise(here)
+            known = (here, level, *leap(whitened(here, level), model))
+        _, level, step, ahead = known
         if ahead < ENOUGH and not (last and _gained(*last, model, here) >= ENOUGH):
             break
         further = model.at(model.point + share * step)
@@ -93,11 +97,11 @@ def fit(
             share /= 2
             continue
         last, share = (level, model, here), 1.0
-        model, here, asked = further, there, taken == iterations
+        model, here = further, there
     if hypotheses and not asked:
         here = here if before is None else as_held(here, before)
         here = asked_about(here, model, setting, hypotheses, staged(progress, about))
-    return weighed(model, here, noise or fit_noise(here))
+    return weighed(model, here, known[1] if known and known[0] is here else noise or fit_noise(here))
 
 
 def weighed(model: Model, evidence: Evidence, noise: Noise) -> Fitted:

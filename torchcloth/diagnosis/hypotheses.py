@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from ..errors import InvalidInput
+from ..pose.objective import CORRECTION
 from ..recordings import Recording
 from . import air, fabric, grip, observer
 from .tried_causes import applied, blamed
@@ -19,7 +20,7 @@ from .world import RESIDUAL, Hypothesis, Model
 
 TAKEN = frozenset(
     {air.DRAG, "linear", "added_mass", "viscosity", "hem", "seam", "rest_shape", "gravity", "bending"}
-    | {"bending_friction", "shear_friction", RESIDUAL}
+    | {"bending_friction", "shear_friction", RESIDUAL, CORRECTION}
 )
 BEGIN, END = "slip_", "_pull"  # of names with a gripper's or a table's
 _registered: list[Hypothesis] = []

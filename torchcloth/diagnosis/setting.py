@@ -15,7 +15,7 @@ from ..identification.replays import Frames
 from ..identification.replicates import keys_of
 from ..identification.sheet import Sheet, sheet_for
 from ..recordings import Recording
-from .cells import Piece
+from .cells import STRETCH, WINDOWS, Piece
 from .refined import refined
 from .world import Model, World
 
@@ -110,7 +110,11 @@ def foreseen(e: Episode) -> Episode:
 
 
 def _telling(e: Episode) -> Episode:
-    """Raises InvalidInput for one that says nothing: its first frame is where the simulation starts."""
+    """Raises InvalidInput for one that says nothing, its first frame being where the simulation starts; or too much."""
+    lasts, longest = float(e.times[-1] - e.times[0]), WINDOWS * STRETCH
+    if lasts >= longest:
+        got, expected = f"{e.name} of {lasts:.0f} s", f"less than {longest:.0f} s"
+        raise InvalidInput("episode", got=got, expected=expected, remedy="cut it into several")
     if not _seen(e) and not any(bool(w[1:].isfinite().any()) for w in e.wrenches.values()):
         raise InvalidInput(
             "episode",

@@ -152,6 +152,10 @@ class Hypothesis:
     brings: str = ""
     finer: bool = False
 
+    def __post_init__(self) -> None:
+        if isinstance(self.kin, list):  # which has no hash
+            object.__setattr__(self, "kin", tuple(self.kin))
+
     @property
     def effect(self) -> str:
         """The name without its axis."""

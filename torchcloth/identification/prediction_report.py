@@ -132,7 +132,8 @@ def predicted(found: EpisodePrediction) -> Any:
         axis.axhline(1e3 * found.law, color=NULL, linestyle="--", label="rms that the fit left in its own episodes")
         half = 1e3 * found.interval.square().mean(-1).sqrt()
         axis.plot(e.times, half, color=AFTER, linestyle=":", label="both: 95 % of measured points should be nearer")
-    axis.set(xlabel="time [s]", ylabel="mm", title=f"{e.name}, predicted")
+    axis.set(xlabel="time [s]", ylabel="mm")
+    axis.set_title(f"{e.name}, predicted", parse_math=False)
     axis.set_ylim(bottom=0)
     axis.legend()
     return figure

@@ -137,7 +137,7 @@ def _noises(recording: Recording, holds: dict[str, Path], seen: dict[str, Frames
     if (markers := recording.markers) is not None:
         found["markers"] = noise.of_markers(markers, still(markers.t), ~seen["markers"].rejected)
     if (points := recording.points) is not None:
-        found["points"] = noise.of_clouds(points, still(points.t))
+        found["points"] = noise.of_clouds(points, still(points.t) if holds else None)
     return {name: value for name, value in found.items() if value is not None}
 
 

@@ -68,14 +68,15 @@ def of_markers(markers: Markers, still: np.ndarray, use: np.ndarray) -> Noise | 
     return Noise(std, (x, y, z), sum(count), method)
 
 
-def of_clouds(clouds: PointClouds, still: np.ndarray) -> Noise | None:
-    """Robust scatter about quadrics through each point's neighbours, by preference in still frames.
+def of_clouds(clouds: PointClouds, still: np.ndarray | None) -> Noise | None:
+    """Robust scatter about quadrics through each point's neighbours, by preference in still frames (None: not known).
 
     Wrinkles finer than a patch of 20 points count as noise: of a thinned cloud it is an upper bound.
     """
     big = np.flatnonzero(clouds.counts >= 2 * PATCH)
-    frames = np.intersect1d(np.flatnonzero(still), big)
+    frames = big[:0] if still is None else np.intersect1d(np.flatnonzero(still), big)
     where = "in still frames" if len(frames) else "in moving frames, as none is still"
+    where = "in all frames, as no gripper tells which are still" if still is None else where
     frames = frames if len(frames) else big
     if len(frames) == 0:
         return None

@@ -57,7 +57,8 @@ def _timeline(axis: Any, report: Inspection) -> None:
                 color=BAD,
                 markersize=4,
             )
-    axis.set(yticks=range(len(streams)), yticklabels=list(streams), xlabel="time on the motion clock [s]")
+    axis.set_yticks(range(len(streams)), list(streams), parse_math=False)
+    axis.set(xlabel="time on the motion clock [s]")
     axis.set_title("streams: bars are gaps, triangles rejected frames", fontsize=10)
     axis.invert_yaxis()
 
@@ -108,8 +109,8 @@ def _images(axes: list[Any], report: Inspection) -> None:
         depth = decode(images.load(i), scale)
         shown = axis.imshow(np.where(depth > 0, depth, np.nan), cmap="viridis")
         axis.figure.colorbar(shown, ax=axis, shrink=0.6, label="depth [m]")
-        axis.set(title=f"{name}, depth image {i}", xticks=[], yticks=[])
-        axis.title.set_fontsize(10)
+        axis.set(xticks=[], yticks=[])
+        axis.set_title(f"{name}, depth image {i}", fontsize=10, parse_math=False)
 
 
 def _frame(axis: Any, report: Inspection, kind: str, i: int) -> None:
@@ -126,7 +127,7 @@ def _frame(axis: Any, report: Inspection, kind: str, i: int) -> None:
         axis.plot(*path.position.T, color=SOFT, linewidth=0.8)
         here = path.at(np.array([t]))[0]
         axis.scatter(*here.T, s=40, color=BAD, marker="s", depthshade=False)
-        axis.text(*here[0], f" {name}", fontsize=7, color=BAD)
+        axis.text(*here[0], f" {name}", fontsize=7, color=BAD, parse_math=False)
         everything.append(path.position)
     points = np.concatenate(everything)
     middle, half = (points.max(0) + points.min(0)) / 2, max(np.ptp(points, axis=0).max() / 2, 1e-3)

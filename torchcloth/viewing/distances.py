@@ -43,10 +43,7 @@ def film_of_fit(recording: Recording, fit: str | Path, *, truth: bool = False) -
         return _film_of_model(recording, fit, truth)
     again = replayed(fit, recording)
     film = film_of(recording, truth=truth, times=again.episode.times.numpy())
-    told = _when(recording, film.times)
-    film = with_cloth(
-        film, again.frames.numpy(), again.cloth.mesh.faces, noise=recording.observation_noise_std, told=told
-    )
+    film = _beside(film, recording, again.frames.numpy(), again.cloth.mesh.faces)
     distance = f", {1e3 * float(again.chamfer.mean()):.2f} mm from the points" if len(again.chamfer) else ""
     title = f"{film.title}: {'fitted' if again.fitted else 'predicted'}{distance}"
     return replace(film, title=title, notes=film.notes + ((again.warning,) if again.warning else ()))
@@ -58,11 +55,19 @@ def _film_of_model(recording: Recording, path: str | Path, truth: bool) -> Film:
     world, data = model.world(), episode(model.base.cloth, recording, RATE)
     film = film_of(recording, truth=truth, times=data.times.numpy())
     x = watched(world, data).x.numpy()
-    told = _when(recording, film.times)
-    film = with_cloth(film, x, world.cloth.mesh.faces, noise=recording.observation_noise_std, told=told)
+    film = _beside(film, recording, x, world.cloth.mesh.faces)
     far = film.curves[DISTANCE].values if DISTANCE in film.curves else np.array([np.nan])
     distance = f", {np.nanmean(far):.2f} mm from the points" if np.isfinite(far).any() else ""
     return replace(film, title=f"{film.title}: {Path(path).stem} model{distance}")
+
+
+def _beside(film: Film, recording: Recording, vertices: Array, faces: Array) -> Film:
+    """With the cloth, at the times of points where there are any: of others there is no distance."""
+    told = _when(recording, film.times)
+    if told.any():
+        kept = np.flatnonzero(told)
+        film, vertices, told = film.take(kept), vertices[kept], told[kept]
+    return with_cloth(film, vertices, faces, noise=recording.observation_noise_std, told=told)
 
 
 def _when(recording: Recording, times: Array) -> Array:
@@ -105,6 +110,7 @@ def with_cloth(
         curves={**curve, **film.curves},
         worst=_worst(np.stack(values), noise),
         legend="distance of measured points",
+        grey="none near",
     )
 
 

@@ -125,7 +125,8 @@ def _depths(recording: Recording, views: dict[str, View], times: Array) -> tuple
         if view.camera.depth is not None and (scale := view.camera.depth_scale) is not None:
             clouds[f"depth/{name}"] = _from_depth(view, camera, scale, times)
     if not clouds:
-        found = "images are not drawn" if views else "no images"
+        images = any(v.camera.depth or v.camera.color or v.camera.mask for v in views.values())
+        found = "images are not drawn" if images else "no images"
         notes.append(f"nothing that was seen of the cloth is drawn: no points, no markers, {found}")
     return clouds, notes
 

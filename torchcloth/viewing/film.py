@@ -109,6 +109,7 @@ class Film:
         sheets, clouds, solids, planes, traces, views, curves: the parts, by name.
         unit, worst: of the sheets' values, and the value at the far end of the colour bar.
         legend: what the values are, for the colour bar.
+        grey: of what there are none.
         notes: what could not be shown, and why.
 
     Raises:
@@ -127,6 +128,7 @@ class Film:
     unit: str = "mm"
     worst: float = 1.0
     legend: str = ""
+    grey: str = ""
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -187,7 +189,7 @@ class Film:
         """The film with frames left out, so that it has no more than ``rate`` a second."""
         if len(self) < 2:
             return self
-        count = int(np.floor((self.times[-1] - self.times[0]) * rate + 1e-6)) + 1
+        count = np.floor((self.times[-1] - self.times[0]) * rate + 1e-6) + 1
         if count >= len(self):
             return self
         wanted = self.times[0] + np.arange(count) / rate

@@ -34,4 +34,5 @@ def film_of_pose(recording: Recording, estimate: PoseEstimate, *, truth: bool = 
         sheets={**nets, "cloth": Sheet(x, estimate.faces.numpy(), np.where(seen, np.nan, error))},
         worst=worst,
         legend="standard error, hidden vertices",
+        grey="seen",
     )

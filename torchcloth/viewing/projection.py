@@ -84,6 +84,19 @@ def _direction(film: Film, centre: Array) -> tuple[float, float]:
     return -60.0, 20.0
 
 
+def ahead(points: Array, camera: DepthCamera, closed: bool = True) -> Array:
+    """[M, 3] m, what lies before the camera of a convex polygon or a line [N, 3] m; where it is cut, it ends anew."""
+    depth = (points - camera.T_world_camera[:3, 3]) @ camera.T_world_camera[:3, 2] - 2 * NEAR
+    found = []
+    for k in range(len(points)):
+        if depth[k] >= 0:
+            found.append(points[k])
+        after = (k + 1) % len(points)
+        if (closed or after) and (depth[k] >= 0) != (depth[after] >= 0):
+            found.append(points[k] + depth[k] / (depth[k] - depth[after]) * (points[after] - points[k]))
+    return np.array(found).reshape(-1, 3)
+
+
 def polygons(film: Film, frame: int, camera: DepthCamera) -> Polygons:
     """Everything in a frame but planes and lines."""
     low, high = film.box

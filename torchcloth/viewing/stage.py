@@ -11,7 +11,7 @@ from ..errors import InvalidInput
 from .colours import colour_map
 from .film import CELL, DISTANCE, Film, Plane, ground_of
 from .geometry import Array
-from .projection import camera_for, polygons
+from .projection import ahead, camera_for, polygons
 
 INK, FAINT, GRID, SHADE, PAPER = "#22262b", "#6d747c", "#dfe2e6", 0.86, "#ffffff"
 DPI = 100
@@ -82,8 +82,12 @@ class Stage:
             if not _from_above(plane, self.camera.T_world_camera[:3, 3]):
                 continue
             colour = np.array(plane.colour) / 255
-            self.axes.add_patch(Polygon(self._project(plane.corners), facecolor=colour, edgecolor="none"))
-            lines = [self._project(line) for line in _grid(plane)]
+            corners = ahead(plane.corners, self.camera)
+            if len(corners) < 3:
+                continue
+            self.axes.add_patch(Polygon(self._project(corners), facecolor=colour, edgecolor="none"))
+            seen = (ahead(line, self.camera, closed=False) for line in _grid(plane))
+            lines = [self._project(line) for line in seen if len(line) == 2]
             self.axes.add_collection(LineCollection(lines, colors=[0.9 * colour], linewidths=0.6))
         for trace in self.film.traces.values():
             self.axes.plot(*self._project(trace.points).T, color=np.array(trace.colour) / 255, linewidth=1, alpha=0.6)
@@ -162,7 +166,8 @@ class Stage:
         width, height = self.figure.get_size_inches() * DPI
         left, low = 52 / width, LABELS / height
         place = self.figure.add_axes((left, low, 0.97 - left - (BAR if self.film.measured else 0), strip - low))
-        place.plot(curve.t, curve.values, color=INK, linewidth=1)
+        known = np.isfinite(curve.values)
+        place.plot(curve.t[known], curve.values[known], color=INK, linewidth=1)
         first, last = self.film.times[[0, -1]]
         place.set(xlim=(first, last if last > first else first + 1.0), ylim=(0, 1.15 * float(np.nanmax(curve.values))))
         place.tick_params(labelsize=7, colors=FAINT, length=2)
@@ -173,7 +178,7 @@ class Stage:
 
         def draw(frame: int) -> None:
             now = self.film.times[frame]
-            mark.set_data([now], [np.interp(now, curve.t, curve.values)])
+            mark.set_data([now], [np.interp(now, curve.t[known], curve.values[known])])
             place.draw_artist(mark)
 
         return draw

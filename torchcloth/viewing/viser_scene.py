@@ -73,20 +73,22 @@ class ViserScene:
         for update in self._updates:
             update(frame)
 
-    def _all(self, parts: Mapping[str, Part], add: Callable[[str, Part], None]) -> None:
+    def _all(self, parts: Mapping[str, Part], add: Callable[[str, Part], Any]) -> None:
         for name, part in parts.items():
             group = name.split("/")[0]
             if group not in self._groups:
                 self._groups[group] = self.scene.add_frame(f"/{group}", show_axes=False)
-            add(f"/{name}", part)
+            made = add(f"/{name}", part)
+            if made is not None and name == group:  # it has taken the frame's place
+                self._groups[group] = made
 
-    def _sheet(self, name: str, sheet: Sheet) -> None:
+    def _sheet(self, name: str, sheet: Sheet) -> Any:
         """Bands of colour: viser's meshes have one colour each, and its GLB are loaded too slowly to be animated."""
         x, faces = sheet.vertices, sheet.faces
         if sheet.values is None:
             mesh = self._mesh(name, x[0], faces, sheet.colour, flat=False, side="double", wireframe=sheet.net)
             self._updates.append(lambda frame: setattr(mesh, "vertices", x[frame]))
-            return
+            return mesh
         steps = self.film.worst * (np.arange(BANDS) + 0.5) / BANDS
         shades = [*colours(steps, self.film.worst).tolist(), UNKNOWN]
         values = sheet.values[:, faces].mean(axis=-1)  # [T, F], NaN beside what is unknown
@@ -97,12 +99,14 @@ class ViserScene:
             self._updates.append(
                 lambda frame, mesh=mesh, number=number: _move(mesh, x[frame], faces[band[frame] == number])
             )
+        return None
 
-    def _cloud(self, name: str, cloud: Cloud) -> None:
+    def _cloud(self, name: str, cloud: Cloud) -> Any:
         points = self.scene.add_point_cloud(
             name, cloud.frames[0], cloud.colour, point_size=DOT, point_shape="circle", precision="float32"
         )
         self._updates.append(lambda frame: setattr(points, "points", cloud.frames[frame]))
+        return points
 
     def _solid(self, name: str, solid: Solid) -> None:
         mesh = self._mesh(name, solid.vertices, solid.faces, solid.colour)

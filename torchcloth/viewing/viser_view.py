@@ -136,7 +136,7 @@ class Viewer:
         """Colour bar, curves, depth images, notes."""
         gui, film = self.server.gui, self.film
         if film.measured:
-            gui.add_image(_colour_bar(), label=f"{film.legend}: 0 to {film.worst:g} {film.unit}; grey: none near")
+            gui.add_image(_colour_bar(), label=f"{film.legend}: 0 to {film.worst:g} {film.unit}; grey: {film.grey}")
         for name, curve in film.curves.items():
             series = ({"label": "s"}, {"label": f"{name} [{curve.unit}]", "stroke": "#bd0026", "width": 1.5})
             gui.add_uplot((curve.t, np.asarray(curve.values, float)), series, scales={"x": {"time": False}}, height=140)

@@ -72,6 +72,15 @@ def test_nothing_is_overwritten_unasked(tmp_path, capsys, suffix):
     assert call(truth.path, out, "--scene", scene, "--overwrite") == 0
 
 
+def test_a_scene_is_not_overwritten_by_what_it_describes(tmp_path, capsys):
+    truth, out = foreign.tum(tmp_path), tmp_path / "ep"
+    out.mkdir()
+    scene = truth.write_scene().rename(out / "scene.json")
+    assert call(truth.path, out, "--scene", scene, "--overwrite") == 2
+    assert "--scene is in DST" in capsys.readouterr().err
+    assert list(out.iterdir()) == [scene]
+
+
 def test_the_target_must_be_what_is_written(tmp_path, capsys):
     """An episode folder that looks like a bag, and an episode written over itself."""
     truth = foreign.tum(tmp_path)
