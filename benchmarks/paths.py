@@ -46,12 +46,12 @@ class Pull(AbstractEffect):
         return c * now.x
 
 
-def sheet(engine: Setting, python: bool, contact: tc.Contact | None = None) -> tc.Cloth:
-    """0.5 m, 441 vertices, 800 triangles."""
+def sheet(engine: Setting, python: bool, contact: tc.Contact | None = None, cells: int = 20) -> tc.Cloth:
+    """0.5 m, of so many cells a side: 441 vertices, 800 triangles."""
     effects = {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(1.2), "bending": tc.effects.Bending(1e-5)}
     if python:
         effects["pull"] = Pull()
-    mesh = tc.meshes.rectangle(0.5, 0.5, resolution=(21, 21))
+    mesh = tc.meshes.rectangle(0.5, 0.5, resolution=(cells + 1, cells + 1))
     hands = {"hand": tc.boundaries.Grasp.corner("upper-left")}
     return tc.Cloth(mesh, tc.materials.AEP(6e4, 0.3), 0.15, effects, hands, contact=contact, engine=engine)
 

@@ -1,6 +1,7 @@
 """The table for a device: refused in one line where there is none, and made by what a CPU has of its ways."""
 
 import sys
+from functools import partial
 
 import pytest
 import torch
@@ -30,6 +31,7 @@ def test_scenes_are_some(monkeypatch, capsys):
 def test_ways_agree_and_are_told(monkeypatch, capsys, how):
     ways = {"fused, CPU": devices.Way("cpu", "fused"), "one by one": devices.Way("cpu", "reference")}
     monkeypatch.setattr(devices, "WAYS", ways)
+    monkeypatch.setattr(devices, "sheet", partial(devices.sheet, cells=8))  # the reference takes minutes for more
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "none")
     asked(monkeypatch, "--scenes", "2", how, "--frames", "1", "--repeats", "1")

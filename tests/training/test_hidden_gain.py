@@ -6,6 +6,8 @@ import torch
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import base_model, fit, save_model, setting_of
 from torchcloth.diagnosis.hypotheses import known
+from torchcloth.recordings.together import together
+from torchcloth.training.studies import hidden_gain
 from torchcloth.training.studies.checkout import module
 from torchcloth.training.studies.hidden_gain import gain, knowing
 
@@ -33,9 +35,20 @@ def case(tmp_path_factory):
     torch.set_default_dtype(before)
 
 
+@pytest.fixture(scope="module")
+def oracle(case):
+    """Fitted once: it knows the same in all of these."""
+    _, paths, _recording, _ = case
+    recordings = [rec.read(paths[name]) for name in ("slow", "lift")]
+    base = base_model(together([*recordings, rec.read(paths["fast"])]))
+    return hidden_gain._fitted(knowing(base, truth()), setting_of(base, recordings))
+
+
 @pytest.mark.parametrize(("amplitude", "low", "high"), [(None, -1e-9, 1e-9), (TRUE, 0.7, 1.0), (0.5 * TRUE, 0.3, 0.7)])
-def test_share_of_the_oracles_gain(case, amplitude, low, high):
+def test_share_of_the_oracles_gain(case, oracle, monkeypatch, amplitude, low, high):
     """The oracle's fabric is fitted beside the drag, the others' was without it: no 1 can be had here."""
+    asked = []
+    monkeypatch.setattr(hidden_gain, "_fitted", lambda *given: asked.append(given[0].hidden) or oracle)
     folder, paths, recording, fitted = case
     model = fitted.model if amplitude is None else fitted.model.plus(DRAG, amplitude)
     kept = lambda name, model: save_model(folder / name, model, recording, torch.eye(len(model.point)).double())  # noqa: E731
@@ -43,6 +56,7 @@ def test_share_of_the_oracles_gain(case, amplitude, low, high):
     share = lambda named: gain([paths["slow"], paths["lift"]], base, path, named, paths["fast"], truth())  # noqa: E731
     assert low <= share({"air.drag_n"}) <= high
     assert share(set()) == 0.0  # what has no name is not said
+    assert [[(h.name, a) for h, a in hidden] for hidden in asked] == 2 * [[("air.drag_n", TRUE)]]
 
 
 def test_what_nobody_can_know_is_not_compared(case):
