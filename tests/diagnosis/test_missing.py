@@ -7,7 +7,7 @@ import torch
 from torchcloth.diagnosis import base_model, fit, lack_of_fit, missing, missing_force, setting_of
 from torchcloth.diagnosis.pushes import Pushes, pushed
 from torchcloth.effects import BodyForce
-from torchcloth.identification.replays import frames_of
+from torchcloth.identification.replays import Frames, frames_of
 from torchcloth.pose.objective import joined
 
 BEGIN, END = 6, 9  # frames of 0.05 s
@@ -92,6 +92,19 @@ def test_pushes_are_those_of_a_body_force(planted):
     beside = world.with_cloth({"more": BodyForce(step * push[0, 0])}).frames(episode)
     difference = (beside.x - frames.x) / step
     assert torch.allclose(moved.x[0], difference, atol=1e-2 * float(difference.abs().max()))
+
+
+@pytest.mark.parametrize("at_once", [1, 10**6])
+def test_memory_does_not_change_what_is_asked(planted, monkeypatch, at_once):
+    """One direction at a time, and some."""
+    found, setting = planted
+    e = setting.episodes[0]
+    x = e.initial.expand(len(e.times), -1, -1).clone()
+    moved = Frames(torch.randn(7, *x.shape), torch.randn(7, *x.shape), {}, torch.zeros(7, len(x)))
+    frames = Frames(x, torch.zeros_like(x), {}, x.new_zeros(len(x)))
+    plain = missing.whitened_beside(found, setting, 0, frames, moved, 100)
+    monkeypatch.setattr(missing, "AT_ONCE", at_once)
+    assert all(map(torch.equal, missing.whitened_beside(found, setting, 0, frames, moved, 100), plain))
 
 
 @pytest.mark.parametrize("size", [1e30, torch.nan])

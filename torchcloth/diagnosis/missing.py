@@ -9,7 +9,7 @@ end: from there on folds decide, and nothing is asked.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ..identification.episodes import Episode
 from ..identification.replays import Frames
+from ..identification.replays import each as of_each
 from ..pose.modes import modes_of
 from ..pose.objective import windows_of
 from .cells import STRETCH, aligned, cells_of
@@ -31,6 +32,7 @@ LEVELS = 10 ** torch.linspace(-2.5, 1.5, 41, dtype=torch.float64)  # m/s^2, prio
 SWEEPS = 15  # of learning the size window by window
 GRAVITY = 9.81  # m/s^2
 FARTHEST = 10.0  # times the square of a motion's duration, that 1 m/s^2 may move the cloth: free flight has half of it
+AT_ONCE = 100_000_000  # slopes of points, 0.8 GB: of long motions they would fill the memory
 SURE = 4.0  # standard errors; a chi of three numbers exceeds it once in 900 places
 
 
@@ -184,13 +186,21 @@ def whitened_beside(
     """
     e, stds, told = setting.episodes[k], found.evidence.stds[k], found.evidence.cells[k].window < count
     cells = found.evidence.cells[k].rows(told)
-    coarse = cells_of(frames, moved, e, setting.sheet, setting.rest)
-    slopes = aligned(cells.key, coarse.key, coarse.jacobian)
+    most = AT_ONCE // max(1, sum(map(len, e.clouds)))
+    coarse = [cells_of(frames, some, e, setting.sheet, setting.rest) for some in _divided(moved, most)]
+    slopes = torch.cat([aligned(cells.key, c.key, c.jacobian) for c in coarse], 1)
     noise, _ = reference(cells, found.evidence.numerics[k][told])
     root = torch.linalg.cholesky(noise.covariance(cells, cells.jacobian[:, -len(stds) :], stds))
     both = torch.cat([cells.value[:, None], cells.jacobian[:, : found.evidence.own], slopes], 1)
     both = torch.linalg.solve_triangular(root, both, upper=False)
     return both[:, 0], both[:, 1:]
+
+
+def _divided(moved: Frames, most: int) -> Iterator[Frames]:
+    """So many directions at a time."""
+    most, count = max(most, 1), len(moved.x)
+    for first in range(0, count, most):
+        yield of_each(moved, lambda d, some=slice(first, first + most): d[some])
 
 
 class _Found(NamedTuple):
