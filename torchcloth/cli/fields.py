@@ -99,7 +99,7 @@ def report(folder: Path, found: FieldFit, cloth: Cloth) -> int:
     table = Table(title=f"{len(cloth.mesh.faces)} triangles", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("field", "median", "5 %", "95 %", "unit"):
         table.add_column(heading, justify="left" if heading == "field" else "right")
-    units = {name: cloth.material.get_submodule(name).unit for name in found.fields}
+    units = {name: str(cloth.material.get_submodule(name).unit) for name in found.fields}
     for name, values in found.fields.items():
         low, middle, high = values.quantile(values.new_tensor([0.05, 0.5, 0.95])).tolist()
         table.add_row(name, f"{middle:.3g}", f"{low:.3g}", f"{high:.3g}", units[name])
