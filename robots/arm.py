@@ -158,7 +158,7 @@ class Arm(nn.Module):
 
     def _bodies(self, q: Tensor) -> Tensor:
         """Poses ``[..., J + 1, 4, 4]`` of the root and of the body behind each joint, in the world."""
-        q = self._checked(q)
+        q = self.checked(q)
         basis = torch.stack([torch.ones_like(q), q.cos(), q.sin(), q], dim=-1)
         joints = torch.einsum("...jm,jmab->...jab", basis, self._modes)
         bodies = [self.base.expand(*q.shape[:-1], 4, 4)]
@@ -216,7 +216,7 @@ class Arm(nn.Module):
         Raises:
             InvalidInput: sizes that do not match, times that do not increase, a motion that the joints cannot do.
         """
-        q = self._checked(q)
+        q = self.checked(q)
         t = torch.as_tensor(t).to(q)
         closed, stop = (None if mask is None else torch.as_tensor(mask) for mask in (closed, stop))
         trajectories.check_waypoints(q, t, closed=closed, stop=stop)
@@ -290,9 +290,14 @@ class Arm(nn.Module):
             raise InvalidInput(
                 f"{name} has the wrong shape", got=tuple(q.shape), expected=f"({len(self.joint_names)},)"
             )
-        return self._checked(q.detach(), name)
+        return self.checked(q.detach(), name)
 
-    def _checked(self, q: Tensor, name: str = "q") -> Tensor:
+    def checked(self, q: Tensor, name: str = "q") -> Tensor:
+        """Joint positions ``[..., J]`` in the arm's precision.
+
+        Raises:
+            InvalidInput: as many joints as it has not, whole numbers, or an arm in half precision.
+        """
         q = torch.as_tensor(q)  # recordings hold arrays
         joints = len(self.joint_names)
         if q.ndim == 0 or q.shape[-1] != joints or not q.is_floating_point():

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcloth.errors import InvalidInput, RecordingError
+from torchcloth.errors import RecordingError
 from torchcloth.recordings import GripperMotion, JointMotion, Recording
 from torchcloth.recordings.together import check_recording
 from torchcloth.types import Trajectory
@@ -55,9 +55,7 @@ def replay(
 
 def unwound(arm: Arm, q: np.ndarray) -> np.ndarray:
     """Recorded joints [K, J] without the jumps of those that turn without end: encoders say +-pi for the same angle."""
-    if q.shape[-1] != len(arm.joint_types):
-        expected = f"[K, {len(arm.joint_types)}], the joints {', '.join(arm.joint_names)} before {arm.frame!r}"
-        raise InvalidInput("q", got=f"shape {list(q.shape)}", expected=expected)
+    arm.checked(_tensor(q))
     columns = zip(q.T, arm.joint_types, strict=True)
     return np.stack([np.unwrap(own) if kind == "continuous" else own for own, kind in columns], axis=-1)
 

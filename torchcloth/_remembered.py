@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from threading import Lock
 from typing import Generic, TypeVar
 
@@ -58,6 +58,11 @@ class Recent(Generic[T]):
         value = find()
         self._alone(lambda: self._keep(key, value))
         return value
+
+    def by_content(self, tensors: Iterable[Tensor], find: Callable[[], T]) -> T:
+        """The same by what tensors say; where more than numbers goes along with them, it is found anew."""
+        key = content(*tensors)
+        return find() if key is None else self.of(key, find)
 
     def _known(self, key: Hashable) -> tuple[T, int] | None:
         found = self._kept.get(key)

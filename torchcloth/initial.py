@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ._remembered import Recent, content, size_of
+from ._remembered import Recent, size_of
 from .boundaries import drive
 from .boundaries.motion import check, check_cover, interpolate
 from .effects import MassDamping
@@ -83,9 +83,7 @@ def held(motion: Mapping[str, Trajectory], start: float, end: float) -> dict[str
     for name, trajectory in motion.items():
         check(trajectory, name)
         check_cover(trajectory, name, start, start)
-        given = content(*trajectory, span)
-        stand = partial(_stood, trajectory, span)
-        found[name] = stand() if given is None else _STOOD.of(given, stand)
+        found[name] = _STOOD.by_content((*trajectory, span), partial(_stood, trajectory, span))
     return found
 
 

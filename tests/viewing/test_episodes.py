@@ -42,7 +42,7 @@ def test_an_arm_with_other_joints_than_were_recorded_is_a_note(rich):
     fewer = replace(rich.joints[name], q=rich.joints[name].q[:, :-1])
     film = film_of(replace(rich, joints={name: fewer}))
     assert not any(part.startswith(f"arms/{name}") for part in film.solids)
-    assert any(f"arm {name!r} is not drawn: q; got shape" in note for note in film.notes)
+    assert any(f"arm {name!r} is not drawn: q has the wrong shape or type; got" in note for note in film.notes)
 
 
 def test_what_was_seen_at_another_time_is_not_shown(rich):

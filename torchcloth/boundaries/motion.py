@@ -6,11 +6,13 @@ determinants): those keep processors from the engine for milliseconds.
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
 from .._math import cross, dot, hermite, last_knot
-from .._remembered import Recent, content, size_of
+from .._remembered import Recent, size_of
 from ..errors import InvalidInput
 from ..types import Trajectory
 from .base import Drive
@@ -28,9 +30,7 @@ def check(trajectory: Trajectory, name: str) -> None:
         parts = trajectory if isinstance(trajectory, Trajectory) else (trajectory,)
         got = ", ".join(type(part).__name__ for part in parts)
         raise InvalidInput(where, got=got, expected="a Trajectory of tensors t, pose and closed")
-    given = content(*trajectory)
-    work = lambda: _check(trajectory, where)  # noqa: E731
-    work() if given is None else _SOUND.of(given, work)
+    _SOUND.by_content(trajectory, partial(_check, trajectory, where))
 
 
 _SOUND: Recent[None] = Recent(16 * 2**20, lambda _: 0)  # what was checked
@@ -124,9 +124,7 @@ def drive(trajectory: Trajectory, times: Tensor) -> Drive:
     They are resolved in float64: what float32 loses of a substep is alike in all of them, and would carry a body that
     stands still by a millimetre a second. Fits ask for the same again and again: nobody may write to one.
     """
-    given = content(*trajectory, times)
-    resolve = lambda: _resolved(trajectory, times)  # noqa: E731
-    return resolve() if given is None else _DRIVES.of(given, resolve)
+    return _DRIVES.by_content((*trajectory, times), partial(_resolved, trajectory, times))
 
 
 _DRIVES: Recent[Drive] = Recent(64 * 2**20, lambda d: size_of(d.increment, d.pose))

@@ -64,20 +64,23 @@ class Worlds:
 
     def happens(self, e: Episode, dt: float | None, finer: bool = False) -> Frames:
         """An episode at the point, on the finer mesh if asked for, whoever looks on; nobody may write to it."""
-        model, world = (self._on_finer, self.finest) if finer else (self.model, self.plain)
+        model, world = self._on_finer if finer else self.model, self._at(finer)
         if self._recent is None:
             return world.simulated(e, dt)
         point = (model.base, model.parameters, model.accepted, tuple(model.point.tolist()))
-        return self._recent.of((point, e, dt), lambda: world.simulated(e, dt))
+        return self._recent.of((point, e, dt), partial(world.simulated, e, dt))
 
     def seen(self, e: Episode, dt: float | None, finer: bool = False) -> Frames:
         """What an observer has of that."""
-        return (self.finest if finer else self.plain).seen(self.happens(e, dt, finer), e)
+        return self._at(finer).seen(self.happens(e, dt, finer), e)
 
     def changed(self, hypothesis: Hypothesis, finer: bool = False) -> World | None:
         """With a hypothesis at its typical amplitude, on the finer mesh if asked for; None: no such world."""
-        h, world = hypothesis, lambda: self.finest if finer else self.plain
-        return self._once((h.name, h.typical, finer), lambda: if_possible(lambda: h.apply(world(), h.typical)))
+        h = hypothesis
+        return self._once((h.name, h.typical, finer), lambda: if_possible(lambda: h.apply(self._at(finer), h.typical)))
+
+    def _at(self, finer: bool) -> World:
+        return self.finest if finer else self.plain
 
     def is_finer(self, hypothesis: Hypothesis) -> bool:
         """Its slopes are taken on the finer mesh; there must be one."""
