@@ -23,7 +23,7 @@ from torchcloth.diagnosis.trials import (
     known,
     standard_errors,
 )
-from torchcloth.diagnosis.verdict import _error, _parameters
+from torchcloth.diagnosis.verdict import _disagreed, _error, _parameters
 from torchcloth.diagnosis.world import Model
 
 
@@ -197,6 +197,26 @@ def test_a_numbers_interval_knows_of_what_motions_disagree_by():
     assert width["p1"] == pytest.approx(math.hypot(student, 0.03 * values[1]))
     assert width["p1"] > 3 * float(noise[1])
     assert all(width[f"p{k}"] >= float(noise[k]) - 1e-12 for k in range(2))
+
+
+@pytest.mark.parametrize(
+    ("own", "told", "disagree"),
+    [((0.0,) * 4, 4.0, False), ((0.3, -0.3, 0.2, -0.2), 4.0, True), ((0.3, -0.3, 0.2, -0.2), 1.9, False)],
+)
+def test_motions_that_differ_by_more_than_noise_disagree(own, told, disagree):
+    """Where hardly two of them tell of a number, nothing is known of what others would say."""
+    ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.zeros(2).double(), 1)
+    cells = [c._replace(value=c.value - a * c.jacobian[:, 1]) for c, a in zip(ev.cells, own, strict=True)]
+    found = SimpleNamespace(end=toys.fitted(replace(ev, cells=cells)))
+    assert _disagreed(found, 1, told, list("abcd")) == disagree  # type: ignore[arg-type]
+
+
+def test_motions_of_one_value_disagree_as_often_as_chance_has_it():
+    slopes, count = toys.smooth(1, 3), 300
+    found = [toys.fitted(toys.evidence(slopes, 2, [], torch.zeros(2).double(), seed)) for seed in range(count)]
+    told = told_by(found[0], 1, list("abcd"))
+    often = sum(_disagreed(SimpleNamespace(end=f), 1, told, list("abcd")) for f in found)  # type: ignore[arg-type]
+    assert often <= 0.02 * count
 
 
 def test_an_error_is_the_noises_where_motions_agree_and_says_how_many_tell():

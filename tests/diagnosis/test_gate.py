@@ -95,6 +95,15 @@ def test_a_planted_fault_is_named(turned, said):
     assert found[0].remedy
 
 
+def test_a_mirrored_cloud_is_told_though_some_frames_are_empty(turned):
+    """A camera drops a frame now and then."""
+    points = seen(turned, lambda x: x * [1, -1, 1]).points
+    full = np.arange(len(points)) % 7 != 3
+    xyz = np.concatenate([points.frame(i) for i in np.flatnonzero(full)])
+    points = rec.PointClouds(points.t, xyz, np.where(full, points.counts, 0))
+    assert "mirrored along y" in str(check([replace(turned, points=points)])[0])
+
+
 GOOD = {
     "as it is": lambda r: r,
     "clock 30 ms": lambda r: stamped(r, lambda t: t + 0.03),

@@ -96,7 +96,7 @@ def test_what_lacks_in_one_stretch_of_time_only_is_said_to():
 
 def test_numbers_without_a_unit_have_none():
     cause = {"effect": "air.drag_n", "amplitude": 1.19, "unit": "-", "ci95": [1.05, 1.32], "typical": 1.2}
-    cause |= {"class": [], "rivals": []}
+    cause |= {"class": [], "rivals": [], "motions_disagree": False}
     cause |= {
         "when": {"episode": 0, "motion": "swing", "from": 0.4, "to": 0.6},
         "moves": {"value": 0.0123, "unit": "m"},
@@ -115,7 +115,7 @@ def test_numbers_without_a_unit_have_none():
 @pytest.mark.parametrize("low", [-17.0, 2.0])
 def test_a_cause_whose_interval_holds_zero_says_what_is_known_of_its_size(low):
     cause = {"effect": "elas.stiffen", "amplitude": 13.5, "unit": "-", "ci95": [low, 44.0], "typical": 10.0}
-    cause |= {"class": [], "rivals": [], "noise_ci95": [12.4, 14.6], "told_by": 1.96}
+    cause |= {"class": [], "rivals": [], "noise_ci95": [12.4, 14.6], "told_by": 1.96, "motions_disagree": False}
     cause |= {"when": {"episode": 0, "from": 0.4, "to": 0.6}, "moves": {"value": 0.035, "unit": "N"}}
     said = summary("identified", causes=[cause | {"where": {"gripper": "left"}}], motions=["stretch"])
     told = [line for line in said if "2.0 motions' worth" in line and "would be 12.4 to 14.6" in line]
@@ -124,6 +124,8 @@ def test_a_cause_whose_interval_holds_zero_says_what_is_known_of_its_size(low):
     said = summary("identified", causes=[cause], motions=["stretch"])
     assert any("leave its size open" in line for line in said) == (low < 0)
     assert not any("disagree about its size" in line for line in said)
+    said = summary("identified", causes=[cause | {"motions_disagree": True}], motions=["stretch"])
+    assert sum("Motions disagree about its size" in line for line in said) == 1
 
 
 def test_what_would_have_the_wrong_sign_is_told_from_what_is_small():

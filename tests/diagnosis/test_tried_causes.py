@@ -56,6 +56,16 @@ def test_a_cause_of_ones_own_is_tried(world, case):
         check_own([own], model.base, setting.episodes)
 
 
+def test_what_fails_at_some_amplitudes_only_is_no_world_there(world):
+    """The first frames with a typical amplitude are fine; a search may come to others."""
+    _, model, _ = world
+    own = Hypothesis("my.root", "-", 1.0, lambda w, a: w if math.sqrt(a) < 2 else None, signed=True)  # type: ignore[arg-type]
+    assert isinstance(own.applied(model.base, 1.0), type(model.base))
+    for amplitude, said in ((-1.0, "ValueError"), (9.0, "no World")):
+        with pytest.raises(InvalidInput, match=f"hypothesis 'my.root'; got .*{said}"):
+            model.plus(own, amplitude).world()
+
+
 def test_what_is_given_and_not_registered_is_ones_own_as_well(world):
     recordings, model, _ = world
     known, own = catalogue(model, recordings), Hypothesis("my.own", "-", 1.0, lambda w, a: w)

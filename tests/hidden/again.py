@@ -26,6 +26,8 @@ from torchcloth.diagnosis.comparison import spread
 from torchcloth.diagnosis.trials import Candidate
 from torchcloth.identification import journal as kept
 
+KEYS = ("effect", "amplitude", "ci95", "noise_ci95", "told_by", "motions_disagree", "class", "rivals", "placebo")
+
 
 def said(c: Candidate, names: list[str]) -> str:
     """One line on a cause that was tried."""
@@ -78,11 +80,11 @@ def main(arguments: list[str] | None = None) -> int:
     for row in answer.content["lack_of_fit"]:
         if row["lacking"]:
             print(f"lacking: {row['motion']} {row['kind']} {row['ratio']:.2f}")
-    print(answer.verdict)
+    print(answer.verdict, "and something else" * answer.content["also_unexplained"])
     for cause in answer.content["causes"]:
         print(
             "named:",
-            json.dumps({key: cause[key] for key in ("effect", "amplitude", "ci95", "class", "rivals", "placebo")}),
+            json.dumps({key: cause[key] for key in KEYS}),
         )
     if (gain := answer.content["gain"]) is not None:
         print(f"gain: {1e3 * gain['rms_before']:.3f} -> {1e3 * gain['rms_after']:.3f} mm on motions held out")

@@ -44,7 +44,7 @@ def alike(found: Fitted, row: Row, amplitude: float, others: Sequence[Row]) -> l
     for other in others:
         r = float(rho[index[other.hypothesis.name]])
         if not other.hypothesis.signed and r * amplitude < 0:
-            r = 0.0
+            continue
         told = square * (1 - r * r)
         if other.hypothesis.effect != row.hypothesis.effect and (abs(r) > ALIKE or told < TOLD):
             instead = r * amplitude * other.std / row.std

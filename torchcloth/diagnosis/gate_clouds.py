@@ -62,6 +62,7 @@ class Seen:
     def left(self, clouds: Sequence[np.ndarray]) -> float:
         """m by which clouds come to lie farther from the grippers than at first, in the worst tenth of the frames."""
         away = np.array([_nearest(c, at) for c, at in zip(clouds, self.held, strict=True)])
+        away = away[np.isfinite(away).all(1)]  # of frames with points
         return float(np.quantile(np.abs(away - np.median(away[:FIRST], axis=0)).max(1), 0.9))
 
     def turned(self, turn: np.ndarray) -> float:
@@ -199,7 +200,8 @@ def handed(seen: Seen) -> Iterator[tuple[str, str]]:
     Where a bar hides what is near a gripper, a sound cloud seems not to follow it either: only mirrors that would turn
     the grippers' own motion by as much are asked about.
     """
-    if not seen.paths or len(seen.clouds) <= FIRST or not all(len(c) for c in seen.clouds):
+    full = [len(c) > 0 for c in seen.clouds]
+    if not seen.paths or sum(full) <= FIRST or not any(full[:FIRST]):
         return
     if (left := seen.left(seen.clouds)) > FOLLOW:
         mirrors = (m for m in _mirrors(seen) if seen.turned(m.turn) > TURNED * left)

@@ -15,7 +15,7 @@ from ..errors import InvalidInput
 from ..pose.objective import CORRECTION
 from ..recordings import Recording
 from . import air, fabric, grip, observer
-from .tried_causes import applied, blamed
+from .tried_causes import blamed
 from .world import RESIDUAL, Hypothesis, Model
 
 TAKEN = frozenset(
@@ -111,7 +111,7 @@ def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]
 
 def _refuse_taken(own: Hypothesis, model: Model) -> None:
     """Of two effects of one name the later would silently take the place of the earlier."""
-    for name, effect in applied(own, model.base, own.typical).cloth.effects.items():
+    for name, effect in own.applied(model.base, own.typical).cloth.effects.items():
         taken = name in TAKEN or name.startswith(BEGIN) or name.endswith(END)
         if taken and not type(effect).__module__.startswith("torchcloth."):
             got = f"an effect {type(effect).__name__} named {name!r}, as the catalogue calls one of its own"

@@ -63,7 +63,7 @@ def beside_the_cloth(model: Model) -> dict[str, float]:
     """Amplitudes of accepted causes that are in robot or observer and not in the cloth."""
     found, world = {}, model.base  # each once: a patch that is wider already may have no room to be wider yet
     for h, amplitude in zip(model.accepted, model.amplitudes, strict=True):
-        if h.apply(world, amplitude).cloth is world.cloth:
+        if h.applied(world, amplitude).cloth is world.cloth:
             found[h.name] = amplitude
     return found
 

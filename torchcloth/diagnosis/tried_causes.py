@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
 from ..errors import InvalidInput, TorchclothError
 from ..identification.episodes import Episode
+from .blame import GIVES, blame
 from .world import Hypothesis, World
 
-LIBRARY = Path(__file__).parents[1]
 NEAR = 1e-6  # of the typical amplitude: as good as none
 CONTINUOUS = 0.1  # of what the typical amplitude does, that such an amplitude may do
 NOTHING = 1e-9  # m
-GIVES = "apply(world, amplitude) that gives a world, whose motions give episodes and views frames"
 
 
 def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode]) -> None:
@@ -33,7 +30,7 @@ def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode
         with blamed(hypothesis):
             moved = []
             for amplitude in (NEAR * hypothesis.typical, hypothesis.typical):
-                world = applied(hypothesis, base, amplitude)
+                world = hypothesis.applied(base, amplitude)
                 moved.append(float((world.frames(early).x - plain).square().mean().sqrt()))
             for k, episode in enumerate(episodes):
                 world.driven(episode)
@@ -54,19 +51,7 @@ def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode
                 )
         with blamed(hypothesis):  # on its own: a world that cannot have the other way passes
             if hypothesis.reverses:
-                applied(hypothesis, base, hypothesis.opposite.typical).frames(early)
-
-
-def applied(hypothesis: Hypothesis, base: World, amplitude: float) -> World:
-    """The world with so much of it.
-
-    Raises:
-        TypeError: it gives something else.
-    """
-    world = hypothesis.apply(base, amplitude)
-    if not isinstance(world, World):
-        raise TypeError(f"apply gives {type(world).__name__}, no World")
-    return world
+                hypothesis.applied(base, hypothesis.opposite.typical).frames(early)
 
 
 @contextmanager
@@ -84,11 +69,4 @@ def blamed(hypothesis: Hypothesis) -> Iterator[None]:
     except TorchclothError:
         pass  # the search says so
     except Exception as error:
-        places = [p for p in traceback.extract_tb(error.__traceback__) if not Path(p.filename).is_relative_to(LIBRARY)]
-        own = [p for p in places if "site-packages" not in p.filename]
-        where = f" in {own[-1].filename}, line {own[-1].lineno}" if own else ""
-        raise InvalidInput(
-            f"hypothesis {hypothesis.name!r}",
-            got=f"{type(error).__name__}: {error}{where}",
-            expected=GIVES,
-        ) from error
+        raise blame(hypothesis.name, error) from error

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from scipy.special import stdtrit
+from scipy.special import chdtrc, stdtrit
 from torch import Tensor
 
 from ..errors import InvalidInput
@@ -30,6 +30,7 @@ from .world import Hypothesis, Model
 
 COMMON = 0.03  # of a number, standard deviation: what is wrong in all motions alike, by sealed answers
 NUDGE = 1e-4  # of a coordinate, for its value's slope
+DISAGREE, TWO = 0.005, 2.0  # chance below which motions disagree about a number; as many must tell of it
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 
@@ -92,6 +93,7 @@ def judge(
     left, drifting = lack_of_fit(found.end, names), drifts(found.end, names)
     learned = residual is not None and bool(residual.found.causes)
     lacking = learned or bool(found.withdrawn) or any(row.lacking for row in (*left, *drifting))
+    lacking = lacking or any(c["motions_disagree"] for c in causes)
     doubtful = [r["effect"] for m in minor for r in m["rivals"]]
     stable = all(row.stable for row in left)
     verdict = _verdict(found, causes, lacking, stable, bool(doubtful or found.end.model.strained))
@@ -184,6 +186,7 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
         "ci95": [amplitude - NORMAL * std, amplitude + NORMAL * std],
         "noise_ci95": [amplitude - NORMAL * noise, amplitude + NORMAL * noise],
         "told_by": told,
+        "motions_disagree": _disagreed(found, count + place, told, names),
         "typical": h.typical,
         "class": sorted({h.name, *kin, *h.kin}),
         "rivals": [_told(c.hypothesis, c.amplitude) for c in rivals],
@@ -215,6 +218,17 @@ def _error(found: Found, place: int, names: Sequence[str], alone: Collection[str
         return own, own, motions
     wider = float(stdtrit(max(count - 1.0, 1.0), 0.975)) / NORMAL
     return own, max(own, wider * float(spread(found.end, names, alone)[1][place])), motions
+
+
+def _disagreed(found: Found, place: int, told: float, names: Sequence[str]) -> bool:
+    """Motions differ about a number by more than noise makes them: what it stands for is not quite what happens.
+
+    Cochran's Q: ``told`` - 1 times the ratio of the two variances, against chi^2 of as many degrees of freedom.
+    """
+    if told < TWO:
+        return False
+    ratio = float(spread(found.end, names)[1].square()[place] / found.end.covariance[place, place])
+    return bool(chdtrc(told - 1.0, (told - 1.0) * ratio) < DISAGREE)
 
 
 def _with_common(std: float, number: float) -> float:

@@ -27,6 +27,10 @@ NO_MASS = (
     "No forces were measured, so mass itself cannot be told: cloth that is heavier, and as many times stiffer and "
     "braked harder, moves alike. What is said of it is what the data sheet says."
 )
+DISAGREED = (
+    "Motions disagree about its size by more than noise and meshes make them: what happens is not quite this, or there "
+    "is more."
+)
 FLOORS = {"sensor only": "the sensor alone would leave", "repetitions": "repetitions of a command differ by"}
 
 
@@ -52,6 +56,7 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
         out += [f"  {said}" for said in (GLOSSARY.get(c["effect"].partition("[")[0]),) if said]
         out.append(f"  {_shown(c, content)}")
         out += _hardly_sized(c)
+        out += [f"  {DISAGREED}"] if c["motions_disagree"] else []
         if others:
             out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
     if content["causes"]:

@@ -14,12 +14,14 @@ from torch import Tensor
 from ..boundaries import AbstractBoundary
 from ..cloth import Cloth
 from ..effects import AbstractEffect
+from ..errors import TorchclothError
 from ..identification.episodes import Episode
 from ..identification.replays import Frames, Replay, frames_of
 from ..materials import AbstractMaterial
 from ..meshes import Mesh
 from ..parts import loose
 from ..recordings import Recording
+from .blame import blame
 
 MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
 MIGHT_MATTER = 0.5  # the same, beside what matters
@@ -156,6 +158,22 @@ class Hypothesis:
         if isinstance(self.kin, list):  # which has no hash
             object.__setattr__(self, "kin", tuple(self.kin))
 
+    def applied(self, world: World, amplitude: float) -> World:
+        """The world with so much of it.
+
+        Raises:
+            InvalidInput: it fails with an error that is none of the library's, or gives something else.
+        """
+        try:
+            found = self.apply(world, amplitude)
+            if not isinstance(found, World):
+                raise TypeError(f"apply gives {type(found).__name__}, no World")
+        except TorchclothError:
+            raise
+        except Exception as error:  # whatever a user's own does wrong
+            raise blame(self.name, error) from error
+        return found
+
     @property
     def effect(self) -> str:
         """The name without its axis."""
@@ -240,7 +258,7 @@ class Model:
         brought = {h.brings for h in self.accepted}  # none of it, where that was found, is not what comes along
         for hypothesis, amplitude in (*own, *extra):
             if amplitude or hypothesis.name in brought:
-                world = hypothesis.apply(world, amplitude)
+                world = hypothesis.applied(world, amplitude)
         return world
 
     @property

@@ -77,7 +77,9 @@ class Worlds:
     def changed(self, hypothesis: Hypothesis, finer: bool = False) -> World | None:
         """With a hypothesis at its typical amplitude, on the finer mesh if asked for; None: no such world."""
         h = hypothesis
-        return self._once((h.name, h.typical, finer), lambda: if_possible(lambda: h.apply(self._at(finer), h.typical)))
+        return self._once(
+            (h.name, h.typical, finer), lambda: if_possible(lambda: h.applied(self._at(finer), h.typical))
+        )
 
     def _at(self, finer: bool) -> World:
         return self.finest if finer else self.plain
