@@ -39,7 +39,7 @@ from .worlds import if_possible
 MOST = 4  # causes
 FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
 LEAST = 1 / 3  # of what is wrong, that all causes explain beside something else
-FAINT = 0.1  # of what could be explained, where nothing is lacking
+FAINT = 0.08  # of what could be explained, where nothing is lacking
 HALF = 0.5  # the same of a further cause, and of what only motions tell that do not fit; of what is gained, a law more
 
 

@@ -21,7 +21,8 @@ TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 3  # steps of the likelier ones among them
 HARDLY = 0.2  # of what the better of two models gains, in density and squares, that two engines may differ by
 VERY_MUCH = 25.0  # log density; nulls' causes that ask for too little to show reach 16, and 27 once
-SURELY = 12.0  # log density held out, beyond which no null's cause surely gains: of what no other motion predicts
+SURELY = 8.0  # log density held out, beyond which no null's cause surely gains: of what no other motion predicts,
+# what is begun at the data sheet though nothing lacks, or what moves too little to be noticed
 SURELY_OF_FEW = VERY_MUCH  # the same of fewer motions than FEWEST: the other tells little of what is usual
 FEWEST = 3  # motions, of which one is held out: two name only what is overwhelming, and that is lacking
 CLEAR = 4.0  # log density below which two models predict alike
@@ -302,14 +303,11 @@ def known(found: Fitted, name: str, names: Sequence[str], c: Candidate, most: fl
 
 
 def worth_naming(c: Candidate, gain: Gain) -> bool:
-    """As ``worthwhile``, or what a number of the fabric did until then, far from its data sheet, and surely a gain.
+    """As ``worthwhile``; what is the same as a number that is fitted (a twin) must show beside the data sheet instead.
 
-    Beside such a number little is left to mend. What is the same as one that is fitted (a twin) must show beside the
-    sheet instead.
+    Beside such a number nothing is left to mend.
     """
-    if _twin(c):
-        return gain.least > 0 or far_from_sheet(c, gain)
-    return worthwhile(gain) or (c.relieves and gain.least > SURELY and not worsens(gain))
+    return gain.least > 0 or far_from_sheet(c, gain) if _twin(c) else worthwhile(gain)
 
 
 def far_from_sheet(c: Candidate, gain: Gain) -> bool:
@@ -325,10 +323,13 @@ def _twin(c: Candidate) -> bool:
 
 
 def worthwhile(gain: Gain) -> bool:
-    """Large enough to be noticed, and surely a gain."""
+    """Large enough to be noticed, or surer than what chance gains, and surely a gain.
+
+    Beside numbers that the cause has bent, hardly a millimetre may be left to mend.
+    """
     seen, felt = gain.mended
     mended = gain.fallen > WORTH_SHARE * gain.calm[0] ** 2 or seen > WORTH_MM or felt > WORTH_PULL
-    return mended and gain.least > 0 and not worsens(gain)
+    return (mended or gain.least > SURELY) and gain.least > 0 and not worsens(gain)
 
 
 def worsens(gain: Gain) -> bool:
