@@ -61,9 +61,10 @@ def load(
         InvalidInput: unknown name or frame, unreadable file, a mimic, planar or floating joint on the way to ``frame``.
         MissingDependency: pytorch-kinematics is not installed.
     """
-    path = locate(name_or_path)
-    home = RIZON_HOME if str(name_or_path) in models() else None
-    return Arm(describe(path, frame), model=str(name_or_path), frame=frame, base=base, home=home, dtype=dtype)
+    path, shipped = locate(name_or_path), str(name_or_path) in models()
+    model = str(name_or_path) if shipped else str(Path(path).resolve())  # elsewhere a path from here may be another's
+    home = RIZON_HOME if shipped else None
+    return Arm(describe(path, frame), model=model, frame=frame, base=base, home=home, dtype=dtype)
 
 
 class Arm(nn.Module):

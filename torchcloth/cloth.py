@@ -19,7 +19,7 @@ from .captured import Graphs
 from .effects import AbstractEffect
 from .engine.choice import TRIED, Choice, Setting, Trial, check_setting, choose, still_drives
 from .errors import TorchclothError
-from .initial import damped, first_state, held, likeness, pressed
+from .initial import damped, first_state, held, likeness, pressed, stopped
 from .intervals import Plan, divided, run
 from .materials import AbstractMaterial
 from .meshes import Mesh
@@ -27,11 +27,12 @@ from .model import Geometry, Model, vertex_mass
 from .parameters import PhysicalParameter
 from .parts import Parts, check_free
 from .sensitivities import Directions, sensitivities
-from .stability import limits_of
+from .stability import check_precision, limits_of
 from .strain import MATERIAL, inverse_growth
 from .transfer import Contact, Grid
 from .types import ClothState, Rollout, Trajectory
 from .validation import (
+    as_positions,
     check_axes,
     check_field,
     check_fields,
@@ -48,8 +49,6 @@ from .validation import (
     doubts,
     expand_state,
 )
-
-STILL = 0.1  # m/s, rms: what has settled is slower
 
 
 class Cloth(nn.Module):
@@ -114,7 +113,7 @@ class Cloth(nn.Module):
         self.effects.update(effects)
         self.boundaries.update(boundaries)
         check_grasps(dict(self._parts()), self.boundaries)
-        self.contact, self._grid = contact, None if contact is None else contact.grid(mesh)
+        self._contact, self._grid = contact, None if contact is None else contact.grid(mesh)
         of_contact = () if self._grid is None else self._grid.doubts(mesh)
         for doubt in (*doubts(mesh, self.areal_density.value), *of_contact):
             warnings.warn(doubt, stacklevel=2)
@@ -137,6 +136,11 @@ class Cloth(nn.Module):
         }
         for name, tensor in arrays.items():
             self.register_buffer(name, tensor, persistent=False)
+
+    @property
+    def contact(self) -> Contact | None:
+        """Between layers; None: they pass through each other. A cloth keeps what it was made with."""
+        return self._contact
 
     @property
     def engine(self) -> Setting:
@@ -167,8 +171,9 @@ class Cloth(nn.Module):
     @undisturbed()
     def state(self, x: Tensor, v: Tensor | None = None) -> ClothState:
         """A state from vertex positions [..., V, 3] m and velocities (None: at rest), directors along the normals."""
-        x = torch.as_tensor(x, dtype=self._area.dtype, device=self._area.device)
-        v = torch.zeros_like(x) if v is None else torch.as_tensor(v, dtype=x.dtype, device=x.device)
+        check_precision(self._area.dtype)
+        x = as_positions("x", x, self._area)
+        v = torch.zeros_like(x) if v is None else as_positions("v", v, x)
         return first_state(self.model(), x, v)
 
     # -- simulation -----------------------------------------------------------------------------------------------
@@ -223,11 +228,7 @@ class Cloth(nn.Module):
             rate: of the mass damping that is added meanwhile [1/s].
         """
         settled = run(self.settling(state, motion or {}, start, duration, rate), checkpoint=True).state
-        speed = float(settled.v.detach().square().sum(-1).mean(-1).sqrt().max())  # of the scene that moves most
-        if speed > STILL:
-            text = f"settle: after {duration:g} s the cloth still moves at {speed:.2g} m/s (rms), and is stopped there"
-            warnings.warn(text, stacklevel=3)
-        return settled.stopped()
+        return stopped(settled, duration, level=3)
 
     def sensitivities(
         self,

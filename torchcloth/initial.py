@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from functools import partial
 
@@ -17,6 +18,7 @@ from .self_contact import first_directors
 from .types import ClothState, Memory, Trajectory
 from .validation import check_duration, check_mapping, check_positions
 
+STILL = 0.1  # m/s, rms: what has settled is slower
 SETTLING = "cloth.settling"  # an effect that no user's can be called: names have no dots
 
 
@@ -62,6 +64,15 @@ def likeness(model: Model, x: Tensor) -> ClothState:
     """A state with the right shapes and no physics."""
     points = 0 if model.grid is None else len(model.geometry.area) * len(model.grid.points)
     return ClothState(x, x, x.new_empty(points, 3), _virgin(model, x))
+
+
+def stopped(state: ClothState, duration: float, level: int) -> ClothState:
+    """At rest; a warning, ``level`` calls above this one, where the cloth was still moving after ``duration`` [s]."""
+    speed = float(state.v.detach().square().sum(-1).mean(-1).sqrt().max())  # of the scene that moves most
+    if speed > STILL:
+        text = f"settle: after {duration:g} s the cloth still moves at {speed:.2g} m/s (rms), and is stopped there"
+        warnings.warn(text, stacklevel=level + 1)
+    return state.stopped()
 
 
 def damped(model: Model, rate: float) -> Model:

@@ -60,7 +60,10 @@ def as_it_is(model: Model) -> Model:
 
 
 def mapped(tree: Any, change: Callable[[Tensor], Tensor], buffers: bool = False) -> Any:
-    """The same with every tensor changed, and every parameter of a module; buffers, too, or the same ones."""
+    """The same with every tensor changed, and every parameter of a module; buffers, too, or the same ones.
+
+    Looked into are modules, mappings, tuples and lists.
+    """
     if isinstance(tree, Tensor):
         return change(tree)
     if isinstance(tree, nn.Module):
@@ -73,9 +76,9 @@ def mapped(tree: Any, change: Callable[[Tensor], Tensor], buffers: bool = False)
         return own
     if isinstance(tree, Mapping):
         return {name: mapped(part, change, buffers) for name, part in tree.items()}
-    if isinstance(tree, tuple):
+    if isinstance(tree, tuple | list):
         parts = [mapped(part, change, buffers) for part in tree]
-        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+        return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)
     return tree
 
 

@@ -14,7 +14,7 @@ from .boundaries import Drive
 from .engine.tangents import FusedTangents
 from .errors import InvalidInput
 from .forward_mode import real_tangents
-from .initial import damped, held
+from .initial import damped, held, stopped
 from .intervals import Interval, Plan, check_finite, collect
 from .model import Model, kept
 from .parameters import PhysicalParameter, called
@@ -22,6 +22,7 @@ from .types import ClothState, Rollout, Trajectory
 from .validation import check_numbers
 
 RATE = 30.0  # 1/s, of the damping while the cloth settles
+DECORATED = 6  # calls below the user's, decorators too
 
 
 class Directions(NamedTuple):
@@ -58,7 +59,7 @@ def sensitivities(
         walk = _Walk(cloth, rest, lambda: damped(cloth.model(), RATE), along, count)
         poses = _Poses(motion, along, count, lambda m: held(m, rest.frames[0], rest.frames[-1]))
         (states, _), (shifts, _) = walk.run(state, moved, poses)
-        state, moved = (s[-1].stopped() for s in (states, shifts))
+        state, moved = stopped(states[-1], settle, DECORATED), shifts[-1].stopped()
     found = _Walk(cloth, plan, cloth.model, along, count).run(state, moved, _Poses(motion, along, count))
     values, tangents = (collect(plan, states, impulses) for states, impulses in found)
     return values, tangents
@@ -188,6 +189,10 @@ def _dual_copies(cloth: nn.Module, along: Mapping[str, Tensor], batch: int) -> d
         path, _, own = name.rpartition(".")
         part = cloth.get_submodule(path)
         value = getattr(part, own)  # a plain tensor inside of `called`
+        if batch and value.ndim > 1 and not isinstance(part, PhysicalParameter):
+            got = f"a parameter of shape {tuple(value.shape)}, and several scenes"
+            remedy = "make it a PhysicalParameter(..., axes=...), which says so, or use reverse mode"
+            raise InvalidInput(f"along.parameters[{name!r}]", got=got, expected="to know its own axes", remedy=remedy)
         axes = part.axes if isinstance(part, PhysicalParameter) else 1
         dual = forward_ad.make_dual(*_copies(value, tangent, len(tangent), batch, axes))
         out |= dict.fromkeys((f"cloth.{same}" for same in _places(cloth, value)), dual)

@@ -53,6 +53,13 @@ class Limits(NamedTuple):
         return [0, *range(2, MOST + 1)] if self.viscous > 0 else [0]
 
 
+def check_precision(dtype: torch.dtype) -> None:
+    """Refuse one in which a substep is lost in rounding."""
+    if dtype not in (torch.float32, torch.float64):
+        got = str(dtype).removeprefix("torch.")
+        raise InvalidInput("precision of the cloth", got=got, expected="float32 or float64", remedy="use cloth.float()")
+
+
 @torch.no_grad()
 def limits_of(model: Model, gradient: Tensor, inelastic: Tensor | None = None) -> Limits:
     """Those of a cloth with all its parts; ``gradient``: of the shape functions of the pattern.
@@ -64,9 +71,7 @@ def limits_of(model: Model, gradient: Tensor, inelastic: Tensor | None = None) -
         InvalidInput: a precision in which a substep is lost in rounding.
         UnstableStep: stiffnesses that overflow.
     """
-    if gradient.dtype not in (torch.float32, torch.float64):
-        got = str(gradient.dtype).removeprefix("torch.")
-        raise InvalidInput("precision of the cloth", got=got, expected="float32 or float64", remedy="use cloth.float()")
+    check_precision(gradient.dtype)
     spacing = None if model.grid is None else model.grid.spacing
     extra = [effect.rates(c, model.mass) for effect, c in model.effects.values()]
     elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))

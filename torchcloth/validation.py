@@ -23,6 +23,7 @@ from .types import ClothState, Trajectory
 
 FRAMES = "at least two, increasing, finite seconds"
 MOST_SUBSTEPS = 10_000_000  # of one simulation: a minute of the stiffest cloth; poses of more fill the memory
+NAME = "a name without dots or a leading underscore that torch's ModuleDict has not"
 
 
 def check_parts(
@@ -43,11 +44,16 @@ def check_parts(
         _check_kind("contact", contact, Contact, "Contact(...) or None")
 
 
+def is_name(name: object) -> bool:
+    """Whether a part can be called so."""
+    plain = isinstance(name, str) and bool(name) and "." not in name and not name.startswith("_")
+    return plain and not hasattr(nn.ModuleDict(), str(name))
+
+
 def check_part(what: str, name: object, part: object) -> None:
     """One of the "effects" or "boundaries"."""
-    if not isinstance(name, str) or not name or "." in name or name.startswith("_") or hasattr(nn.ModuleDict(), name):
-        expected = "a name without dots or a leading underscore that torch's ModuleDict has not"
-        raise InvalidInput("name of an effect or boundary", got=repr(name), expected=expected)
+    if not is_name(name):
+        raise InvalidInput("name of an effect or boundary", got=repr(name), expected=NAME)
     kind = {"effects": AbstractEffect, "boundaries": AbstractBoundary}[what]
     _check_kind(f"{what}: {name}", part, kind, f"an {kind.__name__}, as those of torchcloth.{what}")
 
@@ -224,12 +230,21 @@ def check_motions(
     check_mapping(motion)
     if set(motion) != driven:
         raise InvalidInput(
-            "motion", got=f"trajectories for {sorted(motion)}", expected=f"one for each of {sorted(driven)}"
+            "motion", got=f"trajectories for {sorted(motion, key=str)}", expected=f"one for each of {sorted(driven)}"
         )
     for name, trajectory in motion.items():
         check_motion(trajectory, name)
         check_cover(trajectory, name, frames[0], frames[-1])
     return {name: Trajectory(m.t, m.pose.to(like), m.closed) for name, m in motion.items()}
+
+
+def as_positions(name: str, given: object, like: Tensor) -> Tensor:
+    """[..., V, 3] as the cloth's numbers are."""
+    try:
+        return torch.as_tensor(given, dtype=like.dtype, device=like.device)  # type: ignore[arg-type]
+    except (TypeError, ValueError, RuntimeError) as error:
+        got, expected = f"{given!r:.40}", "a tensor or an array [..., V, 3], SI units"
+        raise InvalidInput(name, got=got, expected=expected) from error
 
 
 def check_positions(x: Tensor, v: Tensor, vertices: int) -> None:

@@ -25,7 +25,7 @@ from torchcloth.identification.journal import digest, facts_of
 from torchcloth.identification.rows import Rows
 from torchcloth.identification.sheet import sheet_of
 from torchcloth.meshes import rectangle
-from torchcloth.recordings import Collider
+from torchcloth.recordings import Collider, Markers
 from torchcloth.recordings.together import together
 
 RECORDING = sheets.episode()
@@ -324,6 +324,12 @@ def test_a_table_that_one_episode_names_is_there_in_all():
     high = replace(RECORDING, colliders={"table": replace(plane, point=np.array([0.0, 0.0, 1.1]))})
     with pytest.raises(InvalidInput, match=r"inside 'table', which only other episodes have"):
         together([RECORDING, high])
+    seen = RECORDING.points
+    marked = Markers(seen.t, np.stack([seen.frame(k)[:9] for k in range(len(seen.t))]), np.full((9, 2), 0.01))
+    with pytest.raises(InvalidInput, match=r"inside 'table', which only other episodes have"):
+        together([replace(RECORDING, points=None, markers=marked), high])
+    plain = replace(RECORDING, colliders={"table": replace(plane, friction=None)})
+    assert together([with_table, plain]).colliders["table"] is plane  # 0.4 where none is said
     again = replace(RECORDING, colliders={"table": replace(plane, point=np.array([0.4, 0.0, 0.501]))})
     assert together([with_table, again]).colliders["table"] is plane  # measured twice
     for other in (replace(plane, point=np.array([0.0, 0.0, 0.3])), replace(plane, friction=0.9)):

@@ -7,6 +7,7 @@ from clothes import close, opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.effects import AbstractEffect, Amplitude
+from torchcloth.errors import InvalidInput
 from torchcloth.sensitivities import Directions
 
 END = 0.012
@@ -243,3 +244,53 @@ def test_a_force_on_triangles_may_be_that_of_all_scenes():
         state = cloth.state(start(cloth).x.expand(2, -1, -1).clone())
         found.append(cloth(state, times=(0.0, 0.01)).x)
     close(found[1], found[0], 1e-10, "positions")
+
+
+class Mixing(Pull):
+    """By a plain matrix, whose axes nobody has told."""
+
+    def __init__(self, strength=1e-3):
+        super().__init__(strength)
+        self.matrix = torch.nn.Parameter(torch.eye(3))
+
+    def force(self, c, now):
+        return 1e-3 * now.v @ self.matrix
+
+
+class Listed(Pull):
+    """With coefficients in a list."""
+
+    def coefficients(self):
+        return [self.strength.value[..., None, None] * torch.ones(1, 1)]
+
+    def force(self, c, now):
+        return super().force(c[0], now)
+
+
+def test_a_plain_matrix_has_slopes_of_one_scene_and_is_refused_of_several():
+    cloth = cloth_with("auto", Mixing)
+    state = start(cloth)
+    torch.manual_seed(0)
+    direction = torch.randn(2, 3, 3)
+    along = Directions({"effects.own.matrix": direction})
+    moved = cloth.sensitivities(state, opening(END), TIMES, along=along)[1].x[0]
+    with torch.no_grad():
+        ends = []
+        for sign in (1, -1):
+            cloth.effects["own"].matrix.copy_(torch.eye(3) + sign * 1e-3 * direction[0])
+            ends.append(cloth(state, opening(END), TIMES).x)
+    close(moved, (ends[0] - ends[1]) / 2e-3, 1e-6, "slope")
+    several = state.map(lambda field: field.expand(2, *field.shape))
+    with pytest.raises(
+        InvalidInput, match=r"effects.own.matrix.*shape \(3, 3\), and several scenes.*PhysicalParameter"
+    ):
+        cloth.sensitivities(several, opening(END), TIMES, along=along)
+
+
+@pytest.mark.parametrize("engine", ["auto", "reference"])
+def test_coefficients_in_a_list_may_be_batched(engine):
+    cloth = cloth_with(engine, Listed)
+    cloth.effects["own"].strength = tc.PhysicalParameter(torch.tensor([1e-3, 2e-3]), "N", "nonnegative", name="pull")
+    out = cloth(start(cloth), opening(END), TIMES)
+    assert out.x.shape[:2] == (2, 3)  # scenes, frames
+    assert not torch.equal(out.x[0, -1], out.x[1, -1])

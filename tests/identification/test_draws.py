@@ -60,3 +60,14 @@ def test_the_same_seed_draws_the_same(fit):
     folder, recording, names = fit
     one, two, other = (drawn(folder, recording, 3, seed)[2] for seed in (1, 1, 2))
     assert values(one, names[0]) == values(two, names[0]) != values(other, names[0])
+
+
+def test_an_amplitude_is_drawn_by_its_errors_alone(fit, tmp_path):
+    """Those of 1/s and the like had been held within 2.3 of their units."""
+    folder, recording, _ = fit
+    content = json.loads((folder / "identification.json").read_text())
+    content["model"]["values"]["air.normal"] = 40.0
+    content["parameters"]["air.normal"]["std"] = 5.0
+    (tmp_path / "identification.json").write_text(json.dumps(content))
+    own = [values(c, "air.normal") for c in drawn(tmp_path, recording, 200)]
+    assert np.std(own) == pytest.approx(5.0, rel=0.2)

@@ -66,6 +66,18 @@ def test_contact_and_step_are_kept(brief, tmp_path):
     assert json.loads((tmp_path / "identification.json").read_text())["model"]["dt"] == 1e-4
 
 
+def test_another_thickness_is_another_fabric(pair, recording, tmp_path):
+    """Moduli [Pa] of one thickness had been taken for those of another: with twice of it, twice as stiff."""
+    path = pair.save(tmp_path)
+    thick = replace(recording, cloth=replace(recording.cloth, thickness=2e-3))
+    with pytest.raises(InvalidInput, match=r"another thickness; got 0.002 m in the episode, 0.001 m in the fit"):
+        replayed(path, thick)
+    content = json.loads(path.read_text())
+    del content["model"]["thickness"]
+    path.write_text(json.dumps(content))
+    assert replayed(path, recording).warning == ""  # a file of before
+
+
 def test_the_right_one_of_several_episodes_is_found(recording, brief, tmp_path):
     fit = identify(twins.at(brief), [brief, recording], ["youngs_modulus"], iterations=1)
     fit.save(tmp_path)

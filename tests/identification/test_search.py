@@ -50,6 +50,7 @@ def test_plain_descent_goes_downhill_slowly(model, brief):
     [
         ({"priors": {"youngs_modulus": (1e6, 1.01)}}, "priors; got youngs_modulus with method .*; expected none"),
         ({"nuisances": ["clock", "grasp"]}, "nuisances; got clock, grasp with method .*; expected none"),
+        ({"use": ["force"]}, "use; got force with method .*; expected none"),
     ],
 )
 def test_a_distance_is_not_weighed_against_priors(model, brief, method, options, said):

@@ -251,9 +251,36 @@ def test_the_friction_of_a_table_alone_may_be_batched(engine):
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_refused(dtype):
-    cloth = sheet().to(dtype)
-    with pytest.raises(InvalidInput, match=r"precision of the cloth; got .*float16; expected float32 or float64"):
-        cloth(cloth.rest_state(), times=(0.0, 1e-3))
+    for contact in (None, tc.Contact()):
+        cloth = sheet(contact=contact).to(dtype)
+        with pytest.raises(InvalidInput, match=r"precision of the cloth; got .*float16; expected float32 or float64"):
+            cloth(cloth.rest_state(), times=(0.0, 1e-3))
+
+
+def test_contact_is_kept_as_it_was_made():
+    """What simulates is its grid: another value would be believed by fits alone."""
+    cloth = sheet(contact=tc.Contact())
+    with pytest.raises(AttributeError):
+        cloth.contact = None
+    assert cloth.contact == tc.Contact()
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: sheet().state(None), r"x; got None; expected a tensor or an array"),
+        (lambda: sheet().state([[1.0], [1.0, 2.0]]), r"x; got .*; expected a tensor or an array"),
+        (lambda: sheet()(sheet().rest_state(), {1: 0, "hand": 0}), r"motion; got trajectories for"),
+        (lambda: tc.boundaries.Sphere(torch.ones(2)), r"radius; got shape \(2,\); expected a scalar or \[B, 1\]"),
+        (lambda: tc.boundaries.Box((1.0, 1.0, 1.0), pose="x"), r"pose; got"),
+        (lambda: tc.materials.AEP(1e5, thickness=torch.full((18,), 1e-3)), r"thickness; got"),
+        (lambda: sheet(contact=tc.Contact(subdivisions=math.nan)), r"contact subdivisions; got nan"),
+        (lambda: tc.effects.ResidualForce(["drag"]), r"terms; got \['drag'\]; expected a dict"),
+    ],
+)
+def test_what_is_no_part_is_one_line(make, said):
+    with pytest.raises(InvalidInput, match=said):
+        make()
 
 
 @pytest.mark.parametrize("duration", [0.0, -1.0, math.nan])
@@ -474,6 +501,10 @@ def test_cloth_that_has_far_to_go_is_not_settled_and_told():
     still = {"pins": trajectory()}
     with torch.no_grad(), pytest.warns(UserWarning, match=r"settle: after 0.3 s .* still moves at 0\.\d+ m/s"):
         cloth.settle(cloth.rest_state(), still)
+    along = tc.Directions(state=cloth.rest_state().map(lambda field: field[None]))
+    with pytest.warns(UserWarning, match=r"settle: after 0.3 s .* still moves") as told:
+        cloth.sensitivities(cloth.rest_state(), still, (0.0, 1e-3), along=along, settle=0.3)
+    assert {warning.filename for warning in told} == {__file__}
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("error")
         cloth.settle(cloth.rest_state(), still, duration=4.0, rate=5.0)

@@ -316,6 +316,9 @@ def test_load_refuses_such_polygons_of_a_ply(tmp_path):
         tc.meshes.load(path)
     path.write_text(head + "0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 1 2 3 0\n")
     np.testing.assert_allclose(tc.meshes.load(path).area.sum(), 1.0)
+    path.write_text(head + "0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 9\n")
+    with pytest.raises(InvalidInput, match=r"a face with vertex 9; expected vertices 0 to 3"):
+        tc.meshes.load(path)
 
 
 @pytest.mark.parametrize("ring", ["1 2 3 4", "2 3 4 1"])

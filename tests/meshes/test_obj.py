@@ -24,6 +24,17 @@ def test_vt_follows_its_corner():
     assert uv.tolist() == [[[0, 0], [9, 0], [0, 9]]]
 
 
+@pytest.mark.parametrize("line", ["v 0 0", "vt 1"])
+def test_a_line_with_too_few_numbers_is_named(line):
+    with pytest.raises(InvalidInput, match=r"cloth.obj is damaged at line 1; got 'v"):
+        obj.parse(line + "\nv 0.2 0 0\nv 0.2 0.2 0\nv 0 0.2 0\nf 1 2 3 4\n", "cloth.obj")
+
+
+def test_lists_are_written_too():
+    mesh = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[0, 1, 2]], [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
+    assert obj.dump(*mesh) == obj.dump(*map(np.array, mesh))
+
+
 @pytest.mark.parametrize("form", ["none", "vertex", "corner"])
 def test_round_trip_is_exact(form):
     rng = np.random.default_rng(0)
@@ -43,12 +54,12 @@ def test_round_trip_is_exact(form):
     [
         ("", "cloth.obj: v has the wrong shape"),
         ("v 0 0 zero", "damaged at line 1; got 'v 0 0 zero'"),
-        ("v 0 0\nv 1 0 0\n", "v is not a rectangular array"),
+        ("v 0 0\nv 1 0 0\n", "damaged at line 1; got 'v 0 0'"),
         ("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3", "v is not finite"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "f has the wrong shape"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4", "damaged at line 4"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3", "a vertex in no face; got vertex 4"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0\nf 1/1 2/1 3/1", "vt has the wrong shape"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0\nf 1/1 2/1 3/1", "damaged at line 4; got 'vt 0'"),
     ],
 )
 def test_damage_is_named(text, message):

@@ -103,12 +103,47 @@ def two_hands(longer, opens=None):
 
 
 def test_what_was_recorded_longer_waits_as_well():
-    """It had driven on through the wait, where no limit is looked at."""
-    for course in courses(two_hands(longer=0.3), wait=0.2):
+    """It had driven on through the wait, where no limit is looked at: it comes to rest."""
+    left, right = courses(two_hands(longer=0.3), wait=0.2)
+    for course, stops in ((left, 0.0), (right, 0.1 / right.limits.acceleration)):
         pose = course.trajectory(course.nothing).pose
-        after = course.t > LASTS + 1e-9
-        assert int(after.sum()) == 2
-        assert torch.equal(pose[after], pose[~after][-1:].expand(2, 4, 4))
+        after = course.t > LASTS + stops + 0.01
+        assert int(after.sum()) > 5
+        assert torch.equal(pose[after], pose[after][-1:].expand_as(pose[after]))
+    beyond = right.start[-1, 0] - right.start[right.t <= LASTS + 1e-9][-1, 0]
+    assert float(beyond) == pytest.approx(0.1**2 / (2 * right.limits.acceleration), rel=1e-3)
+
+
+def test_what_is_under_way_at_the_end_comes_to_rest_within_the_limits():
+    """It had been stopped in 10 ms."""
+    recording = by_arm()
+    own = recording.joints["arm"]
+    q = own.q.copy()
+    q[:, 0] += 0.6 * own.t  # rad/s
+    recording = replace(recording, joints={"arm": replace(own, q=q)})
+    for wait, said in ((0.5, "comes to rest in 0.20 s"), (0.1, "wait 0.20 s or longer")):
+        (course,) = courses_of(cloth_of(recording), recording, 4, wait, 3.0, Limits())
+        (doubt,) = doubts(recording, [course])
+        assert said in doubt
+        velocity = course.q.diff(dim=0) / course.t.diff()[:, None]
+        hardest = (velocity.diff(dim=0)[:, 0] / course.t.diff()[1:])[course.t[:-2] > LASTS - 1e-9].abs().max()
+        assert float(hardest) == pytest.approx(3.0 if wait > 0.2 else 6.0, rel=0.1)
+        assert torch.equal(velocity[-1], torch.zeros(7)) == (wait > 0.2)
+        bounds = Bounds.of([course])
+        last = [k for k, name in enumerate(bounds.names) if name == f"acceleration of {course.labels[0]} of arm"][-1]
+        assert float(bounds.high[last]) < 4.0  # the halt is no recorded motion
+        assert bool((course.span.instants > LASTS + 0.5 * min(wait, 0.2)).any())  # limits of positions hold there, too
+
+
+def test_a_gripper_that_had_let_go_before_moves_as_recorded():
+    recording = two_hands(longer=0.0, opens=0.05)
+    late = replace(recording, points=rec.PointClouds(np.array([0.1, 0.2]), np.zeros((2, 3)), np.ones(2, int)))
+    assert [course.name for course in courses(late, waypoints=2)] == ["hand"]
+
+
+def test_a_hand_recorded_longer_lets_go_in_the_wait_when_it_did():
+    _, course = courses(two_hands(longer=0.3, opens=LASTS + 0.1), wait=0.3)
+    assert float(course.t[~course.closed][0]) == pytest.approx(LASTS + 0.1, abs=1e-6)
 
 
 def test_a_hand_lets_go_when_it_did():

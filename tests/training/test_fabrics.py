@@ -90,6 +90,16 @@ def test_finished_trials_are_not_repeated_and_other_settings_are_refused(study, 
     assert "use the same settings, or another folder" in capsys.readouterr().err
 
 
+def test_distances_allow_for_the_errors_of_the_others():
+    """A sharp trial beside blurred ones of its own fabric had been 2.5 standard errors away."""
+    draw, found = np.random.default_rng(0), []
+    for _ in range(400):
+        others = [classify.Trial("cotton", 0.1 * draw.standard_normal(2), np.full(2, 0.1)) for _ in range(9)]
+        sharp = classify.Trial("cotton", 0.01 * draw.standard_normal(2), np.full(2, 0.01))
+        found.append(classify._squared(sharp, others))
+    assert 0.5 < np.mean(found) / 2 < 1.2  # of two parameters
+
+
 # -- twins -----------------------------------------------------------------------------------------------------------
 
 

@@ -227,7 +227,10 @@ class _Air(NamedTuple):
 
 def _rigid(pose: Tensor) -> Tensor:
     check_value("pose", pose)
-    matrix = torch.as_tensor(pose).detach().to(torch.get_default_dtype())
+    try:
+        matrix = torch.as_tensor(pose).detach().to(torch.get_default_dtype())
+    except (TypeError, ValueError, RuntimeError):
+        matrix = torch.zeros(0)
     if matrix.shape == (4, 4) and bool(torch.isfinite(matrix).all()):
         rotation, last = matrix[:3, :3], matrix[3]
         error = (rotation @ rotation.mT - torch.eye(3).to(matrix)).abs().max()

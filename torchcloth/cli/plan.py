@@ -40,7 +40,7 @@ def add(verbs: Any) -> None:
     option(
         "--pieces",
         action="store_true",
-        help="the goal tells each piece's place: a mesh or pose.npz by the cloth's vertices, an episode by its markers",
+        help="the goal tells each piece's place: a mesh by vt, or like pose.npz by vertices, an episode by markers",
     )
     option("--fit", type=Path, metavar="RESULT", help="identification.json, its folder or a .tcm file: take its values")
     option("--draws", type=int, default=1, metavar="N", help="plan for N models, drawn from what the fit leaves open")

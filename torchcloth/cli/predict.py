@@ -55,6 +55,8 @@ def _predict(options: argparse.Namespace) -> int:
     if options.seen is not None:
         check_apart(out, options.seen)
     check_folder(out)
+    if options.seen is not None and not options.seen.exists():
+        raise InvalidInput("SEEN", got=options.seen, expected="a folder that exists")
     given = any(getattr(options, name) is not None for name in STRIP)
     of_strip = given or (options.seen is not None and (options.seen / TABLE).is_file())
     if options.fit.suffix == ".tcm" and not of_strip:

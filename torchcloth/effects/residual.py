@@ -87,6 +87,8 @@ class ResidualForce(AbstractEffect):
     def __init__(self, terms: Mapping[str, float], held: Sequence[int] = ()) -> None:
         super().__init__()
         known = [f"{law}@{place}".rstrip("@") for law in LAWS for place in PLACES]
+        if not isinstance(terms, Mapping):
+            raise InvalidInput("terms", got=f"{terms!r:.40}", expected="a dict of strengths by law")
         unknown = [term for term in terms if term not in known]
         if unknown or not terms:
             raise InvalidInput(

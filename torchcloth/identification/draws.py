@@ -15,6 +15,7 @@ from .saved import read_saved, rebuilt
 from .unknowns import available
 
 FAR = 3.0  # standard errors, beyond which nothing is drawn
+LINEAR = ("nonnegative", "real")  # domains that are stored as they are
 DECADE = math.log(10.0)  # likewise, in the stored coordinate: of what a fit knows nothing of
 
 
@@ -22,7 +23,7 @@ def drawn(path: str | Path, recording: Recording, count: int, seed: int = 0) -> 
     """``count`` cloths of an episode: at a fit's values, then with its parameters drawn from their joint errors.
 
     Errors are Gaussian in the stored coordinate (the logarithm of positive parameters), correlated as the fit says, and
-    at most ``FAR`` standard errors and a factor of ten; amplitudes without a sign stop at zero.
+    at most ``FAR`` standard errors, of a logarithm or logit a factor of ten; amplitudes without a sign stop at zero.
 
     Args:
         path: identification.json, or the folder that holds it.
@@ -54,4 +55,5 @@ def _move(parameter: PhysicalParameter, std: float, z: float) -> None:
     raw = parameter.raw.detach().clone().requires_grad_()
     (slope,) = torch.autograd.grad(to_value(raw, parameter.domain).sum(), raw)
     with torch.no_grad():
-        parameter.raw.add_((z * std / slope).clamp(-DECADE, DECADE))
+        step = z * std / slope
+        parameter.raw.add_(step if parameter.domain in LINEAR else step.clamp(-DECADE, DECADE))

@@ -21,10 +21,11 @@ from ..materials import AEP, AbstractMaterial
 from ..meshes import Mesh, rectangle
 from ..meshes.patches import Patch
 from ..recordings import Camera, Recording
-from ..recordings.scene import THICKNESS
+from ..recordings.scene import FRICTION, THICKNESS
 from ..robots import closing, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..transfer import Contact
 from ..types import Trajectory
+from ..validation import NAME, is_name
 from . import streams
 from .carried import between, carried, with_patches
 
@@ -203,9 +204,17 @@ def cloth_from(
         raise InvalidInput(
             f"{recording.path}: names", got=f"a grasp and a collider {min(both)!r}", expected="a name for each"
         )
+    for name in (*recording.colliders, *recording.grasps):
+        if not is_name(name):
+            raise RecordingError(
+                f"{recording.path}: name of a grasp or collider",
+                got=repr(name),
+                expected=NAME,
+                remedy="rename it in episode.json and motion.npz",
+            )
     boundaries = {}
     for name, collider in recording.colliders.items():
-        friction = 0.4 if collider.friction is None else collider.friction
+        friction = FRICTION if collider.friction is None else collider.friction
         boundaries[name] = Plane(collider.point.tolist(), collider.normal.tolist(), friction)
     for name, grasp in recording.grasps.items():
         held = None if grasp.vertices is None else grasp.vertices.tolist()

@@ -119,7 +119,7 @@ def identify(
     _check(method, stop, iterations, starts)
     if not 0 < rate < math.inf:
         raise InvalidInput("rate", got=rate, expected="a number > 0")
-    _check_priors(method, priors, nuisances)
+    _check_priors(method, priors, nuisances, use)
     began = time.perf_counter()
     on_cpu(cloth)
     episodes_in = given(recordings)
@@ -167,12 +167,18 @@ def _check(method: str, stop: str, iterations: int, starts: int) -> None:
         )
 
 
-def _check_priors(method: str, priors: Mapping[str, Any] | None, nuisances: Mapping[str, Any] | Sequence[str]) -> None:
+def _check_priors(
+    method: str,
+    priors: Mapping[str, Any] | None,
+    nuisances: Mapping[str, Any] | Sequence[str],
+    use: Sequence[str] | None,
+) -> None:
     """Refuse what a mean distance cannot be weighed against: it has no noise, in whose units priors are.
 
-    A search without them would go where they forbid, and report errors that have them in.
+    A search without them would go where they forbid, and report errors that have them in; nor does it choose among
+    what was seen.
     """
-    for name, asked in (("priors", priors), ("nuisances", nuisances)):
+    for name, asked in (("priors", priors), ("nuisances", nuisances), ("use", use)):
         if method in CHAMFER and asked:
             raise InvalidInput(
                 name,

@@ -32,6 +32,7 @@ RESULT = "identification.json"
 MOST = 100.0  # of the logarithm of a spread, which says nothing long before
 FRICTION = ".friction"  # of a table, behind its name
 FAITHFUL = 0.02  # relative difference of Chamfer between the fit and its replay that other machines explain
+ALIKE = 1e-3  # relative, of thicknesses
 STIFFEST = 1e13  # in SI units: simulated, a fabric of more would take more steps than can be counted
 SHORTEST, FINEST = 1e-7, 1e-5  # s, m: no fit ends that takes such steps, or has such a contact grid
 
@@ -69,6 +70,7 @@ def model_of(cloth: Cloth, fit: Identification, recordings: Sequence[Recording],
     contact = None if cloth.contact is None else asdict(cloth.contact)
     return {
         "values": values,
+        "thickness": getattr(cloth.material, "thickness", None),
         "contact": contact,
         "dt": dt,
         "beyond": beyond(cloth, together(recordings)),
@@ -139,6 +141,7 @@ class SavedModel:
         stds: standard errors of the fitted parameters, by name.
         beyond: names of what the fitted cloth has and its first episode does not describe.
         correlation: [K, K] of the fitted parameters, in the order of ``stds``.
+        thickness: m, with which moduli [Pa] were fitted; None: a file of before does not say.
         left: m, rms distance that the fit left in its own episodes; NaN where nothing was seen.
     """
 
@@ -146,6 +149,7 @@ class SavedModel:
     stds: dict[str, float]
     beyond: list[str]
     correlation: np.ndarray
+    thickness: float | None
     left: float
     contact: Contact | None
     dt: float | None
@@ -193,6 +197,7 @@ def _model(content: dict[str, Any]) -> SavedModel:
         {name: number(said[name]["std"], 0.0, f"{name}'s std") for name in correlation},
         [str(name) for name in model.get("beyond", ())],  # files of before do not say
         matrix,
+        None if (thickness := model.get("thickness")) is None else number(thickness, 0.0, "thickness"),
         math.nan if left is None else number(left, 0.0),
         None if model["contact"] is None else _contact(**model["contact"]),
         None if model["dt"] is None else number(model["dt"], SHORTEST, "dt"),
@@ -221,6 +226,15 @@ def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:
         RecordingError: a value that no such parameter can have.
     """
     cloth = cloth_from(recording, contact=model.contact)
+    own = getattr(cloth.material, "thickness", None)
+    known = model.thickness
+    if own is not None and known is not None and not math.isclose(own, known, rel_tol=ALIKE):
+        raise InvalidInput(
+            f"{path}: a fit of cloth of another thickness",
+            got=f"{own:g} m in the episode, {known:g} m in the fit",
+            expected="one thickness: moduli [Pa] times it are what a motion shows",
+            remedy="correct cloth.thickness in episode.json (0.001 m where it says none), or fit this episode",
+        )
     names = available(cloth)
     tables = {name for name in model.values if name.endswith(FRICTION)} - names.keys()  # of tables that are not there
     absent = {name for name in tables if name.removesuffix(FRICTION) not in recording.colliders}

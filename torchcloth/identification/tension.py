@@ -30,6 +30,7 @@ from .tension_model import RESULT, TensionModel, pulled
 from .unknowns import Unknown, available, collect, needs_contact, overrides
 
 RESOLUTION = 1e-3  # of a table's largest reading: no kind of reading is taken to be better
+SECTIONS = 4  # of a curve, in each of which readings err together
 MISSED = 0.05  # of a table's largest reading, beyond which the law is said to miss it
 CONVENTION = (
     "SI units. errors: force and lateral strain, computed minus measured, as a share of the largest reading of their "
@@ -37,6 +38,13 @@ CONVENTION = (
     "more at one angle differ, not for a wrong law. "
     "identifiable: std below a quarter of the value (of a typical amplitude, where the amplitude is smaller)."
 )
+
+
+def _places(table: ForceDisplacement) -> Tensor:
+    """[N] int64, how far along its curve a reading is, in "frames": errors follow a law's shape."""
+    at = torch.as_tensor(np.asarray(table.displacement, dtype=float))
+    along = (at - at.min()) / (at.max() - at.min()).clamp(min=1e-30)
+    return (along * SECTIONS * gauss_newton.WINDOW).floor().clamp(max=SECTIONS * gauss_newton.WINDOW - 1).long()
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +121,8 @@ def fit_tension(
     """
     tables = [tables] if isinstance(tables, ForceDisplacement) else list(tables)
     _check(tables, iterations)
+    if isinstance(parameters, str):
+        parameters = [parameters]
     cloth = copy.deepcopy(cloth).to(torch.float64).requires_grad_(False)
     names = _membrane(cloth) if parameters is None else list(parameters)
     unknowns = collect(cloth, names, None)
@@ -133,7 +143,7 @@ def fit_tension(
 
 
 def _check(tables: list[ForceDisplacement], iterations: int) -> None:
-    if not tables or iterations < 1:
+    if not tables or not isinstance(iterations, int) or iterations < 1:
         raise InvalidInput("tables or iterations", got=f"{len(tables)}, {iterations}", expected="at least one of each")
     for k, table in enumerate(tables):
         for name in ("length", "width"):
@@ -170,15 +180,14 @@ class _Readings:
         self.cloth, self.unknowns, self.tables, self.specimen = cloth, unknowns, tables, specimen
         self.contraction, self.lateral_scale = contraction, 1.0
         self.start = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
-        frame, patch, lateral, first = [], [], [], 0
-        table = [k for k, t in enumerate(tables) for _ in range(1 + (contraction and t.lateral_strain is not None))]
-        for k, (kind, rows) in enumerate(self._misses(self.curves(self.start))):
-            frame.append(torch.arange(len(rows)) + first)
-            patch.append(torch.full((len(rows),), k))
-            lateral.append(torch.full((len(rows),), kind == "lateral"))
-            first += len(rows) + gauss_newton.WINDOW  # windows do not reach across curves
+        frame, patch, lateral = [], [], []
+        for k, (of, kind, measured) in enumerate(self._measured()):
+            places = _places(tables[of])[np.isfinite(measured)]
+            frame.append(places + k * (SECTIONS + 1) * gauss_newton.WINDOW)  # windows do not reach across curves
+            patch.append(torch.full((len(places),), k))
+            lateral.append(torch.full((len(places),), kind == "lateral"))
         self.frame, self.patch, self.lateral = torch.cat(frame), torch.cat(patch), torch.cat(lateral)
-        self.table = torch.tensor(table)[self.patch]  # of every row
+        self.table = torch.tensor([of for of, *_ in self._measured()])[self.patch]  # of every row
 
     def weigh(self, value: Tensor) -> bool:
         """Let forces and lateral strains count by how well each kind is met at a first fit; whether there are both."""
@@ -218,12 +227,17 @@ class _Readings:
         return torch.cat([rows / scale[kind] for kind, rows in self._misses(self.curves(raw))])
 
     def _misses(self, curves: list[Response]) -> list[tuple[str, Tensor]]:
-        """Force rows, then lateral ones where they were seen, of every table in turn."""
-        out = []
-        for table, curve in zip(self.tables, curves, strict=True):
-            out.append(("force", _share(curve.force, table.force)))
+        """Of every reading that there is, by curve."""
+        computed = {"force": [curve.force for curve in curves], "lateral": [curve.lateral_strain for curve in curves]}
+        return [(kind, _share(computed[kind][of], measured)) for of, kind, measured in self._measured()]
+
+    def _measured(self) -> list[tuple[int, str, Any]]:
+        """(number of its table, kind, readings) of every curve: force, then lateral strain where it was seen."""
+        out: list[tuple[int, str, Any]] = []
+        for k, table in enumerate(self.tables):
+            out.append((k, "force", table.force))
             if self.contraction and table.lateral_strain is not None:
-                out.append(("lateral", _share(curve.lateral_strain, table.lateral_strain)))
+                out.append((k, "lateral", table.lateral_strain))
         return out
 
 

@@ -13,14 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..materials import AEP, AbstractMaterial, OrthotropicAEP
+from ..materials import AEP, AbstractMaterial, OrthotropicAEP, StiffeningAEP
 from ..parameters import PhysicalParameter
 from ..recordings import ForceDisplacement
 from .files import number, read_result
 from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial, curves
 
 RESULT = "tension.json"
-LAWS = {law.__name__: law for law in (AEP, OrthotropicAEP)}
+LAWS = {law.__name__: law for law in (AEP, OrthotropicAEP, StiffeningAEP)}
 SHORTEST = 1e-6  # m, of a specimen
 SPECIMENS = {kind.__name__: kind for kind in (Uniaxial, Trellis)}
 

@@ -30,9 +30,12 @@ class DirectorMaterial(AbstractMaterial, ABC):
 
     def __init__(self, thickness: float) -> None:
         super().__init__()
-        if not 0 < thickness < float("inf"):
-            raise InvalidInput("thickness", got=f"{thickness} m", expected="a value > 0")
-        self.thickness = float(thickness)
+        try:
+            self.thickness = float(thickness)
+        except (TypeError, ValueError, RuntimeError):
+            self.thickness = float("nan")
+        if not 0 < self.thickness < float("inf"):
+            raise InvalidInput("thickness", got=f"{thickness!r:.40} m", expected="a value > 0")
         self.plastic: NormYield | None = None
 
     def _complete(

@@ -8,6 +8,8 @@ import numpy as np
 
 from ..errors import InvalidInput
 
+WIDTH = {"v": 3, "vt": 2}  # numbers that are read; more may follow
+
 
 def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Read vertices [V, 3], faces [F, 3] (polygons are fanned) and vt of their corners [F, 3, 2], or None without.
@@ -23,10 +25,12 @@ def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
     for number, line in enumerate(text.splitlines(), 1):
         word, *items = line.split("#")[0].split() or [""]
         try:
+            if word in ("v", "vt") and len(items) < WIDTH[word]:
+                raise ValueError(f"{len(items)} numbers")
             if word == "v":
-                v.append([float(x) for x in items[:3]])
+                v.append([float(x) for x in items[: WIDTH[word]]])
             elif word == "vt":
-                vt.append([float(x) for x in items[:2]])
+                vt.append([float(x) for x in items[: WIDTH[word]]])
             elif word == "f":
                 ring = [_corner(item, len(v), len(vt)) for item in items]
                 if len(ring) > 3:
@@ -73,13 +77,13 @@ def check_convex(polygons: np.ndarray, place: str) -> None:
 
 def dump(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None) -> str:
     """The OBJ text of a mesh with pattern coordinates [V, 2], [F, 3, 2] or None; numbers read back exactly."""
-    rows, corner = np.zeros((0, 2)), np.asarray(faces)
+    rows, corner, uv = np.zeros((0, 2)), np.asarray(faces), None if uv is None else np.asarray(uv)
     if uv is not None and uv.ndim == 2:
         rows = uv
     elif uv is not None:
         rows, corner = np.unique(uv.reshape(-1, 2), axis=0, return_inverse=True)
         corner = corner.reshape(-1, 3)
-    lines = [f"v {' '.join(map(repr, row))}" for row in vertices.tolist()]
+    lines = [f"v {' '.join(map(repr, row))}" for row in np.asarray(vertices).tolist()]
     lines += [f"vt {' '.join(map(repr, row))}" for row in rows.tolist()]
     form = "{0}" if uv is None else "{0}/{1}"
     pairs = np.stack([faces, corner], axis=-1) + 1

@@ -98,7 +98,14 @@ def _check_polygons(mesh: Any, path: Path) -> None:
         many = [corners] if corners.ndim == 2 else [np.stack(own) for own in _alike(corners)]
         for polygons in many:
             if polygons.shape[1] > 3:
+                _check_corners(polygons, len(mesh.vertices), path)
                 obj.check_convex(np.asarray(mesh.vertices)[polygons], str(path))
+
+
+def _check_corners(polygons: np.ndarray, count: int, path: Path) -> None:
+    if polygons.min() < 0 or polygons.max() >= count:
+        got = f"{path}, a face with vertex {int(polygons.max() if polygons.max() >= count else polygons.min())}"
+        raise InvalidInput("mesh file", got=got, expected=f"vertices 0 to {count - 1}")
 
 
 def _rows(face: Any, key: str) -> np.ndarray:
@@ -133,6 +140,7 @@ def _wedges(raw: Any, path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray] |
         got = f"{path}, polygons of several kinds with coordinates of their corners"
         raise InvalidInput("mesh file", got=got, expected="triangles", remedy="triangulate on export")
     vertices = np.stack([np.asarray(place[axis], dtype=float).ravel() for axis in "xyz"], axis=-1)
+    _check_corners(corners, len(vertices), path)
     fan = np.array([[0, k, k + 1] for k in range(1, corners.shape[1] - 1)])
     obj.check_convex(vertices[corners], str(path))
     return vertices, corners[:, fan].reshape(-1, 3), coordinates.reshape(*corners.shape, 2)[:, fan].reshape(-1, 3, 2)

@@ -22,6 +22,7 @@ from ..robots import Arm  # pyright: ignore[reportMissingImports] - mapped from 
 from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
 from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
+from .halting import Halt
 
 PERIOD = 0.02  # s, between the instants at which limits are held
 OVER = 3  # periods to either side, over which a recorded motion's accelerations are taken: measured joints tremble
@@ -37,6 +38,7 @@ class Span(NamedTuple):
     begin: float  # s, from which on something is
     end: float  # s, after which nothing changes any more
     waypoints: int  # after the beginning, where nothing is added
+    halting: float = 0.0  # s after the end, in which what was recorded under way comes to rest
 
     def basis(self, times: Tensor) -> Tensor:
         """[N, K], what each waypoint adds at ``times`` [N] s."""
@@ -53,7 +55,8 @@ class Span(NamedTuple):
         """[N] s, where limits are held: those of the waypoints, where accelerations are greatest, among them."""
         count = math.ceil((self.end - self.begin) / PERIOD) + 1
         even = torch.linspace(self.begin, self.end, count, dtype=torch.float64)
-        return torch.cat([even, self.knots]).unique()
+        after = self.end + torch.linspace(0.0, self.halting, math.ceil(self.halting / PERIOD) + 1, dtype=torch.float64)
+        return torch.cat([even, self.knots, after]).unique()
 
 
 class Bounds(NamedTuple):
@@ -96,12 +99,14 @@ class Course(ABC):
         t: [S] s, knots as recorded, and of the wait after them.
         closed: [S] bool.
         span: when something is added.
+        halt: how the recorded motion ends.
     """
 
     name: str
     t: Tensor
     closed: Tensor
     span: Span
+    halt: Halt
 
     @property
     @abstractmethod
@@ -139,21 +144,22 @@ class Course(ABC):
         """Within the limits, or within what the recorded motion does where that is beyond them."""
         least, largest, fastest, hardest = self._limits()
         eye, parts = torch.eye(self.start.shape[1], dtype=torch.float64), []
-        at, recorded = self.span.instants, lambda times: between(self.t, self.start, times)
+        begin, end = self.span.begin, self.span.end
+        every, recorded = self.span.instants, lambda times: between(self.t, self.start, times)
         for order, ends in ((0, (least, largest)), (1, (-fastest, fastest)), (2, (-hardest, hardest))):
             step = PERIOD if order < 2 else OVER * PERIOD
-            since = at if order == 0 else at.clamp(min=self.span.begin + step)  # what came before is no part of it
-            before = _derivative(recorded, since, order, step)
-            inside = at.clamp(self.span.begin + NUDGE, self.span.end - NUDGE)  # at its ends accelerations are greatest
+            at = every if order == 0 else every[every <= end]  # then it halts, no faster or harder than it may
+            within = at if order == 0 else at.clamp(begin + step, end - step)  # neither what came before, nor the halt
+            before = _derivative(recorded, within, order, step)
+            inside = at.clamp(begin + NUDGE, end - NUDGE)  # at its ends accelerations are greatest
             more = _derivative(self.span.basis, inside if order == 2 else at, order, NUDGE)
             low, high = (ends[0] - before).clamp(max=0.0), (ends[1] - before).clamp(min=0.0)
             names = [f"{ORDERS[order]} of {label} of {self.name}" for label in self.labels] * len(at)
             parts.append((torch.kron(more, eye), low.flatten(), high.flatten(), names))
         rows, low, high, names = zip(*parts, strict=True)
-        numbers = torch.arange(len(eye))
-        group, groups = numbers.repeat(len(ORDERS) * len(at)), numbers.repeat(self.span.waypoints)
-        every = [name for own in names for name in own]
-        return Bounds(torch.cat(rows), torch.cat(low), torch.cat(high), every, group, groups)
+        numbers, told = torch.arange(len(eye)), [name for own in names for name in own]
+        group, groups = numbers.repeat(len(told) // len(eye)), numbers.repeat(self.span.waypoints)
+        return Bounds(torch.cat(rows), torch.cat(low), torch.cat(high), told, group, groups)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from torch import Tensor
 
 from ..cloth import Cloth
@@ -25,6 +26,8 @@ from .rehearsal import Rehearsal, plain
 from .staging import courses_of, doubts
 from .task import Task
 
+SAME = 1e-6  # m
+LONGEST = 60.0  # s, of a wait
 LARGE = 3.0  # times the cloth's extent: no goal of it in metres
 Believed = Cloth | Model
 
@@ -64,15 +67,19 @@ def posed(
     courses = courses_of(cloth, recording, int(asked.waypoints), asked.wait, asked.acceleration, asked.limits)
     courses = [course(c) for c in courses]
     rehearsals = [Rehearsal(m, recording, courses, asked.dt) for m in models]
-    warnings = [*doubts(recording, courses), *_check_goal(wanted, rehearsals[0])]
+    warnings = [
+        *doubts(recording, courses),
+        *_check_goal(wanted, rehearsals[0]),
+        *_renumbered(wanted, recording, cloth),
+    ]
     judge, doubt = clearance_of(recording, courses, wanted.points, asked.clearance)
     kept = None if journal is None else Journal(journal, _problem(rehearsals, wanted, courses), resume)
     return Task(rehearsals, courses, wanted, judge, kept), [*warnings, *([doubt] if doubt else [])]
 
 
 def _check(asked: Asked) -> None:
-    if not (math.isfinite(asked.wait) and asked.wait >= 0):
-        raise InvalidInput("wait", got=asked.wait, expected="seconds, 0 or more")
+    if not 0 <= asked.wait <= LONGEST:
+        raise InvalidInput("wait", got=asked.wait, expected=f"seconds, 0 to {LONGEST:g}")
     check_positive(waypoints=asked.waypoints, acceleration=asked.acceleration, clearance=asked.clearance)
     check_positive(speed=asked.limits.speed, hardest=asked.limits.acceleration)
 
@@ -101,6 +108,20 @@ def check_positive(**numbers: float) -> None:
         whole = name in ("waypoints", "iterations")
         if not math.isfinite(value) or value <= 0 or (whole and value != int(value)):
             raise InvalidInput(name, got=value, expected="a whole number > 0" if whole else "a finite value > 0")
+
+
+def _renumbered(goal: Goal, recording: Recording, cloth: Cloth) -> list[str]:
+    """A doubt about pieces by vertex, of a mesh on which grips end elsewhere than on that of the episode."""
+    own, moved = recording.cloth.uv, cloth.mesh.uv
+    if goal.vertices is None or own is None or moved is None or own.shape != moved.shape:
+        return []
+    apart = float(np.linalg.norm(moved - own, axis=-1).max())
+    if apart < SAME:
+        return []
+    return [
+        f"pieces by vertex are those of the cloth's own mesh, up to {1e3 * apart:.1f} mm from the episode's where "
+        "grips end: of the episode's mesh give its vt, or uv"
+    ]
 
 
 def _check_goal(goal: Goal, run: Rehearsal) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -118,7 +117,7 @@ def estimate_pose(
 
 def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: float, began: float) -> PoseEstimate:
     data, cloth, raw = objective.episodes[0].until(1.0), objective.cloth, found.raw
-    used = _used(data, [block.name for block in objective.blocks])
+    used = objective.used.until(1.0)
     ends = [data.times[[first, min(last, data.observed - 1)]] for first, last in objective.correction.windows]
     with torch.no_grad():
         frames, moved = objective.tangents(raw)
@@ -159,13 +158,6 @@ def _concluded(objective: Corrected, found: Smoothed, fields: Modes, gravity: fl
         warnings=warnings_of(fit, shares, seen, used, ends, _stated(objective, used), found.holds)
         + fields.doubt(len(objective.correction.modes)),
     )
-
-
-def _used(data: Episode, blocks: Sequence[str]) -> Episode:
-    """What the estimate has seen: the rest of the episode tells of its distances only."""
-    clouds = data.clouds if "points" in blocks else [cloud[:0] for cloud in data.clouds]
-    markers = data.markers if "markers" in blocks else None
-    return replace(data, clouds=clouds, markers=markers, wrenches=data.wrenches if "force" in blocks else {})
 
 
 def _distances(data: Episode, faces: Tensor, frames: Mapping[str, Tensor]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from ..errors import InvalidInput, SimulationDiverged
 from ..identification import gauss_newton
 from ..identification.blocks import Block
 from ..identification.episodes import Episode
+from ..identification.misfit import figures
 from ..identification.nuisances import AbstractNuisance
 from ..identification.objective import Objective, pushed
 from ..identification.replays import SETTLING, Frames, each, frames_of, state_along
@@ -108,6 +109,21 @@ class Corrected(Objective):
     def _like(self, episodes: Sequence[Episode], nuisances: Sequence[AbstractNuisance]) -> Corrected:
         own = self.cloth, self.unknowns, episodes[0], self.correction
         return Corrected(*own, self.dt, nuisances, self.blocks, self.floors)
+
+    @property
+    def used(self) -> Episode:
+        """The episode with what the estimate has seen: all else tells of its distances only."""
+        blocks, own = [block.name for block in self.blocks], self.episodes[0]
+        return replace(
+            own,
+            clouds=own.clouds if "points" in blocks else [cloud[:0] for cloud in own.clouds],
+            markers=own.markers if "markers" in blocks else None,
+            wrenches=own.wrenches if "force" in blocks else {},
+        )
+
+    def missed(self, raw: Tensor) -> float:
+        """m, rms distance of what was used; NaN where nothing of it was seen."""
+        return figures(self.frames(raw), [self.used], self.faces).rms
 
     def expecting(self, std: Tensor) -> None:
         """Take other standard deviations [M] m/s^2 of the force as its prior."""

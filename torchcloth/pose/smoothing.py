@@ -45,13 +45,13 @@ def smooth(objective: Corrected, tell: Tell) -> Smoothed:
     """The likeliest unknowns and their covariance, the force's size included (restricted maximum likelihood)."""
     begun, expected = _begun(objective, tell), objective.correction.std
     found = _rounds(objective, begun, tell)
-    left, noise = objective.figures(found.raw).rms, objective.floors.get("points", objective.episodes[0].noise)
+    left, noise = objective.missed(found.raw), objective.floors.get("points", objective.episodes[0].noise)
     if found.holds == len(objective.episodes[0].times) or not left > LOST * (noise or USUAL):
         return found
     first, learnt = found, objective.correction.std  # it was sought where tangents are of no use
     objective.expecting(expected)
     found = _rounds(objective, _window_by_window(objective, begun, tell), tell)
-    if objective.figures(found.raw).rms < left:
+    if objective.missed(found.raw) < left:
         return found
     objective.expecting(learnt)
     return first

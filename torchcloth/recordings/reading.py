@@ -86,7 +86,7 @@ def assemble(
         observation_noise_std=noise.maybe(noise.number, "std", least=0, most=1, suspect="millimetres"),
         clock_offset=root.maybe(root.number, "clock_offset") or 0.0,
         gravity=np.array([0.0, 0.0, -9.81]) if gravity is None else gravity,
-        air_density=air.maybe(air.number, "density", least=0, most=DENSEST_AIR, suspect="g/m^3"),
+        air_density=air.maybe(air.number, "density", above=0, most=DENSEST_AIR, suspect="g/m^3"),
         split=_split(root),
         licence=root.maybe(root.text, "licence"),
         extra=root.left(observation_noise=noise, air=air),

@@ -17,6 +17,7 @@ from .images import ImageStream, Kind
 from .types import Camera, ClothInfo, Collider, GraspInfo, RobotInfo
 
 THICKEST, THICKNESS = 0.05, 1e-3  # m; the second where nothing is said
+FRICTION = 0.4  # of a table, where nothing is said
 WIDEST_GRASP = 1.0  # m
 NOMINAL: dict[str, dict[str, Any]] = {  # bounds; far above every fabric, where a number is in another unit
     "membrane_stiffness": {"above": 0, "most": 1e9, "suspect": "another unit"},

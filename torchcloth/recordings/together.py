@@ -11,6 +11,7 @@ from zlib import crc32
 import numpy as np
 
 from ..errors import InvalidInput
+from .scene import FRICTION, THICKNESS
 from .types import Collider, GraspInfo, Recording
 
 INSIDE = 0.02  # m, that noise and a table's place may explain
@@ -66,7 +67,7 @@ _CLOTH = {
         None if (b := r.cloth.pattern_box()) is None else b[1] - b[0]
     ),
     "areal density (kg/m^2)": lambda r: r.cloth.areal_density,
-    "thickness (m)": lambda r: r.cloth.thickness,
+    "thickness (m)": lambda r: THICKNESS if r.cloth.thickness is None else r.cloth.thickness,
     "data sheet": lambda r: {name: value for name, value in sorted(r.cloth.nominal.items()) if name != "units"},
     "set of grasps": lambda r: sorted(r.grasps),
 }
@@ -126,8 +127,8 @@ def together(recordings: Sequence[Recording]) -> Recording:
             )
     for r in recordings:
         for name, table in tables.items():
-            depth = 0.0 if name in r.colliders or r.points is None else _depth(r.points.xyz, table)
-            if depth > INSIDE:
+            depths = [0.0] if name in r.colliders else [_depth(xyz, table) for xyz in _seen(r) if len(xyz)]
+            if (depth := max(depths, default=0.0)) > INSIDE:
                 raise InvalidInput(
                     "episodes",
                     got=f"cloth {depth:.3f} m inside {name!r}, which only other episodes have",
@@ -137,10 +138,20 @@ def together(recordings: Sequence[Recording]) -> Recording:
     return replace(recordings[0], colliders=tables)
 
 
+def _seen(recording: Recording) -> list[np.ndarray]:
+    """[N, 3] m each: points, and markers."""
+    streams = [stream.xyz for stream in (recording.points, recording.markers) if stream is not None]
+    return [xyz[np.isfinite(xyz).all(-1)] for xyz in streams]
+
+
 def _same(a: Collider, b: Collider) -> bool:
     """One plane, up to how well a table is measured, of one friction."""
     away = abs(float((b.point - a.point) @ a.normal))
-    return away < ALIKE and float(a.normal @ b.normal) > UPRIGHT and a.friction == b.friction
+    return away < ALIKE and float(a.normal @ b.normal) > UPRIGHT and _friction(a) == _friction(b)
+
+
+def _friction(table: Collider) -> float:
+    return FRICTION if table.friction is None else table.friction
 
 
 def _described(table: Collider) -> str:

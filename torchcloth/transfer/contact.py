@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
@@ -165,9 +166,10 @@ class Contact:
                 remedy="refine the mesh, or give the grid's spacing in metres",
             )
         needed = max(1, int(np.ceil(edge / (SPARSEST * spacing))))
-        s = needed if self.subdivisions is None else int(self.subdivisions)
-        if self.subdivisions is not None and s != self.subdivisions:
+        s = needed if self.subdivisions is None else self.subdivisions
+        if not isinstance(s, Real) or s % 1 != 0:
             raise InvalidInput("contact subdivisions", got=self.subdivisions, expected="a whole number")
+        s = int(s)
         if s > MOST:
             raise InvalidInput("contact subdivisions", got=s, expected=f"at most {MOST}")
         if s < needed:

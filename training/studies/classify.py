@@ -107,10 +107,10 @@ def _squared(trial: Trial, others: Sequence[Trial]) -> float | None:
         return None
     places, errors = np.stack([t.place for t in others]), np.stack([t.error for t in others])
     spread = np.atleast_2d(np.cov(places.T, ddof=1))
-    beyond = _positive(spread - np.diag((errors**2).mean(0)))
-    own = np.diag(trial.error**2)
+    own, theirs = np.diag(trial.error**2), np.diag((errors**2).mean(0))
+    beyond = _positive(spread - theirs)
     off = trial.place - places.mean(0)
-    return float(off @ np.linalg.solve(own + beyond + (own + beyond) / len(others), off))
+    return float(off @ np.linalg.solve(own + beyond + (theirs + beyond) / len(others), off))
 
 
 def _positive(matrix: np.ndarray) -> np.ndarray:
