@@ -206,6 +206,7 @@ def call(*arguments):
     )
 
 
+@pytest.mark.slow
 def test_the_command_says_one_object(tmp_path):
     done = call("--fast", "--json", "--threads", 1, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr

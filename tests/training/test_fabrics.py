@@ -40,6 +40,7 @@ def _captured(patch, arguments):
 # -- the run ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_stretching_finds_stiffness_and_contraction(study):
     result = json.loads((study[0] / "fabrics.json").read_text())
     for name in FAST.fabrics:
@@ -51,6 +52,7 @@ def test_stretching_finds_stiffness_and_contraction(study):
     assert result["fabrics"]["cotton"]["E"]["truth"] == pytest.approx(609.02e3)  # the paper's table
 
 
+@pytest.mark.slow
 def test_a_stretched_sheet_says_nothing_of_k_and_gamma_and_the_press_does(study):
     result = json.loads((study[0] / "fabrics.json").read_text())
     for name in FAST.fabrics:
@@ -64,6 +66,7 @@ def test_a_stretched_sheet_says_nothing_of_k_and_gamma_and_the_press_does(study)
         assert abs(result["fabrics"][name]["k"]["elsewhere"]["error"]) > 0.1  # the grid's part in it, and it is said
 
 
+@pytest.mark.slow
 def test_tables_pictures_and_the_papers_numbers_are_there(study):
     folder, said = study
     assert "not identifiable" in said["fabrics"]
@@ -74,6 +77,7 @@ def test_tables_pictures_and_the_papers_numbers_are_there(study):
         assert (folder / picture).stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_fabrics_are_told_apart_from_the_same_trials(study):
     result = json.loads((study[0] / "classify.json").read_text())["sets"]
     assert result["E and ν"]["right"] == result["E and ν"]["trials"] == 6

@@ -227,6 +227,7 @@ def test_a_joint_fit_takes_what_is_held_alike_and_calm(solved, tmp_path, monkeyp
     assert "3 episodes" in printed
 
 
+@pytest.mark.slow
 def test_two_manipulations_can_be_fitted_at_once():
     together = cases.solve_together(SMALL, [manipulations("dress")[i] for i in (2, 6)])  # both held lower
     assert set(together["found"]) == {*cases.SOUGHT, *cases.FREE}
