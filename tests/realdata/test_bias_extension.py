@@ -42,7 +42,7 @@ def test_one_modulus_fails_at_both_ends(table, shear):
     """G h = 25 N/m, fitted up to 40 degrees: within 20 % from 16 to 58 degrees, half at 8, a third too much past 66."""
     force, stiffness, std = computed(table, shear, 40)
     assert stiffness == pytest.approx(24.7, abs=2)
-    assert std < 0.15 * stiffness
+    assert std < 0.2 * stiffness  # of a law that misses the curve at both ends; a quarter is no estimate
     ratio = force / table.force
     assert np.abs(ratio[(shear > 15.5) & (shear < 58)] - 1).max() < 0.2
     assert (ratio[shear < 8] < 0.6).all(), "friction at the crossings, about 1 N, has no place in an elastic law"

@@ -16,7 +16,8 @@ MISLED = 0.1, 4  # gains below it, so many in a row, show tangents that say noth
 TRUSTED = 0.1  # error of the predicted decrease up to which an updated Jacobian is good enough
 GATE = 5.0  # standard deviations
 NORMAL = 1.95996  # the 97.5 % quantile
-WINDOW = 5  # frames within which residuals of one patch count as one observation
+WINDOW, PACE = 5, 30.0  # frames, at so many a second, within which residuals of one patch count as one observation
+MANY = 10**6  # degrees of freedom, beyond which Student's distribution is the normal one
 FEW = 12  # residuals, of which the median says little of their scatter
 
 
@@ -31,11 +32,17 @@ class Linearised(NamedTuple):
     block: Tensor | None = None  # [R] int64, kind of data: each has noise of its own. None: all alike
     wobble: Tensor | None = None  # [R] variance of one simulation's value, of slopes by regression; None: exact ones
     blur: Tensor | None = None  # [K, K] covariance of such slopes, for each unit of ``wobble``
+    moment: Tensor | None = None  # [R] int64, the same for frames that are nearer than 1 / PACE s. None: the frame
 
     @property
     def kind(self) -> Tensor:
         """[R] the block of every row."""
         return torch.zeros_like(self.frame) if self.block is None else self.block
+
+    @property
+    def when(self) -> Tensor:
+        """[R] the moment of every row: errors last for a time, whatever the rate of frames."""
+        return self.frame if self.moment is None else self.moment
 
 
 class Problem(NamedTuple):
@@ -207,7 +214,7 @@ def _independent_share(linear: Linearised, scale: Tensor, gate: Tensor) -> Tenso
 
 def _groups(linear: Linearised) -> Tensor:
     """[R], equal for what errs together."""
-    return (linear.frame // WINDOW) * (int(linear.patch.max()) + 1) + linear.patch
+    return (linear.when // WINDOW) * (int(linear.patch.max()) + 1) + linear.patch
 
 
 def cost(problem: Problem, at: Iterate, raw: Tensor, value: Tensor) -> float:
@@ -273,24 +280,40 @@ def covariance(problem: Problem, at: Iterate) -> Tensor:
     rows, groups = _left(problem, at)
     share = _independent_share(at.linear, at.scale, at.gate) if problem.scales is None else at.share
     share = torch.minimum(share * groups, rows)
-    counted = float((share[at.linear.kind] * at.linear.factor)[at.influence()[0] > 0].sum())
-    wide = student(max(2, round(counted))) / NORMAL
-    at = at._replace(share=share / wide**2)
+    at = at._replace(share=share)
     inverse = torch.linalg.inv(information(problem, at))
-    weight = at.influence()[0] * wide / groups.sqrt()[at.linear.kind]
+    weight = at.influence()[0] / groups.sqrt()[at.linear.kind]
     scores = (weight * at.linear.value)[:, None] * at.linear.jacobian
-    count = int(at.linear.frame.max()) + 1
-    summed = torch.zeros(count, scores.shape[1], dtype=scores.dtype).index_add(0, at.linear.frame, scores)
+    count = int(at.linear.when.max()) + 1
+    summed = torch.zeros(count, scores.shape[1], dtype=scores.dtype).index_add(0, at.linear.when, scores)
     summed = summed[summed.abs().sum(1) > 0]
     meat = _long_run(summed) * len(summed) / max(1, len(summed) - 1)
     robust = inverse @ (meat + problem.precision) @ inverse
-    return at_least(robust, inverse.diagonal())
+    wide = torch.tensor([student(n) / NORMAL if n < MANY else 1.0 for n in _freedom(problem, at, inverse)]).to(robust)
+    return at_least(robust, inverse.diagonal()) * wide[:, None] * wide
+
+
+def _freedom(problem: Problem, at: Iterate, inverse: Tensor) -> list[int]:
+    """[K] degrees of freedom of each variance, whose parts are of several kinds of data (Satterthwaite 1946).
+
+    A parameter of which six readings tell is known as six readings are, however many of other things there are beside.
+    What the prior tells is exact.
+    """
+    weight, kind = at.influence()[0], at.linear.kind
+    counted = (at.rows[1] * (weight > 0)).double()
+    squares = torch.zeros(len(inverse), dtype=inverse.dtype)
+    for b in kind.unique().tolist():
+        own = kind == b
+        told = (weight[own, None] * at.linear.jacobian[own]).mT @ at.linear.jacobian[own]
+        squares += (inverse @ told @ inverse).diagonal().square() / counted[own].sum().clamp(min=1)
+    freedom = inverse.diagonal().square() / squares.clamp(min=1e-300)
+    return [max(2, round(n)) for n in freedom.clamp(max=MANY).tolist()]
 
 
 def _seen(linear: Linearised) -> Linearised:
     """Without rows of what was not seen, which are zero and have no slopes: no observations, however many they are."""
     seen = (linear.value != 0) | (linear.jacobian != 0).any(1)
-    rows = ("value", "jacobian", "factor", "frame", "patch", "block", "wobble")
+    rows = ("value", "jacobian", "factor", "frame", "patch", "block", "wobble", "moment")
     own = {name: row[seen] for name in rows if (row := getattr(linear, name)) is not None}
     return linear._replace(**own) if bool(seen.any()) else linear
 

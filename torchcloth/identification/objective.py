@@ -304,13 +304,14 @@ class Objective:
 
     def _rows(self, both: Sequence[tuple[Frames, Frames | None]]) -> gauss_newton.Linearised:
         parts: list[tuple[int, int, Rows]] = []
-        first = 0
+        first, strides = 0, []
         for (frames, moved), episode in zip(both, self.episodes, strict=True):
             scene = scene_of(frames, moved, episode, self.sheet)
             for b, block in enumerate(self.blocks):
                 rows = block.rows(scene)
                 if rows is not None:
                     parts.append((b, first, rows))
+                    strides.append(_stride(episode.times))
             first += len(episode.times) + gauss_newton.WINDOW  # windows do not reach across episodes
         if not parts:
             asked = ", ".join(block.name for block in self.blocks)
@@ -329,7 +330,15 @@ class Objective:
             frame=torch.cat([r.frame + offset for _, offset, r in parts]),
             patch=torch.cat([r.patch for *_, r in parts]),
             block=torch.cat([torch.full((len(r.value),), b) for b, _, r in parts]),
+            moment=torch.cat(
+                [r.frame // stride + offset for (_, offset, r), stride in zip(parts, strides, strict=True)]
+            ),
         )
+
+
+def _stride(times: Tensor) -> int:
+    """Frames in 1 / PACE s."""
+    return 1 if len(times) < 2 else max(1, round(1 / (gauss_newton.PACE * float(times.diff().median()))))
 
 
 def pushed(p: Placed, frames: Frames, moved: Frames, raw: Tensor, episode: Episode) -> tuple[Frames, Frames]:
