@@ -35,6 +35,10 @@ from .search import Progress, Search
 from .unknowns import DECADE, needs_contact
 
 NO_ERROR = "no error: gradient method"
+CONVENTION = (
+    "SI units. values: one for each triangle of the cloth's mesh, in its order; they are the likeliest under a prior of "
+    "smoothness, in which they vary by a factor of e^contrast from side to side. chamfer, rms: as in identification.json."
+)
 CONTRAST = 1.0
 FARTHEST = 2 * DECADE  # of a value from its start, unconstrained
 RESULT = "fields.json"
@@ -69,6 +73,7 @@ class FieldFit:
             "fields": {name: {"values": value.tolist(), "std": NO_ERROR} for name, value in self.fields.items()},
             "contrast": self.contrast,
             "fit": {name: or_none(value) for name, value in self.fit.items()},
+            "convention": CONVENTION,
             "warnings": self.warnings,
             "history": [{name: or_none(value) for name, value in entry.items()} for entry in self.history],
         }
