@@ -37,7 +37,8 @@ from .unknowns import DECADE, needs_contact
 NO_ERROR = "no error: gradient method"
 CONVENTION = (
     "SI units. values: one for each triangle of the cloth's mesh, in its order: the likeliest under a prior of "
-    "smoothness, in which they vary by a factor of e^contrast from side to side. chamfer, rms: as in identification.json."
+    "smoothness, in which they vary by a factor of e^contrast from side to side. chamfer, rms: as in "
+    "identification.json."
 )
 CONTRAST = 1.0
 FARTHEST = 2 * DECADE  # of a value from its start, unconstrained
