@@ -190,10 +190,10 @@ def test_distance_is_mahalanobis_with_the_trials_own_error_and_the_spread_beyond
     places = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0], [2.0, 2.0]])
     others = [classify.Trial("a", p, np.zeros(2)) for p in places]
     trial = classify.Trial("a", np.array([4.0, 1.0]), np.array([0.5, 0.5]))
-    variance = (4 / 3 + 0.25) * (1 + 1 / 4)
+    variance = (4 / 3 + 0.25) + 4 / 3 / 4  # a trial's, and of the mean of four that are exact
     assert classify._squared(trial, others) == pytest.approx(9.0 / variance)
     noisy = [other._replace(error=np.array([5.0, 5.0])) for other in others]
-    assert classify._squared(trial, noisy) == pytest.approx(9.0 / (0.25 * 1.25))
+    assert classify._squared(trial, noisy) == pytest.approx(9.0 / (0.25 + 5.0**2 / 4))  # all of their spread is error
     assert classify._squared(trial, others[:1]) is None
 
 
