@@ -62,7 +62,7 @@ def load(
         MissingDependency: pytorch-kinematics is not installed.
     """
     path, shipped = locate(name_or_path), str(name_or_path) in models()
-    model = str(name_or_path) if shipped else str(Path(path).resolve())  # elsewhere a path from here may be another's
+    model = str(name_or_path) if shipped else str(path.resolve())  # elsewhere a path from here may be another's
     home = RIZON_HOME if shipped else None
     return Arm(describe(path, frame), model=model, frame=frame, base=base, home=home, dtype=dtype)
 

@@ -257,32 +257,6 @@ def test_half_precision_is_refused(dtype):
             cloth(cloth.rest_state(), times=(0.0, 1e-3))
 
 
-def test_contact_is_kept_as_it_was_made():
-    """What simulates is its grid: another value would be believed by fits alone."""
-    cloth = sheet(contact=tc.Contact())
-    with pytest.raises(AttributeError):
-        cloth.contact = None
-    assert cloth.contact == tc.Contact()
-
-
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda: sheet().state(None), r"x; got None; expected a tensor or an array"),
-        (lambda: sheet().state([[1.0], [1.0, 2.0]]), r"x; got .*; expected a tensor or an array"),
-        (lambda: sheet()(sheet().rest_state(), {1: 0, "hand": 0}), r"motion; got trajectories for"),
-        (lambda: tc.boundaries.Sphere(torch.ones(2)), r"radius; got shape \(2,\); expected a scalar or \[B, 1\]"),
-        (lambda: tc.boundaries.Box((1.0, 1.0, 1.0), pose="x"), r"pose; got"),
-        (lambda: tc.materials.AEP(1e5, thickness=torch.full((18,), 1e-3)), r"thickness; got"),
-        (lambda: sheet(contact=tc.Contact(subdivisions=math.nan)), r"contact subdivisions; got nan"),
-        (lambda: tc.effects.ResidualForce(["drag"]), r"terms; got \['drag'\]; expected a dict"),
-    ],
-)
-def test_what_is_no_part_is_one_line(make, said):
-    with pytest.raises(InvalidInput, match=said):
-        make()
-
-
 @pytest.mark.parametrize("duration", [0.0, -1.0, math.nan])
 def test_refuses_to_settle_for_no_time(duration):
     cloth = sheet()

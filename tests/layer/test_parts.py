@@ -249,3 +249,29 @@ def test_scenes_differ_in_a_users_own_coefficients(kind):
     found = cloth(cloth.state(cloth.rest_state().x, v), times=(0.0, 0.01)).x
     assert found.shape == (2, 2, 16, 3)
     assert not torch.equal(found[0], found[1])
+
+
+def test_contact_is_kept_as_it_was_made():
+    """What simulates is its grid: another value would be believed by fits alone."""
+    cloth = sheet(contact=tc.Contact())
+    with pytest.raises(AttributeError):
+        cloth.contact = None
+    assert cloth.contact == tc.Contact()
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: sheet().state(None), r"x; got None; expected a tensor or an array"),
+        (lambda: sheet().state([[1.0], [1.0, 2.0]]), r"x; got .*; expected a tensor or an array"),
+        (lambda: sheet()(sheet().rest_state(), {1: 0, "hand": 0}), r"motion; got trajectories for"),
+        (lambda: tc.boundaries.Sphere(torch.ones(2)), r"radius; got shape \(2,\); expected a scalar or \[B, 1\]"),
+        (lambda: tc.boundaries.Box((1.0, 1.0, 1.0), pose="x"), r"pose; got"),
+        (lambda: tc.materials.AEP(1e5, thickness=torch.full((18,), 1e-3)), r"thickness; got"),
+        (lambda: sheet(contact=tc.Contact(subdivisions=float("nan"))), r"contact subdivisions; got nan"),
+        (lambda: tc.effects.ResidualForce(["drag"]), r"terms; got \['drag'\]; expected a dict"),
+    ],
+)
+def test_what_is_no_part_is_one_line(make, said):
+    with pytest.raises(InvalidInput, match=said):
+        make()

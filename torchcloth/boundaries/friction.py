@@ -25,8 +25,7 @@ class Coulomb(PhysicalParameter):
 
     def __init__(self, friction: float | Tensor) -> None:
         super().__init__(friction, "-", "nonnegative", name="friction")
-        if self.raw.ndim and self.raw.shape[-1] != 1:
-            raise InvalidInput("friction", got=f"shape {tuple(self.raw.shape)}", expected="a scalar or [B, 1]")
+        check_scalar("friction", self)
 
     def taken(self, slip: Tensor, push: Tensor) -> Tensor:
         """Share of the slip that is lost [..., N, 1]; 1 where the surfaces stick.
@@ -99,6 +98,12 @@ class Elliptic(Coulomb):
     def _size(self, slip: Tensor) -> Tensor:
         across = slip - dot(slip, self.axis) * self.axis
         return safe_norm(slip + (1 / per_point(self.ratio.value) - 1) * across)
+
+
+def check_scalar(name: str, parameter: PhysicalParameter) -> None:
+    """Refuse what is not one number of a body, or of each of a batch."""
+    if parameter.raw.ndim and parameter.raw.shape[-1] != 1:
+        raise InvalidInput(name, got=f"shape {tuple(parameter.raw.shape)}", expected="a scalar or [B, 1]")
 
 
 def per_point(value: Tensor) -> Tensor:

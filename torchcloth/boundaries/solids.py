@@ -13,7 +13,7 @@ from .._vectors import place
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from .collider import AbstractCollider, Options
-from .friction import Coulomb, per_point
+from .friction import Coulomb, check_scalar, per_point
 
 
 class Sphere(AbstractCollider):
@@ -37,7 +37,8 @@ class Sphere(AbstractCollider):
         **options: Unpack[Options],
     ) -> None:
         super().__init__(friction, **options)
-        self.radius = _radius(radius)
+        self.radius = PhysicalParameter(radius, "m", name="radius")
+        check_scalar("radius", self.radius)
         self.register_buffer("centre", place("centre", centre), persistent=False)
         self.register_buffer("up", place("up", (0.0, 0.0, 1.0)), persistent=False)
         self.centre: Tensor
@@ -94,7 +95,8 @@ class _Axial(AbstractCollider):
         a, b = place("start", start), place("end", end)
         if not float((b - a).norm()) > 0:
             raise InvalidInput("axis", got=f"from {start} to {end}", expected="two different points")
-        self.radius = _radius(radius)
+        self.radius = PhysicalParameter(radius, "m", name="radius")
+        check_scalar("radius", self.radius)
         self.register_buffer("start", a, persistent=False)
         self.register_buffer("end", b, persistent=False)
         aside = cross(b - a, torch.eye(3).to(a)[(b - a).abs().argmin()])
@@ -151,13 +153,6 @@ class Cylinder(_Axial):
         distance, part = _beyond(torch.cat(gaps, dim=-1))
         side, top = part.split(1, dim=-1)
         return distance, side * outwards + torch.where(height < 0, -top, top) * axis
-
-
-def _radius(given: float | Tensor) -> PhysicalParameter:
-    own = PhysicalParameter(given, "m", name="radius")
-    if own.raw.ndim and own.raw.shape[-1] != 1:
-        raise InvalidInput("radius", got=f"shape {tuple(own.raw.shape)}", expected="a scalar or [B, 1]")
-    return own
 
 
 def _polar(q: Tensor, fallback: Tensor) -> tuple[Tensor, Tensor]:

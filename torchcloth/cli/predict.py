@@ -54,9 +54,9 @@ def _predict(options: argparse.Namespace) -> int:
     out = folder / "prediction" if options.out is None else options.out
     if options.seen is not None:
         check_apart(out, options.seen)
+        if not options.seen.exists():
+            raise InvalidInput("SEEN", got=options.seen, expected="a folder that exists")
     check_folder(out)
-    if options.seen is not None and not options.seen.exists():
-        raise InvalidInput("SEEN", got=options.seen, expected="a folder that exists")
     given = any(getattr(options, name) is not None for name in STRIP)
     of_strip = given or (options.seen is not None and (options.seen / TABLE).is_file())
     if options.fit.suffix == ".tcm" and not of_strip:

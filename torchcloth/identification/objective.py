@@ -303,15 +303,14 @@ class Objective:
         return 0.0, []
 
     def _rows(self, both: Sequence[tuple[Frames, Frames | None]]) -> gauss_newton.Linearised:
-        parts: list[tuple[int, int, Rows]] = []
-        first, strides = 0, []
+        parts: list[tuple[int, int, int, Rows]] = []
+        first = 0
         for (frames, moved), episode in zip(both, self.episodes, strict=True):
             scene = scene_of(frames, moved, episode, self.sheet)
             for b, block in enumerate(self.blocks):
                 rows = block.rows(scene)
                 if rows is not None:
-                    parts.append((b, first, rows))
-                    strides.append(_stride(episode.times))
+                    parts.append((b, first, _stride(episode.times), rows))
             first += len(episode.times) + gauss_newton.WINDOW  # windows do not reach across episodes
         if not parts:
             asked = ", ".join(block.name for block in self.blocks)
@@ -327,12 +326,10 @@ class Objective:
             value=value,
             jacobian=jacobian,
             factor=torch.ones_like(value),
-            frame=torch.cat([r.frame + offset for _, offset, r in parts]),
+            frame=torch.cat([r.frame + offset for _, offset, _, r in parts]),
             patch=torch.cat([r.patch for *_, r in parts]),
-            block=torch.cat([torch.full((len(r.value),), b) for b, _, r in parts]),
-            moment=torch.cat(
-                [r.frame // stride + offset for (_, offset, r), stride in zip(parts, strides, strict=True)]
-            ),
+            block=torch.cat([torch.full((len(r.value),), b) for b, *_, r in parts]),
+            moment=torch.cat([r.frame // stride + offset for _, offset, stride, r in parts]),
         )
 
 

@@ -52,12 +52,16 @@ def each_once(recordings: Sequence[Recording]) -> None:
             known.append((own, every))
 
 
+def positions(recording: Recording) -> list[np.ndarray]:
+    """[N, 3] m each: points, and markers where they were seen."""
+    streams = [stream.xyz for stream in (recording.points, recording.markers) if stream is not None]
+    return [xyz[np.isfinite(xyz).all(-1)] for xyz in streams]
+
+
 def _seen(recording: Recording) -> tuple[int, np.ndarray]:
     """Frames, and all that was seen in them [N, 3] m; else the forces [N, 3] N."""
-    points, markers = recording.points, recording.markers
-    seen = [] if points is None else [points.xyz]
-    seen += [] if markers is None else [markers.xyz[np.isfinite(markers.xyz).all(-1)]]
-    frames = sum(len(stream.t) for stream in (points, markers) if stream is not None)
+    seen = positions(recording)
+    frames = sum(len(stream.t) for stream in (recording.points, recording.markers) if stream is not None)
     if not seen:
         motions = (*recording.grippers.values(), *recording.joints.values())
         seen = [motion.force for motion in motions if motion.force is not None]

@@ -11,6 +11,7 @@ from zlib import crc32
 import numpy as np
 
 from ..errors import InvalidInput
+from .marks import positions
 from .scene import FRICTION, THICKNESS
 from .types import Collider, GraspInfo, Recording
 
@@ -127,7 +128,7 @@ def together(recordings: Sequence[Recording]) -> Recording:
             )
     for r in recordings:
         for name, table in tables.items():
-            depths = [0.0] if name in r.colliders else [_depth(xyz, table) for xyz in _seen(r) if len(xyz)]
+            depths = [0.0] if name in r.colliders else [_depth(xyz, table) for xyz in positions(r) if len(xyz)]
             if (depth := max(depths, default=0.0)) > INSIDE:
                 raise InvalidInput(
                     "episodes",
@@ -136,12 +137,6 @@ def together(recordings: Sequence[Recording]) -> Recording:
                     remedy="take episodes with and without it apart, or name it in every episode.json",
                 )
     return replace(recordings[0], colliders=tables)
-
-
-def _seen(recording: Recording) -> list[np.ndarray]:
-    """[N, 3] m each: points, and markers."""
-    streams = [stream.xyz for stream in (recording.points, recording.markers) if stream is not None]
-    return [xyz[np.isfinite(xyz).all(-1)] for xyz in streams]
 
 
 def _same(a: Collider, b: Collider) -> bool:
