@@ -155,7 +155,10 @@ class Arm(nn.Module):
         Raises:
             InvalidInput: the last dimension of ``q`` is not J, or ``q`` is not floating.
         """
-        return self._bodies(q)[..., -1, :, :] @ self._tip
+        return self._tips(self._bodies(q))
+
+    def _tips(self, bodies: Tensor) -> Tensor:
+        return bodies[..., -1, :, :] @ self._tip
 
     def _bodies(self, q: Tensor) -> Tensor:
         """Poses ``[..., J + 1, 4, 4]`` of the root and of the body behind each joint, in the world."""
@@ -177,8 +180,10 @@ class Arm(nn.Module):
         Returns:
             ``[..., 6, J]``: linear velocity (m/s) above angular velocity (rad/s), for each unit of joint velocity.
         """
-        bodies = self._bodies(q)
-        tip = (bodies[..., -1, :, :] @ self._tip)[..., None, :3, 3]
+        return self._jacobian(self._bodies(q))
+
+    def _jacobian(self, bodies: Tensor) -> Tensor:
+        tip = self._tips(bodies)[..., None, :3, 3]
         joint = bodies[..., 1:, :, :]
         axis = (joint[..., :3, :3] @ self._axis[..., None])[..., 0]
         slides = self._prismatic[:, None]
@@ -266,7 +271,9 @@ class Arm(nn.Module):
         start = self.home if q0 is None else self._posture("q0", q0)
         target = start if reference is None else self._posture("reference", reference)
         poses = pose.reshape(-1, 4, 4)
-        q = inverse.solve(self, poses, start, target, self._limits[2:4], tolerance, iterations)
+        (q,) = inverse.solve(self, poses[None], start[None], target[None], tolerance, iterations)
+        if isinstance(q, Exception):
+            raise q
         return q.reshape(*pose.shape[:-2], -1)
 
     @undisturbed()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchcloth._surroundings import undisturbed
 from torchcloth.errors import InvalidInput
 
 from .rigid import twist
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 
 LARGEST_STEP = 0.3  # rad or m in one iteration: the Jacobian is trusted no further
 RESTARTS = 20  # random postures for the first pose of a sequence; later poses must stay on its branch
+AT_ONCE = 4  # of these, side by side
+RANK = 1e-4  # singular values smaller than this share of the largest move nothing
 SEED = 0  # the same poses give the same joints
 
 
@@ -25,25 +28,39 @@ class Unreachable(InvalidInput):
     pose = 0
 
 
+@undisturbed()
 @torch.no_grad()
 def solve(
-    arm: Arm, poses: Tensor, q0: Tensor, reference: Tensor, limit: Tensor, tolerance: float, iterations: int
-) -> Tensor:
-    """Joint positions ``[K, J]`` for ``poses [K, 4, 4]``, each one started from the one before."""
-    solved: list[Tensor] = []
-    q = q0
-    for index, target in enumerate(poses):
-        tries = [q] if solved else [q, *_random_postures(q0, limit)]
-        attempts = []
-        for start in tries:
-            attempts.append(_approach(arm, target, start, reference, limit, tolerance, iterations))
-            if attempts[-1][1] < tolerance:
+    arm: Arm, poses: Tensor, q0: Tensor, reference: Tensor, tolerance: float, iterations: int
+) -> list[Tensor | Unreachable]:
+    """For each of the paths ``poses [B, K, 4, 4]`` joint positions ``[K, J]``, or its first pose without any.
+
+    Each pose is started from the one before, the first from ``q0 [B, J]``. Paths go on side by side and know nothing of
+    each other.
+    """
+    limit = arm._limits[2:4]
+    solved = q0[:, None].expand(*poses.shape[:2], -1).clone()
+    lost: dict[int, Unreachable] = {}
+    going, q = torch.arange(len(poses), device=q0.device), q0
+    for index in range(poses.shape[1]):
+        target, drawn_to = poses[going, index], reference[going]
+        q, error = _approach(arm, target, q, drawn_to, limit, tolerance, iterations)
+        astray = (~(error < tolerance)).nonzero()[:, 0]
+        for starts in _random_postures(q0[0], limit).split(AT_ONCE) if index == 0 else ():
+            if not len(astray):
                 break
-        q, error = min(attempts, key=lambda attempt: attempt[1])
-        if error >= tolerance:
-            raise _unreached(arm, index, target, q, limit)
-        solved.append(q)
-    return torch.stack(solved)
+            again = _from_elsewhere(arm, target[astray], starts, drawn_to[astray], limit, tolerance, iterations)
+            closer = again[1] < error[astray]
+            q[astray[closer]], error[astray[closer]] = again[0][closer], again[1][closer]
+            astray = (~(error < tolerance)).nonzero()[:, 0]
+        for k in astray.tolist():
+            lost[int(going[k])] = _unreached(arm, index, target[k], q[k], limit)
+        kept = error < tolerance
+        going, q = going[kept], q[kept]
+        solved[going, index] = q
+        if not len(going):
+            break
+    return [lost.get(k, joints) for k, joints in enumerate(solved)]
 
 
 @torch.no_grad()
@@ -64,48 +81,73 @@ def reach(arm: Arm) -> tuple[Tensor, float]:
 
 def _approach(
     arm: Arm, target: Tensor, q: Tensor, reference: Tensor, limit: Tensor, tolerance: float, iterations: int
-) -> tuple[Tensor, float]:
-    """The posture reached from ``q`` and what is left of its error (m and rad in one norm)."""
+) -> tuple[Tensor, Tensor]:
+    """Postures ``[N, J]`` reached from ``q [N, J]``, and what is left of their errors ``[N]`` (m, rad in one norm)."""
     q = q.clamp(*limit)
-    for _ in range(iterations):
-        error = twist(arm(q), target)
-        if error.norm() < tolerance:
+    left = torch.empty_like(q[:, 0])
+    going = torch.arange(len(q), device=q.device)
+    for remaining in range(iterations, -1, -1):
+        bodies = arm._bodies(q[going])
+        error = twist(arm._tips(bodies), target[going])
+        left[going] = error.norm(dim=-1)
+        far = left[going] >= tolerance
+        going = going[far]
+        if not remaining or not len(going):
             break
-        step = _step(arm.jacobian(q), error, q, reference, limit)
-        q = (q + step * (LARGEST_STEP / step.abs().max().clamp(min=LARGEST_STEP))).clamp(*limit)
-    return q, float(twist(arm(q), target).norm())
+        step = _step(arm._jacobian(bodies[far]), error[far], q[going], reference[going], limit)
+        longest = step.abs().amax(-1, keepdim=True)
+        q[going] = (q[going] + step * (LARGEST_STEP / longest.clamp(min=LARGEST_STEP))).clamp(*limit)
+    return q, left
+
+
+def _from_elsewhere(
+    arm: Arm, target: Tensor, starts: Tensor, reference: Tensor, limit: Tensor, tolerance: float, iterations: int
+) -> tuple[Tensor, Tensor]:
+    """What ``_approach`` finds from the first of the starts ``[S, J]`` that leads there, or comes closest."""
+    n, each = len(target), len(starts)
+    target, reference = (x.repeat_interleave(each, 0) for x in (target, reference))
+    q, error = _approach(arm, target, starts.repeat(n, 1), reference, limit, tolerance, iterations)
+    q, error = q.unflatten(0, (n, each)), error.unflatten(0, (n, each))
+    reached = error < tolerance
+    best = torch.where(reached.any(1), reached.int().argmax(1), error.argmin(1))
+    every = torch.arange(n, device=best.device)
+    return q[every, best], error[every, best]
 
 
 def _step(jacobian: Tensor, error: Tensor, q: Tensor, reference: Tensor, limit: Tensor) -> Tensor:
-    """One damped step that leaves out the joints which would leave their range.
+    """One damped step ``[N, J]`` that leaves out the joints which would leave their range.
 
     The damping is half the squared error (Sugihara 2011): robust from afar, Newton's method close by. The pull to the
     reference lies in the null space and fades with the error too, so the posture depends on the path and not on how
     finely it is cut.
     """
-    size = error.norm()
-    damping = (0.5 * size**2 + torch.finfo(q.dtype).eps) * torch.eye(6, dtype=q.dtype, device=q.device)
+    size = error.norm(dim=-1, keepdim=True)
+    damping = 0.5 * size**2 + torch.finfo(q.dtype).eps
+    pull = size.clamp(max=0.5) * (reference - q)
     free = torch.ones_like(q)
     step = torch.zeros_like(q)
-    for _ in range(len(q)):
-        j = jacobian * free
-        pull = free * size.clamp(max=0.5) * (reference - q)
-        step = j.mT @ torch.linalg.solve(j @ j.mT + damping, error)
-        step = step + pull - torch.linalg.pinv(j, rtol=1e-4) @ (j @ pull)
+    todo = torch.arange(len(q), device=q.device)
+    for _ in range(q.shape[1]):
+        left, s, right = torch.linalg.svd(jacobian[todo] * free[todo, None], full_matrices=False)
+        wanted = s / (s**2 + damping[todo]) * (left.mT @ error[todo, :, None])[..., 0]
+        drawn = free[todo] * pull[todo]
+        moving = (right @ drawn[..., None])[..., 0] * (s > RANK * s[:, :1])
+        step[todo] = drawn + free[todo] * ((wanted - moving)[:, None] @ right)[:, 0]
         blocked = ((q <= limit[0]) & (step < 0)) | ((q >= limit[1]) & (step > 0))
-        if not bool(blocked.any()):
+        todo = blocked.any(-1).nonzero()[:, 0]
+        if not len(todo):
             break
         free = free * ~blocked
         step = step * free
     return step
 
 
-def _random_postures(q0: Tensor, limit: Tensor) -> list[Tensor]:
-    """Starting points inside the limits; a joint without limits turns within +- pi."""
+def _random_postures(q0: Tensor, limit: Tensor) -> Tensor:
+    """Starting points ``[RESTARTS, J]`` inside the limits; a joint without limits turns within +- pi."""
     generator = torch.Generator().manual_seed(SEED)
     lower, upper = limit.clamp(-torch.pi, torch.pi)
     draws = torch.rand(RESTARTS, len(q0), generator=generator, dtype=torch.float64).to(q0)
-    return list(lower + draws * (upper - lower))
+    return lower + draws * (upper - lower)
 
 
 def _unreached(arm: Arm, index: int, target: Tensor, q: Tensor, limit: Tensor) -> Unreachable:

@@ -45,21 +45,21 @@ def joint_modes(origin: Tensor, axis: Tensor, prismatic: Tensor) -> Tensor:
 
 
 def twist(pose: Tensor, target: Tensor) -> Tensor:
-    """``[6]`` m and rad: the motion in world axes that takes ``pose`` to ``target``."""
-    turn = target[:3, :3] @ pose[:3, :3].mT
-    sine = 0.5 * torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    cosine = 0.5 * (turn.trace() - 1)
-    length = sine.norm()
+    """``[..., 6]`` m and rad: the motion in world axes that takes ``pose [..., 4, 4]`` to ``target``."""
+    turn = target[..., :3, :3] @ pose[..., :3, :3].mT
+    odd = 0.5 * (turn - turn.mT)
+    sine = torch.stack([odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]], dim=-1)
+    cosine = 0.5 * (turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1)
+    length = sine.norm(dim=-1, keepdim=True)
     angle = torch.atan2(length, cosine)
-    if length > 1e-6:
-        rotation = sine * (angle / length)
-    elif cosine > 0:
-        rotation = sine
-    else:  # half a turn: the sine vanishes and any column of turn + I shows the axis
-        column = (turn + torch.eye(3, dtype=turn.dtype, device=turn.device)).T
-        axis = column[column.norm(dim=-1).argmax()]
-        rotation = axis / axis.norm() * angle
-    return torch.cat([target[:3, 3] - pose[:3, 3], rotation])
+    little = length <= 1e-6
+    rotation = sine * torch.where(little, 1.0, angle / length)
+    half = (little & (cosine <= 0))[..., 0]
+    if bool(half.any()):  # half a turn: the sine vanishes and any column of turn + I shows the axis
+        column = (turn[half] + torch.eye(3, dtype=turn.dtype, device=turn.device)).mT
+        axis = column[torch.arange(len(column)), column.norm(dim=-1).argmax(-1)]
+        rotation[half] = axis / axis.norm(dim=-1, keepdim=True) * angle[half]
+    return torch.cat([target[..., :3, 3] - pose[..., :3, 3], rotation], dim=-1)
 
 
 def check_rigid(name: str, pose: Tensor) -> None:

@@ -15,7 +15,7 @@ from . import trajectories
 from .arm import Arm
 from .crowd import STEP
 from .holds import ELBOWS, Hold
-from .inverse import Unreachable
+from .inverse import Unreachable, solve
 from .spline import Spline
 
 GLANCE = 6  # poses of the path by which all holds are judged first
@@ -100,10 +100,9 @@ def follow(task: Task, hold: Hold) -> Way:
             something is in the way.
     """
     arm, path = task.arm, task.path
-    try:
-        q = _solve(task, slice(None), hold, 1e-9, 100)
-    except Unreachable as error:
-        raise _timed(error, float(path.t[error.pose])) from None
+    (q,) = _solve(task, slice(None), [hold], 1e-9, 100)
+    if isinstance(q, Unreachable):
+        raise _timed(q, float(path.t[q.pose]))
     spline = Spline.through(path.t, q)
     times = spline.finer(FINE)
     q, _ = spline.at(times)
@@ -143,12 +142,10 @@ def _judge(task: Task, count: int, holds: Sequence[Hold]) -> tuple[list[Hold], l
     knots = _some(task.path, count)
     times = task.path.t[knots]
     good, bad = [], []
-    for hold in holds:
-        try:
-            q = _solve(task, knots, hold, 1e-6, QUICK)
-        except Unreachable as error:
-            time = float(times[error.pose])
-            bad.append((time, _timed(error, time)))
+    for hold, q in zip(holds, _solve(task, knots, holds, 1e-6, QUICK), strict=True):
+        if isinstance(q, Unreachable):
+            time = float(times[q.pose])
+            bad.append((time, _timed(q, time)))
             continue
         if refusal := task.check(q, times):
             bad.append((float(times[-1]), refusal))
@@ -162,10 +159,14 @@ def _some(path: Trajectory, count: int) -> Tensor:
     return torch.linspace(0, len(path.t) - 1, min(count, len(path.t))).round().long().unique()
 
 
-def _solve(task: Task, knots: Tensor | slice, hold: Hold, tolerance: float, iterations: int) -> Tensor:
-    pose = task.path.pose[knots].clone().to(task.arm.base)
-    pose[:, :3, :3] = pose[:, :3, :3] @ hold.rotation(task.inward.to(pose))
-    return task.arm.inverse(pose, hold.reference(task.arm), tolerance=tolerance, iterations=iterations)
+def _solve(
+    task: Task, knots: Tensor | slice, holds: Sequence[Hold], tolerance: float, iterations: int
+) -> list[Tensor | Unreachable]:
+    pose = task.path.pose[knots].to(task.arm.base).repeat(len(holds), 1, 1, 1)
+    turn = torch.stack([hold.rotation(task.inward.to(pose)) for hold in holds])
+    pose[..., :3, :3] = pose[..., :3, :3] @ turn[:, None]
+    reference = torch.stack([hold.reference(task.arm) for hold in holds])
+    return solve(task.arm, pose, reference, reference, tolerance, iterations)
 
 
 def _timed(error: Unreachable, time: float) -> InvalidInput:

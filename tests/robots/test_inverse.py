@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-import torchcloth.robots as robots
+from torchcloth import robots
 from torchcloth.errors import InvalidInput
+from torchcloth.robots import inverse
 
 
 @pytest.fixture
@@ -112,3 +113,19 @@ def test_refuses_what_is_no_pose(arm):
         arm.inverse(pose, tolerance=float("nan"))
     with pytest.raises(InvalidInput, match="reference has the wrong shape"):
         arm.inverse(pose, reference=arm.home[:6])
+
+
+def test_paths_side_by_side_know_nothing_of_each_other(arm, random_q):
+    elsewhere = line(arm, 10)
+    elsewhere[:, 1, 3] += 0.1
+    beyond = line(arm, 10)
+    beyond[6:, 0, 3] += 5.0
+    hard = arm(random_q(arm, 1, seed=7)).expand(10, -1, -1)  # far from home
+    paths = torch.stack([line(arm, 10), beyond, elsewhere, hard])
+    home = arm.home.expand(4, -1)
+    one, lost, other, far = inverse.solve(arm, paths, home, home, 1e-6, 100)
+    assert isinstance(lost, inverse.Unreachable)
+    assert lost.pose == 6
+    for found, poses in ((one, paths[0]), (other, elsewhere), (far, hard)):
+        assert_reached(arm, found, poses)
+        torch.testing.assert_close(found, arm.inverse(poses, tolerance=1e-6), rtol=0, atol=1e-6)
