@@ -33,7 +33,7 @@ def _float64():
     torch.set_default_dtype(torch.float32)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def realdata() -> Path:
     """Folder of measured data; skips where none is named."""
     folder = os.environ.get("TORCHCLOTH_REALDATA")
@@ -43,7 +43,7 @@ def realdata() -> Path:
     return Path(folder)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def measured_in(realdata: Path) -> Callable[[str], Path]:
     """The folder of a source by name; skips where it is absent."""
 

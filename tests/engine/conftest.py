@@ -1,5 +1,6 @@
 """The fused engine needs a compiler, or to have been built."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from torchcloth.engine import running
 from torchcloth.engine.library import library
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+import on_host
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -22,6 +25,15 @@ def _engine(request):
             raise
         if request.path.name != "test_library.py":  # that file asks what happens then
             pytest.skip(str(error))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _stand_ins(tmp_path_factory):
+    """Where programs for a device that are compiled here lie."""
+    own = tmp_path_factory.getbasetemp()
+    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "stand-ins"
+    shared.mkdir(exist_ok=True)
+    on_host.SHARED[:] = [shared]
 
 
 @pytest.fixture(params=[1, 3], ids=["alone", "team"])

@@ -4,6 +4,8 @@ Memory is the processor's, so programs run on tensors of the CPU.
 """
 
 import ctypes
+import hashlib
+import os
 import subprocess
 import tempfile
 from contextlib import contextmanager, nullcontext
@@ -87,17 +89,21 @@ extern "C" void launch_adjoint(int blocks, Port* p, R* d, int* t, R* w, unsigned
     each(blocks, [&] { adjoint(p, d, t, w, masks, grids, substeps, first, all); });
 }
 """
+SHARED: list[Path] = []  # the folder of what is compiled, for all processes that run tests
 FLAGS = ["-std=c++20", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-pthread", "-w"]
 
 
 @cache
 def compiled(text):
-    """Each once in a process."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "program.cpp"
-        file.write_text(text)
-        subprocess.run([*building.compiler(), *FLAGS, "-o", f"{file}.so", str(file)], check=True)
-        return ctypes.CDLL(f"{file}.so")
+    """Each once in a run of the tests: compilers take a second."""
+    library = SHARED[0] / f"{hashlib.sha256(text.encode()).hexdigest()}.so"
+    if not library.exists():
+        with tempfile.TemporaryDirectory(dir=SHARED[0]) as folder:
+            file = Path(folder) / "program.cpp"
+            file.write_text(text)
+            subprocess.run([*building.compiler(), *FLAGS, "-o", f"{file}.so", str(file)], check=True)
+            os.replace(f"{file}.so", library)
+    return ctypes.CDLL(str(library))
 
 
 class Host:

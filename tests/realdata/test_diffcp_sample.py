@@ -30,18 +30,19 @@ def run(*arguments: str | Path, seconds: float) -> str:
     return done.stdout
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def source(measured_in) -> Path:
     return measured_in("diffcp_sample")
 
 
-@pytest.fixture
-def episode(source: Path, tmp_path: Path) -> Path:
-    run(ADAPTER, tmp_path / "episode", "--source", source, seconds=60)
-    return tmp_path / "episode"
+@pytest.fixture(scope="module")
+def episode(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("diffcp") / "episode"
+    run(ADAPTER, folder, "--source", source, seconds=60)
+    return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def recording(episode: Path) -> Recording:
     return recordings.read(episode)
 

@@ -119,6 +119,7 @@ def test_it_writes_tables_and_pictures(finished, capsys):
     assert not [path for path in finished.rglob(".*") if path.is_file()]
 
 
+@pytest.mark.slow
 def test_finished_runs_are_never_repeated(finished, monkeypatch, capsys):
     before = {path: path.stat().st_mtime_ns for path in (finished / "runs").iterdir()}
     simulated = []
@@ -133,6 +134,7 @@ def test_finished_runs_are_never_repeated(finished, monkeypatch, capsys):
     assert len(after) == len(before) + 4
 
 
+@pytest.mark.slow
 def test_a_stopped_study_keeps_what_is_finished_and_goes_on(finished, tmp_path, monkeypatch, capsys):
     simulate, calls = Scene.simulate, []
 

@@ -14,6 +14,7 @@ def call(out, *more):
     return command.main(["cost", "--out", str(out), "--fast", *more])
 
 
+@pytest.mark.slow
 def test_the_table_has_every_method_beside_the_others(tmp_path, capsys):
     assert call(tmp_path, "--problems", "sheet") == 0
     printed = capsys.readouterr().out

@@ -29,6 +29,7 @@ def test_the_goal_is_elsewhere_and_can_be_reached():
     assert goal.points.shape == (trajectories.POINTS, 3)
 
 
+@pytest.mark.slow
 def test_all_methods_on_one_garment(tmp_path, capsys):
     assert main(["trajectories", "--fast", "--garments", "dress", "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "trajectories.json").read_text())
