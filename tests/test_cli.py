@@ -212,6 +212,15 @@ def test_wrong_usage_is_exit_code_2(capsys, arguments):
     assert line.endswith("--help")
 
 
+@pytest.mark.parametrize("verb", ["identify", "diagnose"])
+def test_an_option_that_a_verb_has_not_is_the_verbs_matter(capsys, verb):
+    with pytest.raises(SystemExit) as stopped:
+        main([verb, "x", "--out", "y", "--mispelt"])
+    assert stopped.value.code == 2
+    said = capsys.readouterr().err
+    assert said == f"torchcloth {verb}: unrecognized arguments: --mispelt; to do: see torchcloth {verb} --help\n"
+
+
 def test_a_diagnosis_does_not_replace_the_model_that_it_starts_from(capsys, tmp_path):
     (tmp_path / "base.tcm").write_text("mine")
     assert main(["diagnose", "a", "b", "--model", str(tmp_path / "base.tcm"), "--out", str(tmp_path)]) == 2

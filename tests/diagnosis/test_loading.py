@@ -12,7 +12,9 @@ import torchcloth as tc
 from torchcloth import diagnosis as dx
 from torchcloth import recordings as rec
 from torchcloth.cli import main
+from torchcloth.cli.identify import what_is_beside
 from torchcloth.errors import InvalidInput
+from torchcloth.identification import cloth_from, fitted, identify, predict_episode
 from torchcloth.recordings.marks import mark
 from torchcloth.viewing import film_of_fit
 
@@ -58,6 +60,44 @@ def test_what_is_not_in_the_cloth_is_beside_it(made, tmp_path):
     dx.save_model(tmp_path / "late.tcm", base.plus(clock, -0.03), blank)
     assert dx.beside_the_cloth(dx.load_model(tmp_path / "late.tcm")) == {"obs.clock": -0.03}
     assert len(dx.load_world(tmp_path / "late.tcm").views) == 1
+
+
+def test_a_fit_that_began_with_a_model_brings_it_along(made, tmp_path):
+    """Its effects stay, and its numbers are the fit's."""
+    folder, seen, _ = made
+    model = folder / "extended.tcm"
+    begun = identify(dx.cloth_for(model, seen), seen, ["youngs_modulus"], iterations=1)
+    path = begun.save(tmp_path / "fit", model)
+    cloth, _ = fitted(path, seen, dx.start_of(path))
+    assert cloth.effects["air"].normal.value.item() == pytest.approx(TRUE)
+    assert cloth.material.youngs_modulus.value.item() == begun.parameters["youngs_modulus"].value
+    assert predict_episode(path, seen, dx.start_of(path)).figures["chamfer"] < 0.01
+    assert "mm from the points" in film_of_fit(seen, tmp_path / "fit").title
+    with pytest.raises(InvalidInput, match=r"a fit of another model.*give begun=diagnosis.start_of"):
+        fitted(path, seen)
+    plain = identify(cloth_from(seen), seen, ["youngs_modulus"], iterations=1)
+    assert dx.start_of(plain.save(tmp_path / "fit")) is None
+
+
+def test_what_a_fit_leaves_out_of_a_model_is_said_with_what_allows_for_it(made):
+    _, _, blank = made
+    base = dx.base_model(blank)
+    clock = next(h for h in dx.catalogue(base, [blank]) if h.name == "obs.clock")
+    own = dx.Hypothesis("my.view", "m", 0.01, lambda w, a: w.with_view(lambda frames, e: frames))
+    late, mine = what_is_beside(base.plus(clock, -0.03).plus(own, 0.02))
+    where = "of the model is of robot or camera and not in the cloth"
+    assert late == f"obs.clock = -0.03 {where}: --nuisance clock allows for it"
+    assert mine == f"my.view = 0.02 {where}: nothing here allows for it"
+
+
+def test_what_was_confirmed_goes_with_its_models(tmp_path):
+    gone = [tmp_path / name for name in ("base.tcm", "extended.tcm", "confirmation/confirmation.json")]
+    gone[2].parent.mkdir()
+    for path in gone:
+        path.write_text("of a diagnosis before")
+    dx.write_diagnosis(dx.refused([dx.Fault("e1", "a clock that jumps", "record again")]), [], tmp_path)
+    assert not any(path.exists() for path in gone)
+    assert json.loads((tmp_path / "diagnosis.json").read_text())["verdict"] == "invalid_data"
 
 
 def test_a_grip_that_is_wider_is_in_the_cloth(made):
@@ -177,6 +217,8 @@ def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
     assert "(the last one is replaced)" in " ".join(capsys.readouterr().out.split())
     found = json.loads((tmp_path / "confirmation.json").read_text())
     assert found["confirmed"]
+    assert found["models"] == models
+    assert found["episodes"] == [str(folder / "fast")]
     assert found["gain"]["rms_after"] < 0.4 * found["gain"]["rms_before"]
     assert found["motions"]["fast"]["explained_fraction"] > 0.8
     assert main(["confirm", *models[::-1], str(folder / "fast"), "--out", str(tmp_path / "b")]) == 2

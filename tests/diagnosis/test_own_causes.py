@@ -76,6 +76,14 @@ def test_what_is_no_file_of_causes_is_one_line(file, content, said, capsys):
     assert capsys.readouterr().err.startswith("torchcloth: causes; got ")
 
 
+def test_what_a_hypothesis_lacks_is_said_once(file):
+    file.write_text(FILE.format(typical=0.0))
+    with pytest.raises(
+        InvalidInput, match=r"^.*mine.py, line 5: typical of 'my.damping'; got 0.0; expected a value > 0"
+    ):
+        register_file(file)
+
+
 def test_kin_may_be_a_list():
     """What was simulated is remembered by the causes of the world."""
     given = {"name": "my.damping", "unit": "1/s", "typical": 2.0, "apply": lambda world, _: world}

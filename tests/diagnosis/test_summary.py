@@ -96,7 +96,7 @@ def test_what_lacks_in_one_stretch_of_time_only_is_said_to():
 
 def test_numbers_without_a_unit_have_none():
     cause = {"effect": "air.drag_n", "amplitude": 1.19, "unit": "-", "ci95": [1.05, 1.32], "typical": 1.2}
-    cause |= {"class": [], "rivals": [], "motions_disagree": False}
+    cause |= {"says": "", "class": [], "rivals": [], "motions_disagree": False}
     cause |= {
         "when": {"episode": 0, "motion": "swing", "from": 0.4, "to": 0.6},
         "moves": {"value": 0.0123, "unit": "m"},
@@ -107,6 +107,12 @@ def test_numbers_without_a_unit_have_none():
     assert "Cause: air.drag_n = 1.19 (95 %: 1.05 to 1.32); 1.2 is typical." in said
     beyond = "beyond what fitted numbers could do instead"
     assert f"  Surest in swing from 0.4 to 0.6 s, at (100, 250) mm of the pattern: 12.3 mm {beyond}." in said
+    rival = {"effect": "air.wind[x]", "amplitude": 0.4, "unit": "m/s"}
+    open_ = cause | {"says": "It pushes.", "class": ["air.drag_n", "air.linear"], "rivals": [rival]}
+    said = summary("ambiguous", causes=[open_], motions=["swing"])
+    assert "  It pushes." in said
+    assert "  Cannot be told from: air.linear, air.wind[x] = 0.4 m/s in its place." in said
+    assert any("the extended model, which has the one that is named" in line for line in said)
     felt = cause | {"where": {"gripper": "left"}, "moves": {"value": 0.035, "unit": "N"}}
     said = summary("identified", causes=[felt], motions=["swing"])
     assert f"  Surest in swing from 0.4 to 0.6 s, in what gripper left feels: 35 mN {beyond}." in said
@@ -115,7 +121,14 @@ def test_numbers_without_a_unit_have_none():
 @pytest.mark.parametrize("low", [-17.0, 2.0])
 def test_a_cause_whose_interval_holds_zero_says_what_is_known_of_its_size(low):
     cause = {"effect": "elas.stiffen", "amplitude": 13.5, "unit": "-", "ci95": [low, 44.0], "typical": 10.0}
-    cause |= {"class": [], "rivals": [], "noise_ci95": [12.4, 14.6], "told_by": 1.96, "motions_disagree": False}
+    cause |= {
+        "says": "",
+        "class": [],
+        "rivals": [],
+        "noise_ci95": [12.4, 14.6],
+        "told_by": 1.96,
+        "motions_disagree": False,
+    }
     cause |= {"when": {"episode": 0, "from": 0.4, "to": 0.6}, "moves": {"value": 0.035, "unit": "N"}}
     said = summary("identified", causes=[cause | {"where": {"gripper": "left"}}], motions=["stretch"])
     told = [line for line in said if "2.0 motions' worth" in line and "would be 12.4 to 14.6" in line]
@@ -130,7 +143,7 @@ def test_a_cause_whose_interval_holds_zero_says_what_is_known_of_its_size(low):
 
 def test_what_would_have_the_wrong_sign_is_told_from_what_is_small():
     said = summary("adequate", ruled_out=["mass.hem", "air.drag_n"], wrong_sign=["air.drag_n"])
-    assert "Too small to matter: mass.hem." in said
+    assert "Not there, or too small to matter: mass.hem." in said
     assert "Would have to be of a sign that makes no sense: air.drag_n." in said
 
 
@@ -147,7 +160,8 @@ def test_what_cannot_be_seen_is_told_from_what_a_fitted_number_does():
 def test_the_gain_is_told_with_its_intervals():
     gain = {"rms_before": 5e-3, "rms_after": 1e-3, "floor": 5e-4, "explained_fraction": 0.97, "ci95": [0.9, 1.0]}
     gain |= {"log_density": 316.0, "log_density_ci95": [113.0, 493.0]}
-    first, second, *_ = summary("identified", gain=gain, floor={"source": "repetitions"})
+    first, second, third, *_ = summary("identified", gain=gain, floor={"source": "repetitions"})
+    assert third.endswith("single points are farther off.")
     assert first.endswith("1.00 mm with the causes below; 0.50 mm is what repetitions of a command differ by.")
     assert second == (
         "That is 97 % of what could be explained (95 %: 90 to 100 %), and 316 in log density (113 to 493)."

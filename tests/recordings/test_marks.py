@@ -17,8 +17,10 @@ def noisy(recording, noise):
 
 def test_one_episode_twice_is_refused_under_any_name(recording, tmp_path):
     copy = replace(recording, path=tmp_path / "copy", clock_offset=0.0)
-    with pytest.raises(InvalidInput, match="episodes; got 'copy' twice; expected each once; leave one out"):
+    with pytest.raises(InvalidInput, match="'recording' and 'copy', which hold the same; expected each once"):
         each_once([recording, noisy(recording, 0.01), copy])
+    with pytest.raises(InvalidInput, match="episodes; got 'copy' twice; expected each once; leave one out"):
+        each_once([copy, copy])
 
 
 def test_noise_of_its_own_makes_a_repetition_even_where_its_mean_is_nothing(recording):

@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal that has no such letter
     try:
-        options = _parser().parse_args(arguments)
+        options = _parsed(arguments)
     except KeyboardInterrupt:
         print("torchcloth: stopped", file=sys.stderr)
         return 130
@@ -90,6 +90,15 @@ def _of_system(error: OSError) -> TorchclothError:
     )
 
 
+def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """What is not known is the verb's matter, which has options of its own."""
+    parser = _parser()
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        options.verb.error(f"unrecognized arguments: {' '.join(unknown)}")
+    return options
+
+
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, without the usage of all options."""
 
@@ -106,4 +115,6 @@ def _parser() -> argparse.ArgumentParser:
     for name in WITH_MODELS:
         more = "a Python file that registers causes of your own (torchcloth.diagnosis.register)"
         verbs.choices[name].add_argument("--causes", metavar="FILE", help=more)
+    for verb in verbs.choices.values():
+        verb.set_defaults(verb=verb)
     return parser

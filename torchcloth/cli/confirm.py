@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._files import write_text
+from .._files import as_json, write_text
 from .diagnose import progress_line
 from .folders import check_apart, check_folder, place, replaces
 
 if TYPE_CHECKING:
     from ..diagnosis import Gain
-
-RESULT = "confirmation.json"
 
 
 def add(verbs: Any) -> None:
@@ -42,17 +39,18 @@ def _confirm(options: argparse.Namespace) -> int:
     import torch
 
     from .. import diagnosis, recordings
+    from ..diagnosis.run import CONFIRMED
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
-    out = options.extended.parent / "confirmation" if options.out is None else options.out
+    out = options.extended.parent / CONFIRMED.parent if options.out is None else options.out
     check_apart(out, *options.episodes)
     check_folder(out)
     episodes = [recordings.read(path) for path in options.episodes]
     with progress_line() as progress:
         found = diagnosis.confirm(options.base, options.extended, episodes, progress)
-    note = replaces(out / RESULT)
-    path = write_text(out / RESULT, json.dumps(found.as_dict(), indent=1, allow_nan=False) + "\n")
+    note = replaces(out / CONFIRMED.name)
+    path = write_text(out / CONFIRMED.name, as_json(found.as_dict()))
     _print(found)
     print(f"result: {path}{note}")
     return 0

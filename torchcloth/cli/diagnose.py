@@ -45,6 +45,9 @@ def _diagnose(options: argparse.Namespace) -> int:
     check_apart(options.out, *options.episodes)
     check_folder(options.out)
     _refuse_own_result(options)
+    replaced = (options.out / RESULT).exists()
+    if replaced:
+        say(f"{options.out} holds a diagnosis, which this one will replace")
     episodes, faults = diagnosis.read_episodes(options.episodes)
     if faults:
         answer = diagnosis.refused(faults)
@@ -66,7 +69,6 @@ def _diagnose(options: argparse.Namespace) -> int:
             answer = diagnosis.diagnose(
                 episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume or None
             )
-    replaced = (options.out / RESULT).exists()
     written = diagnosis.write_diagnosis(answer, episodes, options.out)
     if answer.searched is not None:  # a stopped diagnosis goes on once the episodes can be read
         clear(options.out / PROGRESS)

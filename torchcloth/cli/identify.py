@@ -6,6 +6,7 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from ..recordings import Recording
 
 DEMO = "bimanual_swing"
+NUISANCES = {"obs.clock": "clock", "obs.extrinsic": "camera", "obs.rotation": "camera", "obs.edge": "rim"}  # by cause
 
 
 def add(verbs: Any) -> None:
@@ -125,7 +127,9 @@ def _identify(options: argparse.Namespace) -> int:
     check_folder(options.out)
     fields.check(options, _defaults())
     episodes = [recordings.read(path) for path in options.episodes]
-    cloth = _cloth(options, together(episodes))
+    cloth, notes = _cloth(options, together(episodes))
+    for note in notes:
+        print(f"note: {note}")
     size = f"{len(episodes)} episode(s), {len(cloth.mesh.faces)} triangles"
     seconds, step = sum(float(e.points.t[-1] - e.points.t[0]) for e in episodes if e.points), cloth.stable_step()
     many = f", {seconds / step:.2g} in all frames" if seconds else ""
@@ -134,7 +138,8 @@ def _identify(options: argparse.Namespace) -> int:
         fields.spread_out(cloth, options.fields)
     fit = _fit(options, cloth, episodes)
     if isinstance(fit, Identification):
-        return _report(options.out, fit, cloth, episodes)
+        fit = replace(fit, warnings=[*fit.warnings, *notes])
+        return _report(options, fit, cloth, episodes)
     return fields.report(options.out, fit, cloth)
 
 
@@ -144,41 +149,46 @@ def _defaults() -> argparse.Namespace:
     return parser.parse_args([])
 
 
-def _cloth(options: argparse.Namespace, recording: Recording) -> Cloth:
+def _cloth(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, list[str]]:
+    """The cloth at its start values, and what of its model it has not."""
     from ..identification import cloth_from
     from ..identification.unknowns import available
     from ..transfer import Contact
 
     if options.model is not None:
-        cloth = _of_model(options, recording)
+        cloth, notes = _of_model(options, recording)
     else:
-        cloth = cloth_from(recording, contact=None if options.contact is None else Contact(options.contact))
+        contact = None if options.contact is None else Contact(options.contact)
+        cloth, notes = cloth_from(recording, contact=contact), []
     cloth.engine = options.engine
     names = available(cloth)
     for name, value in assignments(options.start).items():
         if name not in names:
             raise InvalidInput("--start", got=repr(name), expected=f"one of {', '.join(sorted(names))}")
         cloth.get_submodule(names[name]).set(value)  # type: ignore[operator]
-    return cloth
+    return cloth, notes
 
 
-def _of_model(options: argparse.Namespace, recording: Recording) -> Cloth:
+def _of_model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, list[str]]:
     """The extended cloth of a diagnosis, in the episode's scene."""
     from .. import diagnosis
 
     if options.contact is not None:
         raise InvalidInput("--contact", got="it beside --model", expected="one of them")
     file = diagnosis.read_model(options.model, recording)
-    say_what_is_beside(file.model, "name it under --nuisance to allow for it")
-    return file.model.world().cloth.requires_grad_(True)
+    return file.model.world().cloth.requires_grad_(True), what_is_beside(file.model)
 
 
-def say_what_is_beside(model: Model, remedy: str) -> None:
-    """A note on causes that a cloth cannot carry."""
+def what_is_beside(model: Model) -> list[str]:
+    """Notes on causes that a cloth cannot carry."""
     from .. import diagnosis
 
+    notes = []
     for name, amplitude in diagnosis.beside_the_cloth(model).items():
-        print(f"note: {name} = {amplitude:.4g} of the model is not in the cloth: {remedy}")
+        allowed = NUISANCES.get(name.partition("[")[0])
+        to_do = f"--nuisance {allowed} allows for it" if allowed else "nothing here allows for it"
+        notes.append(f"{name} = {amplitude:.4g} of the model is of robot or camera and not in the cloth: {to_do}")
+    return notes
 
 
 def assignments(pairs: Sequence[str], option: str = "--start") -> dict[str, float]:
@@ -269,15 +279,16 @@ def _refines(options: argparse.Namespace) -> bool:
     return options.method in ("gauss-newton", "lbfgs") and options.stop == "converged" and not options.profile
 
 
-def _report(folder: Path, fit: Identification, cloth: Cloth, recordings: list[Recording]) -> int:
+def _report(options: argparse.Namespace, fit: Identification, cloth: Cloth, recordings: list[Recording]) -> int:
     from ..identification import episode
     from ..identification.journal import clear
     from ..identification.pictures import draw
     from ..identification.saved import RESULT
     from ..identification.tables import print_fit
 
+    folder = options.out
     note = replaces(folder / RESULT)
-    path = fit.save(folder)
+    path = fit.save(folder, options.model)
     pictures = draw(fit, [episode(cloth, r) for r in recordings], cloth.mesh.faces, folder)
     clear(folder / PROGRESS)
     print_fit(fit)

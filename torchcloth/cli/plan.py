@@ -123,7 +123,7 @@ def _models(options: argparse.Namespace, recording: Recording) -> list[Cloth] | 
         return [cloth_from(recording)]
     if options.fit.suffix == ".tcm":
         return diagnosis.drawn_models(diagnosis.read_model(options.fit, recording), options.draws)
-    return drawn(options.fit, recording, options.draws)
+    return drawn(options.fit, recording, options.draws, begun=diagnosis.start_of(options.fit))
 
 
 def _words(number: int, distance: float, best: float) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
 from .folders import check_apart, check_folder, place, replaces, say
-from .identify import assignments, nuisances_of, say_what_is_beside
+from .identify import assignments, nuisances_of, what_is_beside
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -80,13 +80,16 @@ def _used(fit: Path, recording: Recording) -> bool:
 
 def _model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
     """The cloth, and what is uncertain of its values."""
+    from ..diagnosis import start_of
     from ..identification import cloth_from, fitted
     from ..identification.unknowns import available
 
-    if options.fit is not None and options.fit.suffix == ".tcm":
+    if options.fit is None:
+        cloth, uncertain = cloth_from(recording), {}
+    elif options.fit.suffix == ".tcm":
         cloth, uncertain = _of_model(options.fit, recording)
     else:
-        cloth, uncertain = (cloth_from(recording), {}) if options.fit is None else fitted(options.fit, recording)
+        cloth, uncertain = fitted(options.fit, recording, start_of(options.fit))
     names = available(cloth)
     for name, spread in assignments(options.uncertain, "--uncertain").items():
         if name not in names:
@@ -99,7 +102,8 @@ def _of_model(path: Path, recording: Recording) -> tuple[Cloth, dict[str, tuple[
     from .. import diagnosis
 
     file = diagnosis.read_model(path, recording)
-    say_what_is_beside(file.model, "name it under --nuisance to allow for it")
+    for note in what_is_beside(file.model):
+        print(f"note: {note}")
     return file.model.world().cloth, diagnosis.uncertain(file)
 
 

@@ -66,9 +66,10 @@ def _predict(options: argparse.Namespace) -> int:
         readable = options.fit.is_file() and (options.fit.suffix == ".tcm" or options.fit.name in known)
         known = [options.fit.name] if readable else []
     if not known:
-        raise InvalidInput(
-            "FIT", got=options.fit, expected=f"{TENSION}, {RESULT} or the folder that holds it, or a .tcm file"
-        )
+        models = ", ".join(sorted(map(str, folder.glob("*.tcm"))))
+        expected = f"{TENSION}, {RESULT} or the folder that holds it, or a .tcm file"
+        remedy = f"name a model: {models}" if models else "correct the path"
+        raise InvalidInput("FIT", got=options.fit, expected=expected, remedy=remedy)
     name = TENSION if of_strip or (options.seen is None and known == [TENSION]) else RESULT
     if name not in known:
         what = "a strip" if of_strip else "an episode"
@@ -105,14 +106,14 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
 
     from .. import recordings
     from .._files import atomically
-    from ..diagnosis import predicted, was_fitted
+    from ..diagnosis import predicted, start_of, was_fitted
     from ..identification import is_fitted, pictures, predict_episode, prediction_report
 
     if options.seen is None:
         raise InvalidInput("SEEN", got="none", expected="an episode whose motion is to be predicted")
     recording = recordings.read(options.seen)
     of_model = fit.suffix == ".tcm"
-    found = predicted(fit, recording) if of_model else predict_episode(fit, recording)
+    found = predicted(fit, recording) if of_model else predict_episode(fit, recording, start_of(fit))
     note = replaces(out / RESULT)
     path = _write(out, found.as_dict())
     with atomically(out / "prediction.npz") as file:

@@ -26,6 +26,7 @@ from .loading import (
     load,
     load_world,
     predicted,
+    start_of,
     uncertain,
     was_fitted,
 )
@@ -91,6 +92,7 @@ __all__ = [
     "screen",
     "search",
     "setting_of",
+    "start_of",
     "uncertain",
     "unstable",
     "was_fitted",

@@ -15,7 +15,7 @@ from ..errors import InvalidInput, RecordingError
 from ..identification.result import or_none
 from ..recordings import Recording
 from ..recordings.marks import alike, each_once, mark
-from ..recordings.together import listed, same_cloth, together
+from ..recordings.together import listed, name_of, same_cloth, together
 from .cells import aligned
 from .comparison import Gain, Predicted, as_it_is, by_motion, compare
 from .evidence import Evidence, as_held, as_rough, gather, shared
@@ -43,12 +43,16 @@ class Confirmation:
         whole: over all episodes.
         motions: by motion.
         floor: m, what a true model would leave; ``source`` says where it is known from.
+        models: files of the base and of the extended model.
+        episodes: folders, or names of what was not read from one.
     """
 
     whole: Gain
     motions: dict[str, Gain]
     floor: float
     source: str
+    models: tuple[str, str]
+    episodes: list[str]
 
     @property
     def confirmed(self) -> bool:
@@ -66,6 +70,8 @@ class Confirmation:
             "gain": _told(self.whole),
             "motions": {name: _told(gain) for name, gain in self.motions.items()},
             "floor": {"value": self.floor, "unit": "m", "source": self.source},
+            "models": list(self.models),
+            "episodes": self.episodes,
             "convention": CONVENTION,
         }
 
@@ -124,7 +130,8 @@ def confirm(
     if (repeated := repeats(whole[1], pairs_of(recordings, settings[1].episodes))) is not None:
         floor, source = repeated.rms, "repetitions"
     motions = by_motion(before, after, floor, settings[0].names)
-    return Confirmation(compare(before, after, floor), motions, floor, source)
+    told = [str(r.path or name_of(r, k)) for k, r in enumerate(recordings)]
+    return Confirmation(compare(before, after, floor), motions, floor, source, (str(base), str(extended)), told)
 
 
 def _refuse_no_extension(base: Model, extended: Model) -> None:

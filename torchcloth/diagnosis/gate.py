@@ -74,7 +74,8 @@ def read_episodes(folders: Sequence[str | Path]) -> tuple[list[Recording], list[
         except RecordingError as error:
             if EPISODE in error.what or not (Path(folder) / EPISODE).is_file():
                 raise
-            what = f"{error.what}, got {error.got}" if error.got is not None else error.what
+            parts = [error.what, *(f"got {error.got}" for _ in range(error.got is not None))]
+            what = ", ".join([*parts, *([f"expected {error.expected}"] if error.expected else [])])
             faults.append(Fault(Path(folder).name, what, error.remedy or "record again"))
     return found, faults
 

@@ -46,6 +46,11 @@ ALIKE = {
 }  # asked about as another
 
 
+def meaning(hypothesis: Hypothesis) -> str:
+    """What a cause is; empty where nobody says so."""
+    return hypothesis.says or GLOSSARY.get(hypothesis.effect, "")
+
+
 def table(hypotheses: list[Hypothesis]) -> str:
     """All causes as a table in Markdown; axes of one effect share a row."""
     rows = ["| cause | typical | meaning |", "|---|---|---|"]
@@ -53,5 +58,5 @@ def table(hypotheses: list[Hypothesis]) -> str:
     for h in hypotheses:
         if first.get(h.effect) is h:
             unit = "" if h.unit == "-" else f" {h.unit}"
-            rows.append(f"| `{h.effect}` | {h.typical:g}{unit} | {GLOSSARY.get(h.effect, 'registered by a user')} |")
+            rows.append(f"| `{h.effect}` | {h.typical:g}{unit} | {meaning(h) or 'registered by a user'} |")
     return "\n".join(rows)

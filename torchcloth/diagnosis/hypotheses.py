@@ -55,6 +55,8 @@ def _check_size(hypothesis: Hypothesis) -> None:
     for key in ("name", "unit"):
         if not isinstance(said := getattr(hypothesis, key), str) or not said:
             raise InvalidInput(f"{key} of a hypothesis", got=repr(said), expected="a word")
+    if not isinstance(hypothesis.says, str):
+        raise InvalidInput(f"says of {hypothesis.name!r}", got=repr(hypothesis.says), expected="a sentence")
     for key in ("typical", "share", "step", "low", "high"):
         if not isinstance(number := getattr(hypothesis, key), (int, float)):
             raise InvalidInput(f"{key} of {hypothesis.name!r}", got=repr(number), expected="a number")
@@ -64,7 +66,7 @@ def _check_size(hypothesis: Hypothesis) -> None:
         raise InvalidInput(f"apply of {hypothesis.name!r}", got=repr(hypothesis.apply), expected="a function")
     wrong = hypothesis.typical == 0 or (hypothesis.typical < 0 and not hypothesis.signed)
     if wrong or not math.isfinite(hypothesis.typical):
-        expected = "another than 0" if hypothesis.signed else "a value > 0, or signed=True"
+        expected = "another than 0" if hypothesis.signed else "a value > 0, or signed=True and one below"
         raise InvalidInput(f"typical of {hypothesis.name!r}", got=hypothesis.typical, expected=expected)
     if not 0 < hypothesis.share < math.inf:
         raise InvalidInput(f"share of {hypothesis.name!r}", got=hypothesis.share, expected="a value > 0, e.g. 0.4")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -14,6 +15,8 @@ from ..errors import InvalidInput
 from ..identification.episode_prediction import EpisodePrediction, with_errors
 from ..identification.episodes import RATE, Episode, episode
 from ..identification.replays import Frames, each
+from ..identification.result import START
+from ..identification.saved import read_saved
 from ..recordings import Recording
 from ..recordings.extents import check_size
 from ..recordings.marks import alike, mark
@@ -57,6 +60,22 @@ def cloth_for(path: str | Path, recording: Recording) -> Cloth:
         RecordingError: as ``load``.
     """
     return read_model(path, recording).model.world().cloth.requires_grad_(True)
+
+
+def start_of(fit: str | Path) -> Callable[[Recording], Cloth] | None:
+    """Makes an episode's cloth of the model that a saved fit of ``identify --model`` began with; None: it had none.
+
+    Args:
+        fit: identification.json, or the folder that holds it.
+
+    Raises:
+        InvalidInput: there is no such file.
+        RecordingError: it cannot be read, or does not hold what is needed.
+    """
+    if not read_saved(fit).begun:
+        return None
+    folder = Path(fit) if Path(fit).is_dir() else Path(fit).parent
+    return partial(cloth_for, folder / START)
 
 
 def beside_the_cloth(model: Model) -> dict[str, float]:

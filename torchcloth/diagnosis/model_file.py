@@ -109,7 +109,9 @@ def read_model(path: str | Path, scene: Recording | None = None, residual: bool 
     """
     path = Path(path)
     if not path.is_file():
-        raise InvalidInput("model", got=f"no file {path}", expected=EXPECTED)
+        others = ", ".join(sorted(map(str, (path if path.is_dir() else path.parent).glob("*.tcm"))))
+        remedy = f"name one: {others}" if others else "correct the path, or diagnose"
+        raise InvalidInput("model", got=f"no file {path}", expected=EXPECTED, remedy=remedy)
     said = read_content(path)
     if scene is None:
         with damage(path):

@@ -268,5 +268,5 @@ def _why(
     )
     return (
         f"{experiment}: {about}, by chi^2 = {now[hardest]:.2g} now and {told[hardest]:.2g} with it "
-        f"({NEEDED:.1f} is needed; {times}). The middle one of all that can be asked gives {median:.2g}."
+        f"({NEEDED:.1f} is needed; {times}). Half of all motions that can be asked for give less than {median:.2g}."
     )

@@ -8,7 +8,7 @@ import traceback
 from collections.abc import Iterable
 from pathlib import Path
 
-from ..errors import InvalidInput
+from ..errors import InvalidInput, TorchclothError
 from ..identification.journal import digest
 from . import hypotheses
 from .world import Hypothesis
@@ -27,7 +27,8 @@ def register_file(path: str | Path) -> list[Hypothesis]:
     """
     path = Path(path)
     if not path.is_file():
-        raise InvalidInput("causes", got=f"no file {path}", expected=EXPECTED)
+        remedy = "correct the path; docs/diagnosis.md has an example"
+        raise InvalidInput("causes", got=f"no file {path}", expected=EXPECTED, remedy=remedy)
     before, beside = set(sys.modules), str(path.resolve().parent)
     sys.path.insert(0, beside)  # as Python has it for a script
     try:
@@ -37,6 +38,9 @@ def register_file(path: str | Path) -> list[Hypothesis]:
         lines = [part.lineno for part in traceback.extract_tb(error.__traceback__) if part.filename == str(path)]
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
         where = f"{path}{f', line {line}' if line else ''}"
+        if isinstance(error, TorchclothError):
+            what = f"{where}: {error.what}"
+            raise InvalidInput(what, got=error.got, expected=error.expected, remedy=error.remedy) from None
         raise InvalidInput("causes", got=f"{type(error).__name__} in {where}: {error}", expected=EXPECTED) from None
     finally:
         sys.path.remove(beside)

@@ -18,7 +18,7 @@ from .screening import Row, screen
 from .verdict import Diagnosis
 
 ASIDE = (
-    "Too small to matter",
+    "Not there, or too small to matter",
     "Would have to be",
     "Undecided",
     "Cannot be seen",
@@ -60,7 +60,10 @@ def _evidence(answer: Diagnosis) -> list[str]:
     found, content = answer.found, answer.content
     before, after = found.held_out
     first = screen(found.start)
-    named = _named(content, [*first, *found.screened])
+    rows = [*first, *found.screened]
+    named = _named(content, rows)
+    own = {r.hypothesis.effect: r.hypothesis.says for r in rows} | {c["effect"]: c["says"] for c in content["causes"]}
+    meanings = {name: said for name, said in own.items() if said} | GLOSSARY | ALIKE
     instead = {n: c["effect"] for c in content["causes"] for n in (*c["class"], *(r["effect"] for r in c["rivals"]))}
     return [
         *_causes(content["causes"]),
@@ -92,7 +95,7 @@ def _evidence(answer: Diagnosis) -> list[str]:
         "<h2>Parameters of the model</h2>",
         _parameters(answer.content["parameters"]),
         "<h2>What the names mean</h2>",
-        *(f"<p><b>{n}</b>: {html.escape(said)}</p>" for n, said in (GLOSSARY | ALIKE).items() if n in named),
+        *(f"<p><b>{n}</b>: {html.escape(said)}</p>" for n, said in meanings.items() if n in named),
     ]
 
 
@@ -126,8 +129,8 @@ def _causes(rows: list[dict[str, Any]]) -> list[str]:
         ]
 
     head = (
-        "cause", "amplitude", "95 %", "of typical", "mends, mm", "of what is explainable", "log density", "by chance",
-        "cannot be told from",
+        "cause", "amplitude", "95 %", "of typical", "mends, mm", "of what is explainable", "log density",
+        "by chance", "cannot be told from",
     )  # fmt: skip
     return [
         "<h2>Causes</h2>",
@@ -187,7 +190,9 @@ COLUMNS = (
 )  # fmt: skip
 CAUSES = (
     "Mends and log density: gained on motions that were held out; each unit of log density makes them e times "
-    "likelier. By chance (its own slopes, put in wrong places) it would rarely gain more than the number beside it."
+    "likelier. Log density is here by slopes, from the fit with all causes, so that it can be held against chance: "
+    "its own slopes, put in wrong places, would rarely gain more than the number beside it. By fits, as above, it is "
+    "another number."
 )
 LACK = (
     "What a right model leaves: the sensor's slow errors, what another mesh changes, and ripples, which another cloth "
@@ -195,9 +200,10 @@ LACK = (
 )
 DECISIONS = (
     "Amplitude: what the residuals ask for. Present: surely larger than what matters. Absent: surely smaller than that "
-    "(not zero), or of a sign that makes no sense. Unresolvable: even a typical amplitude might not show; an amplitude "
-    "shows, in one of two cases, from the value in its column on. Inconclusive: none of these. Typical moves: what a "
-    "typical amplitude does to the cloth beyond what is fitted anyway."
+    "(not zero), or of a sign that makes no sense. Unresolvable: even a typical amplitude might not show, or would "
+    "move the cloth by less than 0.3 mm; an amplitude shows, in one of two cases, from the value in its column on. "
+    "Inconclusive: none of these. Typical moves: what a typical amplitude does to the cloth beyond what is fitted "
+    "anyway."
 )
 
 
@@ -209,6 +215,8 @@ def _table(rows: list[Row], instead: dict[str, str]) -> str:
         numbers = (r.amplitude, r.std, r.bias, abs(h.smallest), r.detectable, h.typical, 1e3 * r.size)
         decision = f"not told from {instead[h.name]}" if h.name in instead else r.decision
         cells = [h.name, h.unit, *(f"{x:.3g}" if math.isfinite(x) else "–" for x in numbers), decision]
+        if not math.isfinite(r.std):  # nobody could ask
+            cells[2] = cells[4] = "–"
         body.append("".join(f"<td>{html.escape(c)}</td>" for c in cells))
     heads = "".join(f"<th>{name}</th>" for name in COLUMNS)
     return f"<p>{DECISIONS}</p><table><tr>{heads}</tr>{''.join(f'<tr>{row}</tr>' for row in body)}</table>"
@@ -276,7 +284,9 @@ def _learned(found: dict[str, Any] | None) -> list[str]:
 def _parameters(found: dict[str, Any]) -> str:
     rows = "".join(
         f"<tr><td>{name}</td><td>{p['value']:.4g}</td><td>{p['ci95'][0]:.4g} to {p['ci95'][1]:.4g}</td>"
-        f"<td>{p['unit']}</td></tr>"
+        f"<td>{p['data_sheet']:.4g}</td><td>{p['unit']}</td></tr>"
         for name, p in found.items()
     )
-    return f"<table><tr><th>parameter</th><th>value</th><th>95 %</th><th>unit</th></tr>{rows}</table>"
+    return (
+        f"<table><tr><th>parameter</th><th>value</th><th>95 %</th><th>data sheet</th><th>unit</th></tr>{rows}</table>"
+    )

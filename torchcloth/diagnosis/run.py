@@ -38,6 +38,7 @@ from .world import Hypothesis, Model
 OPEN = ("ambiguous", "inconclusive", "unexplained")  # verdicts that another experiment may change
 NONE_TELLS = "no short motion that can be done would tell the causes from what they cannot be told from now"
 RESULT, BASE, EXTENDED = "diagnosis.json", "base.tcm", "extended.tcm"
+CONFIRMED = Path("confirmation") / "confirmation.json"  # where `torchcloth confirm` says what they gain
 
 
 @own_gradients()
@@ -165,7 +166,8 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
     ``recordings`` are the episodes, which say what the base model is of.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / RESULT).unlink(missing_ok=True)  # of an earlier diagnosis: it says nothing of other models
+    for name in (RESULT, CONFIRMED):  # of an earlier diagnosis: they say nothing of other models
+        (folder / name).unlink(missing_ok=True)
     if answer.searched is None:
         for name in (BASE, EXTENDED):
             (folder / name).unlink(missing_ok=True)

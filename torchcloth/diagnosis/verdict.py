@@ -18,6 +18,7 @@ from .classes import fitted_alike
 from .comparison import Gain, by_motion, heard, spread, told_by
 from .drifting import drifts
 from .gate import Fault
+from .glossary import meaning
 from .lacking import lack_of_fit
 from .missing import MissingForce
 from .overlays import Overlay
@@ -188,6 +189,7 @@ def _cause(found: Found, step: Step, names: Sequence[str]) -> dict[str, Any]:
         "told_by": told,
         "motions_disagree": _disagreed(found, count + place, told, names),
         "typical": h.typical,
+        "says": meaning(h),
         "class": sorted({h.name, *kin, *h.kin}),
         "rivals": [_told(c.hypothesis, c.amplitude) for c in rivals],
         "gain_mm": 1e3 * (best.gain.before - best.gain.after),
@@ -285,7 +287,7 @@ def _parameters(found: Found, names: Sequence[str]) -> dict[str, Any]:
         value, slope = p.value(c), (p.value(c + NUDGE) - p.value(c - NUDGE)) / (2 * NUDGE)
         wide = NORMAL * _with_common(s, value / slope)
         ends = (p.value(min(max(end, p.low), p.high)) for end in (c - wide, c + wide))
-        out[p.name] = {"value": value, "ci95": sorted(ends), "unit": p.unit}
+        out[p.name] = {"value": value, "ci95": sorted(ends), "unit": p.unit, "data_sheet": p.value(0.0)}
     return out
 
 

@@ -7,7 +7,6 @@ from typing import Any
 
 from .base_model import SILENT
 from .cells import NAMES, SEEN
-from .glossary import GLOSSARY
 from .lacking import TOLERATED, Left
 from .screening import MUCH, Row
 from .stepwise import Found
@@ -21,6 +20,10 @@ HEAVY = 10.0  # weights of the cloth, that hardly anything pushes with
 UNLIKELY = (
     " Hardly anything pushes so much: what is left there is rather of the grip, of what is seen, or of a fold that "
     "turns over."
+)
+MILLIMETRES = (
+    "Millimetres are of means over parts of the fabric and 0.2 s, small errors of clock, camera and grip taken out: "
+    "single points are farther off."
 )
 FELT = NAMES[SEEN:]
 NO_MASS = (
@@ -49,16 +52,18 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
             f"That is {100 * gain['explained_fraction']:.0f} % of what could be explained (95 %: {low:.0f} to "
             f"{high:.0f} %), and {gain['log_density']:.0f} in log density ({least:.0f} to {most:.0f})."
         )
+        out.append(MILLIMETRES)
     out += [f"Came with the model, fitted anew: {_sized(c)}." for c in content["given"]]
     for c in content["causes"]:
         out.append(f"Cause: {_sized(c)}; {abs(c['typical']):.4g} is typical.")
-        others = [name for name in c["class"] if name != c["effect"]] + [r["effect"] for r in c["rivals"]]
-        out += [f"  {said}" for said in (GLOSSARY.get(c["effect"].partition("[")[0]),) if said]
+        sizes = {r["effect"]: f"{_size(r)} in its place" for r in c["rivals"]}
+        others = {name: name for name in c["class"] if name != c["effect"]} | sizes
+        out += [f"  {c['says']}"] if c["says"] else []
         out.append(f"  {_shown(c, content)}")
         out += _hardly_sized(c)
         out += [f"  {DISAGREED}"] if c["motions_disagree"] else []
         if others:
-            out.append(f"  Cannot be told from: {', '.join(dict.fromkeys(others))}.")
+            out.append(f"  Cannot be told from: {', '.join(others.values())}.")
     if content["causes"]:
         out.append(
             "These intervals know of noise, meshes, how far motions disagree, and 3 % for what is wrong in all alike, "
@@ -66,7 +71,8 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
         )
     words = {
         "identified": "Each cause that is named stands alone: nothing else that was asked about does the same.",
-        "ambiguous": "A cause is named, and these data cannot tell it from others.",
+        "ambiguous": "A cause is named, and these data cannot tell it from others: the extended model, which "
+        "has the one that is named, may predict as the wrong one does.",
         "adequate": "No known cause is surely larger than what matters.",
         "unexplained": "The fit is lacking, and no known cause mends it.",
         "inconclusive": "Something may be wrong; these data cannot say what.",
@@ -81,7 +87,7 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
     out += _lacking(content)
     small = [name for name in content["ruled_out"] if name not in content["wrong_sign"]]
     for label, names in (
-        ("Too small to matter", small),
+        ("Not there, or too small to matter", small),
         ("Would have to be of a sign that makes no sense", content["wrong_sign"]),
         ("Undecided", content["undecided"]),
     ):

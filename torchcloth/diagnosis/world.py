@@ -137,6 +137,7 @@ class Hypothesis:
         brings: another hypothesis, which comes along at its typical amplitude where the world has none of it.
         finer: its slopes are taken on the finer mesh where it does something on the given one: it acts in folds, for
             which that is too coarse.
+        says: what it is in a sentence, for reports; the catalogue's have theirs in the glossary.
     """
 
     name: str
@@ -153,6 +154,7 @@ class Hypothesis:
     high: float = math.inf
     brings: str = ""
     finer: bool = False
+    says: str = ""
 
     def __post_init__(self) -> None:
         if isinstance(self.kin, list):  # which has no hash

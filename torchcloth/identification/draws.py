@@ -11,7 +11,7 @@ import torch
 from ..cloth import Cloth
 from ..parameters import PhysicalParameter, to_value
 from ..recordings import Recording
-from .saved import read_saved, rebuilt
+from .saved import Scene, read_saved, rebuilt
 from .unknowns import available
 
 FAR = 3.0  # standard errors, beyond which nothing is drawn
@@ -19,7 +19,7 @@ LINEAR = ("nonnegative", "real")  # domains that are stored as they are
 DECADE = math.log(10.0)  # likewise, in the stored coordinate: of what a fit knows nothing of
 
 
-def drawn(path: str | Path, recording: Recording, count: int, seed: int = 0) -> list[Cloth]:
+def drawn(path: str | Path, recording: Recording, count: int, seed: int = 0, begun: Scene | None = None) -> list[Cloth]:
     """``count`` cloths of an episode: at a fit's values, then with its parameters drawn from their joint errors.
 
     Errors are Gaussian in the stored coordinate (the logarithm of positive parameters), correlated as the fit says, and
@@ -30,17 +30,18 @@ def drawn(path: str | Path, recording: Recording, count: int, seed: int = 0) -> 
         recording: an episode of the same cloth, fitted or not.
         count: how many, the best one included.
         seed: of the draws.
+        begun: of a fit that began with a .tcm file: ``diagnosis.start_of(path)``.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
         RecordingError: the file cannot be read, or does not hold what is needed.
     """
     model, rng = read_saved(path), np.random.default_rng(seed)
-    out = [rebuilt(path, model, recording)]
+    out = [rebuilt(path, model, recording, begun)]
     values, vectors = np.linalg.eigh(model.correlation)
     root = vectors * np.sqrt(values.clip(min=0.0))
     for _ in range(count - 1):
-        cloth = rebuilt(path, model, recording)
+        cloth = rebuilt(path, model, recording, begun)
         names, noise = available(cloth), (root @ rng.standard_normal(len(root))).clip(-FAR, FAR)
         for (name, std), z in zip(model.stds.items(), noise, strict=True):
             if name in names and math.isfinite(std):

@@ -25,7 +25,7 @@ from .misfit import figures, forces_rms
 from .null import no_force, rigid_carry
 from .replays import Frames, each, simulate, tangents
 from .result import or_none
-from .saved import SavedModel, read_saved, rebuilt, step_of
+from .saved import SavedModel, Scene, read_saved, rebuilt, step_of
 from .unknowns import Unknown, collect
 
 CONVENTION = (
@@ -90,13 +90,14 @@ class EpisodePrediction:
         }
 
 
-def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction:
+def predict_episode(path: str | Path, recording: Recording, begun: Scene | None = None) -> EpisodePrediction:
     """Simulate any episode of the fitted cloth with the fitted values, with errors from their covariance.
 
     Args:
         path: identification.json, or the folder that holds it.
         recording: describes the same kind of cloth; points, markers and forces are only compared with. Without any
             there are twenty frames a second.
+        begun: of a fit that began with a .tcm file: ``diagnosis.start_of(path)``.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
@@ -105,7 +106,7 @@ def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction
     """
     model = read_saved(path)
     check_size(recording)
-    cloth = rebuilt(path, model, recording)
+    cloth = rebuilt(path, model, recording, begun)
     unknowns, covariance = _known(model, cloth)
     data = episode(cloth, recording, RATE)
     raw = torch.tensor([u.start for u in unknowns], dtype=torch.float64)

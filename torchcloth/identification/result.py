@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -11,10 +12,11 @@ from typing import Any
 
 from torch import Tensor
 
-from .._files import write_text
+from .._files import atomically, write_text
 from ..cloth import Cloth
 from .statements import Combination, Estimate, Influence, Profile
 
+START = "start.tcm"  # beside identification.json: the model that a fit began with
 CONVENTION = (
     "SI units. chamfer: one-sided, cloud to surface: mean over frames of the mean distance [m] from each measured "
     "point to the nearest point of the simulated triangles. rms: root mean square of the same distances over all "
@@ -90,11 +92,19 @@ class Identification:
             "model": self.model,
         }
 
-    def save(self, folder: str | Path) -> Path:
-        """Write identification.json into ``folder``, atomically; returns its path."""
-        folder = Path(folder)
+    def save(self, folder: str | Path, begun: str | Path | None = None) -> Path:
+        """Write identification.json into ``folder``, atomically; returns its path.
+
+        ``begun`` is the .tcm file whose cloth was fitted, if it was one: a copy is kept beside it, from which
+        ``diagnosis.start_of`` makes that cloth again.
+        """
+        folder, content = Path(folder), self.as_dict()
         folder.mkdir(parents=True, exist_ok=True)
-        return write_text(folder / "identification.json", json.dumps(self.as_dict(), indent=1, allow_nan=False) + "\n")
+        if begun is not None:
+            with atomically(folder / START) as part:
+                shutil.copyfile(begun, part)
+            content["model"] = content["model"] | {"begun": START}
+        return write_text(folder / "identification.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
 
     def apply(self, cloth: Cloth) -> Cloth:
         """Set the fitted values in ``cloth``, leaving what is not identifiable as it is; returns it."""

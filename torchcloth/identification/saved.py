@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,10 +30,12 @@ from .unknowns import available
 
 RESULT = "identification.json"
 MOST = 100.0  # of the logarithm of a spread, which says nothing long before
+Scene = Callable[[Recording], Cloth]  # the cloth that a fit began with, as an episode's
 FRICTION = ".friction"  # of a table, behind its name
 FAITHFUL = 0.02  # relative difference of Chamfer between the fit and its replay that other machines explain
 ALIKE = 1e-3  # relative, of thicknesses
 STIFFEST = 1e13  # in SI units: simulated, a fabric of more would take more steps than can be counted
+FEW = 4  # names in a message
 SHORTEST, FINEST = 1e-7, 1e-5  # s, m: no fit ends that takes such steps, or has such a contact grid
 
 
@@ -78,12 +80,13 @@ def model_of(cloth: Cloth, fit: Identification, recordings: Sequence[Recording],
     }
 
 
-def replayed(path: str | Path, recording: Recording) -> Replayed:
+def replayed(path: str | Path, recording: Recording, begun: Scene | None = None) -> Replayed:
     """Simulate an episode with the values of a fit.
 
     Args:
         path: identification.json, or the folder that holds it.
         recording: one of the episodes that were fitted, or another of the same cloth.
+        begun: of a fit that began with a .tcm file: ``diagnosis.start_of(path)``.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
@@ -92,7 +95,7 @@ def replayed(path: str | Path, recording: Recording) -> Replayed:
     model = read_saved(path)
     own = mark(recording)
     before = [kept["chamfer"] for kept in model.episodes if alike(kept, own)]
-    cloth = rebuilt(path, model, recording)
+    cloth = rebuilt(path, model, recording, begun)
     data = episode(cloth, recording, RATE)
     with torch.no_grad(), step_of(path):
         frames = Replay(cloth)(data, model.dt).x
@@ -106,12 +109,15 @@ def replayed(path: str | Path, recording: Recording) -> Replayed:
     return Replayed(cloth, data, frames, found.per_frame, bool(before), warning)
 
 
-def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
+def fitted(
+    path: str | Path, recording: Recording, begun: Scene | None = None
+) -> tuple[Cloth, dict[str, tuple[float, float]]]:
     """The cloth of any episode with a fit's values, and what the fit leaves open of them.
 
     Args:
         path: identification.json, or the folder that holds it.
         recording: an episode of the same cloth, fitted or not.
+        begun: as ``replayed``.
 
     Returns:
         The cloth, and by name of every fitted parameter (value, spread) as the ``priors`` of ``identify`` take it; the
@@ -122,7 +128,7 @@ def fitted(path: str | Path, recording: Recording) -> tuple[Cloth, dict[str, tup
         RecordingError: the file cannot be read, or does not hold what is needed.
     """
     model = read_saved(path)
-    cloth = rebuilt(path, model, recording)
+    cloth = rebuilt(path, model, recording, begun)
     names, out = available(cloth), {}
     for name, std in model.stds.items():
         value = model.values[name]
@@ -140,6 +146,7 @@ class SavedModel:
         values: by name, fitted or not.
         stds: standard errors of the fitted parameters, by name.
         beyond: names of what the fitted cloth has and its first episode does not describe.
+        begun: whether the fit began with a .tcm file, which is kept beside it.
         correlation: [K, K] of the fitted parameters, in the order of ``stds``.
         thickness: m, with which moduli [Pa] were fitted; None: a file of before does not say.
         left: m, rms distance that the fit left in its own episodes; NaN where nothing was seen.
@@ -148,6 +155,7 @@ class SavedModel:
     values: dict[str, float]
     stds: dict[str, float]
     beyond: list[str]
+    begun: bool
     correlation: np.ndarray
     thickness: float | None
     left: float
@@ -196,6 +204,7 @@ def _model(content: dict[str, Any]) -> SavedModel:
         {str(name): _value(name, value) for name, value in model["values"].items()},
         {name: number(said[name]["std"], 0.0, f"{name}'s std") for name in correlation},
         [str(name) for name in model.get("beyond", ())],  # files of before do not say
+        "begun" in model,
         matrix,
         None if (thickness := model.get("thickness")) is None else number(thickness, 0.0, "thickness"),
         math.nan if left is None else number(left, 0.0),
@@ -218,14 +227,14 @@ def is_fitted(path: str | Path, recording: Recording) -> bool:
     return any(alike(kept, own) for kept in read_saved(path).episodes)
 
 
-def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:
-    """The cloth that an episode describes, at the fitted values.
+def rebuilt(path: str | Path, model: SavedModel, recording: Recording, begun: Scene | None = None) -> Cloth:
+    """The cloth that an episode describes, or that ``begun`` makes of it, at the fitted values.
 
     Raises:
         InvalidInput: it has other parameters than the fitted one, or that has more than its own episode describes.
         RecordingError: a value that no such parameter can have.
     """
-    cloth = cloth_from(recording, contact=model.contact)
+    cloth = cloth_from(recording, contact=model.contact) if begun is None else begun(recording)
     own = getattr(cloth.material, "thickness", None)
     known = model.thickness
     if own is not None and known is not None and not math.isclose(own, known, rel_tol=ALIKE):
@@ -238,12 +247,14 @@ def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:
     names = available(cloth)
     tables = {name for name in model.values if name.endswith(FRICTION)} - names.keys()  # of tables that are not there
     absent = {name for name in tables if name.removesuffix(FRICTION) not in recording.colliders}
-    if other := ((model.values.keys() - absent) ^ names.keys()) | set(model.beyond):
+    beyond = model.beyond if begun is None else ()
+    if other := ((model.values.keys() - absent) ^ names.keys()) | set(beyond):
+        begins = "from Python give begun=diagnosis.start_of(path)" if model.begun else "fit this episode"
         raise InvalidInput(
             f"{path}: a fit of another model",
-            got=f"{', '.join(sorted(other))} not alike in both",
+            got=f"{_few(sorted(other))} not alike in both",
             expected="the model that the episode describes",
-            remedy="fit this episode; where the fit began with --model FILE.tcm, give that file",
+            remedy=begins,
         )
     for name in model.values.keys() - absent:
         value = model.values[name]
@@ -252,6 +263,12 @@ def rebuilt(path: str | Path, model: SavedModel, recording: Recording) -> Cloth:
         except InvalidInput as error:
             raise RecordingError(f"{path}: {error}", remedy="run `torchcloth identify` again") from None
     return cloth
+
+
+def _few(names: Sequence[str]) -> str:
+    """As many as one reads."""
+    more = len(names) - FEW
+    return ", ".join(names[:FEW]) + (f" and {more} more" if more > 0 else "")
 
 
 @contextmanager

@@ -41,10 +41,12 @@ def each_once(recordings: Sequence[Recording]) -> None:
         frames, every = _seen(recording)
         own = _mark(recording, frames, every)
         # repetitions of one motion may have one mean, not the same noise
-        if any(alike(other, own) and np.allclose(old, every, rtol=0, atol=SAME) for other, old in known):
+        same = (other for other, old in known if alike(other, own) and np.allclose(old, every, rtol=0, atol=SAME))
+        if (first := next(same, None)) is not None:
+            one = first["name"] == own["name"]
             raise InvalidInput(
                 "episodes",
-                got=f"{own['name']!r} twice",
+                got=f"{own['name']!r} twice" if one else f"{first['name']!r} and {own['name']!r}, which hold the same",
                 expected="each once",
                 remedy="leave one out, or record another",
             )

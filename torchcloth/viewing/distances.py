@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..diagnosis import read_model
+from ..diagnosis import read_model, start_of
 from ..diagnosis.loading import watched
 from ..identification import replayed
 from ..identification.episodes import RATE, episode
@@ -41,7 +41,7 @@ def film_of_fit(recording: Recording, fit: str | Path, *, truth: bool = False) -
     """
     if Path(fit).suffix == MODEL:
         return _film_of_model(recording, fit, truth)
-    again = replayed(fit, recording)
+    again = replayed(fit, recording, start_of(fit))
     film = film_of(recording, truth=truth, times=again.episode.times.numpy())
     film = _beside(film, recording, again.frames.numpy(), again.cloth.mesh.faces)
     distance = f", {1e3 * float(again.chamfer.mean()):.2f} mm from the points" if len(again.chamfer) else ""
