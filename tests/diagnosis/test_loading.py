@@ -91,8 +91,8 @@ def test_what_a_fit_leaves_out_of_a_model_is_said_with_what_allows_for_it(made):
 
 
 def test_what_was_confirmed_goes_with_its_models(tmp_path):
-    gone = [tmp_path / name for name in ("base.tcm", "extended.tcm", "confirmation/confirmation.json")]
-    gone[2].parent.mkdir()
+    gone = [tmp_path / name for name in ("confirmation/confirmation.json", "base.tcm", "extended.tcm")]
+    gone[0].parent.mkdir()
     for path in gone:
         path.write_text("of a diagnosis before")
     dx.write_diagnosis(dx.refused([dx.Fault("e1", "a clock that jumps", "record again")]), [], tmp_path)

@@ -37,6 +37,7 @@ def _diagnose(options: argparse.Namespace) -> int:
 
     from .. import diagnosis
     from ..diagnosis.feasible import FOLDER
+    from ..diagnosis.report import REPORT
     from ..diagnosis.run import RESULT
     from ..identification.journal import clear
 
@@ -77,7 +78,7 @@ def _diagnose(options: argparse.Namespace) -> int:
     amiss = [text for text in written.content["warnings"] if text not in answer.content["warnings"]]
     print("".join(f"Warning: {text}.\n" for text in amiss), end="")
     proposed = FOLDER if answer.experiment is not None and not amiss else None
-    files = (RESULT, "report.html", answer.content.get("base"), answer.content["model"], proposed)
+    files = (RESULT, REPORT, answer.content.get("base"), answer.content["model"], proposed)
     print("\n".join(str(options.out / name) for name in files if name))
     if replaced:
         print("the last diagnosis there is replaced")

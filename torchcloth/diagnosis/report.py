@@ -17,6 +17,7 @@ from .glossary import ALIKE, GLOSSARY
 from .screening import Row, screen
 from .verdict import Diagnosis
 
+REPORT = "report.html"
 ASIDE = (
     "Not there, or too small to matter",
     "Would have to be",
@@ -41,7 +42,7 @@ def write_report(answer: Diagnosis, folder: Path) -> Path:
     parts = verdict if answer.searched is None else verdict + _evidence(answer)
     title = "What the simulation gets wrong"
     page = f"<!doctype html><html><head><meta charset='utf-8'><title>{title}</title><style>{STYLE}</style></head>"
-    return write_text(folder / "report.html", f"{page}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")
+    return write_text(folder / REPORT, f"{page}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")
 
 
 def _told(answer: Diagnosis) -> list[str]:

@@ -27,7 +27,7 @@ from .model_file import save_model
 from .next_experiment import propose
 from .overlays import overlays
 from .own_causes import digests
-from .report import write_report
+from .report import REPORT, write_report
 from .residual import doubted, is_residual, learn_residual
 from .setting import Progress, motions_of, setting_of, somewhere_seen, staged
 from .stepwise import Found, search
@@ -166,7 +166,7 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
     ``recordings`` are the episodes, which say what the base model is of.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for name in (RESULT, CONFIRMED):  # of an earlier diagnosis: they say nothing of other models
+    for name in (RESULT, REPORT, CONFIRMED):  # of an earlier diagnosis: they say nothing of other models
         (folder / name).unlink(missing_ok=True)
     if answer.searched is None:
         for name in (BASE, EXTENDED):
