@@ -69,6 +69,25 @@ def test_markers_alone_will_do(pulled, model):
     assert fit.fit["chamfer_after"] < fit.fit["chamfer_before"]
 
 
+@pytest.mark.parametrize("use", ["points", "markers", "force"])
+def test_the_distance_is_from_what_is_in_use(pulled, model, use):
+    """By it steps through chaotic motion are judged."""
+    grip = {name: replace(m, force=m.force + 1.0) for name, m in pulled.grippers.items()}
+    off = {
+        "points": replace(pulled, points=replace(pulled.points, xyz=pulled.points.xyz + 0.05)),
+        "markers": replace(pulled, markers=replace(pulled.markers, xyz=pulled.markers.xyz + 0.05)),
+        "force": replace(pulled, grippers=grip),
+    }
+    unknowns = collect(model, ["youngs_modulus"], None)
+    asked = {
+        kind: Objective(model, unknowns, [episode(model, recording)], blocks=blocks_for(use))
+        for kind, recording in {"as it is": pulled, **off}.items()
+    }
+    found = {kind: objective.distance(objective.start) for kind, objective in asked.items()}
+    assert [kind for kind in off if found[kind] > 2 * found["as it is"]] == [use]
+    assert [kind for kind in off if found[kind] == found["as it is"]] == [kind for kind in off if kind != use]
+
+
 def test_neither_points_nor_markers_nor_forces_is_refused(pulled, model):
     mute = {name: replace(motion, force=None, torque=None) for name, motion in pulled.grippers.items()}
     with pytest.raises(RecordingError, match="has no points"):

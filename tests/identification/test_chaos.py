@@ -14,7 +14,6 @@ from torchcloth.errors import SimulationDiverged
 from torchcloth.identification import ensemble, gauss_newton, horizon, identify, linearity
 from torchcloth.identification.blocks import BLOCKS
 from torchcloth.identification.episodes import cloth_from, episode
-from torchcloth.identification.misfit import Figures
 from torchcloth.identification.nuisances import chosen
 from torchcloth.identification.objective import Objective
 from torchcloth.identification.replays import Frames
@@ -109,8 +108,8 @@ class Rippling:
         x = torch.stack([raw, 2 * raw])[None]
         return [Frames(x, 0 * x, {}, torch.zeros(1))]
 
-    def figures(self, raw):
-        return Figures(float((self._shown(raw) - self.data).abs().mean()), 0.0, torch.zeros(0))
+    def distance(self, raw):
+        return float((self._shown(raw) - self.data).abs().mean())
 
 
 FAILED = linearity.Checked(SimpleNamespace(raw=torch.zeros(3, dtype=torch.float64)), None, [], [], "chaotic")
@@ -146,17 +145,17 @@ def test_it_starts_where_all_frames_are_nearer(monkeypatch, known, failed):
     at = {end: SimpleNamespace(raw=torch.full((3,), float(k), dtype=torch.float64)) for k, end in enumerate("kf")}
     far = {0.0: known, 1.0: failed}
 
-    def figures(raw):
+    def distance(raw):
         if far[float(raw[0])] is None:
             raise SimulationDiverged("torn")
-        return Figures(far[float(raw[0])], 0.0, torch.zeros(0))
+        return far[float(raw[0])]
 
     def settle(around, posed, start, *rest):
         starts.append(float(start[0]))
         assert float(posed.prior_mean[0]) == 0.0, "the beginning's"
         raise SimulationDiverged("seen enough")
 
-    monkeypatch.setattr(problem, "figures", figures, raising=False)
+    monkeypatch.setattr(problem, "distance", distance, raising=False)
     monkeypatch.setattr(ensemble, "covariance_of", lambda *_: torch.eye(3, dtype=torch.float64))
     monkeypatch.setattr(ensemble, "later", lambda *_: None)
     monkeypatch.setattr(ensemble, "_settle", settle)

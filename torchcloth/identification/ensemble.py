@@ -113,7 +113,7 @@ def _after(problem: gauss_newton.Problem, told: Tensor, covariance: Tensor) -> g
 def _nearer(objective: Objective, told: Tensor, raw: Tensor) -> Tensor:
     """Where the beginning ended, unless the end of tangents lies nearer to all frames: they may have gone far alone."""
     try:
-        return raw if objective.figures(raw).chamfer < objective.figures(told).chamfer else told
+        return raw if objective.distance(raw) < objective.distance(told) else told
     except (SimulationDiverged, UnstableStep):
         return raw
 
@@ -180,11 +180,11 @@ def _seen_only(problem: gauss_newton.Problem, at: Iterate) -> Iterate:
 
 def _downhill(objective: Objective, problem: gauss_newton.Problem, raw: Tensor, step: Tensor) -> Tensor:
     """As far along a step as the cloth does not come to lie farther off than ripples put it."""
-    now = objective.figures(raw).chamfer
+    now = objective.distance(raw)
     for _ in range(HALVINGS):
         moved = problem.clip(raw + step)
         try:
-            if not objective.figures(moved).chamfer > WORSE * now:
+            if not objective.distance(moved) > WORSE * now:
                 return moved
         except (SimulationDiverged, UnstableStep):
             pass

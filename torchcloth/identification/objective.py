@@ -18,7 +18,7 @@ from .blocks import BLOCKS, USES, Block, floors_of
 from .episodes import Episode
 from .identifiability import Reach
 from .journal import Journal, digest, facts_of
-from .misfit import Figures, figures, huber
+from .misfit import Figures, figures, forces_rms, huber
 from .nuisances import AbstractNuisance, Placed, foreseen, place
 from .replays import Frames, each, simulate, tangents
 from .rows import Rows, scene_of
@@ -239,6 +239,20 @@ class Objective:
     def _figures(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         now = figures(self.frames(raw), self.episodes, self.faces)
         return torch.tensor(now.chamfer), torch.tensor(now.rms), now.per_frame
+
+    def distance(self, raw: Tensor) -> float:
+        """Mean distance [m] from what was seen and is in use; of forces alone their root mean square [N]."""
+        if self.uses("points") and self.uses("markers"):
+            return self.figures(raw).chamfer
+        self._meet(raw)
+        return float(self._ask("distance", raw, lambda: torch.tensor(self._distance(raw))))
+
+    def _distance(self, raw: Tensor) -> float:
+        if not self.uses("points", "markers"):
+            return forces_rms([frames.wrench for frames in self.seen(raw)], self.episodes)
+        other = {"markers": None} if self.uses("points") else {}
+        seen = [replace(e, **(other or {"clouds": [c[:0] for c in e.clouds]})) for e in self.episodes]
+        return figures(self.frames(raw), seen, self.faces).chamfer
 
     def cost(self, raw: Tensor, i: int, at: gauss_newton.Iterate) -> Tensor:
         """Robust cost of episode ``i`` by the scales of ``at``, without priors; differentiable in reverse mode."""
