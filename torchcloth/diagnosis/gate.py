@@ -74,8 +74,9 @@ def read_episodes(folders: Sequence[str | Path]) -> tuple[list[Recording], list[
         except RecordingError as error:
             if EPISODE in error.what or not (Path(folder) / EPISODE).is_file():
                 raise
-            parts = [error.what, *(f"got {error.got}" for _ in range(error.got is not None))]
-            what = ", ".join([*parts, *([f"expected {error.expected}"] if error.expected else [])])
+            got = "" if error.got is None else f", got {error.got}"
+            expected = f", expected {error.expected}" if error.expected else ""
+            what = f"{error.what}{got}{expected}"
             faults.append(Fault(Path(folder).name, what, error.remedy or "record again"))
     return found, faults
 

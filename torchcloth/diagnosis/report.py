@@ -216,7 +216,7 @@ def _table(rows: list[Row], instead: dict[str, str]) -> str:
         numbers = (r.amplitude, r.std, r.bias, abs(h.smallest), r.detectable, h.typical, 1e3 * r.size)
         decision = f"not told from {instead[h.name]}" if h.name in instead else r.decision
         cells = [h.name, h.unit, *(f"{x:.3g}" if math.isfinite(x) else "–" for x in numbers), decision]
-        if not math.isfinite(r.std):  # nobody could ask
+        if not math.isfinite(r.std):  # it could not be asked about
             cells[2] = cells[4] = "–"
         body.append("".join(f"<td>{html.escape(c)}</td>" for c in cells))
     heads = "".join(f"<th>{name}</th>" for name in COLUMNS)
