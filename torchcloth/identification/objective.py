@@ -250,8 +250,10 @@ class Objective:
     def _distance(self, raw: Tensor) -> float:
         if not self.uses("points", "markers"):
             return forces_rms([frames.wrench for frames in self.seen(raw)], self.episodes)
-        other = {"markers": None} if self.uses("points") else {}
-        seen = [replace(e, **(other or {"clouds": [c[:0] for c in e.clouds]})) for e in self.episodes]
+        if self.uses("points"):
+            seen = [replace(e, markers=None) for e in self.episodes]
+        else:
+            seen = [replace(e, clouds=[cloud[:0] for cloud in e.clouds]) for e in self.episodes]
         return figures(self.frames(raw), seen, self.faces).chamfer
 
     def cost(self, raw: Tensor, i: int, at: gauss_newton.Iterate) -> Tensor:
