@@ -109,7 +109,7 @@ def test_wrong_options_are_one_line_and_exit_code_2(folder, tmp_path, capsys, ca
 def test_one_episode_twice(folder, tmp_path, capsys, more):
     copy = shutil.copytree(folder, tmp_path / "copy")
     said = refuse(capsys, tmp_path / "out", "identify", folder, copy, *more)
-    assert "episodes; got 'copy' twice; expected each once" in said
+    assert "episodes; got 'twin' and 'copy', which hold the same; expected each once" in said
 
 
 def test_a_missing_folder(tmp_path, capsys):

@@ -431,7 +431,7 @@ def test_a_single_stretch_of_time_confirms_nothing():
     gain = compare(short, better, 0.0)
     assert gain.density > 0
     assert gain.ci95[0] == gain.ci95[1]
-    assert not Confirmation(gain, {}, 0.0, "the model").confirmed
+    assert not Confirmation(gain, {}, 0.0, "the model", ("base.tcm", "extended.tcm"), ["e1"]).confirmed
 
 
 def test_what_is_surely_there_is_present_though_a_usual_amount_of_it_could_not_be_seen():
