@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.stats import t
 
-from torchcloth.diagnosis.comparison import Gain, heard, spread, told_by
+from torchcloth.diagnosis.comparison import Gain, heard, predict, spread, told_by
 from torchcloth.diagnosis.screening import Row
 from torchcloth.diagnosis.trials import (
     NORMAL,
@@ -19,6 +19,7 @@ from torchcloth.diagnosis.trials import (
     Candidate,
     _agreed,
     _bent,
+    _disturbed,
     _ranked,
     known,
     standard_errors,
@@ -137,6 +138,25 @@ def test_halves_of_one_motion_need_not_agree_about_the_size_of_what_is_overwhelm
     assert not known(tried.fitted, "cause", list("abcd"), replace(tried, disturbs=True))
     nothing = replace(model, amplitudes=(0.0,))
     assert not known(replace(tried.fitted, model=nothing), "cause", list("abcd"), tried)
+
+
+def test_what_one_motion_tells_is_not_there_where_another_becomes_less_likely():
+    """Friction in bending for a stretch that folds another way: it gained 186, and a turn lost 30 (0.76 to 1.26 mm)."""
+    tried = replace(candidate(0.1, 0.0), alone={"a"}, gain=gain(0.7))
+    assert known(tried.fitted, "cause", list("abcd"), replace(tried, disturbs=True))
+    assert not known(tried.fitted, "cause", list("abcd"), replace(tried, disturbs=True, contradicted=True))
+    assert known(tried.fitted, "cause", list("abcd"), replace(tried, contradicted=True, bent=5.1))
+
+
+def test_a_motion_that_is_predicted_worse_is_found_where_it_is_not_the_one_that_tells():
+    ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.tensor([0.0, 0.1]).double(), 0)
+    first = predict(toys.fitted(ev), list("abcd"))
+    larger = torch.ones(4).double().index_fill(0, torch.tensor([1]), 1.5)[first.episode]
+    second = first._replace(value=larger * first.value, white=larger * first.white)
+    (worse,) = _disturbed(first, second, list("abcd"), {"a"})
+    assert worse.after == pytest.approx(1.5 * worse.before)
+    assert worse.density < 0
+    assert _disturbed(first, second, list("abcd"), {"b"}) == []
 
 
 def test_motions_need_not_agree_about_a_number_that_nothing_else_has_bent_so_far():

@@ -53,6 +53,7 @@ class Candidate:
     alone: set[str]  # the motion that alone tells of it, if any
     sure: float  # standard errors between motions that it must be away from zero
     disturbs: bool = False  # where one motion alone tells of it: positions of another are predicted worse
+    contradicted: bool = False  # likewise, and that motion is clearly less likely
     relieves: bool = False  # a fitted number that had left its data sheet is back with it
     bent: float = 0.0  # prior standard deviations, by which its twin had left the data sheet without it
 
@@ -215,11 +216,12 @@ def _compared(
         alone = telling(after, names)
         first, predicted = (predict(f, names, alone) for f in (before, after))
         gain = compare(first, predicted, 0.0)
-        disturbs = bool(alone) and _disturbs(first, predicted, names, alone)
+        worse = _disturbed(first, predicted, names, alone) if alone else []
+        contradicted = any(motion.density < -CLEAR for motion in worse)
         sure = standard_errors(gain, heard(predicted.episode, names), alone, not current.model.accepted)
         relieves = bool(strained - {p.name for p, _ in found.model.strained})
         bent = _bent(current.model, row.hypothesis.twin)
-        out.append(Candidate(row, found, predicted, gain, alone, sure, disturbs, relieves, bent))
+        out.append(Candidate(row, found, predicted, gain, alone, sure, bool(worse), contradicted, relieves, bent))
     return out
 
 
@@ -229,9 +231,10 @@ def _bent(model: Model, twin: str) -> float:
     return max((abs(c) / p.std for p, c in away if p.name == twin), default=0.0)
 
 
-def _disturbs(first: Predicted, second: Predicted, names: Sequence[str], alone: set[str]) -> bool:
+def _disturbed(first: Predicted, second: Predicted, names: Sequence[str], alone: set[str]) -> list[Gain]:
+    """Of the other motions, those whose positions are predicted worse."""
     motions = by_motion(first, second, 0.0, names).items()
-    return any(m.after > (1 + DISTURBED) * m.before for name, m in motions if name not in alone)
+    return [m for name, m in motions if name not in alone and m.after > (1 + DISTURBED) * m.before]
 
 
 def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bool) -> float:
@@ -290,9 +293,12 @@ def known(found: Fitted, name: str, names: Sequence[str], c: Candidate, most: fl
 
     It makes sense up to ``most`` times the typical amplitude; what has ended at nothing is not there. Halves of the one
     motion that tells of it need not agree about its size where it gains overwhelmingly in both and leaves all others as
-    they were: what creases do levels off with their rate, and its slopes there say little. Nor need motions agree about
-    a number that has left its data sheet so far that nothing else has bent it there.
+    they were: what creases do levels off with their rate, and its slopes there say little. Where another motion is
+    clearly less likely with it, it is not there, whatever it gains. Nor need motions agree about a number that has left
+    its data sheet so far that nothing else has bent it there.
     """
+    if c.contradicted and c.bent <= BENT:
+        return False
     place = found.model.place(name)
     amplitude, largest = found.model.amplitudes[place], most * abs(found.model.accepted[place].typical)
     middle, std = (float(v[len(found.model.parameters) + place]) for v in spread(found, names, c.alone))
