@@ -108,6 +108,21 @@ def test_a_step_that_fails_is_not_tried_again():
     assert all(b < 0.9 * a for a, b in pairwise(sizes))
 
 
+def test_what_is_told_of_the_best_is_of_the_motion_that_is_kept():
+    """By mean square: a few points that are far off outweigh a mean that is a hair smaller."""
+
+    class Outlying(Bowl):
+        def look(self, at):
+            self.seen.append(at)
+            return 1.0 / len(self.seen), 1.0 + float(at.norm())
+
+    told = []
+    found = gauss_newton(Outlying(), torch.zeros(2), 20, lambda *numbers: told.append(numbers))
+    assert torch.equal(found.best, torch.zeros(2))
+    assert len(told) > 1
+    assert [best for _, _, best in told] == [1.0] * len(told)
+
+
 def test_slopes_that_are_lost_end_the_search():
     class Lost(Bowl):
         def pull(self, at):

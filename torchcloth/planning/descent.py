@@ -50,7 +50,7 @@ class Problem(Protocol):
         ...
 
 
-OnLook = Callable[[int, float, float], None]  # (motions looked at, distance [m], the best so far)
+OnLook = Callable[[int, float, float], None]  # (motions looked at, distance [m], that of the best so far)
 
 
 class Found(NamedTuple):
@@ -77,6 +77,7 @@ def gauss_newton(problem: Problem, start: Tensor, iterations: int, on_look: OnLo
         on_look: called after every motion that was looked at.
     """
     history: list[float] = []
+    squares: list[float] = []
 
     def look(at: Tensor) -> float:
         try:
@@ -86,7 +87,8 @@ def gauss_newton(problem: Problem, start: Tensor, iterations: int, on_look: OnLo
                 raise
             distance = square = math.inf
         history.append(distance)
-        on_look(len(history), distance, min(history))
+        squares.append(square)
+        on_look(len(history), distance, history[squares.index(min(squares))])  # the one that is kept
         return square
 
     at, damping = start, FIRST
