@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from torchcloth._files import write_text
+from torchcloth._utils.files import write_text
 from torchcloth.errors import InvalidInput
 
 from . import footprint, limits, report

@@ -15,7 +15,7 @@ import torch
 
 import torchcloth as tc
 from torchcloth import cloth as layer
-from torchcloth.engine.choice import Choice, Setting
+from torchcloth.engine.dispatch import Choice, Setting
 
 from .paths import LIKE, motion, seconds, sheet
 

@@ -15,8 +15,8 @@ import torch
 
 import torchcloth as tc
 from torchcloth.effects import AbstractEffect, Amplitude
-from torchcloth.engine.choice import Setting
-from torchcloth.sensitivities import Directions
+from torchcloth.engine.dispatch import Setting
+from torchcloth.simulation.sensitivities import Directions
 
 LIKE = 1e-2  # relative, of slopes in float32
 T = TypeVar("T")

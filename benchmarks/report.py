@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from torchcloth._files import atomically
+from torchcloth._utils.files import atomically
 
 COLUMNS = ("", "triangles", "substeps", "batch", "seconds", "ms/substep")
 

@@ -6,10 +6,10 @@ if __name__ != "torchcloth.robots":
 from . import primitives
 from .arm import Arm, Limits, Primitive, load
 from .description import models
-from .holds import Hold
+from .grasp_orientations import Hold
 from .plan import ACCELERATION, Plan, plan
+from .replan_episode import retrace
 from .replay import arm_of, closing, gripper_motion, replay
-from .retrace import retrace
 from .scene import Scene, Table, bimanual_rig
 
 __all__ = [

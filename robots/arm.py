@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchcloth._surroundings import undisturbed
+from torchcloth._utils.torch_modes import undisturbed
 from torchcloth.errors import InvalidInput
 from torchcloth.types import Trajectory
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchcloth._surroundings import undisturbed
+from torchcloth._utils.torch_modes import undisturbed
 from torchcloth.errors import InvalidInput
 
 from .rigid import twist

@@ -17,13 +17,13 @@ from torchcloth.types import Trajectory
 
 from .arm import Arm
 from .clearance import Gap
-from .crowd import STEP, between_arms, within_arm
-from .holds import Hold, candidates, inward
+from .collision_checks import STEP, between_arms, within_arm
+from .grasp_orientations import Hold, candidates, inward
 from .inverse import reach
+from .path_following import Load, Task, Way, dense, follow, load, ways
 from .primitives import Action
 from .scene import Scene
 from .spline import Spline
-from .ways import Load, Task, Way, dense, follow, load, ways
 
 # Flexiv publishes no joint accelerations; 3 rad/s^2 is what the examples of its RDK command (flexiv_rdk @ dca9a15).
 ACCELERATION = 3.0  # rad/s^2

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcloth.errors import RecordingError
 from torchcloth.recordings import GripperMotion, JointMotion, Recording
-from torchcloth.recordings.together import check_recording
+from torchcloth.recordings.consistency import check_recording
 from torchcloth.types import Trajectory
 
 from .arm import Arm, load

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from torchcloth._files import atomically, write_text
+from torchcloth._utils.files import atomically, write_text
 
 
 def test_an_interrupt_while_writing_leaves_the_old_text(tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 
 import torchcloth as tc
-from torchcloth.forward_mode import real_tangents
+from torchcloth._utils.forward_mode import real_tangents
 
 OPERATIONS = {
     "mul": torch.mul,

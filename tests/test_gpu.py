@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth import captured
 from torchcloth.benchmarks import devices
+from torchcloth.engine import cuda_graphs
 
 pytestmark = [
     pytest.mark.gpu,
@@ -63,8 +63,8 @@ WAYS = {
 @pytest.mark.parametrize(("dtype", "mark"), [(torch.float64, 1e-9), (torch.float32, 1e-4)])
 def test_cuda_equals_cpu(monkeypatch, dtype, mark, contact, way):
     units = []
-    usual = captured.Unit.__init__
-    monkeypatch.setattr(captured.Unit, "__init__", lambda self, *how: (units.append(self), usual(self, *how))[1])
+    usual = cuda_graphs.Unit.__init__
+    monkeypatch.setattr(cuda_graphs.Unit, "__init__", lambda self, *how: (units.append(self), usual(self, *how))[1])
     known, gradient, _ = lifted(devices.Way("cpu", "auto"), dtype, contact, 0.3)
     x, grad, _ = lifted(WAYS[way], dtype, contact, 0.3)
     torch.testing.assert_close(x, known, rtol=mark, atol=mark)
@@ -126,7 +126,7 @@ def test_a_part_that_waits_is_launched_one_by_one_and_spoils_nothing():
         cloth(cloth.rest_state(), times=[0.0, 1.0])
     assert torch.cuda.current_stream() == stream
     torch.cuda.empty_cache()
-    assert not captured.Graphs.broken
+    assert not cuda_graphs.Graphs.broken
     plain = tc.Cloth(mesh, tc.materials.AEP(5e4), 0.3, {"gravity": tc.effects.Gravity()}, contact=None).cuda()
     assert torch.isfinite(plain(plain.rest_state(), times=[0.0, 1.0]).x).all()
 

@@ -89,7 +89,7 @@ def private_names(code: str) -> list[str]:
 @pytest.mark.parametrize(
     "code",
     [
-        "from torchcloth._math import cross",
+        "from torchcloth._utils.linalg import cross",
         "from torchcloth.effects import _curvature",
         "import torchcloth.effects._curvature",
         "import torchcloth as tc\ntc._math",

@@ -13,7 +13,7 @@ WRITTEN = {
     "prediction.json": "identification/episode_prediction.py",
     "pose.json": "pose/result.py",
     "plan.json": "planning/result.py",
-    "confirmation.json": "diagnosis/confirming.py",
+    "confirmation.json": "diagnosis/confirmation.py",
     "inspection.json": "inspection/look.py",
 }
 

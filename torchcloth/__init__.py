@@ -11,11 +11,11 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from . import boundaries, effects, errors, functional, losses, materials, meshes
+from . import boundaries, dynamics, effects, errors, losses, materials, meshes
 from .cloth import Cloth
+from .dynamics.contact import Contact
 from .parameters import PhysicalParameter
-from .sensitivities import Directions
-from .transfer import Contact
+from .simulation.sensitivities import Directions
 from .types import ClothState, Rollout, Trajectory
 
 if TYPE_CHECKING:
@@ -37,10 +37,10 @@ __all__ = [
     "boundaries",
     "diagnose",
     "diagnosis",
+    "dynamics",
     "effects",
     "errors",
     "estimate_pose",
-    "functional",
     "identification",
     "identify",
     "load",

@@ -12,26 +12,21 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from . import functional
-from ._surroundings import undisturbed
+from ._utils.torch_modes import undisturbed
 from .boundaries import AbstractBoundary
-from .captured import Graphs
+from .dynamics import substep
+from .dynamics.contact import Contact, Grid
+from .dynamics.elasticity import MATERIAL, inverse_growth
+from .dynamics.model import Geometry, Model, vertex_mass
+from .dynamics.stability import check_precision, limits_of
 from .effects import AbstractEffect
-from .engine.choice import TRIED, Choice, Setting, Trial, check_setting, choose, still_drives
+from .engine.cuda_graphs import Graphs
+from .engine.dispatch import TRIED, Choice, Setting, Trial, check_setting, choose, still_drives
 from .errors import TorchclothError
-from .initial import damped, first_state, held, likeness, pressed, stopped
-from .intervals import Plan, divided, run
 from .materials import AbstractMaterial
 from .meshes import Mesh
-from .model import Geometry, Model, vertex_mass
 from .parameters import PhysicalParameter
-from .parts import Parts, check_free
-from .sensitivities import Directions, sensitivities
-from .stability import check_precision, limits_of
-from .strain import MATERIAL, inverse_growth
-from .transfer import Contact, Grid
-from .types import ClothState, Rollout, Trajectory
-from .validation import (
+from .simulation.argument_checks import (
     as_positions,
     check_axes,
     check_field,
@@ -49,6 +44,11 @@ from .validation import (
     doubts,
     expand_state,
 )
+from .simulation.bound_modules import Parts, check_free
+from .simulation.initial_state import damped, first_state, held, likeness, pressed, stopped
+from .simulation.rollout import Plan, divided, run
+from .simulation.sensitivities import Directions, sensitivities
+from .types import ClothState, Rollout, Trajectory
 
 
 class Cloth(nn.Module):
@@ -297,7 +297,7 @@ class Cloth(nn.Module):
         """Energies by name, each [...] J."""
         model = self.model()
         check_state(state, likeness(model, self._vertices), finite=False)
-        return functional.energy(model, state)
+        return substep.energy(model, state)
 
     def plan(
         self, state: ClothState, motion: Mapping[str, Trajectory], times: Tensor | Sequence[float], dt: float | None

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from ._vectors import check_value
+from ._utils.vectors import check_value
 from .errors import InvalidInput
 
 Domain = Literal["positive", "unit_half", "nonnegative", "real"]

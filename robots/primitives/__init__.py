@@ -6,12 +6,12 @@
 
 from __future__ import annotations
 
+from .base import Action, Limits, minimum_jerk
 from .cover import cover
 from .drag import drag
 from .fling import fling
 from .fold import fold
 from .hang import hang
-from .moves import Action, Limits, minimum_jerk
 from .shake import shake
 from .stretch import stretch
 from .swing import swing

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from .moves import Action, Grips, Limits, Move, action, along, check, finite, lowest
+from .base import Action, Grips, Limits, Move, action, along, check, finite, lowest
 
 
 def fling(

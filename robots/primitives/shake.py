@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from .moves import Action, Grips, Limits, finite
+from .base import Action, Grips, Limits, finite
 from .swing import to_and_fro
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .moves import Action, Grips, Limits, Move, action, along, check, whole
+from .base import Action, Grips, Limits, Move, action, along, check, whole
 
 
 def swing(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from torchcloth.diagnosis.cells import NAMES, Cells
-from torchcloth.diagnosis.evidence import Evidence
-from torchcloth.diagnosis.fitting import Fitted
-from torchcloth.diagnosis.noise import Noise, whitened
-from torchcloth.diagnosis.world import Hypothesis, Model, Parameter
+from torchcloth.diagnosis.data.binning import NAMES, Cells
+from torchcloth.diagnosis.inference.fitting import Fitted
+from torchcloth.diagnosis.inference.linearise import Evidence
+from torchcloth.diagnosis.inference.noise import Noise, whitened
+from torchcloth.episodes.world import Hypothesis, Model, Parameter
 
 EPISODES, PATCHES, WINDOWS = 4, 16, 6
 WHITE, SLOW, STD = 2e-4, 8e-4, 1.5e-3  # m

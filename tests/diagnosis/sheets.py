@@ -11,10 +11,10 @@ import torch
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import World, base_model
-from torchcloth.identification.carried import between, carried
-from torchcloth.identification.episodes import Episode
-from torchcloth.identification.episodes import episode as tensors
-from torchcloth.identification.replays import Frames
+from torchcloth.episodes.observed import Episode
+from torchcloth.episodes.observed import episode as tensors
+from torchcloth.episodes.pattern_interpolation import between, carried
+from torchcloth.episodes.replay import Frames
 
 SIDE = 0.2  # m
 TRUTH, FIT = (13, 13), (7, 7)

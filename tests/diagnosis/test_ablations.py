@@ -6,10 +6,10 @@ import linear_toys as toys
 import sheets
 import torch
 
-from torchcloth.diagnosis.base_model import base_model
-from torchcloth.diagnosis.hypotheses import catalogue
-from torchcloth.diagnosis.screening import screen
-from torchcloth.diagnosis.setting import setting_of
+from torchcloth.diagnosis.causes.hypotheses import catalogue
+from torchcloth.diagnosis.data.dataset import setting_of
+from torchcloth.diagnosis.inference.screening import screen
+from torchcloth.diagnosis.models.base_model import base_model
 
 NAMES = ["a", "b", "c"]
 SLOPES = toys.smooth(1, 6)  # two parameters, three hypotheses, one nuisance

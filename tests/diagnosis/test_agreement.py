@@ -9,9 +9,7 @@ import pytest
 import torch
 from scipy.stats import t
 
-from torchcloth.diagnosis.comparison import Gain, heard, predict, spread, told_by
-from torchcloth.diagnosis.screening import Row
-from torchcloth.diagnosis.trials import (
+from torchcloth.diagnosis.decide.candidates import (
     NORMAL,
     SURE,
     SURE_OF_BEST,
@@ -24,8 +22,10 @@ from torchcloth.diagnosis.trials import (
     known,
     standard_errors,
 )
-from torchcloth.diagnosis.verdict import _disagreed, _error, _parameters
-from torchcloth.diagnosis.world import Model
+from torchcloth.diagnosis.decide.verdict import _disagreed, _error, _parameters
+from torchcloth.diagnosis.inference.comparison import Gain, heard, predict, spread, told_by
+from torchcloth.diagnosis.inference.screening import Row
+from torchcloth.episodes.world import Model
 
 
 def gain(after):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchcloth.diagnosis.approaching import FARTHEST, _lowest, _parabola
+from torchcloth.diagnosis.inference.warm_start import FARTHEST, _lowest, _parabola
 
 
 def quotients(curve, ahead, back):

@@ -6,11 +6,11 @@ import linear_toys as toys
 import pytest
 import torch
 
-from torchcloth.diagnosis.bursts import FREEDOM, calmed, densities, weights
-from torchcloth.diagnosis.cells import stretches
-from torchcloth.diagnosis.comparison import compare, predict
-from torchcloth.diagnosis.fitting import step_of
-from torchcloth.diagnosis.noise import Noise, whitened
+from torchcloth.diagnosis.data.binning import stretches
+from torchcloth.diagnosis.inference.comparison import compare, predict
+from torchcloth.diagnosis.inference.fitting import step_of
+from torchcloth.diagnosis.inference.noise import Noise, whitened
+from torchcloth.diagnosis.inference.robust_weights import FREEDOM, calmed, densities, weights
 
 SLOPES = toys.smooth(1, 4)  # three parameters, one nuisance
 TRUTH = torch.tensor([0.2, -0.3, 0.7]).double()

@@ -11,10 +11,10 @@ import torch
 from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, run, search, setting_of, write_diagnosis
-from torchcloth.diagnosis.cloud_pictures import over_cloud
-from torchcloth.diagnosis.next_experiment import Proposal
-from torchcloth.diagnosis.pictures import residual_maps
-from torchcloth.diagnosis.verdict import judge
+from torchcloth.diagnosis.decide.verdict import judge
+from torchcloth.diagnosis.experiment.proposal import Proposal
+from torchcloth.diagnosis.report.cloud_pictures import over_cloud
+from torchcloth.diagnosis.report.pictures import residual_maps
 from torchcloth.errors import InvalidInput
 
 ASKED = ("air.drag_n", "air.linear", "mass.hem", "rest.shrink[weft]", "obs.extrinsic[y]")

@@ -6,10 +6,10 @@ import linear_toys as toys
 import pytest
 import torch
 
-from torchcloth.diagnosis import stepwise
-from torchcloth.diagnosis.disputed import LAWS, disputed
-from torchcloth.diagnosis.fabric import OF_BENDING, OF_MEMBRANE
-from torchcloth.diagnosis.hypotheses import known
+from torchcloth.diagnosis.causes.fabric import OF_BENDING, OF_MEMBRANE
+from torchcloth.diagnosis.causes.hypotheses import known
+from torchcloth.diagnosis.decide import search
+from torchcloth.diagnosis.inference.heterogeneity import LAWS, disputed
 
 NAMES = ["a", "b", "c", "d"]
 
@@ -49,8 +49,8 @@ def test_the_laws_are_the_catalogues():
 
 
 def test_where_nothing_is_disputed_nothing_is_fitted(monkeypatch):
-    monkeypatch.setattr(stepwise, "one_step", lambda *_: pytest.fail("nothing to try"))
+    monkeypatch.setattr(search, "one_step", lambda *_: pytest.fail("nothing to try"))
     start = fitted(0.02)
-    chain = stepwise._of_disputed(start, type("S", (), {"names": NAMES})(), known(), lambda _: None)
+    chain = search._of_disputed(start, type("S", (), {"names": NAMES})(), known(), lambda _: None)
     assert chain.steps == []
     assert chain.current is start

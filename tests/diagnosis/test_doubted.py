@@ -7,10 +7,10 @@ import linear_toys as toys
 import pytest
 import torch
 
-from torchcloth.diagnosis import stepwise
-from torchcloth.diagnosis.comparison import compare, predict
-from torchcloth.diagnosis.fitting import renoised
-from torchcloth.diagnosis.stepwise import instead
+from torchcloth.diagnosis.decide import search
+from torchcloth.diagnosis.decide.search import instead
+from torchcloth.diagnosis.inference.comparison import compare, predict
+from torchcloth.diagnosis.inference.fitting import renoised
 
 SLOPES = toys.smooth(1, 5)  # two parameters, a cause, a law, a nuisance
 NAMES = [f"motion {k}" for k in range(toys.EPISODES)]
@@ -31,7 +31,7 @@ def doubted(monkeypatch, cause, law, useful=True):
     start, end, other = models(cause, law)
     best = SimpleNamespace(fitted=other, alone=set(), hypothesis=toys.hypothesis("a"))
     own = SimpleNamespace(best=SimpleNamespace(alone=set(), hypothesis=toys.hypothesis("c")))
-    monkeypatch.setattr(stepwise, "one_step", lambda *_: SimpleNamespace(best=best) if useful else None)
+    monkeypatch.setattr(search, "one_step", lambda *_: SimpleNamespace(best=best) if useful else None)
     first = predict(renoised(start, end.noise, end.evidence), NAMES)
     whole = compare(first, predict(end, NAMES), 0.0)
     setting = SimpleNamespace(names=NAMES, recordings=(), episodes=())

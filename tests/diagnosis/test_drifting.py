@@ -8,10 +8,10 @@ import torch
 from scipy.stats import t as student
 
 from torchcloth.diagnosis import drifts
-from torchcloth.diagnosis.cells import NAMES, SEEN
-from torchcloth.diagnosis.drifting import _beyond, _pooled
-from torchcloth.diagnosis.lacking import SENSOR
-from torchcloth.diagnosis.noise import Noise
+from torchcloth.diagnosis.data.binning import NAMES, SEEN
+from torchcloth.diagnosis.inference.force_drift import _beyond, _pooled
+from torchcloth.diagnosis.inference.lack_of_fit import SENSOR
+from torchcloth.diagnosis.inference.noise import Noise
 
 TARE = 0.1  # N
 SLOPES = torch.zeros(toys.EPISODES, len(toys.grid().value), 2).double()

@@ -13,12 +13,13 @@ import pytest
 import sheets
 import torch
 
-from torchcloth.diagnosis import base_model, catalogue, fit, next_experiment, setting_of
-from torchcloth.diagnosis.cells import NAMES
-from torchcloth.diagnosis.evidence import central
-from torchcloth.diagnosis.experiments import LIBRARY, PLANS, Experiment, heading_of, planned, possible
-from torchcloth.diagnosis.fitting import renoised
-from torchcloth.diagnosis.next_experiment import (
+from torchcloth.diagnosis import base_model, catalogue, fit, setting_of
+from torchcloth.diagnosis.data.binning import NAMES
+from torchcloth.diagnosis.data.dataset import foreseen
+from torchcloth.diagnosis.decide.candidates import HARDLY
+from torchcloth.diagnosis.experiment import proposal
+from torchcloth.diagnosis.experiment.motions import LIBRARY, PLANS, Experiment, heading_of, planned, possible
+from torchcloth.diagnosis.experiment.proposal import (
     Question,
     as_seen,
     distances,
@@ -27,10 +28,10 @@ from torchcloth.diagnosis.next_experiment import (
     question_of,
     whitened_slopes,
 )
-from torchcloth.diagnosis.noise import FLOOR, Noise
-from torchcloth.diagnosis.setting import foreseen
-from torchcloth.diagnosis.trials import HARDLY
-from torchcloth.identification.episodes import episode
+from torchcloth.diagnosis.inference.fitting import renoised
+from torchcloth.diagnosis.inference.linearise import central
+from torchcloth.diagnosis.inference.noise import FLOOR, Noise
+from torchcloth.episodes.observed import episode
 from torchcloth.recordings import Collider
 
 INDEPENDENT = Path(__file__).parents[1] / "independent"
@@ -164,7 +165,7 @@ def test_gravity_and_camera_are_told_apart_by_turning(said, monkeypatch):
     for name in ("hang", "turn"):
         slopes = whitened_slopes(question, planned(Experiment(name, -90.0), setting.recordings[0]), setting)
         told[name] = min(distances(question, information(question, [slopes])).values())
-    monkeypatch.setattr(next_experiment, "central", smooth)
+    monkeypatch.setattr(proposal, "central", smooth)
     calm = whitened_slopes(question, planned(Experiment("turn", -90.0), setting.recordings[0]), setting)
     assert min(distances(question, information(question, [calm])).values()) > told["turn"]  # ripples tell less
     least = min(now.values())

@@ -13,10 +13,10 @@ import torch
 from test_experiments import undecided
 
 from torchcloth import recordings, robots
-from torchcloth.diagnosis import experiments, next_experiment
-from torchcloth.diagnosis.experiments import Experiment, planned
-from torchcloth.diagnosis.feasible import FOLDER, PROPOSED, Choice, feasible, write_episode
-from torchcloth.recordings.proposed import FILES, undone
+from torchcloth.diagnosis.experiment import motions, proposal
+from torchcloth.diagnosis.experiment.feasibility import FOLDER, PROPOSED, Choice, feasible, write_episode
+from torchcloth.diagnosis.experiment.motions import Experiment, planned
+from torchcloth.recordings.templates import FILES, undone
 
 FAST = Experiment("swing-fast")
 
@@ -33,7 +33,7 @@ def shipped():
 @pytest.fixture(scope="module")
 def slowed(shipped):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiments, "LIBRARY", (FAST,))
+        patch.setattr(motions, "LIBRARY", (FAST,))
         (found,) = feasible([shipped], quiet)
     return found
 
@@ -51,14 +51,14 @@ def test_an_experiment_is_as_fast_as_the_arms(shipped, slowed):
 
 
 def test_where_no_arm_is_named_none_is_asked(monkeypatch):
-    monkeypatch.setattr(experiments, "LIBRARY", (FAST, Experiment("turn", 90.0)))
+    monkeypatch.setattr(motions, "LIBRARY", (FAST, Experiment("turn", 90.0)))
     found = feasible([sheets.episode()], lambda _: pytest.fail("an arm was asked"))
     assert [c.experiment for c in found] == [FAST, Experiment("turn", 90.0)]
     assert {(c.plan, c.why_not, c.unasked) for c in found} == {(None, None, None)}
 
 
 def test_what_is_in_the_arms_way_is_said_and_not_proposed(shipped, monkeypatch):
-    monkeypatch.setattr(experiments, "LIBRARY", (FAST,))
+    monkeypatch.setattr(motions, "LIBRARY", (FAST,))
     far = {name: replace(r, T_world_base=r.T_world_base + np.eye(4, k=3) * 3.0) for name, r in shipped.robots.items()}
     paths = {name: robots.gripper_motion(path) for name, path in robots.replay(shipped).items()}
     (refused,) = feasible([replace(shipped, grippers=paths, joints={}, robots=far)], quiet)
@@ -66,16 +66,16 @@ def test_what_is_in_the_arms_way_is_said_and_not_proposed(shipped, monkeypatch):
     found, content, setting = undecided(("env.gravity_tilt[y]", "obs.rotation[x]"))
     turn = Choice(Experiment("turn", -90.0), planned(Experiment("turn", -90.0), setting.recordings[0]))
     hang = replace(refused, experiment=Experiment("hang"))
-    monkeypatch.setattr(next_experiment, "feasible", lambda *_: [hang, turn])
-    proposed = next_experiment.propose(found, content, setting, quiet)
+    monkeypatch.setattr(proposal, "feasible", lambda *_: [hang, turn])
+    proposed = proposal.propose(found, content, setting, quiet)
     assert (proposed.content["motion"], proposed.content["arms"]) == ("turn", None)
     assert proposed.episode is turn.episode
     plan = SimpleNamespace(slower=1.3, limiting="joint4 of left: acceleration")
-    monkeypatch.setattr(next_experiment, "feasible", lambda *_: [hang, replace(turn, plan=plan)])
-    arms = next_experiment.propose(found, content, setting, quiet).content["arms"]
+    monkeypatch.setattr(proposal, "feasible", lambda *_: [hang, replace(turn, plan=plan)])
+    arms = proposal.propose(found, content, setting, quiet).content["arms"]
     assert arms == {"slower": 1.3, "limit": plan.limiting, "refused": {"hang": refused.why_not}}
-    monkeypatch.setattr(next_experiment, "feasible", lambda *_: [hang])
-    assert next_experiment.propose(found, content, setting, quiet) is None
+    monkeypatch.setattr(proposal, "feasible", lambda *_: [hang])
+    assert proposal.propose(found, content, setting, quiet) is None
 
 
 def test_the_proposed_one_is_an_episode_without_blanks(slowed, tmp_path):
@@ -129,7 +129,7 @@ def test_a_urdf_beside_the_episode_is_found_from_a_proposal(shipped, tmp_path):
 
 def test_arms_that_cannot_be_asked_forbid_nothing(shipped, monkeypatch):
     """Of a model that is not here, or whose solids are meshes; one without motion is not looked at."""
-    monkeypatch.setattr(experiments, "LIBRARY", (FAST,))
+    monkeypatch.setattr(motions, "LIBRARY", (FAST,))
     paths = {name: robots.gripper_motion(path) for name, path in robots.replay(shipped).items()}
     plain = replace(shipped, grippers=paths, joints={})
     strange = {name: replace(r, model="nobody's") for name, r in shipped.robots.items()}

@@ -6,15 +6,15 @@ import pytest
 import sheets
 import torch
 
-from torchcloth._remembered import Recent
-from torchcloth.diagnosis.base_model import base_model
-from torchcloth.diagnosis.cells import aligned, cells_of, directions
-from torchcloth.diagnosis.evidence import asked_about, gather
-from torchcloth.diagnosis.hypotheses import catalogue
-from torchcloth.diagnosis.pieces import runs
-from torchcloth.diagnosis.refined import refined
-from torchcloth.diagnosis.world import World
-from torchcloth.diagnosis.worlds import Worlds
+from torchcloth._utils.caching import Recent
+from torchcloth.diagnosis.causes.hypotheses import catalogue
+from torchcloth.diagnosis.data.binning import aligned, cells_of, directions
+from torchcloth.diagnosis.data.fine_mesh import refined
+from torchcloth.diagnosis.inference.episode_simulation import runs
+from torchcloth.diagnosis.inference.linearise import asked_about, gather
+from torchcloth.diagnosis.models.base_model import base_model
+from torchcloth.episodes.world import World
+from torchcloth.episodes.world_cache import Worlds
 from torchcloth.identification.nuisances import Held
 
 RECORDING = sheets.episode()

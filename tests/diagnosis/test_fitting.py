@@ -7,10 +7,10 @@ import linear_toys as toys
 import pytest
 import torch
 
-from torchcloth.diagnosis import fitting
-from torchcloth.diagnosis.evidence import as_held
-from torchcloth.diagnosis.fitting import fit, with_cause
-from torchcloth.diagnosis.stepwise import _impossible
+from torchcloth.diagnosis.decide.search import _impossible
+from torchcloth.diagnosis.inference import fitting
+from torchcloth.diagnosis.inference.fitting import fit, with_cause
+from torchcloth.diagnosis.inference.linearise import as_held
 from torchcloth.errors import SimulationDiverged
 
 TRUTH = torch.tensor([0.4]).double()

@@ -10,10 +10,10 @@ import torch
 
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import base_model
-from torchcloth.diagnosis.branches import FIRST, _begun, _jumped, without
-from torchcloth.diagnosis.comparison import Predicted
-from torchcloth.diagnosis.repeats import pairs_of, repeats
-from torchcloth.diagnosis.setting import setting_of
+from torchcloth.diagnosis.data.dataset import setting_of
+from torchcloth.diagnosis.data.replicate_floor import pairs_of, repeats
+from torchcloth.diagnosis.inference.bifurcations import FIRST, _begun, _jumped, without
+from torchcloth.diagnosis.inference.comparison import Predicted
 from torchcloth.meshes import topology
 
 

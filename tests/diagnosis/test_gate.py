@@ -15,9 +15,9 @@ import torch
 from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, check, diagnose, setting_of
-from torchcloth.diagnosis.gate import _stamps
-from torchcloth.diagnosis.gate_clouds import Seen
-from torchcloth.diagnosis.setting import somewhere_seen
+from torchcloth.diagnosis.data.cloud_checks import Seen
+from torchcloth.diagnosis.data.data_checks import _stamps
+from torchcloth.diagnosis.data.dataset import somewhere_seen
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings.images import ImageStream
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from torchcloth.diagnosis import Hypothesis, register
-from torchcloth.diagnosis.glossary import GLOSSARY, table
-from torchcloth.diagnosis.hypotheses import known
+from torchcloth.diagnosis.causes.glossary import GLOSSARY, table
+from torchcloth.diagnosis.causes.hypotheses import known
 from torchcloth.errors import InvalidInput
 
 DOCS = Path(__file__).parents[2] / "docs" / "causes.md"

@@ -7,8 +7,9 @@ import linear_toys as toys
 import pytest
 import torch
 
-from torchcloth.diagnosis import doubts, lack_of_fit
-from torchcloth.diagnosis.lacking import RARE, SENSOR, Left, explained, is_lacking
+from torchcloth.diagnosis import lack_of_fit
+from torchcloth.diagnosis.decide import backward_elimination
+from torchcloth.diagnosis.inference.lack_of_fit import RARE, SENSOR, Left, explained, is_lacking
 
 NAMES = ["a"]
 SLOPES = toys.smooth(1, 4)  # two parameters, one hypothesis, one nuisance
@@ -80,8 +81,10 @@ def test_where_most_motions_fold_apart_what_is_held_out_says_how_much_is_mended(
     rough = [torch.full_like(c.value, 0.03 if k < folded else 0.0) for k, c in enumerate(wrong.cells)]
     start = toys.fitted(replace(wrong, numerics=rough))
     end = toys.fitted(replace(wrong, cells=[*right.cells[:3], wrong.cells[3]], numerics=rough))
-    assert doubts.mended(start, end, MOTIONS) == pytest.approx(share, abs=0.1)
-    assert doubts.mended(start, toys.fitted(replace(right, numerics=rough)), MOTIONS) == pytest.approx(1.0, abs=0.1)
+    assert backward_elimination.mended(start, end, MOTIONS) == pytest.approx(share, abs=0.1)
+    assert backward_elimination.mended(start, toys.fitted(replace(right, numerics=rough)), MOTIONS) == pytest.approx(
+        1.0, abs=0.1
+    )
 
 
 def test_where_all_motions_fold_apart_more_is_no_mending():
@@ -90,7 +93,7 @@ def test_where_all_motions_fold_apart_more_is_no_mending():
     rough = [torch.full_like(c.value, 0.03) for c in wrong.cells]
     start, end = (toys.fitted(replace(e, numerics=rough)) for e in (wrong, worse))
     assert not is_lacking(end, MOTIONS)
-    assert doubts.mended(start, end, MOTIONS) < 0
+    assert backward_elimination.mended(start, end, MOTIONS) < 0
 
 
 def test_how_much_is_mended_is_counted_on_cells_that_both_fits_have():
@@ -102,7 +105,7 @@ def test_how_much_is_mended_is_counted_on_cells_that_both_fits_have():
     numerics = [n[~elsewhere] for n in wrong.numerics]
     start, end = toys.fitted(replace(wrong, cells=met, numerics=numerics)), toys.fitted(replace(right, cells=cells))
     assert explained(lack_of_fit(start, MOTIONS), lack_of_fit(end, MOTIONS)) < 0
-    assert doubts.mended(start, end, MOTIONS) > 0.9
+    assert backward_elimination.mended(start, end, MOTIONS) > 0.9
 
 
 def row(motion, left, expected=1e-3, kind="points", unit="m", stable=True, stretches=8, episode=0):
@@ -150,9 +153,9 @@ def test_a_cause_is_not_doubted_for_what_was_hardly_less_before(monkeypatch, bef
     """Case 029 of b3f2eda: a late clock, gaining 135 in log density, left a stretched sheet lacking a little."""
     toy = toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.0]).double(), 0))
     told = iter([[row(m, 1e-3 * r) for m, r in zip(("stretch", "swing"), own, strict=True)] for own in (before, after)])
-    monkeypatch.setattr(doubts, "is_lacking", lambda *_: True)
-    monkeypatch.setattr(doubts, "lack_of_fit", lambda *_: next(told))
-    assert doubts.mended(toy, toy, MOTIONS) == pytest.approx(share, abs=0.05)
+    monkeypatch.setattr(backward_elimination, "is_lacking", lambda *_: True)
+    monkeypatch.setattr(backward_elimination, "lack_of_fit", lambda *_: next(told))
+    assert backward_elimination.mended(toy, toy, MOTIONS) == pytest.approx(share, abs=0.05)
 
 
 def snapped(found, at, stretches=8):
@@ -178,13 +181,13 @@ def test_motions_that_fit_are_asked_about_causes_where_others_do_not(monkeypatch
     asked = []
     end = SimpleNamespace(noise=None, evidence=None)
     rows = [row(name, 10.0 if name in lacking else 1.0, 1.0) for name in ("a", "b", "a")]
-    monkeypatch.setattr(doubts, "lack_of_fit", lambda *_: rows)
-    monkeypatch.setattr(doubts, "weighed_alike", lambda *both: both)
-    monkeypatch.setattr(doubts, "predict", lambda found, names, alone: (found, sorted(alone)))
-    monkeypatch.setattr(doubts, "of_episodes", lambda p, which: asked.append((p[1], which)))
-    monkeypatch.setattr(doubts, "compare", lambda *_: None)
-    monkeypatch.setattr(doubts, "worthwhile", lambda _: gains)
+    monkeypatch.setattr(backward_elimination, "lack_of_fit", lambda *_: rows)
+    monkeypatch.setattr(backward_elimination, "weighed_alike", lambda *both: both)
+    monkeypatch.setattr(backward_elimination, "predict", lambda found, names, alone: (found, sorted(alone)))
+    monkeypatch.setattr(backward_elimination, "of_episodes", lambda p, which: asked.append((p[1], which)))
+    monkeypatch.setattr(backward_elimination, "compare", lambda *_: None)
+    monkeypatch.setattr(backward_elimination, "worthwhile", lambda _: gains)
     steps = [SimpleNamespace(best=SimpleNamespace(alone={"c"}))]
-    assert doubts.unheard("start", end, steps, ["a", "b", "a"]) == said  # type: ignore[arg-type]
+    assert backward_elimination.unheard("start", end, steps, ["a", "b", "a"]) == said  # type: ignore[arg-type]
     fit = [k for k, name in enumerate(["a", "b", "a"]) if name not in lacking]
     assert asked == ([(["c"], fit)] * 2 if fit else [])

@@ -15,7 +15,7 @@ from torchcloth.cli import main
 from torchcloth.cli.identify import what_is_beside
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import cloth_from, fitted, identify, predict_episode
-from torchcloth.recordings.marks import mark
+from torchcloth.recordings.fingerprints import mark
 from torchcloth.viewing import film_of_fit
 
 TRUE = 1.5

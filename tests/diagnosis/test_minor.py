@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import linear_toys as toys
 import pytest
 
-from torchcloth.diagnosis import doubts, stepwise, trials
-from torchcloth.diagnosis.comparison import Gain
-from torchcloth.diagnosis.stepwise import Found
-from torchcloth.diagnosis.trials import Step, _open, _rival, _themselves
-from torchcloth.diagnosis.verdict import _minor, _verdict
-from torchcloth.diagnosis.world import MATTERS, Model
+from torchcloth.diagnosis.decide import backward_elimination, candidates, search
+from torchcloth.diagnosis.decide.candidates import Step, _open, _rival, _themselves
+from torchcloth.diagnosis.decide.search import Found
+from torchcloth.diagnosis.decide.verdict import _minor, _verdict
+from torchcloth.diagnosis.inference.comparison import Gain
+from torchcloth.episodes.world import MATTERS, Model
 from torchcloth.errors import SimulationDiverged
 
 SCALE, BIAS = ("obs.depth_scale", 0.015, -0.002), ("obs.depth_bias", 5e-3, -2.5e-3)
@@ -67,7 +67,7 @@ def test_what_slopes_cannot_tell_from_a_cause_might_have_to_matter_too(monkeypat
     (step,), mu = found.steps, toys.hypothesis("contact.mu", 0.2)
     step.best.hypothesis = replace(step.best.hypothesis, kin=kin)
     like = SimpleNamespace(hypothesis=mu, amplitude=asked, gain=1.0)
-    monkeypatch.setattr(stepwise, "alike", lambda before, row, amplitude, others: others)
+    monkeypatch.setattr(search, "alike", lambda before, row, amplitude, others: others)
     found = replace(found, steps=[replace(step, screened=[like])])
     assert (found.causes, found.minor) == ((found.steps, []) if named else ([], found.steps))
     if not named:
@@ -127,8 +127,8 @@ def test_what_predicts_better_and_motions_disagree_about_is_a_rival(monkeypatch,
     brings = "air.drag_n" if name == "air.wind[y]" else ""
     better, best = candidate(name, 1.2, amplitude, brings=brings), candidate("air.linear", 2.0, 1.7)
     better.gain = best.predicted = None
-    monkeypatch.setattr(trials, "worthwhile", lambda _: True)
-    monkeypatch.setattr(trials, "compare", lambda *_: SimpleNamespace(density=over, ci95=ci95))
+    monkeypatch.setattr(candidates, "worthwhile", lambda _: True)
+    monkeypatch.setattr(candidates, "compare", lambda *_: SimpleNamespace(density=over, ci95=ci95))
     assert _open(better, None, best) == open_  # type: ignore[arg-type]
 
 
@@ -150,13 +150,15 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
     base = Model(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
     current = SimpleNamespace(model=base.plus(wind.hypothesis, left), evidence=None)
     step = Step(wind, None, [wind, drag], [drag], [], None, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(doubts, "without_cause", lambda found, name: found.model.without(name))
-    monkeypatch.setattr(doubts, "fit", lambda model, *_, **__: SimpleNamespace(model=model, noise=None, evidence=None))
-    monkeypatch.setattr(doubts, "renoised", lambda found, *_: found)
-    monkeypatch.setattr(doubts, "placebo", lambda *_: SimpleNamespace(passed=passed))
-    monkeypatch.setattr(doubts, "predicts_better", lambda *_: over)
+    monkeypatch.setattr(backward_elimination, "without_cause", lambda found, name: found.model.without(name))
+    monkeypatch.setattr(
+        backward_elimination, "fit", lambda model, *_, **__: SimpleNamespace(model=model, noise=None, evidence=None)
+    )
+    monkeypatch.setattr(backward_elimination, "renoised", lambda found, *_: found)
+    monkeypatch.setattr(backward_elimination, "placebo", lambda *_: SimpleNamespace(passed=passed))
+    monkeypatch.setattr(backward_elimination, "predicts_better", lambda *_: over)
     asked = (SimpleNamespace(names=[]), [camera, wind.hypothesis, drag.hypothesis], lambda _: None)
-    end, (then,) = doubts.plainer(current, [step], *asked)  # type: ignore[arg-type]
+    end, (then,) = backward_elimination.plainer(current, [step], *asked)  # type: ignore[arg-type]
     assert then.best.hypothesis.name == named
     assert [h.name for h in end.model.accepted] == ["obs.extrinsic[y]", named]
     if named == "air.drag_n":
@@ -169,9 +171,9 @@ def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
     drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, brings="air.drag_n")
     model = Model(None, (), toys.torch.zeros(0), (wind.hypothesis, drag.hypothesis), (0.01, 1.4))  # type: ignore[arg-type]
     steps = [Step(c, None, [wind, drag], [], [], None, None) for c in (wind, drag)]  # type: ignore[arg-type]
-    monkeypatch.delattr(doubts, "fit")
+    monkeypatch.delattr(backward_elimination, "fit")
     current = SimpleNamespace(model=model)
-    assert doubts.plainer(current, steps, None, [], print) == (current, steps)  # type: ignore[arg-type]
+    assert backward_elimination.plainer(current, steps, None, [], print) == (current, steps)  # type: ignore[arg-type]
 
 
 def test_what_cannot_be_simulated_without_a_cause_leaves_it_in(monkeypatch):
@@ -185,11 +187,11 @@ def test_what_cannot_be_simulated_without_a_cause_leaves_it_in(monkeypatch):
     def diverges(*_):
         raise SimulationDiverged("no such world")
 
-    monkeypatch.setattr(doubts, "without_cause", lambda found, name: found.model.without(name))
-    monkeypatch.setattr(doubts, "known", lambda *_: False)
-    monkeypatch.setattr(doubts, "fit", diverges)
+    monkeypatch.setattr(backward_elimination, "without_cause", lambda found, name: found.model.without(name))
+    monkeypatch.setattr(backward_elimination, "known", lambda *_: False)
+    monkeypatch.setattr(backward_elimination, "fit", diverges)
     asked = (SimpleNamespace(names=[]), [], lambda _: None)
-    assert doubts.pruned(current, steps, *asked) == (current, steps)  # type: ignore[arg-type]
+    assert backward_elimination.pruned(current, steps, *asked) == (current, steps)  # type: ignore[arg-type]
 
 
 def row_of(shows: bool, decision: str = "present", worth: float = 10.0) -> SimpleNamespace:
@@ -215,11 +217,11 @@ def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, row
     gain = Gain(1e-3, 1e-3, 5.0, (low, 9.0), 0.0, (0.0, 0.0), (1e-3, 1e-3), (0.0, 0.0), low)
     fitted = SimpleNamespace(model=SimpleNamespace(parameters=[toys.parameter("p")]))
     c = SimpleNamespace(hypothesis=toys.hypothesis("m", twin=twin), fitted=fitted, row=row, bent=0.0)
-    assert trials.worth_naming(c, gain) == worth  # type: ignore[arg-type]
-    assert not trials.worthwhile(gain)
-    assert not trials.worth_naming(c, gain._replace(density=3.0, least=-2.0))  # type: ignore[arg-type]
+    assert candidates.worth_naming(c, gain) == worth  # type: ignore[arg-type]
+    assert not candidates.worthwhile(gain)
+    assert not candidates.worth_naming(c, gain._replace(density=3.0, least=-2.0))  # type: ignore[arg-type]
     c.bent = 6.6  # of stiffening, 016 of e9945f3: by slopes beside its prior it need not gain so much
-    assert trials.worth_naming(c, gain) == (worth or (twin == "p" and row.shows))  # type: ignore[arg-type]
+    assert candidates.worth_naming(c, gain) == (worth or (twin == "p" and row.shows))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -228,7 +230,7 @@ def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, row
 def test_what_is_sure_is_not_asked_to_mend_much(low, after, worth):
     """Orthotropy of half its size (050 of b3f2eda) gained 44: most of its millimetres had gone into stiffening."""
     gain = Gain(1e-3, after, 20.0, (low, 30.0), 0.0, (0.0, 0.0), (1e-3, 0.995e-3), (2e-4, 3e-3), low)
-    assert trials.worthwhile(gain) == worth
+    assert candidates.worthwhile(gain) == worth
 
 
 @pytest.mark.parametrize(
@@ -237,10 +239,10 @@ def test_what_is_sure_is_not_asked_to_mend_much(low, after, worth):
 def test_what_leaves_all_positions_together_further_off_mends_none(after, pull, worth):
     """Though it does where nothing else goes on, or in one episode; a pull may be mended without them."""
     gain = Gain(1e-3, after, 18.0, (4.0, 33.0), 0.0, (0.0, 0.0), (0.72e-3, 0.70e-3), (4e-4, pull), 5.0)
-    assert trials.worthwhile(gain) == worth
+    assert candidates.worthwhile(gain) == worth
 
 
 def test_what_was_only_felt_has_no_positions():
     nowhere = float("nan")
     gain = Gain(nowhere, nowhere, 18.0, (4.0, 33.0), 0.0, (0.0, 0.0), (0.0, 0.0), (0.0, 1e-2), 5.0)
-    assert trials.worthwhile(gain)
+    assert candidates.worthwhile(gain)

@@ -4,10 +4,11 @@ import pytest
 import sheets
 import torch
 
-from torchcloth.diagnosis import base_model, fit, lack_of_fit, missing, missing_force, setting_of
-from torchcloth.diagnosis.pushes import Pushes, pushed
+from torchcloth.diagnosis import base_model, fit, lack_of_fit, missing_force, setting_of
+from torchcloth.diagnosis.unknown import missing_force as missing
+from torchcloth.diagnosis.unknown.force_sensitivities import Pushes, pushed
 from torchcloth.effects import BodyForce
-from torchcloth.identification.replays import Frames, frames_of
+from torchcloth.episodes.replay import Frames, frames_of
 from torchcloth.pose.objective import joined
 
 BEGIN, END = 6, 9  # frames of 0.05 s

@@ -15,7 +15,7 @@ from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, catalogue, read_model, save_model
 from torchcloth.errors import RecordingError
-from torchcloth.identification.saved import mark
+from torchcloth.identification.io.saved_fit import mark
 
 RECORDING = sheets.episode(resolution=(4, 4))
 

@@ -10,7 +10,8 @@ import sheets
 import torch
 
 from torchcloth.cli import main
-from torchcloth.diagnosis import Hypothesis, base_model, hypotheses, own_causes, register_file, setting_of
+from torchcloth.diagnosis import Hypothesis, base_model, register_file, setting_of
+from torchcloth.diagnosis.causes import hypotheses, user_hypotheses
 from torchcloth.errors import InvalidInput
 
 FILE = """
@@ -25,7 +26,7 @@ register(Hypothesis("my.damping", "1/s", {typical}, lambda w, a: w.with_cloth({{
 def file(tmp_path):
     yield tmp_path / "mine.py"
     hypotheses.forget("my.damping")
-    own_causes._files.clear()
+    user_hypotheses._files.clear()
 
 
 def test_a_file_registers_and_what_depends_on_it_knows_its_content(file):
@@ -33,11 +34,11 @@ def test_a_file_registers_and_what_depends_on_it_knows_its_content(file):
     (found,) = register_file(file)
     assert (found.name, found.typical) == ("my.damping", 2.0)
     assert "my.damping" in {h.name for h in hypotheses.known()}
-    before = own_causes.digests()
+    before = user_hypotheses.digests()
     file.write_text(FILE.format(typical=3.0))
     assert [h.typical for h in register_file(file)] == [3.0]
-    assert own_causes.digests() != before
-    assert len(own_causes.digests()) == 1
+    assert user_hypotheses.digests() != before
+    assert len(user_hypotheses.digests()) == 1
 
 
 def test_what_the_file_imports_counts_as_well_and_it_may_be_run_again(file):
@@ -48,13 +49,13 @@ def test_what_the_file_imports_counts_as_well_and_it_may_be_run_again(file):
         "from torchcloth.diagnosis import register\nfrom my_helper_of_causes import CAUSE\nregister(CAUSE)\n"
     )
     path = list(sys.path)
-    first, before = register_file(file), own_causes.digests()
+    first, before = register_file(file), user_hypotheses.digests()
     assert sys.path == path
     assert register_file(file) == first
-    assert own_causes.digests() == before
+    assert user_hypotheses.digests() == before
     helper.write_text(helper.read_text() + "# another law\n")
     register_file(file)
-    assert own_causes.digests() != before
+    assert user_hypotheses.digests() != before
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,10 @@ import sheets
 import torch
 
 from torchcloth import diagnosis as dx
-from torchcloth.diagnosis.cells import NAMES, STRETCH
-from torchcloth.diagnosis.fabric_maps import misfit_limit, misfit_maps
-from torchcloth.diagnosis.pictures import FARTHEST, residual_maps, screening
-from torchcloth.diagnosis.screening import Row
+from torchcloth.diagnosis.data.binning import NAMES, STRETCH
+from torchcloth.diagnosis.inference.screening import Row
+from torchcloth.diagnosis.report.fabric_maps import misfit_limit, misfit_maps
+from torchcloth.diagnosis.report.pictures import FARTHEST, residual_maps, screening
 
 
 @pytest.fixture(scope="module")

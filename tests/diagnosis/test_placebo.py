@@ -5,9 +5,9 @@ from dataclasses import replace
 import linear_toys as toys
 import torch
 
-from torchcloth.diagnosis.bursts import calmed
-from torchcloth.diagnosis.fitting import leap
-from torchcloth.diagnosis.placebos import placebo
+from torchcloth.diagnosis.inference.fitting import leap
+from torchcloth.diagnosis.inference.permutation_test import placebo
+from torchcloth.diagnosis.inference.robust_weights import calmed
 
 SLOPES = toys.smooth(1, 4)  # two parameters, a cause, a nuisance
 MOTIONS = [f"motion {k}" for k in range(toys.EPISODES)]

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import sheets
 
-from torchcloth.diagnosis import base_model, catalogue, own_causes
+from torchcloth.diagnosis import base_model, catalogue
+from torchcloth.diagnosis.causes import user_hypotheses
 from torchcloth.diagnosis.run import _plan
 
 NAMES = ["swing", "hang"]
@@ -36,6 +37,6 @@ def test_every_decision_changes_it(monkeypatch):
         "given": _plan(model.plus(asked[0], 0.1), asked, NAMES),
         "how much": _plan(model.plus(asked[0], 0.2), asked, NAMES),
     }
-    monkeypatch.setitem(own_causes._files, "mine.py", "0123")
+    monkeypatch.setitem(user_hypotheses._files, "mine.py", "0123")
     plans["whose"] = _plan(model, asked, NAMES)
     assert len(set(plans.values())) == len(plans)

@@ -10,11 +10,11 @@ import torch
 from torchcloth import diagnosis as dx
 from torchcloth import recordings as rec
 from torchcloth.boundaries import Grasp
-from torchcloth.diagnosis.regripped import regripped
-from torchcloth.diagnosis.setting import setting_of
+from torchcloth.diagnosis.data.dataset import setting_of
+from torchcloth.diagnosis.data.grip_patch_mesh import regripped
+from torchcloth.episodes.observed import episode
+from torchcloth.episodes.replay import Frames
 from torchcloth.errors import InvalidInput
-from torchcloth.identification.episodes import episode
-from torchcloth.identification.replays import Frames
 
 RADIUS = 0.051  # m, of sheets.py: 1.5 edges of the mesh
 

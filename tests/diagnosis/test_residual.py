@@ -17,8 +17,8 @@ from torchcloth.diagnosis import (
     setting_of,
     write_diagnosis,
 )
-from torchcloth.diagnosis.lacking import is_lacking
-from torchcloth.diagnosis.residual import RESIDUAL, TERMS
+from torchcloth.diagnosis.inference.lack_of_fit import is_lacking
+from torchcloth.diagnosis.unknown.residual_force import RESIDUAL, TERMS
 from torchcloth.effects import AirDrag
 
 HIDDEN = 1.5  # C_n, of air

@@ -11,7 +11,8 @@ import torch
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
-from torchcloth.diagnosis import base_model, catalogue, diagnose, evidence, run
+from torchcloth.diagnosis import base_model, catalogue, diagnose, run
+from torchcloth.diagnosis.inference import linearise
 from torchcloth.errors import InvalidInput
 
 ASKED = ("air.drag_n", "obs.extrinsic[y]")
@@ -29,7 +30,7 @@ def episodes():
 @pytest.fixture
 def counted(monkeypatch):
     """Calls of the simulations of an episode; ``stop`` interrupts after so many."""
-    work, state = evidence.piece_of, {"calls": 0, "stop": 10**9}
+    work, state = linearise.piece_of, {"calls": 0, "stop": 10**9}
 
     def piece(*arguments):
         if state["calls"] == state["stop"]:
@@ -37,7 +38,7 @@ def counted(monkeypatch):
         state["calls"] += 1
         return work(*arguments)
 
-    monkeypatch.setattr(evidence, "piece_of", piece)
+    monkeypatch.setattr(linearise, "piece_of", piece)
     return state
 
 

@@ -7,9 +7,9 @@ import linear_toys as toys
 import pytest
 import torch
 
-from torchcloth.diagnosis import fitting, noise
-from torchcloth.diagnosis.evidence import Evidence, central
-from torchcloth.diagnosis.fitting import fit
+from torchcloth.diagnosis.inference import fitting, noise
+from torchcloth.diagnosis.inference.fitting import fit
+from torchcloth.diagnosis.inference.linearise import Evidence, central
 
 TRUTH, STEP = 0.3, 0.1
 RIPPLES, LENGTH = 2e-3, 0.15  # m, of ripples that come and go within so much of the parameter

@@ -5,11 +5,11 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import sheets
 
-from torchcloth.diagnosis.base_model import base_model
-from torchcloth.diagnosis.hypotheses import catalogue
-from torchcloth.diagnosis.steps import both_ways, shifted
-from torchcloth.diagnosis.world import Hypothesis
-from torchcloth.diagnosis.worlds import Worlds
+from torchcloth.diagnosis.causes.hypotheses import catalogue
+from torchcloth.diagnosis.models.base_model import base_model
+from torchcloth.episodes.steps import both_ways, shifted
+from torchcloth.episodes.world import Hypothesis
+from torchcloth.episodes.world_cache import Worlds
 from torchcloth.errors import InvalidInput
 
 RECORDING = sheets.episode()

@@ -7,8 +7,8 @@ import linear_toys as toys
 import pytest
 import torch
 
-from torchcloth.diagnosis.cells import NAMES
-from torchcloth.diagnosis.showing import shown
+from torchcloth.diagnosis.data.binning import NAMES
+from torchcloth.diagnosis.unknown.localisation import shown
 
 PART, WINDOW, EPISODE, BUMP, AMPLITUDE = 5, 3, 2, 2e-3, 1.5
 PLACE = torch.tensor([(PART // 4) * 0.075, (PART % 4) * 0.075], dtype=torch.float64)

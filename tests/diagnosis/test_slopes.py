@@ -6,9 +6,9 @@ import pytest
 import sheets
 import torch
 
-from torchcloth.diagnosis.evidence import asked_about, gather
-from torchcloth.diagnosis.hypotheses import catalogue
-from torchcloth.diagnosis.steps import one_way, step_sizes
+from torchcloth.diagnosis.causes.hypotheses import catalogue
+from torchcloth.diagnosis.inference.linearise import asked_about, gather
+from torchcloth.episodes.steps import one_way, step_sizes
 from torchcloth.errors import InvalidInput
 
 RECORDING = sheets.episode()

@@ -8,17 +8,25 @@ import numpy as np
 import pytest
 import torch
 
-from torchcloth.diagnosis.cells import NAMES as KINDS
-from torchcloth.diagnosis.cells import SEEN
-from torchcloth.diagnosis.classes import TOLD, alike, correlations, fitted_alike
-from torchcloth.diagnosis.comparison import Predicted, _resampled, as_it_is, compare, of_episodes, predict, spread
-from torchcloth.diagnosis.confirming import Confirmation
-from torchcloth.diagnosis.evidence import as_rough
-from torchcloth.diagnosis.fitting import renoised, step_of, weighed_alike
-from torchcloth.diagnosis.noise import MEMORY, ROUGH, Noise, fit_noise, floor_of, whitened
-from torchcloth.diagnosis.screening import Row, _decided, screen
-from torchcloth.diagnosis.trials import CLEAR
-from torchcloth.diagnosis.wording import _is_too_large, _too_large
+from torchcloth.diagnosis.confirmation import Confirmation
+from torchcloth.diagnosis.data.binning import NAMES as KINDS
+from torchcloth.diagnosis.data.binning import SEEN
+from torchcloth.diagnosis.decide.candidates import CLEAR
+from torchcloth.diagnosis.inference.comparison import (
+    Predicted,
+    _resampled,
+    as_it_is,
+    compare,
+    of_episodes,
+    predict,
+    spread,
+)
+from torchcloth.diagnosis.inference.confounding import TOLD, alike, correlations, fitted_alike
+from torchcloth.diagnosis.inference.fitting import renoised, step_of, weighed_alike
+from torchcloth.diagnosis.inference.linearise import as_rough
+from torchcloth.diagnosis.inference.noise import MEMORY, ROUGH, Noise, fit_noise, floor_of, whitened
+from torchcloth.diagnosis.inference.screening import Row, _decided, screen
+from torchcloth.diagnosis.report.wording import _is_too_large, _too_large
 from torchcloth.errors import InvalidInput
 
 NAMES = ["a", "b", "c"]

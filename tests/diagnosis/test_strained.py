@@ -7,11 +7,12 @@ import linear_toys as toys
 import pytest
 import torch
 
-from torchcloth.diagnosis import afresh, stepwise, trials
-from torchcloth.diagnosis.afresh import resettled
-from torchcloth.diagnosis.setting import Setting
-from torchcloth.diagnosis.trials import Candidate, Step
-from torchcloth.diagnosis.world import OFTEN
+from torchcloth.diagnosis.data.dataset import Setting
+from torchcloth.diagnosis.decide import candidates, search
+from torchcloth.diagnosis.decide.candidates import Candidate, Step
+from torchcloth.diagnosis.inference import prior_restarts
+from torchcloth.diagnosis.inference.prior_restarts import resettled
+from torchcloth.episodes.world import OFTEN
 from torchcloth.errors import SimulationDiverged
 
 CAUSE = toys.hypothesis("cause", 2.0)
@@ -39,8 +40,10 @@ def test_it_begins_at_the_data_sheet_and_is_nothing_where_that_ends_as_far(monke
         asked.append(list(hypotheses))
         return found(ends)
 
-    monkeypatch.setattr(afresh, "approach", lambda model, setting, progress: (begun.append(model) or model, None))
-    monkeypatch.setattr(afresh, "fit", fit)
+    monkeypatch.setattr(
+        prior_restarts, "approach", lambda model, setting, progress: (begun.append(model) or model, None)
+    )
+    monkeypatch.setattr(prior_restarts, "fit", fit)
     again = resettled(found(OFTEN + 1), None, [CAUSE])  # type: ignore[arg-type]
     assert begun[0].point.tolist() == [0.0, 1.5]
     assert (again is None) == (ends > OFTEN)
@@ -55,9 +58,9 @@ def test_causes_that_are_known_stay_where_others_are_tried_from_the_data_sheet(m
         asked.append(model)
         raise SimulationDiverged("x", got="nan", expected="numbers")
 
-    monkeypatch.setattr(afresh, "gather", gather)
+    monkeypatch.setattr(prior_restarts, "gather", gather)
     with pytest.raises(SimulationDiverged):
-        afresh.afresh(found(OFTEN + 1), None, [], 4)  # type: ignore[arg-type]
+        prior_restarts.afresh(found(OFTEN + 1), None, [], 4)  # type: ignore[arg-type]
     assert asked[0].point.tolist() == [0.0, 1.5]
 
 
@@ -65,7 +68,7 @@ def test_where_the_data_sheet_is_no_world_nothing_begins_there(monkeypatch):
     def diverges(*_):
         raise SimulationDiverged("x", got="nan", expected="numbers")
 
-    monkeypatch.setattr(afresh, "approach", diverges)
+    monkeypatch.setattr(prior_restarts, "approach", diverges)
     assert resettled(found(OFTEN + 1), None, [CAUSE]) is None  # type: ignore[arg-type]
 
 
@@ -89,15 +92,15 @@ def test_causes_with_which_positions_are_hardly_better_predicted_are_none(
     whole = SimpleNamespace(before=1e-3, after=after, explained=explained, mended=(4e-4, pulls))
     row = SimpleNamespace(hypothesis=CAUSE)
     first = Step(Candidate(row, one, None, None, set(), 0.0, relieves=relieves), None, [], [], [], one, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(stepwise, "fit", lambda *_, **__: one)
-    monkeypatch.setattr(stepwise, "screen", lambda f: [])
-    monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
-    monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
-    monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
-    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: lacking)
-    monkeypatch.setattr(stepwise, "_still", lambda start, current, setting, _: (start, current, setting))
-    monkeypatch.setattr(stepwise, "_of_all", lambda *_: whole)
-    _, steps, _ = stepwise._chain(one, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    monkeypatch.setattr(search, "fit", lambda *_, **__: one)
+    monkeypatch.setattr(search, "screen", lambda f: [])
+    monkeypatch.setattr(search, "one_step", lambda *_: None)
+    monkeypatch.setattr(search, "pruned", lambda current, steps, *_: (current, steps))
+    monkeypatch.setattr(search, "mended", lambda *_: 1.0)
+    monkeypatch.setattr(search, "is_lacking", lambda *_: lacking)
+    monkeypatch.setattr(search, "_still", lambda start, current, setting, _: (start, current, setting))
+    monkeypatch.setattr(search, "_of_all", lambda *_: whole)
+    _, steps, _ = search._chain(one, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert steps == ([first] if kept else [])
 
 
@@ -107,38 +110,38 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     strained, anew = found(OFTEN + 1), found(0.2)
     looked, row = [], SimpleNamespace(hypothesis=CAUSE)
     first = Step(Candidate(row, strained, None, None, set(), 0.0), None, [], [], [], strained, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(stepwise, "resettled", lambda *_: anew)
-    monkeypatch.setattr(stepwise, "fit", lambda *_, **__: strained)
-    monkeypatch.setattr(stepwise, "predicts_better", lambda *_: 1.0 if better else -1.0)
-    monkeypatch.setattr(stepwise, "screen", lambda f: [f])
-    monkeypatch.setattr(stepwise, "begun_with", lambda f, screened, tried, after=0: [(row, f.model)])
-    monkeypatch.setattr(stepwise, "one_step", lambda current, setting, begun, *_: looked.append((current, begun)))
-    monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
-    monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
-    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: False)
-    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
-    end, _, _ = stepwise._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    monkeypatch.setattr(search, "resettled", lambda *_: anew)
+    monkeypatch.setattr(search, "fit", lambda *_, **__: strained)
+    monkeypatch.setattr(search, "predicts_better", lambda *_: 1.0 if better else -1.0)
+    monkeypatch.setattr(search, "screen", lambda f: [f])
+    monkeypatch.setattr(search, "begun_with", lambda f, screened, tried, after=0: [(row, f.model)])
+    monkeypatch.setattr(search, "one_step", lambda current, setting, begun, *_: looked.append((current, begun)))
+    monkeypatch.setattr(search, "pruned", lambda current, steps, *_: (current, steps))
+    monkeypatch.setattr(search, "mended", lambda *_: 1.0)
+    monkeypatch.setattr(search, "is_lacking", lambda *_: False)
+    monkeypatch.setattr(search, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
+    end, _, _ = search._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     ((current, begun),) = looked
     assert current is end is (anew if better else strained)
     assert [model for _, model in begun] == ([anew.model] if better else [strained.model, anew.model])
 
 
-@pytest.mark.parametrize("ahead", [0.0, stepwise.FAR + 1])
+@pytest.mark.parametrize("ahead", [0.0, search.FAR + 1])
 def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     """A fit that still has far to go may take back what a cause was accepted for."""
     far, near = replace(found(0.1), ahead=ahead), found(0.1)
     row = SimpleNamespace(hypothesis=CAUSE)
     first = Step(Candidate(row, far, None, None, set(), 0.0), None, [], [], [], far, None)  # type: ignore[arg-type]
     doubted, fits = [], iter([far, far, near, near])  # fitted, then asked about the other causes
-    monkeypatch.setattr(stepwise, "fit", lambda *_, **__: next(fits))
-    monkeypatch.setattr(stepwise, "screen", lambda f: [])
-    monkeypatch.setattr(stepwise, "begun_with", lambda *_, **__: [])
-    monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
-    monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (doubted.append(current) or current, steps))
-    monkeypatch.setattr(stepwise, "mended", lambda *_: 1.0)
-    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: False)
-    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
-    end, _, _ = stepwise._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    monkeypatch.setattr(search, "fit", lambda *_, **__: next(fits))
+    monkeypatch.setattr(search, "screen", lambda f: [])
+    monkeypatch.setattr(search, "begun_with", lambda *_, **__: [])
+    monkeypatch.setattr(search, "one_step", lambda *_: None)
+    monkeypatch.setattr(search, "pruned", lambda current, steps, *_: (doubted.append(current) or current, steps))
+    monkeypatch.setattr(search, "mended", lambda *_: 1.0)
+    monkeypatch.setattr(search, "is_lacking", lambda *_: False)
+    monkeypatch.setattr(search, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
+    end, _, _ = search._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert doubted == ([far, near] if ahead else [far])
     assert end is doubted[-1]
 
@@ -160,26 +163,26 @@ def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(
     start, tried = found(0.1), []
     gain = SimpleNamespace(least=surely)
     first = Step(Candidate(None, start, None, gain, set(), 0.0), None, [], [], [], start, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(stepwise, "is_lacking", lambda *_: lacking)
-    monkeypatch.setattr(stepwise, "screen", lambda f: [])
-    monkeypatch.setattr(stepwise, "afresh", lambda *a: tried.append(a[-1]) or [])
-    monkeypatch.setattr(stepwise, "one_step", lambda *_: first)
-    monkeypatch.setattr(stepwise, "_chain", lambda *a: (start, [a[-1]], None))
-    _, steps, _ = stepwise._anew(start, SimpleNamespace(names=[*motions]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
+    monkeypatch.setattr(search, "is_lacking", lambda *_: lacking)
+    monkeypatch.setattr(search, "screen", lambda f: [])
+    monkeypatch.setattr(search, "afresh", lambda *a: tried.append(a[-1]) or [])
+    monkeypatch.setattr(search, "one_step", lambda *_: first)
+    monkeypatch.setattr(search, "_chain", lambda *a: (start, [a[-1]], None))
+    _, steps, _ = search._anew(start, SimpleNamespace(names=[*motions]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
     assert steps == ([first] if named else [])
-    assert tried == ([] if motions == "aab" else [0.0 if lacking else stepwise.MUCH])
+    assert tried == ([] if motions == "aab" else [0.0 if lacking else search.MUCH])
 
 
 @pytest.mark.parametrize(("least", "tried"), [(0.0, ["much", "half"]), (5.0, ["much"]), (20.0, [])])
 def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
     promised = [(10.0, "much", None), (5.0, "half", None), (1.0, "little", None)]
     causes = [toys.hypothesis(name, 2.0) for _, name, _ in promised]
-    monkeypatch.setattr(afresh, "gather", lambda *_: found(0.0).evidence)
-    monkeypatch.setattr(afresh, "asked_about", lambda here, *_: here)
-    monkeypatch.setattr(afresh, "_promises", lambda _: promised)
-    monkeypatch.setattr(afresh, "WORTH_TRYING", 0.4)
-    monkeypatch.setattr(afresh, "with_cause", lambda _, h: h)
-    begun = afresh.afresh(found(0.0), None, causes, 4, lambda _: None, least)  # type: ignore[arg-type]
+    monkeypatch.setattr(prior_restarts, "gather", lambda *_: found(0.0).evidence)
+    monkeypatch.setattr(prior_restarts, "asked_about", lambda here, *_: here)
+    monkeypatch.setattr(prior_restarts, "_promises", lambda _: promised)
+    monkeypatch.setattr(prior_restarts, "WORTH_TRYING", 0.4)
+    monkeypatch.setattr(prior_restarts, "with_cause", lambda _, h: h)
+    begun = prior_restarts.afresh(found(0.0), None, causes, 4, lambda _: None, least)  # type: ignore[arg-type]
     assert [h.name for h, _ in begun] == tried
 
 
@@ -195,13 +198,13 @@ def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
 )
 def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, motions, alone, surely, useful):
     """No other motion has predicted it; of two, the other one tells little of what is usual."""
-    monkeypatch.setattr(trials, "worth_naming", lambda *_: True)
-    monkeypatch.setattr(trials, "known", lambda *_: True)
+    monkeypatch.setattr(candidates, "worth_naming", lambda *_: True)
+    monkeypatch.setattr(candidates, "known", lambda *_: True)
     gain, row = SimpleNamespace(least=surely), SimpleNamespace(hypothesis=CAUSE)
     predicted = SimpleNamespace(episode=torch.arange(len(motions)))
     found = Candidate(row, None, predicted, gain, alone, 2.0)  # type: ignore[arg-type]
-    assert trials._useful(found, motions) == useful
-    assert trials._useful(found, [*motions, "one whose cells all jump"]) == useful
+    assert candidates._useful(found, motions) == useful
+    assert candidates._useful(found, [*motions, "one whose cells all jump"]) == useful
 
 
 @pytest.mark.parametrize(("amplitude", "tries"), [(1.0, ["first"]), (11.0, ["first", "more"])])
@@ -220,10 +223,10 @@ def test_where_what_predicts_best_is_too_large_to_be_believed_more_are_tried(mon
     def enough(_):
         raise Enough
 
-    monkeypatch.setattr(trials, "_tried", likely)
-    monkeypatch.setattr(trials, "fit_noise", enough)
+    monkeypatch.setattr(candidates, "_tried", likely)
+    monkeypatch.setattr(candidates, "fit_noise", enough)
     with pytest.raises(Enough):
-        trials.one_step(found(0.1), None, "first", [], print, "more")  # type: ignore[arg-type]
+        candidates.one_step(found(0.1), None, "first", [], print, "more")  # type: ignore[arg-type]
     assert tried == tries
 
 
@@ -237,7 +240,7 @@ def test_further_steps_are_kept_unless_they_predict_worse_than_a_cause(first, th
         name: SimpleNamespace(name=name, amplitude=amplitude, gain=SimpleNamespace(density=density))
         for name, amplitude, density in (("first", first, 50.0), ("then", then, predicts))
     }
-    assert trials._better(*fits.values()).name == kept  # type: ignore[arg-type]
+    assert candidates._better(*fits.values()).name == kept  # type: ignore[arg-type]
 
 
 def test_what_a_model_has_is_not_asked_about_again(monkeypatch):
@@ -251,12 +254,12 @@ def test_what_a_model_has_is_not_asked_about_again(monkeypatch):
         asked.extend(h.name for h in hypotheses)
         raise Enough
 
-    monkeypatch.setattr(stepwise, "approach", lambda model, *_: (model, None))
-    monkeypatch.setattr(stepwise, "fit", base_fit)
+    monkeypatch.setattr(search, "approach", lambda model, *_: (model, None))
+    monkeypatch.setattr(search, "fit", base_fit)
     model = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], torch.tensor([0.4]).double(), 0)).model
     other = toys.hypothesis("another")
     with pytest.raises(Enough):
-        stepwise.search(model.plus(CAUSE, 1.0), None, [CAUSE, other])  # type: ignore[arg-type]
+        search.search(model.plus(CAUSE, 1.0), None, [CAUSE, other])  # type: ignore[arg-type]
     assert asked == ["another"]
 
 
@@ -277,20 +280,20 @@ def test_cells_that_jump_with_a_cause_are_left_out_where_nothing_else_is_lacking
     """A loose grip leaves slack that buckles to either side, where vacuum has none."""
     whole = toys.fitted(toys.evidence(toys.smooth(4, 2), 1, [], torch.tensor([0.4]).double(), 0))
     first, second = (tuple(c.key[k : k + 1] for c in whole.evidence.cells) for k in (0, 1))
-    start = stepwise.without(whole, first)
+    start = search.without(whole, first)
     best = Candidate(SimpleNamespace(hypothesis=CAUSE), start, None, None, set(), 0.0)  # type: ignore[arg-type]
     step = Step(best, None, [], [], [], start, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(stepwise, "fit", lambda model, setting, *_, **__: stepwise.without(whole, setting.unstable))
-    monkeypatch.setattr(stepwise, "unstable", lambda *_: second)
+    monkeypatch.setattr(search, "fit", lambda model, setting, *_, **__: search.without(whole, setting.unstable))
+    monkeypatch.setattr(search, "unstable", lambda *_: second)
     less = lambda f: len(whole.evidence.cells[0].key) - len(f.evidence.cells[0].key)  # noqa: E731
-    monkeypatch.setattr(stepwise, "is_lacking", lambda f, _: less(f) in lacking)
-    monkeypatch.setattr(stepwise, "screen", lambda f: [])
-    monkeypatch.setattr(stepwise, "one_step", lambda *_: None)
-    monkeypatch.setattr(stepwise, "pruned", lambda current, steps, *_: (current, steps))
-    monkeypatch.setattr(stepwise, "mended", lambda *_: float(kept))
-    monkeypatch.setattr(stepwise, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
+    monkeypatch.setattr(search, "is_lacking", lambda f, _: less(f) in lacking)
+    monkeypatch.setattr(search, "screen", lambda f: [])
+    monkeypatch.setattr(search, "one_step", lambda *_: None)
+    monkeypatch.setattr(search, "pruned", lambda current, steps, *_: (current, steps))
+    monkeypatch.setattr(search, "mended", lambda *_: float(kept))
+    monkeypatch.setattr(search, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
     asked = Asked(["a"] * toys.EPISODES, first)
-    found = stepwise._chain(start, asked, [], lambda _: None, 4, step)  # type: ignore[arg-type]
+    found = search._chain(start, asked, [], lambda _: None, 4, step)  # type: ignore[arg-type]
     assert found.steps == ([step] if kept else [])
     for cells, keys, before in zip(
         found.current.evidence.cells, found.setting.unstable, whole.evidence.cells, strict=True

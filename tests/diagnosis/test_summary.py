@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from torchcloth.diagnosis.wording import RIPPLED, sentences, warnings_of
+from torchcloth.diagnosis.report.wording import RIPPLED, sentences, warnings_of
 
 LISTS = ("causes", "given", "minor", "ruled_out", "wrong_sign", "undecided", "unresolvable", "lack_of_fit", "drifts")
 LISTS = (*LISTS, "warnings")

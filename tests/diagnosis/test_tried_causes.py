@@ -7,10 +7,10 @@ import pytest
 import sheets
 
 from torchcloth import effects
-from torchcloth.diagnosis.base_model import base_model
-from torchcloth.diagnosis.hypotheses import Hypothesis, catalogue, forget, own_among, register
-from torchcloth.diagnosis.setting import setting_of
-from torchcloth.diagnosis.tried_causes import check_own
+from torchcloth.diagnosis.causes.hypotheses import Hypothesis, catalogue, forget, own_among, register
+from torchcloth.diagnosis.causes.user_hypothesis_checks import check_own
+from torchcloth.diagnosis.data.dataset import setting_of
+from torchcloth.diagnosis.models.base_model import base_model
 from torchcloth.errors import InvalidInput
 
 

@@ -9,24 +9,25 @@ import sheets
 import torch
 
 from torchcloth import materials
-from torchcloth.diagnosis import air, fabric, grip, observer
-from torchcloth.diagnosis.base_model import SILENT, base_model
-from torchcloth.diagnosis.cells import NAMES as NAMES_OF_DATA
-from torchcloth.diagnosis.cells import SEEN, _averaged, _places, cells_of
-from torchcloth.diagnosis.hypotheses import catalogue, forget, register
-from torchcloth.diagnosis.model_file import load_model, save_model
-from torchcloth.diagnosis.refined import refined
-from torchcloth.diagnosis.setting import LATE, MOST, _telling, motions_of, setting_of
-from torchcloth.diagnosis.wording import on_top
-from torchcloth.diagnosis.world import Hypothesis
+from torchcloth._utils.resume import digest
+from torchcloth.diagnosis.causes import air, fabric, grip, observer
+from torchcloth.diagnosis.causes.hypotheses import catalogue, forget, register
+from torchcloth.diagnosis.data.binning import NAMES as NAMES_OF_DATA
+from torchcloth.diagnosis.data.binning import SEEN, _averaged, _places, cells_of
+from torchcloth.diagnosis.data.dataset import LATE, MOST, _telling, motions_of, setting_of
+from torchcloth.diagnosis.data.fine_mesh import refined
+from torchcloth.diagnosis.models.base_model import SILENT, base_model
+from torchcloth.diagnosis.models.model_file import load_model, save_model
+from torchcloth.diagnosis.report.wording import on_top
 from torchcloth.effects import AirDrag
+from torchcloth.episodes.cloth_facts import facts_of
+from torchcloth.episodes.observed_surface import sheet_of
+from torchcloth.episodes.world import Hypothesis
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification.journal import digest, facts_of
-from torchcloth.identification.rows import Rows
-from torchcloth.identification.sheet import sheet_of
+from torchcloth.identification.residuals.rows import Rows
 from torchcloth.meshes import rectangle
 from torchcloth.recordings import Collider, Markers
-from torchcloth.recordings.together import together
+from torchcloth.recordings.consistency import together
 
 RECORDING = sheets.episode()
 

@@ -18,11 +18,11 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchcloth as tc
-from torchcloth import captured, functional
 from torchcloth.boundaries import Drive
 from torchcloth.boundaries.motion import drive
-from torchcloth.engine import fused, running
-from torchcloth.intervals import CHUNK
+from torchcloth.dynamics import substep
+from torchcloth.engine import cuda_graphs, execution, fused
+from torchcloth.simulation.rollout import CHUNK
 from torchcloth.types import ClothState, Trajectory
 
 VALUES, GRADIENTS = 1e-10, 1e-8  # relative, in float64
@@ -84,9 +84,9 @@ def runs_on_any_device(
     model = deepcopy(cloth).to("meta").model()._replace(stages=stages)
     leaf = state.map(lambda t: t.to("meta").requires_grad_())
     lost = torch.zeros_like(leaf.x, requires_grad=False) if state.x.dtype == torch.float32 else None
-    moving = captured.Moving.of(leaf, lost, dt, drives, 0, 2)
-    graphs = captured.Graphs(model, 2, watched)
-    unit = captured.Unit(graphs.own, moving, closed, 2, watched)
+    moving = cuda_graphs.Moving.of(leaf, lost, dt, drives, 0, 2)
+    graphs = cuda_graphs.Graphs(model, 2, watched)
+    unit = cuda_graphs.Unit(graphs.own, moving, closed, 2, watched)
     unit.get_ready(moving, graphs.given, graphs.leaves)
     end = unit(moving, graphs.given)
     (end.state.x.sum() + sum(value.sum() for value in end.impulses.values())).backward()
@@ -94,7 +94,7 @@ def runs_on_any_device(
     assert leaf.x.grad.is_meta
 
 
-def watched(work: captured.Work, device: torch.device) -> tuple[list[Tensor], captured.Replay]:
+def watched(work: cuda_graphs.Work, device: torch.device) -> tuple[list[Tensor], cuda_graphs.Replay]:
     """As a graph that is captured from tensors without numbers, which refuses what others it would have to wait for."""
     with OnOneDevice(device.type):
         return work(), lambda: None
@@ -140,7 +140,7 @@ def in_chunks(model, state, dt, drives, substeps):
     """``functional.rollout`` as ``Cloth`` calls it: near layers are searched again at the start of each call."""
     total = {}
     for first in range(0, substeps, CHUNK):
-        state, found = functional.rollout(model, state, dt, drives, min(CHUNK, substeps - first), first)
+        state, found = substep.rollout(model, state, dt, drives, min(CHUNK, substeps - first), first)
         total = {name: total[name] + value if name in total else value for name, value in found.items()}
     return state, total
 
@@ -204,11 +204,11 @@ def tangents_transpose(cloth, motion, state: ClothState, substeps: int, dt: floa
         assert engine.torch_parts is None, f"not on the engine: {engine.torch_parts.parts}"
         job = engine.job(state, torch.full((substeps,), dt), drives)
         varied = {field for field in job.inputs if field != engine.low.dt}  # the step itself is not differentiated
-        results, records = running.forward(job, 1)
+        results, records = execution.forward(job, 1)
         seeds = {f: scaled(noise(t.shape, k, t.dtype), t) for k, (f, t) in enumerate(results.items())}
-        gradients = running.reverse(job, records, 1, seeds, varied)
+        gradients = execution.reverse(job, records, 1, seeds, varied)
         dots = {f: scaled_dots(f, job, gradients[f], directions) for f in varied}
-        _, moved = running.tangent(job, dots, directions)
+        _, moved = execution.tangent(job, dots, directions)
         forward = sum((seeds[f].unsqueeze(1) * t).flatten(2).sum(-1) for f, t in moved.items())
         parts = [(gradients[f].unsqueeze(1) * dots[f]).flatten(2).sum(-1) for f in varied]
         return float(((forward - sum(parts)).abs() / sum(part.abs() for part in parts)).max())

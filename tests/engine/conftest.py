@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchcloth.engine import running
+from torchcloth.engine import execution
 from torchcloth.engine.library import library
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -41,6 +41,6 @@ def team(request, monkeypatch):
     """As many threads within one scene, however little there is to do for them."""
     before = torch.get_num_threads()
     torch.set_num_threads(request.param)
-    monkeypatch.setattr(running, "WORTH", 1e-9)
+    monkeypatch.setattr(execution, "WORTH", 1e-9)
     yield request.param
     torch.set_num_threads(before)

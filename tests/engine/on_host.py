@@ -17,8 +17,8 @@ from weakref import WeakKeyDictionary
 import torch
 
 from torchcloth.boundaries.motion import drive
-from torchcloth.engine import building, devices, running
-from torchcloth.engine.cuda import runs
+from torchcloth.engine import building, devices, execution
+from torchcloth.engine.cuda import launch as runs
 from torchcloth.engine.fused import Fused
 
 HOST = """
@@ -149,10 +149,10 @@ def agrees(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1
     ends = (substeps // 3, substeps)
     if model.grid is not None:
         ends = (substeps,)  # what goes on in contact is no frame
-    known, _ = running.forward(job._replace(ends=ends))
+    known, _ = execution.forward(job._replace(ends=ends))
     generator = torch.Generator().manual_seed(0)
     seeds = {f: torch.randn(job.scenes, f.rows, f.comps, generator=generator, dtype=job.like.dtype) for f in known}
-    before = running.reverse(job, running.forward(job, 1)[1], 1, seeds, set(job.inputs))
+    before = execution.reverse(job, execution.forward(job, 1)[1], 1, seeds, set(job.inputs))
     device = "cuda" if torch.cuda.is_available() else "cpu"
     with stand_in() if device == "cpu" else nullcontext():
         there = job._replace(inputs={f: t.to(device) for f, t in job.inputs.items()})

@@ -6,10 +6,10 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 import torchcloth as tc
-from torchcloth import captured
-from torchcloth.captured import Graphs, unit_of
+from torchcloth.engine import cuda_graphs
+from torchcloth.engine.cuda_graphs import Graphs, unit_of
 from torchcloth.errors import InvalidInput
-from torchcloth.intervals import run
+from torchcloth.simulation.rollout import run
 
 FRAMES = [0.0, 0.02, 0.04, 0.08]
 
@@ -17,11 +17,11 @@ FRAMES = [0.0, 0.02, 0.04, 0.08]
 @pytest.fixture(autouse=True)
 def soon(monkeypatch):
     """Short simulations are captured, too."""
-    monkeypatch.setattr(captured, "SOON", 0)
-    monkeypatch.setattr(captured, "PAYS", 0)
+    monkeypatch.setattr(cuda_graphs, "SOON", 0)
+    monkeypatch.setattr(cuda_graphs, "PAYS", 0)
 
 
-def again(work: captured.Work, device: torch.device | None = None) -> tuple[list[Tensor], captured.Replay]:
+def again(work: cuda_graphs.Work, device: torch.device | None = None) -> tuple[list[Tensor], cuda_graphs.Replay]:
     """Computes again what a graph would replay, in the same memory."""
     found = work()
 
@@ -33,7 +33,7 @@ def again(work: captured.Work, device: torch.device | None = None) -> tuple[list
     return found, replay
 
 
-def refused(work: captured.Work, device: torch.device) -> tuple[list[Tensor], captured.Replay]:
+def refused(work: cuda_graphs.Work, device: torch.device) -> tuple[list[Tensor], cuda_graphs.Replay]:
     raise RuntimeError("operation not permitted when stream is capturing\nand more")
 
 
@@ -58,7 +58,7 @@ def scene(contact: bool = True, opens: bool = False, effects: dict[str, tc.effec
     return cloth, cloth.rest_state(), {"hand": tc.Trajectory(t, pose.requires_grad_(), closed)}
 
 
-def outcome(made, capture: captured.Capture | None = None):
+def outcome(made, capture: cuda_graphs.Capture | None = None):
     """(the rollout, gradients of a function of it, the graphs)."""
     cloth, state, motion = made
     x = state.x.clone().requires_grad_()
@@ -131,7 +131,7 @@ def test_layers_that_meet_are_not_captured(monkeypatch):
         run(plan._replace(graphs=graphs), True)
     assert not graphs._units
     usual = outcome(scene())
-    monkeypatch.setattr(captured.Graphs, "reach", property(lambda self: 1e-9))
+    monkeypatch.setattr(cuda_graphs.Graphs, "reach", property(lambda self: 1e-9))
     other = outcome(scene(), again)
     assert other[2]._units
     agree(usual, other, (1e-12, 1e-11))
@@ -139,9 +139,9 @@ def test_layers_that_meet_are_not_captured(monkeypatch):
 
 def test_few_units_do_not_pay(monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(captured, "SOON", 100)
+        patch.setattr(cuda_graphs, "SOON", 100)
         assert not outcome(scene(), again)[2]._units
-    monkeypatch.setattr(captured, "PAYS", 100)
+    monkeypatch.setattr(cuda_graphs, "PAYS", 100)
     assert not outcome(scene(), again)[2]._units
 
 

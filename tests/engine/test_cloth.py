@@ -8,8 +8,8 @@ from clothes import close, opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.boundaries import AbstractBoundary
-from torchcloth.engine import running
-from torchcloth.engine.choice import choose, still_drives
+from torchcloth.engine import execution
+from torchcloth.engine.dispatch import choose, still_drives
 from torchcloth.engine.fused import Fused
 from torchcloth.errors import InvalidInput, SimulationDiverged
 
@@ -115,8 +115,8 @@ def test_slivers_in_float32(thin):
 def test_memory_budget_changes_nothing(budget, monkeypatch):
     """No records at all, some, all: the same gradients to the last digit but the order of sums."""
     expected = outcome("fused", times=(0.0, 0.003, 0.006, END))[1]
-    monkeypatch.setattr(running, "BUDGET", budget)
-    monkeypatch.setattr(running, "ANEW", budget)
+    monkeypatch.setattr(execution, "BUDGET", budget)
+    monkeypatch.setattr(execution, "ANEW", budget)
     found = outcome("fused", times=(0.0, 0.003, 0.006, END))[1]
     for name, grad in found.items():
         assert (grad is None) == (expected[name] is None), name
@@ -129,10 +129,10 @@ def test_records_are_kept_while_the_budget_lasts(monkeypatch):
     cloth, kept = sheet("fused"), []
     model, state = cloth.model(), start(cloth)
     drives = still_drives(model, 9)
-    size = running.full_size(Fused(model, state, drives).low.program, 1, 9)
-    monkeypatch.setattr(running, "BUDGET", int(1.5 * size))
-    fused, forward = Fused(model, state, drives), running.forward
-    monkeypatch.setattr(running, "forward", lambda job, every=0: kept.append(every) or forward(job, every))
+    size = execution.full_size(Fused(model, state, drives).low.program, 1, 9)
+    monkeypatch.setattr(execution, "BUDGET", int(1.5 * size))
+    fused, forward = Fused(model, state, drives), execution.forward
+    monkeypatch.setattr(execution, "forward", lambda job, every=0: kept.append(every) or forward(job, every))
     for _ in range(3):
         state, _ = fused.rollout(state, 1e-4, drives, 9)
     assert kept == [1, 0, 0]
@@ -141,8 +141,8 @@ def test_records_are_kept_while_the_budget_lasts(monkeypatch):
 
 
 def test_a_loop_without_gradients_keeps_no_records(monkeypatch):
-    kept, forward = [], running.forward
-    monkeypatch.setattr(running, "forward", lambda job, every=0: kept.append(every) or forward(job, every))
+    kept, forward = [], execution.forward
+    monkeypatch.setattr(execution, "forward", lambda job, every=0: kept.append(every) or forward(job, every))
     cloth = sheet("fused")
     with torch.no_grad():
         cloth(start(cloth), opening(END), TIMES)

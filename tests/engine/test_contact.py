@@ -10,9 +10,10 @@ import torch.autograd.forward_ad as forward_ad
 from agreement import agree, difference, held, noise, outcome
 
 import torchcloth as tc
-from torchcloth import functional, self_contact
-from torchcloth.engine import fused, running
-from torchcloth.sensitivities import RATE, Directions
+from torchcloth.dynamics import substep
+from torchcloth.dynamics.contact import self_contact
+from torchcloth.engine import execution, fused
+from torchcloth.simulation.sensitivities import RATE, Directions
 
 SPACING, PLAY = 0.012, 0.25
 
@@ -43,7 +44,7 @@ def pressed(cloth, count, scenes=(), sideways=1.0, down=-1.0, steps=60):
     v[..., count:, 2] += down
     v[..., count:, 0] += sideways * (rest[count:, 1] > 0.05)
     with torch.no_grad():
-        state, _ = functional.rollout(cloth.model(), cloth.state(x, v), 1e-4, {}, steps)
+        state, _ = substep.rollout(cloth.model(), cloth.state(x, v), 1e-4, {}, steps)
     memory = {"contact": state.memory["contact"] + noise(state.memory["contact"].shape, 3).to(rest)}
     return state._replace(d3=state.d3 * (1 + 0.05 * noise((*state.d3.shape[:-1], 1), 6).to(rest)), memory=memory)
 
@@ -51,7 +52,7 @@ def pressed(cloth, count, scenes=(), sideways=1.0, down=-1.0, steps=60):
 def branches(cloth, state) -> dict[str, int]:
     """How many points are in which branch of the law."""
     model = cloth.model()
-    n = functional.surface(model.geometry, state.x, state.v).n.repeat_interleave(len(model.grid.points), -2)
+    n = substep.surface(model.geometry, state.x, state.v).n.repeat_interleave(len(model.grid.points), -2)
     c = cloth.material.coefficients()
     each, faces = len(model.grid.points), len(model.geometry.area)
     k, shear, cone = (f.expand(faces, 1).repeat_interleave(each, 0) for f in (c.contact, c.shear, c.cone))
@@ -122,7 +123,7 @@ def test_triangles_come_and_go():
             before, known = known, self_contact.near_layers(model, model.grid, now.x, known)
             if before is not known:
                 seen.append(set(known.active.tolist()))
-            now, _ = functional.step(model, now, 5e-5, {}, 0, known)
+            now, _ = substep.step(model, now, 5e-5, {}, 0, known)
     assert len(seen) > 3
     assert any(b - a for a, b in pairwise(seen))
     assert any(a - b for a, b in pairwise(seen))
@@ -140,7 +141,7 @@ def test_a_sheet_alone_is_bitwise_one_without_contact():
         runs.append(fused.rollout(cloth.model(), cloth.state(x), 1e-4, {}, 100)[0])
     assert torch.equal(runs[0].x, runs[1].x)
     assert torch.equal(runs[0].v, runs[1].v)
-    normals = functional.surface(cloth.model().geometry, runs[1].x, runs[1].v).n
+    normals = substep.surface(cloth.model().geometry, runs[1].x, runs[1].v).n
     assert difference(runs[1].d3, normals.repeat_interleave(cloth.grid().points.shape[0], 0)) < 1e-12
 
 
@@ -162,9 +163,9 @@ def test_recomputed_substeps_are_bitwise_the_recorded_ones():
         job = fused.Fused(cloth.model(), state, {}).job(state, torch.full((120,), 5e-5), {})
     found = []
     for every in (1, 7, 120):
-        results, records = running.forward(job, every)
+        results, records = execution.forward(job, every)
         seeds = {f: noise(t.shape, k, t.dtype) for k, (f, t) in enumerate(results.items())}
-        found.append(running.reverse(job, records, every, seeds, set(job.inputs)))
+        found.append(execution.reverse(job, records, every, seeds, set(job.inputs)))
     for other in found[1:]:
         assert all(torch.equal(value, other[f]) for f, value in found[0].items())
 

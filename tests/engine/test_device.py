@@ -12,12 +12,12 @@ from clothes import opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.boundaries.motion import drive
-from torchcloth.engine import choice, devices, fields, running
+from torchcloth.engine import devices, dispatch, execution, fields
 from torchcloth.engine.building import Unbuilt
-from torchcloth.engine.cuda import arithmetic, listing, runs, trial
+from torchcloth.engine.cuda import kernel_codegen, launch, program_ir, self_test
 from torchcloth.engine.fused import Fused
 from torchcloth.engine.library import kernels
-from torchcloth.initial import pressed
+from torchcloth.simulation.initial_state import pressed
 
 pytestmark = pytest.mark.filterwarnings("error:the engine on")
 TIMES = [0.0, 0.01, 0.02]
@@ -46,7 +46,7 @@ def adjoints(job):
         f: torch.randn(job.scenes, f.rows, f.comps, generator=generator, dtype=job.like.dtype)
         for f in job.program.outputs
     }
-    return runs.reverse(job, runs.forward(job)[1], seeds, set(job.inputs))
+    return launch.reverse(job, launch.forward(job)[1], seeds, set(job.inputs))
 
 
 @pytest.mark.parametrize("meets", [False, True])
@@ -56,8 +56,8 @@ def test_order_of_threads_between_waits_does_not_matter(meets):
     job, found = job_of(cloth, state=folded(cloth) if meets else None), []
     for reverse in (False, True):
         with on_host.stand_in(4, reverse):
-            found.append((runs.forward(job)[0], adjoints(job)))
-            assert bool(runs.forward(job)[1][:, :-1].any()) == meets, "layers that meet"
+            found.append((launch.forward(job)[0], adjoints(job)))
+            assert bool(launch.forward(job)[1][:, :-1].any()) == meets, "layers that meet"
     for one, other in zip(*found, strict=True):
         assert all(torch.equal(t, other[f]) for f, t in one.items())
 
@@ -66,7 +66,7 @@ def test_adjoints_do_not_depend_on_how_many_substeps_are_kept():
     job = job_of(sheet())
     with on_host.stand_in():
         usual = adjoints(job)
-        with patch.object(runs, "MOST", 5):
+        with patch.object(launch, "MOST", 5):
             other = adjoints(job)
     for f, t in usual.items():
         torch.testing.assert_close(other[f], t, rtol=0, atol=1e-12 * float(t.abs().max()))
@@ -155,8 +155,12 @@ def test_what_diverges_is_told():
 def test_too_many_nodes_are_an_error(monkeypatch):
     cloth = sheet(contact=tc.Contact(), n=17, boundaries={})
     small = property(lambda self: 16)
-    monkeypatch.setattr(trial, "agrees", lambda job, rounding: True)  # it has enough for its own
-    with elsewhere(), patch.object(listing.Layers, "room", small), pytest.raises(tc.errors.InvalidInput, match="nodes"):
+    monkeypatch.setattr(self_test, "agrees", lambda job, rounding: True)  # it has enough for its own
+    with (
+        elsewhere(),
+        patch.object(program_ir.Layers, "room", small),
+        pytest.raises(tc.errors.InvalidInput, match="nodes"),
+    ):
         cloth(folded(cloth), times=TIMES)
 
 
@@ -167,7 +171,7 @@ def test_what_it_cannot_do_is_said():
     for effects, contact in (({"own": Own()}, None), ({"own": Own()}, tc.Contact())):
         with elsewhere():
             assert "effects.own in torch, on cuda" in sheet(effects=effects, contact=contact).engine_in_use
-    with elsewhere(), patch.object(runs, "kernels", side_effect=Unbuilt("no libnvrtc", "install it")):
+    with elsewhere(), patch.object(launch, "kernels", side_effect=Unbuilt("no libnvrtc", "install it")):
         with pytest.warns(UserWarning, match="no libnvrtc: simulations run on the torch reference"):
             assert sheet().engine_in_use == "reference (no libnvrtc)"
         with pytest.raises(tc.errors.InvalidInput, match=r"no libnvrtc.*install it"):
@@ -179,13 +183,13 @@ def test_a_device_is_tried_once(dtype, monkeypatch):
     """On a fold that is pressed; one that does something else is not believed."""
     torch.set_default_dtype(dtype)
     cloth = sheet(contact=tc.Contact(), n=17).to(dtype)
-    tried, forward, agrees = [], runs.forward, trial.agrees
+    tried, forward, agrees = [], launch.forward, self_test.agrees
 
     def watched(job, rounding):
         tried.append(bool(forward(job)[1][:, :-1].any()))
         return agrees(job, rounding)
 
-    monkeypatch.setattr(trial, "agrees", watched)
+    monkeypatch.setattr(self_test, "agrees", watched)
     for _ in range(2):
         with elsewhere():
             for scenes in ((), (2,)):
@@ -201,14 +205,14 @@ def test_a_device_is_tried_once(dtype, monkeypatch):
         raise RuntimeError("CUDA: an illegal memory access\nat a place")
 
     for other, said in ((wrong, "is not the CPU's"), (failing, "fails .CUDA: an illegal memory access.")):
-        monkeypatch.setattr(runs, "forward", other)
-        choice._warn.cache_clear()
+        monkeypatch.setattr(launch, "forward", other)
+        dispatch._warn.cache_clear()
         with elsewhere():
             with pytest.warns(UserWarning, match=f"the engine on cpu {said}: simulations run on the torch reference"):
                 cloth(start(cloth), opening(2e-3), [0.0, 2e-3])
             cloth(start(cloth), opening(2e-3), [0.0, 2e-3])
             assert cloth.engine_in_use.startswith("reference (the engine on cpu ")
-    assert len(tried) == 2 + 2 * choice.TRIALS
+    assert len(tried) == 2 + 2 * dispatch.TRIALS
 
 
 @pytest.mark.parametrize("contact", [tc.Contact(), None])
@@ -225,20 +229,20 @@ def test_rounding_is_no_reason_to_doubt_a_device(monkeypatch, contact, n, offset
         x, _ = next((f, t) for f, t in job.inputs.items() if f.kind == fields.Kind.STATE)
         noise = 0.3 * torch.finfo(torch.float32).eps * torch.randn_like(job.inputs[x])
         job = job._replace(inputs={**job.inputs, x: job.inputs[x] * (1 + noise)})
-        return running.forward(job)[0], torch.zeros(0)
+        return execution.forward(job)[0], torch.zeros(0)
 
     def reverse(job, masks, seeds, wanted, chunk):
-        return running.reverse(job, running.forward(job, 1)[1], 1, seeds, wanted)
+        return execution.reverse(job, execution.forward(job, 1)[1], 1, seeds, wanted)
 
-    monkeypatch.setattr(runs, "forward", rounded)
-    monkeypatch.setattr(runs, "reverse", reverse)
+    monkeypatch.setattr(launch, "forward", rounded)
+    monkeypatch.setattr(launch, "reverse", reverse)
     model, agreed = cloth.model(), []
     dt = cloth.stable_step() / 2
-    begin = partial(pressed, model, cloth.rest_state().x, choice.TRIED * dt)
+    begin = partial(pressed, model, cloth.rest_state().x, dispatch.TRIED * dt)
     with patch.object(devices, "elsewhere", lambda tensor: True):
-        rounding = Fused(model, cloth.rest_state(), choice.still_drives(model)).rounding
-        for job in choice._trials(model, torch.Size(), choice.Trial(begin, dt)):
-            agreed.append(trial.agrees(job, rounding))
+        rounding = Fused(model, cloth.rest_state(), dispatch.still_drives(model)).rounding
+        for job in dispatch._trials(model, torch.Size(), dispatch.Trial(begin, dt)):
+            agreed.append(self_test.agrees(job, rounding))
     assert all(agreed)
 
 
@@ -253,7 +257,7 @@ def test_directions_are_the_references():
 
 def test_every_kernel_can_be_written_down():
     for name, (number, takes, gives) in kernels().items():
-        kernel = arithmetic.kernel(number)
+        kernel = kernel_codegen.kernel(number)
         assert len(kernel.out) == gives, name
         lines = list(kernel.values("n", [f"r{k}" for k in range(takes)]))
         lines += kernel.adjoints("n", ["g"] * gives, [f"b{k}" for k in range(takes)])
@@ -261,19 +265,19 @@ def test_every_kernel_can_be_written_down():
 
 
 def test_what_does_not_compile_is_tried_once():
-    runs._kernels.cache_clear()
+    launch._kernels.cache_clear()
     device = torch.device("cpu")
-    with patch.object(runs, "Kernels", side_effect=Unbuilt("NVRTC: no", "report it")) as tried:
+    with patch.object(launch, "Kernels", side_effect=Unbuilt("NVRTC: no", "report it")) as tried:
         for _ in range(2):
             with pytest.raises(Unbuilt, match="NVRTC: no"):
-                runs.kernels("text", device)
+                launch.kernels("text", device)
         assert tried.call_count == 1
-    runs._kernels.cache_clear()
+    launch._kernels.cache_clear()
 
 
 def test_masks_are_bits():
     masks = (torch.rand(2, 3, 29) < 0.5).to(torch.uint8)[:, 0]
-    bits = runs._packed(masks)
+    bits = launch._packed(masks)
     assert bits.shape == (2, 4)
-    assert torch.equal(runs._unpacked(bits, 29), masks)
-    assert runs._packed(masks[:, :0]).shape == (2, 0)
+    assert torch.equal(launch._unpacked(bits, 29), masks)
+    assert launch._packed(masks[:, :0]).shape == (2, 0)

@@ -5,7 +5,7 @@ import torch
 from agreement import GRADIENTS, agree, difference, held, layer_transposes, moving, noise, outcome
 
 import torchcloth as tc
-from torchcloth import functional
+from torchcloth.dynamics import substep
 from torchcloth.engine import fused
 from torchcloth.engine.lowering import Unfused, lower
 
@@ -86,7 +86,7 @@ def test_creases_where_it_is_bent_far(options):
     cloth = sheet({"crease": E.CreasingBending(1e-4, 30.0, yield_curvature=12.0, **options)})
     state = remembering(moving(cloth))
     with torch.no_grad():
-        after, _ = functional.rollout(cloth.model(), state, 1e-4, {}, 1)
+        after, _ = substep.rollout(cloth.model(), state, 1e-4, {}, 1)
     flowed = (after.memory["effects.crease"] != state.memory["effects.crease"]).any(-1).float().mean()
     assert 0.2 < flowed < 0.9
     agree(cloth, {}, state)
@@ -201,7 +201,7 @@ def test_float32_gradients_over_a_thousand_steps(name):
     cloth = made()
     state = moving(cloth, strain=0.01)
     state = state.map(lambda t: t.float().double())
-    exact = outcome(functional.rollout, cloth, {}, state, 1000, 5e-5)
+    exact = outcome(substep.rollout, cloth, {}, state, 1000, 5e-5)
     torch.set_default_dtype(torch.float32)
     rough = made()
     found = outcome(fused.rollout, rough, {}, state.map(torch.Tensor.float), 1000, 5e-5)
@@ -228,6 +228,6 @@ def test_settling():
     settling = E.MassDamping(30.0)
     model = model._replace(effects={**model.effects, "settling": (settling, settling.coefficients().detach())})
     state = moving(cloth)
-    one, _ = functional.rollout(model, state, 1e-4, {}, 20)
+    one, _ = substep.rollout(model, state, 1e-4, {}, 20)
     other, _ = fused.rollout(model, state, 1e-4, {}, 20)
     assert difference(other.x - state.x, one.x - state.x) < 1e-10

@@ -5,9 +5,9 @@ import torch
 from clothes import opening, sheet, start
 
 import torchcloth as tc
-from torchcloth import intervals
-from torchcloth.engine import running
+from torchcloth.engine import execution
 from torchcloth.errors import SimulationDiverged
+from torchcloth.simulation import rollout
 
 END = 0.02
 UNEVEN = (0.0, 0.003, 0.0035, 0.011, END)  # substeps of another length in each interval
@@ -46,12 +46,12 @@ def test_frames_together_are_frames_one_by_one(make, batch, monkeypatch):
 
 def test_long_simulations_are_cut_into_calls(monkeypatch):
     cloth, calls = sheet("fused"), []
-    forward = running.forward
-    monkeypatch.setattr(running, "forward", lambda job, every=0: calls.append(job.ends) or forward(job, every))
+    forward = execution.forward
+    monkeypatch.setattr(execution, "forward", lambda job, every=0: calls.append(job.ends) or forward(job, every))
     with torch.no_grad():
         whole = cloth(start(cloth), opening(END), UNEVEN)
         assert len(calls) == 1
-        monkeypatch.setattr(intervals, "AT_ONCE", 2 * calls[0][0] * intervals.FEW)
+        monkeypatch.setattr(rollout, "AT_ONCE", 2 * calls[0][0] * rollout.FEW)
         cut = cloth(start(cloth), opening(END), UNEVEN)
     assert 1 < len(calls[1:]) < len(UNEVEN)
     assert torch.equal(whole.x, cut.x)

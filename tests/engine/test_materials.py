@@ -50,7 +50,7 @@ def test_stiffening():
 def test_orthotropic_in_all_its_branches():
     cloth = sheet(orthotropic())
     state = moving(cloth, strain=0.03)
-    s = tc.functional.surface(cloth.model().geometry, state.x, state.v)
+    s = tc.dynamics.surface(cloth.model().geometry, state.x, state.v)
     strain = torch.cat([s.f1, s.f2]).norm(dim=-1) - 1
     parts = (strain < 0, (strain > 0) & (strain < REACH), strain > REACH)
     assert all(int(part.sum()) > 5 for part in parts)
@@ -65,7 +65,7 @@ def test_sets_and_grown(law, grown):
     cloth = sheet(material, growth() if grown else None)
     state = with_set(moving(cloth, strain=0.1))
     with torch.no_grad():
-        after, _ = tc.functional.rollout(cloth.model(), state, 1e-4, {}, 1)
+        after, _ = tc.dynamics.rollout(cloth.model(), state, 1e-4, {}, 1)
     flowed = (after.memory["material"] != state.memory["material"]).any(-1).float().mean()
     assert 0.2 < flowed < 0.9
     agree(cloth, {}, state)

@@ -7,7 +7,7 @@ from clothes import close, opening, sheet, start
 from torch.func import functional_call, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 import torchcloth as tc
-from torchcloth.engine.choice import still_drives
+from torchcloth.engine.dispatch import still_drives
 from torchcloth.engine.fused import Fused
 from torchcloth.engine.operators import Rollout, ops
 from torchcloth.errors import InvalidInput

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth.engine import running
-from torchcloth.engine.pool import WORTH, Pool
+from torchcloth.engine import execution
+from torchcloth.engine.record_buffer_pool import WORTH, Pool
 
 MB = 2**20
 
@@ -38,7 +38,7 @@ def test_a_block_is_a_tensor_like_others(dtype):
         assert lent.shape == shape
         assert lent.dtype == dtype
         assert lent.is_contiguous()
-        assert lent.data_ptr() % running.ALIGNED == 0
+        assert lent.data_ptr() % execution.ALIGNED == 0
         assert torch.equal(lent.fill_(1.5).clone(), torch.full(shape, 1.5, dtype=dtype))
     with torch.device("meta"):
         assert pool.lend(WORTH, dtype=dtype).device.type == "cpu"
@@ -80,7 +80,7 @@ def test_threads_share_a_pool():
 
 def test_gradients_share_memory_and_nothing_else(monkeypatch):
     """Graphs that live at once have records of their own; a later one writes to theirs."""
-    monkeypatch.setattr(running, "MEMORY", Pool(running.BUDGET))
+    monkeypatch.setattr(execution, "MEMORY", Pool(execution.BUDGET))
     mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(20, 20))
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, {"g": tc.effects.Gravity()}, contact=None, engine="fused")
 
@@ -92,10 +92,10 @@ def test_gradients_share_memory_and_nothing_else(monkeypatch):
         return torch.autograd.grad(loss, x)[0]
 
     alone = [gradient(*graph(stretch)) for stretch in (1.01, 1.02)]
-    waiting = running.MEMORY.waiting
+    waiting = execution.MEMORY.waiting
     assert waiting > 0
     first, second = graph(1.01), graph(1.02)
     assert torch.equal(gradient(*second), alone[1])
     assert torch.equal(gradient(*first), alone[0])
-    assert running.MEMORY.waiting <= 2 * waiting, "and no more than two graphs need"
+    assert execution.MEMORY.waiting <= 2 * waiting, "and no more than two graphs need"
     assert not torch.equal(*alone)

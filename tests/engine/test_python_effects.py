@@ -8,7 +8,7 @@ from clothes import close, opening, sheet, start
 import torchcloth as tc
 from torchcloth.effects import AbstractEffect, Amplitude
 from torchcloth.errors import InvalidInput
-from torchcloth.sensitivities import Directions
+from torchcloth.simulation.sensitivities import Directions
 
 END = 0.012
 TIMES = (0.0, 0.4 * END, END)

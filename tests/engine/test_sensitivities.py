@@ -9,7 +9,7 @@ from clothes import close, opening, sheet, start
 import torchcloth as tc
 from torchcloth.engine import tangents
 from torchcloth.errors import InvalidInput
-from torchcloth.sensitivities import Directions
+from torchcloth.simulation.sensitivities import Directions
 
 END = 0.012
 

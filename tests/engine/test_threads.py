@@ -11,7 +11,7 @@ from agreement import agree, held, moving
 from clothes import opening, sheet, start
 
 import torchcloth as tc
-from torchcloth.engine import running
+from torchcloth.engine import execution
 
 SCENES, TIMES = 3, [0.0, 0.01, 0.02]
 
@@ -150,7 +150,7 @@ def test_threads_change_what_a_scene_does_by_rounding_only(contact, monkeypatch)
     state, motion = start(cloth), opening(0.03)
     found = []
     for threads in (1, 2):
-        monkeypatch.setattr(running, "WORTH", 1e-9)
+        monkeypatch.setattr(execution, "WORTH", 1e-9)
         torch.set_num_threads(threads)
         found.append(_all(cloth, state, motion)[:3])  # positions, their tangents, gradient by positions
     torch.set_num_threads(1)

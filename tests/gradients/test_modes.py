@@ -7,7 +7,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from gradient_scenes import parameters, simulate
 
-from torchcloth.forward_mode import real_tangents
+from torchcloth._utils.forward_mode import real_tangents
 from torchcloth.testing.contract import batched, close, single
 
 

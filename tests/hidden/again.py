@@ -21,10 +21,10 @@ from drawn import DEVELOPMENT, REDUCED, SMALL, case
 from partners import NUMBERS
 
 from torchcloth import diagnosis, recordings
-from torchcloth.diagnosis import trials
-from torchcloth.diagnosis.comparison import spread
-from torchcloth.diagnosis.trials import Candidate
-from torchcloth.identification import journal as kept
+from torchcloth._utils import resume as kept
+from torchcloth.diagnosis.decide import candidates
+from torchcloth.diagnosis.decide.candidates import Candidate
+from torchcloth.diagnosis.inference.comparison import spread
 
 KEYS = ("effect", "amplitude", "ci95", "noise_ci95", "told_by", "motions_disagree", "class", "rivals", "placebo")
 
@@ -61,14 +61,14 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     episodes = [recordings.read(path) for path in sorted((folder / "episodes").iterdir())]
     journal = folder / "journal"
-    usual = trials._compared
+    usual = candidates._compared
 
     def compared(current, fits, names, *how):
         found = usual(current, fits, names, *how)
         print("tried:", *(said(c, names) for c in found), sep="\n", flush=True)
         return found
 
-    trials._compared = compared
+    candidates._compared = compared
     kept.program = lambda: "whatever decides"  # else every change of the library would begin anew
     answer = diagnosis.diagnose(episodes, journal=journal, resume=journal.exists())
     model, std = answer.model, answer.found.end.covariance.diagonal().sqrt()

@@ -23,7 +23,7 @@ from shows import rms, shown
 from test_independence import forbidden
 
 from torchcloth import recordings
-from torchcloth.diagnosis.hypotheses import known
+from torchcloth.diagnosis.causes.hypotheses import known
 from torchcloth.training.studies import hidden_rates
 
 HERE = Path(__file__).parent

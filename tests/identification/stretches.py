@@ -12,9 +12,9 @@ import torch
 
 import torchcloth as tc
 from torchcloth import recordings as rec
-from torchcloth.identification.unknowns import available
+from torchcloth.episodes.unknowns import available
 from torchcloth.robots import replay
-from torchcloth.training.studies.twins import on_grid, readings
+from torchcloth.training.studies.synthetic_sheets import on_grid, readings
 
 WIDTH, HEIGHT = 0.30, 0.20  # m, between the jaws and along them
 THICKNESS = 1e-3  # m

@@ -9,12 +9,13 @@ import torch
 import twins
 
 from torchcloth import recordings as rec
+from torchcloth.episodes import streams
+from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import episode, identify, streams
-from torchcloth.identification.blocks import blocks_for
+from torchcloth.identification import episode, identify
+from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.nuisances import chosen
-from torchcloth.identification.objective import Objective
-from torchcloth.identification.unknowns import collect
+from torchcloth.identification.residuals.blocks import blocks_for
 
 GRASP = {"grasp": 1e-3}
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from torchcloth.episodes.pattern_interpolation import between, carried
 from torchcloth.errors import InvalidInput
-from torchcloth.identification.carried import between, carried
 from torchcloth.meshes import Mesh, rectangle
 
 RNG = np.random.default_rng(0)

@@ -10,14 +10,20 @@ import toys
 import twins
 
 from torchcloth import recordings, synthesis
+from torchcloth.episodes.observed import cloth_from, episode
+from torchcloth.episodes.replay import Frames
+from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import SimulationDiverged
-from torchcloth.identification import ensemble, gauss_newton, horizon, identify, linearity
-from torchcloth.identification.blocks import BLOCKS
-from torchcloth.identification.episodes import cloth_from, episode
+from torchcloth.identification import identify
+from torchcloth.identification.estimators import (
+    levenberg_marquardt,
+    linearity,
+    predictability,
+    statistical_linearisation,
+)
+from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.nuisances import chosen
-from torchcloth.identification.objective import Objective
-from torchcloth.identification.replays import Frames
-from torchcloth.identification.unknowns import collect
+from torchcloth.identification.residuals.blocks import BLOCKS
 
 TRUE = {"youngs_modulus": 129.32e3, "air.normal": 1.2}
 RIPPLES = 3e-3  # m
@@ -58,7 +64,10 @@ def test_tangents_of_a_light_sheet_run_away_and_those_of_its_beginning_do_not(sw
     whole = Objective(model, collect(model, list(TRUE), None), [episode(model, swung)], nuisances=chosen([], ["rim"]))
     for objective, away in ((whole, True), (whole.part(0.3), False)):
         linear = objective.linearise(objective.start)
-        assert linearity.runaway(objective, gauss_newton.judged(objective.problem(), objective.start, linear)) == away
+        assert (
+            linearity.runaway(objective, levenberg_marquardt.judged(objective.problem(), objective.start, linear))
+            == away
+        )
 
 
 # -- ripples without simulation --------------------------------------------------------------------------------------
@@ -94,7 +103,9 @@ class Rippling:
 
     def problem(self):
         one = torch.ones(3, dtype=torch.float64)
-        return gauss_newton.Problem(None, None, self.clip, 0 * one, self.prior_std, one, torch.tensor([toys.SIGMA]))
+        return levenberg_marquardt.Problem(
+            None, None, self.clip, 0 * one, self.prior_std, one, torch.tensor([toys.SIGMA])
+        )
 
     def clip(self, raw):
         return raw
@@ -102,7 +113,7 @@ class Rippling:
     def evaluate_all(self, raw):
         value = self._shown(raw) - self.data
         factor, nothing = torch.ones_like(value), value.new_zeros(len(value), 3)
-        return gauss_newton.Linearised(value, nothing, factor, self.frame, self.patch)
+        return levenberg_marquardt.Linearised(value, nothing, factor, self.frame, self.patch)
 
     def seen(self, raw):
         x = torch.stack([raw, 2 * raw])[None]
@@ -119,7 +130,7 @@ def test_simulations_around_a_point_see_through_ripples():
     """20 problems: unbiased, errors of the size that is stated, some times smaller than the ripples would make them."""
     z, stds = [], []
     for seed in range(20):
-        found = ensemble.resolved(Rippling(seed), FAILED, None, 8, lambda raw: None)
+        found = statistical_linearisation.resolved(Rippling(seed), FAILED, None, 8, lambda raw: None)
         deviation = found.covariance.diagonal().sqrt()
         z.append((found.final.raw - toys.TRUE) / deviation)
         stds.append(deviation)
@@ -132,7 +143,7 @@ def test_simulations_around_a_point_see_through_ripples():
 
 
 def test_what_nothing_tells_stays_open_under_ripples():
-    found = ensemble.resolved(Rippling(0, blind=True), FAILED, None, 8, lambda raw: None)
+    found = statistical_linearisation.resolved(Rippling(0, blind=True), FAILED, None, 8, lambda raw: None)
     deviation = found.covariance.diagonal().sqrt()
     assert float(deviation[2]) > 1.0
     assert float(deviation[:2].max()) < 0.3
@@ -156,11 +167,13 @@ def test_it_starts_where_all_frames_are_nearer(monkeypatch, known, failed):
         raise SimulationDiverged("seen enough")
 
     monkeypatch.setattr(problem, "distance", distance, raising=False)
-    monkeypatch.setattr(ensemble, "covariance_of", lambda *_: torch.eye(3, dtype=torch.float64))
-    monkeypatch.setattr(ensemble, "later", lambda *_: None)
-    monkeypatch.setattr(ensemble, "_settle", settle)
-    begun = horizon.Within(problem, FAILED._replace(final=at["k"]), 0.5)
-    assert ensemble.resolved(problem, FAILED._replace(final=at["f"]), begun, 8, lambda raw: None) is None
+    monkeypatch.setattr(statistical_linearisation, "covariance_of", lambda *_: torch.eye(3, dtype=torch.float64))
+    monkeypatch.setattr(statistical_linearisation, "later", lambda *_: None)
+    monkeypatch.setattr(statistical_linearisation, "_settle", settle)
+    begun = predictability.Within(problem, FAILED._replace(final=at["k"]), 0.5)
+    assert (
+        statistical_linearisation.resolved(problem, FAILED._replace(final=at["f"]), begun, 8, lambda raw: None) is None
+    )
     assert starts == [0.0 if known == 0.0 else 1.0]
 
 
@@ -169,7 +182,7 @@ def test_what_cannot_be_simulated_around_is_left_as_it_was():
         def evaluate_all(self, raw):
             raise SimulationDiverged("torn")
 
-    assert ensemble.resolved(Torn(0), FAILED, None, 8, lambda raw: None) is None
+    assert statistical_linearisation.resolved(Torn(0), FAILED, None, 8, lambda raw: None) is None
 
 
 def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
@@ -187,13 +200,13 @@ def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
         part = SimpleNamespace(
             episodes=[SimpleNamespace(times=torch.arange(round(100 * share)) / 10.0, observed=round(100 * share))]
         )
-        final = gauss_newton.Iterate(torch.tensor(share), *[None] * 5)
+        final = levenberg_marquardt.Iterate(torch.tensor(share), *[None] * 5)
         checked = linearity.Checked(final, None, [], [])
         return (part, checked) if 0.12 < share < 0.45 else None
 
-    monkeypatch.setattr(horizon, "_solved", solved)
+    monkeypatch.setattr(predictability, "_solved", solved)
     whole = SimpleNamespace(episodes=[motion(100)])
-    found = horizon.within(whole, FAILED, torch.tensor(0.0), lambda it, o: False)
+    found = predictability.within(whole, FAILED, torch.tensor(0.0), lambda it, o: False)
     shares, starts, tolerances = zip(*asked, strict=True)
     assert shares == pytest.approx([0.1, 0.15, 0.22, 0.33, 0.5, 0.415, 0.4575, 0.415])
     assert starts == pytest.approx([0.0, 0.0, 0.15, 0.22, 0.33, 0.33, 0.415, 0.415])
@@ -206,7 +219,7 @@ def test_of_the_beginning_combinations_are_known_as_such():
     told, known = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
     known[0, 1] = known[1, 0] = -0.95
     known[2, 2] = 1e6  # less than the fit's own prior
-    problem = ensemble._after(Rippling(0).problem(), told, 0.01 * known)
+    problem = statistical_linearisation._after(Rippling(0).problem(), told, 0.01 * known)
     torch.testing.assert_close(torch.linalg.inv(problem.precision)[:2, :2], 0.01 * known[:2, :2])
     assert float(problem.prior_std[2]) == float(Rippling(0).problem().prior_std[2])
     assert float(problem.precision[2, 2]) == pytest.approx(float(problem.prior_std[2]) ** -2)

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from torchcloth.episodes.unknowns import available
 from torchcloth.identification import drawn
-from torchcloth.identification.unknowns import available
 
 
 @pytest.fixture

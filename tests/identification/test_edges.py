@@ -4,11 +4,11 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth.identification.edges import edge_rows
-from torchcloth.identification.episodes import Episode
-from torchcloth.identification.replays import Frames
-from torchcloth.identification.rows import scene_of
-from torchcloth.identification.sheet import BAND, sheet_of
+from torchcloth.episodes.observed import Episode
+from torchcloth.episodes.observed_surface import BAND, sheet_of
+from torchcloth.episodes.replay import Frames
+from torchcloth.identification.residuals.edges import edge_rows
+from torchcloth.identification.residuals.rows import scene_of
 from torchcloth.training.fit.losses import Loss
 
 SIDE = 0.3

@@ -11,12 +11,12 @@ import twins
 
 import torchcloth as tc
 from torchcloth import recordings as rec
+from torchcloth.episodes.replay import Frames, simulate, tangents
+from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import InvalidInput, RecordingError, UnstableStep
 from torchcloth.identification import cloth_from, episode, episode_prediction, predict_episode
 from torchcloth.identification.episode_prediction import _held_to_steps, with_errors
 from torchcloth.identification.prediction_report import print_predicted
-from torchcloth.identification.replays import Frames, simulate, tangents
-from torchcloth.identification.unknowns import collect
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,13 @@ from twins import at, shifted
 
 import torchcloth as tc
 from torchcloth import recordings as rec
+from torchcloth.episodes import streams
+from torchcloth.episodes.observed import eye_of, first_shape, mesh_of
+from torchcloth.episodes.unknowns import available, collect
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import cloth_from, episode, identify, streams
-from torchcloth.identification.episodes import eye_of, first_shape, mesh_of
-from torchcloth.identification.finer import finer_cloth, finer_recording
-from torchcloth.identification.objective import Objective
-from torchcloth.identification.unknowns import available, collect
+from torchcloth.identification import cloth_from, episode, identify
+from torchcloth.identification.estimators.objective import Objective
+from torchcloth.identification.uncertainty.richardson import finer_cloth, finer_recording
 
 
 def with_cloth(recording, **changes):

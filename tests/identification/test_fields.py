@@ -11,8 +11,8 @@ import torch
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import fields, fit_fields, identify
-from torchcloth.identification.blocks import blocks_for
 from torchcloth.identification.fields import NO_ERROR, laplacian
+from torchcloth.identification.residuals.blocks import blocks_for
 
 STIFF = 4.0  # times, in the stripe
 

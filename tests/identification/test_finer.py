@@ -9,11 +9,11 @@ import twins
 
 import torchcloth as tc
 from torchcloth.boundaries import Grasp
+from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.identification import fit, identify
-from torchcloth.identification.finer import finer_cloth, finer_recording
-from torchcloth.identification.objective import Objective
-from torchcloth.identification.unknowns import collect
+from torchcloth.identification.estimators.objective import Objective
+from torchcloth.identification.uncertainty.richardson import finer_cloth, finer_recording
 
 PAIR = ["youngs_modulus", "air.normal"]
 

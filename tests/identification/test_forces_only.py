@@ -11,10 +11,11 @@ import stretches
 import torch
 import twins
 
+from torchcloth.episodes import streams
+from torchcloth.episodes.replay import Frames
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import cloth_from, draw, episode, identify, print_fit, replayed, streams
-from torchcloth.identification.null import CARRIED, STAYS, UNFELT, no_better_than
-from torchcloth.identification.replays import Frames
+from torchcloth.identification import cloth_from, draw, episode, identify, print_fit, replayed
+from torchcloth.identification.residuals.rigid_carry import CARRIED, STAYS, UNFELT, no_better_than
 
 STIFFNESS = ["youngs_modulus"]
 

@@ -9,11 +9,11 @@ import toys
 from toys import TRUE, curved, linear
 
 from torchcloth.errors import SimulationDiverged, UnstableStep
-from torchcloth.identification import gauss_newton
-from torchcloth.identification.bounds import bounded
-from torchcloth.identification.gauss_newton import Linearised, covariance, minimise
-from torchcloth.identification.misfit import huber
-from torchcloth.identification.unfinished import way_left
+from torchcloth.identification.estimators import levenberg_marquardt
+from torchcloth.identification.estimators.box_qp import bounded
+from torchcloth.identification.estimators.convergence import way_left
+from torchcloth.identification.estimators.levenberg_marquardt import Linearised, covariance, minimise
+from torchcloth.identification.residuals.metrics import huber
 
 START = torch.zeros(3, dtype=torch.float64)
 FITS = 200
@@ -137,7 +137,7 @@ def test_few_readings_of_one_kind_are_few_beside_many_of_another(rows):
     many = 600
     jacobian = torch.zeros(many + rows, 2, dtype=torch.float64)
     jacobian[:many, 0], jacobian[many:, 1] = 1.0, torch.linspace(0.5, 1, rows, dtype=torch.float64)
-    where, block = torch.arange(many + rows) * gauss_newton.WINDOW, (torch.arange(many + rows) >= many).long()
+    where, block = torch.arange(many + rows) * levenberg_marquardt.WINDOW, (torch.arange(many + rows) >= many).long()
     hits = []
     for seed in range(400):
         generator = torch.Generator().manual_seed(seed)
@@ -182,7 +182,7 @@ def test_broyden_and_exact_jacobians_end_at_the_same_point(monkeypatch):
     """To a fraction of a standard error; Broyden saves linearisations, which are what a simulation pays for."""
     saving = curved()
     a = solve(saving, tolerance=0.01)
-    monkeypatch.setattr(gauss_newton, "TRUSTED", -1.0)
+    monkeypatch.setattr(levenberg_marquardt, "TRUSTED", -1.0)
     exact = curved()
     b = solve(exact, tolerance=0.01)
     assert float(((a.raw - b.raw).abs() / deviations(exact, b)).max()) < 0.05
@@ -249,8 +249,8 @@ def test_unknowns_do_not_wait_for_one_that_may_go_no_farther():
 def test_nothing_is_left_to_go_at_the_optimum():
     toy, _ = linear(0)
     assert way_left(toy.problem(), solve(toy, tolerance=1e-6)) < 1e-3
-    start = gauss_newton._linearise(toy.problem(), START)
-    gradient, hessian = gauss_newton.normal_equations(toy.problem(), start)
+    start = levenberg_marquardt._linearise(toy.problem(), START)
+    gradient, hessian = levenberg_marquardt.normal_equations(toy.problem(), start)
     far = float((gradient @ torch.linalg.solve(hessian, gradient)).sqrt())
     assert way_left(toy.problem(), start) == pytest.approx(far)
 
@@ -376,14 +376,14 @@ def test_a_step_that_is_short_for_its_damping_is_no_convergence():
 
         def linear(raw, value=value):
             slopes = torch.autograd.functional.jacobian(value, raw)
-            return gauss_newton.Linearised(value(raw), slopes, torch.ones(40), where, where % 4)
+            return levenberg_marquardt.Linearised(value(raw), slopes, torch.ones(40), where, where % 4)
 
-        problem = gauss_newton.Problem(
+        problem = levenberg_marquardt.Problem(
             linear, lambda raw, value=value: (value(raw), where % 4), lambda raw: raw, start, torch.full((2,), 2.3),
             torch.ones(2), 1e-6,
         )  # fmt: skip
         final = minimise(problem, start, 35, lambda _: False)
-        gradient, hessian = gauss_newton.normal_equations(problem, final)
+        gradient, hessian = levenberg_marquardt.normal_equations(problem, final)
         ended += final.converged
         away += final.converged and float(gradient @ torch.linalg.solve(hessian, gradient)) > 0.5**2
     assert away == 0
@@ -400,6 +400,6 @@ def test_what_was_not_seen_is_no_observation():
         )
         both = Linearised(*(torch.cat(rows) for rows in zip(own[:5], unseen[:5], strict=True)))
         alone, among = (
-            covariance(toy.problem(), gauss_newton.judged(toy.problem(), TRUE, rows)) for rows in (own, both)
+            covariance(toy.problem(), levenberg_marquardt.judged(toy.problem(), TRUE, rows)) for rows in (own, both)
         )
         torch.testing.assert_close(alone, among, rtol=1e-12, atol=0.0)

@@ -8,10 +8,10 @@ import stretches
 import torch
 import twins
 
+from torchcloth.episodes.unknowns import collect
 from torchcloth.identification import identify
-from torchcloth.identification.identifiability import Reach, combinations, experiment_for, influences
-from torchcloth.identification.statements import Estimate
-from torchcloth.identification.unknowns import collect
+from torchcloth.identification.uncertainty.estimates import Estimate
+from torchcloth.identification.uncertainty.identifiability import Reach, combinations, experiment_for, influences
 
 NAMES = ("youngs_modulus", "areal_density", "air.normal")
 

@@ -11,8 +11,9 @@ from twins import THICKNESS, TRUE, at, first, twin
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import cloth_from, episode, fit_fields, identify, search
-from torchcloth.identification.descent import to_vertices
+from torchcloth.identification import cloth_from, episode, fit_fields, identify
+from torchcloth.identification.estimators import search
+from torchcloth.identification.estimators.gradient_descent import to_vertices
 
 PAIR = ["youngs_modulus", "air.normal"]
 STATED = 0.005  # kg/m^2, the recording's error of its areal density

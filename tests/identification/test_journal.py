@@ -9,12 +9,14 @@ import torch
 import twins
 
 import torchcloth as tc
+from torchcloth._utils import resume
+from torchcloth._utils.resume import Journal, digest
+from torchcloth.episodes.cloth_facts import facts_of
+from torchcloth.episodes.observed import episode
+from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import identify, journal
-from torchcloth.identification.episodes import episode
-from torchcloth.identification.journal import Journal, digest, facts_of
-from torchcloth.identification.objective import Objective
-from torchcloth.identification.unknowns import collect
+from torchcloth.identification import identify
+from torchcloth.identification.estimators.objective import Objective
 
 POINT = torch.tensor([1.0, 2.0], dtype=torch.float64)
 
@@ -67,7 +69,7 @@ def test_stopped_work_is_not_deleted_by_other_work(tmp_path):
 
 def test_another_program_answers_anew(tmp_path, monkeypatch):
     Journal(tmp_path / "j", ["a"], resume=None).ask("rows", POINT, answer(1.0))
-    monkeypatch.setattr(journal, "program", lambda: "another")
+    monkeypatch.setattr(resume, "program", lambda: "another")
     with pytest.raises(InvalidInput, match="another version of torchcloth"):
         Journal(tmp_path / "j", ["a"], resume=True)
 
@@ -108,10 +110,10 @@ def test_a_folder_whose_removal_was_interrupted_is_a_journal_still(tmp_path, mon
 
     monkeypatch.setattr(Path, "unlink", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        journal.clear(tmp_path / "j")
+        resume.clear(tmp_path / "j")
     monkeypatch.undo()
     Journal(tmp_path / "j", ["a"], resume=True)
-    journal.clear(tmp_path / "j")
+    resume.clear(tmp_path / "j")
     assert not (tmp_path / "j").exists()
 
 
@@ -181,15 +183,15 @@ def test_beginnings_of_several_episodes_are_told_apart(recording, tmp_path):
 
 def test_all_code_that_answers_is_in_the_fingerprint(tmp_path, monkeypatch):
     """An editable install keeps the robots beside the library, not in it."""
-    monkeypatch.setattr(journal, "files", lambda name: tmp_path / name)
+    monkeypatch.setattr(resume, "files", lambda name: tmp_path / name)
     places = [tmp_path / "torchcloth" / "a.py", tmp_path / "torchcloth.robots" / "arm.py", tmp_path / "studies" / "s.h"]
     for place in places:
         place.parent.mkdir()
         place.write_text("1")
-    known = [journal.program.__wrapped__(tmp_path / "studies")]
+    known = [resume.program.__wrapped__(tmp_path / "studies")]
     for place in places:
         place.write_text("2")
-        known.append(journal.program.__wrapped__(tmp_path / "studies"))
+        known.append(resume.program.__wrapped__(tmp_path / "studies"))
     assert len(set(known)) == 4
 
 
@@ -198,7 +200,7 @@ def test_two_problems_at_work_in_one_folder_do_not_share_answers(tmp_path):
     one, other = Journal(tmp_path / "j", ["a"], resume=None), Journal(tmp_path / "j", ["b"], resume=None)
     assert float(one.ask("rows", POINT, answer(1.0))[0]) == 1.0
     assert float(other.ask("rows", POINT, answer(2.0))[0]) == 2.0
-    journal.clear(tmp_path / "j")
-    journal.clear(tmp_path / "j")
+    resume.clear(tmp_path / "j")
+    resume.clear(tmp_path / "j")
     assert float(other.ask("rows", POINT, answer(3.0))[0]) == 3.0
-    assert (tmp_path / "j" / journal.STAMP).read_text() == other.key
+    assert (tmp_path / "j" / resume.STAMP).read_text() == other.key

@@ -6,9 +6,9 @@ import pytest
 import torch
 import toys
 
-from torchcloth.identification import ensemble, gauss_newton, linearity
-from torchcloth.identification.blocks import BLOCKS
-from torchcloth.identification.identifiability import Reach
+from torchcloth.identification.estimators import levenberg_marquardt, linearity, statistical_linearisation
+from torchcloth.identification.residuals.blocks import BLOCKS
+from torchcloth.identification.uncertainty.identifiability import Reach
 
 ONE = torch.ones(3, dtype=torch.float64)
 
@@ -19,8 +19,8 @@ def problem():
     draw = torch.Generator().manual_seed(0)
     slopes, (frame, patch) = toys.sensitivities(draw), toys.layout()
     value = toys.SIGMA * torch.randn(len(frame), generator=draw, dtype=torch.float64)
-    linear = gauss_newton.Linearised(value, slopes, torch.ones_like(value), frame, patch)
-    solver = gauss_newton.Problem(None, None, None, 0 * ONE, 5 * ONE, ONE, torch.tensor([toys.SIGMA]))
+    linear = levenberg_marquardt.Linearised(value, slopes, torch.ones_like(value), frame, patch)
+    solver = levenberg_marquardt.Problem(None, None, None, 0 * ONE, 5 * ONE, ONE, torch.tensor([toys.SIGMA]))
     objective = SimpleNamespace(
         problem=lambda: solver,
         unknowns=[SimpleNamespace(name=name) for name in "abc"],
@@ -28,7 +28,7 @@ def problem():
         cloth=SimpleNamespace(mesh=SimpleNamespace(extent=1e9)),
         secants=lambda raw, steps: (linear, Reach(ONE, ONE)),
     )
-    return objective, gauss_newton.judged(solver, 0 * ONE, linear)
+    return objective, levenberg_marquardt.judged(solver, 0 * ONE, linear)
 
 
 def test_slopes_that_hold_are_not_withdrawn(problem):
@@ -53,7 +53,9 @@ def test_without_grippers_that_feel_nothing_reaches_forces():
     draw = torch.Generator().manual_seed(0)
     raws = torch.randn(12, 2, generator=draw, dtype=torch.float64)
     slope = torch.tensor([[1.0, 0, 0], [0, 0, 0]], dtype=torch.float64)
-    near = [ensemble.Sample(raw, raw[:1], (raw @ slope)[None, None], torch.zeros(0, 3)) for raw in raws]
-    reach = ensemble._reach(objective, near, torch.zeros(2, dtype=torch.float64))
+    near = [
+        statistical_linearisation.Sample(raw, raw[:1], (raw @ slope)[None, None], torch.zeros(0, 3)) for raw in raws
+    ]
+    reach = statistical_linearisation._reach(objective, near, torch.zeros(2, dtype=torch.float64))
     assert reach.position[0] == pytest.approx(1.0, rel=1e-3)
     assert torch.equal(reach.force, torch.zeros(2, dtype=torch.float64))

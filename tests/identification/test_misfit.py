@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 import torchcloth as tc
-from torchcloth.identification.episodes import Episode
-from torchcloth.identification.finer import finer_cloth
-from torchcloth.identification.misfit import HUBER, figures, huber, noise_scale
-from torchcloth.identification.null import rigid_carry
-from torchcloth.identification.sheet import patch_at, rim_of, share_of, sheet_of
+from torchcloth.episodes.observed import Episode
+from torchcloth.episodes.observed_surface import patch_at, rim_of, share_of, sheet_of
+from torchcloth.identification.residuals.metrics import HUBER, figures, huber, noise_scale
+from torchcloth.identification.residuals.rigid_carry import rigid_carry
+from torchcloth.identification.uncertainty.richardson import finer_cloth
 
 
 def seen(clouds: list[Tensor], motion=None, initial=None) -> Episode:

@@ -8,12 +8,12 @@ import stretches
 import torch
 import twins
 
+from torchcloth.episodes.replay import Frames, simulate
+from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import episode, identify
+from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.nuisances import KINDS, chosen
-from torchcloth.identification.objective import Objective
-from torchcloth.identification.replays import Frames, simulate
-from torchcloth.identification.unknowns import collect
 
 EVERY = ("clock", "camera", "tare", "grasp", "shape")
 

@@ -10,10 +10,11 @@ import toys
 from test_gauss_newton import solve
 
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import gauss_newton, identify
-from torchcloth.identification.profile import profiles
-from torchcloth.identification.report import Found, skewed
-from torchcloth.identification.statements import Estimate
+from torchcloth.identification import identify
+from torchcloth.identification.estimators import levenberg_marquardt
+from torchcloth.identification.uncertainty.estimates import Estimate
+from torchcloth.identification.uncertainty.profile_likelihood import profiles
+from torchcloth.identification.uncertainty.reporting import Found, skewed
 
 BEND = 1.0
 
@@ -29,7 +30,7 @@ def toy(model=lambda raw: raw, loud=5.0):
 def profiled(given, clip=lambda raw: raw, names="abc"):
     """(optimum, its covariance by the cost's own curvature, profiles by name)."""
     final = solve(given, start=toys.TRUE.clone())
-    covariance = torch.linalg.inv(gauss_newton.curvature(given.problem(), final))
+    covariance = torch.linalg.inv(levenberg_marquardt.curvature(given.problem(), final))
     unknowns = [SimpleNamespace(name=n, clip=clip, value=lambda raw: raw) for n in "abc"]
     objective = SimpleNamespace(problem=given.problem, unknowns=unknowns)
     return final, covariance, profiles(objective, final, covariance, names, lambda _: False)

@@ -9,11 +9,12 @@ import torch
 import toys
 
 from torchcloth import recordings as rec
-from torchcloth.identification import gauss_newton, replicates
-from torchcloth.identification.considered import covariance_of
-from torchcloth.identification.gauss_newton import WINDOW, at_least, covariance, minimise, student
-from torchcloth.identification.linearity import Checked
-from torchcloth.identification.replicates import strata_of
+from torchcloth.identification.estimators import levenberg_marquardt
+from torchcloth.identification.estimators.levenberg_marquardt import WINDOW, at_least, covariance, minimise, student
+from torchcloth.identification.estimators.linearity import Checked
+from torchcloth.identification.uncertainty import replicates
+from torchcloth.identification.uncertainty.consider_covariance import covariance_of
+from torchcloth.identification.uncertainty.replicates import strata_of
 
 HIDDEN = 0.05  # standard deviation of what differs between episodes, in units of the unknowns
 FRAMES = 12
@@ -163,8 +164,8 @@ def test_nuisances_of_an_episode_do_not_scatter():
     def value(raw):
         return data + J @ raw
 
-    problem = gauss_newton.Problem(
-        lambda raw: gauss_newton.Linearised(value(raw), J, torch.ones(len(J)), frame, patch),
+    problem = levenberg_marquardt.Problem(
+        lambda raw: levenberg_marquardt.Linearised(value(raw), J, torch.ones(len(J)), frame, patch),
         lambda raw: (value(raw), patch),
         lambda raw: raw,
         torch.zeros(1 + episodes),

@@ -9,15 +9,15 @@ import torch
 from twins import at
 
 import torchcloth as tc
-from torchcloth.identification import gauss_newton, linearity
-from torchcloth.identification.episodes import Episode
-from torchcloth.identification.misfit import Figures
+from torchcloth.episodes.observed import Episode
+from torchcloth.episodes.unknowns import collect, with_priors
+from torchcloth.identification.estimators import levenberg_marquardt, linearity
 from torchcloth.identification.nuisances import Placed
-from torchcloth.identification.null import CARRIED
-from torchcloth.identification.report import Found, estimates, nuisance_estimates, warnings_of, withdraw
+from torchcloth.identification.residuals.metrics import Figures
+from torchcloth.identification.residuals.rigid_carry import CARRIED
 from torchcloth.identification.result import Identification
-from torchcloth.identification.statements import Estimate
-from torchcloth.identification.unknowns import collect, with_priors
+from torchcloth.identification.uncertainty.estimates import Estimate
+from torchcloth.identification.uncertainty.reporting import Found, estimates, nuisance_estimates, warnings_of, withdraw
 
 GOOD = Estimate(2.0, 0.1, (1.8, 2.2), "-", 1.0, True)
 LOST = Estimate(2.0, 1.9, (0.1, 9.0), "-", 1.0, False)
@@ -96,12 +96,14 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
     spread = torch.linspace(-1, 1, rows)
 
     def linear(slope):
-        return gauss_newton.Linearised(noise, slope * 1e-2 * spread[:, None], one, frame, patch)
+        return levenberg_marquardt.Linearised(noise, slope * 1e-2 * spread[:, None], one, frame, patch)
 
     class Fake(SimpleNamespace):
         def problem(self):
             one = torch.ones(1)
-            return gauss_newton.Problem(None, None, None, prior_mean=0 * one, prior_std=one, longest=one, noise=1e-3)
+            return levenberg_marquardt.Problem(
+                None, None, None, prior_mean=0 * one, prior_std=one, longest=one, noise=1e-3
+            )
 
         def secants(self, raw, steps):
             assert 0.005 <= float(steps[0]) <= 0.1
@@ -109,7 +111,7 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
 
     def at_slope(slope):
         size, own = torch.tensor([1e-3]), torch.ones(1)
-        return gauss_newton.Iterate(torch.zeros(1), linear(slope), True, size, own, torch.tensor([torch.inf]))
+        return levenberg_marquardt.Iterate(torch.zeros(1), linear(slope), True, size, own, torch.tensor([torch.inf]))
 
     def made(name, secant):
         cloth, blocks = SimpleNamespace(mesh=SimpleNamespace(extent=1.0)), [SimpleNamespace(unit="m")]

@@ -9,12 +9,12 @@ import torch
 import twins
 
 from torchcloth import recordings
+from torchcloth.dynamics.contact import Contact
 from torchcloth.effects import AirDrag, Gravity
 from torchcloth.errors import InvalidInput, RecordingError, UnstableStep
 from torchcloth.identification import cloth_from, fitted, identify, predict_episode, replayed
-from torchcloth.identification.described import beyond
-from torchcloth.identification.saved import read_saved
-from torchcloth.transfer import Contact
+from torchcloth.identification.io.saved_fit import read_saved
+from torchcloth.identification.io.unrecorded_settings import beyond
 
 
 def test_the_frames_of_the_fit_come_back(pair, recording, tmp_path):

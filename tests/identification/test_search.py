@@ -10,13 +10,14 @@ import toys
 import twins
 from test_gauss_newton import solve
 
+from torchcloth._utils.resume import Journal
+from torchcloth.episodes.unknowns import collect, with_priors
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import episode, gauss_newton, identify, starts
-from torchcloth.identification.descent import descend
-from torchcloth.identification.journal import Journal
+from torchcloth.identification import episode, identify
+from torchcloth.identification.estimators import levenberg_marquardt, multistart
+from torchcloth.identification.estimators.gradient_descent import descend
+from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.nuisances import chosen
-from torchcloth.identification.objective import Objective
-from torchcloth.identification.unknowns import collect, with_priors
 
 PAIR = ["youngs_modulus", "air.normal"]
 
@@ -110,7 +111,7 @@ def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_
 def test_starts_are_spread_over_two_decades(model):
     unknowns = collect(model, ["youngs_modulus", "poisson_ratio", "air.normal"], (0.3, 0.005))
     begin = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
-    found = torch.stack(starts.spread(unknowns, begin, 33))
+    found = torch.stack(multistart.spread(unknowns, begin, 33))
     assert torch.equal(found[0], begin)
     decades = (found[:, 0] - begin[0]) / 2.302585
     assert float(decades.min()) < -0.9
@@ -125,8 +126,8 @@ def test_starts_that_agree_are_counted():
     toy, _ = toys.linear(0)
     ends = [solve(toy), solve(toy, start=torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64))]
     astray = ends[0]._replace(raw=ends[0].raw + 5.0)
-    astray = gauss_newton.judged(toy.problem(), astray.raw, toy._linearise(astray.raw))
-    reached = starts.best(toy.problem(), [astray, *ends])
+    astray = levenberg_marquardt.judged(toy.problem(), astray.raw, toy._linearise(astray.raw))
+    reached = multistart.best(toy.problem(), [astray, *ends])
     assert (reached.agree, reached.tried) == (2, 3)
     assert float((reached.raw - ends[0].raw).abs().max()) < 1e-2
 

@@ -4,14 +4,14 @@ import pytest
 import torch
 from twins import at
 
+from torchcloth.episodes.observed_surface import sheet_of
+from torchcloth.episodes.replay import simulate, tangents
+from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import UnstableStep
 from torchcloth.identification import episode
-from torchcloth.identification.blocks import point_rows
-from torchcloth.identification.objective import Objective
-from torchcloth.identification.replays import simulate, tangents
-from torchcloth.identification.rows import scene_of
-from torchcloth.identification.sheet import sheet_of
-from torchcloth.identification.unknowns import collect
+from torchcloth.identification.estimators.objective import Objective
+from torchcloth.identification.residuals.blocks import point_rows
+from torchcloth.identification.residuals.rows import scene_of
 
 NAMES = ("youngs_modulus", "poisson_ratio", "bending.stiffness", "air.normal")
 EARLY = 0.35  # five frames: 200 ms of the motion, 0.3 s of settling before it
@@ -67,11 +67,11 @@ def test_tangents_do_not_keep_the_substeps(short, monkeypatch):
     """Proxy for memory: no graph is recorded, and no state of a substep outlives the next few."""
     import weakref
 
-    from torchcloth import functional
+    from torchcloth.dynamics import substep
 
     model, unknowns, seen = short
     model.engine = "reference"
-    alive, most, step = [], 0, functional.step
+    alive, most, step = [], 0, substep.step
 
     def watched(*args, **kwargs):
         nonlocal most
@@ -81,7 +81,7 @@ def test_tangents_do_not_keep_the_substeps(short, monkeypatch):
         most = max(most, sum(ref() is not None for ref in alive[-50:]))
         return state, impulses
 
-    monkeypatch.setattr(functional, "step", watched)
+    monkeypatch.setattr(substep, "step", watched)
     tangents(model, unknowns[:2], start(unknowns[:2]), seen.until(0.0))
     assert len(alive) > 100
     assert most <= 4  # the present one, its predecessor, the last frame's

@@ -12,7 +12,8 @@ import torch
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput, SimulationDiverged
-from torchcloth.identification import Trellis, Uniaxial, specimens
+from torchcloth.identification import Trellis, Uniaxial
+from torchcloth.identification.tension import specimens
 from torchcloth.recordings import ForceDisplacement
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "physics"))

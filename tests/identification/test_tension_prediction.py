@@ -13,8 +13,8 @@ from offaxis import NAMES, H, cloth, modulus, readings
 
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import cross_validated, fit_tension, predict_tension, read_model, specimen_like
-from torchcloth.identification.specimens import curves
-from torchcloth.identification.tension_model import with_left_out
+from torchcloth.identification.tension.model import with_left_out
+from torchcloth.identification.tension.specimens import curves
 from torchcloth.recordings import ForceDisplacement
 
 ANGLES = (0, 45, 90)

@@ -6,9 +6,10 @@ import pytest
 import torch
 import twins
 
-from torchcloth.identification import identify, linearity, search
-from torchcloth.identification.search import Search
-from torchcloth.identification.unfinished import OFF
+from torchcloth.identification import identify
+from torchcloth.identification.estimators import linearity, search
+from torchcloth.identification.estimators.convergence import OFF
+from torchcloth.identification.estimators.search import Search
 from torchcloth.training.studies import cost
 
 MEMBRANE = cost.SHEET.membrane  # N/m, of the truth; the start has 2.5 times as much

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchcloth.identification.gauss_newton import WINDOW, Linearised, Problem
+from torchcloth.identification.estimators.levenberg_marquardt import WINDOW, Linearised, Problem
 
 FRAMES, PATCHES, EACH = 40, 16, 3  # rows: 40 frames of 16 patches of 3 points
 SIGMA = 1e-3  # m

@@ -16,7 +16,7 @@ import torch
 import torchcloth as tc
 from torchcloth import identification
 from torchcloth import recordings as rec
-from torchcloth.identification.unknowns import available
+from torchcloth.episodes.unknowns import available
 from torchcloth.robots import replay
 
 SIDE = 0.3  # m

@@ -17,7 +17,7 @@ from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
 from torchcloth.inspection import draw, inspect, show
 from torchcloth.inspection.cuts import cuts
-from torchcloth.recordings.ticks import ticks
+from torchcloth.recordings.timing import ticks
 
 GRID = {"extra": {"grid": np.array([8, 8])}}
 

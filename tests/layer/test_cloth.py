@@ -8,8 +8,8 @@ import torch
 from small import sheet
 
 import torchcloth as tc
-from torchcloth import functional
 from torchcloth.boundaries import drive
+from torchcloth.dynamics import substep
 from torchcloth.errors import InvalidInput, SimulationDiverged, UnstableStep
 
 
@@ -302,12 +302,12 @@ def test_the_stable_step_is_stable(contact):
 
 def test_beyond_the_limit_a_membrane_blows_up():
     """The bound is no more than 1.6 times too careful on this mesh: 2 / omega x 1.6 diverges."""
-    from torchcloth.stability import SAFETY
+    from torchcloth.dynamics.stability import SAFETY
 
     cloth = sheet()
     state, dt = shaken(cloth), 1.6 * cloth.stable_step() / SAFETY
     with torch.no_grad():
-        grown, _ = functional.rollout(cloth.model(), state, dt, {}, 100)
+        grown, _ = substep.rollout(cloth.model(), state, dt, {}, 100)
     moved = (grown.x - cloth.rest_state().x).abs().max()
     assert not bool(moved < 1e-3)  # ten thousand times the noise, or NaN
 

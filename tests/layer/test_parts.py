@@ -9,8 +9,8 @@ from small import sheet
 from torch.func import functional_call
 
 import torchcloth as tc
+from torchcloth.dynamics.model import kept
 from torchcloth.errors import InvalidInput
-from torchcloth.model import kept
 
 
 @pytest.mark.parametrize(

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from torchcloth import Trajectory
-from torchcloth._remembered import Recent, content
+from torchcloth._utils.caching import Recent, content
 from torchcloth.boundaries import drive
 from torchcloth.boundaries.motion import check
 from torchcloth.errors import InvalidInput
-from torchcloth.initial import held
+from torchcloth.simulation.initial_state import held
 
 TIMES = torch.linspace(0.0, 1.0, 9, dtype=torch.float64)
 

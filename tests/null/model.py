@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from torchcloth import Cloth, effects, materials, meshes, recordings
+from torchcloth.episodes.replay import Replay
 from torchcloth.identification import Identification, cloth_from, episode, identify
-from torchcloth.identification.replays import Replay
 from torchcloth.losses import closest
 
 Array = np.ndarray

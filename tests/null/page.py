@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth._files import write_text
+from torchcloth._utils.files import write_text
 
 COLOURS = ("#c9a58f", "#b0653a", "#1f6f8b")
 ACROSS = 6  # motions side by side

@@ -26,7 +26,7 @@ from rich.progress import Progress
 from null import page
 from null.model import FITTED, Values, between, compare, fit, load
 from torchcloth import recordings
-from torchcloth._files import write_text
+from torchcloth._utils.files import write_text
 from torchcloth.errors import TorchclothError
 
 ROOT = Path(__file__).resolve().parents[2]

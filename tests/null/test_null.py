@@ -12,8 +12,8 @@ import torch
 from null import page, run
 from null.model import Values, between, carry, cloth, compare, load, pattern
 from torchcloth import meshes
+from torchcloth.episodes.replay import Replay
 from torchcloth.identification import episode
-from torchcloth.identification.replays import Replay
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 import torchcloth as tc
-from torchcloth import functional
+from torchcloth.dynamics import substep
 from torchcloth.types import Moment
 
 
@@ -39,7 +39,7 @@ def model(mesh):
 def moment(mesh, x, memory=None, dt=0.0):
     """What an effect sees of the sheet at ``x``, at rest."""
     v, bare = torch.zeros_like(x), model(mesh)
-    return Moment(x, v, functional.surface(bare.geometry, x, v), bare.mass, memory, dt)
+    return Moment(x, v, substep.surface(bare.geometry, x, v), bare.mass, memory, dt)
 
 
 def through(effect, mesh, path, dt=0.0):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import torchcloth as tc
-from torchcloth import functional
+from torchcloth.dynamics import substep
 
 TOLERANCE = 1e-9  # of the largest force on a vertex, relative to the pull
 
@@ -58,7 +58,7 @@ class Strip:
         x = corners.transpose(-3, -2).flatten(-3, -2)
         x = torch.cat([x, torch.zeros_like(x[..., :1])], dim=-1)
         geometry = model.geometry._replace(corners=torch.arange(x.shape[-2]))
-        s = functional.surface(geometry, x, torch.zeros_like(x))
+        s = substep.surface(geometry, x, torch.zeros_like(x))
         return (geometry.area * model.material.membrane_energy(model.coefficients, s)).sum()
 
     def _derivatives(self, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth import dynamics, functional, self_contact, strain
+from torchcloth.dynamics import elasticity, forces, substep
+from torchcloth.dynamics.contact import self_contact
 from torchcloth.materials import AEP
 
 
@@ -38,11 +39,11 @@ def test_forces_are_minus_the_gradient_of_the_energy(convention, seed):
     x, d3 = state.x.clone().requires_grad_(), state.d3.clone().requires_grad_()
     by_x, by_d3 = torch.autograd.grad(potential(cloth, state._replace(x=x, d3=d3)), (x, d3))
     model = cloth.model()
-    s = functional.surface(model.geometry, state.x, state.v)
+    s = substep.surface(model.geometry, state.x, state.v)
     layers = self_contact.near_layers(model, model.grid, state.x)
     director = self_contact.pressure(model, model.grid, layers, state, s, 1e-4)
-    columns = self_contact.add_columns(layers, strain.membrane_stress(model, s, {}), director)
-    force = dynamics.vertex_forces(model, state, s, {}, columns)
+    columns = self_contact.add_columns(layers, elasticity.membrane_stress(model, s, {}), director)
+    force = forces.vertex_forces(model, state, s, {}, columns)
     torch.testing.assert_close(force, -by_x, rtol=1e-10, atol=1e-10 * by_x.abs().max())
     torch.testing.assert_close(director.pull, by_d3, rtol=1e-10, atol=1e-10 * by_d3.abs().max())
 
@@ -51,7 +52,7 @@ def test_energy_equals_the_singular_value_form_of_the_paper():
     cloth = random_cloth("paper")
     state = deformed(cloth)
     model = cloth.model()
-    s = functional.surface(model.geometry, state.x, state.v)
+    s = substep.surface(model.geometry, state.x, state.v)
     F = torch.stack([s.f1, s.f2], dim=-1)
     sigma = torch.linalg.svdvals(F)
     E, nu, h = 1e5, 0.3, 1e-3
@@ -73,7 +74,7 @@ def test_rest_is_stress_free():
     cloth = random_cloth()
     model = cloth.model()
     state = cloth.rest_state()
-    s = functional.surface(model.geometry, state.x, state.v)
+    s = substep.surface(model.geometry, state.x, state.v)
     for column in model.material.membrane_stress(model.coefficients, s):
         assert column.abs().max() < 1e-10
     assert sum(abs(e.item()) for e in cloth.energy(state).values()) < 1e-20
@@ -149,6 +150,6 @@ def test_the_energy_of_small_strains_has_its_digits_in_float32(strain):
     for dtype in (torch.float64, torch.float32):
         cloth = tc.Cloth(tc.meshes.rectangle(0.4, 0.4, triangles=72), AEP(5e4), 0.2, contact=None).to(dtype)
         turn = torch.tensor([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]).to(dtype)
-        x = (cloth.rest_state().x * (1 + strain)) @ turn.mT
+        x = (cloth.rest_state().x * (1 + elasticity)) @ turn.mT
         energies.append(float(cloth.energy(cloth.state(x))["membrane"]))
-    assert energies[1] == pytest.approx(energies[0], rel=0.02 if strain < 1e-3 else 2e-3)
+    assert energies[1] == pytest.approx(energies[0], rel=0.02 if elasticity < 1e-3 else 2e-3)

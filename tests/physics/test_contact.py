@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth import apic, functional, self_contact
-from torchcloth.transfer import FADING, GAP, TOUCH
-from torchcloth.transfer.neighbours import over
+from torchcloth.dynamics import substep
+from torchcloth.dynamics.contact import FADING, GAP, TOUCH, apic, self_contact
+from torchcloth.dynamics.contact.neighbours import over
 
 SPACING, STIFFNESS, DENSITY = 0.01, 100.0, 0.15  # m, k h [N/m], kg/m^2
 
@@ -243,7 +243,7 @@ def test_all_that_weighs_is_on_the_grid_of_the_usual_scheme():
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(5, 5))
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), DENSITY, {"hem": tc.effects.LineMass(0.02)}, transfer="apic")
     model, state = cloth.model(), cloth.rest_state()
-    carried = apic._masses(model, state, functional.surface(model.geometry, state.x, state.v))
+    carried = apic._masses(model, state, substep.surface(model.geometry, state.x, state.v))
     torch.testing.assert_close(carried.sum(), model.mass.sum())
     assert bool((carried > 0).all())
 
@@ -259,7 +259,7 @@ def test_the_usual_scheme_brakes_a_turning_sheet_and_ours_does_not():
         v = torch.linalg.cross(torch.tensor([6.0, 0.0, 0.0]).expand_as(x), x)
         with torch.no_grad():
             state = cloth(cloth.state(x, v), times=[0.0, 0.2]).state
-        s = functional.surface(cloth.model().geometry, x, v)
+        s = substep.surface(cloth.model().geometry, x, v)
         assert s.n.shape[-1] == 3
         angular = [(cloth.model().mass * torch.linalg.cross(a, b)).sum(0)[0] for a, b in ((x, v), (state.x, state.v))]
         kept[transfer] = float(angular[1] / angular[0])

@@ -7,8 +7,8 @@ import torch
 from strips import Strip
 
 import torchcloth as tc
+from torchcloth.dynamics.stability import SAFETY, Limits, squared_frequency
 from torchcloth.materials import AEP, OrthotropicAEP
-from torchcloth.stability import SAFETY, Limits, squared_frequency
 from torchcloth.testing import samples
 
 WARP, WEFT, SHEAR, NU, H = 2e4, 5e4, 3e3, 0.2, 1e-3  # N/m, N/m, N/m, -, m

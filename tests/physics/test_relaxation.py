@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth import functional
-from torchcloth.relaxation import MOST, PEAK, Polynomial
-from torchcloth.stability import Limits, limits_of
+from torchcloth.dynamics import substep
+from torchcloth.dynamics.stability import Limits, limits_of
+from torchcloth.dynamics.viscous_stages import MOST, PEAK, Polynomial
 
 E = tc.effects
 
@@ -63,7 +63,7 @@ def test_one_step_is_the_polynomial_of_the_viscous_force():
     still = state._replace(v=torch.zeros_like(state.v))
 
     def after(begin, stages):
-        return functional.step(cloth.model()._replace(stages=stages), begin, dt, {}, 0)[0].v
+        return substep.step(cloth.model()._replace(stages=stages), begin, dt, {}, 0)[0].v
 
     pushed = after(still, 0)  # elastic forces alone
     unit = torch.eye(48).reshape(48, 16, 3)

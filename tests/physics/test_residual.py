@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth import functional
+from torchcloth.dynamics import substep
 from torchcloth.effects import AirDrag, Bending, KelvinVoigt, MassDamping, ResidualForce
 from torchcloth.effects.residual import LAWS, PLACES, describe
 from torchcloth.errors import InvalidInput
@@ -28,7 +28,7 @@ def force(cloth, x, v):
     """[V, 3] N."""
     model = cloth.model()
     effect, c = model.effects["it"]
-    found = effect.force(c, Moment(x, v, functional.surface(model.geometry, x, v), model.mass))
+    found = effect.force(c, Moment(x, v, substep.surface(model.geometry, x, v), model.mass))
     if effect.acts_on == "vertices":
         return found
     corners = torch.as_tensor(cloth.mesh.faces)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import torchcloth as tc
+from torchcloth.dynamics.contact.transfer import push, stencil
 from torchcloth.effects import AbstractEffect
-from torchcloth.transfer.reference import push, stencil
 
 SPEED = 1e-3  # m/s: some two units a substep at half a metre from the origin
 

@@ -5,7 +5,7 @@ import torch
 from strips import Strip
 
 import torchcloth as tc
-from torchcloth import functional
+from torchcloth.dynamics import substep
 from torchcloth.materials import OrthotropicAEP, StiffeningAEP, stiffening
 from torchcloth.testing import finite_difference_sweep, samples
 from torchcloth.testing.contract import call_with
@@ -101,7 +101,7 @@ def growth(material, strain, dt):
         model = cloth.model()
         for _ in range(60):
             totals.append(sum(cloth.energy(state).values()))
-            state, _ = functional.rollout(model, state, dt, {}, 20)
+            state, _ = substep.rollout(model, state, dt, {}, 20)
     return float(torch.stack(totals).max() / totals[0])
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth import functional
+from torchcloth.dynamics import substep
 from torchcloth.types import Moment
 
 ETA = 0.7
@@ -26,7 +26,7 @@ def sheet(eta=ETA, Y=100.0, n=5):
 def force(cloth, x, v):
     model = cloth.model()
     effect, c = model.effects["viscous"]
-    return effect.force(c, Moment(x, v, functional.surface(model.geometry, x, v), model.mass))
+    return effect.force(c, Moment(x, v, substep.surface(model.geometry, x, v), model.mass))
 
 
 def bent(cloth, batch=()):
@@ -59,7 +59,7 @@ def test_power_is_that_of_the_strain_rate():
     geometry = cloth.model().geometry
 
     def strain(moved):
-        s = functional.surface(geometry, moved, v)
+        s = substep.surface(geometry, moved, v)
         F = torch.stack([s.f1, s.f2], dim=-1)
         return 0.5 * (F.mT @ F - torch.eye(2))
 

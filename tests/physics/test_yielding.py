@@ -177,8 +177,8 @@ def test_illegal_limits_are_refused(limit):
 
 
 def test_set_appears_in_what_can_be_fitted():
+    from torchcloth.episodes.unknowns import collect
     from torchcloth.identification.fit import default_parameters
-    from torchcloth.identification.unknowns import collect
 
     cloth = tc.Cloth(tc.meshes.rectangle(0.1, 0.1, triangles=20), AEP(1e5, plastic=NormYield(LIMIT)), 0.2)
     unknowns = {u.name: u for u in collect(cloth, default_parameters(cloth), None)}

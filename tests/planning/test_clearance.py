@@ -9,7 +9,7 @@ from scenes import by_arm, by_hand, cloth_of
 
 from torchcloth import recordings as rec
 from torchcloth.planning.clearance import clearance_of
-from torchcloth.planning.staging import courses_of
+from torchcloth.planning.episode_conversion import courses_of
 from torchcloth.robots import ACCELERATION
 from torchcloth.robots.primitives import Limits
 

@@ -11,7 +11,7 @@ from scenes import by_arm, by_hand, cloth_of
 from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, save_model
-from torchcloth.diagnosis.hypotheses import known
+from torchcloth.diagnosis.causes.hypotheses import known
 from torchcloth.identification import episode
 from torchcloth.planning.result import PLANNED
 

@@ -8,10 +8,10 @@ import torch
 from scenes import EDGE, LASTS, by_arm, by_hand, cloth_of
 
 from torchcloth import recordings as rec
-from torchcloth.planning import staging
-from torchcloth.planning.courses import Bounds, Span, rotation
-from torchcloth.planning.feasible import step_within
-from torchcloth.planning.staging import as_episode, courses_of, doubts
+from torchcloth.planning import episode_conversion
+from torchcloth.planning.constrained_step import step_within
+from torchcloth.planning.episode_conversion import as_episode, courses_of, doubts
+from torchcloth.planning.motion_parameters import Bounds, Span, rotation
 from torchcloth.robots import ACCELERATION, arm_of, replay
 from torchcloth.robots.primitives import Limits
 
@@ -188,7 +188,7 @@ def test_joints_that_turn_without_end_go_the_short_way(monkeypatch):
     joints = recording.joints["arm"]
     turned = joints.q.copy()
     turned[20:, 6] -= 2 * np.pi  # as encoders say it
-    monkeypatch.setattr(staging, "arm_of", lambda *_: arm)
+    monkeypatch.setattr(episode_conversion, "arm_of", lambda *_: arm)
     arm.joint_types = (*arm.joint_types[:6], "continuous")
     wrapped = replace(recording, joints={"arm": replace(joints, q=turned)})
     (course,), (plain,) = courses(wrapped), courses(recording)

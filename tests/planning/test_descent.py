@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from torchcloth.errors import SimulationDiverged
-from torchcloth.planning.aim import Pull
-from torchcloth.planning.courses import Bounds
-from torchcloth.planning.descent import adam, gauss_newton
+from torchcloth.planning.motion_parameters import Bounds
+from torchcloth.planning.objective import Pull
+from torchcloth.planning.optimizers import adam, gauss_newton
 
 GOAL = torch.tensor([0.3, -0.2], dtype=torch.float64)
 

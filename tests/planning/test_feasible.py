@@ -2,9 +2,9 @@
 
 import torch
 
-from torchcloth.identification.bounds import bounded
-from torchcloth.planning.courses import Bounds
-from torchcloth.planning.feasible import step_within
+from torchcloth.identification.estimators.box_qp import bounded
+from torchcloth.planning.constrained_step import step_within
+from torchcloth.planning.motion_parameters import Bounds
 
 
 def all_of_one(rows, low, high):

@@ -11,7 +11,7 @@ from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.planning import Goal, read_goal
-from torchcloth.planning.aim import aim_at
+from torchcloth.planning.objective import aim_at
 
 MESH = meshes.rectangle(0.2, 0.2, triangles=72)
 FACES = torch.as_tensor(MESH.faces)

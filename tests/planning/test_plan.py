@@ -10,14 +10,14 @@ from scenes import LASTS, by_arm, by_hand, cloth_of, sheet_of
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import Model, World, base_model
-from torchcloth.diagnosis.hypotheses import known
+from torchcloth.diagnosis.causes.hypotheses import known
+from torchcloth.episodes.replay import Replay
+from torchcloth.episodes.streams import on_pattern
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import cloth_from, episode
-from torchcloth.identification.replays import Replay
-from torchcloth.identification.streams import on_pattern
 from torchcloth.planning import Goal
-from torchcloth.planning.rehearsal import Rehearsal, plain
-from torchcloth.planning.staging import courses_of
+from torchcloth.planning.episode_conversion import courses_of
+from torchcloth.planning.forward_model import Rehearsal, plain
 from torchcloth.planning.task import Task
 from torchcloth.robots import ACCELERATION, gripper_motion
 from torchcloth.robots.primitives import Limits

@@ -14,10 +14,10 @@ from torchcloth import recordings as rec
 from torchcloth.effects import BodyForce
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import episode, nuisances
-from torchcloth.identification.misfit import figures
+from torchcloth.identification.residuals.metrics import figures
 from torchcloth.pose import estimate_pose
 from torchcloth.pose.estimate import held_at
-from torchcloth.pose.local import unexplained
+from torchcloth.pose.fine_scale_uncertainty import unexplained
 from torchcloth.pose.modes import modes_of
 from torchcloth.types import ClothState
 

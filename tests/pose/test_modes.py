@@ -8,7 +8,7 @@ import torch
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
-from torchcloth.pose.local import _basis
+from torchcloth.pose.fine_scale_uncertainty import _basis
 from torchcloth.pose.modes import Modes, modes_of
 
 

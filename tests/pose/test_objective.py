@@ -7,12 +7,12 @@ import torch
 import twins
 from occluded import model
 
+from torchcloth.episodes.replay import Replay
+from torchcloth.episodes.unknowns import collect
 from torchcloth.identification import episode
-from torchcloth.identification.blocks import blocks_for
+from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.nuisances import chosen
-from torchcloth.identification.objective import Objective
-from torchcloth.identification.replays import Replay
-from torchcloth.identification.unknowns import collect
+from torchcloth.identification.residuals.blocks import blocks_for
 from torchcloth.pose.modes import modes_of
 from torchcloth.pose.objective import Corrected, Correction, pushable, windows_of
 

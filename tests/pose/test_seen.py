@@ -4,9 +4,9 @@ import pytest
 import torch
 
 import torchcloth as tc
+from torchcloth.episodes.streams import on_pattern
 from torchcloth.identification import Episode
-from torchcloth.identification.streams import on_pattern
-from torchcloth.pose.seen import rings, seen_vertices
+from torchcloth.pose.visibility import rings, seen_vertices
 
 SIDE, ROWS = 0.3, 7
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchcloth.identification import Uniaxial, fit_tension
-from torchcloth.identification.tension import misses
+from torchcloth.identification.tension.fit import misses
 from torchcloth.recordings import read_tension, write_tension
 
 pytestmark = pytest.mark.realdata

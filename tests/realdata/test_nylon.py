@@ -20,8 +20,8 @@ from nylon import LENGTH, NAMES, STRIPS, WIDTH, H, start, tables
 from strips import Strip
 
 from torchcloth.identification import fit_tension
-from torchcloth.identification.specimens import Uniaxial
-from torchcloth.identification.tension import misses
+from torchcloth.identification.tension.fit import misses
+from torchcloth.identification.tension.specimens import Uniaxial
 from torchcloth.materials import OrthotropicAEP
 from torchcloth.recordings import read_tension, write_tension
 

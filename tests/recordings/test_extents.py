@@ -11,7 +11,7 @@ import pytest
 from torchcloth import meshes
 from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
-from torchcloth.recordings.extents import check_size, of_another_size, size
+from torchcloth.recordings.size_checks import check_size, of_another_size, size
 
 FRAMES, POINTS = 5, 60
 

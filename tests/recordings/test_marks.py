@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torchcloth.errors import InvalidInput
-from torchcloth.recordings.marks import alike, each_once, mark
+from torchcloth.recordings.fingerprints import alike, each_once, mark
 
 
 def noisy(recording, noise):

@@ -17,7 +17,7 @@ from PIL import Image
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.recordings import placing, writing
+from torchcloth.recordings import atomic_write, writing
 
 FLOAT32 = 1e-7  # relative precision of float32 times the 1 m size of the scene
 HALF_STEP = 0.5e-4 + 1e-12  # points are stored in tenths of a millimetre
@@ -236,7 +236,7 @@ def test_a_target_that_appears_meanwhile_is_kept(recording, tmp_path, monkeypatc
         rec.write(replace(recording, licence="first"), tmp_path / "ep")
 
     with monkeypatch.context() as patch:
-        patch.setattr(placing, "_sync_all", lambda part: (patch.undo(), appear(part)))
+        patch.setattr(atomic_write, "_sync_all", lambda part: (patch.undo(), appear(part)))
         with pytest.raises(RecordingError, match="cannot be written"):
             rec.write(recording, tmp_path / "ep")
     assert rec.read(tmp_path / "ep").licence == "first"
@@ -300,7 +300,7 @@ def test_a_crash_at_any_step_keeps_the_old_episode(recording, episode, tmp_path,
     if step == "rename":
         monkeypatch.setattr("pathlib.Path.rename", crash_into_place)
     else:
-        monkeypatch.setattr(writing if step == "_fill" else placing, step, crash)
+        monkeypatch.setattr(writing if step == "_fill" else atomic_write, step, crash)
     expected = RecordingError if isinstance(error, OSError) else KeyboardInterrupt
     with pytest.raises(expected):
         rec.write(replace(recording, licence="new"), episode, overwrite=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-import torchcloth.robots.crowd as crowd
+import torchcloth.robots.collision_checks as crowd
 from torchcloth import recordings, robots
 from torchcloth.boundaries.motion import interpolate
 from torchcloth.errors import InvalidInput
@@ -17,7 +17,7 @@ from torchcloth.robots import primitives as P
 from torchcloth.robots.arm import Primitive
 from torchcloth.robots.description import locate
 from torchcloth.robots.inverse import reach
-from torchcloth.robots.primitives.moves import PERIOD
+from torchcloth.robots.primitives.base import PERIOD
 from torchcloth.robots.spline import Spline
 from torchcloth.types import Trajectory
 

@@ -8,7 +8,7 @@ import torch
 from torchcloth.boundaries.motion import check, check_cover, interpolate
 from torchcloth.errors import InvalidInput
 from torchcloth.robots.primitives import Limits, cover, drag, fling, fold, hang, minimum_jerk, shake, stretch, swing
-from torchcloth.robots.primitives.moves import PERIOD
+from torchcloth.robots.primitives.base import PERIOD
 
 TABLE = {"left": (-0.2, 0.3, 0.01), "right": (0.2, 0.3, 0.01)}
 HANGING = {"left": (-0.2, 0.0, 0.6), "right": (0.2, 0.0, 0.6)}

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from torchcloth import recordings, robots
-from torchcloth.diagnosis.experiments import about_z
+from torchcloth.diagnosis.experiment.motions import about_z
 from torchcloth.errors import InvalidInput
 from torchcloth.robots import primitives
-from torchcloth.robots.retrace import scene_of
+from torchcloth.robots.replan_episode import scene_of
 
 DOWN = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 

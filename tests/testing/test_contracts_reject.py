@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth._math import dot
+from torchcloth._utils.linalg import dot
 from torchcloth.testing import BoundaryContract, ColliderContract, EffectContract, GraspContract, MaterialContract
 
 

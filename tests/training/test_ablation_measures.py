@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchcloth as tc
+from torchcloth.dynamics.contact import Contact
 from torchcloth.errors import InvalidInput
 from torchcloth.materials import AEP
 from torchcloth.training.ablation.measures import (
@@ -23,7 +24,6 @@ from torchcloth.training.ablation.scenes import (
     LEVELS,
     PARAMETERS,
 )
-from torchcloth.transfer import Contact
 
 
 def test_rescaling_of_poissons_ratio():

@@ -12,7 +12,7 @@ from torchcloth.training.studies import classify, fabrics, pressing, stretching
 from torchcloth.training.studies.command import main
 from torchcloth.training.studies.fabric_trials import FAST, PULLS, fabric, layer
 from torchcloth.training.studies.paper_fabrics import FABRICS
-from torchcloth.training.studies.twins import on_grid
+from torchcloth.training.studies.synthetic_sheets import on_grid
 
 
 @pytest.fixture(scope="module")

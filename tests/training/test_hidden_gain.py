@@ -5,8 +5,8 @@ import torch
 
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import base_model, fit, save_model, setting_of
-from torchcloth.diagnosis.hypotheses import known
-from torchcloth.recordings.together import together
+from torchcloth.diagnosis.causes.hypotheses import known
+from torchcloth.recordings.consistency import together
 from torchcloth.training.studies import hidden_gain
 from torchcloth.training.studies.checkout import module
 from torchcloth.training.studies.hidden_gain import gain, knowing

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchcloth.diagnosis.experiments import Experiment
+from torchcloth.diagnosis.experiment.motions import Experiment
 from torchcloth.errors import InvalidInput
-from torchcloth.training import kept
+from torchcloth.training import resumable
 from torchcloth.training.studies import hidden
 from torchcloth.training.studies.checkout import module
 from torchcloth.training.studies.command import main
@@ -57,9 +57,9 @@ def test_the_truth_is_opened_after_the_answer_and_nothing_is_told(called, tmp_pa
     kinds = [command[0] if command[0] != "-m" else command[2] for command in called]
     assert kinds == ["make.py", "diagnose", "reveal.py"] * 2
     assert called[1] == ["-m", "torchcloth.cli", "diagnose", "e1", "e2", "--out", "001"]
-    kept = json.loads((tmp_path / "s" / "cases" / "001.json").read_text())
-    assert kept["truth"]["family"] == "null"
-    assert kept["answer"] == ANSWER
+    resumable = json.loads((tmp_path / "s" / "cases" / "001.json").read_text())
+    assert resumable["truth"]["family"] == "null"
+    assert resumable["answer"] == ANSWER
 
 
 def test_what_the_catalogue_does_not_know_is_asked_whether_it_shows(called, tmp_path):
@@ -185,7 +185,7 @@ def test_what_the_system_kills_is_no_answer(monkeypatch, tmp_path):
 
 def test_one_round_is_of_one_code(called, tmp_path, monkeypatch):
     hidden.run(options(tmp_path, seed=9, cases=1))
-    monkeypatch.setattr(kept, "program", lambda *beside: "another")
+    monkeypatch.setattr(resumable, "program", lambda *beside: "another")
     with pytest.raises(InvalidInput, match="holds a study with code"):
         hidden.run(options(tmp_path, cases=2))
 

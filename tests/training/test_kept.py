@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.training.kept import Kept
+from torchcloth.training.resumable import Kept
 
 
 def test_a_stopped_study_goes_on_where_it_was(tmp_path, capsys):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchcloth.diagnosis import screen
-from torchcloth.training.studies import left_out, parts
+from torchcloth.training.studies import parts, screening_ablations
 from torchcloth.training.studies.command import main
 
 sys.path.append(str(Path(__file__).parents[1] / "diagnosis"))
@@ -24,7 +24,7 @@ def evidence(truth=(0.0, 0.3, 0.0, 0.7, 0.0), mesh=0.0):
 
 def test_independent_errors_are_as_large_and_agree_with_nobody():
     found = toys.fitted(evidence())
-    other = left_out.independent(found)
+    other = screening_ablations.independent(found)
     cells, nothing = found.evidence.cells[0], torch.zeros(0).double()
     usual, alone = (f.noise.covariance(cells, cells.jacobian[:, :0], nothing) for f in (found, other))
     assert torch.equal(usual.diagonal(), alone.diagonal())
@@ -35,13 +35,13 @@ def test_independent_errors_are_as_large_and_agree_with_nobody():
 
 def test_exact_episodes_keep_all_but_their_nuisances():
     found = toys.fitted(evidence())
-    other = left_out.exact(found)
+    other = screening_ablations.exact(found)
     assert all(float(s.max()) < 1e-11 for s in other.evidence.stds)
     assert all(a is b for a, b in zip(found.evidence.cells, other.evidence.cells, strict=True))
 
 
 def test_against_zero_only_what_matters_changes():
-    rows = {r.hypothesis.name: r for r in screen(left_out.against_zero(toys.fitted(evidence())))}
+    rows = {r.hypothesis.name: r for r in screen(screening_ablations.against_zero(toys.fitted(evidence())))}
     for r in screen(toys.fitted(evidence())):
         assert rows[r.hypothesis.name].amplitude == r.amplitude
         assert rows[r.hypothesis.name].hypothesis.smallest == 0.0 < r.hypothesis.smallest
@@ -49,7 +49,7 @@ def test_against_zero_only_what_matters_changes():
 
 def test_on_one_mesh_residuals_are_those_of_the_given_one():
     found = toys.fitted(evidence(mesh=-0.5))
-    other = left_out.one_mesh(found)
+    other = screening_ablations.one_mesh(found)
     for a, b, n in zip(found.evidence.cells, other.evidence.cells, found.evidence.numerics, strict=True):
         assert torch.equal(b.value, a.value + n)
         assert torch.equal(b.jacobian, a.jacobian)
@@ -58,7 +58,7 @@ def test_on_one_mesh_residuals_are_those_of_the_given_one():
 
 def test_a_rigid_fabric_leaves_all_to_the_causes():
     """What is asked for is then the plain regression on that cause alone."""
-    found = left_out.rigid(toys.fitted(evidence()))
+    found = screening_ablations.rigid(toys.fitted(evidence()))
     slopes, value = found.white.jacobian[:, found.evidence.own :], found.white.value
     for r in screen(found):
         k = [h.name for h in found.evidence.hypotheses].index(r.hypothesis.name)

@@ -14,8 +14,8 @@ from scenes import by_arm, by_hand, cloth_of
 
 from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.planning import Goal
-from torchcloth.planning.rehearsal import Rehearsal, plain
-from torchcloth.planning.staging import courses_of
+from torchcloth.planning.episode_conversion import courses_of
+from torchcloth.planning.forward_model import Rehearsal, plain
 from torchcloth.planning.task import Task
 from torchcloth.robots import ACCELERATION
 from torchcloth.robots.primitives import Limits

@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from torchcloth.training.studies import salting
+from torchcloth.training.studies import fault_injection
 from torchcloth.training.studies.command import main
-from torchcloth.training.studies.salting import SALTS
+from torchcloth.training.studies.fault_injection import SALTS
 
 EYE, MIDDLE = np.array([0.0, -1.3, 0.2]), np.array([0.1, 0.0, 0.3])
 XYZ, T = MIDDLE + 0.1 * np.random.default_rng(0).standard_normal((50, 3)), np.linspace(0.0, 1.0, 10)
@@ -64,7 +64,7 @@ def test_what_diagnoses_say_is_told_beside_the_truth():
         },
     }
     console = Console(width=200, record=True, file=io.StringIO())
-    console.print(salting._blindly(answers))
+    console.print(fault_injection._blindly(answers))
     *_, plain, given, named = filter(str.strip, console.export_text().splitlines())
     assert "unexplained" in plain
     assert "air.linear (given)" in given

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcloth.planning.aim import aim_at
+from torchcloth.planning.objective import aim_at
 from torchcloth.training.studies import trajectories
 from torchcloth.training.studies.command import main
 from torchcloth.training.studies.trajectories import FAST, hidden_goal, on_surface, set_up

@@ -193,7 +193,7 @@ def fold_half_a_metre(fast: bool) -> Outcome:
     """The right edge is turned over onto the left one, which is held meanwhile; then both layers' back edge."""
     cloth, x, speed = folded()
     mesh, grid = cloth.mesh, cloth.grid()
-    unseen = tc.transfer.TURNED * grid.reach + mesh.mean_edge  # contact acts between points of triangles
+    unseen = tc.dynamics.contact.TURNED * grid.reach + mesh.mean_edge  # contact acts between points of triangles
     ways = [crossings(frame, mesh) for frame in x]
     rows = [
         *judged("half", x[FRAMES.index(QUARTER[0])], mesh),

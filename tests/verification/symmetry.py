@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 import torchcloth as tc
-from torchcloth import functional
+from torchcloth.dynamics import substep
 from torchcloth.types import Moment
 
 from .pictures import colour
@@ -120,7 +120,7 @@ def turning_cylinder(fast: bool) -> Outcome:
         cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.15, {"b": tc.effects.Bending(stiffness, damping)}, contact=None)
         model, state = cloth.model(), cloth.state(x, v)
         effect, c = model.effects["b"]
-        now = Moment(x, v, functional.surface(model.geometry, x, v), model.mass)
+        now = Moment(x, v, substep.surface(model.geometry, x, v), model.mass)
         still = now._replace(v=torch.zeros_like(v))
         powers.append(-float(((effect.force(c, now) - effect.force(c, still)) * state.v).sum().detach()))
     lost = stiffness * time * (speed / radius) ** 2 * 0.06

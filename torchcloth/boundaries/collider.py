@@ -9,8 +9,8 @@ from typing import NamedTuple, TypedDict, cast
 import torch
 from torch import Tensor
 
-from .._math import displacement, dot, times, withheld
-from .._vectors import check_value
+from .._utils.linalg import displacement, dot, times, withheld
+from .._utils.vectors import check_value
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from .base import AbstractBoundary, Drive

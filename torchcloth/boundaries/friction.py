@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from .._math import dot, safe_norm
-from .._vectors import direction
+from .._utils.linalg import dot, safe_norm
+from .._utils.vectors import direction
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from .._math import displacement
+from .._utils.linalg import displacement
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from .base import AbstractBoundary, Drive

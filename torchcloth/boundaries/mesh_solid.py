@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from .._math import safe_norm
+from .._utils.linalg import safe_norm
 from ..errors import InvalidInput, MissingDependency
 from ..meshes.topology import edges
 from .collider import AbstractCollider, Options

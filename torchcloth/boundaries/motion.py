@@ -11,8 +11,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from .._math import cross, dot, hermite, last_knot
-from .._remembered import Recent, size_of
+from .._utils.caching import Recent, size_of
+from .._utils.linalg import cross, dot, hermite, last_knot
 from ..errors import InvalidInput
 from ..types import Trajectory
 from .base import Drive

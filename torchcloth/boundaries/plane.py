@@ -7,8 +7,8 @@ from typing import Unpack
 
 from torch import Tensor
 
-from .._math import dot
-from .._vectors import direction, place
+from .._utils.linalg import dot
+from .._utils.vectors import direction, place
 from ..errors import InvalidInput
 from .collider import AbstractCollider, Options
 from .friction import Coulomb, Elliptic

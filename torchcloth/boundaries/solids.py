@@ -8,8 +8,8 @@ from typing import Unpack
 import torch
 from torch import Tensor
 
-from .._math import cross, dot, safe_norm
-from .._vectors import place
+from .._utils.linalg import cross, dot, safe_norm
+from .._utils.vectors import place
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from .collider import AbstractCollider, Options

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._files import as_json, write_text
+from .._utils.files import as_json, write_text
 from .diagnose import progress_line
 from .folders import check_apart, check_folder, place, replaces
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .._files import PROGRESS
+from .._utils.files import PROGRESS
 from ..errors import InvalidInput
 from .folders import check_apart, check_folder, how_to_go_on, place, say
 
@@ -36,10 +36,10 @@ def _diagnose(options: argparse.Namespace) -> int:
     import torch
 
     from .. import diagnosis
-    from ..diagnosis.feasible import FOLDER
-    from ..diagnosis.report import REPORT
+    from .._utils.resume import clear
+    from ..diagnosis.experiment.feasibility import FOLDER
+    from ..diagnosis.report.html_report import REPORT
     from ..diagnosis.run import RESULT
-    from ..identification.journal import clear
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)

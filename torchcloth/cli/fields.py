@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._files import PROGRESS
+from .._utils.files import PROGRESS
 from ..errors import InvalidInput
 from .folders import replaces
 
@@ -88,8 +88,8 @@ def report(folder: Path, found: FieldFit, cloth: Cloth) -> int:
     from rich.console import Console
     from rich.table import Table
 
+    from .._utils.resume import clear
     from ..identification.fields import RESULT
-    from ..identification.journal import clear
     from ..identification.pictures import field_maps, save_figure
 
     note = replaces(folder / RESULT)

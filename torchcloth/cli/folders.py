@@ -7,7 +7,7 @@ import os
 import sys
 from pathlib import Path
 
-from .._files import PROGRESS, check_folder
+from .._utils.files import PROGRESS, check_folder
 from ..errors import InvalidInput
 
 

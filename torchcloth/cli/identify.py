@@ -11,7 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._files import PROGRESS
+from .._utils.files import PROGRESS
 from ..errors import InvalidInput
 from . import fields
 from .folders import check_apart, check_folder, how_to_go_on, place, replaces, say
@@ -119,7 +119,7 @@ def _identify(options: argparse.Namespace) -> int:
 
     from .. import recordings
     from ..identification import Identification
-    from ..recordings.together import together
+    from ..recordings.consistency import together
 
     torch.set_default_dtype(torch.float64)  # sensitivities lose digits over thousands of substeps in float32
     torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
@@ -151,9 +151,9 @@ def _defaults() -> argparse.Namespace:
 
 def _cloth(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, list[str]]:
     """The cloth at its start values, and what of its model it has not."""
+    from ..dynamics.contact import Contact
+    from ..episodes.unknowns import available
     from ..identification import cloth_from
-    from ..identification.unknowns import available
-    from ..transfer import Contact
 
     if options.model is not None:
         cloth, notes = _of_model(options, recording)
@@ -280,10 +280,10 @@ def _refines(options: argparse.Namespace) -> bool:
 
 
 def _report(options: argparse.Namespace, fit: Identification, cloth: Cloth, recordings: list[Recording]) -> int:
+    from .._utils.resume import clear
     from ..identification import episode
-    from ..identification.journal import clear
+    from ..identification.io.saved_fit import RESULT
     from ..identification.pictures import draw
-    from ..identification.saved import RESULT
     from ..identification.tables import print_fit
 
     folder = options.out

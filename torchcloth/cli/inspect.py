@@ -6,7 +6,7 @@ import argparse
 import json
 from typing import Any
 
-from .._files import write_text
+from .._utils.files import write_text
 from .folders import check_apart, check_folder, place, replaces
 
 RESULT = "inspection.json"

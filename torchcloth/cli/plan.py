@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._files import PROGRESS
+from .._utils.files import PROGRESS
 from ..errors import InvalidInput
 from .diagnose import progress_line
 from .folders import check_apart, check_folder, how_to_go_on, place, replaces
@@ -72,7 +72,7 @@ def _plan(options: argparse.Namespace) -> int:
     import torch
 
     from .. import planning, recordings, viewing
-    from ..identification.journal import clear
+    from .._utils.resume import clear
     from ..planning.result import EPISODE, RESULT, check_place
     from ..robots import ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 

@@ -81,8 +81,8 @@ def _used(fit: Path, recording: Recording) -> bool:
 def _model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
     """The cloth, and what is uncertain of its values."""
     from ..diagnosis import start_of
+    from ..episodes.unknowns import available
     from ..identification import cloth_from, fitted
-    from ..identification.unknowns import available
 
     if options.fit is None:
         cloth, uncertain = cloth_from(recording), {}

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from .._files import as_json, write_text
+from .._utils.files import as_json, write_text
 from ..errors import InvalidInput
 from .folders import check_apart, check_folder, place, replaces
 
@@ -45,8 +45,8 @@ def add(verbs: Any) -> None:
 def _predict(options: argparse.Namespace) -> int:
     import torch
 
-    from ..identification.saved import RESULT
-    from ..identification.tension_model import RESULT as TENSION
+    from ..identification.io.saved_fit import RESULT
+    from ..identification.tension.model import RESULT as TENSION
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
@@ -105,7 +105,7 @@ def _of_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
     import numpy as np
 
     from .. import recordings
-    from .._files import atomically
+    from .._utils.files import atomically
     from ..diagnosis import predicted, start_of, was_fitted
     from ..identification import is_fitted, pictures, predict_episode, prediction_report
 

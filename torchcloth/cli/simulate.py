@@ -13,7 +13,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._files import atomically
+from .._utils.files import atomically
 from ..errors import InvalidInput, TorchclothError
 from .folders import check_folder, place, say
 

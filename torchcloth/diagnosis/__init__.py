@@ -6,19 +6,28 @@
 Read ``stepwise.py`` and ``trials.py`` first.
 """
 
-from .approaching import approach
-from .base_model import base_model
-from .branches import unstable
-from .classes import correlations
-from .comparison import Gain, compare, predict
-from .confirming import Confirmation, confirm
-from .drifting import drifts
-from .evidence import gather
-from .fitting import Fitted, fit
-from .gate import Fault, check, read_episodes
-from .hypotheses import catalogue, register
-from .lacking import lack_of_fit
-from .loading import (
+from ..episodes.world import Hypothesis, Model, World
+from .causes.hypotheses import catalogue, register
+from .causes.user_hypotheses import register_file
+from .confirmation import Confirmation, confirm
+from .data.data_checks import Fault, check, read_episodes
+from .data.dataset import setting_of
+from .decide.search import search
+from .decide.verdict import Diagnosis, judge, refused
+from .experiment.proposal import propose
+from .inference.bifurcations import unstable
+from .inference.comparison import Gain, compare, predict
+from .inference.confounding import correlations
+from .inference.fitting import Fitted, fit
+from .inference.force_drift import drifts
+from .inference.lack_of_fit import lack_of_fit
+from .inference.linearise import gather
+from .inference.noise import fit_noise
+from .inference.permutation_test import placebo
+from .inference.screening import screen
+from .inference.warm_start import approach
+from .models.base_model import base_model
+from .models.loading import (
     begin_with,
     beside_the_cloth,
     cloth_for,
@@ -30,19 +39,10 @@ from .loading import (
     uncertain,
     was_fitted,
 )
-from .missing import MissingForce, missing_force
-from .model_file import load_model, read_model, save_model
-from .next_experiment import propose
-from .noise import fit_noise
-from .own_causes import register_file
-from .placebos import placebo
-from .residual import Residual, doubted, learn_residual
+from .models.model_file import load_model, read_model, save_model
 from .run import diagnose, write_diagnosis
-from .screening import screen
-from .setting import setting_of
-from .stepwise import search
-from .verdict import Diagnosis, judge, refused
-from .world import Hypothesis, Model, World
+from .unknown.missing_force import MissingForce, missing_force
+from .unknown.residual_force import Residual, doubted, learn_residual
 
 __all__ = [
     "Confirmation",

@@ -9,31 +9,32 @@ from pathlib import Path
 
 import torch
 
-from .._files import as_json, write_text
-from .._surroundings import own_gradients
+from .._utils.files import as_json, write_text
+from .._utils.resume import digest, program
+from .._utils.torch_modes import own_gradients
+from ..episodes.cloth_facts import facts_of
+from ..episodes.world import Hypothesis, Model
 from ..errors import InvalidInput
-from ..identification.journal import digest, facts_of, program
 from ..recordings import Recording
-from ..recordings.marks import each_once, mark
-from ..recordings.together import listed, together
-from .base_model import base_model
-from .feasible import write_episode
-from .gate import check
-from .hypotheses import catalogue, own_among
-from .keeping import kept_in
-from .lacking import lack_of_fit
-from .missing import missing_force
-from .model_file import save_model
-from .next_experiment import propose
-from .overlays import overlays
-from .own_causes import digests
-from .report import REPORT, write_report
-from .residual import doubted, is_residual, learn_residual
-from .setting import Progress, motions_of, setting_of, somewhere_seen, staged
-from .stepwise import Found, search
-from .tried_causes import check_own
-from .verdict import Diagnosis, judge, refused
-from .world import Hypothesis, Model
+from ..recordings.consistency import listed, together
+from ..recordings.fingerprints import each_once, mark
+from .causes.hypotheses import catalogue, own_among
+from .causes.user_hypotheses import digests
+from .causes.user_hypothesis_checks import check_own
+from .checkpointing import kept_in
+from .data.data_checks import check
+from .data.dataset import Progress, motions_of, setting_of, somewhere_seen, staged
+from .decide.search import Found, search
+from .decide.verdict import Diagnosis, judge, refused
+from .experiment.feasibility import write_episode
+from .experiment.proposal import propose
+from .inference.lack_of_fit import lack_of_fit
+from .models.base_model import base_model
+from .models.model_file import save_model
+from .report.cloud_overlays import overlays
+from .report.html_report import REPORT, write_report
+from .unknown.missing_force import missing_force
+from .unknown.residual_force import doubted, is_residual, learn_residual
 
 OPEN = ("ambiguous", "inconclusive", "unexplained")  # verdicts that another experiment may change
 NONE_TELLS = "no short motion that can be done would tell the causes from what they cannot be told from now"

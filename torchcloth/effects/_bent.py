@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .._math import cross, dot, safe_norm
+from .._utils.linalg import cross, dot, safe_norm
 from ..meshes import Mesh
 from ._curvature import curvature_stencils, gathered, largest_eigenvalue, local_matrices, mixed_area, pattern
 

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from .._math import safe_norm
+from .._utils.linalg import safe_norm
 from ..errors import InvalidInput
 
 

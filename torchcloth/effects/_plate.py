@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .._math import dot
+from .._utils.linalg import dot
 from ._curvature import Stencils, local_matrices, pattern
 
 PARTS = ((0, 0), (1, 1), (0, 1), (2, 2))  # entries of P that do not vanish, in the order of ``Plate``

@@ -6,7 +6,7 @@ import math
 
 from torch import Tensor
 
-from .._math import dot
+from .._utils.linalg import dot
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter

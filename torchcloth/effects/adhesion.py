@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._vectors import direction, place
+from .._utils.vectors import direction, place
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .._math import dot, safe_norm
-from .._vectors import numbers
+from .._utils.linalg import dot, safe_norm
+from .._utils.vectors import numbers
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter

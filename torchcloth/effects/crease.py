@@ -8,7 +8,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from .._math import safe_norm
+from .._utils.linalg import safe_norm
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from ..types import Moment

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._math import cross, dot
+from .._utils.linalg import cross, dot
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from ..types import Moment

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from .._vectors import numbers
+from .._utils.vectors import numbers
 from ..types import Moment
 from .base import AbstractEffect, Amplitude
 

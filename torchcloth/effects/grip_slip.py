@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._math import dot, loaded, safe_norm, times
+from .._utils.linalg import dot, loaded, safe_norm, times
 from ..parameters import PhysicalParameter
 from .base import AbstractEffect, Amplitude
 

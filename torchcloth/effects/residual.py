@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._math import dot, safe_norm
+from .._utils.linalg import dot, safe_norm
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._math import dot
+from .._utils.linalg import dot
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from ..types import Moment

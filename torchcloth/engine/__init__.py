@@ -1,4 +1,4 @@
-"""The fused engine: the substeps of ``functional.py`` in C++, many in one call, with adjoint and tangents of their own.
+"""The fused engine: the substeps of ``dynamics/substep.py`` in C++, many in one call, with adjoint and tangents.
 
 From the model to the numbers, in the order in which to read:
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..boundaries import Drive
-from ..dynamics import Impulses
+from ..dynamics.forces import Impulses
 from ..types import ClothState
 from .fields import Field
 from .lowering import Lowering

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInput
-from . import running
+from . import execution
 from .building import Unbuilt
-from .cuda import runs, trial
+from .cuda import launch, self_test
+from .execution import Job
 from .fields import Field
 from .program import Program
-from .running import Job
 
 
 def elsewhere(tensor: Tensor) -> bool:
@@ -27,7 +27,7 @@ def forward(job: Job, every: int = 0, keep: bool = False) -> tuple[dict[Field, T
     ``every``: see ``running.forward``. On a device, which goes through all substeps again, records are which triangles
     met others, where ``keep`` says that there will be a reverse sweep.
     """
-    return runs.forward(job, keep) if elsewhere(job.like) else running.forward(job, every)
+    return launch.forward(job, keep) if elsewhere(job.like) else execution.forward(job, every)
 
 
 def reverse(
@@ -38,19 +38,19 @@ def reverse(
     ``every``: 0: without records.
     """
     if elsewhere(job.like):
-        return runs.reverse(job, records, seeds, wanted)
+        return launch.reverse(job, records, seeds, wanted)
     if every == 0:
-        every = running.spacing(job)
-        records = running.forward(job, every)[1]
-    return running.reverse(job, records.contiguous(), every, seeds, wanted)
+        every = execution.spacing(job)
+        records = execution.forward(job, every)[1]
+    return execution.reverse(job, records.contiguous(), every, seeds, wanted)
 
 
 def records_like(program: Program, scenes: int, substeps: int, every: int, like: Tensor) -> Tensor:
     """The shape and precision of what ``forward`` gives besides results, without numbers."""
     if elsewhere(like):
-        size = runs.mask_size(runs.on_device(program, like.device).source, substeps)
+        size = launch.mask_size(launch.on_device(program, like.device).source, substeps)
         return like.new_empty(scenes, -(-size // 8), dtype=torch.uint8)
-    return like.new_empty(scenes, running.record_size(program, substeps, every))
+    return like.new_empty(scenes, execution.record_size(program, substeps, every))
 
 
 def prepare(program: Program, device: torch.device) -> bool:
@@ -59,7 +59,7 @@ def prepare(program: Program, device: torch.device) -> bool:
     Raises:
         Unbuilt: it cannot be, or it failed when it was tried.
     """
-    there = runs.on_device(program, device)
+    there = launch.on_device(program, device)
     if there.doubt is not None:
         raise Unbuilt(*there.doubt)
     return there.tried
@@ -75,7 +75,7 @@ def try_out(jobs: Iterable[Job], rounding: Field | None) -> None:
     """
     doubt = None
     for job in jobs:
-        there, doubt = runs.on_device(job.program, job.like.device), _doubt(job, rounding)
+        there, doubt = launch.on_device(job.program, job.like.device), _doubt(job, rounding)
         there.tried, there.doubt = doubt is None, doubt
         if there.tried:
             return
@@ -86,7 +86,7 @@ def try_out(jobs: Iterable[Job], rounding: Field | None) -> None:
 def _doubt(job: Job, rounding: Field | None) -> tuple[str, str] | None:
     """What a device does instead, and what to do about it."""
     try:
-        if trial.agrees(job, rounding):
+        if self_test.agrees(job, rounding):
             return None
     except torch.OutOfMemoryError:
         raise

@@ -9,16 +9,16 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint as recompute
 
-from .._surroundings import transformed
+from .._utils.torch_modes import transformed
 from ..boundaries import Drive
-from ..dynamics import Impulses, added
-from ..model import Model
-from ..self_contact import CHUNK
+from ..dynamics.contact.self_contact import CHUNK
+from ..dynamics.forces import Impulses, added
+from ..dynamics.model import Model
 from ..types import ClothState, Trajectory
-from . import conversion, devices, running
+from . import conversion, devices, execution
+from .execution import Job
 from .fields import Field
 from .operators import Rollout
-from .running import Job
 from .torch_parts import TorchParts, divide
 
 
@@ -35,7 +35,7 @@ class Fused:
 
     def __init__(self, model: Model, state: ClothState, drives: Mapping[str, Drive]) -> None:
         self.model = model
-        self._left = running.BUDGET  # bytes of records that the adjoint may find ready
+        self._left = execution.BUDGET  # bytes of records that the adjoint may find ready
         self.low, parts = divide(model, state, drives)
         self.torch_parts = TorchParts(model, parts) if parts else None
         self._coefficients: dict[Field, Tensor] = {}
@@ -186,7 +186,7 @@ class Fused:
             return 0
         if not checkpoint:
             return 1
-        size = running.full_size(self.low.program, scenes, substeps)
+        size = execution.full_size(self.low.program, scenes, substeps)
         if size > self._left:
             return 0
         self._left -= size

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from ..boundaries import Drive
+from ..dynamics.elasticity import MATERIAL
+from ..dynamics.model import Model
 from ..effects._bent import BentSheet
-from ..model import Model
-from ..strain import MATERIAL
 from ..types import ClothState
 from . import devices
 from .constants import array
@@ -169,8 +169,8 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive], in_torch
     Raises:
         Unfused: a part without kernels.
     """
-    from .parts import boundaries, effects, materials
-    from .parts.contact import Contact
+    from .lowerings import boundaries, effects, materials
+    from .lowerings.contact import Contact
 
     if model.transfer != "mesh":
         raise Unfused(f"transfer {model.transfer!r}")
@@ -205,7 +205,7 @@ def _part(name: str, lower: Callable[[], None]) -> None:
 
 
 def _kick(low: Lowering) -> Velocities:
-    from .parts.relaxation import relaxed
+    from .lowerings.viscous_stages import relaxed
 
     loop, v = relaxed(low)
     dt, force, mass = (loop.load(field) for field in (low.dt, low.force, low.mass))

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInput
-from . import devices, running
+from . import devices, execution
+from .execution import Job
 from .program import program_of
-from .running import Job
 
 Batch = list[int | None]  # vmap's axis of every tensor
 
@@ -127,7 +127,7 @@ def _tangents(
     fields = job.program.inputs
     dtype = job.program.dtype  # torch.func.jvp makes float64 of a Python number times a scalar
     dots = {fields[i]: t.to(dtype).contiguous() for i, t in zip(moved, tangents, strict=True)}
-    results, moves = running.tangent(job, dots, tangents[0].shape[1])
+    results, moves = execution.tangent(job, dots, tangents[0].shape[1])
     return [*results.values(), *moves.values()]
 
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ..boundaries import Drive
-from ..dynamics import Impulses
-from ..model import Model
+from ..dynamics.forces import Impulses
+from ..dynamics.model import Model
 from ..types import ClothState
 from . import conversion
 from .fields import Field

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from ..boundaries import Drive
-from ..dynamics import force_of, vertex_forces
+from ..dynamics.elasticity import evolve, membrane_stress
+from ..dynamics.forces import force_of, vertex_forces
+from ..dynamics.model import Model, as_it_is, assemble, surface
 from ..effects import AbstractEffect
-from ..model import Model, as_it_is, assemble, surface
-from ..strain import evolve, membrane_stress
 from ..types import ClothState, Memory, Moment
 from .constants import is_wrapped, readable
 from .lowering import MATERIAL, Lowering, Unfused, lower

@@ -1,20 +1,20 @@
 """From recordings to fabric parameters with error bars."""
 
-from .draws import drawn
+from ..episodes.observed import Episode, cloth_from, episode
 from .episode_prediction import EpisodePrediction, predict_episode
-from .episodes import Episode, cloth_from, episode
 from .fields import FieldFit, fit_fields
 from .fit import identify
-from .null import rigid_carry
+from .io.saved_fit import Replayed, fitted, is_fitted, replayed
 from .pictures import draw
+from .residuals.rigid_carry import rigid_carry
 from .result import Identification
-from .saved import Replayed, fitted, is_fitted, replayed
-from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial
-from .statements import Estimate
 from .tables import print_fit, print_tension
-from .tension import TensionFit, fit_tension
-from .tension_model import TensionModel, read_model
-from .tension_prediction import Band, TensionPrediction, cross_validated, predict_tension, specimen_like
+from .tension.fit import TensionFit, fit_tension
+from .tension.model import TensionModel, read_model
+from .tension.prediction import Band, TensionPrediction, cross_validated, predict_tension, specimen_like
+from .tension.specimens import AbstractSpecimen, Response, Trellis, Uniaxial
+from .uncertainty.estimates import Estimate
+from .uncertainty.posterior_samples import drawn
 
 __all__ = [
     "AbstractSpecimen",

@@ -13,20 +13,20 @@ import torch
 from torch import Tensor
 
 from ..cloth import Cloth
+from ..episodes.observed import RATE, Episode, episode
+from ..episodes.replay import Frames, each, simulate, tangents
+from ..episodes.unknowns import Unknown, collect
 from ..errors import SimulationDiverged, UnstableStep
 from ..losses import closest
 from ..losses.surface import distances
 from ..recordings import Recording
-from ..recordings.extents import check_size
-from .episodes import RATE, Episode, episode
-from .gauss_newton import NORMAL
-from .linearity import NONLINEAR
-from .misfit import figures, forces_rms
-from .null import no_force, rigid_carry
-from .replays import Frames, each, simulate, tangents
+from ..recordings.size_checks import check_size
+from .estimators.levenberg_marquardt import NORMAL
+from .estimators.linearity import NONLINEAR
+from .io.saved_fit import SavedModel, Scene, read_saved, rebuilt, step_of
+from .residuals.metrics import figures, forces_rms
+from .residuals.rigid_carry import no_force, rigid_carry
 from .result import or_none
-from .saved import SavedModel, Scene, read_saved, rebuilt, step_of
-from .unknowns import Unknown, collect
 
 CONVENTION = (
     "SI units. std_parameters: standard error [m] of a vertex's place (root mean square over the cloth and time, and "

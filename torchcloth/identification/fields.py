@@ -15,24 +15,24 @@ import torch
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from .._files import write_text
-from .._surroundings import own_gradients
+from .._utils.files import write_text
+from .._utils.resume import Journal
+from .._utils.torch_modes import own_gradients
 from ..cloth import Cloth
+from ..episodes.observed import Episode, episode, on_cpu
+from ..episodes.replay import Frames, Replay, frames_of
+from ..episodes.unknowns import DECADE, needs_contact
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter, called, to_value
 from ..recordings import Recording
-from .blocks import Block, blocks_for
-from .descent import quasi_newton
-from .episodes import Episode, episode, on_cpu
+from .estimators.gradient_descent import quasi_newton
+from .estimators.objective import Objective
+from .estimators.search import Progress, Search
 from .given import given
-from .journal import Journal
-from .misfit import figures
-from .objective import Objective
-from .replays import Frames, Replay, frames_of
+from .residuals.blocks import Block, blocks_for
+from .residuals.metrics import figures
 from .result import or_none
-from .search import Progress, Search
-from .unknowns import DECADE, needs_contact
 
 NO_ERROR = "no error: gradient method"
 CONVENTION = (

@@ -12,32 +12,32 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor
 
-from .._surroundings import own_gradients
+from .._utils.resume import Journal
+from .._utils.torch_modes import own_gradients
 from ..cloth import Cloth
 from ..effects import AbstractEffect
+from ..episodes.observed import Episode, episode, on_cpu
+from ..episodes.replay import Frames
+from ..episodes.unknowns import collect, with_priors
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
-from . import gauss_newton
-from .blocks import blocks_for
-from .considered import covariance_of
-from .episodes import Episode, episode, on_cpu
-from .finer import LIMIT, OPEN, finer_cloth, mesh_step
+from .estimators import levenberg_marquardt
+from .estimators.objective import Objective
+from .estimators.search import CHAMFER, METHODS, Method, Outcome, Progress, Search
 from .given import given
-from .identifiability import combinations, influences
-from .journal import Journal
-from .misfit import figures, forces_rms
+from .io.saved_fit import model_of
 from .nuisances import chosen, foreseen, implied
-from .null import constant_force, no_better_than, no_force, rigid_carry
-from .objective import Objective
-from .profile import profiles
-from .replays import Frames
-from .replicates import strata_of
-from .report import estimates, nuisance_estimates, skewed, warnings_of, with_profiles, withdraw
+from .residuals.blocks import blocks_for
+from .residuals.metrics import figures, forces_rms
+from .residuals.rigid_carry import constant_force, no_better_than, no_force, rigid_carry
 from .result import Identification
-from .saved import model_of
-from .search import CHAMFER, METHODS, Method, Outcome, Progress, Search
-from .unknowns import collect, with_priors
+from .uncertainty.consider_covariance import covariance_of
+from .uncertainty.identifiability import combinations, influences
+from .uncertainty.profile_likelihood import profiles
+from .uncertainty.replicates import strata_of
+from .uncertainty.reporting import estimates, nuisance_estimates, skewed, warnings_of, with_profiles, withdraw
+from .uncertainty.richardson import LIMIT, OPEN, finer_cloth, mesh_step
 
 PAPER_ITERATIONS = 35  # of the DiffCP paper's stop rule
 MOST_STARTS = 1000
@@ -295,8 +295,12 @@ def _concluded(
 
 
 def _refined(
-    full: Objective, told: Objective, final: gauss_newton.Iterate, covariance: Tensor, recordings: Sequence[Recording]
-) -> tuple[gauss_newton.Iterate, Tensor, dict[str, float], list[str]]:
+    full: Objective,
+    told: Objective,
+    final: levenberg_marquardt.Iterate,
+    covariance: Tensor,
+    recordings: Sequence[Recording],
+) -> tuple[levenberg_marquardt.Iterate, Tensor, dict[str, float], list[str]]:
     """The solution on a mesh of ever smaller triangles, with wider errors, how far that is; or why it is not known."""
     if not recordings or told is not full:
         return final, covariance, {}, []
@@ -334,7 +338,7 @@ def _force_figures(full: Objective, start: list[Frames], end: list[Frames]) -> d
     return {f"force_rms_{key}": forces_rms(wrenches, full.episodes) for key, wrenches in {**both, **nulls}.items()}
 
 
-def _counts(full: Objective, final: gauss_newton.Iterate) -> dict[str, float]:
+def _counts(full: Objective, final: levenberg_marquardt.Iterate) -> dict[str, float]:
     """Independent observations, and how far each kind of data is off."""
     out, total = {}, 0.0
     for b, block in enumerate(full.blocks):

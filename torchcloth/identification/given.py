@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from ..errors import InvalidInput
 from ..recordings import Recording
-from ..recordings.extents import check_size
-from ..recordings.marks import each_once
-from ..recordings.together import listed, same_cloth, together
+from ..recordings.consistency import listed, same_cloth, together
+from ..recordings.fingerprints import each_once
+from ..recordings.size_checks import check_size
 
 
 def given(recordings: Recording | Sequence[Recording]) -> list[Recording]:

@@ -13,12 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._math import hermite, hermite_slope
+from .._utils.linalg import hermite, hermite_slope
 from ..boundaries import Grasp
 from ..cloth import Cloth
+from ..episodes.observed import Episode
+from ..episodes.replay import Frames
 from ..errors import InvalidInput
-from .episodes import Episode
-from .replays import Frames
 
 LEVER = 0.1  # m, at which a turned camera is off by as much as a shifted one
 AXES = "xyz"

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._files import atomically
+from .._utils.files import atomically
 from ..cloth import Cloth
+from ..episodes.observed import Episode
 from ..losses import closest
-from .episodes import Episode
 from .result import Identification
 
 WIDE = 5.0  # ends of an axis of positive values so many times apart are shown on a logarithmic one

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from .episode_prediction import EpisodePrediction
-from .gauss_newton import NORMAL
+from .estimators.levenberg_marquardt import NORMAL
 from .pictures import AFTER, BEFORE, NULL
-from .tension_prediction import Band, TensionPrediction
+from .tension.prediction import Band, TensionPrediction
 
 SHOWN = 9  # rows of a curve
 

@@ -12,9 +12,9 @@ from typing import Any
 
 from torch import Tensor
 
-from .._files import atomically, write_text
+from .._utils.files import atomically, write_text
 from ..cloth import Cloth
-from .statements import Combination, Estimate, Influence, Profile
+from .uncertainty.estimates import Combination, Estimate, Influence, Profile
 
 START = "start.tcm"  # beside identification.json: the model that a fit began with
 CONVENTION = (

@@ -6,8 +6,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from .result import Identification
-from .statements import Estimate
-from .tension import TensionFit
+from .tension.fit import TensionFit
+from .uncertainty.estimates import Estimate
 
 if TYPE_CHECKING:
     from rich.table import Table

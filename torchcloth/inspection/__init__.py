@@ -5,7 +5,7 @@ inspection.show(report)
 inspection.draw(report, "out/ep_01")
 """
 
-from ..recordings.ticks import Stream
+from ..recordings.timing import Stream
 from .frames import Frames
 from .images import Depth
 from .lag import Lag

@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import MissingDependency, RecordingError
 from ..observe import Segmentation, segment
 from ..recordings import ClothInfo, Markers, PointClouds
-from ..recordings.extents import longest, size
+from ..recordings.size_checks import longest, size
 from .cuts import cuts
 from .robust import median
 

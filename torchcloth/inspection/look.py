@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import MissingDependency, TorchclothError
-from ..recordings import Recording, extents, ticks
-from ..recordings.ticks import Stream
+from ..recordings import Recording, size_checks, timing
+from ..recordings.timing import Stream
 from ..robots.paths import Path, holding, paths  # pyright: ignore[reportMissingImports] - mapped from robots/
 from . import frames, images, noise
 from .frames import Frames
@@ -114,7 +114,7 @@ def inspect(recording: Recording) -> Inspection:
             notes.append(f"{name}: {error}")
     return Inspection(
         recording,
-        {name: ticks.ticks(kind, t) for name, (kind, t) in ticks.times(recording).items()},
+        {name: timing.ticks(kind, t) for name, (kind, t) in timing.times(recording).items()},
         moved,
         late,
         _noises(recording, holds, seen, shift),
@@ -153,7 +153,7 @@ def _remarks(recording: Recording, holds: dict[str, Path], late: Lag | None) -> 
             f"the clocks differ: observations come {late.value:.3f} s late, the recording says {late.stated:.3f} s; "
             f"set clock_offset to {-late.value:.3f} if the stamps are to blame"
         )
-    if (found := extents.of_another_size(recording)) is not None:
+    if (found := size_checks.of_another_size(recording)) is not None:
         remarks.append("; ".join(found))
     if recording.points is None and recording.markers is None:
         remarks.append("no points and no markers: nothing to compare a simulation with")

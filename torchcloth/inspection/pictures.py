@@ -9,7 +9,7 @@ import numpy as np
 
 from ..identification.pictures import save_figure
 from ..observe import decode
-from ..recordings.ticks import GAP, times
+from ..recordings.timing import GAP, times
 from .look import Inspection
 
 INK, GOOD, BAD, SOFT = "#1f6f8b", "#1f6f8b", "#b0653a", "#888888"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._math import EXACT, cross
+from .._utils.linalg import EXACT, cross
 from ..engine.library import at_hand
 from ..errors import InvalidInput
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._math import cross, dot, safe_norm
-from .._remembered import Remembered
-from .._surroundings import undisturbed
+from .._utils.caching import Remembered
+from .._utils.linalg import cross, dot, safe_norm
+from .._utils.torch_modes import undisturbed
 from .nearest import nearest
 from .shapes import check_places, check_triangles, taken
 

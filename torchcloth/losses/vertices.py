@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._math import EXACT
+from .._utils.linalg import EXACT
 from ..errors import InvalidInput
 from .shapes import check_places, taken
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from .._math import dot
+from .._utils.linalg import dot
 from ..types import Surface
 from .stretch import right_stretch
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._math import dot, safe_norm
+from .._utils.linalg import dot, safe_norm
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from ..types import Surface

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from .._math import safe_norm
+from .._utils.linalg import safe_norm
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 from ..types import Surface

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from .._math import dot
+from .._utils.linalg import dot
 from ..types import Surface
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from .._math import safe_norm
+from .._utils.linalg import safe_norm
 from ..parameters import PhysicalParameter
 from ..types import Surface
 from .stretch import right_stretch

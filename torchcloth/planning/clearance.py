@@ -9,11 +9,11 @@ from torch import Tensor
 from ..errors import InvalidInput
 from ..recordings import Recording
 from ..robots.clearance import Gap  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ..robots.crowd import between_arms, within_arm  # pyright: ignore[reportMissingImports]
-from ..robots.retrace import table_of  # pyright: ignore[reportMissingImports]
+from ..robots.collision_checks import between_arms, within_arm  # pyright: ignore[reportMissingImports]
+from ..robots.replan_episode import table_of  # pyright: ignore[reportMissingImports]
 from ..robots.scene import Scene, Table  # pyright: ignore[reportMissingImports]
 from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
-from .courses import ArmCourse, Course
+from .motion_parameters import ArmCourse, Course
 
 AROUND = 0.1  # m, that the table reaches beyond the goal
 

@@ -14,11 +14,11 @@ from ..recordings import Recording
 from ..robots import ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
-from .descent import OnLook, adam, gauss_newton
+from .episode_conversion import as_episode
 from .goal import Goal
-from .posing import Asked, Believed, check_positive, posed
+from .optimizers import OnLook, adam, gauss_newton
+from .problem import Asked, Believed, check_positive, posed
 from .result import MotionPlan
-from .staging import as_episode
 
 METHODS = ("gauss-newton", "adam")
 

@@ -9,10 +9,10 @@ from typing import Any
 
 from torch import Tensor
 
-from .._files import as_json, write_text
+from .._utils.files import as_json, write_text
 from ..errors import InvalidInput
 from ..recordings import Recording, write
-from ..recordings.proposed import is_undone
+from ..recordings.templates import is_undone
 from ..types import Trajectory
 
 RESULT, EPISODE = "plan.json", "episode"  # in the result's folder

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd
 
-from ..identification.journal import Journal
+from .._utils.resume import Journal
 from ..robots.clearance import Gap  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..types import Trajectory
-from .aim import Pull, aim_at, mean
 from .clearance import Clearance
-from .courses import Bounds, Course
+from .forward_model import Rehearsal
 from .goal import Goal
-from .rehearsal import Rehearsal
+from .motion_parameters import Bounds, Course
+from .objective import Pull, aim_at, mean
 
 LEVER = 0.1  # m, at which a gripper's turns count as shifts
 T = TypeVar("T", bound=Sequence)

@@ -10,28 +10,28 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._math import last_knot
-from .._surroundings import own_gradients
+from .._utils.linalg import last_knot
+from .._utils.torch_modes import own_gradients
 from ..boundaries import Grasp
 from ..cloth import Cloth
+from ..episodes.observed import Episode, episode, on_cpu
+from ..episodes.unknowns import collect, with_priors
 from ..errors import InvalidInput, RecordingError
-from ..identification.blocks import blocks_for
-from ..identification.episodes import Episode, episode, on_cpu
-from ..identification.misfit import LEAST_SCALE, figures
 from ..identification.nuisances import chosen, foreseen, implied
-from ..identification.null import rigid_carry
-from ..identification.report import estimates, nuisance_estimates
-from ..identification.unknowns import collect, with_priors
+from ..identification.residuals.blocks import blocks_for
+from ..identification.residuals.metrics import LEAST_SCALE, figures
+from ..identification.residuals.rigid_carry import rigid_carry
+from ..identification.uncertainty.reporting import estimates, nuisance_estimates
 from ..recordings import Recording
-from ..recordings.extents import check_size
-from ..recordings.together import check_recording
-from .local import unexplained
+from ..recordings.consistency import check_recording
+from ..recordings.size_checks import check_size
+from .fine_scale_uncertainty import unexplained
 from .modes import Modes, check_count, modes_of
 from .objective import Corrected, Correction, pushable, windows_of
 from .result import PoseEstimate
-from .seen import seen_vertices
 from .smoothing import Smoothed, smooth
-from .warn import warnings_of
+from .visibility import seen_vertices
+from .warnings import warnings_of
 
 FIRST_GUESS = 0.5  # m/s^2, of the corrective force; its size is then learnt from the recording
 

@@ -13,17 +13,17 @@ from torch import Tensor, nn
 
 from ..cloth import Cloth
 from ..effects import BodyForce
+from ..episodes.observed import Episode
+from ..episodes.replay import SETTLING, Frames, each, frames_of, state_along
+from ..episodes.unknowns import Unknown, overrides
 from ..errors import InvalidInput, SimulationDiverged
-from ..identification import gauss_newton
-from ..identification.blocks import Block
-from ..identification.episodes import Episode
-from ..identification.misfit import figures
+from ..identification.estimators import levenberg_marquardt
+from ..identification.estimators.objective import Objective, pushed
 from ..identification.nuisances import AbstractNuisance
-from ..identification.objective import Objective, pushed
-from ..identification.replays import SETTLING, Frames, each, frames_of, state_along
-from ..identification.unknowns import Unknown, overrides
+from ..identification.residuals.blocks import Block
+from ..identification.residuals.metrics import figures
 from ..parameters import called
-from ..sensitivities import Directions
+from ..simulation.sensitivities import Directions
 from ..types import ClothState, Rollout
 
 CORRECTION = "correction"  # the effect's name in the model
@@ -131,7 +131,7 @@ class Corrected(Objective):
         self.prior_std = self.prior_std.clone()
         self.prior_std[self.pushes] = self.correction.stds.to(self.prior_std)
 
-    def problem(self) -> gauss_newton.Problem:
+    def problem(self) -> levenberg_marquardt.Problem:
         """The callbacks of Gauss-Newton; the force may move farther in a step than its prior is wide."""
         problem = super().problem()
         longest = problem.longest.clone()

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from .._files import atomically, write_text
+from .._utils.files import atomically, write_text
 from ..cloth import Cloth
+from ..episodes.unknowns import available
 from ..identification.result import or_none
-from ..identification.statements import Estimate
-from ..identification.unknowns import available
+from ..identification.uncertainty.estimates import Estimate
 from ..types import ClothState
 
 CONVENTION = (

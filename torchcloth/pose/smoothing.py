@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import SimulationDiverged
-from ..identification import gauss_newton
+from ..identification.estimators import levenberg_marquardt
 from .objective import Corrected
 
 PARTS = (0.25, 0.5)  # of the frames: far from the truth a long motion is too nonlinear to start with
@@ -30,7 +30,7 @@ class Smoothed(NamedTuple):
     """Where it ended."""
 
     raw: Tensor  # [K]
-    final: gauss_newton.Iterate
+    final: levenberg_marquardt.Iterate
     root: Tensor  # [K, K], times its own transpose the covariance
     converged: bool
     holds: int  # frames in which tangents describe a motion
@@ -62,7 +62,7 @@ def _rounds(objective: Corrected, raw: Tensor, tell: Tell) -> Smoothed:
     converged = False
     for number in range(ROUNDS):
         tell(f"all frames, round {number + 1}", raw)
-        final = gauss_newton.minimise(objective.problem(), raw, 1, lambda _: False)
+        final = levenberg_marquardt.minimise(objective.problem(), raw, 1, lambda _: False)
         raw = final.raw
         found = _learn(objective, final)
         prior = (found.step / objective.prior_std).square().sum()  # of what a round asks for: it may make none
@@ -85,7 +85,7 @@ def _begun(objective: Corrected, tell: Tell) -> Tensor:
         part = objective.part(share) if share < 1 else objective
         if part.told and (share == 1 or len(part.episodes[0].times) < len(objective.episodes[0].times)):
             tell(f"the first {100 * share:.0f} % of the frames" if share < 1 else "all frames, the fabric", raw)
-            raw = gauss_newton.minimise(part.problem(), raw, FABRIC if fabric else 1, lambda _: False).raw
+            raw = levenberg_marquardt.minimise(part.problem(), raw, FABRIC if fabric else 1, lambda _: False).raw
     objective.expecting(expected)
     return raw
 
@@ -109,7 +109,7 @@ def _window_by_window(objective: Corrected, raw: Tensor, tell: Tell) -> Tensor:
         tell(f"the first {last + 1} of {count} frames", raw)
         part.expecting(objective.correction.std)
         for _ in range(rounds):
-            at = gauss_newton.minimise(part.problem(), raw, steps, lambda _: False)
+            at = levenberg_marquardt.minimise(part.problem(), raw, steps, lambda _: False)
             raw = at.raw
             _learn(part, at)
         objective.expecting(part.correction.std)
@@ -123,7 +123,7 @@ class Told(NamedTuple):
     value: Tensor  # [K or less]
 
     @classmethod
-    def of(cls, at: gauss_newton.Iterate) -> Told:
+    def of(cls, at: levenberg_marquardt.Iterate) -> Told:
         """By weighted rows."""
         weight = at.influence()[0].sqrt()
         q, r = torch.linalg.qr(weight[:, None] * at.linear.jacobian)
@@ -136,7 +136,7 @@ class _Learnt(NamedTuple):
     step: Tensor  # [K] to the likeliest unknowns
 
 
-def _learn(objective: Corrected, at: gauss_newton.Iterate) -> _Learnt:
+def _learn(objective: Corrected, at: levenberg_marquardt.Iterate) -> _Learnt:
     """Set the prior's size of every mode to what the numbers and their errors show.
 
     Expectation and maximisation (Dempster et al. 1977) on the linearised problem, where both are closed forms.

@@ -12,7 +12,7 @@ from ..errors import RecordingError
 from . import images, scene, streams
 from .checks import Fields
 from .files import Folder
-from .ticks import SLOWEST
+from .timing import SLOWEST
 from .types import Camera, GraspInfo, Recording
 
 EPISODE = "episode.json"

@@ -21,8 +21,8 @@ import numpy as np
 
 from ..errors import RecordingError
 from . import checks
+from .atomic_write import place
 from .files import Folder
-from .placing import place
 
 FORMAT, VERSION = "torchcloth-tension", 1
 META, ROWS = "table.json", "table.csv"

@@ -13,10 +13,10 @@ import numpy as np
 from ..errors import InvalidInput, RecordingError
 from ..meshes import obj
 from . import checks, images, streams
+from .atomic_write import place
+from .consistency import check_recording
 from .files import Folder, save_npz
-from .placing import place
 from .reading import EPISODE, FORMAT, VERSION, read_folder
-from .together import check_recording
 from .types import Camera, ClothInfo, GraspInfo, Recording
 
 MESH, INITIAL = "cloth.obj", "cloth_initial.npy"

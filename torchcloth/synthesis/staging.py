@@ -12,11 +12,11 @@ import numpy as np
 
 from ..boundaries import Grasp, Plane
 from ..cloth import Cloth
+from ..dynamics.contact import Contact
 from ..effects import AirDrag, Bending, Gravity
 from ..meshes import Mesh
 from ..robots import primitives  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..robots.primitives import Action, Limits  # pyright: ignore[reportMissingImports]
-from ..transfer import Contact
 from .garments import DAMPING, GARMENTS, Garment, material, numbers, sewn
 from .orders import Order
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._math import cross, dot
+from .._utils.linalg import cross, dot
 from ..boundaries import AbstractCollider
 from . import samples
 from .boundary import BoundaryContract

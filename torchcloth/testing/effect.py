@@ -8,9 +8,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from .. import functional
 from ..boundaries import Grasp
 from ..cloth import Cloth
+from ..dynamics import substep
 from ..effects import AbstractEffect, Amplitude
 from ..materials import AEP
 from ..meshes import Mesh, rectangle
@@ -73,10 +73,10 @@ class EffectContract(Contract):
             geometry, mass = _cast(model.geometry, x.dtype), model.mass.to(x.dtype).detach()
             c = effect.coefficients()
             memory = effect.start(rest.to(x).expand_as(x))
-            now = Moment(x, v, functional.surface(geometry, x, v), mass, memory, dt=1e-3)
+            now = Moment(x, v, substep.surface(geometry, x, v), mass, memory, dt=1e-3)
             if now.memory is not None:
                 half = (rest.to(x) + x) / 2
-                between = now._replace(x=half, surface=functional.surface(geometry, half, v))
+                between = now._replace(x=half, surface=substep.surface(geometry, half, v))
                 now = now._replace(memory=effect.evolve(c, between))
                 now = now._replace(memory=effect.evolve(c, now))
             index = torch.arange(3)
@@ -245,7 +245,7 @@ class EffectContract(Contract):
             close(got.detach().double(), exact[name].detach(), 1e-4, f"{name} in float32")
 
 
-def _cast(geometry: functional.Geometry, dtype: torch.dtype) -> functional.Geometry:
+def _cast(geometry: substep.Geometry, dtype: torch.dtype) -> substep.Geometry:
     def cast(value: Tensor) -> Tensor:
         return value.to(dtype)
 

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from ..diagnosis import read_model, start_of
-from ..diagnosis.loading import watched
+from ..diagnosis.models.loading import watched
+from ..episodes.observed import RATE, episode
+from ..episodes.streams import SAME
 from ..identification import replayed
-from ..identification.episodes import RATE, episode
-from ..identification.streams import SAME
 from ..losses import closest
 from ..recordings import Recording
 from .episodes import film_of

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .._files import atomically
+from .._utils.files import atomically
 from ..errors import InvalidInput
 from .film import Film
 from .geometry import Array

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._files import atomically
+from .._utils.files import atomically
 from ..errors import MissingDependency
 from ..meshes.mesh import vertex_normals
 from ..observe import DepthCamera, decode, encode, reproject

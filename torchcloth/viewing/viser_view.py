@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .._files import atomically
+from .._utils.files import atomically
 from .colours import colour_map, colours
 from .film import DISTANCE, Film, View
 from .geometry import Array

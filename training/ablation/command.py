@@ -14,7 +14,7 @@ from pathlib import Path
 
 from torchcloth.errors import InvalidInput
 
-from ..kept import guarded
+from ..resumable import guarded
 from .scenes import ACTIONS, ASSUMED, GARMENTS, LEVELS, Scene, Setup, Variant, variants
 from .study import Name, Study, Task, missing, simulate
 

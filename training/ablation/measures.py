@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcloth import functional
+from torchcloth.dynamics import substep
+from torchcloth.dynamics.model import Model
 from torchcloth.errors import InvalidInput
 from torchcloth.losses import chamfer_to_vertices
-from torchcloth.model import Model
 from torchcloth.types import ClothState
 
 WITHOUT = ("E", "nu", "k", "gamma", "nu = 0")  # the last: nu put to 0 in mu as well, not only its term left out
@@ -64,7 +64,7 @@ def energies(model: Model, state: ClothState) -> dict[str, Tensor]:
 
 
 def _elastic(model: Model, state: ClothState) -> Tensor:
-    energy = functional.energy(model, state)
+    energy = substep.energy(model, state)
     return energy["membrane"] + energy.get("director", torch.zeros(()))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth._files import atomically
+from torchcloth._utils.files import atomically
 
 from .paper import CHAMFER, ENERGY
 from .scenes import LEVELS, PARAMETERS, PERTURBED, REFERENCE, Scene, Variant

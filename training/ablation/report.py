@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchcloth._files import write_text
+from torchcloth._utils.files import write_text
 from torchcloth.errors import InvalidInput
 
 from .measures import bidirectional_chamfer, contributions, spearman

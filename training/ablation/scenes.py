@@ -14,6 +14,8 @@ from torch import Tensor
 import torchcloth as tc
 from torchcloth import meshes
 from torchcloth.boundaries import Grasp, Plane
+from torchcloth.dynamics.contact import Contact
+from torchcloth.dynamics.contact.grid import GAP, SPARSEST
 from torchcloth.effects import AirDrag, Bending, Gravity
 from torchcloth.errors import InvalidInput
 from torchcloth.materials import AEP
@@ -26,8 +28,6 @@ from torchcloth.robots.primitives import (  # pyright: ignore[reportMissingImpor
     drag,
     fling,
 )
-from torchcloth.transfer import Contact
-from torchcloth.transfer.contact import GAP, SPARSEST
 
 from .measures import energies, scaled_poisson
 

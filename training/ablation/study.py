@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from torchcloth._files import atomically
+from torchcloth._utils.files import atomically
 from torchcloth.errors import InvalidInput, TorchclothError
 
-from ..kept import check_settings, unreadable, write_settings
+from ..resumable import check_settings, unreadable, write_settings
 from .measures import WITHOUT
 from .scenes import Run, Scene, Setup, Variant
 

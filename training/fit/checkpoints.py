@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from torchcloth._files import atomically
+from torchcloth._utils.files import atomically
 
 
 class Whole(TorchCheckpointIO):

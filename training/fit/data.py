@@ -15,7 +15,7 @@ from torchcloth import Cloth, recordings
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import Episode, episode
 from torchcloth.recordings import Recording
-from torchcloth.recordings.extents import check_size
+from torchcloth.recordings.size_checks import check_size
 
 from .config import Data
 from .described import described, same_cloth

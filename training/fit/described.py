@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from torchcloth import Cloth, Contact
+from torchcloth.episodes.unknowns import available
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import cloth_from
-from torchcloth.identification.unknowns import available
 from torchcloth.recordings import ClothInfo, Collider, GraspInfo, Recording
 
 from .config import Model

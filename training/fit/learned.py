@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from torchcloth import Cloth, PhysicalParameter
+from torchcloth.episodes.unknowns import available, collect
 from torchcloth.errors import InvalidInput
-from torchcloth.identification.unknowns import available, collect
 from torchcloth.meshes import Mesh
 from torchcloth.parameters import to_value
 

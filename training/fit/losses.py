@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchcloth.errors import InvalidInput
-from torchcloth.identification.blocks import BLOCKS
-from torchcloth.identification.misfit import huber
-from torchcloth.identification.rows import Scene
+from torchcloth.identification.residuals.blocks import BLOCKS
+from torchcloth.identification.residuals.metrics import huber
+from torchcloth.identification.residuals.rows import Scene
 from torchcloth.losses import chamfer_to_vertices
 from torchcloth.losses.surface import distances
 

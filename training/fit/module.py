@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from torchcloth import Cloth
+from torchcloth.episodes.observed_surface import Sheet
+from torchcloth.episodes.replay import Replay, frames_of
 from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.identification import Episode
-from torchcloth.identification.objective import Objective
-from torchcloth.identification.replays import Replay, frames_of
-from torchcloth.identification.rows import Scene, scene_of
-from torchcloth.identification.sheet import Sheet
+from torchcloth.identification.estimators.objective import Objective
+from torchcloth.identification.residuals.rows import Scene, scene_of
 from torchcloth.parameters import called
 
 from .config import from_dict

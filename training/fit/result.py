@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth._files import as_json, atomically, write_text
+from torchcloth._utils.files import as_json, atomically, write_text
 
 from .config import Config
 from .learned import summary

@@ -20,9 +20,9 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch import nn
 
 from torchcloth import Cloth
+from torchcloth._utils.resume import DAMAGED, digest, program
 from torchcloth.errors import InvalidInput, MissingDependency
-from torchcloth.identification.journal import DAMAGED, digest, program
-from torchcloth.identification.objective import Objective
+from torchcloth.identification.estimators.objective import Objective
 
 from . import result
 from .checkpoints import Whole

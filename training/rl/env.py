@@ -19,9 +19,9 @@ from torch import Tensor
 from torchcloth.cloth import Cloth
 from torchcloth.errors import InvalidInput, MissingDependency, SimulationDiverged
 from torchcloth.planning import Goal
-from torchcloth.planning.courses import Course, Span
-from torchcloth.planning.feasible import step_within
-from torchcloth.planning.posing import Asked, posed
+from torchcloth.planning.constrained_step import step_within
+from torchcloth.planning.motion_parameters import Course, Span
+from torchcloth.planning.problem import Asked, posed
 from torchcloth.planning.task import Task
 from torchcloth.recordings import Recording
 from torchcloth.robots import ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/

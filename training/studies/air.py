@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth._files import write_text
+from torchcloth._utils.files import write_text
 from torchcloth.diagnosis import base_model, catalogue, load_model
 from torchcloth.diagnosis.run import BASE, EXTENDED
 from torchcloth.recordings import Recording
-from torchcloth.recordings.together import together
+from torchcloth.recordings.consistency import together
 
-from ..kept import Kept
+from ..resumable import Kept
 from . import air_tables
 from .checkout import module
 from .diagnosing import diagnosis_in

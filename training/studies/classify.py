@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchcloth._files import write_text
+from torchcloth._utils.files import write_text
 
-from ..kept import Kept
+from ..resumable import Kept
 from . import class_pictures
 from .fabric_tables import table
 from .fabric_trials import PAIR, stretches

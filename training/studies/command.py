@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-from ..kept import guarded
+from ..resumable import guarded
 
 # Modules of this package; ``add(parser)`` declares options, ``run(options)`` does it.
 STUDIES: tuple[str, ...] = (

@@ -10,11 +10,11 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from torchcloth.episodes.unknowns import available
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import identify
-from torchcloth.identification.unknowns import available
 
-from ..kept import Kept
+from ..resumable import Kept
 from . import stretching
 from .manipulations import cases
 from .manipulations.printing import heading_table, mm, number, show, write

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchcloth._files import PROGRESS
+from torchcloth._utils.files import PROGRESS
+from torchcloth._utils.resume import clear
 from torchcloth.diagnosis import Diagnosis, Hypothesis, Model, diagnose, write_diagnosis
-from torchcloth.identification.journal import clear
 from torchcloth.recordings import Recording
 
 

@@ -13,7 +13,7 @@ import torchcloth as tc
 from torchcloth.identification import Identification, identify
 from torchcloth.materials.presets import find
 
-from ..kept import Case
+from ..resumable import Case
 from . import pressing, stretching
 from .paper_fabrics import FABRICS
 from .pressing import Layer, Plates

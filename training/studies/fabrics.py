@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth._files import write_text
+from torchcloth._utils.files import write_text
 from torchcloth.materials.presets import find
 
-from ..kept import Kept
+from ..resumable import Kept
 from . import fabric_pictures, fabric_tables
 from .fabric_trials import DENSITIES, FAST, FULL, Scale, others, stretches, truth, values
 from .paper_fabrics import COV, FABRICS, SYMBOLS

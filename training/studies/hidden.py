@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchcloth._files import PROGRESS, write_text
-from torchcloth.diagnosis.experiments import heading_of, possible
+from torchcloth._utils.files import PROGRESS, write_text
+from torchcloth.diagnosis.experiment.motions import heading_of, possible
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings import read
 
-from ..kept import Kept
+from ..resumable import Kept
 from . import hidden_tables
 from .checkout import folder, module
 from .hidden_gain import gain

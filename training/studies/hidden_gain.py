@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from torchcloth.diagnosis import Hypothesis, Model, World, approach, base_model, fit, load_model, setting_of
-from torchcloth.diagnosis.cells import SEEN, cells_of
-from torchcloth.diagnosis.hypotheses import known
-from torchcloth.diagnosis.setting import Setting
+from torchcloth.diagnosis.causes.hypotheses import known
+from torchcloth.diagnosis.data.binning import SEEN, cells_of
+from torchcloth.diagnosis.data.dataset import Setting
 from torchcloth.recordings import read
-from torchcloth.recordings.together import together
+from torchcloth.recordings.consistency import together
 
 LEAST = 2e-4  # m: where an oracle gains less, there is nothing to be gained
 

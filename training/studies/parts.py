@@ -14,17 +14,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from torchcloth._files import write_text
+from torchcloth._utils.files import write_text
 from torchcloth.diagnosis import Fitted, approach, base_model, catalogue, fit, screen, setting_of, unstable
-from torchcloth.diagnosis.branches import without
+from torchcloth.diagnosis.inference.bifurcations import without
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings import read
-from torchcloth.recordings.together import together
+from torchcloth.recordings.consistency import together
 
-from ..kept import Kept, check_jobs
+from ..resumable import Kept, check_jobs
 from .checkout import module
 from .fabric_tables import NOTHING, table
-from .left_out import WAYS, rigid, tangents
+from .screening_ablations import WAYS, rigid, tangents
 
 # numbers for development: a null and four hard ones; half of a drag, and wind
 NULLS, SINGLES = (40, 42, 43, 44, 45), (6, 567)

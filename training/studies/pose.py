@@ -20,14 +20,14 @@ from torch import Tensor
 
 import torchcloth as tc
 from torchcloth import identification, viewing
-from torchcloth._files import write_text
+from torchcloth._utils.files import write_text
 from torchcloth.effects import AirDrag, Bending, Gravity
 from torchcloth.errors import InvalidInput
 from torchcloth.pose import PoseEstimate, estimate_pose
-from torchcloth.pose.seen import seen_vertices
+from torchcloth.pose.visibility import seen_vertices
 from torchcloth.recordings import Recording, read
 
-from ..kept import Kept
+from ..resumable import Kept
 from .checkout import folder, module
 from .geometry import registered, snapped
 

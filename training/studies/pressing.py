@@ -16,7 +16,7 @@ import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
-from .twins import readings
+from .synthetic_sheets import readings
 
 SIDE = 0.05  # m
 APART, PRESSED, SLIDE = 2.2, 0.8, 0.4  # grid spacings: between the plates at first and at last, and sideways

@@ -20,13 +20,13 @@ import torch
 
 from torchcloth import planning
 from torchcloth.identification import cloth_from, fitted, identify
-from torchcloth.identification.saved import RESULT
+from torchcloth.identification.io.saved_fit import RESULT
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.planning import Goal
 from torchcloth.recordings import Recording
 from torchcloth.robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
-from ..kept import Kept, check_jobs
+from ..resumable import Kept, check_jobs
 from .checkout import module
 from .manipulations.printing import heading_table, mm, show, write
 

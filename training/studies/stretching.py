@@ -18,7 +18,7 @@ from torchcloth.observe import DepthCamera, DepthNoise, View, capture, look_at
 from torchcloth.robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from torchcloth.types import Rollout
 
-from .twins import on_grid, readings
+from .synthetic_sheets import on_grid, readings
 
 CLOTH = np.array([0.30, 0.20])  # m, along x and y
 THICKNESS = 1e-3  # m, of the presets

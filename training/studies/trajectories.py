@@ -23,18 +23,18 @@ from torchcloth import planning
 from torchcloth.cloth import Cloth
 from torchcloth.errors import InvalidInput
 from torchcloth.planning import Goal
-from torchcloth.planning.aim import aim_at
-from torchcloth.planning.courses import Course
-from torchcloth.planning.feasible import step_within
-from torchcloth.planning.rehearsal import Rehearsal, plain
-from torchcloth.planning.staging import courses_of
+from torchcloth.planning.constrained_step import step_within
+from torchcloth.planning.episode_conversion import courses_of
+from torchcloth.planning.forward_model import Rehearsal, plain
+from torchcloth.planning.motion_parameters import Course
+from torchcloth.planning.objective import aim_at
 from torchcloth.planning.task import Task
 from torchcloth.recordings import ClothInfo, Collider, GraspInfo, Recording
 from torchcloth.robots import ACCELERATION, gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/
 from torchcloth.robots.primitives import Limits  # pyright: ignore[reportMissingImports]
 from torchcloth.types import Trajectory
 
-from ..kept import Kept
+from ..resumable import Kept
 from .manipulations.printing import heading_table, mm, show, write
 from .manipulations.scenes import FRICTION, LAYERS, Discretisation, Fabric, Manipulation
 from .manipulations.scenes import Scene as Staged

@@ -16,7 +16,7 @@ import foreign
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.recordings import formats
-from torchcloth.recordings.formats import words
+from torchcloth.recordings.formats import sidecar_schema
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 HEIGHT = 0.3  # m, of the cloth over the table
@@ -35,7 +35,7 @@ def test_the_episode_can_be_read(tmp_path):
     assert not recording.extra
     assert recording.cloth.sheet == (0.3, 0.3)
     np.testing.assert_array_equal(recording.cameras["cam0"].distortion, [0.2624, -0.9531, -0.0054, 0.0026, 1.1633])
-    words.check(json.loads(text), "docs/episode.md")
+    sidecar_schema.check(json.loads(text), "docs/episode.md")
 
 
 def test_an_arm_of_ones_own(tmp_path, monkeypatch):
@@ -54,13 +54,18 @@ def test_an_arm_of_ones_own(tmp_path, monkeypatch):
 
 def test_every_word_is_explained():
     page = (DOCS / "episode.md").read_text()
-    every = [words.SCENE, *words.OBJECTS.values(), *words.GROUPS.values(), words.PLANE]
+    every = [
+        sidecar_schema.SCENE,
+        *sidecar_schema.OBJECTS.values(),
+        *sidecar_schema.GROUPS.values(),
+        sidecar_schema.PLANE,
+    ]
     assert not [word for group in every for word in group if word != "source" and word not in page]
 
 
 def test_the_scenes(tmp_path):
     tum, ros2 = blocks("formats.md", "json")
-    words.check(json.loads(ros2), "docs/formats.md")
+    sidecar_schema.check(json.loads(ros2), "docs/formats.md")
     truth = foreign.tum(tmp_path)
     (truth.path / "groundtruth.txt").unlink()
     truth.scene = json.loads(tum)

@@ -25,7 +25,7 @@ import foreign
 
 from torchcloth import recordings as rec
 from torchcloth.errors import MissingDependency, TorchclothError
-from torchcloth.recordings import formats, placing
+from torchcloth.recordings import atomic_write, formats
 
 FEW, MANY = 100, 500
 HEAD = 3000  # bytes at either end, where the structure is
@@ -151,7 +151,7 @@ def attempt(truth: foreign.Foreign, scene: Path, out: Path) -> Content | None:
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch):
     """Tiny files are not brought to the disk 20 000 times."""
-    monkeypatch.setattr(placing, "sync", lambda path: None)
+    monkeypatch.setattr(atomic_write, "sync", lambda path: None)
 
 
 def fuzz(case: str, tmp_path: Path, count: int) -> Counter:

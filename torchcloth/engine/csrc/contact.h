@@ -1,4 +1,4 @@
-// Which triangles are near another layer of cloth, and where their points lie on the grid: torchcloth/self_contact.py.
+// Which triangles are near another layer of cloth, and where their points lie on the grid: torchcloth/dynamics/contact/self_contact.py.
 // This stage decides; loops over what it lists do the rest. Nothing is listed for a sheet that is alone.
 #pragma once
 
@@ -13,7 +13,7 @@
 
 namespace tc {
 
-// Of Scene::counts, in the order of engine/parts/contact.py.
+// Of Scene::counts, in the order of engine/lowerings/contact.py.
 enum Counted { POINTS, WOKEN, ASLEEP, COUNTS };
 
 // What one scene remembers.

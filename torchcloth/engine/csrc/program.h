@@ -75,7 +75,7 @@ struct Fixed {
     int made = -1;  // for which lists of contact
 };
 
-// Rows that contact lists, in the order of engine/parts/contact.py: of points, of those woken and those asleep, from the
+// Rows that contact lists, in the order of engine/lowerings/contact.py: of points, of those woken and those asleep, from the
 // seventh on anew at every substep. OWN_ROW: no two points have the same there.
 enum Listed { POINTS_LIST, OWN_ROW = 4, WOKEN_LIST = 7, ASLEEP_LIST = 13, LISTS = 19 };
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from ..._files import atomically
+from ..._utils.files import atomically
 from .. import building
 from ..building import Unbuilt
 

@@ -16,7 +16,7 @@ from .. import reading
 from ..types import Recording
 from . import kinect, lerobot, redwood, ros2, tum
 from .mcap_writer import write as write_mcap
-from .side import Scene
+from .sidecar import Scene
 
 IMPORTERS = (ros2, lerobot, redwood, tum, kinect)
 EPISODE = "episode"

@@ -14,7 +14,7 @@ from .. import streams
 from ..files import Folder
 from .bag import Bag
 from .imported import Imported, damaged
-from .side import Scene
+from .sidecar import Scene
 
 SCENE, FILES = "/torchcloth/scene", "/torchcloth/files"
 EXTRA = "extra.npz"

@@ -26,7 +26,7 @@ from ..checks import Fields
 from ..images import ImageSource, ImageStream, Kind
 from . import matroska
 from .imported import Imported, ImportedCamera, damaged, frame_numbers, nothing_left, seconds
-from .side import Scene
+from .sidecar import Scene
 from .video import VideoFrames, listening, opened, packet_times
 
 NAME = "kinect"

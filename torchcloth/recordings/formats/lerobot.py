@@ -28,7 +28,7 @@ from ..checks import Fields
 from ..files import Folder
 from ..images import ImageStream
 from .imported import NANO, Imported, ImportedCamera, damaged, nothing_left
-from .side import Scene
+from .sidecar import Scene
 from .video import VideoFrames
 
 NAME = "lerobot"

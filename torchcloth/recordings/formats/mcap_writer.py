@@ -23,13 +23,13 @@ import numpy as np
 
 from ...errors import MissingDependency, RecordingError
 from ...meshes import obj
-from .. import images, placing, streams, writing
+from .. import atomic_write, images, streams, writing
 from ..files import save_npz
 from ..types import Camera, PointClouds, Recording
 from . import embedded, mcap_checksums, ros2
 from .imported import NANO
 from .ros2_topics import WORLD
-from .side import Scene
+from .sidecar import Scene
 
 Event = tuple[int, Callable[[], None]]  # ns, and what writes the message of that time
 FINGER = "finger_width"
@@ -54,14 +54,14 @@ def write(
         raise RecordingError(f"{target} exists", expected="a new name", remedy="pass overwrite=True to replace a file")
     part = target.absolute().with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
     try:
-        with placing.room_for(part):
+        with atomic_write.room_for(part):
             _Bag(part, recording, on_image).write()
             file = part / f"{part.name}.mcap"
             mcap_checksums.seal(file)
             _read_back(file, target)
-            placing.sync(file)
+            atomic_write.sync(file)
             file.replace(target.absolute())
-            placing.sync(target.absolute().parent)
+            atomic_write.sync(target.absolute().parent)
     except (OSError, ValueError, TypeError) as error:
         if isinstance(error, RecordingError | MissingDependency):
             raise

@@ -35,7 +35,7 @@ from .imported import (
     plausible,
     seconds,
 )
-from .side import Scene
+from .sidecar import Scene
 
 NAME = "redwood"
 TITLE = "Open3D/Redwood RGB-D folder"

@@ -31,7 +31,7 @@ from .bag import Bag, is_bag
 from .imported import Imported, nothing_left
 from .ros2_cameras import CameraTopics
 from .ros2_topics import CloudTopic, MotionTopics
-from .side import Scene
+from .sidecar import Scene
 
 NAME = "ros2"
 TITLE = "ROS 2 bag (rosbag2 folder, .mcap, .db3)"

@@ -10,7 +10,7 @@ from ..checks import Fields
 from . import ros2_messages
 from .bag import Bag, Message
 from .imported import nothing_left, pose_matrix, quaternions, seconds
-from .side import Scene
+from .sidecar import Scene
 
 WORLD = ("world", "map")
 EDGE = 0.1  # s; a wrench may begin this much after the first knot, or end before the last

@@ -36,7 +36,7 @@ from .imported import (
     pose_matrix,
     seconds,
 )
-from .side import Scene
+from .sidecar import Scene
 
 NAME = "tum"
 TITLE = "TUM RGB-D folder"

@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcloth.episodes.observed import Episode, episode
+from torchcloth.episodes.replay import Replay
 from torchcloth.errors import SimulationDiverged, UnstableStep
 from torchcloth.identification import Identification, identify
-from torchcloth.identification.episodes import Episode, episode
-from torchcloth.identification.null import rigid_carry
-from torchcloth.identification.replays import Replay
+from torchcloth.identification.residuals.rigid_carry import rigid_carry
 from torchcloth.losses import chamfer_to_surface, chamfer_to_vertices
 
 from .episodes import Seen, record

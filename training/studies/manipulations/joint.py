@@ -8,7 +8,7 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-from ...kept import Kept
+from ...resumable import Kept
 from . import options
 from .cases import SOUGHT, solve_together
 from .printing import heading_table, number, show, write

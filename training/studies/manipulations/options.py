@@ -11,7 +11,7 @@ from typing import Any
 
 from torchcloth.errors import InvalidInput
 
-from ...kept import Kept
+from ...resumable import Kept
 from .cases import Setup, solve
 from .scenes import WORN, Manipulation, manipulations
 

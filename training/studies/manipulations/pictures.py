@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchcloth._files import atomically
+from torchcloth._utils.files import atomically
 
 from . import paper
 from .cases import SOUGHT

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchcloth._files import as_json, write_text
+from torchcloth._utils.files import as_json, write_text
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -11,6 +11,7 @@ import numpy as np
 import torchcloth as tc
 from torchcloth import meshes
 from torchcloth.boundaries import Grasp, Plane
+from torchcloth.dynamics.contact import Contact
 from torchcloth.effects import AirDrag, Bending, Gravity
 from torchcloth.errors import InvalidInput
 from torchcloth.materials import AEP
@@ -18,7 +19,6 @@ from torchcloth.meshes import Mesh
 from torchcloth.robots import primitives  # pyright: ignore[reportMissingImports] - mapped from robots/
 from torchcloth.robots.primitives import Action, Limits  # pyright: ignore[reportMissingImports]
 from torchcloth.synthesis.garments import BENDING, DAMPING, DENSITY, GARMENTS, material, numbers, sewn
-from torchcloth.transfer import Contact
 
 WORN = ("dress", "trousers", "shirt")
 ACTIONS = ("cover", "fling", "drag")

@@ -13,11 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from torchcloth._files import write_text
+from torchcloth._utils.files import write_text
+from torchcloth._utils.resume import clear
 from torchcloth.errors import InvalidInput
-from torchcloth.identification.journal import clear
 
-from ...kept import Kept
+from ...resumable import Kept
 from . import free_swings, pictures, sample, swing_predictions, swings, tables, tension
 
 VARIABLE = "TORCHCLOTH_REALDATA"

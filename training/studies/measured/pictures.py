@@ -9,7 +9,7 @@ import numpy as np
 
 from torchcloth.identification.pictures import AFTER, BEFORE, NULL, save_figure
 from torchcloth.identification.prediction_report import draw_band
-from torchcloth.identification.tension_prediction import Band
+from torchcloth.identification.tension.prediction import Band
 
 from ..checkout import module
 from .tables import MODELS

@@ -16,9 +16,9 @@ import torch
 
 from torchcloth.cloth import Cloth
 from torchcloth.diagnosis import World
+from torchcloth.episodes.replay import Replay
+from torchcloth.episodes.streams import on_pattern
 from torchcloth.identification import episode, rigid_carry
-from torchcloth.identification.replays import Replay
-from torchcloth.identification.streams import on_pattern
 from torchcloth.losses import Hits
 from torchcloth.recordings import Recording
 

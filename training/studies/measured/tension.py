@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchcloth.identification import cross_validated, fit_tension, predict_tension, specimen_like
-from torchcloth.identification.tension_model import TensionModel
+from torchcloth.identification.tension.model import TensionModel
 from torchcloth.recordings import ForceDisplacement
 
 from ..checkout import module

@@ -1,4 +1,4 @@
-// Contact between layers: torchcloth/self_contact.py, transfer/reference.py and materials/director.py.
+// Contact between layers: torchcloth/dynamics/contact/self_contact.py, dynamics/contact/transfer.py and materials/director.py.
 #include "kernels.h"
 #include "../vec.h"
 

@@ -1,4 +1,4 @@
-// Kinematics of the triangles, and how their stresses reach the vertices: torchcloth/model.py, dynamics.py.
+// Kinematics of the triangles, and how their stresses reach the vertices: torchcloth/dynamics/model.py, dynamics.py.
 #pragma once
 
 #include "../vec.h"

@@ -1,0 +1,78 @@
+"""Files that are there whole or not at all, and folders for them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ..errors import InvalidInput
+
+PROGRESS = "progress"  # folder in an output folder, while the work is not done
+
+
+@contextmanager
+def atomically(path: Path) -> Iterator[Path]:
+    """A name beside ``path`` to write to; it becomes ``path`` when the block ends well, and is removed otherwise."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
+    try:
+        try:
+            yield part
+            with part.open("rb") as file:
+                os.fsync(file.fileno())
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        if str(error.filename) == str(part):  # a name that nobody has given
+            error.filename, error.filename2 = str(path), None
+        raise
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a text file so that a crash leaves the old content or the new, never half; returns its path."""
+    with atomically(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return path
+
+
+def as_json(content: Any) -> str:
+    """Text of a result; what is not a finite number is null."""
+    return json.dumps(_finite(content), indent=1, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def check_folder(path: Path, option: str = "--out") -> None:
+    """Refuse, before any work is done, a folder that cannot be made or written to; leaves nothing behind.
+
+    Raises:
+        InvalidInput: the path, or what should be a folder above it, is a file, or the system lets nothing be made.
+    """
+    plain = Path(os.path.abspath(path))
+    above = next(part for part in (plain, *plain.parents) if os.path.lexists(part) or part == part.parent)
+    if not above.is_dir():
+        raise InvalidInput(option, got=f"{above}, a file", expected="a folder, new or existing")
+    try:  # in a place of its own: two commands may make the same folder at once
+        with tempfile.TemporaryDirectory(prefix=".torchcloth-", dir=above) as trial:
+            (Path(trial) / plain.relative_to(above)).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInput(
+            option,
+            got=f"{path}, which cannot be written ({error.strerror})",
+            expected="a folder, new or existing, where files can be made",
+            remedy="choose another, or change its permissions",
+        ) from None

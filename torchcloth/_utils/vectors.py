@@ -1,0 +1,60 @@
+"""Points and directions that a user gives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInput
+
+
+def direction(what: str, given: Sequence[float]) -> Tensor:
+    """[3] unit vector.
+
+    Raises:
+        InvalidInput: not three finite numbers, or all zero.
+    """
+    vector = place(what, given)
+    length = float(vector.norm())
+    if not 0 < length < math.inf:
+        raise InvalidInput(what, got=given, expected="three finite numbers, not all zero")
+    return vector / length
+
+
+def place(what: str, given: Sequence[float]) -> Tensor:
+    """[3] a point or vector.
+
+    Raises:
+        InvalidInput: not three finite numbers.
+    """
+    return numbers(what, given, 3, "three finite numbers")
+
+
+def numbers(what: str, given: Sequence[float], count: int, expected: str) -> Tensor:
+    """[count] finite numbers, which ``expected`` describes.
+
+    Raises:
+        InvalidInput: something else.
+    """
+    check_value(what, given)
+    try:
+        vector = torch.as_tensor(given, dtype=torch.get_default_dtype())
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InvalidInput(what, got=f"{given!r:.40}", expected=expected) from error
+    if vector.shape != (count,) or not bool(torch.isfinite(vector).all()):
+        raise InvalidInput(what, got=given, expected=expected)
+    return vector
+
+
+def check_value(what: str, given: object) -> None:
+    """Refuse a tensor whose gradients would be lost, as a part keeps a copy.
+
+    Raises:
+        InvalidInput: it wants gradients.
+    """
+    if isinstance(given, Tensor) and given.requires_grad and torch.is_grad_enabled():
+        remedy = "its detach(); what a network gives goes in by torch.func.functional_call, as a parameter of the cloth"
+        raise InvalidInput(what, got="a tensor that wants gradients", expected="a value", remedy=remedy)

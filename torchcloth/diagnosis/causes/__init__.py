@@ -1,0 +1,1 @@
+"""The catalogue of causes, each one number that changes the simulated world."""

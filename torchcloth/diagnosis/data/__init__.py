@@ -1,0 +1,1 @@
+"""Episodes of a diagnosis: checks, binned residuals, finer meshes, repeatability."""

@@ -1,0 +1,1 @@
+"""The decision: which cause is named, and the verdict."""

@@ -1,0 +1,1 @@
+"""The answer for a person: sentences, pictures, report.html."""

@@ -1,0 +1,6 @@
+"""The physics of one substep: kinematics, elasticity, forces, viscous stages, contact between layers, stability."""
+
+from .model import Geometry, Model, surface
+from .substep import energy, rollout, step
+
+__all__ = ["Geometry", "Model", "energy", "rollout", "step", "surface"]

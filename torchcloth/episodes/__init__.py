@@ -1,0 +1,1 @@
+"""Recorded episodes as tensors, and the simulated world that replays them."""

@@ -1,0 +1,1 @@
+"""Searches for the unknowns: Levenberg-Marquardt, gradient descent, statistical linearisation, several starts."""

@@ -1,0 +1,1 @@
+"""Fits on disk: written, checked and loaded again."""

@@ -1,0 +1,1 @@
+"""Residuals between simulated and recorded data, and the distances that are reported."""

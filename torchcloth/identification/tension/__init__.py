@@ -1,0 +1,1 @@
+"""Fits to the force readings of a tension machine."""

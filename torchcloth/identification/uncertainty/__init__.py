@@ -1,0 +1,1 @@
+"""Error bars: covariance, identifiability, profile likelihood, mesh correction, posterior samples."""

@@ -1,0 +1,1 @@
+"""Rollouts over frames: schedules of substeps, initial states, forward sensitivities, checks of arguments."""
