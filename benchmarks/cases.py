@@ -15,6 +15,7 @@ import torchcloth as tc
 from torchcloth.effects import AbstractEffect, AirDrag, Bending, Gravity
 from torchcloth.errors import InvalidInput
 from torchcloth.meshes import Mesh
+from torchcloth.training.validation.verification.apic import APICCloth
 
 DT = 1.6e-4  # s, every case is stable with it
 FRAME = 250  # substeps between frames: 25 frames a second
@@ -55,7 +56,7 @@ class Case:
     path: Path
     contact: tc.Contact | None
     effects: Callable[[], dict[str, AbstractEffect]]
-    transfer: str = "mesh"
+    cloth_type: type[tc.Cloth] = tc.Cloth
     boundaries: Callable[[], dict[str, tc.boundaries.AbstractBoundary]] = field(default=dict)
 
     @property
@@ -115,14 +116,13 @@ def make_cloth(case: Case, engine: str) -> tc.Cloth:
     if engine not in engines():
         raise InvalidInput("engine", got=repr(engine), expected=f"one of {', '.join(engines())}")
     grasps = {name: tc.boundaries.Grasp(vertices) for name, vertices in case.held.items()}
-    return tc.Cloth(
+    return case.cloth_type(
         case.mesh,
         tc.materials.AEP(**MATERIAL),  # type: ignore[arg-type]
         DENSITY,
         case.effects(),
         {**case.boundaries(), **grasps},
         case.contact,
-        case.transfer,  # type: ignore[arg-type]
         engine,  # type: ignore[arg-type]
     )
 
@@ -167,7 +167,7 @@ def _hanging(
     cells: int,
     contact: tc.Contact | None,
     effects: Callable[[], dict[str, AbstractEffect]] = _weight,
-    transfer: str = "mesh",
+    cloth_type: type[tc.Cloth] = tc.Cloth,
 ) -> Case:
     """A square sheet in the xz plane that hangs from its two upper corners, swung along y."""
     flat = tc.meshes.rectangle(cells * SPACING, cells * SPACING, resolution=(cells + 1, cells + 1))
@@ -175,7 +175,8 @@ def _hanging(
     mesh = Mesh.build(np.column_stack([u - cells * SPACING / 2, np.zeros_like(u), w]), flat.faces, flat.uv)
     top = mesh.vertices[:, 2] > w.max() - 1e-9
     left, right = (int(np.flatnonzero(top & (mesh.vertices[:, 0] == x))[0]) for x in np.ptp(u) * np.array([-0.5, 0.5]))
-    return Case(name, mesh, {"left": [left], "right": [right]}, Path((0.0, SWING, 0.0)), contact, effects, transfer)
+    hands = {"left": [left], "right": [right]}
+    return Case(name, mesh, hands, Path((0.0, SWING, 0.0)), contact, effects, cloth_type)
 
 
 def _garment(small: bool) -> Case:
@@ -202,6 +203,6 @@ CASES: dict[str, Callable[[bool], Case]] = {
     "standard-everywhere": _standard("standard-everywhere", _EVERYWHERE),
     "standard": _standard("standard", _DEFAULT),
     "standard-usual": _standard("standard-usual", _DEFAULT, effects=_usual),
-    "standard-apic": _standard("standard-apic", _DEFAULT, transfer="apic"),
+    "standard-apic": _standard("standard-apic", _DEFAULT, cloth_type=APICCloth),
     "garment": _garment,
 }

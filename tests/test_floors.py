@@ -30,7 +30,8 @@ FLOORS = (
     ("planning",),
     ("inspection", "synthesis", "viewing"),
     ("",),  # torchcloth/__init__.py: the names a user sees
-    ("training", "benchmarks"),
+    ("training",),
+    ("benchmarks",),
     ("cli",),
     ("__main__",),
 )

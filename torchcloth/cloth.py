@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import Literal, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -40,7 +40,6 @@ from .simulation.argument_checks import (
     check_step,
     check_substeps,
     check_times,
-    check_transfer,
     doubts,
     expand_state,
 )
@@ -62,9 +61,6 @@ class Cloth(nn.Module):
         boundaries: grasps and colliders by name, applied in order.
         contact: discretisation of contact between layers; None leaves contact out, and with it the parameters k, gamma
             and c_F of the material.
-        transfer: "mesh": elastic forces act on the vertices, the grid carries contact only. "apic": the usual material
-            point method, everything through the grid, for comparison; one contact point per triangle, no play, no
-            collision damping, no added mass; wrenches leave out what the grid takes up, some per cent of the weight.
         engine: what computes the substeps. "auto": the fused engine (C++, CUDA C++; in float32 or float64) where it
             knows the parts, else the torch reference, on CUDA in graphs; ``print`` of the cloth tells which and why.
             "fused": an error where it cannot. "reference": always torch, on CUDA launched one by one. The attribute of
@@ -90,16 +86,12 @@ class Cloth(nn.Module):
         effects: Mapping[str, AbstractEffect] | None = None,
         boundaries: Mapping[str, AbstractBoundary] | None = None,
         contact: Contact | None = Contact(),  # noqa: B008 - frozen, carries no state
-        transfer: Literal["mesh", "apic"] = "mesh",
         engine: Setting = "auto",
     ) -> None:
         super().__init__()
         effects, boundaries = {} if effects is None else effects, {} if boundaries is None else boundaries
         check_parts(mesh, material, effects, boundaries, contact)
         self.engine = engine
-        self.transfer: Literal["mesh", "apic"] = transfer
-        if transfer != "mesh":
-            contact = check_transfer(transfer, contact).usual()
         self.mesh, self.material = mesh, material
         for path, part in material.named_modules():
             if isinstance(part, PhysicalParameter):
@@ -288,7 +280,6 @@ class Cloth(nn.Module):
             effects=effects,
             boundaries=dict(self.boundaries.items()),  # type: ignore[arg-type]
             grid=self.grid(),
-            transfer=self.transfer,
             rest=inverse_growth(effect.growth(c) for effect, c in effects.values()),
         )
 

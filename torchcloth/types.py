@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-RATES = ("apic", "contact")  # internal variables that are velocities
+RATES = ("contact",)  # internal variables that are velocities
 Memory = dict[str, Tensor]  # internal variables by owner, "material" or "effects.NAME": [..., N, K] each
 
 
@@ -50,7 +50,7 @@ class Surface(NamedTuple):
     v: Tensor  # [..., E, 3] m/s, centroid velocity
 
 
-class Moment(NamedTuple):
+class EffectInputs(NamedTuple):
     """What an effect sees of the cloth in one substep."""
 
     x: Tensor  # [..., V, 3] m

@@ -241,9 +241,6 @@ def test_fused_refuses_what_it_cannot():
     message = r"""engine; got "fused"; expected .*boundary 'floor' \(Floor\) has no kernels; use engine="auto\""""
     with pytest.raises(InvalidInput, match=message):
         cloth(start(cloth), times=TIMES)
-    apic = sheet("fused", contact=tc.Contact(), transfer="apic", boundaries={})
-    with pytest.raises(InvalidInput, match=r"transfer 'apic' has no kernels"):
-        apic(apic.rest_state(), times=(0.0, 1e-3))
 
 
 def test_divergence_names_time_and_vertex():

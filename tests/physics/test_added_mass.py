@@ -209,17 +209,6 @@ def test_what_stops_cloth_and_air_pushes_along_the_normal(turn):
     assert energy[1] < energy[0]
 
 
-def test_the_usual_scheme_knows_nothing_of_it():
-    """Neither its mass nor the force that goes with it."""
-    mesh = tc.meshes.rectangle(0.1, 0.1, triangles=8)
-    v = torch.randn(9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    after = []
-    for effects in ({}, {"air": tc.effects.AddedMass(0.15)}):
-        cloth = tc.Cloth(mesh, tc.materials.AEP(1e4), DENSITY, effects, transfer="apic").double()
-        after.append(cloth(cloth.state(cloth.rest_state().x, v), times=[0.0, 1e-4], dt=1e-5).v)
-    assert torch.equal(*after)
-
-
 @pytest.mark.parametrize("options", [{"length": -0.1}, {"density": 0.0}, {"density": math.inf}])
 def test_refusals(options):
     with pytest.raises(tc.errors.InvalidInput, match="depth" if "length" in options else "density"):

@@ -158,12 +158,6 @@ def test_a_step_that_overflows_is_told():
         cloth(cloth.rest_state(), times=[0.0, 0.1])
 
 
-def test_the_usual_material_point_method_knows_no_stages():
-    mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(4, 4))
-    cloth = tc.Cloth(mesh, tc.materials.AEP(3e5, 0.3), 0.2, {"viscous": E.KelvinVoigt(3.0)}, transfer="apic")
-    assert cloth.stable_step() == limits(cloth).longest(0)
-
-
 @pytest.mark.parametrize("engine", ["reference", "auto"])
 @pytest.mark.parametrize("effect", [E.KelvinVoigt(3.0), E.Bending(1e-3, 0.3)])
 def test_a_hand_feels_what_the_cloth_is_given(effect, engine):

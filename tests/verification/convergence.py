@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 import torchcloth as tc
+from torchcloth.training.validation.verification.apic import APICCloth
 
 from .pictures import colour
 from .registry import Outcome, Row, absolute, case
@@ -38,7 +39,7 @@ class Swing:
     turn: float = 0.0  # of the scene about (1, 2, 3), degrees: the same as turning the grid
     duration: float = 1.0
     grid: Mapping[str, Any] = field(default_factory=dict)  # further arguments of Contact
-    layer: Mapping[str, Any] = field(default_factory=dict)  # further arguments of Cloth
+    cloth_type: type[tc.Cloth] = tc.Cloth
 
     def run(self) -> Tensor:
         """Frames [T, 15 * 15, 3] of the vertices that all meshes share, with the shift and turn taken back."""
@@ -64,14 +65,13 @@ class Swing:
             "bending": tc.effects.Bending(self.bending, damping_time=5e-3),
         }
         corners = {side: tc.boundaries.Grasp.corner(f"upper-{side}", radius=PATCH) for side in ("left", "right")}
-        return tc.Cloth(
+        return self.cloth_type(
             tc.meshes.rectangle(SIZE, SIZE, resolution=(self.n, self.n)),
             tc.materials.AEP(6.09e5, 0.3, self.contact_stiffness, 2.5e4),
             0.15,
             effects,
             corners,
             None if self.spacing is None else tc.Contact(self.spacing, **self.grid),
-            **self.layer,
         )
 
 
@@ -176,6 +176,5 @@ def schemes() -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {OURS: {}}
     if "everywhere" in inspect.signature(tc.Contact).parameters:
         found["the same, grid everywhere"] = {"grid": {"everywhere": True}}
-    if "transfer" in inspect.signature(tc.Cloth).parameters:
-        found["APIC, all through the grid"] = {"layer": {"transfer": "apic"}}
+    found["APIC, all through the grid"] = {"cloth_type": APICCloth}
     return found

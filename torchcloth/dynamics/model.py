@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from copy import copy
-from typing import Any, Literal, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ from .._utils.linalg import cross, dot
 from ..boundaries import AbstractBoundary
 from ..effects import AbstractEffect
 from ..materials import AbstractMaterial
-from ..types import Surface
+from ..types import ClothState, Surface
 from .contact import Grid
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
@@ -34,6 +34,21 @@ class Geometry(NamedTuple):
         return cls(corners, (g[:, 1, 0:1], g[:, 2, 0:1]), (g[:, 1, 1:2], g[:, 2, 1:2]), area)
 
 
+class CustomSubstep(NamedTuple):
+    """A substep that replaces ``dynamics.substep.step``. It compares schemes; the fused engine does not know it.
+
+    Attributes:
+        name: the scheme's, for messages.
+        advance: takes and returns what ``dynamics.substep.step`` does.
+        initial_memory: returns the scheme's internal variables by name, for vertex positions [..., V, 3] m and the
+            number of triangles. They are kept in ``ClothState.memory``.
+    """
+
+    name: str
+    advance: Callable[..., tuple[ClothState, dict[str, Tensor]]]
+    initial_memory: Callable[[Tensor, int], dict[str, Tensor]]
+
+
 class Model(NamedTuple):
     """Everything a substep needs, with all parameters resolved to tensors."""
 
@@ -45,7 +60,7 @@ class Model(NamedTuple):
     effects: Mapping[str, tuple[AbstractEffect, Any]]
     boundaries: Mapping[str, AbstractBoundary]
     grid: Grid | None = None  # of the contact between layers; None without contact
-    transfer: Literal["mesh", "apic"] = "mesh"  # where elastic forces act: on the vertices, or through the grid
+    custom_substep: CustomSubstep | None = None  # None: the substep of dynamics/substep.py
     rest: Tensor | None = None  # [..., E or 1, 4]: F_E = F A for a rest shape that differs from the pattern
     stages: int = 0  # in which viscous forces act, see relaxation.py; 0: with all other forces
 

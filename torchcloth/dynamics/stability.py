@@ -75,9 +75,9 @@ def limits_of(model: Model, gradient: Tensor, inelastic: Tensor | None = None) -
     spacing = None if model.grid is None else model.grid.spacing
     extra = [effect.rates(c, model.mass) for effect, c in model.effects.values()]
     elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
-    staged = model.effects.values() if model.transfer == "mesh" else ()
+    staged = model.effects.values() if model.custom_substep is None else ()
     viscous = sum(float(effect.viscous_rate(c, model.mass)) for effect, c in staged)
-    yielding = max((effect.yielding(c) for effect, c in model.effects.values()), default=0.0)
+    yielding = max((effect.grip_compliance(c) for effect, c in model.effects.values()), default=0.0)
     if viscous > 0 and yielding * viscous * float(model.mass.detach().max()) > LOOSE:
         viscous = 0.0
     lighter = _lighter(model)

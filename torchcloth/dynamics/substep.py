@@ -16,7 +16,6 @@ from torch import Tensor
 from .._utils.linalg import dot, resisted
 from ..boundaries import Drive
 from ..types import ClothState
-from .contact import apic
 from .contact.self_contact import Layers, add_columns, director_energy, follow, near_layers, pressure, repulsion
 from .elasticity import elastic, evolve, membrane_stress
 from .forces import Impulses, added, constrain, resistance_of, vertex_forces
@@ -33,14 +32,14 @@ def step(
     drives: Mapping[str, Drive],
     substep: int,
     layers: Layers | None = None,
-    lost: Tensor | None = None,
+    compensation: Tensor | None = None,
 ) -> tuple[ClothState, Impulses]:
     """Advance one substep (symplectic Euler).
 
     ``layers``: of this state or one nearby, None: to be found. ``lost``: see ``stretch``.
     """
-    s = surface(model.geometry, state.x, state.v, lost)
-    memory = evolve(model, state, s, dt, lost)
+    s = surface(model.geometry, state.x, state.v, compensation)
+    memory = evolve(model, state, s, dt, compensation)
     columns = membrane_stress(model, s, memory)
     grid, press = model.grid, None
     if grid is not None:
@@ -50,7 +49,7 @@ def step(
             columns = add_columns(layers, columns, press)
 
     resistance = resistance_of(model, s, state.x)
-    force = vertex_forces(model, state, s, memory, columns, lost)
+    force = vertex_forces(model, state, s, memory, columns, compensation)
     v = relaxed(model, state, s, memory, dt, drives, substep, resistance)
     free = v + dt * resisted(resistance, force / model.mass)
     if grid is not None and layers is not None and press is not None:
@@ -98,8 +97,8 @@ def substep(
     k: int,
     layers: Layers | None,
 ) -> tuple[ClothState, Tensor | None, Impulses]:
-    """As ``step`` or ``apic.step``, with what the substep before has ``lost``."""
-    before, advance = state.x, apic.step if model.transfer == "apic" else step
+    """As ``step``, or the model's custom substep, with what the substep before has ``lost``."""
+    before, advance = state.x, step if model.custom_substep is None else model.custom_substep.advance
     state, impulses = advance(model, state, dt, drives, k, layers, lost)
     if state.x.dtype == torch.float32:
         state, lost = _kept(before, state, lost, dt)

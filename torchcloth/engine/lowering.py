@@ -172,8 +172,8 @@ def lower(model: Model, state: ClothState, drives: Mapping[str, Drive], in_torch
     from .lowerings import boundaries, effects, materials
     from .lowerings.contact import Contact
 
-    if model.transfer != "mesh":
-        raise Unfused(f"transfer {model.transfer!r}")
+    if model.custom_substep is not None:
+        raise Unfused(f"substep {model.custom_substep.name!r}")
     for key in state.memory:
         if key not in (MATERIAL, "contact") and key.removeprefix("effects.") not in model.effects:
             raise Unfused(f"memory {key!r} that no part owns")

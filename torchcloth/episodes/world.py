@@ -111,7 +111,6 @@ def rebuilt(
         {**kept.effects, **effects},
         {**kept.boundaries, **boundaries},
         cloth.contact,
-        cloth.transfer,
         cloth.engine,
     )
     return found.requires_grad_(False)

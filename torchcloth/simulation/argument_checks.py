@@ -195,15 +195,6 @@ def check_substeps(seconds: float, step: float, dt: float | None = None) -> None
     raise UnstableStep("the stable substep", got=got, expected=expected, remedy=remedy)
 
 
-def check_transfer(transfer: str, contact: Contact | None) -> Contact:
-    """Refuse unknown schemes, and the material point method without its grid."""
-    if transfer != "apic":
-        raise InvalidInput("transfer", got=repr(transfer), expected='"mesh" or "apic"')
-    if contact is None:
-        raise InvalidInput("contact", got="None", expected='a Contact: transfer="apic" needs a grid')
-    return contact
-
-
 def check_grasps(effects: Mapping[str, AbstractEffect], boundaries: nn.ModuleDict) -> None:
     """An effect on a grip needs that grip."""
     grasps = [name for name, boundary in boundaries.items() if isinstance(boundary, Grasp)]

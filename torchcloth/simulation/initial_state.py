@@ -113,7 +113,7 @@ def _virgin(model: Model, x: Tensor) -> Memory:
     found = {"material": None if own is None else own.to(x).expand(*x.shape[:-2], -1, -1)}
     if model.grid is not None:
         found["contact"] = x.new_zeros(*x.shape[:-2], triangles * len(model.grid.points), 1)
-    if model.transfer == "apic":
-        found["apic"] = x.new_zeros(*x.shape[:-2], x.shape[-2] + triangles, 9)
+    if model.custom_substep is not None:
+        found |= model.custom_substep.initial_memory(x, triangles)
     found |= {f"effects.{name}": effect.start(x) for name, (effect, _) in model.effects.items()}
     return {name: value for name, value in found.items() if value is not None}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from numbers import Real
 from typing import NamedTuple
 
@@ -119,10 +119,6 @@ class Contact:
         if not 0 < gap < float("inf"):
             raise InvalidInput("contact gap", got=f"{gap:g} m", expected="a length > 0")
         return cls(spacing=gap / GAP, **changes)
-
-    def usual(self) -> Contact:
-        """As material point methods have it, on the same grid: for ``transfer="apic"``."""
-        return replace(self, subdivisions=1, everywhere=True, play=0.0, damping=0.0)
 
     def grid(self, mesh: Mesh) -> Grid:
         """Everything that mesh and contact fix, in the default precision.

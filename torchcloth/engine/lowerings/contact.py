@@ -46,8 +46,6 @@ class Contact:
 
     def __init__(self, low: Lowering, grid: Grid) -> None:
         model = low.model
-        if model.transfer != "mesh":
-            raise Unfused(f"transfer {model.transfer!r}")
         if type(model.material) not in _LAWS:
             raise Unfused(f"contact of the material {type(model.material).__name__}")
         self.low, self.grid = low, grid

@@ -58,7 +58,6 @@ def finer_cloth(cloth: Cloth) -> Cloth:
         kept.effects,
         boundaries,
         contact,
-        cloth.transfer,
         cloth.engine,
     )
 

@@ -1,0 +1,155 @@
+"""APIC, the usual material point scheme, for comparison: all forces pass through the grid (Jiang, Gast, Teran 2017).
+
+Vertices and triangles are particles; a quarter of a triangle's mass goes to each corner and to itself. The transfer
+filters velocities at every substep, so its damping depends on dt: docs/verification.md shows both schemes side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import cast
+
+import torch
+from torch import Tensor
+
+import torchcloth as tc
+from torchcloth.boundaries import AbstractBoundary, Drive
+from torchcloth.dynamics.contact import Grid, carried_momentum, lattice, stencil, through
+from torchcloth.dynamics.contact.self_contact import Layers, add_columns, near_layers, per_point, pressure
+from torchcloth.dynamics.elasticity import evolve, membrane_stress
+from torchcloth.dynamics.forces import Impulses, constrain, vertex_forces
+from torchcloth.dynamics.model import CustomSubstep, Model, centroids, surface
+from torchcloth.effects import AbstractEffect
+from torchcloth.engine.dispatch import Setting
+from torchcloth.errors import InvalidInput
+from torchcloth.types import ClothState, Memory, Surface, Trajectory
+
+MEMORY = "apic"  # name of the affine velocities in ClothState.memory
+
+
+class APICCloth(tc.Cloth):
+    """A cloth whose forces all pass through the contact grid, as in the usual material point method.
+
+    Triangles have one contact point each. Contact has no play and no collision damping, and air adds no mass. Wrenches
+    leave out what the grid takes up, some per cent of the weight. Only the torch reference computes it.
+
+    Args:
+        mesh: as for ``torchcloth.Cloth``.
+        material: likewise.
+        areal_density: likewise.
+        effects: likewise.
+        boundaries: likewise.
+        contact: likewise, but not None: the scheme needs its grid.
+        engine: likewise.
+
+    Raises:
+        InvalidInput: no contact, or a part that does not fit.
+    """
+
+    def __init__(
+        self,
+        mesh: tc.meshes.Mesh,
+        material: tc.materials.AbstractMaterial,
+        areal_density: float | Tensor,
+        effects: Mapping[str, AbstractEffect] | None = None,
+        boundaries: Mapping[str, AbstractBoundary] | None = None,
+        contact: tc.Contact | None = tc.Contact(),  # noqa: B008 - frozen, carries no state
+        engine: Setting = "auto",
+    ) -> None:
+        if contact is None:
+            raise InvalidInput("contact", got="None", expected="a Contact: APIC needs its grid")
+        contact = replace(contact, subdivisions=1, everywhere=True, play=0.0, damping=0.0)
+        super().__init__(mesh, material, areal_density, effects, boundaries, contact, engine)
+
+    def model(self) -> Model:
+        """Return the model of ``Cloth``, with APIC as its substep."""
+        return super().model()._replace(custom_substep=APIC)
+
+    def settle(
+        self,
+        state: ClothState,
+        motion: Mapping[str, Trajectory] | None = None,
+        *,
+        start: float = 0.0,
+        duration: float = 0.3,
+        rate: float = 30.0,
+    ) -> ClothState:
+        """Let the cloth come to rest as ``Cloth.settle`` does, and stop the particles' affine velocities, too."""
+        settled = super().settle(state, motion, start=start, duration=duration, rate=rate)
+        return settled._replace(memory={**settled.memory, MEMORY: torch.zeros_like(settled.memory[MEMORY])})
+
+
+def step(
+    model: Model,
+    state: ClothState,
+    dt: float,
+    drives: Mapping[str, Drive],
+    substep: int,
+    layers: Layers | None = None,
+    lost: Tensor | None = None,
+) -> tuple[ClothState, Impulses]:
+    """Advance the cloth by one substep: a ``CustomSubstep``.
+
+    ``state.memory["apic"]`` [..., V + E, 9] 1/s are the affine velocities of the particles: vertices, then triangles.
+    """
+    grid = cast("Grid", model.grid)  # APICCloth refuses to be made without
+    s = surface(model.geometry, state.x, state.v, lost)
+    memory = evolve(model, state, s, dt, lost)
+    layers = near_layers(model, grid, state.x) if layers is None else layers
+    press = pressure(model, grid, layers, state, s, dt)
+    columns = add_columns(layers, membrane_stress(model, s, memory), press)
+    nothing = (torch.zeros_like(columns[0]), torch.zeros_like(columns[1]))
+    # Weight, air: triangles get their share of it as well. Of air that moves along, nothing.
+    light = {name: (effect, c) for name, (effect, c) in model.effects.items() if effect.inertia(c, s) is None}
+    airless = model._replace(effects=light)
+    outer = vertex_forces(airless, state, s, memory, nothing, lost)
+    force = vertex_forces(airless, state, s, memory, columns, lost) - outer
+    v = state.v + dt * outer / model.mass
+
+    batch, vertices = state.x.shape[:-2], state.x.shape[-2]
+    position, velocity = (
+        torch.cat([field, centroids(model.geometry, field)], dim=-2).reshape(-1, 3) for field in (state.x, v)
+    )
+    mass = _masses(model, state, s).reshape(-1, 1)
+    each = position.shape[0] // max(1, batch.numel())
+    scene = torch.arange(batch.numel(), device=position.device).repeat_interleave(each)
+    nodes = stencil(position, mass, scene, grid, layers.slots)
+
+    affine = memory[MEMORY].reshape(-1, 3, 3)
+    momentum = carried_momentum(nodes, mass, velocity, affine, grid.spacing)
+    slope = nodes.slope.unflatten(0, (-1, each))[:, vertices:].flatten(0, 1)
+    director = -(slope @ press.d3.unsqueeze(-1)) * press.pull.unsqueeze(-2)
+    weight = nodes.weight.unflatten(0, (-1, each))[:, :vertices].flatten(0, 1)
+    mesh = weight.unsqueeze(-1) * force.reshape(-1, 1, 3)
+    both = torch.cat([part.unflatten(0, (batch.numel(), -1)) for part in (mesh, director)], dim=1).flatten(0, 1)
+    seen = through(nodes.node, momentum + dt * both) * nodes.inverse.unsqueeze(-1)
+
+    arm = (lattice(position) - nodes.offset.unsqueeze(-2)) * grid.spacing
+    weighted = nodes.weight.unsqueeze(-1) * seen
+    memory[MEMORY] = (4 / grid.spacing**2 * weighted.mT @ arm).view(*batch, each, 9)
+    free = weighted.sum(-2).view(*batch, each, 3)[..., :vertices, :]
+    v, impulses = constrain(model, state.x, free, dt, drives, substep, None)
+    x = state.x + dt * v
+
+    gradient = (seen.mT @ nodes.slope).unflatten(0, (-1, each))[:, vertices:].flatten(0, 1)
+    moved = press.d3 + dt * (gradient @ press.d3.unsqueeze(-1)).squeeze(-1)
+    n = surface(model.geometry, x, v).n.reshape(-1, 1, 3)
+    mapped = model.material.return_map(per_point(model, layers, s), n, moved.unsqueeze(-2))
+    return ClothState(x, v, mapped.view(state.d3.shape), memory), impulses
+
+
+def _masses(model: Model, state: ClothState, s: Surface) -> Tensor:
+    """[..., V + E, 1] kg; what triangles carry is not the vertices', what effects add is."""
+    triangle = (model.areal_density * s.area / 4).expand(*s.n.shape[:-1], 1)
+    vertex = model.mass.expand(*state.x.shape[:-1], 1)
+    corners = torch.cat([triangle / 3] * 3, dim=-2)
+    return torch.cat([vertex.index_add(-2, model.geometry.corners, corners, alpha=-1), triangle], dim=-2)
+
+
+def initial_memory(x: Tensor, triangles: int) -> Memory:
+    """Return affine velocities of zero for vertices at x [..., V, 3] m and so many triangles."""
+    return {MEMORY: x.new_zeros(*x.shape[:-2], x.shape[-2] + triangles, 9)}
+
+
+APIC = CustomSubstep("apic", step, initial_memory)
