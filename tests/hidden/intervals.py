@@ -1,12 +1,11 @@
-"""How often the intervals of kept answers hold the truth, and how often with a share of the number in quadrature.
+"""Coverage of the intervals of archived answers, as they are and with a share of the number in quadrature.
 
-python tests/hidden/intervals.py docs/hidden/*/     # answers as `studies hidden` keeps them, one folder a round
+python tests/hidden/intervals.py docs/hidden/rounds/*.xz     # archives, or folders of `studies hidden`
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections import defaultdict
@@ -17,7 +16,9 @@ from typing import Any
 import beside  # noqa: F401
 from partners import NUMBERS
 
+from torchcloth.errors import InvalidInput
 from torchcloth.training.studies import hidden_scores as scores
+from torchcloth.training.studies.hidden_archive import read_round
 
 SHARES = (0.0, 0.02, 0.03, 0.04)  # of the number, standard deviations
 THICK = 1e-3  # m, of all sheets
@@ -53,15 +54,19 @@ def numbers(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str
 def main(arguments: list[str] | None = None) -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("rounds", nargs="+", type=Path, metavar="DIR")
+    parser.add_argument("rounds", nargs="+", type=Path, metavar="ROUND")
     rows: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    for path in (p for folder in parser.parse_args(arguments).rounds for p in sorted(folder.glob("cases/*.json"))):
-        case = json.loads(path.read_text())
-        for found in (amplitudes, numbers):
-            for name, error, std in found(case["truth"], case["answer"]):
+    try:
+        cases = [case for path in parser.parse_args(arguments).rounds for case in read_round(path).cases.values()]
+    except InvalidInput as error:
+        print(error, file=sys.stderr)
+        return 2
+    for case in cases:
+        for errors_of in (amplitudes, numbers):
+            for name, error, std in errors_of(case["truth"], case["answer"]):
                 rows[name].append((error, std))
     if not rows:
-        print("no answer to be compared in any cases/*.json of these folders", file=sys.stderr)
+        print("these rounds have no answer that can be compared", file=sys.stderr)
         return 2
     print("| of | number | mean error |" + "".join(f" held, with {100 * s:.0f} % |" for s in SHARES))
     print("| --- |" + " --- |" * (2 + len(SHARES)))

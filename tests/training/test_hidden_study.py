@@ -1,6 +1,8 @@
 """The hidden round as a study: what each process is given, in which order, and what is kept."""
 
+import csv
 import json
+import lzma
 from argparse import Namespace
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import pytest
 from torchcloth.diagnosis.experiment.motions import Experiment
 from torchcloth.errors import InvalidInput
 from torchcloth.training import resumable
-from torchcloth.training.studies import hidden
+from torchcloth.training.studies import hidden, hidden_archive, hidden_tables
 from torchcloth.training.studies.checkout import module
 from torchcloth.training.studies.command import main
 
@@ -47,7 +49,7 @@ def called(monkeypatch):
 
 def options(tmp_path, **more):
     return Namespace(
-        **{"out": tmp_path / "s", "cases": None, "seed": None, "dev": False, "fast": False, "jobs": 1, "kept": None}
+        **{"out": tmp_path / "s", "cases": None, "seed": None, "dev": False, "fast": False, "jobs": 1, "answers": None}
         | more
     )
 
@@ -79,42 +81,88 @@ def test_finished_cases_are_not_repeated_and_more_may_be_added(called, tmp_path,
     assert (tmp_path / "s" / "hidden.md").read_text().count("| 00") == 4
 
 
-def test_kept_rounds_are_scored_beside_each_other_and_together(called, tmp_path, capsys):
+def test_rounds_are_scored_side_by_side_and_together(called, tmp_path, capsys):
     for name, count in (("one", 3), ("two", 5)):
         hidden.run(options(tmp_path, out=tmp_path / name, dev=True, cases=count))
     del called[:]
-    hidden.run(options(tmp_path, out=tmp_path / "both", kept=[tmp_path / "one", tmp_path / "two"]))
-    assert not called
-    assert "rounds.md" in capsys.readouterr().out
-    lines = (tmp_path / "both" / "rounds.md").read_text().splitlines()
-    assert lines[0] == "| figure | one (3) | two (5) | together | 95 % |"
-    assert "| nulls with a named cause, or refused | 0 of 3 | 0 of 5 | 0 of 8 | 0 %–37 % |" in lines
-    assert "| one effect, class identified | half its typical size | typical | 1.5 | of all that show |" in lines
-    assert (tmp_path / "both" / "hidden.md").read_text().count("| two/00") == 5
+    hidden_archive.write_archive(tmp_path / "two", tmp_path / "x.jsonl.xz", "two", "2026-01-01T00:00:00+00:00")
+    for two in ("two", "x.jsonl.xz"):
+        hidden.run(options(tmp_path, out=tmp_path / "both", answers=[tmp_path / "one", tmp_path / two]))
+        assert not called
+        assert "rounds.md" in capsys.readouterr().out
+        lines = (tmp_path / "both" / "rounds.md").read_text().splitlines()
+        columns = "one (3) | two (5)" if two == "two" else "two (5) | one (3)"  # what has a date comes first
+        assert lines[0] == f"| figure | {columns} | together | 95 % |"
+        assert sum("0 of 3" in line and "0 of 5" in line and "0 of 8" in line for line in lines) > 0
+        assert "| one effect, class identified | half its typical size | typical | 1.5 | of all that show |" in lines
+        assert (tmp_path / "both" / "hidden.md").read_text().count("| two/00") == 5
+        rows = (tmp_path / "both" / "rounds.csv").read_text().splitlines()
+        assert sum(row.startswith("two,5,") for row in rows) == sum(row.startswith("one,3,") for row in rows) > 30
     with pytest.raises(InvalidInput, match="--out"):
-        hidden.run(options(tmp_path, out=tmp_path / "one", kept=[tmp_path / "two"]))
+        hidden.run(options(tmp_path, out=tmp_path / "one", answers=[tmp_path / "two"]))
+
+
+def test_archived_rounds_are_scored_as_the_page_has_them(tmp_path):
+    """If a label or a key is renamed: a row of ``RENAMED_KEYS`` for keys, and rounds.csv written again for labels."""
+    folder = Path(__file__).parents[2] / "docs" / "hidden"
+    archives = sorted((folder / "rounds").glob("*.jsonl.xz"))
+    assert all(path.stat().st_size < 200_000 for path in archives)
+    rounds = hidden.score_rounds(options(tmp_path, answers=archives))
+    fresh = list(csv.reader(hidden_tables.rounds_csv(rounds).splitlines()))
+    stored = list(csv.reader((folder / "rounds.csv").read_text().splitlines()))
+    assert sum(len(cases) for cases in rounds.values()) == 532
+    assert [row for row in stored if row[0] in ("round", *rounds)] == fresh
+
+
+def test_keys_of_old_files_get_their_present_names(monkeypatch):
+    table = {"truth.effects.beside": "extra", "answer.causes": "reasons", "answer.causes.rivals": "others"}
+    monkeypatch.setattr(hidden_archive, "RENAMED_KEYS", {7: table})
+    monkeypatch.setattr(hidden_archive, "CURRENT_SCHEMA", 8)
+    answer = {"causes": [{"rivals": [{"rivals": 1}]}], "gain": {"causes": 2}}
+    new = {"reasons": [{"others": [{"rivals": 1}]}], "gain": {"causes": 2}}
+    case = {"truth": {"effects": [{"beside": True}]}, "answer": answer, "next": {"proposed": answer, "random": None}}
+    expected = {"truth": {"effects": [{"extra": True}]}, "answer": new, "next": {"proposed": new, "random": None}}
+    assert hidden_archive.upgrade(case, 7) == expected
+    assert hidden_archive.upgrade(expected, 8) == expected
+    with pytest.raises(ValueError, match="schema 6"):
+        hidden_archive.upgrade(case, 6)
 
 
 @pytest.mark.parametrize(
     "content", [None, "{", "{}", "[]", "null", '{"truth": {}, "answer": []}', '{"truth": 1, "answer": 2}']
 )
-def test_what_is_no_kept_round_is_refused(tmp_path, content):
+def test_a_folder_without_a_round_is_refused(tmp_path, content):
     (tmp_path / "r" / "cases").mkdir(parents=True)
     if content is not None:
         (tmp_path / "r" / "cases" / "001.json").write_text(content)
-    with pytest.raises(InvalidInput, match="--kept"):
-        hidden.run(options(tmp_path, kept=[tmp_path / "r"]))
+    with pytest.raises(InvalidInput, match="--answers"):
+        hidden.run(options(tmp_path, answers=[tmp_path / "r"]))
     assert not (tmp_path / "s").exists()
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"kept": ["a/r", "b/r"]}, {"kept": ["r"], "cases": 3}, {"kept": ["r"], "fast": True}, {"kept": ["r"], "jobs": 0}],
+    "lines", ["", "{", "[]", '{"schema": 1, "round": "r", "date": ""}', '{"schema": 99}\n{"name": "1"}', "{}\n{}"]
 )
-def test_kept_rounds_have_different_names_and_draw_nothing(tmp_path, wrong):
-    rounds = [tmp_path / name for name in wrong.get("kept", ["r"])]
-    with pytest.raises(InvalidInput, match="--kept"):
-        hidden.run(options(tmp_path, **wrong | {"kept": rounds}))
+def test_a_file_that_is_no_archive_is_refused(tmp_path, lines):
+    (tmp_path / "plain").write_text(lines)
+    with lzma.open(tmp_path / "packed", "wt") as file:
+        file.write(lines)
+    for name in ("plain", "packed", "missing"):
+        with pytest.raises(InvalidInput, match="--answers"):
+            hidden.run(options(tmp_path, answers=[tmp_path / name]))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"answers": ["a/r", "b/r"]}, {"cases": 3}, {"fast": True}, {"jobs": 0}],
+    ids=lambda wrong: next(iter(wrong)),
+)
+def test_rounds_have_different_names_and_draw_nothing(called, tmp_path, wrong):
+    for name in ("a/r", "b/r"):
+        hidden.run(options(tmp_path, out=tmp_path / name, dev=True, cases=1))
+    rounds = [tmp_path / name for name in wrong.get("answers", ["a/r"])]
+    with pytest.raises(InvalidInput, match="--answers"):
+        hidden.run(options(tmp_path, **wrong | {"answers": rounds}))
 
 
 def test_a_round_that_is_stopped_in_its_first_case_keeps_its_secret(called, tmp_path, monkeypatch):

@@ -28,7 +28,7 @@ from torchcloth.errors import InvalidInput
 from torchcloth.recordings import read
 
 from ..resumable import Kept
-from . import hidden_tables
+from . import hidden_archive, hidden_tables
 from .checkout import folder, module
 from .hidden_gain import gain
 from .hidden_scores import judged, shows, told_apart
@@ -63,19 +63,24 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     which.add_argument("--dev", action="store_true", help="cases for development, on which thresholds may be tuned")
     which.add_argument(
-        "--kept", type=Path, nargs="+", metavar="ROUND", help="only score finished rounds anew, each and all together"
+        "--answers",
+        type=Path,
+        nargs="+",
+        metavar="ROUND",
+        help="only score finished rounds again, each and all together: archives (docs/hidden/rounds) or study folders",
     )
 
 
 def run(options: argparse.Namespace) -> None:
     """Make, diagnose and reveal what is missing, then print and write hidden.json and hidden.md."""
-    if options.kept:
-        rounds = together(options)
+    if options.answers:
+        rounds = score_rounds(options)
         report(options.out, [{**c, "name": f"{name}/{c['name']}"} for name, cases in rounds.items() for c in cases])
         every = [case for cases in rounds.values() for case in cases]
         tables = hidden_tables.beside(rounds), hidden_tables.by_effect(every)
         write_text(options.out / "rounds.md", "\n\n".join(tables) + "\n")
-        print(f"one beside the other: {options.out / 'rounds.md'}")
+        write_text(options.out / "rounds.csv", hidden_tables.rounds_csv(rounds))
+        print(f"all rounds: {options.out / 'rounds.md'}, {options.out / 'rounds.csv'}")
         return
     chosen = drawn(options)
     kept = Kept(options.out, chosen.settings)
@@ -95,27 +100,21 @@ def report(out: Path, cases: Sequence[Mapping[str, Any]]) -> None:
     print(f"result: {out / 'hidden.json'}, {out / 'hidden.md'}")
 
 
-def together(options: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
-    """The judged cases of each kept round, by its folder's name."""
-    names = [folder.resolve().name for folder in options.kept]
-    if len(set(names)) < len(names):
-        raise InvalidInput("--kept", got=f"rounds named {', '.join(names)}", expected="folders of different names")
+def score_rounds(options: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
+    """Score the cases of finished rounds as they are scored today; by the round's name, in the order of their dates."""
     if options.fast or options.cases is not None or options.jobs != 1:
-        raise InvalidInput("--kept", got="with --fast, --cases or --jobs", expected="alone: no case is drawn")
+        raise InvalidInput("--answers", got="with --fast, --cases or --jobs", expected="alone: no case is drawn")
     if (options.out / "study.json").exists():
         raise InvalidInput("--out", got=f"{options.out}, which holds a round", expected="a folder for the tables")
-    return {name: finished(folder) for name, folder in zip(names, options.kept, strict=True)}
-
-
-def finished(folder: Path) -> list[dict[str, Any]]:
-    """A kept round's cases, judged as they are today."""
-    paths = sorted(folder.glob("cases/*.json"))
-    if not paths:
-        raise InvalidInput("--kept", got=f"{folder}, without cases/*.json", expected="folders of hidden rounds")
+    rounds = [hidden_archive.read_round(path) for path in options.answers]
+    names = [r.name for r in rounds]
+    if len(set(names)) < len(names):
+        raise InvalidInput("--answers", got=f"rounds named {', '.join(names)}", expected="rounds of different names")
+    rounds.sort(key=lambda r: (not r.date, r.date))  # folders have no date, and stay in the order given
     try:
-        return [scored(path.stem, json.loads(path.read_text())) for path in paths]
+        return {r.name: [scored(name, case) for name, case in r.cases.items()] for r in rounds}
     except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise InvalidInput("--kept", got=f"{folder}: {error!r}", expected="cases as `hidden` keeps them") from None
+        raise InvalidInput("--answers", got=f"{error!r}", expected="cases as `hidden` writes them") from None
 
 
 def drawn(options: argparse.Namespace) -> Round:
@@ -165,7 +164,8 @@ def one(out: Path, name: str, seed: int, fast: bool) -> dict[str, Any]:
     spent = None if stopped else round(time.perf_counter() - begun, 1)
     # only now
     truth = json.loads(_script("reveal.py", "--seed", str(seed), *(["--fast"] if fast else [])))
-    case = {"truth": truth, "answer": found, "seconds": spent, "gain": None}
+    schema = hidden_archive.CURRENT_SCHEMA
+    case = {"schema": schema, "truth": truth, "answer": found, "seconds": spent, "gain": None}
     if truth["family"] == "next experiment":
         case["next"] = experiments(out, name, make, given, found, seed)
     if truth["family"] in ("single", "double") and not fast:
@@ -251,7 +251,7 @@ def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
 
 
 def scored(name: str, case: Mapping[str, Any]) -> dict[str, Any]:
-    """A kept case as the tables have it."""
+    """Return a case as the tables have it."""
     truth, later = case["truth"], case.get("next")
     rest: dict[str, Any] = {key: case.get(key) for key in ("seconds", "gain")}
     if rest["gain"] is not None and not case["answer"].get("causes"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -44,6 +46,21 @@ def beside(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     rows = [(label, *(c[label][0] for c in columns), columns[-1][label][1]) for label in columns[-1]]
     counts = [f"{name} ({len(cases)})" for name, cases in rounds.items()]
     return _lines(("figure", *counts, "together", "95 %"), rows)
+
+
+def rounds_csv(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """Return the figures of each round as CSV: value, counts where it is a rate, and its exact 95 % interval."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(("round", "cases", "figure", "value", "hits", "of", "low_95", "high_95"))
+    for name, cases in rounds.items():
+        for label, value in [*((m.label, m.value) for m in marks(cases)), *further(cases)]:
+            numbers: tuple[Any, ...] = (value, None, None, None, None)
+            if isinstance(value, Rate):
+                numbers = (value.share, value.hits, value.of, *(value.bounds or (None, None)))
+            digits = ["" if n is None else f"{n:.4g}" for n in numbers]
+            writer.writerow((name, len(cases), label, *digits))
+    return file.getvalue()
 
 
 def by_effect(cases: Sequence[Mapping[str, Any]]) -> str:
