@@ -1,4 +1,4 @@
-"""docs/results.md names every key that is written."""
+"""docs/reference/results.md names every key that is written."""
 
 import ast
 import re
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "reference" / "results.md").read_text(encoding="utf-8")
 WRITTEN = {
     "identification.json": "identification/result.py",
     "prediction.json": "identification/episode_prediction.py",

@@ -9,7 +9,7 @@ from torchcloth.diagnosis.causes.glossary import GLOSSARY, table
 from torchcloth.diagnosis.causes.hypotheses import known
 from torchcloth.errors import InvalidInput
 
-DOCS = Path(__file__).parents[2] / "docs" / "causes.md"
+DOCS = Path(__file__).parents[2] / "docs" / "reference" / "causes.md"
 
 
 def test_every_cause_has_a_sentence_and_no_other_has():

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-import sheets
+from helpers import sheet_episodes
 import torch
 
 from torchcloth.cli import main
@@ -112,14 +112,14 @@ def test_causes_that_a_search_could_not_use_are_refused(change, said):
 
 
 def test_the_example_of_the_docs_is_one(file):
-    page = (Path(__file__).parents[2] / "docs" / "diagnosis.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "explanation" / "diagnosis.md").read_text(encoding="utf-8")
     layer, example, whole = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     for text in (layer, whole):
-        compile(text, "docs/diagnosis.md", "exec")
+        compile(text, "docs/explanation/diagnosis.md", "exec")
     file.write_text(example)
     (travel,) = register_file(file)
     hypotheses.forget(travel.name)
-    recording = sheets.episode()
+    recording = sheet_episodes.episode()
     model = base_model(recording)
     (episode,) = setting_of(model, [recording]).episodes
     before, after = (model.world([(travel, a)]).driven(episode).motion["left"].pose[:, :3, 3] for a in (0.0, 0.1))

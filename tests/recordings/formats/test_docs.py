@@ -1,4 +1,4 @@
-"""The examples in docs/episode.md and docs/formats.md run as they stand."""
+"""The examples in docs/reference/episode.md and docs/how-to/import-recordings.md run as they stand."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent))
 
-import foreign
+from helpers import foreign_formats
 
 import torchcloth as tc
 from torchcloth import recordings as rec
@@ -27,7 +26,7 @@ def blocks(page: str, language: str) -> list[str]:
 
 
 def test_the_episode_can_be_read(tmp_path):
-    (text,) = blocks("episode.md", "json")
+    (text,) = blocks("reference/episode.md", "json")
     (tmp_path / "episode.json").write_text(text)
     pose = {"t": [0.0, 1.0], "position": np.zeros((2, 3)), "quat_wxyz": [[1.0, 0, 0, 0]] * 2, "closed": [True, True]}
     np.savez(tmp_path / "motion.npz", **{f"left/{key}": np.array(value) for key, value in pose.items()})
@@ -35,7 +34,7 @@ def test_the_episode_can_be_read(tmp_path):
     assert not recording.extra
     assert recording.cloth.sheet == (0.3, 0.3)
     np.testing.assert_array_equal(recording.cameras["cam0"].distortion, [0.2624, -0.9531, -0.0054, 0.0026, 1.1633])
-    sidecar_schema.check(json.loads(text), "docs/episode.md")
+    sidecar_schema.check(json.loads(text), "docs/reference/episode.md")
 
 
 def test_an_arm_of_ones_own(tmp_path, monkeypatch):
@@ -44,16 +43,16 @@ def test_an_arm_of_ones_own(tmp_path, monkeypatch):
     urdf = Path(tc.robots.__file__).parent / "urdf" / "rizon4.urdf"
     (tmp_path / "my.urdf").write_text(urdf.read_text().replace('"tcp_closed"', '"tip"'))
     monkeypatch.setattr(tc.robots, "plan", lambda rig, action: (rig, action))
-    (text,) = blocks("episode.md", "python")
+    (text,) = blocks("reference/episode.md", "python")
     own = {}
-    exec(compile(text, "docs/episode.md", "exec"), own)
+    exec(compile(text, "docs/reference/episode.md", "exec"), own)
     rig, action = own["plan"]
     assert rig["hand"].frame == "tip"
     assert set(action.motion) == {"hand"}
 
 
 def test_every_word_is_explained():
-    page = (DOCS / "episode.md").read_text()
+    page = (DOCS / "reference" / "episode.md").read_text()
     every = [
         sidecar_schema.SCENE,
         *sidecar_schema.OBJECTS.values(),
@@ -64,9 +63,9 @@ def test_every_word_is_explained():
 
 
 def test_the_scenes(tmp_path):
-    tum, ros2 = blocks("formats.md", "json")
-    sidecar_schema.check(json.loads(ros2), "docs/formats.md")
-    truth = foreign.tum(tmp_path)
+    tum, ros2 = blocks("how-to/import-recordings.md", "json")
+    sidecar_schema.check(json.loads(ros2), "docs/how-to/import-recordings.md")
+    truth = foreign_formats.tum(tmp_path)
     (truth.path / "groundtruth.txt").unlink()
     truth.scene = json.loads(tum)
     assert formats.read(truth.path, scene=truth.write_scene()).cameras["cam0"].K[0, 0] == 517.3
@@ -81,23 +80,23 @@ def test_depth_images_become_points(tmp_path, monkeypatch):
     images = tmp_path / "my_episode" / "cam0" / "depth"
     images.mkdir(parents=True)
     for i in range(2):
-        (images / f"{i:06d}.png").write_bytes(foreign.png(depth))
+        (images / f"{i:06d}.png").write_bytes(foreign_formats.png(depth))
     (images.parent / "timestamps.csv").write_text("frame,t_color,t_depth\n0,,0.0\n1,,0.5\n")
     matrix = [[140.0, 0, 79.5], [0, 140.0, 59.5], [0, 0, 1]]
     size = {"width": 160, "height": 120, "depth_scale": 0.001}
-    told = {**foreign.KNOWN, "format": "torchcloth-recording", "version": 1}
+    told = {**foreign_formats.KNOWN, "format": "torchcloth-recording", "version": 1}
     told["cloth"] = told["cloth"] | {"sheet": {"width": 0.2, "height": 0.2}}
     told["cameras"] = {"cam0": {**size, "K": matrix, "T_world_camera": pose.tolist()}}
     (tmp_path / "my_episode" / "episode.json").write_text(json.dumps(told))
-    cut_out, laid_on = blocks("formats.md", "python")
-    exec(compile(cut_out, "docs/formats.md", "exec"), {})
+    cut_out, laid_on = blocks("how-to/import-recordings.md", "python")
+    exec(compile(cut_out, "docs/how-to/import-recordings.md", "exec"), {})
     points = rec.read("my_episode_points").require("points")
     np.testing.assert_array_equal(points.t, [0, 0.5])
     assert points.counts.min() > 150
     np.testing.assert_allclose(points.xyz[:, 2], HEIGHT, atol=1e-4)
     side = 40 / 140 * (1 - HEIGHT) / 2
     assert 0.85 * side < np.abs(points.xyz[:, :2] - [0.5, 0]).max() <= side
-    exec(compile(laid_on, "docs/formats.md", "exec"), {})
+    exec(compile(laid_on, "docs/how-to/import-recordings.md", "exec"), {})
     first = rec.read("my_episode_ready").cloth.initial_vertices
     np.testing.assert_allclose(first[:, 2], HEIGHT, atol=2e-3)
     np.testing.assert_allclose(np.ptp(first[:, :2], axis=0), 0.2, atol=5e-3)
