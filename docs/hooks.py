@@ -1,0 +1,110 @@
+"""Pages that are generated when the site is built: command line, API, result schemas, notebooks."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+from pathlib import Path
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[1]
+API_ROOMS = (
+    "torchcloth",
+    "torchcloth.meshes",
+    "torchcloth.materials",
+    "torchcloth.effects",
+    "torchcloth.boundaries",
+    "torchcloth.dynamics",
+    "torchcloth.losses",
+    "torchcloth.recordings",
+    "torchcloth.observe",
+    "torchcloth.episodes",
+    "torchcloth.identification",
+    "torchcloth.pose",
+    "torchcloth.diagnosis",
+    "torchcloth.planning",
+    "torchcloth.robots",
+    "torchcloth.synthesis",
+    "torchcloth.viewing",
+    "torchcloth.testing",
+    "torchcloth.errors",
+)
+
+
+def on_files(files: Files, config) -> Files:
+    """Add the generated pages and the notebooks to the site."""
+    pages = {"reference/command-line.md": command_line(), "reference/api.md": api_index()}
+    pages |= {f"reference/api/{room}.md": api_page(room) for room in API_ROOMS}
+    for path, text in pages.items():
+        files.append(File.generated(config, path, content=text))
+    for notebook in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        files.append(File(f"tutorials/{notebook.name}", str(ROOT), config["site_dir"], config["use_directory_urls"]))
+        files.get_file_from_path(f"tutorials/{notebook.name}").abs_src_path = str(notebook)
+    return files
+
+
+def command_line() -> str:
+    """Return the reference of all commands as Markdown, from their argument parsers."""
+    from torchcloth.cli import build_parser
+
+    parser = build_parser()
+    (verbs,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    helps = {choice.dest: choice.help or "" for choice in verbs._choices_actions}
+    text = ["# Command line", "", parser.description or "", "", "Exit codes: 0 done, 2 wrong input, 130 interrupted."]
+    for name, verb in verbs.choices.items():
+        usage = " ".join(verb.format_usage().removeprefix("usage: ").split())
+        text += ["", f"## {name}", "", f"{helps.get(name, '')[:1].upper()}{helps.get(name, '')[1:]}.", ""]
+        text += ["```text", usage, "```", "", "| argument | meaning |", "|---|---|"]
+        for action in verb._actions:
+            if action.dest == "help":
+                continue
+            names = ", ".join(action.option_strings) or str(action.metavar or action.dest)
+            value = "" if not action.option_strings or action.nargs == 0 else f" {format_value(action)}"
+            text.append(f"| `{names}{value}` | {format_help(verb, action)} |")
+        if verb.epilog:
+            text += ["", verb.epilog]
+    return "\n".join(text) + "\n"
+
+
+def format_value(action: argparse.Action) -> str:
+    """Return what follows an option, e.g. ``NAME ...``."""
+    word = action.metavar or ("{" + ",".join(map(str, action.choices)) + "}" if action.choices else action.dest.upper())
+    word = " ".join(word) if isinstance(word, tuple) else word
+    return f"{word} ..." if action.nargs in ("+", "*") else word
+
+
+def format_help(verb: argparse.ArgumentParser, action: argparse.Action) -> str:
+    """Return the help text of an option for a table cell."""
+    text = verb._get_formatter()._expand_help(action) if action.help else ""
+    return text.replace("|", "\\|").replace("<", "&lt;")
+
+
+def api_index() -> str:
+    """Return the list of public modules with their first sentences."""
+    rows = ["# Python API", "", "Every public name, by module.", "", "| module | content |", "|---|---|"]
+    for room in API_ROOMS:
+        first = (importlib.import_module(room).__doc__ or "").strip().splitlines()[0]
+        rows.append(f"| [`{room}`](api/{room}.md) | {first} |")
+    return "\n".join(rows) + "\n"
+
+
+def api_page(room: str) -> str:
+    """Return the page of one module: its docstring, then each public object."""
+    module = importlib.import_module(room)
+    text = [f"# {room}", "", (module.__doc__ or "").strip(), ""]
+    for name in getattr(module, "__all__", ()):
+        value = getattr(module, name)
+        if hasattr(value, "__path__") or type(value).__name__ == "module":
+            continue
+        home = getattr(value, "__module__", room) or room
+        path = f"{home}.{name}" if isinstance(value, type) or callable(value) else f"{room}.{name}"
+        text += [f"::: {path}", ""]
+    return "\n".join(text) + "\n"
+
+
+def on_env(env, config, files):
+    """Offer the result schemas to the pages that render them as tables."""
+    env.globals["schemas"] = {p.stem: json.loads(p.read_text()) for p in (ROOT / "torchcloth").rglob("*.schema.json")}
+    return env
