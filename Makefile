@@ -30,10 +30,10 @@ test-slow: .venv/.open3d-works  ## the tests that take minutes
 	$(PYTEST) -m "slow and not gpu" $(PYTEST_ARGS)
 
 verify: .venv/.installed-dev  ## physics against closed forms and symmetry, writes docs/verification.md (VERIFY_ARGS=--help)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/verification/run.py $(VERIFY_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m torchcloth.training.validation.verification.run $(VERIFY_ARGS)
 
 example: .venv/.open3d-works  ## make the shipped example again (MuJoCo simulates it, minutes)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/independent/make_example.py --out torchcloth/examples/bimanual_swing --overwrite
+	OMP_NUM_THREADS=1 $(BIN)/python -m torchcloth.training.validation.independent.make_example --out torchcloth/examples/bimanual_swing --overwrite
 
 lint: .venv/.installed-dev  ## style, without changing files
 	$(BIN)/ruff check .

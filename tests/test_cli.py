@@ -14,14 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent / "identification"))
-
-from twins import doubles, first, twin
+from helpers.twins import doubles, first, twin
 
 from torchcloth import recordings
 from torchcloth.cli import doctor, main
-from torchcloth.cli.folders import check_file, check_folder
+from torchcloth.cli.output_paths import check_file, check_output_folder
 from torchcloth.errors import InvalidInput
 from torchcloth.observe import render
 
@@ -342,7 +339,7 @@ def test_fields_have_a_value_for_each_triangle(folder, tmp_path, capsys):
 
 
 def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(folder, tmp_path, done):
-    """SIGINT after some work: the second run ends where an undisturbed one does, to the last bit."""
+    """SIGINT after some work: the second run ends where an disable_autocast one does, to the last bit."""
     out = tmp_path / "out"
     command = [*COMMAND, "identify", str(folder), "--out", str(out), "--start", "youngs_modulus=5e4", *QUICK]
     process = subprocess.Popen(
@@ -420,11 +417,11 @@ def test_a_place_that_can_be_written_is_left_as_it_is(tmp_path, monkeypatch):
     (tmp_path / "old").mkdir()
     (tmp_path / "dangling").symlink_to(tmp_path / "nothing")
     for path in (Path("old"), Path("new/a/b"), tmp_path / "new" / ".." / "b", Path(".."), Path("old/../c")):
-        check_folder(path)
+        check_output_folder(path)
     check_file(Path("new/a.gif"))
     for path in (Path("dangling"), Path("dangling/a")):
         with pytest.raises(InvalidInput, match="dangling, a file"):
-            check_folder(path)
+            check_output_folder(path)
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["dangling", "old"]
 
 

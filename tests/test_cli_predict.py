@@ -2,17 +2,11 @@
 
 import json
 import re
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parent / "identification"))
-
-import offaxis
-import twins
+from helpers import off_axis_strips, twins
 
 from torchcloth import recordings
 from torchcloth.cli import main
@@ -24,9 +18,9 @@ def strips(tmp_path_factory):
     """Folder of a fit of three directions."""
     torch.set_default_dtype(torch.float64)
     draw = np.random.default_rng(0)
-    tables = [offaxis.readings(a, 0.02, draw, count=12) for a in (0, 45, 90)]
+    tables = [off_axis_strips.readings(a, 0.02, draw, count=12) for a in (0, 45, 90)]
     folder = tmp_path_factory.mktemp("fits") / "strips"
-    fit_tension(offaxis.cloth(), tables, offaxis.NAMES).save(folder)
+    fit_tension(off_axis_strips.cloth(), tables, off_axis_strips.NAMES).save(folder)
     return folder
 
 
@@ -50,7 +44,7 @@ def test_a_strip_at_any_angle(strips, tmp_path, capsys):
         assert word in printed
     content = json.loads((out / "prediction.json").read_text())
     low, high = np.array(content["force"]["ci95"])
-    truth = offaxis.modulus(30) * offaxis.H * 0.02 * np.array(content["strain"])
+    truth = off_axis_strips.modulus(30) * off_axis_strips.H * 0.02 * np.array(content["strain"])
     assert ((low <= truth) & (truth <= high)).all()
     assert content["measured"] == {}
     assert (out / "prediction.png").stat().st_size > 5000
@@ -60,7 +54,7 @@ def test_a_strip_at_any_angle(strips, tmp_path, capsys):
 
 
 def test_a_table_is_predicted_and_compared_with(strips, tmp_path, capsys):
-    table = offaxis.readings(60, 0.02, np.random.default_rng(1), count=12)
+    table = off_axis_strips.readings(60, 0.02, np.random.default_rng(1), count=12)
     place = recordings.write_tension(table, tmp_path / "table")
     assert main(["predict", str(strips / "tension.json"), str(place)]) == 0
     assert "of the readings inside" in capsys.readouterr().out
@@ -97,7 +91,7 @@ def test_wrong_input_is_one_line(strips, swing, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     model = tmp_path / "m.tcm"
     model.touch()
-    table = recordings.write_tension(offaxis.readings(60, 0.0, np.random.default_rng(1)), tmp_path / "table")
+    table = recordings.write_tension(off_axis_strips.readings(60, 0.0, np.random.default_rng(1)), tmp_path / "table")
     wrong = {
         ("nothing", "--angle", "30"): "FIT; got .*nothing; expected tension.json, identification.json or",
         (strips,): "--angle; got none; expected degrees",

@@ -12,12 +12,11 @@ from typing import Any
 
 import torch
 
-from torchcloth._utils.files import as_json, check_folder, write_text
-from torchcloth._utils.resume import program
+from torchcloth._utils.files import check_output_folder, to_json, write_text
+from torchcloth._utils.resume import source_fingerprint
 from torchcloth.errors import InvalidInput, RecordingError, TorchclothError
 
 Case = Callable[[], dict[str, Any]]
-MAKERS = ("hidden", "independent", "realdata")  # folders of tests/ that give studies their data
 
 
 class Kept:
@@ -58,7 +57,7 @@ class Kept:
         """Write a finished case, with null for what is not a number; a crash leaves no half file."""
         self.begin()
         self._path(name).parent.mkdir(exist_ok=True)
-        write_text(self._path(name), as_json(content))
+        write_text(self._path(name), to_json(content))
 
     def run(self, cases: Mapping[str, Case], jobs: int = 1) -> dict[str, dict[str, Any]]:
         """All cases by name, the missing ones computed in turn, ``jobs`` at a time, with progress."""
@@ -130,7 +129,7 @@ def check_jobs(jobs: int) -> None:
 
 def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
     """Raises InvalidInput where the folder cannot hold a study of these settings, or has one by other code."""
-    check_folder(folder)
+    check_output_folder(folder)
     try:
         found = json.loads((folder / "study.json").read_text())
     except FileNotFoundError:
@@ -160,7 +159,7 @@ def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
 def _of_this_code(settings: Mapping[str, Any]) -> dict[str, Any]:
     """With a fingerprint of the code that makes data and studies them: results of two versions are no study."""
     here = Path(__file__).resolve().parent
-    code = program(here, *(here.parent / "tests" / name for name in MAKERS))
+    code = source_fingerprint(here)
     return json.loads(json.dumps({**settings, "code": code}))  # as they are read again: a tuple is a list
 
 

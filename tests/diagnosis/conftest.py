@@ -1,12 +1,8 @@
-"""Helpers beside the tests."""
+"""Shared fixtures: float64, and one base model."""
 
-import sys
-from pathlib import Path
 
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture(autouse=True)
@@ -20,11 +16,11 @@ def _doubles():
 @pytest.fixture(scope="module")
 def made():
     """The base model of ``sheets.episode()``, and its setting."""
-    import sheets
+    from helpers import sheet_episodes
 
     from torchcloth.diagnosis import base_model, setting_of
 
-    before, recording = torch.get_default_dtype(), sheets.episode()
+    before, recording = torch.get_default_dtype(), sheet_episodes.episode()
     torch.set_default_dtype(torch.float64)
     model = base_model(recording)
     yield model, setting_of(model, [recording])

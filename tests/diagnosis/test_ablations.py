@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import linear_toys as toys
-import sheets
 import torch
+from helpers import linear_evidence as toys
+from helpers import sheet_episodes
 
 from torchcloth.diagnosis.causes.hypotheses import catalogue
 from torchcloth.diagnosis.data.dataset import setting_of
@@ -86,8 +86,8 @@ def test_on_one_mesh_what_a_mesh_does_would_be_a_cause():
 
 def test_a_tangent_would_not_see_what_begins_slowly(monkeypatch):
     """Wind pushes by its square: at a hundredth of a typical one cloth that hangs still feels nothing."""
-    monkeypatch.setitem(sheets.MOTIONS, "still", sheets.swing(0.0, 1.0))
-    recording = sheets.episode("still", duration=0.5)
+    monkeypatch.setitem(sheet_episodes.MOTIONS, "still", sheet_episodes.swing(0.0, 1.0))
+    recording = sheet_episodes.episode("still", duration=0.5)
     model = base_model(recording)
     setting = setting_of(model, [recording])
     (wind,) = (h for h in catalogue(model, [recording]) if h.name == "air.wind[y]")

@@ -4,9 +4,9 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
-import linear_toys as toys
 import pytest
 import torch
+from helpers import linear_evidence as toys
 from scipy.stats import t
 
 from torchcloth.diagnosis.decide.candidates import (

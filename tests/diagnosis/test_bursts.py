@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import linear_toys as toys
 import pytest
 import torch
+from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.data.binning import stretches
 from torchcloth.diagnosis.inference.comparison import compare, predict

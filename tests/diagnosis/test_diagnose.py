@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
@@ -21,7 +21,7 @@ ASKED = ("air.drag_n", "air.linear", "mass.hem", "rest.shrink[weft]", "obs.extri
 
 
 def episodes(change, seed=0):
-    return [sheets.recorded(motion, change, seed + k) for k, motion in enumerate(sheets.MOTIONS)]
+    return [sheet_episodes.recorded(motion, change, seed + k) for k, motion in enumerate(sheet_episodes.MOTIONS)]
 
 
 def asked(recordings):
@@ -32,7 +32,7 @@ def asked(recordings):
 def with_drag():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    (hidden,) = (h for h in asked([sheets.episode()]) if h.name == "air.drag_n")
+    (hidden,) = (h for h in asked([sheet_episodes.episode()]) if h.name == "air.drag_n")
     recordings = episodes(lambda world: hidden.apply(world, 1.5))
     yield recordings, diagnose(recordings, hypotheses=asked(recordings))
     torch.set_default_dtype(before)
@@ -45,11 +45,11 @@ def test_hidden_drag_is_named(with_drag):
     assert cause["amplitude"] == pytest.approx(1.5, rel=0.15)
     low, high = cause["noise_ci95"]
     assert cause["ci95"][0] <= low < cause["amplitude"] < high <= cause["ci95"][1]
-    assert 1.0 <= cause["told_by"] <= len(sheets.MOTIONS)
+    assert 1.0 <= cause["told_by"] <= len(sheet_episodes.MOTIONS)
     gain = answer.content["gain"]
     assert gain["rms_after"] < 0.5 * gain["rms_before"]
     assert gain["explained_fraction"] > 0.9
-    assert [row["motion"] for row in gain["per_motion"]] == list(sheets.MOTIONS)
+    assert [row["motion"] for row in gain["per_motion"]] == list(sheet_episodes.MOTIONS)
     assert all(row["rms_after"] < row["rms_before"] for row in gain["per_motion"])
     for share, ends in (("explained_fraction", "ci95"), ("log_density", "log_density_ci95")):
         assert all(row[ends][0] <= row[share] <= row[ends][1] for row in gain["per_motion"])
@@ -65,15 +65,15 @@ def test_a_cause_says_where_and_when_it_shows(with_drag):
     """Drag holds back what is free to move: the lower end of the sheet, and not in the first moment."""
     _, answer = with_drag
     (cause,) = answer.content["causes"]
-    assert cause["where"]["at"][1] < 0.5 * sheets.SIDE
-    assert cause["when"]["motion"] in sheets.MOTIONS
-    assert 0.0 < cause["when"]["from"] < cause["when"]["to"] <= 0.2 + sheets.FRAMES / sheets.RATE
+    assert cause["where"]["at"][1] < 0.5 * sheet_episodes.SIDE
+    assert cause["when"]["motion"] in sheet_episodes.MOTIONS
+    assert 0.0 < cause["when"]["from"] < cause["when"]["to"] <= 0.2 + sheet_episodes.FRAMES / sheet_episodes.RATE
     assert 1e-3 < cause["moves"]["value"] < 0.1
 
 
 def test_the_cloud_is_shown_over_both_models_where_the_first_is_farthest_off(with_drag):
     recordings, answer = with_drag
-    assert [o.motion for o in answer.overlays] == list(sheets.MOTIONS)
+    assert [o.motion for o in answer.overlays] == list(sheet_episodes.MOTIONS)
     for o, recording in zip(answer.overlays, recordings, strict=True):
         frame = int(np.abs(recording.points.t - recording.points.t[0] - o.time).argmin())
         first = recording.points.counts[:frame].sum()
@@ -173,7 +173,7 @@ def test_where_nothing_is_hidden_nothing_is_named():
 
 
 def test_one_motion_is_refused(tmp_path, capsys):
-    only = [sheets.episode(), sheets.episode(duration=0.5)]
+    only = [sheet_episodes.episode(), sheet_episodes.episode(duration=0.5)]
     with pytest.raises(InvalidInput, match="at least two motions"):
         diagnose(only)
     with pytest.raises(InvalidInput, match="twice"):  # and not advice to name them apart
@@ -191,7 +191,7 @@ def test_single_precision_is_refused(with_drag):
 
 
 def test_a_model_that_is_none_is_refused(tmp_path, capsys):
-    folder = rec.write(sheets.episode(), tmp_path / "a")
+    folder = rec.write(sheet_episodes.episode(), tmp_path / "a")
     (tmp_path / "m.tcm").write_text("x")
     assert main(["diagnose", str(folder), "--model", str(tmp_path / "m.tcm"), "--out", str(tmp_path / "out")]) == 2
     assert "m.tcm: unreadable" in capsys.readouterr().err

@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import linear_toys as toys
 import pytest
 import torch
+from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.causes.fabric import OF_BENDING, OF_MEMBRANE
 from torchcloth.diagnosis.causes.hypotheses import known

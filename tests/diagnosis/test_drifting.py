@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import linear_toys as toys
 import pytest
 import torch
+from helpers import linear_evidence as toys
 from scipy.stats import t as student
 
 from torchcloth.diagnosis import drifts

@@ -4,17 +4,16 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
-import linear_toys as toys
 import numpy as np
 import pytest
-import sheets
 import torch
+from helpers import linear_evidence as toys
+from helpers import sheet_episodes
+from helpers.undecided_search import undecided
 
-from torchcloth.diagnosis import base_model, catalogue, fit, setting_of
-from torchcloth.diagnosis.data.binning import NAMES
+from torchcloth.diagnosis import base_model, setting_of
 from torchcloth.diagnosis.data.dataset import foreseen
 from torchcloth.diagnosis.decide.candidates import HARDLY
 from torchcloth.diagnosis.experiment import proposal
@@ -28,17 +27,14 @@ from torchcloth.diagnosis.experiment.proposal import (
     question_of,
     whitened_slopes,
 )
-from torchcloth.diagnosis.inference.fitting import renoised
 from torchcloth.diagnosis.inference.linearise import central
-from torchcloth.diagnosis.inference.noise import FLOOR, Noise
-from torchcloth.episodes.observed import episode
+from torchcloth.episodes.observed import build_episode
 from torchcloth.recordings import Collider
 
-INDEPENDENT = Path(__file__).parents[1] / "independent"
 MOTIONS = """
 import json, sys
-from flex_sheet import SheetSpec
-from motions import motion
+from torchcloth.training.validation.independent.flex_sheet import SheetSpec
+from torchcloth.training.validation.independent.motions import motion
 sheet = SheetSpec(0.2, 0.2, areal_density=0.2, membrane_stiffness=60.0, damping_time=1e-4)
 found = []
 for name, heading, speed in json.loads(sys.argv[1]):
@@ -50,11 +46,11 @@ print(json.dumps(found))
 
 def test_the_library_is_that_of_the_independent_engine():
     """Displacements and turns of both grippers, by the other code."""
-    template = sheets.episode()
+    template = sheet_episodes.episode()
     own = float(np.rad2deg(heading_of(template)))
     asked = json.dumps([[e.motion, e.heading + own, e.speed] for e in LIBRARY])
     run = [sys.executable, "-c", MOTIONS, asked]
-    out = subprocess.run(run, cwd=INDEPENDENT, capture_output=True, text=True, check=True).stdout
+    out = subprocess.run(run, capture_output=True, text=True, check=True).stdout
     for experiment, paths in zip(LIBRARY, json.loads(out), strict=True):
         plan = planned(experiment, template)
         own = np.stack([plan.grippers[n].position for n in ("left", "right")])
@@ -68,7 +64,7 @@ def test_the_library_is_that_of_the_independent_engine():
 
 
 def test_an_experiment_begins_as_the_episode_that_it_repeats_and_is_turned_from_there():
-    template = sheets.episode()
+    template = sheet_episodes.episode()
     begun = {n: np.asarray(g.position[0]) for n, g in template.grippers.items()}
     centre = np.mean(list(begun.values()), axis=0)
     for heading in (0.0, 90.0):
@@ -86,7 +82,7 @@ def test_an_experiment_begins_as_the_episode_that_it_repeats_and_is_turned_from_
 
 
 def test_cloth_that_lies_is_dragged_away_from_where_it_lies():
-    hanging = sheets.episode()
+    hanging = sheet_episodes.episode()
     flat = np.asarray(hanging.cloth.initial_vertices)
     own = heading_of(hanging)
     for side in (-1.0, 1.0):
@@ -99,7 +95,7 @@ def test_cloth_that_lies_is_dragged_away_from_where_it_lies():
 
 
 def test_only_what_can_be_begun_is_asked_for():
-    hanging = [str(e) for e, _ in possible([sheets.episode()])]
+    hanging = [str(e) for e, _ in possible([sheet_episodes.episode()])]
     assert len(hanging) == sum(not PLANS[e.motion].lying for e in LIBRARY)
     assert "swing, grippers and cloth turned by 90 degrees" in hanging
     assert possible([]) == []
@@ -125,25 +121,6 @@ def test_distances_are_those_of_two_columns():
     again = white[: len(white) // 2][:, [0, 1, 4, 2]]
     more = distances(question, information(question, [again]))[("c", "a")]
     assert more > told
-
-
-def undecided(names, said="causes"):
-    """A search of a slow episode that ends with two causes of one class, named or too small to matter."""
-    recordings = [sheets.episode("slow", duration=0.4), sheets.episode("lift", duration=0.4)]
-    model = base_model(recordings[0])
-    setting = setting_of(model, recordings)
-    asked = [h for h in catalogue(model, recordings) if h.name in names]
-    level = 3 * torch.tensor([FLOOR[name] for name in NAMES]).double()  # the points here are anywhere
-    found = fit(model, setting, asked, 0)
-    found = renoised(found, Noise(level), found.evidence)
-    hypothesis = SimpleNamespace(name=names[0])
-    step = SimpleNamespace(best=SimpleNamespace(hypothesis=hypothesis), before=found, screened=[])
-    amplitudes = {h.name: h.typical for h in asked}
-    rivals = [{"effect": names[1], "amplitude": amplitudes[names[1]]}]
-    cause = {"effect": names[0], "amplitude": amplitudes[names[0]], "rivals": rivals}
-    steps, content = ({"causes": [], "minor": []} | {said: [one]} for one in (step, cause))
-    alike = [(h, h.typical) for name in names for h in asked if h.name == name]
-    return SimpleNamespace(**steps, screened=[], end=found, alike=lambda _: alike), content, setting
 
 
 def smooth(*of):
@@ -192,12 +169,12 @@ def test_what_does_the_same_as_a_fitted_number_is_not_waited_for():
 
 def test_an_experiment_feels_what_the_data_felt():
     """Forces without torques are no torques that would be felt."""
-    seen = sheets.recorded("slow", lambda world: world, 0)
+    seen = sheet_episodes.recorded("slow", lambda world: world, 0)
     pulled = {name: replace(g, force=np.tile([0, 0, -0.04], (len(g.t), 1))) for name, g in seen.grippers.items()}
     seen = replace(seen, grippers=pulled)
     model = base_model(seen)
     setting = setting_of(model, [seen])
-    blank = foreseen(episode(model.base.cloth, replace(planned(Experiment("hang"), seen), joints={})))
+    blank = foreseen(build_episode(model.base.cloth, replace(planned(Experiment("hang"), seen), joints={})))
     felt = as_seen(model.world().frames(blank), blank, setting).wrenches["left"]
     assert felt[1:, :3].isfinite().all()
     assert felt[:, 3:].isnan().all()

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import sheets
 import torch
-from test_experiments import undecided
+from helpers import sheet_episodes
+from helpers.undecided_search import undecided
 
 from torchcloth import recordings, robots
 from torchcloth.diagnosis.experiment import motions, proposal
@@ -52,7 +52,7 @@ def test_an_experiment_is_as_fast_as_the_arms(shipped, slowed):
 
 def test_where_no_arm_is_named_none_is_asked(monkeypatch):
     monkeypatch.setattr(motions, "LIBRARY", (FAST, Experiment("turn", 90.0)))
-    found = feasible([sheets.episode()], lambda _: pytest.fail("an arm was asked"))
+    found = feasible([sheet_episodes.episode()], lambda _: pytest.fail("an arm was asked"))
     assert [c.experiment for c in found] == [FAST, Experiment("turn", 90.0)]
     assert {(c.plan, c.why_not, c.unasked) for c in found} == {(None, None, None)}
 
@@ -90,7 +90,7 @@ def test_the_proposed_one_is_an_episode_without_blanks(slowed, tmp_path):
 
 
 def test_a_proposal_replaces_the_last_one_and_nothing_that_was_recorded(slowed, tmp_path):
-    hang = planned(Experiment("hang"), sheets.episode())
+    hang = planned(Experiment("hang"), sheet_episodes.episode())
     assert write_episode(hang, tmp_path) is None
     assert write_episode(slowed.episode, tmp_path) is None
     assert recordings.read(tmp_path / FOLDER).split == slowed.episode.split

@@ -3,10 +3,10 @@
 from dataclasses import replace
 
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
-from torchcloth._utils.caching import Recent
+from torchcloth._utils.caching import LRUCache
 from torchcloth.diagnosis.causes.hypotheses import catalogue
 from torchcloth.diagnosis.data.binning import aligned, cells_of, directions
 from torchcloth.diagnosis.data.fine_mesh import refined
@@ -17,7 +17,7 @@ from torchcloth.episodes.world import World
 from torchcloth.episodes.world_cache import Worlds
 from torchcloth.identification.nuisances import Held
 
-RECORDING = sheets.episode()
+RECORDING = sheet_episodes.episode()
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_who_asks_later_is_told_the_same(made, asked):
 @pytest.mark.parametrize(("memory", "again"), [(2**30, 0), (0, 2)])
 def test_the_point_itself_is_simulated_once(made, asked, monkeypatch, memory, again):
     """On both meshes; beside it each of three causes, one of them on the finer mesh, too."""
-    model, setting = made[0], replace(made[1], recent=Recent(memory, lambda frames: 1))
+    model, setting = made[0], replace(made[1], recent=LRUCache(memory, lambda frames: 1))
     known, simulate, simulated = gather(model, setting, asked[:1]), World.simulated, []
 
     def counted(world, *arguments):

@@ -3,9 +3,9 @@
 import math
 from dataclasses import replace
 
-import linear_toys as toys
 import pytest
 import torch
+from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.decide.search import _impossible
 from torchcloth.diagnosis.inference import fitting

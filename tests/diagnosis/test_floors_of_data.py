@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-import linear_toys as toys
 import numpy as np
 import pytest
-import sheets
 import torch
+from helpers import linear_evidence as toys
+from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import base_model
@@ -37,7 +37,7 @@ def test_the_floor_is_what_repetitions_differ_by_whatever_the_model_gets_wrong()
 
 def test_repetitions_are_of_one_command(tmp_path):
     def kept(name, motion, split, shift=0.0, turn=1.0):
-        own = replace(sheets.episode(motion), split=split)
+        own = replace(sheet_episodes.episode(motion), split=split)
         facing = np.array([turn, 0.0, 0.0, (1 - turn**2) ** 0.5])
         moved = {
             n: replace(g, position=g.position + shift * g.t[:, None], quat_wxyz=np.tile(facing, (len(g.t), 1)))
@@ -62,12 +62,12 @@ def test_repetitions_are_of_one_command(tmp_path):
 
 
 def test_first_shapes_are_off_by_smooth_fields_along_the_normal_there_and_back():
-    blank = sheets.episode()
+    blank = sheet_episodes.episode()
     model = base_model(blank)
     (e,) = setting_of(model, [blank]).episodes
     begun = _begun(e, model.world(), torch.Generator().manual_seed(0))
     off = [b.initial - e.initial for b in begun]
-    assert all(b.settles for b in begun)
+    assert all(b.needs_settling for b in begun)
     assert torch.equal(begun[0].initial, _begun(e, model.world(), torch.Generator().manual_seed(0))[0].initial)
     torch.testing.assert_close(off[1], -off[0])
     assert (off[0] - off[2]).norm() > 0.5 * off[0].norm()

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
@@ -22,7 +22,7 @@ from torchcloth.errors import InvalidInput
 from torchcloth.recordings.images import ImageStream
 
 EXAMPLE = Path(__file__).parents[2] / "torchcloth" / "examples" / "bimanual_swing"
-GENERATE = Path(__file__).parents[1] / "independent" / "generate.py"
+GENERATE = "torchcloth.training.validation.independent.generate"
 AHEAD, DEEP = np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.0, 0.6])
 SMALL = ("--nodes", "9", "--fit-nodes", "7")
 
@@ -31,7 +31,8 @@ SMALL = ("--nodes", "9", "--fit-nodes", "7")
 def turned(tmp_path_factory):
     """A sheet that is turned by a quarter; MuJoCo's."""
     out = tmp_path_factory.mktemp("gate") / "turn"
-    subprocess.run([sys.executable, GENERATE, "--motion", "turn", *SMALL, "--seed", "5", "--out", out], check=True)
+    command = [sys.executable, "-m", GENERATE, "--motion", "turn", *SMALL, "--seed", "5", "--out", out]
+    subprocess.run(command, check=True)
     return rec.read(out)
 
 
@@ -257,7 +258,7 @@ def test_the_verdict_is_written_and_the_command_is_done(turned, tmp_path, capsys
 
 
 def test_a_stream_that_cannot_be_read_is_invalid_data_and_a_missing_folder_is_not(tmp_path, capsys):
-    folders = [str(rec.write(sheets.episode(motion), tmp_path / motion)) for motion in ("slow", "fast")]
+    folders = [str(rec.write(sheet_episodes.episode(motion), tmp_path / motion)) for motion in ("slow", "fast")]
     with np.load(tmp_path / "slow" / "points.npz") as file:
         arrays = dict(file)
     arrays["t"] = arrays["t"][::-1].copy()
@@ -294,21 +295,21 @@ def test_forces_alone_do_not_say_where_the_cloth_goes(turned):
 
 def test_small_episodes_of_the_same_engine_pass():
     torch.set_default_dtype(torch.float64)
-    assert check([sheets.episode(motion, duration=0.6) for motion in sheets.MOTIONS]) == []
+    assert check([sheet_episodes.episode(motion, duration=0.6) for motion in sheet_episodes.MOTIONS]) == []
 
 
 @pytest.mark.parametrize("seed", [2, 3])
 def test_a_bar_in_view_is_no_mirror(tmp_path, seed):
     """It hides the cloth near a gripper now and then, and a mirrored cloud would hide that."""
     out, barred = tmp_path / "shake", ("--effect", "obs.occlusion=0.2")
-    made = [sys.executable, GENERATE, "--motion", "shake", *SMALL, *barred, "--seed", str(seed), "--out", out]
+    made = [sys.executable, "-m", GENERATE, "--motion", "shake", *SMALL, *barred, "--seed", str(seed), "--out", out]
     subprocess.run(made, check=True)
     assert check([rec.read(out)]) == []
 
 
 def test_an_episode_that_says_nothing_is_refused_by_name(tmp_path, capsys):
     """Two frames, of which the first begins the simulation and the last is what a late clock would see."""
-    good = [sheets.episode(motion) for motion in ("slow", "fast")]
+    good = [sheet_episodes.episode(motion) for motion in ("slow", "fast")]
     points = good[1].points
     short = rec.PointClouds(points.t[:2], points.xyz[: points.counts[:2].sum()], points.counts[:2])
     cut = {name: _until(g, points.t[1] + 0.01) for name, g in good[1].grippers.items()}

@@ -3,9 +3,9 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import linear_toys as toys
 import pytest
 import torch
+from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis import lack_of_fit
 from torchcloth.diagnosis.decide import backward_elimination

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
 import torchcloth as tc
 from torchcloth import diagnosis as dx
@@ -14,7 +14,7 @@ from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.cli.identify import what_is_beside
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import cloth_from, fitted, identify, predict_episode
+from torchcloth.identification import build_cloth, fitted, identify, predict_episode
 from torchcloth.recordings.fingerprints import mark
 from torchcloth.viewing import film_of_fit
 
@@ -26,14 +26,14 @@ def made(tmp_path_factory):
     """(base and extended model files, an episode of another motion than they know)."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    folder, blank = tmp_path_factory.mktemp("models"), sheets.episode()
+    folder, blank = tmp_path_factory.mktemp("models"), sheet_episodes.episode()
     by = {h.name: h for h in dx.catalogue(dx.base_model(blank), [blank])}
     base = dx.base_model(blank)
     extended = base.plus(by["air.drag_n"], TRUE).plus(by["obs.clock"], 0.0)
     dx.save_model(folder / "base.tcm", base, blank)
     covariance = torch.diag(torch.tensor([0.02, 0.5, 0.05, 0.01, 1.2, 0.03, 1e-3]).double() ** 2)
     dx.save_model(folder / "extended.tcm", extended, blank, covariance, episodes=[mark(blank)])
-    seen = sheets.recorded("fast", lambda world: by["air.drag_n"].apply(world, TRUE), 3)
+    seen = sheet_episodes.recorded("fast", lambda world: by["air.drag_n"].apply(world, TRUE), 3)
     yield folder, rec.read(rec.write(seen, folder / "fast")), blank
     torch.set_default_dtype(before)
 
@@ -75,7 +75,7 @@ def test_a_fit_that_began_with_a_model_brings_it_along(made, tmp_path):
     assert "mm from the points" in film_of_fit(seen, tmp_path / "fit").title
     with pytest.raises(InvalidInput, match=r"a fit of another model.*give begun=diagnosis.start_of"):
         fitted(path, seen)
-    plain = identify(cloth_from(seen), seen, ["youngs_modulus"], iterations=1)
+    plain = identify(build_cloth(seen), seen, ["youngs_modulus"], iterations=1)
     assert dx.start_of(plain.save(tmp_path / "fit")) is None
 
 
@@ -235,7 +235,7 @@ def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
 @pytest.mark.parametrize("other", ["data sheet", "set of grasps"])
 def test_another_cloth_confirms_nothing(made, other):
     folder, _, _ = made
-    unseen = sheets.episode("lift", duration=0.4)
+    unseen = sheet_episodes.episode("lift", duration=0.4)
     if other == "data sheet":
         nominal = {**unseen.cloth.nominal, "membrane_stiffness": 77.0}
         unseen = replace(unseen, cloth=replace(unseen.cloth, nominal=nominal))
@@ -248,8 +248,8 @@ def test_another_cloth_confirms_nothing(made, other):
 def test_a_table_that_one_episode_has_is_in_the_scene_of_all(made):
     folder, _, _ = made
     plane = rec.Collider(np.array([0.0, 0.0, 1.004]), np.array([0.0, 0.0, 1.0]), 0.4)
-    over = replace(sheets.episode("lift", duration=0.4), colliders={"table": plane})
-    free = sheets.episode("fast", duration=0.5)
+    over = replace(sheet_episodes.episode("lift", duration=0.4), colliders={"table": plane})
+    free = sheet_episodes.episode("fast", duration=0.5)
     models = [folder / name for name in ("base.tcm", "extended.tcm")]
     one, other = (dx.confirm(*models, order).motions["lift"] for order in ([free, over], [over, free]))
     assert one.after == pytest.approx(other.after, rel=1e-9)

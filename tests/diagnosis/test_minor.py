@@ -3,8 +3,8 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import linear_toys as toys
 import pytest
+from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.decide import backward_elimination, candidates, search
 from torchcloth.diagnosis.decide.candidates import Step, _open, _rival, _themselves

@@ -1,8 +1,8 @@
 """A force planted in a known part of the cloth for a known time, on another mesh, is found there and then."""
 
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
 from torchcloth.diagnosis import base_model, fit, lack_of_fit, missing_force, setting_of
 from torchcloth.diagnosis.unknown import missing_force as missing
@@ -17,7 +17,7 @@ STRETCH = 0.15  # s
 
 
 def quarter(uv):
-    return (uv < 0.5 * sheets.SIDE).all(1)
+    return (uv < 0.5 * sheet_episodes.SIDE).all(1)
 
 
 def pushed_for_a_while(world, episode):
@@ -50,7 +50,7 @@ def planted():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     still = lambda world: world  # noqa: E731
-    recordings = [sheets.recorded("slow", still, 0, pushed_for_a_while), sheets.recorded("fast", still, 1)]
+    recordings = [sheet_episodes.recorded("slow", still, 0, pushed_for_a_while), sheet_episodes.recorded("fast", still, 1)]
     yield fitted(recordings)
     torch.set_default_dtype(before)
 
@@ -60,18 +60,18 @@ def test_it_is_found_there_and_then(planted):
     answer = missing_force(found, setting, window=STRETCH)
     there, elsewhere = answer.parts
     window, vertex = there.strongest
-    begin, end = BEGIN / sheets.RATE, END / sheets.RATE
+    begin, end = BEGIN / sheet_episodes.RATE, END / sheet_episodes.RATE
     assert float(there.windows[window].mean()) == pytest.approx((begin + end) / 2, abs=STRETCH)
     assert bool(quarter(answer.uv)[vertex])
     force = there.force[window, vertex]
     assert float(force[1] / force.norm()) > 0.9
     assert float(there.certainty[window, vertex]) > 4
     total = answer.total(there)[window]
-    assert float(total[1]) == pytest.approx(0.2 * float(PUSH[1]) * sheets.SIDE**2 / 4, rel=0.25)
+    assert float(total[1]) == pytest.approx(0.2 * float(PUSH[1]) * sheet_episodes.SIDE**2 / 4, rel=0.25)
     assert float(elsewhere.certainty.max()) < 0.5 * float(there.certainty.max())
     told = answer.as_dict()["motions"]
     assert [t["sure"] for t in told] == [True, False]
-    assert max(told[0]["at"]) < 0.5 * sheets.SIDE
+    assert max(told[0]["at"]) < 0.5 * sheet_episodes.SIDE
 
 
 def test_the_fit_lacks_there_and_not_in_the_other_motion(planted):

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
@@ -17,7 +17,7 @@ from torchcloth.diagnosis import base_model, catalogue, read_model, save_model
 from torchcloth.errors import RecordingError
 from torchcloth.identification.io.saved_fit import mark
 
-RECORDING = sheets.episode(resolution=(4, 4))
+RECORDING = sheet_episodes.episode(resolution=(4, 4))
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers import sheet_episodes
 import torch
+from helpers import sheet_episodes
 
 from torchcloth.cli import main
 from torchcloth.diagnosis import Hypothesis, base_model, register_file, setting_of

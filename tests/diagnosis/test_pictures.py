@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
 from torchcloth import diagnosis as dx
 from torchcloth.diagnosis.data.binning import NAMES, STRETCH
@@ -20,10 +20,10 @@ def gathered():
     """(evidence, setting) of an episode whose points lie on a surface that wind has moved."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    blank = sheets.episode()
+    blank = sheet_episodes.episode()
     wind = next(h for h in dx.catalogue(dx.base_model(blank), [blank]) if h.name == "air.wind[y]")
     model = dx.base_model(blank)
-    setting = dx.setting_of(model, [sheets.recorded("slow", lambda world: wind.apply(world, 0.5), 3)])
+    setting = dx.setting_of(model, [sheet_episodes.recorded("slow", lambda world: wind.apply(world, 0.5), 3)])
     yield dx.gather(model, setting), setting
     torch.set_default_dtype(before)
 

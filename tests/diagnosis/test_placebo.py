@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-import linear_toys as toys
 import torch
+from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.inference.fitting import leap
 from torchcloth.diagnosis.inference.permutation_test import placebo

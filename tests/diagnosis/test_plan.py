@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-import sheets
+from helpers import sheet_episodes
 
 from torchcloth.diagnosis import base_model, catalogue
 from torchcloth.diagnosis.causes import user_hypotheses
@@ -12,7 +12,7 @@ NAMES = ["swing", "hang"]
 
 
 def decided():
-    recording = sheets.episode()
+    recording = sheet_episodes.episode()
     model = base_model(recording)
     return recording, model, catalogue(model, [recording])
 

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
 from torchcloth import diagnosis as dx
 from torchcloth import recordings as rec
 from torchcloth.boundaries import Grasp
 from torchcloth.diagnosis.data.dataset import setting_of
 from torchcloth.diagnosis.data.grip_patch_mesh import regripped
-from torchcloth.episodes.observed import episode
+from torchcloth.episodes.observed import build_episode
 from torchcloth.episodes.replay import Frames
 from torchcloth.errors import InvalidInput
 
@@ -23,7 +23,7 @@ RADIUS = 0.051  # m, of sheets.py: 1.5 edges of the mesh
 def made():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    blank = sheets.episode()
+    blank = sheet_episodes.episode()
     model = dx.base_model(blank)
     yield model, setting_of(model, [blank]).episodes[0], blank
     torch.set_default_dtype(before)
@@ -52,7 +52,7 @@ def test_the_edge_of_a_patch_goes_along_and_the_outline_stays(made, along):
 def test_a_wider_patch_grows_on_all_sides_and_the_next_grows_from_there(made):
     world = made[0].world()
     wider = regripped(world, wider=0.01)
-    far = lambda w: np.linalg.norm(held(w, "left") - [0.0, sheets.SIDE], axis=1)  # noqa: E731
+    far = lambda w: np.linalg.norm(held(w, "left") - [0.0, sheet_episodes.SIDE], axis=1)  # noqa: E731
     np.testing.assert_allclose(far(wider), far(world) * (RADIUS + 0.01) / RADIUS)
     both = regripped(wider, wider=0.01)
     np.testing.assert_allclose(far(both), far(world) * (RADIUS + 0.02) / RADIUS)
@@ -90,14 +90,14 @@ def test_a_model_of_an_episode_starts_where_the_episode_says(made, tmp_path):
     by = {h.name: h for h in dx.catalogue(model, [blank])}
     path = dx.save_model(tmp_path / "held.tcm", model.plus(by["robot.regrasp"], 0.008), blank)
     cloth = dx.cloth_for(path, blank)
-    first = episode(cloth, blank).initial
+    first = build_episode(cloth, blank).initial
     u, bulge, v = (first - torch.tensor([0.0, 0.0, 1.0])).T.numpy()
     np.testing.assert_allclose(np.stack([u, v], 1), cloth.mesh.uv, atol=1e-6)
     np.testing.assert_allclose(bulge, 0.01 * np.sin(8 * cloth.mesh.uv[:, 0]), atol=1e-4)
-    seen = sheets.recorded("fast", lambda world: world, 3)
+    seen = sheet_episodes.recorded("fast", lambda world: world, 3)
     found = dx.predicted(path, rec.read(rec.write(seen, tmp_path / "fast")))
     world = dx.load_world(path)
-    torch.testing.assert_close(found.frames.x, world.frames(episode(model.base.cloth, seen)).x)
+    torch.testing.assert_close(found.frames.x, world.frames(build_episode(model.base.cloth, seen)).x)
 
 
 def test_grips_without_a_place_and_patterns_without_room(made):
@@ -107,4 +107,4 @@ def test_grips_without_a_place_and_patterns_without_room(made):
     with pytest.raises(InvalidInput, match="150 mm further along; expected as much"):
         regripped(world, along=0.15)
     with pytest.raises(InvalidInput, match=r"without a place.*given by uv"):
-        Grasp([0, 1]).moved(0.01, 0.0)
+        Grasp([0, 1]).shifted(0.01, 0.0)

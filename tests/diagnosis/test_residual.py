@@ -3,8 +3,8 @@
 import json
 
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
 from torchcloth.diagnosis import (
     base_model,
@@ -26,7 +26,7 @@ MOTIONS = ("slow", "fast")
 
 
 def recorded(change, seed):
-    return [sheets.recorded(motion, change, seed + k) for k, motion in enumerate(MOTIONS)]
+    return [sheet_episodes.recorded(motion, change, seed + k) for k, motion in enumerate(MOTIONS)]
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_it_is_written_with_the_answer(without_air, tmp_path):
 
 
 def test_it_is_kept_with_the_model_and_can_be_left_out(tmp_path):
-    recording = sheets.episode()
+    recording = sheet_episodes.episode()
     plain = base_model(recording)
     terms = {"across2": 0.8, "mass@edge": 0.05}
     extended = plain.at(plain.point + 0.1)

@@ -6,8 +6,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
@@ -22,8 +22,8 @@ ASKED = ("air.drag_n", "obs.extrinsic[y]")
 def episodes():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    drag = next(h for h in catalogue(base_model(sheets.episode()), [sheets.episode()]) if h.name == "air.drag_n")
-    yield [sheets.recorded(m, lambda world: drag.apply(world, 1.5), k) for k, m in enumerate(("slow", "fast"))]
+    drag = next(h for h in catalogue(base_model(sheet_episodes.episode()), [sheet_episodes.episode()]) if h.name == "air.drag_n")
+    yield [sheet_episodes.recorded(m, lambda world: drag.apply(world, 1.5), k) for k, m in enumerate(("slow", "fast"))]
     torch.set_default_dtype(before)
 
 

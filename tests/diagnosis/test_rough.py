@@ -3,9 +3,9 @@
 import math
 from dataclasses import replace
 
-import linear_toys as toys
 import pytest
 import torch
+from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.inference import fitting, noise
 from torchcloth.diagnosis.inference.fitting import fit

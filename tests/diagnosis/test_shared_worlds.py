@@ -3,7 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-import sheets
+from helpers import sheet_episodes
 
 from torchcloth.diagnosis.causes.hypotheses import catalogue
 from torchcloth.diagnosis.models.base_model import base_model
@@ -12,7 +12,7 @@ from torchcloth.episodes.world import Hypothesis
 from torchcloth.episodes.world_cache import Worlds
 from torchcloth.errors import InvalidInput
 
-RECORDING = sheets.episode()
+RECORDING = sheet_episodes.episode()
 
 
 @pytest.fixture

@@ -3,15 +3,15 @@
 from dataclasses import replace
 
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
 from torchcloth.diagnosis.causes.hypotheses import catalogue
 from torchcloth.diagnosis.inference.linearise import asked_about, gather
 from torchcloth.episodes.steps import one_way, step_sizes
 from torchcloth.errors import InvalidInput
 
-RECORDING = sheets.episode()
+RECORDING = sheet_episodes.episode()
 
 
 def test_what_a_parameter_does_already_has_its_slopes(made):

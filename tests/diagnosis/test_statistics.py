@@ -3,10 +3,10 @@
 import math
 from dataclasses import replace
 
-import linear_toys as toys
 import numpy as np
 import pytest
 import torch
+from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.confirmation import Confirmation
 from torchcloth.diagnosis.data.binning import NAMES as KINDS

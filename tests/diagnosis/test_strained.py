@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
-import linear_toys as toys
 import pytest
 import torch
+from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.data.dataset import Setting
 from torchcloth.diagnosis.decide import candidates, search

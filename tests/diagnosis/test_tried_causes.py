@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import pytest
-import sheets
+from helpers import sheet_episodes
 
 from torchcloth import effects
 from torchcloth.diagnosis.causes.hypotheses import Hypothesis, catalogue, forget, own_among, register
@@ -42,7 +42,7 @@ WRONG = {
 
 @pytest.fixture
 def world():
-    recordings = [sheets.episode(motion) for motion in ("slow", "fast")]
+    recordings = [sheet_episodes.episode(motion) for motion in ("slow", "fast")]
     model = base_model(recordings[0])
     return recordings, model, setting_of(model, recordings)
 

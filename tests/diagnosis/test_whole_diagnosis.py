@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -12,7 +11,7 @@ pytest.importorskip("mujoco", minversion="4.0")
 
 from torchcloth.cli import main
 
-GENERATE = Path(__file__).parents[1] / "independent" / "generate.py"
+GENERATE = "torchcloth.training.validation.independent.generate"
 
 # motion, heading in degrees, speed
 TAKES = (
@@ -35,7 +34,7 @@ def test_eight_episodes_are_diagnosed_in_a_quarter_of_an_hour(tmp_path):
     for k, (path, (motion, heading, speed)) in enumerate(zip(episodes, TAKES, strict=True)):
         take = ["--motion", motion, "--heading", str(heading), "--speed", str(speed), "--seed", str(k)]
         mesh = ["--nodes", "21", "--fit-nodes", "15", "--effect", f"air.drag_n={DRAG}"]
-        subprocess.run([sys.executable, GENERATE, *take, *mesh, "--out", path], check=True)
+        subprocess.run([sys.executable, "-m", GENERATE, *take, *mesh, "--out", path], check=True)
     began = time.monotonic()
     assert main(["diagnose", *map(str, episodes), "--out", str(tmp_path / "out")]) == 0
     assert time.monotonic() - began < SECONDS

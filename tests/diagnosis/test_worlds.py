@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import sheets
 import torch
+from helpers import sheet_episodes
 
 from torchcloth import materials
 from torchcloth._utils.resume import digest
@@ -20,7 +20,7 @@ from torchcloth.diagnosis.models.base_model import SILENT, base_model
 from torchcloth.diagnosis.models.model_file import load_model, save_model
 from torchcloth.diagnosis.report.wording import on_top
 from torchcloth.effects import AirDrag
-from torchcloth.episodes.cloth_facts import facts_of
+from torchcloth.episodes.cloth_facts import cloth_fingerprint_parts
 from torchcloth.episodes.observed_surface import sheet_of
 from torchcloth.episodes.world import Hypothesis
 from torchcloth.errors import InvalidInput, RecordingError
@@ -29,7 +29,7 @@ from torchcloth.meshes import rectangle
 from torchcloth.recordings import Collider, Markers
 from torchcloth.recordings.consistency import together
 
-RECORDING = sheets.episode()
+RECORDING = sheet_episodes.episode()
 
 
 EVERY = [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES]
@@ -71,7 +71,7 @@ def test_air_and_hem_do_what_their_names_say(made):
     assert float((last("env.gravity_tilt[x]", 0.2) - base)[free, 0].mean()) > 1e-5
     assert float((last("rest.shrink[weft]", 0.05) - base)[free, 2].mean()) > 1e-3
     torch.testing.assert_close(last("obs.extrinsic[x]", 0.004) - base, torch.tensor([0.004, 0.0, 0.0]).expand_as(base))
-    depth = lambda x: (x - torch.as_tensor(sheets.EYE)).norm(dim=-1)  # noqa: E731
+    depth = lambda x: (x - torch.as_tensor(sheet_episodes.EYE)).norm(dim=-1)  # noqa: E731
     torch.testing.assert_close(depth(last("obs.depth_scale", 0.015)), 1.015 * depth(base))
     torch.testing.assert_close(depth(last("obs.depth_bias", 5e-3)), depth(base) + 5e-3)
 
@@ -98,7 +98,7 @@ def test_whatever_was_accepted_all_others_still_apply(made, first):
     alone = model.world([(by[first], by[first].typical)])
     for h in by.values():
         both = model.world([(by[first], by[first].typical), (h, h.typical)])
-        changed = digest(facts_of(both.cloth)) != digest(facts_of(alone.cloth))
+        changed = digest(cloth_fingerprint_parts(both.cloth)) != digest(cloth_fingerprint_parts(alone.cloth))
         seen = (len(both.motions), len(both.views)) != (len(alone.motions), len(alone.views))
         assert changed or seen, h.name
 
@@ -351,7 +351,7 @@ def test_a_table_that_leans_or_stands_rubs_otherwise_along_an_axis_of_its_own(no
 
 def test_a_late_clock_sees_only_frames_that_were_simulated():
     """Of the last ones, which it would see beyond the motion's end, no points are used."""
-    recording = sheets.recorded("fast", lambda world: world, 4)
+    recording = sheet_episodes.recorded("fast", lambda world: world, 4)
     model = base_model(recording)
     (e,) = setting_of(model, [recording]).episodes
     used = torch.tensor([len(c) > 0 for c in e.clouds])
@@ -371,12 +371,12 @@ def test_a_late_clock_sees_only_frames_that_were_simulated():
 def test_a_seam_is_the_same_on_every_mesh(columns):
     """Where no line of vertices lies in the middle, too."""
     seam = next(h for h in fabric.HYPOTHESES if h.name == "mass.seam")
-    model = base_model(sheets.episode(resolution=(columns, 7)))
+    model = base_model(sheet_episodes.episode(resolution=(columns, 7)))
     for world in (model.world(), refined(model, [])[0].world()):
         mass = (seam.apply(world, 0.02).cloth.model().mass - world.cloth.model().mass)[:, 0].detach().numpy()
-        assert mass.sum() == pytest.approx(0.02 * sheets.SIDE, rel=1e-6)
-        assert mass @ world.cloth.mesh.uv[:, 0] / mass.sum() == pytest.approx(sheets.SIDE / 2, abs=1e-6)
-        assert np.abs(world.cloth.mesh.uv[mass > 1e-9, 0] - sheets.SIDE / 2).max() < 0.7 * sheets.SIDE / (columns - 1)
+        assert mass.sum() == pytest.approx(0.02 * sheet_episodes.SIDE, rel=1e-6)
+        assert mass @ world.cloth.mesh.uv[:, 0] / mass.sum() == pytest.approx(sheet_episodes.SIDE / 2, abs=1e-6)
+        assert np.abs(world.cloth.mesh.uv[mass > 1e-9, 0] - sheet_episodes.SIDE / 2).max() < 0.7 * sheet_episodes.SIDE / (columns - 1)
 
 
 def test_drag_beside_wind_says_what_it_counts_from(made):

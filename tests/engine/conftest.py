@@ -1,18 +1,13 @@
 """The fused engine needs a compiler, or to have been built."""
 
 import os
-import sys
-from pathlib import Path
 
 import pytest
 import torch
+from helpers import cuda_on_host
 
 from torchcloth.engine import execution
 from torchcloth.engine.library import library
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-import on_host
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -33,7 +28,7 @@ def _stand_ins(tmp_path_factory):
     own = tmp_path_factory.getbasetemp()
     shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "stand-ins"
     shared.mkdir(exist_ok=True)
-    on_host.SHARED[:] = [shared]
+    cuda_on_host.SHARED[:] = [shared]
 
 
 @pytest.fixture(params=[1, 3], ids=["alone", "team"])

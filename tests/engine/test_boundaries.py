@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from agreement import agree, noise
+from helpers.engine_agreement import agree, noise
 from torch import Tensor
 
 import torchcloth as tc
@@ -18,7 +18,7 @@ from torchcloth.boundaries import (
     Sphere,
     Stribeck,
 )
-from torchcloth.boundaries.motion import drive
+from torchcloth.boundaries.motion import sample_trajectory
 from torchcloth.dynamics import substep
 from torchcloth.effects import AddedMass, Gravity, GripSlip, LineMass
 from torchcloth.engine import fused
@@ -96,7 +96,7 @@ def moves(cloth: tc.Cloth, scenes: tuple[int, ...] = ()) -> dict[str, tc.Traject
 
 def watched(monkeypatch) -> dict[str, bool]:
     """Whether anything was seen to stick and to slip."""
-    seen, taken = {"sticks": False, "slips": False}, Coulomb.taken
+    seen, taken = {"sticks": False, "slips": False}, Coulomb.slip_reduction
 
     def watch(friction, slip, push):
         share = taken(friction, slip, push)
@@ -141,7 +141,7 @@ def test_contact_points_of_uneven_mass():
 
 def run(cloth, state, substeps=20):
     times = torch.linspace(0, 1e-4 * substeps, substeps + 1, dtype=torch.float64)
-    drives = {name: drive(trajectory, times) for name, trajectory in moves(cloth).items()}
+    drives = {name: sample_trajectory(trajectory, times) for name, trajectory in moves(cloth).items()}
     with torch.no_grad():
         return fused.rollout(cloth.model(), state, 1e-4, drives, substeps)[0]
 

@@ -4,7 +4,7 @@ import warnings
 
 import pytest
 import torch
-from clothes import close, opening, sheet, start
+from helpers.engine_cloths import close, opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.boundaries import AbstractBoundary

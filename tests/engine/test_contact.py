@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from agreement import agree, difference, held, noise, outcome
+from helpers.engine_agreement import agree, difference, held, noise, outcome
 
 import torchcloth as tc
 from torchcloth.dynamics import substep

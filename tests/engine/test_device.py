@@ -4,14 +4,14 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from unittest.mock import patch
 
-import on_host
 import pytest
 import torch
-from agreement import moving
-from clothes import opening, sheet, start
+from helpers import cuda_on_host
+from helpers.engine_agreement import moving
+from helpers.engine_cloths import opening, sheet, start
 
 import torchcloth as tc
-from torchcloth.boundaries.motion import drive
+from torchcloth.boundaries.motion import sample_trajectory
 from torchcloth.engine import devices, dispatch, execution, fields
 from torchcloth.engine.building import Unbuilt
 from torchcloth.engine.cuda import kernel_codegen, launch, program_ir, self_test
@@ -26,14 +26,14 @@ TIMES = [0.0, 0.01, 0.02]
 @contextmanager
 def elsewhere(**how):
     """Tensors of the CPU are a device's."""
-    with on_host.stand_in(**how), patch.object(devices, "elsewhere", lambda tensor: True):
+    with cuda_on_host.stand_in(**how), patch.object(devices, "elsewhere", lambda tensor: True):
         yield
 
 
 def job_of(cloth, scenes=(2,), substeps=12, state=None):
     state, dt = moving(cloth, scenes) if state is None else state, 1e-4
     times = torch.arange(substeps + 1, dtype=torch.float64) * dt
-    drives = {name: drive(t, times) for name, t in opening(float(times[-1])).items()}
+    drives = {name: sample_trajectory(t, times) for name, t in opening(float(times[-1])).items()}
     with patch.object(devices, "elsewhere", lambda tensor: True):
         fused = Fused(cloth.model(), state, drives)
     job = fused.job(state, torch.full((substeps,), dt), drives)
@@ -55,7 +55,7 @@ def test_order_of_threads_between_waits_does_not_matter(meets):
     cloth = sheet(contact=tc.Contact(), n=17) if meets else sheet()
     job, found = job_of(cloth, state=folded(cloth) if meets else None), []
     for reverse in (False, True):
-        with on_host.stand_in(4, reverse):
+        with cuda_on_host.stand_in(4, reverse):
             found.append((launch.forward(job)[0], adjoints(job)))
             assert bool(launch.forward(job)[1][:, :-1].any()) == meets, "layers that meet"
     for one, other in zip(*found, strict=True):
@@ -64,7 +64,7 @@ def test_order_of_threads_between_waits_does_not_matter(meets):
 
 def test_adjoints_do_not_depend_on_how_many_substeps_are_kept():
     job = job_of(sheet())
-    with on_host.stand_in():
+    with cuda_on_host.stand_in():
         usual = adjoints(job)
         with patch.object(launch, "MOST", 5):
             other = adjoints(job)

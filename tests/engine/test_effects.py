@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from agreement import GRADIENTS, agree, difference, held, layer_transposes, moving, noise, outcome
+from helpers.engine_agreement import GRADIENTS, agree, difference, held, layer_transposes, moving, noise, outcome
 
 import torchcloth as tc
 from torchcloth.dynamics import substep

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from clothes import opening, sheet, start
+from helpers.engine_cloths import opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.engine import execution

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from agreement import agree, moving, noise
+from helpers.engine_agreement import agree, moving, noise
 
 import torchcloth as tc
 from torchcloth.engine.lowering import Unfused, lower

@@ -3,7 +3,7 @@
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from clothes import close, opening, sheet, start
+from helpers.engine_cloths import close, opening, sheet, start
 from torch.func import functional_call, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 import torchcloth as tc

@@ -3,7 +3,7 @@
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from clothes import close, opening, sheet, start
+from helpers.engine_cloths import close, opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.effects import AbstractEffect, Amplitude
@@ -42,10 +42,10 @@ class Blow(Pull):
 class Fading(Pull):
     """With a memory."""
 
-    def start(self, x):
+    def initial_memory(self, x):
         return torch.zeros_like(x)
 
-    def evolve(self, c, now):
+    def update_memory(self, c, now):
         return now.memory + now.dt * (now.v - 10 * now.memory)
 
     def force(self, c, now):
@@ -71,7 +71,7 @@ class Slippery(Pull):
 
     grasp = "left"
 
-    def loosen(self, c, index, free, held, mass, dt, resistance):
+    def grip_velocities(self, c, index, free, held, mass, dt, resistance):
         return held + c * (free - held)
 
 

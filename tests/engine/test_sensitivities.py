@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from clothes import close, opening, sheet, start
+from helpers.engine_cloths import close, opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.engine import tangents

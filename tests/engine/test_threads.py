@@ -7,8 +7,8 @@ import sys
 
 import pytest
 import torch
-from agreement import agree, held, moving
-from clothes import opening, sheet, start
+from helpers.engine_agreement import agree, held, moving
+from helpers.engine_cloths import opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.engine import execution

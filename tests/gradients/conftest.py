@@ -1,15 +1,11 @@
 """Small sheets in smooth motion: no vertex changes side of a switch within the reach of the sweeps."""
 
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 
 import torchcloth as tc
-
-sys.path.insert(0, str(Path(__file__).parent))  # helpers beside the tests
 
 
 def turning(start, duration, speed=1.5, rate=3.0):

@@ -5,9 +5,9 @@ from contextlib import nullcontext
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from gradient_scenes import parameters, simulate
+from helpers.gradient_scenes import parameters, simulate
 
-from torchcloth._utils.forward_mode import real_tangents
+from torchcloth._utils.forward_mode import dense_tangents
 from torchcloth.testing.contract import batched, close, single
 
 
@@ -47,7 +47,7 @@ def test_forward_mode_equals_reverse_mode(scene):
     gradients = dict(zip(leaves, torch.autograd.grad((weight * out).sum(), list(leaves.values())), strict=True))
     for name, value in inputs.items():
         along = torch.randn_like(value)
-        with torch.no_grad(), forward_ad.dual_level(), real_tangents():
+        with torch.no_grad(), forward_ad.dual_level(), dense_tangents():
             dual = forward_ad.make_dual(value, along)
             tangent = forward_ad.unpack_dual(evaluate(scene, {**inputs, name: dual}, checkpoint=False)).tangent
         reverse, forward = (gradients[name] * along).sum(), (weight * tangent).sum()
@@ -63,7 +63,7 @@ def test_real_tangents_change_nothing(scene):
             duals = dict(inputs)
             for name in parameters(scene.cloth):
                 duals[name] = forward_ad.make_dual(inputs[name], torch.ones_like(inputs[name]))
-            with real_tangents() if inside else nullcontext():
+            with dense_tangents() if inside else nullcontext():
                 dual = evaluate(scene, duals, checkpoint=False)
             values.append(forward_ad.unpack_dual(dual))
     close(values[1].primal, values[0].primal, 1e-13, "values")

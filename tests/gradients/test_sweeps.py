@@ -5,7 +5,7 @@ The mark is the project's; sweeps reach 1e-8 to 1e-10 here, where truncation (h^
 
 import pytest
 import torch
-from gradient_scenes import STEPS, parameters, simulate, sizes
+from helpers.gradient_scenes import STEPS, parameters, simulate, sizes
 
 import torchcloth as tc
 from torchcloth.testing import check_gradients

@@ -1,13 +1,8 @@
 """One twin episode, and one fit of it, for all tests of this folder."""
 
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))  # helpers beside the tests
-
-import twins
+from helpers import twins
 
 from torchcloth.identification import identify
 

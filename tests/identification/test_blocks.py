@@ -4,15 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import stretches
 import torch
-import twins
+from helpers import stretched_sheets, twins
 
 from torchcloth import recordings as rec
 from torchcloth.episodes import streams
 from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import episode, identify
+from torchcloth.identification import build_episode, identify
 from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.nuisances import chosen
 from torchcloth.identification.residuals.blocks import blocks_for
@@ -23,34 +22,34 @@ GRASP = {"grasp": 1e-3}
 @pytest.fixture(scope="module")
 def pulled():
     with twins.doubles():
-        return stretches.record(markers=5)
+        return stretched_sheets.record(markers=5)
 
 
 @pytest.fixture
 def model(pulled):
-    return stretches.model(pulled, youngs_modulus=7e4, poisson_ratio=0.3)
+    return stretched_sheets.model(pulled, youngs_modulus=7e4, poisson_ratio=0.3)
 
 
 def test_streams_share_one_list_of_times(pulled, model):
     """Markers seen between the clouds: frames without a cloud, clouds without markers."""
     late = replace(pulled, markers=replace(pulled.markers, t=pulled.markers.t + 0.02))
-    seen = episode(model, late)
+    seen = build_episode(model, late)
     assert len(seen.times) == 2 * len(pulled.points)
     assert [len(c) > 0 for c in seen.clouds[:4]] == [True, False, True, False]
     assert bool(seen.markers[0].isnan().all())
     np.testing.assert_array_equal(seen.markers[1].numpy(), pulled.markers.xyz[0])
-    assert seen.clouds[0].shape == seen.positions(0).shape
+    assert seen.clouds[0].shape == seen.observed_points(0).shape
 
 
 def test_markers_lie_on_their_material_points(pulled, model):
-    seen = episode(model, pulled)
+    seen = build_episode(model, pulled)
     flat = torch.nn.functional.pad(torch.as_tensor(model.mesh.uv), (0, 1))
-    np.testing.assert_allclose(seen.places.on(flat)[:, :2].numpy(), pulled.markers.uv, atol=1e-12)
+    np.testing.assert_allclose(seen.marker_places.on(flat)[:, :2].numpy(), pulled.markers.uv, atol=1e-12)
     uv = pulled.markers.uv.copy()
     uv[3] = [-0.1, 0.1]
     off = replace(pulled, markers=replace(pulled.markers, uv=uv))
     with pytest.raises(InvalidInput, match=r"markers.uv\[3\]; got 0.1"):
-        episode(model, off)
+        build_episode(model, off)
 
 
 def test_markers_without_uv_are_points(pulled, model):
@@ -58,7 +57,7 @@ def test_markers_without_uv_are_points(pulled, model):
     plain = replace(pulled, markers=replace(pulled.markers, uv=None))
     known = np.isfinite(pulled.markers.xyz[1]).all(-1)
     for recording, count in ((replace(plain, points=None), known.sum()), (plain, pulled.points.counts[1])):
-        seen = episode(model, recording)
+        seen = build_episode(model, recording)
         assert seen.markers is None
         assert len(seen.clouds[1]) == count
 
@@ -81,7 +80,7 @@ def test_the_distance_is_from_what_is_in_use(pulled, model, use):
     }
     unknowns = collect(model, ["youngs_modulus"], None)
     asked = {
-        kind: Objective(model, unknowns, [episode(model, recording)], blocks=blocks_for(use))
+        kind: Objective(model, unknowns, [build_episode(model, recording)], blocks=blocks_for(use))
         for kind, recording in {"as it is": pulled, **off}.items()
     }
     found = {kind: objective.distance(objective.start) for kind, objective in asked.items()}
@@ -92,7 +91,7 @@ def test_the_distance_is_from_what_is_in_use(pulled, model, use):
 def test_neither_points_nor_markers_nor_forces_is_refused(pulled, model):
     mute = {name: replace(motion, force=None, torque=None) for name, motion in pulled.grippers.items()}
     with pytest.raises(RecordingError, match="has no points"):
-        episode(model, replace(pulled, points=None, markers=None, grippers=mute))
+        build_episode(model, replace(pulled, points=None, markers=None, grippers=mute))
 
 
 def test_means_of_a_signal_between_frames():
@@ -116,15 +115,15 @@ def test_a_lost_reading_takes_its_interval_and_no_other():
 
 def test_forces_are_those_of_the_rollout(pulled, model):
     """At the truth, on the truth's mesh: what is left is the sensor's noise, averaged over some three knots."""
-    exact = stretches.cloth(stretches.Fabric(), stretches.TRUTH)
-    seen = episode(model, pulled)
-    start = torch.as_tensor(stretches.flat(exact.mesh))
+    exact = stretched_sheets.cloth(stretched_sheets.Fabric(), stretched_sheets.TRUTH)
+    seen = build_episode(model, pulled)
+    start = torch.as_tensor(stretched_sheets.flat(exact.mesh))
     with torch.no_grad():
         state = exact.settle(exact.state(start), seen.motion, duration=0.6)
         out = exact(state, seen.motion, seen.times)
     for name in ("left", "right"):
         error = (out.wrench[name] - seen.wrenches[name])[1:, :3]
-        noise = stretches.FORCE_NOISE / 3**0.5
+        noise = stretched_sheets.FORCE_NOISE / 3**0.5
         assert float(error.square().mean(0).sqrt().max()) < 2 * noise
         assert float(error.mean(0).abs().max()) < 4 * noise / len(error) ** 0.5
         assert float(seen.wrenches[name][1:, 0].abs().max()) > 0.4  # N: the noise is small beside it
@@ -132,7 +131,7 @@ def test_forces_are_those_of_the_rollout(pulled, model):
 
 
 def test_each_kind_has_a_scale_of_its_own(pulled, model):
-    problem = Objective(model, collect(model, ["youngs_modulus"], None), [episode(model, pulled)])
+    problem = Objective(model, collect(model, ["youngs_modulus"], None), [build_episode(model, pulled)])
     linear = problem.linearise(problem.start)
     assert [b.name for b in problem.blocks] == ["points", "edges", "markers", "force", "torque"]
     assert sorted(set(linear.block.tolist())) == [0, 1, 2, 3]

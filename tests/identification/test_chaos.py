@@ -6,11 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-import toys
-import twins
+from helpers import least_squares, twins
 
 from torchcloth import recordings, synthesis
-from torchcloth.episodes.observed import cloth_from, episode
+from torchcloth.episodes.observed import build_cloth, build_episode
 from torchcloth.episodes.replay import Frames
 from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import SimulationDiverged
@@ -42,7 +41,7 @@ def swung(tmp_path_factory):
 
 def test_a_light_sheet_that_buckles_is_identified_from_what_can_be_predicted(swung, tmp_path):
     """Started half as stiff again: stiffness and drag to a few per cent, with errors that hold the truth; resumable."""
-    model, options = cloth_from(swung), {"iterations": 5, "journal": tmp_path / "journal"}
+    model, options = build_cloth(swung), {"iterations": 5, "journal": tmp_path / "journal"}
     fit = identify(model, swung, list(TRUE), **options)  # few iterations: tangents of the whole lead nowhere
     for name, truth in TRUE.items():
         found = fit.parameters[name]
@@ -60,8 +59,8 @@ def test_a_light_sheet_that_buckles_is_identified_from_what_can_be_predicted(swu
 
 
 def test_tangents_of_a_light_sheet_run_away_and_those_of_its_beginning_do_not(swung):
-    model = cloth_from(swung)
-    whole = Objective(model, collect(model, list(TRUE), None), [episode(model, swung)], nuisances=chosen([], ["rim"]))
+    model = build_cloth(swung)
+    whole = Objective(model, collect(model, list(TRUE), None), [build_episode(model, swung)], nuisances=chosen([], ["rim"]))
     for objective, away in ((whole, True), (whole.part(0.3), False)):
         linear = objective.linearise(objective.start)
         assert (
@@ -85,14 +84,14 @@ class Rippling:
 
     def __init__(self, seed: int, blind: bool = False) -> None:
         generator = torch.Generator().manual_seed(seed)
-        self.slopes = toys.sensitivities(generator)
+        self.slopes = least_squares.sensitivities(generator)
         if blind:
             self.slopes[:, 2] = 0.0  # nothing tells the third
-        self.frame, self.patch = toys.layout()
+        self.frame, self.patch = least_squares.layout()
         rows, windows = len(self.frame), int(self.frame.max()) + 1
-        self.waves = 400 * torch.randn(windows, toys.PATCHES, 3, generator=generator, dtype=torch.float64)
-        self.phase = 6 * torch.rand(windows, toys.PATCHES, generator=generator, dtype=torch.float64)
-        self.data = self._shown(toys.TRUE) + toys.SIGMA * torch.randn(rows, generator=generator, dtype=torch.float64)
+        self.waves = 400 * torch.randn(windows, least_squares.PATCHES, 3, generator=generator, dtype=torch.float64)
+        self.phase = 6 * torch.rand(windows, least_squares.PATCHES, generator=generator, dtype=torch.float64)
+        self.data = self._shown(least_squares.TRUE) + least_squares.SIGMA * torch.randn(rows, generator=generator, dtype=torch.float64)
         self.unknowns, self.start, self.simulations = [0, 1, 2], torch.zeros(3, dtype=torch.float64), 0
         self.prior_std = torch.full((3,), 5.0, dtype=torch.float64)
 
@@ -104,7 +103,7 @@ class Rippling:
     def problem(self):
         one = torch.ones(3, dtype=torch.float64)
         return levenberg_marquardt.Problem(
-            None, None, self.clip, 0 * one, self.prior_std, one, torch.tensor([toys.SIGMA])
+            None, None, self.clip, 0 * one, self.prior_std, one, torch.tensor([least_squares.SIGMA])
         )
 
     def clip(self, raw):
@@ -132,7 +131,7 @@ def test_simulations_around_a_point_see_through_ripples():
     for seed in range(20):
         found = statistical_linearisation.resolved(Rippling(seed), FAILED, None, 8, lambda raw: None)
         deviation = found.covariance.diagonal().sqrt()
-        z.append((found.final.raw - toys.TRUE) / deviation)
+        z.append((found.final.raw - least_squares.TRUE) / deviation)
         stds.append(deviation)
         assert found.final.converged
     z = torch.stack(z)

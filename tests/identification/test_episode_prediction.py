@@ -7,14 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import twins
+from helpers import twins
 
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.episodes.replay import Frames, simulate, tangents
 from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import InvalidInput, RecordingError, UnstableStep
-from torchcloth.identification import cloth_from, episode, episode_prediction, predict_episode
+from torchcloth.identification import build_cloth, build_episode, episode_prediction, predict_episode
 from torchcloth.identification.episode_prediction import _held_to_steps, with_errors
 from torchcloth.identification.prediction_report import print_predicted
 
@@ -45,7 +45,7 @@ def test_the_error_is_that_of_finite_steps(found, pair, other):
     unknowns = collect(cloth, list(pair.correlation), None)
     raw = torch.tensor([u.start for u in unknowns])
     std = torch.tensor([pair.parameters[u.name].std / u.slope(u.start) for u in unknowns])
-    data = episode(cloth, other)
+    data = build_episode(cloth, other)
     with torch.no_grad():
         centre = simulate(cloth, unknowns, raw, data).x
         steps = 0.1 * torch.diag(std)
@@ -133,8 +133,8 @@ def test_tangents_of_an_unstable_motion_are_held_to_steps():
     said = {"air_density": 1.2, "provenance": "synthetic: test"}
     swing = rec.Recording(cloth=info, grasps=grasps, grippers=hands, points=clouds, **said)
     with twins.doubles():
-        cloth = cloth_from(swing)
-        data, unknowns = episode(cloth, swing), collect(cloth, ["youngs_modulus", "air.normal"], None)
+        cloth = build_cloth(swing)
+        data, unknowns = build_episode(cloth, swing), collect(cloth, ["youngs_modulus", "air.normal"], None)
         raw, covariance = torch.tensor([u.start for u in unknowns]), torch.diag(torch.tensor([0.02, 0.03]) ** 2)
         both = tangents(cloth, unknowns, raw, data)
         moved, lost, untried = _held_to_steps(cloth, unknowns, raw, data, None, both, covariance)

@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import twins
-from twins import at, shifted
+from helpers import twins
+from helpers.twins import at, shifted
 
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.episodes import streams
-from torchcloth.episodes.observed import eye_of, first_shape, mesh_of
+from torchcloth.episodes.observed import find_depth_camera, compute_initial_vertices, build_mesh
 from torchcloth.episodes.unknowns import available, collect
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import cloth_from, episode, identify
+from torchcloth.identification import build_cloth, build_episode, identify
 from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.uncertainty.richardson import finer_cloth, finer_recording
 
@@ -28,28 +28,28 @@ def with_cloth(recording, **changes):
 
 
 def test_an_episode_holds_what_was_recorded(recording, model):
-    seen = episode(model, recording)
+    seen = build_episode(model, recording)
     assert set(seen.motion) == {"left", "right"}
     assert [len(cloud) for cloud in seen.clouds] == recording.points.counts.tolist()
     np.testing.assert_array_equal(torch.cat(seen.clouds).numpy(), recording.points.xyz)
     np.testing.assert_array_equal(seen.initial.numpy(), recording.cloth.initial_vertices)
-    assert seen.settles
-    assert seen.noise == recording.observation_noise_std
+    assert seen.needs_settling
+    assert seen.noise_std == recording.observation_noise_std
     assert seen.clouds[0].dtype == seen.initial.dtype == torch.float64
 
 
 def test_a_cloud_takes_the_cloths_dtype(recording):
     torch.set_default_dtype(torch.float32)
-    seen = episode(cloth_from(recording), recording)
+    seen = build_episode(build_cloth(recording), recording)
     assert seen.clouds[0].dtype == seen.initial.dtype == seen.motion["left"].pose.dtype == torch.float32
     assert seen.times.dtype == torch.float64  # seconds since an epoch do not fit into float32
 
 
 def test_without_initial_vertices_the_mesh_is_the_first_frame(recording):
     placed = with_cloth(recording, vertices=recording.cloth.initial_vertices, initial_vertices=None)
-    model = cloth_from(placed)
-    seen = episode(model, placed)
-    assert not seen.settles
+    model = build_cloth(placed)
+    seen = build_episode(model, placed)
+    assert not seen.needs_settling
     np.testing.assert_array_equal(seen.initial.numpy(), model.mesh.vertices)
 
 
@@ -60,7 +60,7 @@ def test_patches_end_where_they_are_said_to_and_the_first_shape_is_carried_there
     given = with_cloth(recording, initial_vertices=bent(recording.cloth.uv))
     for radius in (0.036, 0.045):
         held = replace(given, grasps={**given.grasps, "left": rec.GraspInfo(corner, radius)})
-        cloth = cloth_from(held)
+        cloth = build_cloth(held)
         fine = finer_cloth(cloth)
         for model, episode_ in ((cloth, held), (fine, finer_recording(held, cloth.mesh, fine.mesh))):
             uv = model.mesh.uv
@@ -68,7 +68,7 @@ def test_patches_end_where_they_are_said_to_and_the_first_shape_is_carried_there
             assert mine[mine[:, 1] == 0, 0].max() == pytest.approx(radius, rel=1e-9)
             assert mine[mine[:, 0] == 0, 1].max() == pytest.approx(radius, rel=1e-9)
             assert model.mesh.area.sum() == pytest.approx(twins.SIDE**2)
-            reached = first_shape("", model, episode_).numpy()
+            reached = compute_initial_vertices("", model, episode_).numpy()
             np.testing.assert_allclose(reached[:, :2], uv, atol=1e-9)
             if model is cloth:  # of the finer mesh, vertices lie on the coarse one's chords
                 np.testing.assert_allclose(reached, bent(uv), atol=1e-9)
@@ -77,7 +77,7 @@ def test_patches_end_where_they_are_said_to_and_the_first_shape_is_carried_there
 def test_a_cloth_far_from_its_grippers_is_refused(recording, model):
     """Without initial vertices the flat rest mesh lies at the origin, a metre below the hands."""
     with pytest.raises(InvalidInput, match=r"grasp 'left'; got the held patch 1\.\d+ m .*initial_vertices in world"):
-        episode(model, with_cloth(recording, initial_vertices=None))
+        build_episode(model, with_cloth(recording, initial_vertices=None))
 
 
 def test_parameters_of_contact_need_contact(recording, model):
@@ -88,36 +88,36 @@ def test_parameters_of_contact_need_contact(recording, model):
 @pytest.mark.parametrize("key", ["youngs_modulus", "poisson_ratio", "bending_stiffness"])
 def test_a_nominal_value_that_is_no_number_is_refused(recording, key):
     with pytest.raises(RecordingError, match=f"nominal.{key}; got 'soft'"):
-        cloth_from(with_cloth(recording, nominal={key: "soft"}))
+        build_cloth(with_cloth(recording, nominal={key: "soft"}))
 
 
 def test_initial_vertices_of_another_mesh_are_refused(recording, model):
     bad = with_cloth(recording, initial_vertices=recording.cloth.initial_vertices[:-3])
     with pytest.raises(InvalidInput, match=r"initial_vertices; got 46 rows; expected 49"):
-        episode(model, bad)
+        build_episode(model, bad)
 
 
 def test_a_grasp_without_motion_is_refused(recording, model):
     bad = replace(recording, grippers={"left": recording.grippers["left"]})
     with pytest.raises(RecordingError, match=r"no motion for grasp 'right'; got motion of \['left'\]"):
-        episode(model, bad)
+        build_episode(model, bad)
 
 
 def test_motion_that_no_grasp_needs_is_left_aside(recording, model):
     more = replace(recording, grippers={**recording.grippers, "third": recording.grippers["left"]})
-    assert set(episode(model, more).motion) == {"left", "right"}
+    assert set(build_episode(model, more).motion) == {"left", "right"}
 
 
 def test_an_episode_without_points_is_refused(recording, model):
     with pytest.raises(RecordingError, match="has no points, which a fit needs"):
-        episode(model, replace(recording, points=None))
+        build_episode(model, replace(recording, points=None))
 
 
 def test_a_single_frame_is_refused(recording, model):
     p = recording.points
     one = rec.PointClouds(p.t[:1], p.xyz[: p.counts[0]], p.counts[:1])
     with pytest.raises(RecordingError, match=r"1 frame.*at least two"):
-        episode(model, replace(recording, points=one))
+        build_episode(model, replace(recording, points=one))
 
 
 @pytest.mark.parametrize("offset", [12.5, -0.3])
@@ -125,7 +125,7 @@ def test_the_clock_offset_is_added_to_the_observations(recording, model, offset)
     """t_motion = t_observation + clock_offset, as the format says; the wrong sign would be off by twice it."""
     moved = shifted(recording, offset)
     np.testing.assert_allclose(moved.points.t, recording.points.t - offset)
-    seen = episode(model, moved)
+    seen = build_episode(model, moved)
     np.testing.assert_allclose(seen.times.numpy(), recording.points.t, atol=1e-9)
     assert len(seen.clouds) == len(recording.points)
 
@@ -133,22 +133,22 @@ def test_the_clock_offset_is_added_to_the_observations(recording, model, offset)
 def test_a_clock_that_is_off_is_refused_with_the_remedy(recording, model):
     for offset in (-0.1, 5.0):
         with pytest.raises(RecordingError, match=r"covers the first frame; check clock_offset"):
-            episode(model, replace(recording, clock_offset=offset))
+            build_episode(model, replace(recording, clock_offset=offset))
 
 
 def test_frames_after_the_motion_are_left_out(recording, model):
     late = replace(recording, clock_offset=0.12)  # two and a half frames beyond 0.72 s
-    seen = episode(model, late)
+    seen = build_episode(model, late)
     assert len(seen.times) == len(seen.clouds) == twins.FRAMES - 2
     assert float(seen.times[-1]) <= 0.72
-    (doubt,) = seen.doubts()
+    (doubt,) = seen.data_warnings()
     assert f"2 of {twins.FRAMES} frames come after the motion's end" in doubt
-    assert episode(model, recording).doubts() == []
+    assert build_episode(model, recording).data_warnings() == []
 
 
 def test_an_episode_in_which_nothing_is_held_says_so(recording, model):
     open_ = {name: replace(g, closed=np.zeros_like(g.closed)) for name, g in recording.grippers.items()}
-    (doubt,) = episode(model, replace(recording, grippers=open_)).doubts()
+    (doubt,) = build_episode(model, replace(recording, grippers=open_)).data_warnings()
     assert "no gripper is ever closed" in doubt
 
 
@@ -156,32 +156,32 @@ def test_a_cloud_beside_the_cloth_says_so(recording, model):
     """Of half of the cloth, that is not missed; of a camera that is said to stand elsewhere, it is told where."""
     points = recording.points
     shifted = replace(recording, points=replace(points, xyz=points.xyz + np.array([0.3, 0.0, 0.0])))
-    (doubt,) = episode(model, shifted).doubts()
+    (doubt,) = build_episode(model, shifted).data_warnings()
     assert re.search(r"lies \(\+(29|30|31)\d, [+-]\d+, [+-]\d+\) mm from the cloth: check T_world_camera", doubt)
-    x = episode(model, recording).initial
-    half = replace(episode(model, recording), clouds=[x[x[:, 0] > x[:, 0].median()]])
-    assert half.doubts() == []
+    x = build_episode(model, recording).initial
+    half = replace(build_episode(model, recording), clouds=[x[x[:, 0] > x[:, 0].median()]])
+    assert half.data_warnings() == []
 
 
 def test_a_gripper_without_a_grasp_says_so(recording, model):
     hand = next(iter(recording.grippers.values()))
-    (doubt,) = episode(model, replace(recording, grippers={**recording.grippers, "third": hand})).doubts()
+    (doubt,) = build_episode(model, replace(recording, grippers={**recording.grippers, "third": hand})).data_warnings()
     assert "no grasp is called third" in doubt
     away = replace(hand, closed=np.zeros_like(hand.closed))
-    assert episode(model, replace(recording, grippers={**recording.grippers, "third": away})).doubts() == []
+    assert build_episode(model, replace(recording, grippers={**recording.grippers, "third": away})).data_warnings() == []
 
 
 def test_until_keeps_the_early_frames(recording, model):
-    seen = episode(model, recording)
-    assert len(seen.until(0.5).clouds) == len(seen.until(0.5).times) == round(0.5 * twins.FRAMES)
-    assert len(seen.until(0.0).clouds) == 4  # fewer would not be a motion
+    seen = build_episode(model, recording)
+    assert len(seen.first_fraction(0.5).clouds) == len(seen.first_fraction(0.5).times) == round(0.5 * twins.FRAMES)
+    assert len(seen.first_fraction(0.0).clouds) == 4  # fewer would not be a motion
 
 
-# -- cloth_from() ----------------------------------------------------------------------------------------------------
+# -- build_cloth() ----------------------------------------------------------------------------------------------------
 
 
 def test_the_cloth_starts_at_the_data_sheet(recording):
-    cloth = cloth_from(recording)
+    cloth = build_cloth(recording)
     assert cloth.material.youngs_modulus.value.item() == pytest.approx(8e4)
     assert cloth.material.poisson_ratio.value.item() == pytest.approx(0.15)
     assert cloth.effects["bending"].stiffness.value.item() == pytest.approx(3e-5)
@@ -194,7 +194,7 @@ def test_the_cloth_starts_at_the_data_sheet(recording):
 
 def test_without_a_data_sheet_and_air_the_base_model_is_bare(recording):
     bare = replace(with_cloth(recording, nominal={}), air_density=None)
-    cloth = cloth_from(bare)
+    cloth = build_cloth(bare)
     assert set(cloth.effects) == {"gravity"}
     assert cloth.material.youngs_modulus.value.item() * cloth.material.thickness == pytest.approx(300.0)  # N/m
 
@@ -202,16 +202,16 @@ def test_without_a_data_sheet_and_air_the_base_model_is_bare(recording):
 def test_a_sheet_needs_no_mesh_and_something_is_needed(recording):
     nothing = with_cloth(recording, vertices=None, faces=None, uv=None, initial_vertices=None)
     with pytest.raises(RecordingError, match="neither mesh nor sheet"):
-        mesh_of(nothing)
+        build_mesh(nothing)
     sheet = with_cloth(nothing, sheet=(0.3, 0.2))
-    np.testing.assert_allclose(np.ptp(mesh_of(sheet).vertices, axis=0)[:2], [0.3, 0.2])
+    np.testing.assert_allclose(np.ptp(build_mesh(sheet).vertices, axis=0)[:2], [0.3, 0.2])
 
 
 def test_of_several_cameras_the_one_with_depth_sees_how_far_things_are(recording):
     """A Kinect is two: colour has no say in depth."""
     camera = rec.Camera(width=640, height=480, K=np.eye(3), T_world_camera=np.eye(4))
     deep = replace(camera, depth_scale=1e-3)
-    seen = lambda **cameras: eye_of(replace(recording, cameras=cameras))  # noqa: E731
+    seen = lambda **cameras: find_depth_camera(replace(recording, cameras=cameras))  # noqa: E731
     assert seen(depth=deep, color=camera) is deep
     assert seen(only=camera) is camera
     assert seen(one=camera, two=camera) is None
@@ -219,19 +219,19 @@ def test_of_several_cameras_the_one_with_depth_sees_how_far_things_are(recording
 
 
 def test_a_gripper_that_comes_for_the_cloth_later_may_be_far_away(recording):
-    model = cloth_from(recording)
+    model = build_cloth(recording)
     away = {
         name: replace(g, position=g.position + np.array([0.0, 0.0, 0.5]), closed=np.arange(len(g.t)) > 2)
         for name, g in recording.grippers.items()
     }
-    episode(model, replace(recording, grippers=away))
+    build_episode(model, replace(recording, grippers=away))
     with pytest.raises(InvalidInput, match=r"the held patch 0\.5\d m from its gripper"):
-        episode(model, replace(recording, grippers={n: replace(g, closed=g.closed | True) for n, g in away.items()}))
+        build_episode(model, replace(recording, grippers={n: replace(g, closed=g.closed | True) for n, g in away.items()}))
 
 
 def test_a_collider_becomes_a_plane(recording):
     table = rec.Collider(np.array([0.0, 0.0, 0.2]), np.array([0.0, 0.0, 1.0]), 0.3)
-    assert set(cloth_from(replace(recording, colliders={"table": table})).boundaries) == {"table", "left", "right"}
+    assert set(build_cloth(replace(recording, colliders={"table": table})).boundaries) == {"table", "left", "right"}
 
 
 # -- unknowns --------------------------------------------------------------------------------------------------------
@@ -265,7 +265,7 @@ def test_slopes_are_those_of_the_values(model):
 
 
 def test_values_and_raw_are_inverse(model, recording):
-    problem = Objective(model, collect(model, ["youngs_modulus", "poisson_ratio"], None), [episode(model, recording)])
+    problem = Objective(model, collect(model, ["youngs_modulus", "poisson_ratio"], None), [build_episode(model, recording)])
     values = {"youngs_modulus": 3.3e4, "poisson_ratio": 0.31}
     assert problem.values(problem.raw(values)) == pytest.approx(values)
 
@@ -309,9 +309,9 @@ def test_episodes_of_another_cloth_or_grasp_are_refused(model, recording):
 def test_a_first_shape_of_another_mesh_is_refused(recording, model):
     elsewhere = with_cloth(recording, uv=0.001 + recording.cloth.uv, faces=recording.cloth.faces[:, ::-1][5:])
     with pytest.raises(InvalidInput, match="those of a mesh with other triangles"):
-        episode(model, elsewhere)
+        build_episode(model, elsewhere)
     turned = with_cloth(recording, faces=recording.cloth.faces[:, ::-1])  # the same triangles
-    assert torch.equal(episode(model, turned).initial, episode(model, recording).initial)
+    assert torch.equal(build_episode(model, turned).initial, build_episode(model, recording).initial)
 
 
 def test_no_recordings_are_refused(model):
@@ -347,23 +347,23 @@ def test_force_readings_after_the_last_cloud_are_told():
     t = whole.grippers["left"].t
     hands = {name: replace(m, force=np.zeros((len(t), 3))) for name, m in whole.grippers.items()}
     short = replace(twins.first(whole, 4), grippers=hands)
-    data = episode(twins.at(short), short)
-    assert data.unused > 10
-    assert any("force readings come after the last frame that was seen" in doubt for doubt in data.doubts())
-    assert episode(twins.at(whole), replace(whole, grippers=hands)).unused == 0
+    data = build_episode(twins.at(short), short)
+    assert data.readings_after_last_frame > 10
+    assert any("force readings come after the last frame that was seen" in doubt for doubt in data.data_warnings())
+    assert build_episode(twins.at(whole), replace(whole, grippers=hands)).readings_after_last_frame == 0
 
 
 def test_the_frame_of_a_time_is_the_nearest_one_that_is_the_same():
     frames = np.array([0.0, 0.1, 0.25, 0.4])
     times = np.array([0.4, 0.1 + 1e-9, -1.0, 0.0, 0.17, 9.0, 0.25 - 1e-9])
-    assert streams.places(times, frames).tolist() == [3, 1, -1, 0, -1, -1, 2]
-    assert streams.places(times[:2], frames[3:]).tolist() == [0, -1]
+    assert streams.match_frames(times, frames).tolist() == [3, 1, -1, 0, -1, -1, 2]
+    assert streams.match_frames(times[:2], frames[3:]).tolist() == [0, -1]
     many = np.arange(200_000) / 30  # two hours: a table of all pairs would have 320 GB
-    assert np.array_equal(streams.places(many, many), np.arange(200_000))
+    assert np.array_equal(streams.match_frames(many, many), np.arange(200_000))
 
 
 def test_an_arm_that_stands_by_need_not_be_known(recording, model):
     beside = replace(recording, joints={"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))})
-    seen, alone = (episode(model, r) for r in (beside, recording))
+    seen, alone = (build_episode(model, r) for r in (beside, recording))
     assert set(seen.motion) == {"left", "right"}
     assert torch.equal(seen.motion["left"].pose, alone.motion["left"].pose)

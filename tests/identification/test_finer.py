@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import twins
+from helpers import twins
 
 import torchcloth as tc
 from torchcloth.boundaries import Grasp

@@ -7,14 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import stretches
 import torch
-import twins
+from helpers import stretched_sheets, twins
 
 from torchcloth.episodes import streams
 from torchcloth.episodes.replay import Frames
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import cloth_from, draw, episode, identify, print_fit, replayed
+from torchcloth.identification import build_cloth, draw, build_episode, identify, print_fit, replayed
 from torchcloth.identification.residuals.rigid_carry import CARRIED, STAYS, UNFELT, no_better_than
 
 STIFFNESS = ["youngs_modulus"]
@@ -23,13 +22,13 @@ STIFFNESS = ["youngs_modulus"]
 @pytest.fixture(scope="module")
 def felt():
     with twins.doubles():
-        return replace(stretches.record(seed=5, setting=stretches.Setting(frames=9, strain=0.08)), points=None)
+        return replace(stretched_sheets.record(seed=5, setting=stretched_sheets.Setting(frames=9, strain=0.08)), points=None)
 
 
 @pytest.fixture(scope="module")
 def fit(felt):
     with twins.doubles():
-        return identify(cloth_from(felt), felt, STIFFNESS, guess={"youngs_modulus": 1e5})
+        return identify(build_cloth(felt), felt, STIFFNESS, guess={"youngs_modulus": 1e5})
 
 
 def test_forces_alone_tell_stiffness(fit):
@@ -45,19 +44,19 @@ def test_forces_are_compared_with_their_own_nulls(fit, felt):
     assert f["points"] == 0
     # two grippers, three axes of 0.02 N each; a frame's mean is over one or two readings
     assert 0.015 < f["force_rms_after"] < 0.04
-    measured = torch.cat([w[1:, :3] for w in episode(cloth_from(felt), felt).wrenches.values()])
+    measured = torch.cat([w[1:, :3] for w in build_episode(build_cloth(felt), felt).wrenches.values()])
     assert f["force_rms_null"] == pytest.approx(float(measured.square().sum(-1).mean().sqrt()))
     assert f["force_rms_after"] < 0.2 * f["force_rms_constant"] < 0.2 * f["force_rms_null"]
 
 
 def test_frames_are_the_thinned_readings(felt):
-    times = episode(cloth_from(felt), felt).times.numpy()
+    times = build_episode(build_cloth(felt), felt).times.numpy()
     knots = felt.grippers["left"].t
     assert np.isin(times, knots).all()
     assert times[0] == knots[0]
-    assert len(times) / (times[-1] - times[0]) == pytest.approx(streams.FELT_RATE, rel=0.1)
+    assert len(times) / (times[-1] - times[0]) == pytest.approx(streams.MAX_FORCE_RATE_HZ, rel=0.1)
     slow = {name: replace(m, t=4 * m.t) for name, m in felt.grippers.items()}
-    assert len(episode(cloth_from(felt), replace(felt, grippers=slow)).times) == len(knots)  # slow ones: all
+    assert len(build_episode(build_cloth(felt), replace(felt, grippers=slow)).times) == len(knots)  # slow ones: all
 
 
 def test_what_was_not_seen_is_null_on_disk_and_a_dash_in_the_table(fit, felt, tmp_path, capsys):
@@ -79,15 +78,15 @@ def test_what_was_not_seen_is_null_on_disk_and_a_dash_in_the_table(fit, felt, tm
 
 def test_its_pictures_show_forces(fit, felt, tmp_path):
     (tmp_path / "fit.png").write_text("of an earlier fit, to points")
-    drawn = draw(fit, [episode(cloth_from(felt), felt)], cloth_from(felt).mesh.faces, tmp_path)
+    drawn = draw(fit, [build_episode(build_cloth(felt), felt)], build_cloth(felt).mesh.faces, tmp_path)
     assert [p.name for p in drawn] == ["forces.png", "parameters.png"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["forces.png", "parameters.png"]
 
 
 def test_a_fit_is_held_against_the_null_of_the_data_that_tell(felt):
     """Cloth that hangs still lies where it lay, whatever it is: only force tells of it, and only where it is in use."""
-    model = cloth_from(felt)
-    own = episode(model, felt)
+    model = build_cloth(felt)
+    own = build_episode(model, felt)
     here = [own.initial + 1e-4 * torch.randn(400, *own.initial.shape)[0] for _ in own.times]
     still = replace(
         own,
@@ -115,10 +114,10 @@ def test_a_fit_is_held_against_the_null_of_the_data_that_tell(felt):
 @pytest.mark.parametrize("options", [{"method": "adam"}, {"stop": "paper"}])
 def test_what_follows_the_chamfer_distance_needs_something_seen(felt, options):
     with pytest.raises(InvalidInput, match="neither points nor markers; expected something seen"):
-        identify(cloth_from(felt), felt, STIFFNESS, **options)
+        identify(build_cloth(felt), felt, STIFFNESS, **options)
 
 
 def test_nothing_seen_and_nothing_felt_is_refused(felt):
     silent = {name: replace(m, force=None) for name, m in felt.grippers.items()}
     with pytest.raises(RecordingError, match="has no points, which a fit needs"):
-        episode(cloth_from(felt), replace(felt, grippers=silent))
+        build_episode(build_cloth(felt), replace(felt, grippers=silent))

@@ -5,8 +5,8 @@ from itertools import pairwise
 import pytest
 import scipy.optimize
 import torch
-import toys
-from toys import TRUE, curved, linear
+from helpers import least_squares
+from helpers.least_squares import START, TRUE, curved, linear, solve
 
 from torchcloth.errors import SimulationDiverged, UnstableStep
 from torchcloth.identification.estimators import levenberg_marquardt
@@ -15,12 +15,7 @@ from torchcloth.identification.estimators.convergence import way_left
 from torchcloth.identification.estimators.levenberg_marquardt import Linearised, covariance, minimise
 from torchcloth.identification.residuals.metrics import huber
 
-START = torch.zeros(3, dtype=torch.float64)
 FITS = 200
-
-
-def solve(toy, iterations=35, start=START, **options):
-    return minimise(toy.problem(), start, iterations, lambda _: False, **options)
 
 
 def optimum(toy):
@@ -49,7 +44,7 @@ def test_a_linear_problem_is_solved():
     missed = (final.raw - optimum(toy)).abs() / deviations(toy, final)
     assert float(missed.max()) < 1e-2  # standard errors: a tenth of nothing is lost to the stop rule
     assert float(((final.raw - TRUE).abs() / deviations(toy, final)).max()) < 3.5
-    assert final.scale == pytest.approx(toys.SIGMA, rel=0.1)
+    assert final.scale == pytest.approx(least_squares.SIGMA, rel=0.1)
     assert final.share > 0.5  # independent residuals count as such
 
 
@@ -100,9 +95,9 @@ def many(seed, shared, unknowns, frames=20):
     """(error, stated deviation) of three parameters beside nuisances, of twenty frames."""
     generator = torch.Generator().manual_seed(seed)
     true = 0.3 * torch.randn(unknowns, generator=generator, dtype=torch.float64)
-    jacobian = toys.sensitivities(generator, frames, unknowns)
-    data = jacobian @ true + toys.noise(generator, shared, frames)
-    toy = toys.Toy(lambda raw: jacobian @ raw, data, *toys.layout(frames), unknowns=unknowns)
+    jacobian = least_squares.sensitivities(generator, frames, unknowns)
+    data = jacobian @ true + least_squares.noise(generator, shared, frames)
+    toy = least_squares.Toy(lambda raw: jacobian @ raw, data, *least_squares.layout(frames), unknowns=unknowns)
     final = solve(toy, start=torch.zeros(unknowns, dtype=torch.float64))
     return (final.raw - true)[:3], deviations(toy, final)[:3]
 
@@ -125,7 +120,7 @@ def test_few_readings_are_as_uncertain_as_few_are(rows, unknowns):
     for seed in range(FITS):
         generator = torch.Generator().manual_seed(seed)
         true, noise = (torch.randn(n, generator=generator, dtype=torch.float64) for n in (unknowns, rows))
-        toy = toys.Toy(lambda raw: jacobian @ raw, jacobian @ true + 0.01 * noise, *where, unknowns=unknowns)
+        toy = least_squares.Toy(lambda raw: jacobian @ raw, jacobian @ true + 0.01 * noise, *where, unknowns=unknowns)
         final = solve(toy, start=torch.zeros(unknowns, dtype=torch.float64))
         hits.append((final.raw - true).abs() < 1.96 * deviations(toy, final))
     assert 0.9 < share(torch.stack(hits)) < 0.99
@@ -142,7 +137,7 @@ def test_few_readings_of_one_kind_are_few_beside_many_of_another(rows):
     for seed in range(400):
         generator = torch.Generator().manual_seed(seed)
         true, noise = (torch.randn(n, generator=generator, dtype=torch.float64) for n in (2, many + rows))
-        toy = toys.Toy(lambda raw: jacobian @ raw, jacobian @ true + 0.01 * noise, where, 0 * where, unknowns=2)
+        toy = least_squares.Toy(lambda raw: jacobian @ raw, jacobian @ true + 0.01 * noise, where, 0 * where, unknowns=2)
         kinds = toy.problem()._replace(linearise=lambda raw, toy=toy: toy._linearise(raw)._replace(block=block))
         final = minimise(kinds, torch.zeros(2, dtype=torch.float64), 35, lambda _: False)
         hits.append((final.raw - true).abs() < 1.96 * covariance(kinds, final).diagonal().sqrt())
@@ -160,7 +155,7 @@ def test_errors_do_not_hang_on_the_rate_of_frames():
         frame = torch.arange(len(t))
         for seed in range(60):
             noise = root @ torch.randn(len(t), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-            toy = toys.Toy(lambda raw, j=jacobian: j @ raw, 0.01 * noise, frame, 0 * frame, unknowns=2)
+            toy = least_squares.Toy(lambda raw, j=jacobian: j @ raw, 0.01 * noise, frame, 0 * frame, unknowns=2)
             moment = frame // (rate // 30)
             slow = toy.problem()._replace(linearise=lambda raw, t=toy, m=moment: t._linearise(raw)._replace(moment=m))
             final = minimise(slow, torch.zeros(2, dtype=torch.float64), 35, lambda _: False)
@@ -238,7 +233,7 @@ def test_unknowns_do_not_wait_for_one_that_may_go_no_farther():
     faint = jacobian.clone()
     faint[:, 2] = 0.01 * (jacobian[:, 0] + 0.3 * jacobian[:, 2])
     toy.prior_std, toy.model = 1e4, lambda raw: faint @ raw
-    toy.data = jacobian @ TRUE + toys.noise(torch.Generator().manual_seed(0), 0.0)
+    toy.data = jacobian @ TRUE + least_squares.noise(torch.Generator().manual_seed(0), 0.0)
     final = solve(toy, iterations=3)
     assert float(final.raw[2]) < 4
     rest = torch.linalg.lstsq(faint[:, :2], (toy.data - faint[:, 2] * final.raw[2])[:, None]).solution.squeeze()
@@ -330,7 +325,7 @@ def test_outliers_do_not_move_the_answer():
     spoilt, _ = linear(0)
     pick = torch.randperm(len(spoilt.data), generator=torch.Generator().manual_seed(1))[: len(spoilt.data) // 20]
     spoilt.data = spoilt.data.clone()
-    spoilt.data[pick] += 50 * toys.SIGMA
+    spoilt.data[pick] += 50 * least_squares.SIGMA
     clean, dirty = solve(toy), solve(spoilt)
     least = torch.linalg.lstsq(jacobian, spoilt.data[:, None]).solution.squeeze()
     moved, deviation = (dirty.raw - clean.raw).abs(), deviations(toy, clean)
@@ -343,7 +338,7 @@ def test_a_prior_decides_where_the_data_are_silent():
     blind = jacobian.clone()
     blind[:, 2] = 0.0
     toy.model = lambda raw: blind @ raw
-    toy.data = blind @ TRUE + toys.noise(torch.Generator().manual_seed(0), 0.0)
+    toy.data = blind @ TRUE + least_squares.noise(torch.Generator().manual_seed(0), 0.0)
     final = solve(toy)
     assert float(final.raw[2]) == 0.0
     assert float(deviations(toy, final)[2]) == pytest.approx(toy.prior_std, rel=1e-6)

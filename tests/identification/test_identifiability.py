@@ -4,9 +4,8 @@ import math
 from types import SimpleNamespace
 
 import pytest
-import stretches
 import torch
-import twins
+from helpers import stretched_sheets, twins
 
 from torchcloth.episodes.unknowns import collect
 from torchcloth.identification import identify
@@ -87,8 +86,8 @@ def test_every_parameter_has_an_experiment():
 def test_without_force_only_the_ratio_and_with_force_both():
     """Equivalence 2 of mechanics: motion alone does not know a scale. A twin's density, free of its measurement."""
     with twins.doubles():
-        pulled = stretches.record()
-        model = stretches.model(pulled, youngs_modulus=6.5e4, poisson_ratio=0.3)
+        pulled = stretched_sheets.record()
+        model = stretched_sheets.model(pulled, youngs_modulus=6.5e4, poisson_ratio=0.3)
         for name in ("air.normal", "bending.stiffness"):  # they would tell a scale
             model.get_submodule(f"effects.{name}").set(0.0)
     names, options = ["youngs_modulus", "areal_density"], {"iterations": 2, "nuisances": {"grasp": 1e-3}}

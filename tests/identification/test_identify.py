@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from twins import THICKNESS, TRUE, at, first, twin
+from helpers.twins import THICKNESS, TRUE, at, first, twin
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import cloth_from, episode, fit_fields, identify
+from torchcloth.identification import build_cloth, build_episode, fit_fields, identify
 from torchcloth.identification.estimators import search
 from torchcloth.identification.estimators.gradient_descent import to_vertices
 
@@ -195,7 +195,7 @@ def test_adam_lowers_the_chamfer_in_three_iterations(model, brief):
 @pytest.mark.parametrize("method", ["gauss-newton", "adam"])
 def test_the_papers_stop_rule_ends_a_fit_that_is_good_enough(model, brief, monkeypatch, method):
     """By the distance that the paper minimises, to vertices: it holds half an edge even where the fit is perfect."""
-    seen = episode(model, brief)
+    seen = build_episode(model, brief)
     with torch.no_grad():
         start = float(to_vertices(model(model.state(seen.initial), seen.motion, seen.times).x, seen))
     monkeypatch.setattr(search, "PAPER_CHAMFER", 1.05 * start)
@@ -263,7 +263,7 @@ def test_a_fit_repeats_bit_by_bit_and_leaves_the_cloth_as_it_was(model, brief, o
 def test_an_effect_that_the_episode_does_not_bring_says_how(recording, name, remedy):
     bare = replace(recording, air_density=None, cloth=replace(recording.cloth, nominal={}))
     with pytest.raises(InvalidInput, match=remedy):
-        identify(cloth_from(bare), bare, [name])
+        identify(build_cloth(bare), bare, [name])
 
 
 def test_the_density_was_weighed_wherever_the_fit_starts(recording):

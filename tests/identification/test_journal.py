@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
-import twins
+from helpers import twins
 
 import torchcloth as tc
 from torchcloth._utils import resume
-from torchcloth._utils.resume import Journal, digest
-from torchcloth.episodes.cloth_facts import facts_of
-from torchcloth.episodes.observed import episode
+from torchcloth._utils.resume import ResumableStore, digest
+from torchcloth.episodes.cloth_facts import cloth_fingerprint_parts
+from torchcloth.episodes.observed import build_episode
 from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import identify
@@ -26,63 +26,63 @@ def answer(number):
 
 
 def test_an_answer_is_computed_once(tmp_path):
-    kept = Journal(tmp_path / "j", ["a"], resume=False)
-    assert float(kept.ask("rows", POINT, answer(1.0))[0]) == 1.0
-    again = Journal(tmp_path / "j", ["a"], resume=True)
-    found = again.ask("rows", POINT, lambda: pytest.fail("was known"))
+    kept = ResumableStore(tmp_path / "j", ["a"], resume=False)
+    assert float(kept.get_or_compute("rows", POINT, answer(1.0))[0]) == 1.0
+    again = ResumableStore(tmp_path / "j", ["a"], resume=True)
+    found = again.get_or_compute("rows", POINT, lambda: pytest.fail("was known"))
     assert float(found[0]) == 1.0
     assert found[1] is None
-    assert again.recalled == 1
-    assert float(again.ask("other rows", POINT, answer(2.0))[0]) == 2.0
-    assert float(again.ask("rows", POINT + 1e-16, lambda: pytest.fail("the same number"))[0]) == 1.0
-    assert float(again.ask("rows", POINT + 1e-15, answer(3.0))[0]) == 3.0  # the next number is another question
+    assert again.reused_count == 1
+    assert float(again.get_or_compute("other rows", POINT, answer(2.0))[0]) == 2.0
+    assert float(again.get_or_compute("rows", POINT + 1e-16, lambda: pytest.fail("the same number"))[0]) == 1.0
+    assert float(again.get_or_compute("rows", POINT + 1e-15, answer(3.0))[0]) == 3.0  # the next number is another question
 
 
 @pytest.mark.parametrize("damage", ["cut", "junk", "empty"])
 def test_a_damaged_answer_is_computed_anew(tmp_path, damage):
-    Journal(tmp_path / "j", ["a"], resume=False).ask("rows", POINT, answer(1.0))
+    ResumableStore(tmp_path / "j", ["a"], resume=False).get_or_compute("rows", POINT, answer(1.0))
     (file,) = (tmp_path / "j").glob("*.pt")
     file.write_bytes({"cut": file.read_bytes()[:300], "junk": b"no tensor at all", "empty": b""}[damage])
-    again = Journal(tmp_path / "j", ["a"], resume=True)
-    assert float(again.ask("rows", POINT, answer(2.0))[0]) == 2.0
-    assert again.recalled == 0
+    again = ResumableStore(tmp_path / "j", ["a"], resume=True)
+    assert float(again.get_or_compute("rows", POINT, answer(2.0))[0]) == 2.0
+    assert again.reused_count == 0
 
 
 def test_another_problem_is_refused(tmp_path):
-    Journal(tmp_path / "j", ["a", torch.zeros(3)], resume=False).ask("rows", POINT, answer(1.0))
-    Journal(tmp_path / "j", ["a", torch.zeros(3)], resume=True)
+    ResumableStore(tmp_path / "j", ["a", torch.zeros(3)], resume=False).get_or_compute("rows", POINT, answer(1.0))
+    ResumableStore(tmp_path / "j", ["a", torch.zeros(3)], resume=True)
     with pytest.raises(InvalidInput, match=r"of another fit, or of another version .*; expected the same episodes"):
-        Journal(tmp_path / "j", ["a", torch.ones(3)], resume=True)
+        ResumableStore(tmp_path / "j", ["a", torch.ones(3)], resume=True)
     with pytest.raises(InvalidInput, match=r"resume; got no .*; expected what an interrupted run left"):
-        Journal(tmp_path / "nowhere", ["a"], resume=True)
+        ResumableStore(tmp_path / "nowhere", ["a"], resume=True)
 
 
 def test_stopped_work_is_not_deleted_by_other_work(tmp_path):
     """A command into the same folder: hours may lie there."""
-    kept = Journal(tmp_path / "j", ["a"], resume=None)
-    kept.ask("rows", POINT, answer(1.0))
+    kept = ResumableStore(tmp_path / "j", ["a"], resume=None)
+    kept.get_or_compute("rows", POINT, answer(1.0))
     for problem, said in ((["a"], "the same work"), (["b"], "other work")):
         with pytest.raises(InvalidInput, match=f"{said}, stopped; .*delete"):
-            Journal(tmp_path / "j", problem, resume=None)
-    assert float(Journal(tmp_path / "j", ["a"], resume=True).ask("rows", POINT, answer(2.0))[0]) == 1.0
+            ResumableStore(tmp_path / "j", problem, resume=None)
+    assert float(ResumableStore(tmp_path / "j", ["a"], resume=True).get_or_compute("rows", POINT, answer(2.0))[0]) == 1.0
 
 
 def test_another_program_answers_anew(tmp_path, monkeypatch):
-    Journal(tmp_path / "j", ["a"], resume=None).ask("rows", POINT, answer(1.0))
+    ResumableStore(tmp_path / "j", ["a"], resume=None).get_or_compute("rows", POINT, answer(1.0))
     monkeypatch.setattr(resume, "program", lambda: "another")
     with pytest.raises(InvalidInput, match="another version of torchcloth"):
-        Journal(tmp_path / "j", ["a"], resume=True)
+        ResumableStore(tmp_path / "j", ["a"], resume=True)
 
 
 def test_without_resuming_nothing_is_found(tmp_path):
-    Journal(tmp_path / "j", ["a"], resume=False).ask("rows", POINT, answer(1.0))
-    assert float(Journal(tmp_path / "j", ["a"], resume=False).ask("rows", POINT, answer(2.0))[0]) == 2.0
+    ResumableStore(tmp_path / "j", ["a"], resume=False).get_or_compute("rows", POINT, answer(1.0))
+    assert float(ResumableStore(tmp_path / "j", ["a"], resume=False).get_or_compute("rows", POINT, answer(2.0))[0]) == 2.0
 
 
 def test_other_files_are_not_removed(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(InvalidInput, match="with other content"):
-        Journal(tmp_path, ["a"], resume=False)
+        ResumableStore(tmp_path, ["a"], resume=False)
     assert (tmp_path / "thesis.tex").exists()
 
 
@@ -91,15 +91,15 @@ def test_a_folder_that_was_begun_when_all_ended_is_begun_again(tmp_path, half):
     (tmp_path / "j").mkdir()
     if half == "stamp":
         (tmp_path / "j" / ".problem.0a1b").write_text("0")
-    assert float(Journal(tmp_path / "j", ["a"], resume=None).ask("rows", POINT, answer(1.0))[0]) == 1.0
-    assert float(Journal(tmp_path / "j", ["a"], resume=True).ask("rows", POINT, answer(2.0))[0]) == 1.0
+    assert float(ResumableStore(tmp_path / "j", ["a"], resume=None).get_or_compute("rows", POINT, answer(1.0))[0]) == 1.0
+    assert float(ResumableStore(tmp_path / "j", ["a"], resume=True).get_or_compute("rows", POINT, answer(2.0))[0]) == 1.0
     assert sorted(path.suffix for path in (tmp_path / "j").iterdir()) in (["", ".pt"], ["", "", ".pt"])
 
 
 def test_a_folder_whose_removal_was_interrupted_is_a_journal_still(tmp_path, monkeypatch):
-    kept = Journal(tmp_path / "j", ["a"], resume=False)
+    kept = ResumableStore(tmp_path / "j", ["a"], resume=False)
     for number in range(3):
-        kept.ask("rows", POINT + number, answer(1.0))
+        kept.get_or_compute("rows", POINT + number, answer(1.0))
     unlink, removed = Path.unlink, []
 
     def interrupted(path, **options):
@@ -110,21 +110,21 @@ def test_a_folder_whose_removal_was_interrupted_is_a_journal_still(tmp_path, mon
 
     monkeypatch.setattr(Path, "unlink", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        resume.clear(tmp_path / "j")
+        resume.clear_store(tmp_path / "j")
     monkeypatch.undo()
-    Journal(tmp_path / "j", ["a"], resume=True)
-    resume.clear(tmp_path / "j")
+    ResumableStore(tmp_path / "j", ["a"], resume=True)
+    resume.clear_store(tmp_path / "j")
     assert not (tmp_path / "j").exists()
 
 
 def test_an_interrupt_while_writing_leaves_no_answer(tmp_path, monkeypatch):
-    kept = Journal(tmp_path / "j", ["a"], resume=False)
-    kept.ask("other rows", POINT, answer(0.0))
+    kept = ResumableStore(tmp_path / "j", ["a"], resume=False)
+    kept.get_or_compute("other rows", POINT, answer(0.0))
     monkeypatch.setattr(os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        kept.ask("rows", POINT, answer(1.0))
+        kept.get_or_compute("rows", POINT, answer(1.0))
     monkeypatch.undo()
-    assert float(Journal(tmp_path / "j", ["a"], resume=True).ask("rows", POINT, answer(2.0))[0]) == 2.0
+    assert float(ResumableStore(tmp_path / "j", ["a"], resume=True).get_or_compute("rows", POINT, answer(2.0))[0]) == 2.0
 
 
 def test_fingerprints_tell_apart_what_is_joined():
@@ -145,7 +145,7 @@ def test_what_is_no_tensor_tells_problems_apart(recording, other):
     ids = []
     for made in (recording, other(recording)):
         cloth = twins.at(made)
-        objective = Objective(cloth, collect(cloth, ["youngs_modulus"], None), [episode(cloth, made)])
+        objective = Objective(cloth, collect(cloth, ["youngs_modulus"], None), [build_episode(cloth, made)])
         ids.append(digest(objective.identity()))
     assert ids[0] != ids[1]
 
@@ -157,7 +157,7 @@ def test_another_law_with_the_same_numbers_is_another_problem():
 
     mesh = tc.meshes.rectangle(0.1, 0.1, triangles=8)
     facts = [
-        digest(facts_of(tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, {"gravity": weight()}, contact=None)))
+        digest(cloth_fingerprint_parts(tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, {"gravity": weight()}, contact=None)))
         for weight in (tc.effects.Gravity, Heavier)
     ]
     assert facts[0] != facts[1]
@@ -167,7 +167,7 @@ def test_another_engine_is_another_problem(recording):
     """Its last digits differ, and a fit goes on bit by bit."""
     cloth, ids = twins.at(recording), []
     for cloth.engine in ("fused", "reference"):
-        objective = Objective(cloth, collect(cloth, ["youngs_modulus"], None), [episode(cloth, recording)])
+        objective = Objective(cloth, collect(cloth, ["youngs_modulus"], None), [build_episode(cloth, recording)])
         ids.append(digest(objective.identity()))
     assert ids[0] != ids[1]
 
@@ -188,19 +188,19 @@ def test_all_code_that_answers_is_in_the_fingerprint(tmp_path, monkeypatch):
     for place in places:
         place.parent.mkdir()
         place.write_text("1")
-    known = [resume.program.__wrapped__(tmp_path / "studies")]
+    known = [resume.source_fingerprint.__wrapped__(tmp_path / "studies")]
     for place in places:
         place.write_text("2")
-        known.append(resume.program.__wrapped__(tmp_path / "studies"))
+        known.append(resume.source_fingerprint.__wrapped__(tmp_path / "studies"))
     assert len(set(known)) == 4
 
 
 def test_two_problems_at_work_in_one_folder_do_not_share_answers(tmp_path):
     """Neither had begun when the other looked; one that ends takes the folder away, and the other goes on."""
-    one, other = Journal(tmp_path / "j", ["a"], resume=None), Journal(tmp_path / "j", ["b"], resume=None)
-    assert float(one.ask("rows", POINT, answer(1.0))[0]) == 1.0
-    assert float(other.ask("rows", POINT, answer(2.0))[0]) == 2.0
-    resume.clear(tmp_path / "j")
-    resume.clear(tmp_path / "j")
-    assert float(other.ask("rows", POINT, answer(3.0))[0]) == 3.0
-    assert (tmp_path / "j" / resume.STAMP).read_text() == other.key
+    one, other = ResumableStore(tmp_path / "j", ["a"], resume=None), ResumableStore(tmp_path / "j", ["b"], resume=None)
+    assert float(one.get_or_compute("rows", POINT, answer(1.0))[0]) == 1.0
+    assert float(other.get_or_compute("rows", POINT, answer(2.0))[0]) == 2.0
+    resume.clear_store(tmp_path / "j")
+    resume.clear_store(tmp_path / "j")
+    assert float(other.get_or_compute("rows", POINT, answer(3.0))[0]) == 3.0
+    assert (tmp_path / "j" / resume.STAMP_FILE_NAME).read_text() == other.key

@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import stretches
 import torch
-import twins
+from helpers import stretched_sheets, twins
 
 from torchcloth.episodes.replay import Frames, simulate
 from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import episode, identify
+from torchcloth.identification import build_episode, identify
 from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.nuisances import KINDS, chosen
 
@@ -21,18 +20,18 @@ EVERY = ("clock", "camera", "tare", "grasp", "shape")
 @pytest.fixture(scope="module")
 def pulled():
     with twins.doubles():
-        return stretches.record(markers=5)
+        return stretched_sheets.record(markers=5)
 
 
 def near(recording):
     """A start that is wrong by a sixth: the search is short."""
-    return stretches.model(recording, youngs_modulus=7e4, poisson_ratio=0.3)
+    return stretched_sheets.model(recording, youngs_modulus=7e4, poisson_ratio=0.3)
 
 
 @pytest.fixture
 def objective(pulled):
-    model = stretches.model(pulled)
-    seen = episode(model, pulled).until(0.3)
+    model = stretched_sheets.model(pulled)
+    seen = build_episode(model, pulled).first_fraction(0.3)
     return Objective(model, collect(model, ["youngs_modulus"], None), [seen, seen], 4e-4, chosen(EVERY, ["rim"]))
 
 
@@ -56,16 +55,16 @@ def test_every_unknown_has_its_slope(objective):
 
 def test_a_first_shape_that_was_not_measured_does_not_settle(pulled):
     """Slopes along where the grippers hold, of cloth that moves from the first frame on."""
-    model = stretches.model(pulled)
-    seen = replace(episode(model, pulled).until(0.3), settles=False)
+    model = stretched_sheets.model(pulled)
+    seen = replace(build_episode(model, pulled).first_fraction(0.3), settles=False)
     found = Objective(model, collect(model, ["youngs_modulus"], None), [seen], 4e-4, chosen(["grasp"]))
     still = simulate(model, found.unknowns, found.start[:1], seen, 4e-4)
     torch.testing.assert_close(found.seen(found.start)[0].x, still.x)
 
 
 def test_what_a_late_clock_sees_moves_as_fast_as_it_is_seen_to(pulled):
-    model = stretches.model(pulled)
-    seen, own = episode(model, pulled).until(0.3), collect(model, ["youngs_modulus"], None)
+    model = stretched_sheets.model(pulled)
+    seen, own = build_episode(model, pulled).first_fraction(0.3), collect(model, ["youngs_modulus"], None)
     frames, clock, h = simulate(model, own, torch.tensor([own[0].start]), seen), KINDS["clock"](), 1e-6
     one, two = (clock.see(frames, torch.tensor([0.004 + d]), seen) for d in (-h, h))
     torch.testing.assert_close((two.x - one.x)[:-1] / (2 * h), 0.5 * (one.v + two.v)[:-1], rtol=1e-5, atol=1e-6)
@@ -79,7 +78,7 @@ def test_an_episodes_nuisances_do_not_touch_the_other(objective):
 
 
 def test_a_late_clock_is_found(pulled):
-    late = stretches.record(setting=stretches.Setting(clock=0.02))
+    late = stretched_sheets.record(setting=stretched_sheets.Setting(clock=0.02))
     fit = identify(near(late), late, ["youngs_modulus"], nuisances={"clock": 0.05}, iterations=4)
     (own,) = fit.nuisances.values()
     assert abs(own["clock"].value - 0.02) < 4 * own["clock"].std
@@ -89,7 +88,7 @@ def test_a_late_clock_is_found(pulled):
 
 
 def test_a_late_clock_far_from_zero_and_in_single_precision(pulled):
-    seen = episode(stretches.model(pulled), pulled)
+    seen = build_episode(stretched_sheets.model(pulled), pulled)
     wave = lambda t: (torch.sin(9.0 * t), 9.0 * torch.cos(9.0 * t))  # noqa: E731
     since = seen.times - seen.times[0]
     x, v = (f.float()[:, None, None] for f in wave(since))
@@ -101,10 +100,10 @@ def test_a_late_clock_far_from_zero_and_in_single_precision(pulled):
 
 def test_a_late_clock_sees_what_comes_after_the_last_frame(pulled):
     """Against a simulation at the later times; without more frames the cloth would stand still at the last."""
-    model = stretches.model(pulled)
-    seen = episode(model, pulled)
-    longer, late = seen.beyond(0.09), 0.05
-    assert longer.observed == len(seen.times)
+    model = stretched_sheets.model(pulled)
+    seen = build_episode(model, pulled)
+    longer, late = seen.with_lookahead(0.09), 0.05
+    assert longer.observed_count == len(seen.times)
     assert float(longer.times[-1]) == pytest.approx(float(seen.times[-1]) + 0.09)
     assert [len(longer.clouds[t]) for t in range(len(seen.times), len(longer.times))] == [0, 0]
     assert not bool(longer.markers[len(seen.times) :].isfinite().any())

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-import toys
-from test_gauss_newton import solve
+from helpers import least_squares
+from helpers.least_squares import solve
 
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import identify
@@ -22,14 +22,14 @@ BEND = 1.0
 def toy(model=lambda raw: raw, loud=5.0):
     """The linear problem seen through ``model``, with so much noise that an error bar reaches far."""
     generator = torch.Generator().manual_seed(3)
-    jacobian = toys.sensitivities(generator)
-    data = jacobian @ toys.TRUE + loud * toys.noise(generator, 0.0)
-    return toys.Toy(lambda raw: jacobian @ model(raw), data, *toys.layout(), prior_std=1e4)
+    jacobian = least_squares.sensitivities(generator)
+    data = jacobian @ least_squares.TRUE + loud * least_squares.noise(generator, 0.0)
+    return least_squares.Toy(lambda raw: jacobian @ model(raw), data, *least_squares.layout(), prior_std=1e4)
 
 
 def profiled(given, clip=lambda raw: raw, names="abc"):
     """(optimum, its covariance by the cost's own curvature, profiles by name)."""
-    final = solve(given, start=toys.TRUE.clone())
+    final = solve(given, start=least_squares.TRUE.clone())
     covariance = torch.linalg.inv(levenberg_marquardt.curvature(given.problem(), final))
     unknowns = [SimpleNamespace(name=n, clip=clip, value=lambda raw: raw) for n in "abc"]
     objective = SimpleNamespace(problem=given.problem, unknowns=unknowns)

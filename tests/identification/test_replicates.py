@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import scipy.stats
 import torch
-import toys
+from helpers import least_squares
 
 from torchcloth import recordings as rec
 from torchcloth.identification.estimators import levenberg_marquardt
@@ -28,28 +28,28 @@ def repeats(seed, count, motions=1, hidden=HIDDEN, offset=0.0):
     generator = torch.Generator().manual_seed(seed)
     jacobian, data, frame, patch, episode = [], [], [], [], []
     for motion in range(motions):
-        own = toys.sensitivities(generator, FRAMES)
+        own = least_squares.sensitivities(generator, FRAMES)
         for _ in range(count):
-            value = toys.TRUE + hidden * torch.randn(3, generator=generator, dtype=torch.float64) + offset * motion
-            number, (t, where) = len(jacobian), toys.layout(FRAMES)
+            value = least_squares.TRUE + hidden * torch.randn(3, generator=generator, dtype=torch.float64) + offset * motion
+            number, (t, where) = len(jacobian), least_squares.layout(FRAMES)
             jacobian.append(own)
-            data.append(own @ value + 0.1 * toys.noise(generator, 0.0, FRAMES))
+            data.append(own @ value + 0.1 * least_squares.noise(generator, 0.0, FRAMES))
             frame.append(t + number * (FRAMES + WINDOW + 1))
             patch.append(where)
             episode.append(torch.full_like(t, number))
     J = torch.cat(jacobian)
-    toy = toys.Toy(lambda raw: J @ raw, torch.cat(data), torch.cat(frame), torch.cat(patch), prior_std=1e3)
+    toy = least_squares.Toy(lambda raw: J @ raw, torch.cat(data), torch.cat(frame), torch.cat(patch), prior_std=1e3)
     return toy, torch.cat(episode)
 
 
 def found(seed, count, motions=1, strata=None, scatter=True, **options):
     toy, episode = repeats(seed, count, motions, **options)
-    at = minimise(toy.problem(), toys.TRUE.clone(), 20, lambda _: False)
+    at = minimise(toy.problem(), least_squares.TRUE.clone(), 20, lambda _: False)
     matrix = covariance(toy.problem(), at)
     if scatter:
         strata = torch.zeros(count * motions, dtype=torch.int64) if strata is None else strata
         matrix = at_least(matrix, replicates.scatter(toy.problem(), at, episode, strata))
-    return at.raw - toys.TRUE, matrix.diagonal().sqrt()
+    return at.raw - least_squares.TRUE, matrix.diagonal().sqrt()
 
 
 @pytest.mark.parametrize("count", [3, 6])
@@ -74,12 +74,12 @@ def test_errors_are_those_of_a_mean_of_episodes():
 def test_leaving_out_an_episode_moves_the_estimate_as_a_fit_without_it_does():
     """Episodes that differ much: what was an outlier among all is none without the one that made the others small."""
     toy, episode = repeats(1, 3, hidden=0.5)
-    whole = minimise(toy.problem(), toys.TRUE.clone(), 20, lambda _: False)
+    whole = minimise(toy.problem(), least_squares.TRUE.clone(), 20, lambda _: False)
     for e in range(3):
         kept = episode != e
-        J = torch.func.jacfwd(toy.model)(toys.TRUE)[kept]
-        alone = toys.Toy(lambda raw, J=J: J @ raw, toy.data[kept], toy.frame[kept], toy.patch[kept], prior_std=1e3)
-        wanted = minimise(alone.problem(), toys.TRUE.clone(), 20, lambda _: False).raw - whole.raw
+        J = torch.func.jacfwd(toy.model)(least_squares.TRUE)[kept]
+        alone = least_squares.Toy(lambda raw, J=J: J @ raw, toy.data[kept], toy.frame[kept], toy.patch[kept], prior_std=1e3)
+        wanted = minimise(alone.problem(), least_squares.TRUE.clone(), 20, lambda _: False).raw - whole.raw
         moved = replicates._without(toy.problem(), whole, ~kept)
         assert float((moved - wanted).norm()) < 0.1 * float(wanted.norm())
 
@@ -87,7 +87,7 @@ def test_leaving_out_an_episode_moves_the_estimate_as_a_fit_without_it_does():
 def test_episodes_without_data_of_a_kind_do_not_scatter():
     """One of three alone has readings: without it there is no fit, and the others move nothing."""
     toy, episode = repeats(1, 3)
-    at = minimise(toy.problem(), toys.TRUE.clone(), 20, lambda _: False)
+    at = minimise(toy.problem(), least_squares.TRUE.clone(), 20, lambda _: False)
     alone = torch.zeros_like(episode)
     assert torch.equal(replicates.scatter(toy.problem(), at, alone, torch.zeros(3).long()), torch.zeros_like(at.raw))
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from twins import at
+from helpers.twins import at
 
 import torchcloth as tc
 from torchcloth.episodes.observed import Episode
@@ -22,7 +22,7 @@ from torchcloth.identification.uncertainty.reporting import Found, estimates, nu
 GOOD = Estimate(2.0, 0.1, (1.8, 2.2), "-", 1.0, True)
 LOST = Estimate(2.0, 1.9, (0.1, 9.0), "-", 1.0, False)
 FIT = {"chamfer_before": 5e-3, "chamfer_after": 0.8e-3, "chamfer_null": 10e-3, "rms_after": 1e-3}
-EPISODE = Episode("shake", {}, torch.zeros(9), [], torch.zeros(0, 3), settles=True, noise=1e-3)
+EPISODE = Episode("shake", {}, torch.zeros(9), [], torch.zeros(0, 3), needs_settling=True, noise_std=1e-3)
 
 
 def found(a=GOOD, b=GOOD, correlation=0.0, density=True):

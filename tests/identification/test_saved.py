@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import twins
+from helpers import twins
 
 from torchcloth import recordings
 from torchcloth.dynamics.contact import Contact
 from torchcloth.effects import AirDrag, Gravity
 from torchcloth.errors import InvalidInput, RecordingError, UnstableStep
-from torchcloth.identification import cloth_from, fitted, identify, predict_episode, replayed
+from torchcloth.identification import build_cloth, fitted, identify, predict_episode, replayed
 from torchcloth.identification.io.saved_fit import read_saved
 from torchcloth.identification.io.unrecorded_settings import beyond
 
@@ -58,7 +58,7 @@ def test_points_may_have_been_rounded_on_disk(pair, recording, tmp_path):
 
 def test_contact_and_step_are_kept(brief, tmp_path):
     """As they were given: the simulation with other ones would be another."""
-    cloth = cloth_from(brief, contact=Contact(0.05, damping=0.2, play=0.1))
+    cloth = build_cloth(brief, contact=Contact(0.05, damping=0.2, play=0.1))
     fit = identify(cloth, brief, ["youngs_modulus"], iterations=1, dt=1e-4)
     again = replayed(fit.save(tmp_path), brief)
     assert again.cloth.contact == Contact(0.05, damping=0.2, play=0.1)
@@ -114,10 +114,10 @@ def test_what_no_episode_describes_is_not_left_out_silently(brief, tmp_path, key
 
 def test_precision_and_mesh_are_no_other_model(brief):
     assert beyond(twins.at(brief).double(), brief) == []
-    assert beyond(cloth_from(brief, contact=Contact(0.05)), brief) == []
+    assert beyond(build_cloth(brief, contact=Contact(0.05)), brief) == []
     finer = replace(brief, cloth=replace(brief.cloth, vertices=None, faces=None, sheet=(0.3, 0.3)))
     assert beyond(twins.at(brief), finer) == []
-    thin = cloth_from(replace(brief, cloth=replace(brief.cloth, thickness=5e-4)))
+    thin = build_cloth(replace(brief, cloth=replace(brief.cloth, thickness=5e-4)))
     assert beyond(thin, brief) == ["material.thickness"]
     nothing = replace(brief, cloth=replace(brief.cloth, vertices=None, faces=None, sheet=None))
     assert beyond(thin, nothing) == []

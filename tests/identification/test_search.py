@@ -6,14 +6,13 @@ from itertools import pairwise
 
 import pytest
 import torch
-import toys
-import twins
-from test_gauss_newton import solve
+from helpers import least_squares, twins
+from helpers.least_squares import solve
 
-from torchcloth._utils.resume import Journal
+from torchcloth._utils.resume import ResumableStore
 from torchcloth.episodes.unknowns import collect, with_priors
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import episode, identify
+from torchcloth.identification import build_episode, identify
 from torchcloth.identification.estimators import levenberg_marquardt, multistart
 from torchcloth.identification.estimators.gradient_descent import descend
 from torchcloth.identification.estimators.objective import Objective
@@ -64,7 +63,7 @@ def test_a_distance_is_not_weighed_against_priors(model, brief, method, options,
 def test_descent_steps_by_each_unknowns_own_size(model, brief, adam):
     """A bowl with its bottom at twice the start: bending, of 1e-5 N m, gets as near as stiffness and drag do."""
     names = ["youngs_modulus", "air.normal", "bending.stiffness"]
-    objective = Objective(model, collect(model, names, None), [episode(model, brief)], nuisances=chosen([], ["rim"]))
+    objective = Objective(model, collect(model, names, None), [build_episode(model, brief)], nuisances=chosen([], ["rim"]))
     bottom = objective.start + 0.5 * objective.sizes
 
     def value_and_slope(question, raw, loss):
@@ -87,13 +86,13 @@ def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_
         kept(*args)
         raise Stop
 
-    kept = Journal._write
+    kept = ResumableStore._write
     for method in ("gauss-newton", "lbfgs"):
         options = {"method": method, "iterations": 2, "guess": {"youngs_modulus": 5e4}}
         whole, folder, resumed, stops = identify(model, brief, PAIR, **options), tmp_path / method, None, 0
         while resumed is None:
             with monkeypatch.context() as patch, contextlib.suppress(Stop):
-                patch.setattr(Journal, "_write", write)
+                patch.setattr(ResumableStore, "_write", write)
                 resumed = identify(model, brief, PAIR, journal=folder, resume=stops > 0, **options)
             stops += resumed is None
         assert stops > 5
@@ -123,7 +122,7 @@ def test_starts_are_spread_over_two_decades(model):
 
 
 def test_starts_that_agree_are_counted():
-    toy, _ = toys.linear(0)
+    toy, _ = least_squares.linear(0)
     ends = [solve(toy), solve(toy, start=torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64))]
     astray = ends[0]._replace(raw=ends[0].raw + 5.0)
     astray = levenberg_marquardt.judged(toy.problem(), astray.raw, toy._linearise(astray.raw))

@@ -2,13 +2,13 @@
 
 import pytest
 import torch
-from twins import at
+from helpers.twins import at
 
 from torchcloth.episodes.observed_surface import sheet_of
 from torchcloth.episodes.replay import simulate, tangents
 from torchcloth.episodes.unknowns import collect
 from torchcloth.errors import UnstableStep
-from torchcloth.identification import episode
+from torchcloth.identification import build_episode
 from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.residuals.blocks import point_rows
 from torchcloth.identification.residuals.rows import scene_of
@@ -21,7 +21,7 @@ EARLY = 0.35  # five frames: 200 ms of the motion, 0.3 s of settling before it
 def short(recording, model):
     """(cloth, unknowns with density, five frames)."""
     unknowns = collect(model, NAMES, recording.cloth.weighed)
-    return model, unknowns, episode(model, recording).until(EARLY)
+    return model, unknowns, build_episode(model, recording).first_fraction(EARLY)
 
 
 def start(unknowns):

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from math import cos, pi, radians, sin
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers.tension_strips import Strip
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.identification import Trellis, Uniaxial
 from torchcloth.identification.tension import specimens
 from torchcloth.recordings import ForceDisplacement
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "physics"))
-
-from strips import Strip
 
 WARP, WEFT, SHEAR, NU, H = 15e6, 59e6, 3e6, 0.2, 1e-3
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from offaxis import NAMES, TRUTH, WARP, H, cloth, readings
+from helpers.off_axis_strips import NAMES, TRUTH, WARP, H, cloth, readings
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput

@@ -9,7 +9,7 @@ from math import radians
 import numpy as np
 import pytest
 import torch
-from offaxis import NAMES, H, cloth, modulus, readings
+from helpers.off_axis_strips import NAMES, H, cloth, modulus, readings
 
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import cross_validated, fit_tension, predict_tension, read_model, specimen_like

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-import twins
+from helpers import twins
 
 from torchcloth.identification import identify
 from torchcloth.identification.estimators import linearity, search

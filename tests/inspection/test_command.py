@@ -1,15 +1,10 @@
 """``torchcloth inspect`` as a user meets it."""
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from swinging import episode, markers
+from helpers.swinging_cloth import episode, markers
 
 from torchcloth import recordings
 from torchcloth.cli import main

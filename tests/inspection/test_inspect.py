@@ -3,20 +3,16 @@
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from swinging import clouds, episode, markers, motion, path, pattern
+from helpers.swinging_cloth import clouds, episode, markers, motion, path, pattern
 
 from torchcloth import meshes
 from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
 from torchcloth.inspection import draw, inspect, show
-from torchcloth.inspection.cuts import cuts
+from torchcloth.inspection.crop_planes import cuts
 from torchcloth.recordings.timing import ticks
 
 GRID = {"extra": {"grid": np.array([8, 8])}}

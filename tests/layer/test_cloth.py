@@ -5,10 +5,10 @@ import warnings
 
 import pytest
 import torch
-from small import sheet
+from helpers.small_sheet import sheet
 
 import torchcloth as tc
-from torchcloth.boundaries import drive
+from torchcloth.boundaries import sample_trajectory
 from torchcloth.dynamics import substep
 from torchcloth.errors import InvalidInput, SimulationDiverged, UnstableStep
 
@@ -144,7 +144,7 @@ def test_a_stiffness_changed_later_moves_the_limit():
         (lambda: tc.boundaries.Grasp([[0, 1]]), r"Grasp vertices; got int64 of shape \(1, 2\)"),
         (lambda: tc.boundaries.Grasp("ab"), "Grasp vertices"),
         (lambda: tc.boundaries.Grasp(uv=[[5.0, 5.0]]), "no vertex within"),
-        (lambda: tc.boundaries.Grasp([0]).holding(torch.tensor([3, -1])), r"Grasp vertices; got \[-1, 3\]"),
+        (lambda: tc.boundaries.Grasp([0]).with_vertices(torch.tensor([3, -1])), r"Grasp vertices; got \[-1, 3\]"),
         (lambda: tc.boundaries.Grasp.corner("middle"), "lower-left"),
         (lambda: tc.boundaries.Plane(normal=(0.0, 0.0, 0.0)), "not all zero"),
         (lambda: tc.boundaries.Plane(friction=-0.1), "friction"),
@@ -419,10 +419,10 @@ def test_in_float32_still_bodies_stand_still_and_moving_ones_are_smooth(start):
     times = start + torch.arange(5001).double() * 1.2e-4
     point = torch.tensor([0.1, 0.1, 0.0, 1.0])
     total = torch.eye(4).double()
-    for step in drive(still, times).increment.double():
+    for step in sample_trajectory(still, times).increment.double():
         total = step @ total
     assert float((total @ point.double() - point.double()).norm()) < 1e-9
-    speed = (drive(moving, times).increment.double() @ point.double() - point.double())[:, 0] / 1.2e-4
+    speed = (sample_trajectory(moving, times).increment.double() @ point.double() - point.double())[:, 0] / 1.2e-4
     assert float((speed[1:] - speed[:-1]).abs().max()) < 3e-3  # m/s
 
 

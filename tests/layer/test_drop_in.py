@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from small import sheet
+from helpers.small_sheet import sheet
 from torch import nn
 from torch.func import functional_call
 

@@ -5,7 +5,7 @@ import gc
 
 import pytest
 import torch
-from small import sheet
+from helpers.small_sheet import sheet
 from torch.func import functional_call
 
 import torchcloth as tc

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from bent_shapes import irregular, moment
+from helpers.bent_shapes import irregular, moment
 
 import torchcloth as tc
-from torchcloth.types import Moment
+from torchcloth.types import EffectInputs
 
 
 def cylinder(uv, degrees, radius=0.2):
@@ -29,7 +29,7 @@ def matrix(bending):
     count = bending.columns.shape[1]
     unit = torch.eye(count).unsqueeze(-1).expand(-1, -1, 3)
     c = tc.effects.bending.Coefficients(torch.ones(()), torch.zeros(()))
-    return -bending.force(c, Moment(unit, torch.zeros_like(unit), None, None))[..., 0].T
+    return -bending.force(c, EffectInputs(unit, torch.zeros_like(unit), None, None))[..., 0].T
 
 
 def share(mesh):
@@ -170,7 +170,7 @@ def sag(mesh, bending, held=0.0026):
     """[V] m, small deflections under 1 N/m^2 with two columns of vertices held; linear, so solved exactly."""
     count = len(mesh.vertices)
     unit = torch.eye(count).unsqueeze(-1).expand(-1, -1, 3)
-    Q = -bending.force(bending.coefficients(), Moment(unit, torch.zeros_like(unit), None, None))[..., 0].T
+    Q = -bending.force(bending.coefficients(), EffectInputs(unit, torch.zeros_like(unit), None, None))[..., 0].T
     free = torch.as_tensor(mesh.vertices[:, 0] > held)
     out = torch.zeros(count)
     out[free] = torch.linalg.solve(Q[free][:, free].detach(), share(mesh)[free])
@@ -221,9 +221,9 @@ def test_force_is_minus_the_gradient_of_the_energy():
     x = (torch.as_tensor(mesh.vertices) + 0.02 * torch.randn(2, 36, 3)).requires_grad_()
     c = bending.coefficients()
     (gradient,) = torch.autograd.grad(bending.energy(c, x).sum(), x)
-    force = bending.force(c, Moment(x, torch.zeros_like(x), None, None))
+    force = bending.force(c, EffectInputs(x, torch.zeros_like(x), None, None))
     torch.testing.assert_close(force, -gradient, rtol=1e-10, atol=1e-12)
-    damping = bending.force(c, Moment(torch.zeros_like(x), x, None, None))
+    damping = bending.force(c, EffectInputs(torch.zeros_like(x), x, None, None))
     torch.testing.assert_close(damping, 0.01 * force, rtol=1e-10, atol=1e-14)
 
 
@@ -231,7 +231,7 @@ def test_force_has_no_resultant():
     mesh = irregular(6)
     bending = tc.effects.Bending(2e-5).bind(mesh)
     x = torch.as_tensor(mesh.vertices) + 0.02 * torch.randn(36, 3) + 5.0
-    force = bending.force(bending.coefficients(), Moment(x, x, None, None))
+    force = bending.force(bending.coefficients(), EffectInputs(x, x, None, None))
     scale = force.abs().sum()
     assert force.sum(0).norm() < 1e-12 * scale
     assert torch.linalg.cross(x, force).sum(0).norm() < 1e-11 * scale
@@ -245,7 +245,7 @@ def test_rigid_motion_and_affine_stretch_cost_nothing():
     for transform in (torch.linalg.qr(torch.randn(3, 3))[0], torch.randn(3, 3)):
         x = torch.as_tensor(mesh.vertices) @ transform.mT + 1.0
         assert bending.energy(bending.coefficients(), x).item() < 1e-20
-        force = bending.force(bending.coefficients(), Moment(x, x, None, None))
+        force = bending.force(bending.coefficients(), EffectInputs(x, x, None, None))
         assert force.abs().max() < 1e-13
 
 
@@ -254,7 +254,7 @@ def test_float32_far_from_the_origin():
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(21, 21))
     bending = tc.effects.Bending(1e-5).bind(mesh).float()
     x = (torch.as_tensor(mesh.vertices) + 1.0).float()
-    force = bending.force(bending.coefficients(), Moment(x, x, None, None))
+    force = bending.force(bending.coefficients(), EffectInputs(x, x, None, None))
     assert force.dtype == torch.float32
     assert force.abs().max() < 0.01 * 0.2 * 9.81 * 1e-4
     assert force.sum(0).abs().max() < 1e-5 * 0.2 * 9.81 * 0.04
@@ -270,7 +270,7 @@ def test_derivatives_in_both_modes_and_in_batches():
     def force(raw, x):
         value = raw.unsqueeze(-1)
         c = tc.effects.bending.Coefficients(value, value * bending.damping_time.value)
-        return bending.force(c, Moment(x, v, None, None))
+        return bending.force(c, EffectInputs(x, v, None, None))
 
     with forward_ad.dual_level():
         out = force(forward_ad.make_dual(raw, torch.ones_like(raw)), forward_ad.make_dual(x, tangent))
@@ -278,10 +278,10 @@ def test_derivatives_in_both_modes_and_in_batches():
     torch.testing.assert_close(derivative, force(torch.ones_like(raw), x) + force(raw, tangent) - force(raw, 0 * x))
     single = tc.effects.Bending(3e-5, damping_time=0.01).bind(mesh)
     c = single.coefficients()
-    torch.testing.assert_close(force(raw, x)[1], single.force(c, Moment(x[1], v[1], None, None)))
+    torch.testing.assert_close(force(raw, x)[1], single.force(c, EffectInputs(x[1], v[1], None, None)))
     assert torch.autograd.gradcheck(force, (raw.requires_grad_(), x.requires_grad_()), atol=1e-8)
     c = bending.coefficients()
-    bending.force(c, Moment(x, v, None, None)).square().sum().backward()
+    bending.force(c, EffectInputs(x, v, None, None)).square().sum().backward()
     assert bending.stiffness.raw.grad.shape == (2, 1)
 
 
@@ -339,13 +339,13 @@ def test_bound_on_the_frequency(make):
     bending = tc.effects.Bending(1e-3, damping_time=2e-3).bind(mesh)
     exact = 1e-3 / 0.2 * squared_frequencies(bending, mesh)[-1].item()
     mass = 0.2 * share(mesh).unsqueeze(-1)
-    squared, rate = (value.item() for value in bending.rates(bending.coefficients(), mass))
+    squared, rate = (value.item() for value in bending.stability_bounds(bending.coefficients(), mass))
     assert 1 < squared / exact < 1.1
     assert rate == pytest.approx(2e-3 * squared)
     uneven = mass * (1 + torch.rand(len(mass), 1))
     root = uneven.rsqrt()
     exact = 1e-3 * torch.linalg.eigvalsh(root * matrix(bending) * root.T)[-1].item()
-    assert 1 < bending.rates(bending.coefficients(), uneven)[0].item() / exact < 1.3**2
+    assert 1 < bending.stability_bounds(bending.coefficients(), uneven)[0].item() / exact < 1.3**2
 
 
 def strip(kind, length=0.1, resolution=(21, 5)):

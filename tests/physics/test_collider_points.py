@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from colliding import lowered, sheet, slide
+from helpers.collider_scenes import lowered, sheet, slide
 
 import torchcloth as tc
 from torchcloth.boundaries import (
@@ -44,7 +44,7 @@ def test_points_on_triangles_keep_small_bodies_out(body, vertices_alone, sampled
         x = cloth.rest_state().x - torch.tensor([0.103, 0.102, -0.002])
         with torch.no_grad():
             out = cloth(cloth.state(x), times=torch.linspace(0, 0.25, 6))
-            depths.append(-1e3 * float(solid.clearance(fine.at(out.x))[0].min()))
+            depths.append(-1e3 * float(solid.clearance(fine.interpolate(out.x))[0].min()))
     assert depths[0] > vertices_alone
     assert depths[1] < sampled
 
@@ -60,17 +60,17 @@ def test_points_share_impulses_without_losing_momentum():
     torch.manual_seed(0)
     x = torch.as_tensor(mesh.vertices)
     mass = 0.1 + torch.rand(len(x), 1)  # of hems, pockets, wet places
-    some = torch.randn_like(points.at(x)) * (torch.rand(len(points.at(x)), 1) < 0.3)
+    some = torch.randn_like(points.interpolate(x)) * (torch.rand(len(points.interpolate(x)), 1) < 0.3)
     alone = torch.zeros_like(some)
     alone[37] = some.abs().amax(0) + 1
-    torch.testing.assert_close(points.at(points.share(alone, mass))[37], alone[37])  # one point: exactly as wanted
+    torch.testing.assert_close(points.interpolate(points.distribute(alone, mass))[37], alone[37])  # one point: exactly as wanted
     same = torch.ones_like(some)
     even = torch.as_tensor(mesh.vertex_area)[:, None]
-    torch.testing.assert_close(points.share(same, even), torch.ones_like(x), rtol=0, atol=0.15)  # all alike: nearly
-    change = points.share(alone, mass)
+    torch.testing.assert_close(points.distribute(same, even), torch.ones_like(x), rtol=0, atol=0.15)  # all alike: nearly
+    change = points.distribute(alone, mass)
     linear, angular = (mass * change).sum(0), torch.linalg.cross(x, mass * change).sum(0)
-    torch.testing.assert_close(angular, torch.linalg.cross(points.at(x)[37], linear))  # it acts at the point
-    batch = points.share(torch.stack([some, alone]), mass)
+    torch.testing.assert_close(angular, torch.linalg.cross(points.interpolate(x)[37], linear))  # it acts at the point
+    batch = points.distribute(torch.stack([some, alone]), mass)
     torch.testing.assert_close(batch[1], change)
 
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from colliding import G, about_z, block, lowered, path, sheet, slide
+from helpers.collider_scenes import G, about_z, block, lowered, path, sheet, slide
 from torch.func import functional_call
 
 import torchcloth as tc

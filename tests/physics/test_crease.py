@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from bent_shapes import cylinder, drift, irregular, moment, relative, through
+from helpers.bent_shapes import cylinder, drift, irregular, moment, relative, through
 
 import torchcloth as tc
 from torchcloth.testing import check_gradients

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from bent_shapes import cycles, cylinder, drift, irregular, moment, relative, through, work
+from helpers.bent_shapes import cycles, cylinder, drift, irregular, moment, relative, through, work
 
 import torchcloth as tc
 from torchcloth.testing import check_gradients

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 import torch
-from colliding import block
+from helpers.collider_scenes import block
 
 import torchcloth as tc
 from torchcloth.boundaries import (

@@ -4,7 +4,7 @@ from math import cos, radians, sin
 
 import pytest
 import torch
-from strips import Strip
+from helpers.tension_strips import Strip
 
 import torchcloth as tc
 from torchcloth.dynamics.stability import SAFETY, Limits, squared_frequency

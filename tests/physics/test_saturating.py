@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from bent_shapes import cylinder, drift, irregular, moment
+from helpers.bent_shapes import cylinder, drift, irregular, moment
 
 import torchcloth as tc
 from torchcloth.testing import check_gradients

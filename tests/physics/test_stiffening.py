@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from strips import Strip
+from helpers.tension_strips import Strip
 
 import torchcloth as tc
 from torchcloth.dynamics import substep

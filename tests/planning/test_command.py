@@ -6,13 +6,13 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from scenes import by_arm, by_hand, cloth_of
+from helpers.planning_scenes import by_arm, by_hand, cloth_of
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, save_model
 from torchcloth.diagnosis.causes.hypotheses import known
-from torchcloth.identification import episode
+from torchcloth.identification import build_episode
 from torchcloth.planning.result import PLANNED
 
 OPTIONS = ["--iterations", "3", "--wait", "0.1", "--waypoints", "2"]
@@ -25,7 +25,7 @@ def folder(tmp_path):
 
 def goal_in(place):
     """The cloth as it hangs at first, 3 cm in front."""
-    x = episode(cloth_of(by_arm()), by_arm(), 20.0).initial.numpy()
+    x = build_episode(cloth_of(by_arm()), by_arm(), 20.0).initial.numpy()
     np.save(place / "goal.npy", x + np.array([0.03, 0.0, 0.0]))
     return place / "goal.npy"
 

@@ -5,23 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes import EDGE, LASTS, by_arm, by_hand, cloth_of
+from helpers.planning_scenes import EDGE, LASTS, by_arm, by_hand, cloth_of
 
 from torchcloth import recordings as rec
 from torchcloth.planning import episode_conversion
 from torchcloth.planning.constrained_step import step_within
-from torchcloth.planning.episode_conversion import as_episode, courses_of, doubts
-from torchcloth.planning.motion_parameters import Bounds, Span, rotation
+from torchcloth.planning.episode_conversion import build_planned_episode, extract_motion_parameters, motion_warnings
+from torchcloth.planning.motion_parameters import LinearBounds, SplineSpan, rotation_matrix
 from torchcloth.robots import ACCELERATION, arm_of, replay
 from torchcloth.robots.primitives import Limits
 
 
 def courses(recording, waypoints=4, wait=0.1, limits=Limits()):  # noqa: B008 - a tuple
-    return courses_of(cloth_of(recording), recording, waypoints, wait, ACCELERATION, limits)
+    return extract_motion_parameters(cloth_of(recording), recording, waypoints, wait, ACCELERATION, limits)
 
 
 def test_what_is_added_begins_and_ends_at_rest():
-    span = Span(0.1, 0.5, 3)
+    span = SplineSpan(0.1, 0.5, 3)
     at, h = torch.tensor([0.1, 0.5]), 1e-4
     assert torch.allclose(span.basis(torch.tensor([0.0, 0.1])), torch.zeros(2, 3))
     assert torch.allclose(span.basis(torch.tensor([0.5, 0.9])), torch.tensor([[0.0, 0, 1], [0, 0, 1]]))
@@ -33,7 +33,7 @@ def test_with_nothing_added_the_motion_is_the_recorded_one():
     for recording in (by_hand(), by_arm()):
         (course,) = courses(recording)
         (path,) = replay(recording).values()
-        own = course.trajectory(course.nothing)
+        own = course.trajectory(course.zero_waypoints)
         assert torch.allclose(own.pose[: len(path.t)], path.pose, atol=1e-12)
         assert float(own.t[-1]) == pytest.approx(LASTS + 0.1)
         assert torch.equal(own.pose[-1], own.pose[len(path.t) - 1])  # it waits where it ends
@@ -41,7 +41,7 @@ def test_with_nothing_added_the_motion_is_the_recorded_one():
 
 def test_turns_are_rotations():
     turn = torch.tensor([[0.0, 0.0, torch.pi / 2], [0.3, -0.2, 0.1]])
-    found = rotation(turn)
+    found = rotation_matrix(turn)
     assert torch.allclose(found[0], torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), atol=1e-12)
     assert torch.allclose(found @ found.mT, torch.eye(3).expand(2, 3, 3), atol=1e-12)
     assert torch.allclose(found[1] @ turn[1], turn[1])
@@ -50,10 +50,10 @@ def test_turns_are_rotations():
 def test_limits_hold_between_waypoints_too():
     recording = by_arm()
     (course,) = courses(recording)
-    bounds, arm = Bounds.of([course]), arm_of(recording, "arm")
-    at = torch.zeros(course.nothing.numel())
+    bounds, arm = LinearBounds.concatenate([course]), arm_of(recording, "arm")
+    at = torch.zeros(course.zero_waypoints.numel())
     step = step_within(at, -torch.randn(len(at)), torch.eye(len(at)), bounds)
-    assert bounds.nearest(step)[0] > 0.99  # as far as it may go
+    assert bounds.nearest_limit(step)[0] > 0.99  # as far as it may go
     q = course.coordinates(step.reshape(4, 7))
     velocity = (q.diff(dim=0) / course.t.diff()[:, None]).abs()
     assert bool((velocity < 1.01 * arm.limits.velocity).all())
@@ -66,14 +66,14 @@ def test_limits_hold_between_waypoints_too():
 def test_a_motion_beyond_the_limits_is_no_reason_to_give_up():
     """The recorded one accelerates by more than 3 rad/s^2 already; other joints still have their room."""
     (course,) = courses(by_arm())
-    bounds = Bounds.of([course])
+    bounds = LinearBounds.concatenate([course])
     assert bool((bounds.low <= 0).all() and (bounds.high >= 0).all())
     assert float(bounds.high.min()) == 0.0
 
 
 def test_a_hand_stays_above_the_table():
     (course,) = courses(by_hand(table=0.45))
-    bounds = Bounds.of([course])
+    bounds = LinearBounds.concatenate([course])
     down = torch.zeros(4, 6)
     down[:, 2] = -1.0
     step = step_within(torch.zeros(24), -down.flatten(), torch.eye(24), bounds)
@@ -83,8 +83,8 @@ def test_a_hand_stays_above_the_table():
 def test_the_planned_episode_says_what_was_planned(tmp_path):
     for recording in (by_hand(), by_arm()):
         (course,) = courses(recording)
-        z = 0.01 * torch.randn(course.nothing.shape)
-        path = rec.write(as_episode(recording, [course], [z]), tmp_path / course.name)
+        z = 0.01 * torch.randn(course.zero_waypoints.shape)
+        path = rec.write(build_planned_episode(recording, [course], [z]), tmp_path / course.name)
         (again,) = replay(rec.read(path)).values()
         assert torch.allclose(again.pose, course.trajectory(z).pose, atol=1e-9)
         assert again.closed.tolist() == course.closed.tolist()
@@ -106,11 +106,11 @@ def test_what_was_recorded_longer_waits_as_well():
     """It had driven on through the wait, where no limit is looked at: it comes to rest."""
     left, right = courses(two_hands(longer=0.3), wait=0.2)
     for course, stops in ((left, 0.0), (right, 0.1 / right.limits.acceleration)):
-        pose = course.trajectory(course.nothing).pose
+        pose = course.trajectory(course.zero_waypoints).pose
         after = course.t > LASTS + stops + 0.01
         assert int(after.sum()) > 5
         assert torch.equal(pose[after], pose[after][-1:].expand_as(pose[after]))
-    beyond = right.start[-1, 0] - right.start[right.t <= LASTS + 1e-9][-1, 0]
+    beyond = right.recorded_coordinates[-1, 0] - right.recorded_coordinates[right.t <= LASTS + 1e-9][-1, 0]
     assert float(beyond) == pytest.approx(0.1**2 / (2 * right.limits.acceleration), rel=1e-3)
 
 
@@ -122,17 +122,17 @@ def test_what_is_under_way_at_the_end_comes_to_rest_within_the_limits():
     q[:, 0] += 0.6 * own.t  # rad/s
     recording = replace(recording, joints={"arm": replace(own, q=q)})
     for wait, said in ((0.5, "comes to rest in 0.20 s"), (0.1, "wait 0.20 s or longer")):
-        (course,) = courses_of(cloth_of(recording), recording, 4, wait, 3.0, Limits())
-        (doubt,) = doubts(recording, [course])
+        (course,) = extract_motion_parameters(cloth_of(recording), recording, 4, wait, 3.0, Limits())
+        (doubt,) = motion_warnings(recording, [course])
         assert said in doubt
         velocity = course.q.diff(dim=0) / course.t.diff()[:, None]
         hardest = (velocity.diff(dim=0)[:, 0] / course.t.diff()[1:])[course.t[:-2] > LASTS - 1e-9].abs().max()
         assert float(hardest) == pytest.approx(3.0 if wait > 0.2 else 6.0, rel=0.1)
         assert torch.equal(velocity[-1], torch.zeros(7)) == (wait > 0.2)
-        bounds = Bounds.of([course])
-        last = [k for k, name in enumerate(bounds.names) if name == f"acceleration of {course.labels[0]} of arm"][-1]
+        bounds = LinearBounds.concatenate([course])
+        last = [k for k, name in enumerate(bounds.names) if name == f"acceleration of {course.coordinate_names[0]} of arm"][-1]
         assert float(bounds.high[last]) < 4.0  # the halt is no recorded motion
-        assert bool((course.span.instants > LASTS + 0.5 * min(wait, 0.2)).any())  # limits of positions hold there, too
+        assert bool((course.span.bound_check_times > LASTS + 0.5 * min(wait, 0.2)).any())  # limits of positions hold there, too
 
 
 def test_a_gripper_that_had_let_go_before_moves_as_recorded():
@@ -160,7 +160,7 @@ def test_a_hand_lets_go_when_it_did():
 def test_accelerations_are_bounded_where_they_are_greatest():
     """At the ends of what is added; there half of them was looked at."""
     (course,) = courses(by_hand(), waypoints=4)
-    bounds = Bounds.of([course])
+    bounds = LinearBounds.concatenate([course])
     added = torch.zeros(4, 6)
     added[0, 0] = 1.0
     of_x = [k for k, name in enumerate(bounds.names) if name == "acceleration of x of hand"]
@@ -176,7 +176,7 @@ def test_a_recorded_motion_that_is_under_way_is_no_acceleration():
     recording = two_hands(longer=0.0)
     late = replace(recording, points=rec.PointClouds(np.array([0.1, 0.2]), np.zeros((2, 3)), np.ones(2, int)))
     _, course = courses(late, waypoints=2)  # 0.1 m/s all the time
-    bounds = Bounds.of([course])
+    bounds = LinearBounds.concatenate([course])
     first = bounds.names.index("acceleration of x of right")
     assert course.span.begin == pytest.approx(0.1)
     assert float(bounds.high[first]) == pytest.approx(course.limits.acceleration, rel=1e-3)
@@ -199,13 +199,13 @@ def test_an_arm_that_stands_by_need_not_be_known():
     beside = {"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))}
     (course,) = courses(replace(by_hand(), joints=beside))
     assert course.name == "hand"
-    assert not doubts(replace(by_hand(), joints=beside), [course])
+    assert not motion_warnings(replace(by_hand(), joints=beside), [course])
 
 
 def test_of_a_table_that_leans_its_height_below_the_path_is_kept():
     recording = by_hand(table=0.1)
-    assert not doubts(recording, courses(recording))
+    assert not motion_warnings(recording, courses(recording))
     for angle, said in ((0.2, "hand: table leans"), (1.2, "hand: table stands too steep")):
         table = replace(recording.colliders["table"], normal=np.array([np.sin(angle), 0.0, np.cos(angle)]))
         leaning = replace(recording, colliders={"table": table})
-        assert [doubt for doubt in doubts(leaning, courses(leaning)) if doubt.startswith(said)]
+        assert [doubt for doubt in motion_warnings(leaning, courses(leaning)) if doubt.startswith(said)]

@@ -11,7 +11,7 @@ from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.planning import Goal, read_goal
-from torchcloth.planning.objective import aim_at
+from torchcloth.planning.objective import build_objective
 
 MESH = meshes.rectangle(0.2, 0.2, triangles=72)
 FACES = torch.as_tensor(MESH.faces)
@@ -26,7 +26,7 @@ def bent(height: float = 0.03) -> torch.Tensor:
 
 def test_a_cloud_is_asked_for_one_way_and_a_surface_both_ways():
     half = FLAT[FLAT[:, 0] < 0.11] + torch.tensor([0.0, 0.0, 0.02])
-    assert float(aim_at(Goal(half), MESH).distance(FLAT)) == pytest.approx(
+    assert float(build_objective(Goal(half), MESH).distance(FLAT)) == pytest.approx(
         0.02
     )  # what lies beyond the cloud is not seen
     small = meshes.rectangle(0.1, 0.2, triangles=36)
@@ -34,7 +34,7 @@ def test_a_cloud_is_asked_for_one_way_and_a_surface_both_ways():
     there = float(chamfer_to_surface(known.points, FLAT, FACES))
     back = float(chamfer_to_surface(FLAT, known.points, known.faces))
     assert there == pytest.approx(0.0, abs=1e-12)
-    assert float(aim_at(known, MESH).distance(FLAT)) == pytest.approx(back / 2)
+    assert float(build_objective(known, MESH).distance(FLAT)) == pytest.approx(back / 2)
     assert back > 0.02
 
 
@@ -48,15 +48,15 @@ GOALS = {
 
 @pytest.mark.parametrize("kind", GOALS)
 def test_the_pull_is_the_derivative_of_the_mean_square(kind):
-    aim, x = aim_at(GOALS[kind], MESH), bent(0.01) + 0.003 * torch.randn(len(FLAT), 3)
+    aim, x = build_objective(GOALS[kind], MESH), bent(0.01) + 0.003 * torch.randn(len(FLAT), 3)
     ways = torch.randn(3, len(FLAT), 3)
-    pull = aim.pull(x, ways)
-    assert float(pull.value) == pytest.approx(aim.square(x))
-    assert float(aim.distance(x)) ** 2 <= aim.square(x)
+    pull = aim.quadratic_model(x, ways)
+    assert float(pull.value) == pytest.approx(aim.mean_square(x))
+    assert float(aim.distance(x)) ** 2 <= aim.mean_square(x)
     for way, slope in zip(ways, pull.gradient.tolist(), strict=True):
         errors = []
         for h in (1e-4, 1e-5, 1e-6):
-            up, down = (aim.square(x + sign * h * way) for sign in (1, -1))
+            up, down = (aim.mean_square(x + sign * h * way) for sign in (1, -1))
             errors.append(abs((up - down) / (2 * h) - slope))
         assert min(errors) < 1e-6 * abs(slope)
     assert float(torch.linalg.eigvalsh(pull.curvature).min()) > 0
@@ -65,7 +65,7 @@ def test_the_pull_is_the_derivative_of_the_mean_square(kind):
 def test_the_curvature_lets_cloth_slide_along_the_goal():
     goal, middle = Goal(FLAT[(FLAT[:, :2] - 0.1).abs().amax(1) < 0.04]), torch.eye(3)[:, None, :]
     ways = middle.expand(3, len(FLAT), 3)
-    along, aside, across = aim_at(goal, MESH).pull(FLAT, ways).curvature.diagonal().tolist()
+    along, aside, across = build_objective(goal, MESH).quadratic_model(FLAT, ways).curvature.diagonal().tolist()
     assert across == pytest.approx(2.0)
     assert along == pytest.approx(0.2)
     assert aside == pytest.approx(0.2)
@@ -75,12 +75,12 @@ def test_of_pieces_it_counts_which_is_where():
     """Cloth that was turned over lies on itself, and each of its pieces somewhere else."""
     over = FLAT * torch.tensor([-1.0, 1.0, -1.0]) + torch.tensor([0.2, 0.0, 0.0])
     surface, pieces = Goal(FLAT, FACES), Goal(FLAT, FACES, vertices=torch.arange(len(FLAT)))
-    assert float(aim_at(surface, MESH).distance(over)) == pytest.approx(0.0, abs=1e-9)
-    assert float(aim_at(pieces, MESH).distance(over)) == pytest.approx(float((FLAT - over).norm(dim=1).mean()))
+    assert float(build_objective(surface, MESH).distance(over)) == pytest.approx(0.0, abs=1e-9)
+    assert float(build_objective(pieces, MESH).distance(over)) == pytest.approx(float((FLAT - over).norm(dim=1).mean()))
     ways = torch.eye(3)[:, None, :].expand(3, len(FLAT), 3)
-    assert aim_at(pieces, MESH).pull(over, ways).curvature.diagonal().tolist() == pytest.approx([2.0, 2.0, 2.0])
+    assert build_objective(pieces, MESH).quadratic_model(over, ways).curvature.diagonal().tolist() == pytest.approx([2.0, 2.0, 2.0])
     corner = Goal(torch.tensor([[0.3, 0.1, 0.0]]), uv=torch.tensor([[0.2, 0.1]]))
-    assert float(aim_at(corner, MESH).distance(FLAT)) == pytest.approx(0.1)
+    assert float(build_objective(corner, MESH).distance(FLAT)) == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_of_pieces_it_counts_which_is_where():
 )
 def test_pieces_that_the_cloth_has_not_are_refused(goal, said):
     with pytest.raises(InvalidInput, match=said):
-        aim_at(goal, MESH)
+        build_objective(goal, MESH)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_files_of_pieces(tmp_path):
 
 
 def test_markers_are_pieces_where_the_last_frame_has_them(tmp_path):
-    from scenes import by_hand
+    from helpers.planning_scenes import by_hand
 
     uv, xyz = np.array([[0.0, 0.0], [0.1, 0.1]]), np.zeros((3, 2, 3))
     xyz[-1] = [[np.nan] * 3, [0.1, 0.2, 0.3]]
@@ -196,7 +196,7 @@ def test_files_that_show_no_cloth_are_refused_in_one_line(tmp_path, name):
 
 
 def test_an_episode_without_points_is_no_goal(tmp_path):
-    from scenes import by_hand
+    from helpers.planning_scenes import by_hand
 
     rec.write(by_hand(), tmp_path / "blind")
     with pytest.raises(RecordingError, match="points"):

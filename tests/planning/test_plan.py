@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes import LASTS, by_arm, by_hand, cloth_of, sheet_of
+from helpers.planning_scenes import LASTS, by_arm, by_hand, cloth_of, sheet_of
 
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import Model, World, base_model
 from torchcloth.diagnosis.causes.hypotheses import known
 from torchcloth.episodes.replay import Replay
-from torchcloth.episodes.streams import on_pattern
+from torchcloth.episodes.streams import locate_on_pattern
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import cloth_from, episode
+from torchcloth.identification import build_cloth, build_episode
 from torchcloth.planning import Goal
-from torchcloth.planning.episode_conversion import courses_of
-from torchcloth.planning.forward_model import Rehearsal, plain
+from torchcloth.planning.episode_conversion import extract_motion_parameters
+from torchcloth.planning.forward_model import ForwardModel, exact_model
 from torchcloth.planning.task import Task
 from torchcloth.robots import ACCELERATION, gripper_motion
 from torchcloth.robots.primitives import Limits
@@ -29,8 +29,8 @@ AWAY = torch.tensor([0.04, 0.02, 0.03])
 
 def task_of(recording, goal, waypoints=2):
     cloth = cloth_of(recording).requires_grad_(False)
-    courses = courses_of(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())
-    return Task([Rehearsal(plain(cloth), recording, courses, None)], courses, goal, None, None)
+    courses = extract_motion_parameters(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())
+    return Task([ForwardModel(exact_model(cloth), recording, courses, None)], courses, goal, None, None)
 
 
 def end_of(recording, at=None):
@@ -97,8 +97,8 @@ def test_the_planned_episode_does_what_was_expected(tmp_path):
     assert found.after[0] < 0.5 * found.before[0]
     folder, _ = found.save(tmp_path)
     again = rec.read(folder)
-    cloth = cloth_from(again)
-    seen = episode(cloth, again, 20.0)
+    cloth = build_cloth(again)
+    seen = build_episode(cloth, again, 20.0)
     with torch.no_grad():
         x = Replay(cloth)(seen).x[-1]
     assert torch.allclose(x, found.frames[-1], atol=2e-4)  # frames at other times, substeps of other lengths
@@ -236,10 +236,10 @@ def test_a_patch_that_a_diagnosis_moved_is_carried_over_once():
     named = {h.name: h for h in known()}
     for name, amplitude in (("robot.regrasp", 0.012), ("obs.clock", 0.02)):
         model = base_model(recording).plus(named[name], amplitude)
-        courses = courses_of(model.base.cloth, recording, 2, 0.0, ACCELERATION, Limits())
-        run = Rehearsal(model, recording, courses, None)
-        seen = run.run({c.name: c.trajectory(c.nothing) for c in courses})
-        data = replace(episode(model.base.cloth, recording, 20.0), times=run.times)
+        courses = extract_motion_parameters(model.base.cloth, recording, 2, 0.0, ACCELERATION, Limits())
+        run = ForwardModel(model, recording, courses, None)
+        seen = run.simulate({c.name: c.trajectory(c.zero_waypoints) for c in courses})
+        data = replace(build_episode(model.base.cloth, recording, 20.0), times=run.times)
         plain_world = model.world().frames(data).x
         assert torch.allclose(seen[:-1], plain_world[:-1], atol=1e-4)
 
@@ -250,11 +250,11 @@ def test_pieces_are_those_of_the_cloth_whatever_a_grip_really_holds():
     named = {h.name: h for h in known()}
     models = [base_model(recording), base_model(recording).plus(named["robot.regrasp"], 0.012)]
     uv = recording.cloth.uv[::7]
-    courses = courses_of(models[0].base.cloth, recording, 2, 0.0, ACCELERATION, Limits())
+    courses = extract_motion_parameters(models[0].base.cloth, recording, 2, 0.0, ACCELERATION, Limits())
     for model in models:
-        run = Rehearsal(model, recording, courses, None)
-        x = run.run({c.name: c.trajectory(c.nothing) for c in courses})[-1]
-        own = on_pattern(cloth_from(recording).mesh, uv).on(x)
+        run = ForwardModel(model, recording, courses, None)
+        x = run.simulate({c.name: c.trajectory(c.zero_waypoints) for c in courses})[-1]
+        own = locate_on_pattern(build_cloth(recording).mesh, uv).on(x)
         task = Task([run], courses, Goal(own, uv=torch.as_tensor(uv)), None, None)
         assert float(task.aims[0].distance(x)) < 1e-9
 
@@ -274,7 +274,7 @@ def test_in_float32_too():
     torch.set_default_dtype(torch.float32)
     recording = by_hand()
     cloth = cloth_of(recording)
-    x = episode(cloth, recording, 20.0).initial
+    x = build_episode(cloth, recording, 20.0).initial
     found = tc.plan(cloth, recording, Goal(x + torch.tensor([0.06, 0.0, 0.0])), wait=WAIT, iterations=2)
     assert found.frames.dtype == torch.float32
     assert found.after[0] < 0.5 * found.before[0]
@@ -286,7 +286,7 @@ def test_in_float32_too_where_the_first_frame_is_between_knots():
     seen = rec.PointClouds(np.array([0.0, 0.1, 0.2]), np.tile([0.0, 0.1, 0.45], (3, 1)), np.ones(3, int))
     recording = replace(by_hand(), points=seen, clock_offset=0.105)  # 0.105 is less in float32
     cloth = cloth_of(recording)
-    x = episode(cloth, recording, 20.0).initial
+    x = build_episode(cloth, recording, 20.0).initial
     found = tc.plan(
         cloth, recording, Goal(x + torch.tensor([0.03, 0.0, 0.0])), wait=WAIT, waypoints=2.0, iterations=1.0
     )

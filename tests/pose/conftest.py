@@ -1,15 +1,8 @@
 """One occluded twin episode, and estimates from it, for all tests of this folder."""
 
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))  # its twins
-sys.path.insert(0, str(Path(__file__).parent))
-
-import occluded
-import twins
+from helpers import occluded_twins, twins
 
 from torchcloth.pose import estimate_pose
 
@@ -20,18 +13,18 @@ SMALL = {"modes": 4, "window": 0.18}
 def scene():
     """The recording, and where the fit's vertices truly were [T, V, 3] m."""
     with twins.doubles():
-        return occluded.twin()
+        return occluded_twins.twin()
 
 
 @pytest.fixture(scope="session")
 def right(scene):
     """With the true values."""
     with twins.doubles():
-        return estimate_pose(occluded.model(scene, twins.TRUE), scene.recording, **SMALL)
+        return estimate_pose(occluded_twins.model(scene, twins.TRUE), scene.recording, **SMALL)
 
 
 @pytest.fixture(scope="session")
 def wrong(scene):
     """Half the stiffness and half the drag, taken as exact."""
     with twins.doubles():
-        return estimate_pose(occluded.model(scene, occluded.WRONG), scene.recording, **SMALL)
+        return estimate_pose(occluded_twins.model(scene, occluded_twins.WRONG), scene.recording, **SMALL)

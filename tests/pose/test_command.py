@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-import twins
+from helpers import twins
 
 from torchcloth import recordings
 from torchcloth.cli import main

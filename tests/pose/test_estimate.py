@@ -7,13 +7,13 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-import twins
-from occluded import WRONG, model
+from helpers import twins
+from helpers.occluded_twins import WRONG, model
 
 from torchcloth import recordings as rec
 from torchcloth.effects import BodyForce
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import episode, nuisances
+from torchcloth.identification import build_episode, nuisances
 from torchcloth.identification.residuals.metrics import figures
 from torchcloth.pose import estimate_pose
 from torchcloth.pose.estimate import held_at
@@ -70,7 +70,7 @@ def test_one_continuous_motion(scene, wrong):
     """Every window goes on from the state that the one before left: simulated in one piece it is the same motion."""
     cloth = model(scene, WRONG)
     cloth.effects["push"] = BodyForce(torch.zeros_like(wrong.x[0]))
-    motion = episode(cloth, scene.recording).motion
+    motion = build_episode(cloth, scene.recording).motion
     for w in range(1, len(wrong.windows)):
         first, last = ((wrong.times - t).abs().argmin() for t in wrong.windows[w])
         cloth.effects["push"].acceleration.set(wrong.acceleration[w])
@@ -92,7 +92,7 @@ def test_shares_are_those_of_the_weight(wrong, scene):
 
 def test_distances_are_those_of_the_room_next_door(scene, right):
     cloth = model(scene, twins.TRUE)
-    again = figures([right.x], [episode(cloth, scene.recording)], right.faces)
+    again = figures([right.x], [build_episode(cloth, scene.recording)], right.faces)
     assert right.fit["chamfer_after"] == pytest.approx(again.chamfer)
 
 
@@ -100,7 +100,7 @@ def test_the_last_state_goes_on(scene, right):
     assert isinstance(right.last, ClothState)
     cloth = model(scene, twins.TRUE)
     x = right.last.x.clone().requires_grad_()
-    out = cloth(right.last._replace(x=x), episode(cloth, scene.recording).motion, [0.70, 0.71])
+    out = cloth(right.last._replace(x=x), build_episode(cloth, scene.recording).motion, [0.70, 0.71])
     out.x[-1, :, 2].mean().backward()
     assert float(x.grad.norm()) > 0
 
@@ -172,7 +172,7 @@ def test_what_a_gripper_has_let_go_is_as_uncertain_as_the_rest(scene, right):
     hands = scene.recording.grippers
     left = replace(hands["left"], closed=hands["left"].t < 0.53)  # until the knot at 0.54 s
     cloth = model(scene, twins.TRUE)
-    data = episode(cloth, replace(scene.recording, grippers={**hands, "left": left}))
+    data = build_episode(cloth, replace(scene.recording, grippers={**hands, "left": left}))
     held, patch = held_at(cloth, data), cloth.boundaries["left"].index
     assert torch.equal(held[:, patch].all(1), data.times < 0.54)
     assert bool(held[:, cloth.boundaries["right"].index].all())
@@ -269,7 +269,7 @@ def test_a_late_clock_sees_beyond_the_last_stamp(scene, monkeypatch):
 def test_few_points_of_each_frame_tell_together(scene):
     """12 points a frame tell no field from noise, 12 of each of two frames do: the errors are not zero."""
     cloth = model(scene, WRONG)
-    data = episode(cloth, scene.recording)
+    data = build_episode(cloth, scene.recording)
     few = replace(data, clouds=[cloud[:12] for cloud in data.clouds])
     held, modes, x = held_at(cloth, data), modes_of(cloth.mesh), scene.truth + 5e-3 * torch.sin(40 * scene.truth)
     std = [unexplained(x, some, torch.as_tensor(cloth.mesh.faces), modes, 4, held, 1e-3, 1e-3) for some in (data, few)]

@@ -4,12 +4,12 @@ from itertools import pairwise
 
 import pytest
 import torch
-import twins
-from occluded import model
+from helpers import twins
+from helpers.occluded_twins import model
 
 from torchcloth.episodes.replay import Replay
 from torchcloth.episodes.unknowns import collect
-from torchcloth.identification import episode
+from torchcloth.identification import build_episode
 from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.nuisances import chosen
 from torchcloth.identification.residuals.blocks import blocks_for
@@ -20,7 +20,7 @@ from torchcloth.pose.objective import Corrected, Correction, pushable, windows_o
 @pytest.fixture
 def objective(scene):
     cloth = model(scene, twins.TRUE)
-    data = episode(cloth, twins.first(scene.recording, 6))
+    data = build_episode(cloth, twins.first(scene.recording, 6))
     correction = Correction(windows_of(data.times, 0.1), modes_of(cloth.mesh, 2).fields, torch.full((2,), 0.5))
     nuisances = chosen(["clock", "grasp", "shape"], ["rim"])
     unknowns = collect(cloth, ["youngs_modulus"], None)
@@ -93,7 +93,7 @@ def test_a_part_is_the_beginning_of_the_same_motion(objective):
 def test_the_early_frames_of_a_fit_are_the_beginning_of_the_same_motion(scene):
     """``identify`` never sets velocity or rest shape anew: what it begins with is a prefix."""
     cloth = model(scene, twins.TRUE)
-    data = episode(cloth, twins.first(scene.recording, 8))
+    data = build_episode(cloth, twins.first(scene.recording, 8))
     whole = Objective(cloth, collect(cloth, ["youngs_modulus"], None), [data])
     raw = whole.start + 0.1
     torch.testing.assert_close(whole.part(0.5).frames(raw)[0], whole.frames(raw)[0][:4], rtol=0, atol=1e-12)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-import twins
+from helpers import twins
 
 import torchcloth as tc
 from torchcloth import recordings as rec

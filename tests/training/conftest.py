@@ -1,6 +1,5 @@
 """Tiny episodes for the fits: a sheet of 32 triangles shaken for two frames."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,10 +7,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))  # the twins
-
-import twins
+from helpers import twins
 
 from torchcloth import recordings as rec
 

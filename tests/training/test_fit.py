@@ -4,7 +4,6 @@ import csv
 import json
 import shutil
 import signal
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,12 +20,10 @@ import torchcloth.training.fit.run as run
 from torchcloth import recordings as rec
 from torchcloth.training.fit.command import main
 from torchcloth.training.fit.config import Learn, Network, load
-from torchcloth.training.fit.learned import Learned
+from torchcloth.training.fit.learned_cloth import Learned
 from torchcloth.training.fit.module import FitModule
 
-sys.path.insert(0, str(Path(__file__).parent))  # the network in nets.py
-
-NETWORK = {"module": "nets.Small", "gives": ["youngs_modulus"], "arguments": {"width": 3, "drop": 0.3}}
+NETWORK = {"module": "helpers.user_networks.Small", "gives": ["youngs_modulus"], "arguments": {"width": 3, "drop": 0.3}}
 EVERYTHING = {"parameters": ["air.normal"], "fields": ["areal_density"], "network": NETWORK, "roughness": 0.1}
 
 
@@ -118,7 +115,7 @@ def test_resuming_is_bit_for_bit(config, episodes, tmp_path, monkeypatch, step):
 
 def test_a_gradient_that_is_no_number_is_not_followed(config, tmp_path, capsys):
     """The checkpoint is from the step before, and can be gone on from."""
-    path = config(learn={"network": {"module": "nets.Spoilt", "gives": ["youngs_modulus"]}}, optimizer={"steps": 4})
+    path = config(learn={"network": {"module": "helpers.user_networks.Spoilt", "gives": ["youngs_modulus"]}}, optimizer={"steps": 4})
     for again in ([], ["--resume"]):
         assert main(["--config", path, *again]) == 2
         assert "gradient of step 2; got numbers that are not finite" in capsys.readouterr().err

@@ -1,9 +1,7 @@
 """Wrong input: one line, exit code 2, nothing written; episodes dealt without padding."""
 
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from torch import nn
@@ -14,8 +12,6 @@ from torchcloth import recordings as rec
 from torchcloth.training.fit.command import main
 from torchcloth.training.fit.config import load
 from torchcloth.training.fit.data import Deal
-
-sys.path.insert(0, str(Path(__file__).parent))  # nets.py
 
 PAIR = "{in1_features: 2, in2_features: 2, out_features: 1}"
 SEVEN, TWO = "{in_features: 7, out_features: 1}", "{input_size: 2, hidden_size: 1}"
@@ -63,7 +59,7 @@ LESS = "{in_features: -2, out_features: 1}"
             "config: learn.network; got a network without any; expected some parameter that may change",
         ),
         (
-            ["learn.network={module: nets.Counting, gives: [poisson_ratio]}", "run.processes=2"],
+            ["learn.network={module: helpers.user_networks.Counting, gives: [poisson_ratio]}", "run.processes=2"],
             "config: learn.network; got layers with running statistics, on several processes",
         ),
         (["out=~nosuchuser/x"], "config: out; got ~nosuchuser/x"),
@@ -159,11 +155,11 @@ def test_a_network_whose_code_has_changed_is_not_resumed(config, tmp_path, capsy
 
 
 def test_a_network_that_has_changed_is_not_resumed(config, capsys, monkeypatch):
-    network = {"module": "nets.Wavy", "gives": ["poisson_ratio"]}
-    monkeypatch.setattr("nets.Wavy", lambda: nn.Linear(2, 1), raising=False)
+    network = {"module": "helpers.user_networks.Wavy", "gives": ["poisson_ratio"]}
+    monkeypatch.setattr("helpers.user_networks.Wavy", lambda: nn.Linear(2, 1), raising=False)
     path = config(optimizer={"steps": 1}, learn={"network": network})
     assert main(["--config", path]) == 0
-    monkeypatch.setattr("nets.Wavy", lambda: nn.Sequential(nn.Linear(2, 3), nn.Linear(3, 1)))
+    monkeypatch.setattr("helpers.user_networks.Wavy", lambda: nn.Sequential(nn.Linear(2, 3), nn.Linear(3, 1)))
     assert main(["--config", path, "--resume"]) == 2
     assert "got learned.network.0.bias of shape none; expected (3,): the model" in capsys.readouterr().err
 

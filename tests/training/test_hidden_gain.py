@@ -2,13 +2,13 @@
 
 import pytest
 import torch
+from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.diagnosis import base_model, fit, save_model, setting_of
 from torchcloth.diagnosis.causes.hypotheses import known
 from torchcloth.recordings.consistency import together
 from torchcloth.training.studies import hidden_gain
-from torchcloth.training.studies.checkout import module
 from torchcloth.training.studies.hidden_gain import gain, knowing
 
 DRAG = next(h for h in known() if h.name == "air.drag_n")
@@ -22,11 +22,11 @@ def truth(hypothesis="air.drag_n", sign=1.0):
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):
     """Folders of two episodes and an unseen one, and the base model fitted to the two."""
-    before, folder, sheets = torch.get_default_dtype(), tmp_path_factory.mktemp("case"), module("diagnosis", "sheets")
+    before, folder = torch.get_default_dtype(), tmp_path_factory.mktemp("case")
     torch.set_default_dtype(torch.float64)
     paths = {}
     for k, motion in enumerate(("slow", "lift", "fast")):
-        recording = sheets.recorded(motion, lambda world: DRAG.apply(world, TRUE), k)
+        recording = sheet_episodes.recorded(motion, lambda world: DRAG.apply(world, TRUE), k)
         paths[motion] = rec.write(recording, folder / motion)
     recordings = [rec.read(paths[name]) for name in ("slow", "lift")]
     model = base_model(recordings[0])

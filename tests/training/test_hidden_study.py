@@ -13,8 +13,8 @@ from torchcloth.diagnosis.experiment.motions import Experiment
 from torchcloth.errors import InvalidInput
 from torchcloth.training import resumable
 from torchcloth.training.studies import hidden, hidden_archive, hidden_tables
-from torchcloth.training.studies.checkout import module
 from torchcloth.training.studies.command import main
+from torchcloth.training.validation.hidden import case_sampling, reveal_truth
 
 ANSWER = {"verdict": "adequate", "causes": [], "unresolvable": [], "undecided": [], "model": None}
 
@@ -39,7 +39,7 @@ def called(monkeypatch):
             return Namespace(returncode=0, stdout=json.dumps(sizes), stderr="")
         else:  # what reveal.py prints
             seed = int(command[command.index("--seed") + 1])
-            truth = module("hidden", "reveal").truth(module("hidden", "drawn").case(seed))
+            truth = reveal_truth.truth(case_sampling.case(seed))
             return Namespace(returncode=0, stdout=json.dumps(truth), stderr="")
         return Namespace(returncode=0, stdout="", stderr="")
 
@@ -65,7 +65,7 @@ def test_the_truth_is_opened_after_the_answer_and_nothing_is_told(called, tmp_pa
 
 
 def test_what_the_catalogue_does_not_know_is_asked_whether_it_shows(called, tmp_path):
-    seed = next(s for s in range(20) if module("hidden", "drawn").case(s).family == "outside")
+    seed = next(s for s in range(20) if case_sampling.case(s).family == "outside")
     assert hidden.one(tmp_path, "001", seed, False)["sizes"][0]["name"] == "x.jet"
     assert [c[0] for c in called].index("shows.py") > [c[0] for c in called].index("reveal.py")
 
@@ -278,8 +278,8 @@ def test_experiments_are_made_of_the_same_case_and_answered_with_all_episodes(ca
 
 
 def test_a_case_that_needs_no_experiment_tells_nothing_of_experiments():
-    seed = next(s for s in range(20) if module("hidden", "drawn").case(s).family == "next experiment")
-    truth = module("hidden", "reveal").truth(module("hidden", "drawn").case(seed))
+    seed = next(s for s in range(20) if case_sampling.case(s).family == "next experiment")
+    truth = reveal_truth.truth(case_sampling.case(seed))
     (name,) = (e["hypothesis"] for e in truth["effects"] if not e["beside"])
     cause = {"effect": name, "amplitude": 1.0, "class": [name], "rivals": [], "ci95": [0.0, 2.0]}
     sure, unsure = ANSWER | {"causes": [cause]}, ANSWER | {"causes": [cause | {"rivals": [{"effect": "my.own"}]}]}

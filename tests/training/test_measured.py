@@ -11,9 +11,9 @@ import pytest
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import read_model
 from torchcloth.recordings import ForceDisplacement
-from torchcloth.training.studies.checkout import module
 from torchcloth.training.studies.command import main
 from torchcloth.training.studies.measured import SOURCES, find, swing_predictions, swings, tension
+from torchcloth.training.validation.realdata import free_swing
 
 
 @pytest.mark.slow
@@ -116,11 +116,10 @@ def test_the_floor_is_the_third_pulls_distance_from_the_mean_of_the_others():
 
 def test_frequency_and_decay_are_found_with_their_spread():
     """Swings of 0.9 Hz and B = 30 1/(m s) with noise; drawn again, they differ by what the noise makes of them."""
-    free = module("realdata", "free_swing")
     draw, t = np.random.default_rng(0), np.linspace(0, 2.5, 26)
     rows = []
     for size in (0.05, 0.07, 0.06, 0.08):
-        q = free.waves(t, 0.9, 30.0, size, 0.02) + 1e-3 * draw.normal(size=len(t))
+        q = free_swing.waves(t, 0.9, 30.0, size, 0.02) + 1e-3 * draw.normal(size=len(t))
         rows.append({"swing_t": t.tolist(), "swing_q": q.tolist(), "squares": 4.0, "count": 100, "median": 0.1})
     runs = {str(k): {"measured": row, "null": row, "still": row, "model": row} for k, row in enumerate(rows)}
     found = swing_predictions.summary(runs, ["model"], draws=5)

@@ -1,21 +1,16 @@
 """The environment of ``torchcloth plan``'s scenes, and a learner in it."""
 
-import sys
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "planning"))
-
-from scenes import by_arm, by_hand, cloth_of
+from helpers.planning_scenes import by_arm, by_hand, cloth_of
 
 from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.planning import Goal
-from torchcloth.planning.episode_conversion import courses_of
-from torchcloth.planning.forward_model import Rehearsal, plain
+from torchcloth.planning.episode_conversion import extract_motion_parameters
+from torchcloth.planning.forward_model import ForwardModel, exact_model
 from torchcloth.planning.task import Task
 from torchcloth.robots import ACCELERATION
 from torchcloth.robots.primitives import Limits
@@ -28,10 +23,10 @@ WAIT = 0.1
 def task_of(recording, way=(0.04, 0.02, 0.03), waypoints=2, judge=None):
     """Where the recorded motion's cloth would be if all were shifted."""
     cloth = cloth_of(recording).requires_grad_(False)
-    courses = [stepwise(c) for c in courses_of(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())]
-    run = Rehearsal(plain(cloth), recording, courses, None)
+    courses = [stepwise(c) for c in extract_motion_parameters(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())]
+    run = ForwardModel(exact_model(cloth), recording, courses, None)
     with torch.no_grad():
-        x = run.run({c.name: c.trajectory(c.nothing) for c in courses})[-1]
+        x = run.simulate({c.name: c.trajectory(c.zero_waypoints) for c in courses})[-1]
     return Task([run], courses, Goal(x + torch.tensor(way), run.faces), judge, None)
 
 
@@ -79,7 +74,7 @@ def test_step_by_step_the_cloth_goes_where_the_whole_motion_brings_it():
     (last,) = tried
     assert last.distance == pytest.approx(info["distance"])
     assert task.look(last.at)[0] == pytest.approx(last.distance, rel=2e-2)  # substeps of other lengths
-    assert float(task.bounds.nearest(last.at)[0]) <= 1.0
+    assert float(task.bounds.nearest_limit(last.at)[0]) <= 1.0
 
 
 def test_what_is_in_the_way_is_not_stepped_into():
@@ -88,7 +83,7 @@ def test_what_is_in_the_way_is_not_stepped_into():
             return None, "in the way" if float((q["arm"] - recorded).abs().max()) > 0.02 else None
 
     course = task_of(by_arm()).courses[0]
-    recorded = course.at_instants(course.nothing)
+    recorded = course.coordinates_at_check_times(course.zero_waypoints)
 
     env = ReachEnv(task_of(by_arm(), judge=Wall()))
     env.reset()

@@ -1,11 +1,10 @@
 """A recording as a film: clocks, places, and what is not there."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.rich_recording import make_recording
 from PIL import Image
 
 from torchcloth import recordings as rec
@@ -13,9 +12,6 @@ from torchcloth import robots
 from torchcloth.errors import RecordingError
 from torchcloth.viewing import film_of
 from torchcloth.viewing.film import placed
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "recordings"))
-from conftest import make_recording
 
 
 @pytest.fixture

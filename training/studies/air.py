@@ -25,11 +25,11 @@ from torchcloth.recordings import Recording
 from torchcloth.recordings.consistency import together
 
 from ..resumable import Kept
+from ..validation.realdata import swings as iri_swings
 from . import air_tables
-from .checkout import module
-from .diagnosing import diagnosis_in
 from .measured import VARIABLE, find, swings
 from .measured.swing_predictions import predict, summary
+from .resumable_diagnosis import diagnosis_in
 
 GROUPS = 6
 SECONDS, FAST_SECONDS = 6.0, 3.0  # from when the tool starts: until then it stands for up to three
@@ -81,9 +81,9 @@ def diagnosed(source: Path, names: Sequence[str], folder: Path, fast: bool) -> d
 
 def beginning(source: Path, name: str, seconds: float) -> Recording:
     """A run until that long after the cloth was seen to start."""
-    adapter, found = module("realdata", "swings"), swings.recording(source, name)
-    data, points = adapter.runs(source)[name], found.require("points", by="the study")
-    end = adapter.start(data) + adapter.lag(data).value + seconds
+    found = swings.recording(source, name)
+    data, points = iri_swings.runs(source)[name], found.require("points", by="the study")
+    end = iri_swings.start(data) + iri_swings.lag(data).value + seconds
     return replace(found, points=points.only(points.t <= end), markers=None)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from .manipulations import options, paper, pictures
+from .manipulations import manipulation_figures, paper_tables, study_cases
+from .manipulations.console_tables import heading_table, mm, percent, show, write
 from .manipulations.measures import Spread, spread
-from .manipulations.printing import heading_table, mm, percent, show, write
 from .manipulations.scenes import ACTIONS, WORN
 
 STATES = {"null": "rigid carry", "start": "not fitted", "fit": "fitted"}
@@ -20,17 +20,17 @@ CONVENTIONS = {
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Options."""
-    options.add(parser)
+    study_cases.add(parser)
 
 
 def run(chosen: argparse.Namespace) -> None:
     """All cases, then both tables."""
-    found = options.cases(chosen)
+    found = study_cases.cases(chosen)
     result = {by: summary(found, by, names) for by, names in (("action", ACTIONS), ("garment", WORN))}
     failed = sum("failed" in case for case in found.values())
     show(*(_table(by, rows) for by, rows in result.items()), *_notes(len(found), failed))
     write(chosen.out / "chamfer.json", {"by": result, "cases": len(found), "failed": failed})
-    pictures.distances(result, chosen.out / "chamfer.png")
+    manipulation_figures.distances(result, chosen.out / "chamfer.png")
 
 
 def summary(found: dict[str, dict[str, Any]], by: str, names: tuple[str, ...]) -> dict[str, dict[str, dict[str, Any]]]:
@@ -50,7 +50,7 @@ def _table(by: str, rows: dict[str, dict[str, dict[str, Any]]]):
     title = f"Mean distance [mm] by {by}, over all frames; those that were not fitted, the late ones, are predicted"
     table = heading_table(title, by, "convention", *STATES.values(), "CoV", "cases", "| paper", "CoV")
     for name, conventions in rows.items():
-        mean, cov = paper.CHAMFER[name]
+        mean, cov = paper_tables.CHAMFER[name]
         for convention, states in conventions.items():
             fit = Spread(**states["fit"])
             theirs = [mm(mean), f"{cov:.1f} %"] if convention == "vertices" else ["", ""]

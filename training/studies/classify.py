@@ -17,7 +17,7 @@ import numpy as np
 from torchcloth._utils.files import write_text
 
 from ..resumable import Kept
-from . import class_pictures
+from . import classification_figures
 from .fabric_tables import table
 from .fabric_trials import PAIR, stretches
 from .fabrics import LABEL, add, chosen
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
     content = {"what": LABEL, "paper": f'"{CLAIM}"; no table, no number', "sets": results}
     write_text(options.out / "classify.json", json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
     _show(results)
-    picture = class_pictures.draw(options.out, _trials(cases.values(), PAIR), results)
+    picture = classification_figures.draw(options.out, _trials(cases.values(), PAIR), results)
     print(f"result:  {options.out / 'classify.json'}\npicture: {picture}")
 
 

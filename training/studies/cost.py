@@ -17,7 +17,7 @@ from torchcloth.identification import identify
 from ..resumable import Kept
 from . import stretching
 from .manipulations import cases
-from .manipulations.printing import heading_table, mm, number, show, write
+from .manipulations.console_tables import heading_table, mm, number, show, write
 from .manipulations.scenes import Discretisation, Fabric, Manipulation, manipulations, slowed
 
 if TYPE_CHECKING:

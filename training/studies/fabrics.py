@@ -13,7 +13,7 @@ from torchcloth._utils.files import write_text
 from torchcloth.materials.presets import find
 
 from ..resumable import Kept
-from . import fabric_pictures, fabric_tables
+from . import fabric_figures, fabric_tables
 from .fabric_trials import DENSITIES, FAST, FULL, Scale, others, stretches, truth, values
 from .paper_fabrics import COV, FABRICS, SYMBOLS
 
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     result = summary(scale, cases)
     write_text(options.out / "fabrics.json", json.dumps(result, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
     fabric_tables.show(result)
-    pictures = fabric_pictures.draw(options.out, scale, cases)
+    pictures = fabric_figures.draw(options.out, scale, cases)
     print(f"result:   {options.out / 'fabrics.json'}")
     print("pictures: " + ", ".join(map(str, pictures)))
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from .manipulations import options, paper, pictures
+from .manipulations import manipulation_figures, paper_tables, study_cases
 from .manipulations.cases import SOUGHT
+from .manipulations.console_tables import heading_table, mm, number, show, write
 from .manipulations.measures import Pooled, pooled
-from .manipulations.printing import heading_table, mm, number, show, write
 from .manipulations.scenes import GRIPS, POSTURES, SPEEDS
 
 FACTORS = {"speed": SPEEDS, "grip": GRIPS, "posture": POSTURES}
@@ -18,12 +18,12 @@ LEAST = 3  # values before their variance is shown
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Options."""
-    options.add(parser)
+    study_cases.add(parser)
 
 
 def run(chosen: argparse.Namespace) -> None:
     """All cases, then both tables."""
-    found = options.cases(chosen)
+    found = study_cases.cases(chosen)
     seen = {factor: {c: distances(found, factor, c) for c in CONVENTIONS} for factor in FACTORS}
     values = {factor: {name: estimates(found, factor, name) for name in SOUGHT} for factor in FACTORS}
     show(_distance_table(seen), _parameter_table(values), *_notes(len(found)))
@@ -31,7 +31,7 @@ def run(chosen: argparse.Namespace) -> None:
         chosen.out / "factors.json",
         {"distance": _plain(seen), "parameters_over_truth": _plain(values), "cases": len(found)},
     )
-    pictures.levels({factor: own["surface"] for factor, own in seen.items()}, chosen.out / "factors.png")
+    manipulation_figures.levels({factor: own["surface"] for factor, own in seen.items()}, chosen.out / "factors.png")
 
 
 def distances(found: dict[str, dict[str, Any]], factor: str, convention: str) -> Pooled:
@@ -64,7 +64,7 @@ def _distance_table(seen: dict[str, dict[str, Pooled]]):
         "variance [m²]", "between levels", "levels [mm]", "| paper: mean [mm]", "variance [m²]",
     )  # fmt: skip
     for factor, conventions in seen.items():
-        mean, variance = paper.FACTORS[factor]
+        mean, variance = paper_tables.FACTORS[factor]
         for convention, p in conventions.items():
             levels = " / ".join(mm(p.levels[level].mean) if level in p.levels else "–" for level in FACTORS[factor])
             theirs = [mm(mean), f"{variance:.2e}"] if convention == "vertices" else ["", ""]

@@ -29,9 +29,9 @@ from torchcloth.recordings import Camera, PointClouds, Recording
 from torchcloth.recordings.consistency import together
 
 from ..resumable import Kept
-from .diagnosing import diagnosis_in
 from .fabric_tables import table
 from .measured import VARIABLE, find, swings
+from .resumable_diagnosis import diagnosis_in
 
 RUNS = ("range60_rep1", "range90_rep1", "range30_rep1", "range60_rep2")
 SECONDS, FAST_SECONDS = 6.0, 4.0

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from .manipulations import joint, options, paper, pictures
+from .manipulations import joint, manipulation_figures, paper_tables, study_cases
 from .manipulations.cases import FREE, SOUGHT
+from .manipulations.console_tables import heading_table, number, percent, show, write
 from .manipulations.measures import spread
-from .manipulations.printing import heading_table, number, percent, show, write
 
 LEAST = 3  # cases that identify a parameter before their scatter is given
 SHOWN = {  # symbol, unit, SI units in one of these
@@ -25,7 +25,7 @@ SHOWN = {  # symbol, unit, SI units in one of these
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Options."""
-    options.add(parser)
+    study_cases.add(parser)
     joint.add(parser)
 
 
@@ -33,11 +33,11 @@ def run(chosen: argparse.Namespace) -> None:
     """All cases, or what is done instead; then tables, result and pictures."""
     if chosen.joint:
         return joint.run(chosen)
-    found = options.cases(chosen)
+    found = study_cases.cases(chosen)
     result = {garment: _garment(own) for garment, own in _by_garment(found).items()}
     show(_table(result), *_notes(found))
     write(chosen.out / "garments.json", {"garments": result, "cases": len(found)})
-    pictures.estimates(found, chosen.out / "garments.png")
+    manipulation_figures.estimates(found, chosen.out / "garments.png")
 
 
 def _by_garment(found: dict[str, dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
@@ -77,7 +77,7 @@ def _table(result: dict[str, dict[str, Any]]):
     for garment, rows in result.items():
         for name, r in rows.items():
             symbol, unit, scale = SHOWN[name]
-            mean, cov = paper.PARAMETERS.get(name, {}).get(garment, (None, None))
+            mean, cov = paper_tables.PARAMETERS.get(name, {}).get(garment, (None, None))
             known = r["mean"] is not None
             table.add_row(
                 garment,

@@ -1,7 +1,7 @@
 """Hidden effects: another engine hides one in recordings, ``torchcloth diagnose`` answers, then the truth is opened.
 
 Each case is made by a process of its own, diagnosed by another that gets the episodes alone, and revealed by a third
-once the answer is on disk (tests/hidden). Sealed cases are drawn from a secret; the program is tuned on others.
+once the answer is on disk (validation.hidden). Sealed cases are drawn from a secret; the program is tuned on others.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchcloth._utils.files import PROGRESS, write_text
+from torchcloth._utils.files import PROGRESS_FOLDER_NAME, write_text
 from torchcloth.diagnosis.experiment.motions import heading_of, possible
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings import read
 
 from ..resumable import Kept
+from ..validation.hidden import case_sampling
+from ..validation.independent import motions
 from . import hidden_archive, hidden_tables
-from .checkout import folder, module
 from .hidden_gain import gain
 from .hidden_scores import judged, shows, told_apart
 
@@ -122,7 +123,6 @@ def drawn(options: argparse.Namespace) -> Round:
     fixed = options.fast and options.seed is None and not options.dev
     usual = len(FAST) if fixed else CASES
     count = usual if options.cases is None else options.cases
-    cases = module("hidden", "drawn")
     for option, number in (("--cases", count), ("--jobs", options.jobs)):
         if number < 1:
             raise InvalidInput(option, got=number, expected="1 or more")
@@ -134,11 +134,11 @@ def drawn(options: argparse.Namespace) -> Round:
             raise InvalidInput("--cases", got=count, expected=f"at most {usual}", remedy="or --seed")
     elif options.dev:
         secret, seeds = None, list(range(count))
-        if count > cases.DEVELOPMENT:
-            raise InvalidInput("--cases", got=count, expected=f"at most {cases.DEVELOPMENT} for development")
+        if count > case_sampling.DEVELOPMENT:
+            raise InvalidInput("--cases", got=count, expected=f"at most {case_sampling.DEVELOPMENT} for development")
     else:
         secret = _secret(options)
-        seeds = cases.sealed(secret, count)
+        seeds = case_sampling.sealed(secret, count)
     settings = {"study": "hidden", "secret": secret, "fast": options.fast}
     return Round({f"{k:03d}": seed for k, seed in enumerate(seeds, 1)}, options.fast, settings)
 
@@ -156,14 +156,14 @@ def _secret(options: argparse.Namespace) -> int:
 def one(out: Path, name: str, seed: int, fast: bool) -> dict[str, Any]:
     """One case from making to revealing."""
     episodes, answer = out / "episodes" / name, out / "answers" / name
-    make = partial(_script, "make.py", "--seed", str(seed), *(["--fast"] if fast else []))
+    make = partial(_script, "make_case", "--seed", str(seed), *(["--fast"] if fast else []))
     given = _made(make("--out", str(episodes)))
     begun = time.perf_counter()
-    stopped = (answer / PROGRESS).exists() or (answer / ANSWER).exists()  # and what it took before is not known
+    stopped = (answer / PROGRESS_FOLDER_NAME).exists() or (answer / ANSWER).exists()  # and what it took before is not known
     found = answered(given, answer)
     spent = None if stopped else round(time.perf_counter() - begun, 1)
     # only now
-    truth = json.loads(_script("reveal.py", "--seed", str(seed), *(["--fast"] if fast else [])))
+    truth = json.loads(_script("reveal_truth", "--seed", str(seed), *(["--fast"] if fast else [])))
     schema = hidden_archive.CURRENT_SCHEMA
     case = {"schema": schema, "truth": truth, "answer": found, "seconds": spent, "gain": None}
     if truth["family"] == "next experiment":
@@ -171,7 +171,7 @@ def one(out: Path, name: str, seed: int, fast: bool) -> dict[str, Any]:
     if truth["family"] in ("single", "double") and not fast:
         case["gain"] = _gain(out, name, make, given, found, truth)
     if truth["family"] in ("single", "double", "outside") and not fast:
-        case["sizes"] = json.loads(_script("shows.py", "--seed", str(seed)))
+        case["sizes"] = json.loads(_script("visibility", "--seed", str(seed)))
     return case
 
 
@@ -183,8 +183,7 @@ def experiments(
     if not proposed:
         return {"proposed": None, "random": None}
     rng = np.random.default_rng([seed, 17])
-    motions = module("independent", "motions").NAMES
-    drawn = {"motion": str(rng.choice(motions)), "heading": float(rng.choice(HEADINGS)), "speed": 1.0}
+    drawn = {"motion": str(rng.choice(motions.NAMES)), "heading": float(rng.choice(HEADINGS)), "speed": 1.0}
     found = {}
     for which, plan in (("proposed", turned(proposed, given)), ("random", drawn)):
         folder = out / "episodes" / f"{name}-{which}"
@@ -212,19 +211,19 @@ def _gain(
 
 
 def _made(said: str) -> list[Path]:
-    """The episodes that make.py names; what a stopped one has left lies in the same folder."""
+    """The episodes that make_case names; what a stopped one has left lies in the same folder."""
     return sorted(Path(line.rpartition(": ")[0]) for line in said.splitlines())
 
 
 def answered(episodes: list[Path], out: Path) -> dict[str, Any]:
     """What ``torchcloth diagnose`` writes, or how it ended instead. What is written stays: its truth may be open."""
-    begun = (out / PROGRESS).exists()
+    begun = (out / PROGRESS_FOLDER_NAME).exists()
     if (out / ANSWER).exists() and not begun:
         return json.loads((out / ANSWER).read_text())
     command = [sys.executable, "-m", "torchcloth.cli", "diagnose", *map(str, episodes), "--out", str(out)]
     done = _run([*command, "--resume"] if begun else command)
     if begun and done.returncode == REFUSED:  # another version of the program left it
-        shutil.rmtree(out / PROGRESS)
+        shutil.rmtree(out / PROGRESS_FOLDER_NAME)
         done = _run(command)
     if done.returncode in STOPPED:  # by who stops the study, or the system for want of memory: that is no answer
         raise KeyboardInterrupt
@@ -238,10 +237,10 @@ def answered(episodes: list[Path], out: Path) -> dict[str, Any]:
 
 
 def _script(name: str, *arguments: str) -> str:
-    """Output of a script of tests/hidden."""
-    done = _run([sys.executable, str(folder("hidden") / name), *arguments])
+    """Output of a program of validation.hidden."""
+    done = _run([sys.executable, "-m", f"torchcloth.training.validation.hidden.{name}", *arguments])
     if done.returncode:
-        raise InvalidInput(f"tests/hidden/{name} {' '.join(arguments)}", got=done.stderr.strip()[-300:])
+        raise InvalidInput(f"validation.hidden.{name} {' '.join(arguments)}", got=done.stderr.strip()[-300:])
     return done.stdout
 
 

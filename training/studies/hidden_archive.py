@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torchcloth._utils.files import atomically
+from torchcloth._utils.files import write_atomically
 from torchcloth.errors import InvalidInput
 
 SUFFIX = ".jsonl.xz"
@@ -88,7 +88,7 @@ def write_archive(folder: Path, path: Path, name: str, date: str) -> None:
     settings = json.loads((folder / "study.json").read_text())
     lines = [{"schema": schemas.pop(), "round": name, "date": date, **settings}]
     lines += [{"name": key, **{k: _round_statistics(k, v) for k, v in case.items()}} for key, case in cases.items()]
-    with atomically(path) as part, lzma.open(part, "wt", preset=9 | lzma.PRESET_EXTREME, encoding="utf-8") as file:
+    with write_atomically(path) as part, lzma.open(part, "wt", preset=9 | lzma.PRESET_EXTREME, encoding="utf-8") as file:
         file.writelines(json.dumps(line, ensure_ascii=False, separators=(",", ":")) + "\n" for line in lines)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from .hidden_scores import NULLS, WITH_EFFECT
 
 Judged = Mapping[str, Any]
-CONFOUNDED = ("tilt or wind", "base or extrinsic", "mass without forces", "damping or drag")  # as tests/hidden has them
+CONFOUNDED = ("tilt or wind", "base or extrinsic", "mass without forces", "damping or drag")  # as validation.hidden has them
 
 
 class Rate(NamedTuple):

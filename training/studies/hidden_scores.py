@@ -1,6 +1,6 @@
 """How answers to hidden cases are judged: pure functions of what was hidden and what was answered.
 
-A truth is what tests/hidden/reveal.py prints; an answer is the content of diagnosis.json, or ``{"refused": text}``
+A truth is what validation.hidden.reveal_truth prints; an answer is the content of diagnosis.json, or ``{"refused": text}``
 where the command refused the recordings, or ``{"failed": text}`` where it ended otherwise.
 """
 
@@ -111,7 +111,7 @@ def judged(truth: Truth, answer: Answer) -> dict[str, Any]:
 def shows(truth: Truth, sizes: Sequence[Mapping[str, Any]] | None) -> list[bool] | None:
     """Whether each effect that is there for its own sake changes what is recorded beside what the fabric's numbers do.
 
-    ``sizes`` is what tests/hidden/shows.py prints; what is not there moves no cloth and is seen as it is. None: not
+    ``sizes`` is what validation.hidden.visibility prints; what is not there moves no cloth and is seen as it is. None: not
     known.
     """
     if sizes is None:

@@ -28,8 +28,8 @@ from torchcloth.pose.visibility import seen_vertices
 from torchcloth.recordings import Recording, read
 
 from ..resumable import Kept
-from .checkout import folder, module
-from .geometry import registered, snapped
+from ..validation.independent.flex_sheet import SheetSpec, bilinear
+from .geometric_baselines import registered, snapped
 
 DRAG = 1.2  # of the truth; its membrane has the data sheet's value
 HIDDEN = ["air.drag_n=1.2", "obs.occlusion=0.3", "obs.bias=0.0007"]
@@ -91,13 +91,13 @@ def _scene(out: Path, setting: Setting, motion: str) -> Scene:
     if not path.is_dir():
         effects = [part for effect in HIDDEN for part in ("--effect", effect)]
         sizes = ["--nodes", str(setting.nodes), "--fit-nodes", str(setting.fit)]
-        script = [sys.executable, str(folder("independent") / "generate.py"), "--motion", motion, "--seed", "1"]
+        script = [sys.executable, "-m", "torchcloth.training.validation.independent.generate", "--motion", motion, "--seed", "1"]
         done = subprocess.run([*script, *sizes, *effects, "--out", str(path)], capture_output=True, text=True)
         if done.returncode:
-            raise InvalidInput("tests/independent/generate.py", got=done.stderr.strip()[-300:])
+            raise InvalidInput("validation.independent.generate", got=done.stderr.strip()[-300:])
     recording = read(path, with_truth=True)
     cloth = _cloth(recording)
-    data = identification.episode(cloth, recording)
+    data = identification.build_episode(cloth, recording)
     truth = _at(recording, cloth, data.times.numpy())
     return Scene(recording, truth, ~seen_vertices(truth, data, cloth.mesh))
 
@@ -106,19 +106,19 @@ def _at(recording: Recording, cloth: tc.Cloth, times: np.ndarray) -> Tensor:
     """[T, V, 3] m, the truth at the vertices of a coarser mesh."""
     from scipy.interpolate import CubicSpline
 
-    sheets, found = module("independent", "flex_sheet"), recording.require("truth", by="the study")
+    found = recording.require("truth", by="the study")
     side = round(len(found.vertices[0]) ** 0.5)
     width, height = np.ptp(np.asarray(cloth.mesh.uv), axis=0)
-    spec = sheets.SheetSpec(width, height, nodes=(side, side))
+    spec = SheetSpec(width, height, nodes=(side, side))
     frames = CubicSpline(found.t, found.vertices)(times)
-    return torch.as_tensor(np.stack([sheets.bilinear(spec, x, cloth.mesh.uv)[0] for x in frames]))
+    return torch.as_tensor(np.stack([bilinear(spec, x, cloth.mesh.uv)[0] for x in frames]))
 
 
 def _cloth(recording: Recording, stiffness: float = 1.0, drag: float = DRAG) -> tc.Cloth:
     nominal = recording.cloth.nominal
     bending = Bending(nominal["bending_stiffness"], nominal["bending_damping_time"])
     effects = {"gravity": Gravity(recording.gravity.tolist()), "bending": bending, "air": AirDrag(drag)}
-    cloth = identification.cloth_from(recording, effects=effects)
+    cloth = identification.build_cloth(recording, effects=effects)
     _stiffness(cloth).set(stiffness * float(_stiffness(cloth).value.detach()))
     return cloth
 
@@ -158,7 +158,7 @@ def _identified(start: tc.Cloth, recording: Recording) -> tuple[tc.Cloth, Uncert
 def _geometry(scene: Scene) -> dict[str, Any]:
     """Without physics: carried, snapped, registered."""
     cloth = _cloth(scene.recording)
-    data = identification.episode(cloth, scene.recording)
+    data = identification.build_episode(cloth, scene.recording)
     held = torch.cat([part.index for part in cloth.boundaries.values()])  # type: ignore[misc]
     carried = identification.rigid_carry(data)
     noise = scene.recording.observation_noise_std or 1e-3

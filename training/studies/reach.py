@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from torchcloth import planning
-from torchcloth.identification import cloth_from, fitted, identify
+from torchcloth.identification import build_cloth, fitted, identify
 from torchcloth.identification.io.saved_fit import RESULT
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.planning import Goal
@@ -27,8 +27,14 @@ from torchcloth.recordings import Recording
 from torchcloth.robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
 from ..resumable import Kept, check_jobs
-from .checkout import module
-from .manipulations.printing import heading_table, mm, show, write
+from ..validation.independent import motions
+from ..validation.independent.effects import hide
+from ..validation.independent.flex_sheet import grid
+from ..validation.independent.generate import record
+from ..validation.independent.scene import Scene as IndependentScene
+from ..validation.independent.scene import simulate
+from ..validation.independent.sensor import see
+from .manipulations.console_tables import heading_table, mm, show, write
 
 FIT = "fit"
 LEARNT = ("stretch", "swing")  # motions that the fabric is fitted to
@@ -84,8 +90,7 @@ def run(options: argparse.Namespace) -> None:
 
 def scene(scale: Scale) -> Scene:
     """A knit in air, and the same with what a wrong data sheet says of it."""
-    make = module("independent", "scene").Scene()
-    hide = module("independent", "effects").hide
+    make = IndependentScene()
     true = replace(make, sheet=replace(make.sheet, nodes=(scale.nodes, scale.nodes)))
     said = replace(
         true,
@@ -99,7 +104,7 @@ def learn(scale: Scale, folder: Path) -> dict[str, Any]:
     """The fabric, from two motions."""
     torch.set_default_dtype(torch.float64)
     recordings = [_recorded(scale, name, k)[0] for k, name in enumerate(LEARNT)]
-    fit = identify(cloth_from(recordings[0]), recordings, nuisances=["grasp"])
+    fit = identify(build_cloth(recordings[0]), recordings, nuisances=["grasp"])
     fit.save(folder)
     return {name: {"value": p.value, "std": p.std, "unit": p.unit} for name, p in fit.parameters.items()}
 
@@ -107,23 +112,22 @@ def learn(scale: Scale, folder: Path) -> dict[str, Any]:
 def reach(scale: Scale, number: int, name: str, folder: Path) -> dict[str, Any]:
     """One goal: how far the cloth is from it as recorded, as planned, and when the plan is carried out."""
     torch.set_default_dtype(torch.float64)
-    generate, see = module("independent", "scene").simulate, module("independent", "sensor").see
     episode, moved, begun = _recorded(scale, name, 10 + number)
     cloth = scene(scale).true
     hidden = _elsewhere(moved, np.random.default_rng([7, number]))
-    there = generate(cloth, hidden)
+    there = simulate(cloth, hidden)
     cloud = see(cloth.sensor, cloth.sheet, hidden.t, there.x, np.random.default_rng([8, number]))
     goal = Goal(torch.as_tensor(cloud.frame(len(cloud) - 1)))
-    faces = torch.as_tensor(module("independent", "flex_sheet").grid(cloth.sheet)[1])
+    faces = torch.as_tensor(grid(cloth.sheet)[1])
     out: dict[str, Any] = {
         "noise": _from_goal(goal, there.x[-1], faces),
         "recorded": _from_goal(goal, begun.x[-1], faces) | {"vertices": _rms(begun.x[-1], there.x[-1])},
     }
     for label, how in METHODS.items():
-        model = cloth_from(episode) if label == "data sheet" else fitted(folder / RESULT, episode)[0]
+        model = build_cloth(episode) if label == "data sheet" else fitted(folder / RESULT, episode)[0]
         began = time.perf_counter()
         found = planning.plan(model, episode, goal, **({"iterations": scale.iterations, "wait": 0.0} | how))
-        done = generate(cloth, _along(moved, found.recording))
+        done = simulate(cloth, _along(moved, found.recording))
         out[label] = {
             "before": found.before[0],
             "expected": found.after[0],
@@ -138,22 +142,22 @@ def reach(scale: Scale, number: int, name: str, folder: Path) -> dict[str, Any]:
 
 def _recorded(scale: Scale, name: str, seed: int) -> tuple[Recording, Any, Any]:
     """(recording, motion, what happened) of a motion by name."""
-    record, cloth = module("independent", "generate").record, scene(scale)
-    moved = module("independent", "motions").motion(name, cloth.true.sheet)
-    result = module("independent", "scene").simulate(cloth.true, moved)
+    cloth = scene(scale)
+    moved = motions.motion(name, cloth.true.sheet)
+    result = simulate(cloth.true, moved)
     said = record(cloth.true, moved, result, name, seed, scale.fit_nodes, said=cloth.said)
     return replace(said, air_density=cloth.true.air.density, truth=None), moved, result
 
 
 def _elsewhere(moved: Any, rng: np.random.Generator) -> Any:
     """The motion with its end elsewhere: both hands shifted and turned about the vertical, ever more on the way."""
-    jerk = module("independent", "motions").minimum_jerk
+    jerk = motions.minimum_jerk
     t = moved.t
     share = jerk(t, np.array([t[0] + 0.2, t[-1] - 0.2]), np.array([0.0, 1.0]))
     shift, angle = rng.uniform(-FAR, FAR, 3), rng.uniform(-TURN, TURN)
     shift[2] = abs(shift[2])  # up: a table may lie below
     middle = np.mean([pose[:, :3, 3] for pose in moved.pose.values()], axis=0)
-    turn = module("independent", "motions")._about_z(share * angle)
+    turn = motions._about_z(share * angle)
     pose = {}
     for name, own in moved.pose.items():
         new = own.copy()

@@ -13,7 +13,7 @@ import torch
 
 import torchcloth as tc
 from torchcloth import recordings as rec
-from torchcloth.identification import cloth_from
+from torchcloth.identification import build_cloth
 from torchcloth.observe import DepthCamera, DepthNoise, View, capture, look_at
 from torchcloth.robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from torchcloth.types import Rollout
@@ -151,7 +151,7 @@ def sheet(
     material = tc.materials.AEP(
         fabric.membrane / THICKNESS, fabric.poisson, contact_stiffness, shear_stiffness, thickness=THICKNESS
     )
-    return cloth_from(recording, material, effects, contact)
+    return build_cloth(recording, material, effects, contact)
 
 
 def _info(density: float, pull: Pull, resolution: tuple[int, int], first: np.ndarray | None = None) -> rec.ClothInfo:

@@ -24,10 +24,10 @@ from torchcloth.cloth import Cloth
 from torchcloth.errors import InvalidInput
 from torchcloth.planning import Goal
 from torchcloth.planning.constrained_step import step_within
-from torchcloth.planning.episode_conversion import courses_of
-from torchcloth.planning.forward_model import Rehearsal, plain
-from torchcloth.planning.motion_parameters import Course
-from torchcloth.planning.objective import aim_at
+from torchcloth.planning.episode_conversion import extract_motion_parameters
+from torchcloth.planning.forward_model import ForwardModel, exact_model
+from torchcloth.planning.motion_parameters import GripperMotionParameters
+from torchcloth.planning.objective import build_objective
 from torchcloth.planning.task import Task
 from torchcloth.recordings import ClothInfo, Collider, GraspInfo, Recording
 from torchcloth.robots import ACCELERATION, gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/
@@ -35,10 +35,10 @@ from torchcloth.robots.primitives import Limits  # pyright: ignore[reportMissing
 from torchcloth.types import Trajectory
 
 from ..resumable import Kept
-from .manipulations.printing import heading_table, mm, show, write
+from .manipulations.console_tables import heading_table, mm, show, write
 from .manipulations.scenes import FRICTION, LAYERS, Discretisation, Fabric, Manipulation
 from .manipulations.scenes import Scene as Staged
-from .trajectory_pictures import curves
+from .trajectory_figures import curves
 
 CASES = (("dress", "drag"), ("trousers", "cover"), ("shirt", "cover"))
 METHODS = ("gauss-newton", "adam", "sac")
@@ -84,8 +84,8 @@ class Scene(NamedTuple):
 
     cloth: Cloth
     recording: Recording
-    courses: list[Course]
-    run: Rehearsal
+    courses: list[GripperMotionParameters]
+    run: ForwardModel
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -126,8 +126,8 @@ def sought(scale: Scale, number: int, garment: str, motion: str, method: str) ->
     moved, expected, history, more = found_by(method, scale, coarse, goal)
     seconds = time.perf_counter() - began
     with torch.no_grad():
-        first, done = (fine.run.run(m)[-1] for m in ({c.name: c.trajectory(c.nothing) for c in fine.courses}, moved))
-    distance = lambda x: float(aim_at(goal, fine.cloth.mesh).distance(x))  # noqa: E731
+        first, done = (fine.run.simulate(m)[-1] for m in ({c.name: c.trajectory(c.zero_waypoints) for c in fine.courses}, moved))
+    distance = lambda x: float(build_objective(goal, fine.cloth.mesh).distance(x))  # noqa: E731
     return {
         "recorded": distance(first),
         "done": distance(done),
@@ -179,18 +179,18 @@ def set_up(garment: str, motion: str, fine: Discretisation, waypoints: int) -> S
         grippers={name: gripper_motion(path) for name, path in staged.action.motion.items()},
         colliders={"table": Collider(np.array([0.0, 0.0, LAYERS / 2]), np.array([0.0, 0.0, 1.0]), FRICTION)},
     )
-    courses = courses_of(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())
-    return Scene(cloth, recording, courses, Rehearsal(plain(cloth), recording, courses, None))
+    courses = extract_motion_parameters(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())
+    return Scene(cloth, recording, courses, ForwardModel(exact_model(cloth), recording, courses, None))
 
 
 def hidden_goal(scene: Scene, rng: np.random.Generator) -> Goal:
     """Where another motion within the limits brings the garment, as noisy points of its surface."""
     blank = Task([scene.run], scene.courses, Goal(torch.zeros(1, 3)), None, None)
-    wanted = torch.as_tensor(rng.standard_normal((len(scene.courses), *blank.courses[0].nothing.shape)))
+    wanted = torch.as_tensor(rng.standard_normal((len(scene.courses), *blank.courses[0].zero_waypoints.shape)))
     wanted = (0.7 * wanted.mean(0) + 0.3 * wanted) * torch.tensor([AWAY] * 3 + [TURN] * 3)  # hands go much alike
     at = step_within(blank.start, -wanted.flatten(), torch.eye(len(blank.start)).to(wanted), blank.bounds)
     with torch.no_grad():
-        x = scene.run.run(blank.motion(at))[-1]
+        x = scene.run.simulate(blank.motion(at))[-1]
     return Goal(on_surface(x, scene.run.faces, POINTS, rng) + torch.as_tensor(NOISE * rng.standard_normal((POINTS, 3))))
 
 

@@ -10,7 +10,6 @@ import copy
 import random
 import re
 import shutil
-import sys
 import warnings
 from collections import Counter
 from dataclasses import dataclass
@@ -18,10 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-import foreign
+from helpers import foreign_formats
 
 from torchcloth import recordings as rec
 from torchcloth.errors import MissingDependency, TorchclothError
@@ -129,7 +125,7 @@ def mutate(rng: random.Random, files: list[Path]) -> tuple[str, set[Path]]:
     return f"{how} {file.name}", touched
 
 
-def attempt(truth: foreign.Foreign, scene: Path, out: Path) -> Content | None:
+def attempt(truth: foreign_formats.Foreign, scene: Path, out: Path) -> Content | None:
     """Import and write; None when it was refused, by one line and without a trace."""
     try:
         with warnings.catch_warnings():
@@ -157,7 +153,7 @@ def _quick(monkeypatch):
 def fuzz(case: str, tmp_path: Path, count: int) -> Counter:
     """Mutations of one format by what became of them."""
     (name, options), rng, outcome = CASES[case], random.Random(case), Counter()
-    truth = foreign.WRITERS[name](tmp_path / "whole", **options)
+    truth = foreign_formats.WRITERS[name](tmp_path / "whole", **options)
     scene, out = truth.write_scene(), tmp_path / "out"
     expected = attempt(truth, scene, out)
     assert expected is not None
@@ -225,7 +221,7 @@ VALUES = [None, True, 0, -1, 1e400, 10**400, "", "x", "/", "\0", [], {}, [[]], [
 def wrong_scenes(name: str, tmp_path: Path, count: int) -> Counter:
     """Side files with faults of people: read, or refused by one line; whatever is read can be written."""
     rng, outcome = random.Random(name), Counter()
-    truth = foreign.WRITERS[name](tmp_path)
+    truth = foreign_formats.WRITERS[name](tmp_path)
     table = {"plane": {"point": [0, 0, 0], "normal": [0, 0, 1]}}
     whole = {"cameras": {}, **truth.scene, "grasps": {}, "colliders": {"table": table}}
     camera = whole["cameras"].setdefault("depth" if name == "kinect" else "cam0", {})
@@ -250,13 +246,13 @@ def wrong_scenes(name: str, tmp_path: Path, count: int) -> Counter:
     return outcome
 
 
-@pytest.mark.parametrize("name", foreign.WRITERS)
+@pytest.mark.parametrize("name", foreign_formats.WRITERS)
 def test_wrong_scenes(name, tmp_path):
     assert wrong_scenes(name, tmp_path, FEW // 4)[False] > 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", foreign.WRITERS)
+@pytest.mark.parametrize("name", foreign_formats.WRITERS)
 def test_many_wrong_scenes(name, tmp_path):
     outcome = wrong_scenes(name, tmp_path, MANY)
     print(name, dict(outcome))

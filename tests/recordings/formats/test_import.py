@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-import foreign
+from helpers import foreign_formats
 
 from torchcloth import recordings as rec
 from torchcloth.recordings import formats
@@ -32,7 +26,7 @@ def arrays_of(recording: rec.Recording) -> dict[str, np.ndarray]:
     return {key: value for key, value in found.items() if isinstance(value, np.ndarray)}
 
 
-def check(recording: rec.Recording, truth: foreign.Foreign, *, lossy: int = 0, points: float = 0.0) -> None:
+def check(recording: rec.Recording, truth: foreign_formats.Foreign, *, lossy: int = 0, points: float = 0.0) -> None:
     found = streams_of(recording)
     assert found.keys() == truth.images.keys()
     for key, stream in found.items():
@@ -48,10 +42,10 @@ def check(recording: rec.Recording, truth: foreign.Foreign, *, lossy: int = 0, p
         np.testing.assert_allclose(found[key], expected, rtol=0, atol=points if key == "points/xyz" else 0, err_msg=key)
 
 
-@pytest.mark.parametrize("name", foreign.WRITERS)
+@pytest.mark.parametrize("name", foreign_formats.WRITERS)
 def test_import_write_read(name, tmp_path):
     """As an episode, and from there as MCAP."""
-    truth = foreign.WRITERS[name](tmp_path)
+    truth = foreign_formats.WRITERS[name](tmp_path)
     imported = formats.read(truth.path, scene=truth.write_scene(), **truth.options)
     check(imported, truth, lossy=LOSSY.get(name, 0))
     counted = []

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import shutil
 import struct
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-sys.path.insert(0, str(Path(__file__).parent / "mcap"))
-
-import foreign
-import make_mcap as mcap_truth
+from helpers import foreign_formats
+from helpers import mcap_files as mcap_truth
 
 from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
@@ -75,11 +70,11 @@ def test_times_that_no_stamp_holds_are_refused_without_a_trace(recording, tmp_pa
 
 
 def test_an_imported_bag_keeps_its_absolute_times(tmp_path):
-    truth = foreign.ros2(tmp_path)
+    truth = foreign_formats.ros2(tmp_path)
     imported = formats.read(truth.path, scene=truth.write_scene())
     file = formats.write_mcap(imported, tmp_path / "again.mcap")
     back = formats.read(file)
-    assert back.extra["source"]["start_ns"] == foreign.EPOCH
+    assert back.extra["source"]["start_ns"] == foreign_formats.EPOCH
     assert back.extra["source"]["origin"] == imported.extra["source"]
     np.testing.assert_array_equal(back.points.xyz, imported.points.xyz)
     np.testing.assert_array_equal(back.grippers["left"].t, imported.grippers["left"].t)
@@ -107,8 +102,8 @@ def test_rosbags_itself_reads_the_standard_messages(recording, tmp_path):
 @pytest.mark.parametrize(("name", "cover"), [("chunk_crcs", "messages"), ("all_crcs", "all bytes")])
 def test_a_file_of_the_mcap_project_is_read(tmp_path, name, cover):
     file = Path(shutil.copy(FOXGLOVE / f"{name}.mcap", tmp_path))
-    scene = {**foreign.KNOWN, "source": {"motion": {"hand": {"pose": "/hand", "closed": True}}}}
-    recording = formats.read(file, scene=foreign.Foreign(file, scene).write_scene())
+    scene = {**foreign_formats.KNOWN, "source": {"motion": {"hand": {"pose": "/hand", "closed": True}}}}
+    recording = formats.read(file, scene=foreign_formats.Foreign(file, scene).write_scene())
     np.testing.assert_array_equal(recording.grippers["hand"].position, [mcap_truth.position(i) for i in range(5)])
     np.testing.assert_array_equal(recording.grippers["hand"].t, np.arange(5) / 50)
     assert recording.extra["source"]["checksums"] == cover

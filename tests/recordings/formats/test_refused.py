@@ -5,16 +5,11 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-import foreign
+from helpers import foreign_formats
 
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
@@ -28,30 +23,30 @@ from torchcloth.recordings.formats.ros2_cameras import BagImages
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """Each format once, to be copied."""
-    return {name: write(tmp_path_factory.mktemp(name)) for name, write in foreign.WRITERS.items()}
+    return {name: write(tmp_path_factory.mktemp(name)) for name, write in foreign_formats.WRITERS.items()}
 
 
 @pytest.fixture
 def copy(written, tmp_path):
     """A function that copies one format here and gives its scene to be changed."""
 
-    def make(name: str) -> foreign.Foreign:
+    def make(name: str) -> foreign_formats.Foreign:
         truth = written[name]
         target = tmp_path / truth.path.name
         (shutil.copytree if truth.path.is_dir() else shutil.copy)(truth.path, target)
         scene = json.loads(json.dumps(truth.scene))
-        return foreign.Foreign(target, scene, truth.images, truth.times, truth.arrays, dict(truth.options))
+        return foreign_formats.Foreign(target, scene, truth.images, truth.times, truth.arrays, dict(truth.options))
 
     return make
 
 
-def refuse(truth: foreign.Foreign, match: str, **options):
+def refuse(truth: foreign_formats.Foreign, match: str, **options):
     with pytest.raises((RecordingError, InvalidInput), match=match) as caught:
         formats.read(truth.path, scene=truth.write_scene(), **{**truth.options, **options})
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", foreign.WRITERS)
+@pytest.mark.parametrize("name", foreign_formats.WRITERS)
 def test_without_a_scene_it_says_what_to_write(name, copy):
     truth = copy(name)
     kept = {key: value for key, value in truth.scene.items() if key in ("source", "cameras")}
@@ -69,7 +64,7 @@ def test_without_a_camera_pose_it_says_what_to_write(name, copy):
     refuse(truth, r'"cameras": \{"\w+": \{"T_world_camera": \[\[1,0,0,0\]')
 
 
-@pytest.mark.parametrize("name", foreign.WRITERS)
+@pytest.mark.parametrize("name", foreign_formats.WRITERS)
 def test_another_name_is_refused(name, copy):
     other = "tum" if name != "tum" else "redwood"
     refuse(copy(name), f"mislabelled; got content of {name}; expected {other}", format=other)
@@ -162,8 +157,8 @@ def test_a_folder_of_open3ds_recorder(copy):
         file.rename(file.with_name(f"{i % 3:05d}.png"))
     (truth.path / "camera_intrinsic.json").unlink()
     told = o3d.t.io.RGBDVideoMetadata()
-    told.fps, told.width, told.height, told.depth_scale = 20.0, foreign.WIDTH, foreign.HEIGHT, 4000.0
-    told.intrinsics = o3d.camera.PinholeCameraIntrinsic(foreign.WIDTH, foreign.HEIGHT, 14.0, 15.0, 7.5, 5.25)
+    told.fps, told.width, told.height, told.depth_scale = 20.0, foreign_formats.WIDTH, foreign_formats.HEIGHT, 4000.0
+    told.intrinsics = o3d.camera.PinholeCameraIntrinsic(foreign_formats.WIDTH, foreign_formats.HEIGHT, 14.0, 15.0, 7.5, 5.25)
     (truth.path / "intrinsic.json").write_text(repr(told))
     camera = formats.read(truth.path, scene=truth.write_scene()).cameras["cam0"]
     np.testing.assert_array_equal(camera.depth.t, [0, 0.05, 0.1])
@@ -203,7 +198,7 @@ def test_masks_without_depth_keep_their_times(copy, tmp_path):
 
 @pytest.mark.parametrize("name", ["run #3", "a?b", "50%25"])
 def test_a_sqlite_bag_whose_path_is_another_in_a_uri(tmp_path, name):
-    truth = foreign.ros2(tmp_path / "plain", "sqlite3")
+    truth = foreign_formats.ros2(tmp_path / "plain", "sqlite3")
     truth.path = truth.path.rename(tmp_path / name)
     truth.write_scene()
     before = sorted(tmp_path.iterdir())
@@ -240,7 +235,7 @@ def test_a_moving_camera(copy, name, file):
 
 def test_tum_may_track_the_hand(copy):
     truth = copy("tum")
-    truth.scene["cameras"]["cam0"]["T_world_camera"] = foreign.POSE
+    truth.scene["cameras"]["cam0"]["T_world_camera"] = foreign_formats.POSE
     truth.scene["source"] = {"trajectory": "hand"}
     refuse(truth, "source.closed is unclear; expected true or false")
     truth.scene["source"]["closed"] = True
@@ -339,7 +334,7 @@ def test_lerobot_episodes(copy):
     refuse(truth, "holds 2 episodes; got --episode 2", episode=2)
     first = formats.read(truth.path, scene=truth.write_scene(), episode=0)
     assert len(first.joints["left"].t) == len(first.cameras["cam0"].color) == 6
-    assert abs(int(first.cameras["cam0"].color.load(0).mean()) - foreign.lerobot_truth.grey(0, 0)) <= 2
+    assert abs(int(first.cameras["cam0"].color.load(0).mean()) - foreign_formats.lerobot_truth.grey(0, 0)) <= 2
 
 
 def test_lerobot_units_are_asked_for(copy):
@@ -395,7 +390,7 @@ def test_kinect_calibration(copy):
     truth = copy("kinect")
     recording = formats.read(truth.path, scene=truth.write_scene())
     depth, color = recording.cameras["depth"], recording.cameras["color"]
-    factory = foreign.FACTORY
+    factory = foreign_formats.FACTORY
     assert depth.K[0, 0] == pytest.approx(factory[2] * 512)
     assert depth.K[0, 2] == pytest.approx(factory[0] * 512 - 96 - 0.5)
     assert depth.K[1, 2] == pytest.approx(factory[1] * 512 - 90 - 0.5)
@@ -404,7 +399,7 @@ def test_kinect_calibration(copy):
     assert depth.depth_scale == 0.001
     assert color.K[1, 2] == pytest.approx(0.5 * 960 - 120 - 0.5)
     in_depth = np.array([0.1, 0.2, 1.5, 1.0])
-    c, s = np.cos(foreign.TILT), np.sin(foreign.TILT)
+    c, s = np.cos(foreign_formats.TILT), np.sin(foreign_formats.TILT)
     in_color = np.array([[1, 0, 0, -0.032], [0, c, -s, -0.002], [0, s, c, 0.004], [0, 0, 0, 1]]) @ in_depth
     np.testing.assert_allclose(depth.T_world_camera @ in_depth, color.T_world_camera @ in_color, atol=1e-12)
 
@@ -414,7 +409,7 @@ def test_two_lenses_are_two_cameras(copy):
     truth.scene["source"] = {"depth": "top", "color": "top"}
     refuse(truth, "gives both lenses one name; got top")
     truth.scene["source"] = {"depth": "top", "color": "top_color"}
-    truth.scene["cameras"] = {"top": {"T_world_camera": foreign.POSE}}
+    truth.scene["cameras"] = {"top": {"T_world_camera": foreign_formats.POSE}}
     assert formats.read(truth.path, scene=truth.write_scene()).cameras.keys() == {"top", "top_color"}
 
 

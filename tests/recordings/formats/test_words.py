@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-import foreign
+from helpers import foreign_formats
 
 from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
@@ -38,7 +34,7 @@ WRONG = {
 
 @pytest.fixture(scope="module")
 def tum(tmp_path_factory):
-    return foreign.tum(tmp_path_factory.mktemp("tum"))
+    return foreign_formats.tum(tmp_path_factory.mktemp("tum"))
 
 
 def scene(folder: Path, values: dict) -> Path:

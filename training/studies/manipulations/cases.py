@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcloth.episodes.observed import Episode, episode
+from torchcloth.episodes.observed import Episode, build_episode
 from torchcloth.episodes.replay import Replay
 from torchcloth.errors import SimulationDiverged, UnstableStep
 from torchcloth.identification import Identification, identify
@@ -121,7 +121,7 @@ def _distances(setup: Setup, model: Scene, data: Seen, fit: Identification) -> d
     """State -> convention -> m, over all frames: most of them were not fitted."""
     start = Fabric.true(model.what.garment).start()
     fitted = Fabric(*(fit.parameters[name].value for name in start.named()))
-    clouds = episode(model.cloth(start), data.recording)
+    clouds = build_episode(model.cloth(start), data.recording)
     frames = {"null": rigid_carry(clouds)}
     for state, fabric in (("start", start), ("fit", fitted)):
         with torch.no_grad():

@@ -9,9 +9,9 @@ from functools import partial
 from typing import Any
 
 from ...resumable import Kept
-from . import options
+from . import study_cases
 from .cases import SOUGHT, solve_together
-from .printing import heading_table, number, show, write
+from .console_tables import heading_table, number, show, write
 from .scenes import GRIPS, Manipulation
 
 CALM = ("cover", "drag")  # a fling's slopes are of no use, alone or beside others
@@ -25,10 +25,10 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(chosen: argparse.Namespace) -> None:
     """Fits, table and result."""
-    setup, wanted = options.chosen(chosen)
+    setup, wanted = study_cases.chosen(chosen)
     kept = Kept(chosen.out, asdict(setup))
     cases = {_name(garment, own): partial(solve_together, setup, own) for garment, own in alike(wanted).items()}
-    found = options.finished(kept, cases, chosen.out) if chosen.report else kept.run(cases)
+    found = study_cases.finished(kept, cases, chosen.out) if chosen.report else kept.run(cases)
     show(_table(found))
     write(chosen.out / "joint.json", found)
 

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from torchcloth._utils.files import write_text
-from torchcloth._utils.resume import clear
+from torchcloth._utils.resume import clear_store
 from torchcloth.errors import InvalidInput
 
 from ...resumable import Kept
-from . import free_swings, pictures, sample, swing_predictions, swings, tables, tension
+from . import free_swings, measured_figures, measured_tables, sample, swing_predictions, swings, tension
 
 VARIABLE = "TORCHCLOTH_REALDATA"
 SOURCES = (tension.NYLON, tension.KNITS, swings.SOURCE, sample.SOURCE)
@@ -68,8 +68,8 @@ def find(given: Path | None) -> Path:
 def _nylon(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
     cases = {"nylon": partial(tension.nylon, source, options.out / "nylon", options.fast)}
     found = kept.run(cases)["nylon"]
-    tables.nylon(found, options.out / "nylon")
-    pictures.nylon(found, source, options.out / "nylon.png")
+    measured_tables.nylon(found, options.out / "nylon")
+    measured_figures.nylon(found, source, options.out / "nylon.png")
     return found
 
 
@@ -77,8 +77,8 @@ def _knits(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, A
     names = tension.fabrics(source, options.fast)
     cases = {f"knit-{name}": partial(tension.knit, source, options.out / "knits" / name, name) for name in names}
     found = dict(zip(names, kept.run(cases).values(), strict=True))
-    tables.knits(found)
-    pictures.knits(found, source, options.out / "knits.png")
+    measured_tables.knits(found)
+    measured_figures.knits(found, source, options.out / "knits.png")
     return found
 
 
@@ -90,7 +90,7 @@ def _swings(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, 
             "swings-free": partial(free_swings.match, source, fitted, options.fast),
         }
     )
-    clear(_journal(options.out))
+    clear_store(_journal(options.out))
     fits = {part.removeprefix("swings-"): content for part, content in found.items()}
     models = {"vacuum": dict.fromkeys(swings.NAMES, 0.0), "textbook": swings.START}
     models |= {part: content["values"] for part, content in fits.items()}
@@ -102,8 +102,8 @@ def _swings(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, 
         "fits": fits,
         "predicted": swing_predictions.summary(runs, list(models)),
     }
-    tables.swings(found)
-    pictures.swings(found, runs, options.out / "swings.png")
+    measured_tables.swings(found)
+    measured_figures.swings(found, runs, options.out / "swings.png")
     return found
 
 
@@ -128,6 +128,6 @@ def _sample(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, 
     journal = options.out / "progress" / "sample"
     work = partial(sample.run, source, options.out / "sample", journal, options.fast)
     found = kept.run({"sample": work})["sample"]
-    clear(journal)
-    tables.sample(found)
+    clear_store(journal)
+    measured_tables.sample(found)
     return found

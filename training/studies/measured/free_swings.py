@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..checkout import module
+from ...validation.realdata import swings
 from .swing_predictions import drawn, frequency_and_decay, predict
 from .swings import DENSITY, EFFECTS, NAMES
 
@@ -24,7 +24,7 @@ def match(source: Path, names: Sequence[str], fast: bool) -> dict[str, Any]:
     A small swing has the frequency f0 / sqrt(1 + mu) with mu the added mass, and its quadratic decay goes as
     delta f / (1 + mu) with delta the drag; both are exact in the limit, and their steps are repeated.
     """
-    air, values = module("realdata", "swings").AIR, dict(BEGIN)
+    air, values = swings.AIR, dict(BEGIN)
     for left in reversed(range(1 if fast else ROUNDS)):
         runs = [predict(source, name, {"model": values}) for name in names]
         seen = frequency_and_decay([run["measured"] for run in runs], drawn(len(runs), DRAWS))

@@ -1,6 +1,6 @@
 """The sample that the DiffCP paper's authors released: null, start and fit, Chamfer in both directions.
 
-248 points of 8 clouds; what the simulation assumes is in the adapter (tests/realdata/diffcp_sample.py).
+248 points of 8 clouds; what the simulation assumes is in the adapter (validation/realdata/diffcp_sample.py).
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcloth.identification import cloth_from, episode, identify
+from torchcloth.identification import build_cloth, build_episode, identify
 from torchcloth.losses import chamfer_to_surface, chamfer_to_vertices
 from torchcloth.recordings import Recording
 
-from ..checkout import module
+from ...validation.realdata import diffcp_sample
 
 SOURCE = "diffcp_sample"
 NAMES = ["youngs_modulus"]
@@ -25,17 +25,17 @@ CLOUDS = {True: 3, False: None}  # fast: the first ones
 
 def recording(source: Path, fast: bool) -> Recording:
     """The episode."""
-    return module("realdata", "diffcp_sample").convert(source, count=CLOUDS[fast])
+    return diffcp_sample.convert(source, count=CLOUDS[fast])
 
 
 def run(source: Path, out: Path, journal: Path, fast: bool) -> dict[str, Any]:
     """Fit the membrane stiffness; distances of every model."""
     given = recording(source, fast)
-    cloth = cloth_from(given)
+    cloth = build_cloth(given)
     resume = (journal / "problem").exists()
     fit = identify(cloth, given, NAMES, iterations=1 if fast else ITERATIONS, journal=journal, resume=resume)
     fit.save(out)
-    data, faces = episode(cloth, given), torch.as_tensor(cloth.mesh.faces)
+    data, faces = build_episode(cloth, given), torch.as_tensor(cloth.mesh.faces)
     still = data.initial.expand(len(data.times), -1, -1)
     models = {
         "left where it lay": still,

@@ -17,12 +17,12 @@ import torch
 from torchcloth.cloth import Cloth
 from torchcloth.diagnosis import World
 from torchcloth.episodes.replay import Replay
-from torchcloth.episodes.streams import on_pattern
-from torchcloth.identification import episode, rigid_carry
+from torchcloth.episodes.streams import locate_on_pattern
+from torchcloth.identification import build_episode, rigid_carry
 from torchcloth.losses import Hits
 from torchcloth.recordings import Recording
 
-from ..checkout import module
+from ...validation.realdata import free_swing, swings
 from .swings import START, cloth_of, recording
 
 Run = dict[str, np.ndarray]
@@ -37,20 +37,19 @@ def predict(source: Path, name: str, models: Mapping[str, Values | World]) -> di
 
 
 def _predict(source: Path, name: str, models: Mapping[str, Values | World]) -> dict[str, Any]:
-    swings, free = module("realdata", "swings"), module("realdata", "free_swing")
     run, data = recording(source, name), swings.runs(source)[name]
     t = run.require("points", by="the study").t
     rows = np.flatnonzero(np.isin(data["t_mesh_s"], t))
     seen = data["mesh_base_m"].reshape(len(data["t_mesh_s"]), -1, 3)[rows]
     moving = t - swings.lag(data).value > swings.start(data)
-    out: dict[str, Any] = {"t": t.tolist(), "measured": _swing(free.swing(name, data))}
+    out: dict[str, Any] = {"t": t.tolist(), "measured": _swing(free_swing.swing(name, data))}
     for model, values in {"null": None, **models}.items():
         nodes = _nodes(run, values)
         off = seen - nodes
         off = off - np.nanmedian(off[~moving], axis=0)
         out[model] = _distances(off[moving])
         if values is not None:
-            out[model] |= _swing(free.swing(name, _as_seen(data, rows, nodes)))
+            out[model] |= _swing(free_swing.swing(name, _as_seen(data, rows, nodes)))
             out[model]["lower_edge"] = _lower_edge(nodes)
         out["still"] = _distances(off[~moving])
     shift = np.nanmedian((seen - nodes)[~moving], axis=0)
@@ -73,9 +72,9 @@ def _lower_edge(nodes: np.ndarray) -> list[float | None]:
 def _nodes(run: Recording, model: Values | World | None) -> np.ndarray:
     """[F, 64, 3] m of a model at the run's frames; None: carried rigidly."""
     if isinstance(model, World):
-        return _hits(model.cloth).on(model.frames(episode(model.cloth, run)).x).numpy()
+        return _hits(model.cloth).on(model.frames(build_episode(model.cloth, run)).x).numpy()
     cloth = cloth_of(run, model or START)
-    data = episode(cloth, run)
+    data = build_episode(cloth, run)
     with torch.no_grad():
         x = rigid_carry(data) if model is None else Replay(cloth)(data).x
     return _hits(cloth).on(x).numpy()
@@ -83,8 +82,8 @@ def _nodes(run: Recording, model: Values | World | None) -> np.ndarray:
 
 def _hits(cloth: Cloth) -> Hits:
     """Where the camera's 8 x 8 nodes are on the sheet."""
-    u = np.linspace(0, module("realdata", "swings").SIDE, 8)
-    return on_pattern(cloth.mesh, np.stack(np.meshgrid(u, u, indexing="ij"), -1).reshape(-1, 2))
+    u = np.linspace(0, swings.SIDE, 8)
+    return locate_on_pattern(cloth.mesh, np.stack(np.meshgrid(u, u, indexing="ij"), -1).reshape(-1, 2))
 
 
 def _as_seen(data: Run, rows: np.ndarray, nodes: np.ndarray) -> Run:
@@ -120,9 +119,8 @@ def drawn(count: int, draws: int) -> list[np.ndarray]:
 
 def frequency_and_decay(rows: Sequence[dict[str, Any]], chosen: Sequence[np.ndarray]) -> dict[str, float]:
     """Of all runs, and their standard deviations over draws of runs."""
-    free = module("realdata", "free_swing")
-    swings = [free.Swing("", np.array(row["swing_t"]), np.array(row["swing_q"]), 0.0, 0.0) for row in rows]
-    found = np.array([free.fit([swings[i] for i in d])[:2] for d in chosen])
+    swings = [free_swing.Swing("", np.array(row["swing_t"]), np.array(row["swing_q"]), 0.0, 0.0) for row in rows]
+    found = np.array([free_swing.fit([swings[i] for i in d])[:2] for d in chosen])
     std = found[1:].std(0)
     value = dict(zip(("frequency", "decay"), found[0].tolist(), strict=True))
     return value | {"frequency_std": float(std[0]), "decay_std": float(std[1])}

@@ -15,9 +15,9 @@ import numpy as np
 
 from torchcloth import effects, materials, meshes, recordings
 from torchcloth.cloth import Cloth
-from torchcloth.identification import Identification, cloth_from, identify
+from torchcloth.identification import Identification, build_cloth, identify
 
-from ..checkout import module
+from ...validation.realdata import swings
 
 SOURCE = "iri_cloth_swings"
 DENSITY = 0.3  # kg/m^2, nominal: only ratios to it are seen
@@ -34,7 +34,7 @@ EFFECTS = {"drag per areal density": "1/m", "added mass per areal density": "-",
 
 def split(source: Path, fast: bool) -> tuple[list[str], list[str]]:
     """Names of fitted and of predicted runs."""
-    names = sorted(module("realdata", "swings").runs(source))
+    names = sorted(swings.runs(source))
     held = names[HELD_OUT - 1 :: HELD_OUT]
     fitted = [name for name in names if name not in held]
     return (fitted[::10], held[4:5]) if fast else (fitted, held)
@@ -42,7 +42,7 @@ def split(source: Path, fast: bool) -> tuple[list[str], list[str]]:
 
 def recording(source: Path, name: str, every: int = 1) -> recordings.Recording:
     """One run on the study's mesh, with some of its frames."""
-    swings, mesh = module("realdata", "swings"), _mesh()
+    mesh = _mesh()
     found = swings.episode(source, name)
     cloth = replace(
         found.cloth,
@@ -59,13 +59,12 @@ def recording(source: Path, name: str, every: int = 1) -> recordings.Recording:
 
 
 def _mesh() -> meshes.Mesh:
-    side = module("realdata", "swings").SIDE
+    side = swings.SIDE
     return meshes.rectangle(side, side, resolution=(COLUMNS, ROWS))
 
 
 def cloth_of(run: recordings.Recording, values: dict[str, float]) -> Cloth:
     """The hanging cloth in air of these values."""
-    swings = module("realdata", "swings")
     parts = {
         "gravity": effects.Gravity(),
         "air": effects.AirDrag(values["air.normal"], swings.AIR),
@@ -73,7 +72,7 @@ def cloth_of(run: recordings.Recording, values: dict[str, float]) -> Cloth:
         "damping": effects.MassDamping(values["damping.rate"]),
         "bending": effects.Bending(swings.BENDING, swings.DAMPING),
     }
-    return cloth_from(run, materials.AEP(STIFFNESS / 1e-3, POISSON, thickness=1e-3), parts)
+    return build_cloth(run, materials.AEP(STIFFNESS / 1e-3, POISSON, thickness=1e-3), parts)
 
 
 def fit(source: Path, names: Sequence[str], journal: Path, fast: bool) -> Identification:
@@ -87,7 +86,7 @@ def fit(source: Path, names: Sequence[str], journal: Path, fast: bool) -> Identi
 
 def ratios(fit: dict[str, Any]) -> dict[str, dict[str, float | bool]]:
     """What is identifiable, from the parameters of identification.json: ratios to the areal density, and the rate."""
-    air, out = module("realdata", "swings").AIR, {}
+    air, out = swings.AIR, {}
     for effect, key, factor in zip(EFFECTS, NAMES, (air / DENSITY, air / DENSITY, 1.0), strict=True):
         found = fit[key]
         low, high = found["ci95"]

@@ -13,7 +13,8 @@ from torchcloth.identification import cross_validated, fit_tension, predict_tens
 from torchcloth.identification.tension.model import TensionModel
 from torchcloth.recordings import ForceDisplacement
 
-from ..checkout import module
+from ...validation.realdata import knits as knit_adapter
+from ...validation.realdata import nylon as nylon_adapter
 
 NYLON, KNITS = "nylon_offaxis_tension", "knit_tension"
 LIGHT = 5.0  # N, over 0.07 to 0.15 m of knit: what a robot pulls with
@@ -27,7 +28,7 @@ def nylon(source: Path, out: Path, fast: bool) -> dict[str, Any]:
 
     The interval of an angle that was left out takes the law's part from the others, each left out of those three.
     """
-    adapter = module("realdata", "nylon")
+    adapter = nylon_adapter
     tables = {angle: t.rows(slice(None, None, EVERY[fast])) for angle, t in adapter.tables(source).items()}
     pulls, names = list(tables.values()), adapter.NAMES
     fit = fit_tension(adapter.start(), pulls, names)
@@ -61,13 +62,13 @@ def at_strains(model: TensionModel, angle: float) -> list[dict[str, float]]:
 
 def fabrics(source: Path, fast: bool) -> list[str]:
     """Names of the knits; fast: one."""
-    found = sorted(module("realdata", "knits").fabrics(source))
+    found = sorted(knit_adapter.fabrics(source))
     return found[-1:] if fast else found
 
 
 def knit(source: Path, out: Path, name: str) -> dict[str, Any]:
     """One fabric, both directions: fit of repeats 1 and 2, prediction of 3, and how far repeats are from each other."""
-    adapter = module("realdata", "knits")
+    adapter = knit_adapter
     light = [table.rows(table.force < LIGHT) for table in adapter.fabrics(source)[name]]
     fit = fit_tension(adapter.start(), [table.repeats(1, 2) for table in light], adapter.NAMES)
     fit.save(out)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 import torchcloth as tc
-from torchcloth.boundaries import AbstractBoundary, Drive
+from torchcloth.boundaries import AbstractBoundary, PrescribedMotion
 from torchcloth.dynamics.contact import Grid, carried_momentum, lattice, stencil, through
 from torchcloth.dynamics.contact.self_contact import Layers, add_columns, near_layers, per_point, pressure
 from torchcloth.dynamics.elasticity import evolve, membrane_stress
@@ -84,7 +84,7 @@ def step(
     model: Model,
     state: ClothState,
     dt: float,
-    drives: Mapping[str, Drive],
+    drives: Mapping[str, PrescribedMotion],
     substep: int,
     layers: Layers | None = None,
     lost: Tensor | None = None,

@@ -1,0 +1,102 @@
+"""Sheets that are bent on purpose, for the tests of what bending does."""
+
+import math
+from functools import cache
+
+import numpy as np
+import torch
+
+import torchcloth as tc
+from torchcloth.dynamics import substep
+from torchcloth.types import EffectInputs
+
+
+def irregular(n, amount=0.25, size=0.3):
+    """A square sheet whose inner vertices are moved by up to ``amount`` cells."""
+    mesh = tc.meshes.rectangle(size, size, resolution=(n, n))
+    uv = mesh.uv.copy()
+    inside = ((uv > 1e-9) & (uv < size - 1e-9)).all(-1)
+    generator = np.random.default_rng(n)
+    uv[inside] += amount * size / (n - 1) * generator.uniform(-1, 1, (inside.sum(), 2))
+    return tc.meshes.Mesh.build(np.column_stack([uv, np.zeros(len(uv))]), mesh.faces, uv)
+
+
+def cylinder(mesh, curvature, degrees=0.0):
+    """[V, 3] m: the sheet rolled along a direction of its pattern, the centre on its normal's side if > 0."""
+    a = math.radians(degrees)
+    u, v = torch.as_tensor(mesh.uv).T
+    u, v = math.cos(a) * u + math.sin(a) * v, math.cos(a) * v - math.sin(a) * u
+    angle = curvature * u
+    half = torch.where(angle == 0, 0.0, torch.sin(angle / 2) ** 2 / torch.where(angle == 0, 1.0, angle) * 2)
+    return torch.stack([u * torch.sinc(angle / math.pi), v, u * half], dim=-1)
+
+
+@cache
+def model(mesh):
+    return tc.Cloth(mesh, tc.materials.AEP(1e3), 0.2, contact=None).model()
+
+
+def moment(mesh, x, memory=None, dt=0.0):
+    """What an effect sees of the sheet at ``x``, at rest."""
+    v, bare = torch.zeros_like(x), model(mesh)
+    return EffectInputs(x, v, substep.surface(bare.geometry, x, v), bare.mass, memory, dt)
+
+
+def through(effect, mesh, path, dt=0.0):
+    """Internal variables after each of the positions of ``path``, from a virgin sheet at the first."""
+    memory = effect.start(path[0])
+    found = [memory]
+    for x in path[1:]:
+        memory = effect.update_memory(effect.coefficients(), moment(mesh, x, memory, dt))
+        found.append(memory)
+    return found
+
+
+def work(effect, mesh, path):
+    """[J] that a sheet led along ``path`` takes up, by the trapezoidal rule."""
+    memories = through(effect, mesh, path)
+    c = effect.coefficients()
+    forces = [effect.force(c, moment(mesh, x, memory)) for x, memory in zip(path, memories, strict=True)]
+    pairs = zip(forces, forces[1:], path, path[1:], strict=False)
+    return -sum(0.5 * ((f0 + f1) * (x1 - x0)).sum() for f0, f1, x0, x1 in pairs).item()
+
+
+def cycles(largest, steps, count=2):
+    """0, up to ``largest``, down to -``largest`` and back, ``count`` times."""
+    ramp = torch.linspace(-1, 1, steps + 1)
+    loop = torch.cat([ramp.flip(0)[1:], ramp[1:]])
+    return largest * torch.cat([torch.linspace(0, 1, steps // 2 + 1), *[loop] * count])
+
+
+def drift(effects, steps=100, seed=0):
+    """Change of momentum and of angular momentum, relative, over a free motion with these effects."""
+    mesh = irregular(6, size=0.15)
+    cloth = tc.Cloth(mesh, tc.materials.AEP(1e3), 0.2, effects, contact=None)
+    generator = torch.Generator().manual_seed(seed)
+    x = cylinder(mesh, 8.0, 30) + 5.0
+    v = 0.3 * torch.randn(x.shape, generator=generator)
+    with torch.no_grad():
+        out = cloth(cloth.state(x, v), times=(0.0, steps * cloth.stable_step()))
+    mass = cloth.model().mass
+    momenta = [(mass * u).sum(0) for u in out.v]
+    turning = [(mass * torch.linalg.cross(y, u)).sum(0) for y, u in zip(out.x, out.v, strict=True)]
+    scale = (mass * out.v[0].norm(dim=-1, keepdim=True)).sum()
+    far = (mass * torch.linalg.cross(out.x[0], out.v[0]).norm(dim=-1, keepdim=True)).sum()
+    return ((momenta[1] - momenta[0]).norm() / scale).item(), ((turning[1] - turning[0]).norm() / far).item()
+
+
+def relative(cloth, state, times, names, effect=None):
+    """(function, inputs) for ``check_gradients``: the end of a motion, by start [0.1 mm] and logarithms of parameters.
+
+    Laws with kinks are smooth only within what a step of these changes.
+    """
+    prefix = "effects." if effect is None else f"effects.{effect}."
+    start = {name: cloth.state_dict()[f"{prefix}{name}.raw"].clone() for name in names}
+    options = {"times": times, "dt": 0.7 * cloth.stable_step()}  # chosen steps would jump with the parameters
+
+    def end(x, **logs):
+        parameters = {f"{prefix}{name}.raw": start[name] * logs[name].exp() for name in names}
+        moved = cloth.state(state.x + 1e-4 * x, state.v)  # what it remembers moves along
+        return torch.func.functional_call(cloth, parameters, (moved,), options).x[-1]
+
+    return end, {"x": torch.zeros_like(state.x), **{name: torch.zeros(()) for name in names}}

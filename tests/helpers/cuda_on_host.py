@@ -1,0 +1,163 @@
+"""Stands in for a CUDA device: the same source by the C++ compiler, a block's threads one after another.
+
+Memory is the processor's, so programs run on tensors of the CPU.
+"""
+
+import ctypes
+import hashlib
+import os
+import subprocess
+import tempfile
+from contextlib import contextmanager, nullcontext
+from functools import cache
+from pathlib import Path
+from unittest.mock import patch
+from weakref import WeakKeyDictionary
+
+import torch
+
+from torchcloth.boundaries.motion import sample_trajectory
+from torchcloth.engine import building, devices, execution
+from torchcloth.engine.cuda import launch as runs
+from torchcloth.engine.fused import Fused
+
+HOST = """
+#include <cmath>
+#include <condition_variable>
+#include <mutex>
+#include <thread>
+#include <vector>
+using std::atan2, std::exp, std::expm1, std::floor, std::sqrt;
+#define ON_HOST
+#define WARP 1
+#define THREADS {threads}
+static thread_local int thread_number, block_number;
+static double shared_memory[1 << 16];
+#define T thread_number
+#define SCENE block_number
+#define SYNC() next_one()
+#define STAGE static
+#define KERNEL extern "C" void
+#define FIXED static const
+#define ATOMIC_ADD added_to
+#define ATOMIC_CAS exchanged
+static int added_to(int* at, int more) {{ const int before = *at; *at += more; return before; }}
+static unsigned long long exchanged(unsigned long long* at, unsigned long long wanted, unsigned long long other) {{
+    const unsigned long long before = *at;
+    if (before == wanted) *at = other;
+    return before;
+}}
+
+// One thread runs at a time, in order or the other way round, each until all have to wait.
+static const bool reversed = {reversed};
+static std::mutex guard;
+static std::condition_variable changed;
+static int turn, waits;
+static void begin(int round) {{
+    std::unique_lock<std::mutex> lock(guard);
+    changed.wait(lock, [&] {{ return waits == round && turn == (reversed ? THREADS - 1 - T : T); }});
+}}
+static void end() {{
+    std::lock_guard<std::mutex> lock(guard);
+    if (++turn == THREADS) turn = 0, waits++;
+    changed.notify_all();
+}}
+static void next_one() {{
+    if (THREADS == 1) return;
+    const int round = waits;
+    end(), begin(round + 1);
+}}
+"""
+LAUNCH = """
+template <class F>
+static void each(int blocks, F work) {
+    for (int block = 0; block < blocks; block++) {
+        turn = waits = 0;
+        auto job = [&](int t) { thread_number = t, block_number = block, begin(0), work(), end(); };
+        std::vector<std::thread> others;
+        for (int t = 1; t < THREADS; t++) others.emplace_back(job, t);
+        job(0);
+        for (auto& other : others) other.join();
+    }
+}
+extern "C" void launch_values(int blocks, Port* p, R* d, int* t, R* w, unsigned char* masks, int* grids, Count* ends,
+                              int substeps, int frames, int keeps) {
+    each(blocks, [&] { values(p, d, t, w, masks, grids, ends, substeps, frames, keeps); });
+}
+extern "C" void launch_adjoint(int blocks, Port* p, R* d, int* t, R* w, unsigned char* masks, int* grids, int substeps,
+                               int first, int all) {
+    each(blocks, [&] { adjoint(p, d, t, w, masks, grids, substeps, first, all); });
+}
+"""
+SHARED: list[Path] = []  # the folder of what is compiled, for all processes that run tests
+FLAGS = ["-std=c++20", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-pthread", "-w"]
+
+
+@cache
+def compiled(text):
+    """Each once in a run of the tests: compilers take a second."""
+    library = SHARED[0] / f"{hashlib.sha256(text.encode()).hexdigest()}.so"
+    if not library.exists():
+        with tempfile.TemporaryDirectory(dir=SHARED[0]) as folder:
+            file = Path(folder) / "program.cpp"
+            file.write_text(text)
+            subprocess.run([*building.compiler(), *FLAGS, "-o", f"{file}.so", str(file)], check=True)
+            os.replace(f"{file}.so", library)
+    return ctypes.CDLL(str(library))
+
+
+class Host:
+    """A text, compiled here."""
+
+    def __init__(self, text, threads, reverse):
+        self.threads = threads
+        self._library = compiled(HOST.format(threads=threads, reversed=str(reverse).lower()) + text + LAUNCH)
+
+    def launch(self, name, blocks, shared, arguments):
+        assert shared <= 8 << 16
+        getattr(self._library, f"launch_{name}")(blocks, *arguments)
+
+
+@contextmanager
+def stand_in(threads=1, reverse=False):
+    """Programs for the CPU are compiled for it."""
+    with (
+        patch.object(runs, "kernels", lambda text, device: Host(text, threads, reverse)),
+        patch.object(runs, "_KNOWN", WeakKeyDictionary()),
+    ):
+        yield
+
+
+CHECKED: set[str] = set()  # kernels, in this process
+
+
+def agrees(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1e-9)):
+    """Values and adjoints of a program on a device, or here, and by the processor's own engine, in float64.
+
+    Compilers take a while: only where there is a kernel that was not looked at yet.
+    """
+    model = cloth.model()._replace(stages=stages)
+    drives = {name: sample_trajectory(t, torch.arange(substeps + 1, dtype=torch.float64) * dt) for name, t in motion.items()}
+    with patch.object(devices, "elsewhere", lambda tensor: True):
+        fused = Fused(model, state, drives)
+    used = {str(given[0]) if name == "call" else name for name, given in fused.low.program.written}
+    if used <= CHECKED:
+        return
+    CHECKED.update(used)
+    job = fused.job(state, torch.full((substeps,), dt, dtype=torch.float64), drives)
+    job = job._replace(inputs={f: t.detach().contiguous() for f, t in job.inputs.items()})
+    ends = (substeps // 3, substeps)
+    if model.grid is not None:
+        ends = (substeps,)  # what goes on in contact is no frame
+    known, _ = execution.forward(job._replace(ends=ends))
+    generator = torch.Generator().manual_seed(0)
+    seeds = {f: torch.randn(job.scenes, f.rows, f.comps, generator=generator, dtype=job.like.dtype) for f in known}
+    before = execution.reverse(job, execution.forward(job, 1)[1], 1, seeds, set(job.inputs))
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    with stand_in() if device == "cpu" else nullcontext():
+        there = job._replace(inputs={f: t.to(device) for f, t in job.inputs.items()})
+        found, masks = runs.forward(there._replace(ends=ends))
+        after = runs.reverse(there, masks, {f: t.to(device) for f, t in seeds.items()}, set(job.inputs))
+    for one, other, mark in ((known, found, marks[0]), (before, after, marks[1])):
+        for f, t in one.items():
+            torch.testing.assert_close(other[f].cpu(), t, rtol=0, atol=mark * float(t.abs().max()) + 1e-300, msg=str(f))

@@ -1,0 +1,261 @@
+"""The fused engine against the torch reference: values, memory, impulses, all gradients, and tangents.
+
+    agree(cloth, motion, state)
+
+runs both from the same state, which should be bent, strained, moving and have a memory of its own (``moving``), with
+the parameters at values that are all different, so that no branch and no sign can hide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+import torchcloth as tc
+from helpers.cuda_on_host import agrees
+from torchcloth.boundaries import PrescribedMotion
+from torchcloth.boundaries.motion import sample_trajectory
+from torchcloth.dynamics import substep
+from torchcloth.engine import cuda_graphs, execution, fused
+from torchcloth.simulation.rollout import CHUNK
+from torchcloth.types import ClothState, Trajectory
+
+VALUES, GRADIENTS = 1e-10, 1e-8  # relative, in float64
+
+
+class Outcome(NamedTuple):
+    """By name: what came out, and the gradients of a random function of it."""
+
+    values: dict[str, Tensor]
+    gradients: dict[str, Tensor | None]
+
+
+def agree(
+    cloth: tc.Cloth,
+    motion: Mapping[str, Trajectory],
+    state: ClothState,
+    substeps: int = 100,
+    dt: float = 1e-4,
+    marks: tuple[float, float] = (VALUES, GRADIENTS),
+    stages: int = 0,
+) -> dict[str, float]:
+    """Demand agreement; the largest differences by name are returned for reports."""
+    reference = outcome(in_chunks, cloth, motion, state, substeps, dt, stages)
+    engine = outcome(fused.rollout, cloth, motion, state, substeps, dt, stages)
+    found = {name: difference(engine.values[name], value) for name, value in reference.values.items()}
+    worse = {name: value for name, value in found.items() if not value <= marks[0]}
+    assert set(engine.values) == set(reference.values)
+    assert not worse, worse
+    for name, value in reference.gradients.items():
+        other = engine.gradients[name]
+        assert (value is None) == (other is None), f"only one engine has a gradient of {name}"
+        if value is not None and other is not None:
+            found[f"d/d {name}"] = difference(other, value)
+    worse = {name: value for name, value in found.items() if not value <= marks[1]}
+    assert not worse, worse
+    runs_on_any_device(cloth, motion, state, dt, stages)
+    agrees(cloth, motion, state, dt=dt, stages=stages)
+    found["tangents"] = tangents_transpose(cloth, motion, state, substeps, dt, stages)
+    assert found["tangents"] <= marks[1], found["tangents"]
+    if not stages:
+        found["layer"] = layer_transposes(cloth, motion, state, substeps, dt)
+        assert found["layer"] <= marks[1], found["layer"]
+    return found
+
+
+def runs_on_any_device(
+    cloth: tc.Cloth, motion: Mapping[str, Trajectory], state: ClothState, dt: float, stages: int
+) -> None:
+    """A unit of the reference's substeps and its gradients on a device whose tensors have no numbers.
+
+    So nothing waits for a number; and nothing is made elsewhere and brought there: it can be captured as a CUDA graph.
+    Where layers meet none is: here none do.
+    """
+    drives = {
+        name: PrescribedMotion(d.increment.to("meta"), d.pose.to("meta"), d.closed)
+        for name, d in drives_of(motion, 2, dt, {name: t.pose for name, t in motion.items()}).items()
+    }
+    closed = {name: d.closed[0] for name, d in drives.items()}
+    model = deepcopy(cloth).to("meta").model()._replace(stages=stages)
+    leaf = state.map(lambda t: t.to("meta").requires_grad_())
+    lost = torch.zeros_like(leaf.x, requires_grad=False) if state.x.dtype == torch.float32 else None
+    moving = cuda_graphs.Moving.of(leaf, lost, dt, drives, 0, 2)
+    graphs = cuda_graphs.Graphs(model, 2, watched)
+    unit = cuda_graphs.Unit(graphs.own, moving, closed, 2, watched)
+    unit.get_ready(moving, graphs.given, graphs.leaves)
+    end = unit(moving, graphs.given)
+    (end.state.x.sum() + sum(value.sum() for value in end.impulses.values())).backward()
+    assert leaf.x.grad is not None
+    assert leaf.x.grad.is_meta
+
+
+def watched(work: cuda_graphs.Work, device: torch.device) -> tuple[list[Tensor], cuda_graphs.Replay]:
+    """As a graph that is captured from tensors without numbers, which refuses what others it would have to wait for."""
+    with OnOneDevice(device.type):
+        return work(), lambda: None
+
+
+class OnOneDevice(TorchDispatchMode):
+    """Refuses operations that give a tensor elsewhere."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__()
+        self.device = device
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        """Each of them."""
+        out = func(*args, **(kwargs or {}))
+        for tensor in out if isinstance(out, (tuple, list)) else [out]:
+            if isinstance(tensor, Tensor) and tensor.device.type != self.device:
+                raise AssertionError(f"{func} makes a tensor on {tensor.device}")
+        return out
+
+
+def layer_transposes(
+    cloth: tc.Cloth, motion: Mapping[str, Trajectory], state: ClothState, substeps: int, dt: float
+) -> float:
+    """``Cloth.sensitivities`` along changes of all parameters against gradients: the largest relative difference."""
+    cloth.zero_grad()
+    generator, limit = torch.Generator().manual_seed(2), dt * (1 + 1e-9)
+    named, times = dict(cloth.named_parameters()), (0.0, substeps * dt)
+    along = {name: torch.randn(3, *p.shape, generator=generator, dtype=p.dtype) for name, p in named.items()}
+    for change in along.values():
+        change[1] = 0.0  # nothing changes along one of them
+    out = cloth(state, motion, times, dt=limit)
+    weight = torch.randn(out.x.shape, generator=generator, dtype=out.x.dtype)
+    (weight * out.x).sum().backward()
+    _, moved = cloth.sensitivities(state, motion, times, along=tc.Directions(along), dt=limit)
+    gradients = {name: torch.zeros_like(p) if p.grad is None else p.grad for name, p in named.items()}
+    reverse = torch.stack([(along[name] * gradient).reshape(3, -1).sum(1) for name, gradient in gradients.items()])
+    forward = (weight * moved.x).reshape(3, -1).sum(1)
+    return float(((forward - reverse.sum(0)).abs() / (reverse.abs().sum(0) + 1e-12)).max())
+
+
+def in_chunks(model, state, dt, drives, substeps):
+    """``functional.rollout`` as ``Cloth`` calls it: near layers are searched again at the start of each call."""
+    total = {}
+    for first in range(0, substeps, CHUNK):
+        state, found = substep.rollout(model, state, dt, drives, min(CHUNK, substeps - first), first)
+        total = {name: total[name] + value if name in total else value for name, value in found.items()}
+    return state, total
+
+
+def outcome(rollout, cloth, motion, state: ClothState, substeps: int, dt: float, stages: int = 0) -> Outcome:
+    """Of one of the engines."""
+    cloth.zero_grad()
+    leaf = state.map(lambda t: t.clone().requires_grad_())
+    poses = {name: trajectory.pose.clone().requires_grad_() for name, trajectory in motion.items()}
+    model = cloth.model()._replace(stages=stages)
+    end, impulses = rollout(model, leaf, dt, drives_of(motion, substeps, dt, poses), substeps)
+    values = {
+        "displacement": end.x - state.x,
+        "v": end.v,
+        **({"d3": end.d3} if end.d3.numel() else {}),
+        **{f"memory {name}": value for name, value in end.memory.items()},
+        **{f"impulse {name}": value for name, value in impulses.items()},
+    }
+    some_function(values).backward()
+    gradients = {"x": leaf.x.grad, "v": leaf.v.grad, **({"d3": leaf.d3.grad} if leaf.d3.numel() else {})}
+    gradients |= {f"memory {name}": value.grad for name, value in leaf.memory.items()}
+    gradients |= {f"pose {name}": pose.grad for name, pose in poses.items()}
+    gradients |= {name: parameter.grad for name, parameter in cloth.named_parameters()}
+    grads = {name: None if grad is None else grad.clone() for name, grad in gradients.items()}
+    return Outcome({name: value.detach() for name, value in values.items()}, grads)
+
+
+def drives_of(motion: Mapping[str, Trajectory], substeps: int, dt: float, poses: Mapping[str, Tensor]):
+    """The trajectories on the substeps, with these poses."""
+    times = torch.linspace(0, substeps * dt, substeps + 1, dtype=torch.float64)
+    return {name: sample_trajectory(trajectory._replace(pose=poses[name]), times) for name, trajectory in motion.items()}
+
+
+def some_function(values: Mapping[str, Tensor]) -> Tensor:
+    """A number in which all count, whatever their units: every component over its size, times random weights."""
+    total = torch.zeros(())
+    for seed, value in enumerate(values.values()):
+        size = _columns(value.detach()).norm(dim=0).clamp(min=1e-12)
+        total = total + (value / size * noise(value.shape, seed, value.dtype)).sum()
+    return total
+
+
+def difference(value: Tensor, reference: Tensor) -> float:
+    """The largest of the components' relative errors; a component that is 0 in the reference must be 0."""
+    if value.shape != reference.shape or not bool(torch.isfinite(value).all()):
+        return float("inf")
+    value, reference = value.detach(), reference.detach()
+    error, size = _columns(value - reference).norm(dim=0), _columns(reference).norm(dim=0)
+    return float(torch.where(size > 1e-9 * size.max(), error / size, error / size.max().clamp(min=1e-300)).max())
+
+
+def _columns(value: Tensor) -> Tensor:
+    return value.reshape(-1, value.shape[-1] if value.ndim > 1 else 1)
+
+
+def tangents_transpose(cloth, motion, state: ClothState, substeps: int, dt: float, stages: int, directions=9) -> float:
+    """Relative error of <seed, J dot> = <J^T seed, dot> of the engine, for random dots of all inputs."""
+    with torch.no_grad():
+        drives = drives_of(motion, substeps, dt, {name: t.pose for name, t in motion.items()})
+        engine = fused.Fused(cloth.model()._replace(stages=stages), state, drives)
+        assert engine.torch_parts is None, f"not on the engine: {engine.torch_parts.parts}"
+        job = engine.job(state, torch.full((substeps,), dt), drives)
+        varied = {field for field in job.inputs if field != engine.low.dt}  # the step itself is not differentiated
+        results, records = execution.forward(job, 1)
+        seeds = {f: scaled(noise(t.shape, k, t.dtype), t) for k, (f, t) in enumerate(results.items())}
+        gradients = execution.reverse(job, records, 1, seeds, varied)
+        dots = {f: scaled_dots(f, job, gradients[f], directions) for f in varied}
+        _, moved = execution.tangent(job, dots, directions)
+        forward = sum((seeds[f].unsqueeze(1) * t).flatten(2).sum(-1) for f, t in moved.items())
+        parts = [(gradients[f].unsqueeze(1) * dots[f]).flatten(2).sum(-1) for f in varied]
+        return float(((forward - sum(parts)).abs() / sum(part.abs() for part in parts)).max())
+
+
+def scaled(seed: Tensor, value: Tensor) -> Tensor:
+    """Seeds per size of what they multiply."""
+    return seed / value.abs().mean(1, keepdim=True).clamp(min=1e-12)
+
+
+def scaled_dots(field, job, gradient: Tensor, directions: int) -> Tensor:
+    """Random directions that all matter alike: [scenes, directions, rows, comps] over the gradient's size."""
+    dots = noise((len(gradient), directions, *gradient.shape[1:]), field.id, gradient.dtype)
+    if len(job.inputs[field]) == 1:
+        dots = dots[:1].expand_as(dots)
+    size = gradient.norm()
+    return (dots / size if float(size) > 0 else dots).contiguous()
+
+
+# -- states in which something happens ----------------------------------------------------------------------------
+
+
+def moving(cloth: tc.Cloth, scenes: tuple[int, ...] = (), strain: float = 0.03, seed: int = 0) -> ClothState:
+    """Bent to curves of both signs, turned, strained and sheared, creased and moving; memory as yet virgin."""
+    rest = cloth.rest_state().x
+    size = (rest.amax(0) - rest.amin(0)).max()
+    u, w = (2 * torch.pi * (rest[:, :2] - rest.amin(0)[:2]) / size).unbind(-1)
+    bend = torch.stack([0.1 * torch.sin(w), 0.1 * torch.cos(2 * u), torch.sin(u) + torch.cos(w + u)], dim=-1)
+    x = rest + 0.04 * size * bend + 0.5 * strain * rest @ noise((3, 3), seed)
+    edge = size / len(rest) ** 0.5
+    x = x + strain * edge * noise((*scenes, *x.shape), seed + 1)
+    turn = torch.linalg.qr(noise((3, 3), seed + 2))[0]
+    turn = turn * torch.linalg.det(turn)
+    return cloth.state((x @ turn.mT).to(rest), 0.5 * noise(x.shape, seed + 3).to(rest))
+
+
+def held(cloth_time: float, knots: int = 3, scenes: tuple[int, ...] = ()) -> Trajectory:
+    """A hand that moves and turns."""
+    pose = torch.eye(4).repeat(*scenes, knots, 1, 1)
+    angle = torch.linspace(0, 0.1, knots)
+    pose[..., 0, 0], pose[..., 0, 1] = angle.cos(), -angle.sin()
+    pose[..., 1, 0], pose[..., 1, 1] = angle.sin(), angle.cos()
+    pose[..., :3, 3] = 1e-3 * noise((*scenes, knots, 3), 11).to(pose)
+    times = torch.linspace(0, cloth_time, knots, dtype=torch.float64)
+    return Trajectory(times, pose, torch.ones(knots, dtype=torch.bool))
+
+
+def noise(shape, seed: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Standard normal numbers that do not depend on the global generator."""
+    return torch.randn(tuple(shape), generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)

@@ -1,0 +1,339 @@
+"""Tiny recordings in other formats, written by the libraries of those formats, with the truth beside them."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from helpers import lerobot_dataset as lerobot_truth
+
+POSE = [[0.0, 1.0, 0.0, 0.5], [1.0, 0.0, 0.0, 0.1], [0.0, 0.0, -1.0, 1.5], [0.0, 0.0, 0.0, 1.0]]
+CLOTH = {"sheet": {"width": 0.3, "height": 0.2}, "areal_density": 0.15, "thickness": 5e-4}
+KNOWN = {"cloth": CLOTH, "provenance": "measured"}
+WIDTH, HEIGHT, FRAMES = 16, 12, 3
+EPOCH = 1_700_000_000_123_456_789  # ns; not a multiple of what float64 seconds can tell apart
+
+
+@dataclass
+class Foreign:
+    """A recording on disk, the scene that completes it, and what must be read."""
+
+    path: Path
+    scene: dict
+    images: dict[str, list[np.ndarray]] = field(default_factory=dict)  # "camera/kind": pixels
+    times: dict[str, list[float]] = field(default_factory=dict)  # likewise [s]
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)  # "name/key" of the motion; "points/xyz"
+    options: dict = field(default_factory=dict)
+
+    def write_scene(self) -> Path:
+        path = self.path.parent / "scene.json"
+        path.write_text(json.dumps(self.scene))
+        return path
+
+
+def pictures(seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Depth [mm, 1 to 2 m, some invalid] and colour images."""
+    rng = np.random.default_rng(seed)
+    depth = [rng.integers(1000, 2000, (HEIGHT, WIDTH)).astype(np.uint16) for _ in range(FRAMES)]
+    depth[0][0, :3] = 0
+    return depth, [rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(FRAMES)]
+
+
+def jpeg(pixels: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=95)
+    return file.getvalue()
+
+
+def png(pixels: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return file.getvalue()
+
+
+def decoded(data: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+
+def redwood(folder: Path) -> Foreign:
+    """By open3d.io."""
+    import open3d as o3d
+
+    root, (depth, color) = folder / "redwood", pictures()
+    for kind in ("depth", "color"):
+        (root / kind).mkdir(parents=True)
+    stamps = [33_369, 66_736, 100_103]
+    for i, us in enumerate(stamps):
+        name = f"{i + 1:07d}-{us:012d}.png"
+        o3d.io.write_image(str(root / "depth" / name), o3d.geometry.Image(depth[i]))
+        o3d.io.write_image(str(root / "color" / name), o3d.geometry.Image(color[i]))
+    intrinsic = o3d.camera.PinholeCameraIntrinsic(WIDTH, HEIGHT, 14.0, 15.0, 7.5, 5.25)
+    o3d.io.write_pinhole_camera_intrinsic(str(root / "camera_intrinsic.json"), intrinsic)
+    one = o3d.camera.PinholeCameraParameters()
+    one.intrinsic, one.extrinsic = intrinsic, np.linalg.inv(POSE)  # Open3D's extrinsic is world to camera
+    trajectory = o3d.camera.PinholeCameraTrajectory()
+    trajectory.parameters = [one] * FRAMES
+    o3d.io.write_pinhole_camera_trajectory(str(root / "trajectory.log"), trajectory)
+    times = [(us - stamps[0]) / 1e6 for us in stamps]
+    both = {"cam0/depth": depth, "cam0/color": color}
+    return Foreign(root, dict(KNOWN), both, dict.fromkeys(both, times))
+
+
+TUM_K = [[14.0, 0.0, 7.5], [0.0, 15.0, 5.25], [0.0, 0.0, 1.0]]
+
+
+def tum(folder: Path) -> Foreign:
+    """In the published layout; colour comes 12 ms after depth, and once more at the end."""
+    root, (depth, color) = folder / "tum", pictures(1)
+    color.append(color[0][::-1].copy())
+    names = {"depth": ("depth", depth, 0), "rgb": ("color", color, 12_000)}
+    times = {}
+    for name, (kind, images, late) in names.items():
+        (root / name).mkdir(parents=True)
+        lines = [f"# {name} images", "# file: 'x.bag'", "# timestamp filename"]
+        for i, pixels in enumerate(images):
+            stamp = f"1305031102.{175_304 + i * 33_333 + late}"
+            (root / name / f"{stamp}.png").write_bytes(png(pixels))
+            lines.append(f"{stamp} {name}/{stamp}.png")
+        (root / f"{name}.txt").write_text("\n".join(lines) + "\n")
+        times[f"cam0/{kind}"] = [(i * 33_333 + late) / 1e6 for i in range(len(images))]
+    # x axis along +y, y along +x, z down: half a turn about (1, 1, 0)
+    pose = "0.5 0.1 1.5 0.70710678 0.70710678 0.0 0.0"
+    lines = ["# ground truth trajectory", "# timestamp tx ty tz qx qy qz qw"]
+    lines += [f"{1305031102.1758 + i / 100:.4f} {pose}" for i in range(10)]
+    (root / "groundtruth.txt").write_text("\n".join(lines) + "\n")
+    scene = {**KNOWN, "cameras": {"cam0": {"K": TUM_K, "distortion": [0.26, -0.95, -0.005, 0.0026, 1.16]}}}
+    return Foreign(root, scene, {"cam0/depth": depth, "cam0/color": color}, times)
+
+
+def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
+    """By rosbags' writer, in the standard messages of ROS 2."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    from torchcloth.recordings.formats import mcap_checksums
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    root, (depth, color) = folder / f"bag_{storage}", pictures(2)
+    rng, n = np.random.default_rng(3), 5
+    stamps = [EPOCH + i * 10_000_000 for i in range(n)]
+    position, quat = rng.normal(0, 0.2, (n, 3)), rng.normal(size=(n, 4))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    q, width, force = rng.normal(size=(n, 7)), np.linspace(0.04, 0.0, n), rng.normal(size=(n, 6))
+    clouds = [rng.normal(0, 0.2, (k, 3)).astype(np.float32) for k in (7, 4)]
+    make = lambda kind, *values: store.types[kind](*values)  # noqa: E731
+    std, sensor, geometry = "std_msgs/msg/", "sensor_msgs/msg/", "geometry_msgs/msg/"
+
+    def header(ns: int, frame: str = "world"):
+        return make(std + "Header", make("builtin_interfaces/msg/Time", *divmod(ns, 10**9)), frame)
+
+    def image(ns: int, encoding: str, pixels: np.ndarray):
+        step = pixels.strides[0]
+        raw = np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)
+        return make(sensor + "Image", header(ns, "lens"), HEIGHT, WIDTH, encoding, 0, step, raw)
+
+    def info(ns: int):
+        K, D = np.array(TUM_K).reshape(-1), np.array([0.26, -0.95, -0.005, 0.0026, 1.16])
+        P = np.column_stack([TUM_K, np.zeros(3)]).reshape(-1)
+        region = make(sensor + "RegionOfInterest", 0, 0, 0, 0, False)
+        head = header(ns, "lens")
+        return make(
+            sensor + "CameraInfo", head, HEIGHT, WIDTH, "plumb_bob", D, K, np.eye(3).reshape(-1), P, 0, 0, region
+        )
+
+    def cloud(ns: int, xyz: np.ndarray):
+        fields = [make(sensor + "PointField", name, 4 * i, 7, 1) for i, name in enumerate("xyz")]
+        padded = np.concatenate([xyz, np.full((1, 3), np.nan, dtype=np.float32)])
+        data = padded.reshape(-1).view(np.uint8)
+        size = len(padded)
+        return make(sensor + "PointCloud2", header(ns), 1, size, fields, False, 12, 12 * size, data, False)
+
+    with Writer(root, version=9, storage_plugin=plugin) as bag:
+
+        def put(topic: str, kind: str, messages: list) -> None:
+            connection = bag.add_connection(topic, kind, typestore=store)
+            for ns, message in messages:
+                bag.write(connection, ns + 1_500_000, store.serialize_cdr(message, kind))  # logged 1.5 ms later
+
+        put("/closed", std + "Bool", [(stamps[0], make(std + "Bool", True)), (stamps[3], make(std + "Bool", False))])
+        poses, based, joints, wrenches, sensed = [], [], [], [], []
+        for i, ns in enumerate(stamps):
+            w, x, y, z = quat[i].tolist()
+            orientation = make(geometry + "Quaternion", x, y, z, w)
+            pose = make(geometry + "Pose", make(geometry + "Point", *position[i].tolist()), orientation)
+            poses.append((ns, make(geometry + "PoseStamped", header(ns), pose)))
+            based.append((ns, make(geometry + "PoseStamped", header(ns, "base"), pose)))
+            names = [*(f"j{k}" for k in range(7)), "finger"]
+            values, none = np.append(q[i], width[i]), np.zeros(0)
+            order = np.roll(np.arange(8), i)  # drivers do not promise an order
+            state = make(sensor + "JointState", header(ns), [names[k] for k in order], values[order], none, none)
+            joints.append((ns, state))
+            both = [make(geometry + "Vector3", *part.tolist()) for part in np.split(force[i], 2)]
+            wrench = make(geometry + "Wrench", *both)
+            wrenches.append((ns, make(geometry + "WrenchStamped", header(ns), wrench)))
+            sensed.append((ns, make(geometry + "WrenchStamped", header(ns, "sensor"), wrench)))
+        put("/left/pose", geometry + "PoseStamped", poses)
+        put("/left/pose_in_base", geometry + "PoseStamped", based)
+        put("/joint_states", sensor + "JointState", joints)
+        put("/left/ft", geometry + "WrenchStamped", wrenches)
+        put("/left/ft_sensor", geometry + "WrenchStamped", sensed)
+        put("/cloth", sensor + "PointCloud2", [(stamps[i], cloud(stamps[i], c)) for i, c in enumerate(clouds)])
+        put("/lens/info", sensor + "CameraInfo", [(stamps[0], info(stamps[0]))])
+        put("/lens/depth", sensor + "Image", [(stamps[i], image(stamps[i], "16UC1", d)) for i, d in enumerate(depth)])
+        metres = [(d / 1000).astype(np.float32) for d in depth]
+        metres[0][0, :3] = 20.0, np.inf, np.nan  # a far wall, too far, no reading: none is in the episode's range
+        put(
+            "/lens/metres",
+            sensor + "Image",
+            [(ns, image(ns, "32FC1", d)) for ns, d in zip(stamps, metres, strict=False)],
+        )
+        swapped = [np.ascontiguousarray(c[..., ::-1]) for c in color]
+        put(
+            "/lens/color",
+            sensor + "Image",
+            [(ns, image(ns, "bgr8", c)) for ns, c in zip(stamps, swapped, strict=False)],
+        )
+        compressed = [jpeg(c) for c in color]
+        kind, files = sensor + "CompressedImage", [np.frombuffer(c, dtype=np.uint8) for c in compressed]
+        put(
+            "/lens/jpeg",
+            kind,
+            [(ns, make(kind, header(ns, "lens"), "jpeg", c)) for ns, c in zip(stamps, files, strict=False)],
+        )
+    if storage == "mcap" and seal:
+        mcap_checksums.seal(root / f"{root.name}.mcap")
+    joint_map = {"topic": "/joint_states", "names": [f"j{k}" for k in range(7)], "width": "finger"}
+    left = {"pose": "/left/pose", "closed": "/closed", "wrench": "/left/ft", "wrench_frame": "world"}
+    scene = {
+        **KNOWN,
+        "robots": {"arm": {"model": "rizon4", "T_world_base": np.eye(4).tolist()}},
+        "cameras": {"cam0": {"T_world_camera": POSE}, "cam1": {"T_world_camera": POSE, "K": TUM_K}},
+        "source": {
+            "motion": {"left": left, "arm": {"joints": joint_map, "closed": True}},
+            "points": {"topic": "/cloth"},
+            "cameras": {
+                "cam0": {"depth": "/lens/depth", "color": "/lens/color", "info": "/lens/info"},
+                "cam1": {"depth": "/lens/metres", "color": "/lens/jpeg"},
+            },
+        },
+    }
+    fine = [5 * d for d in depth]  # in units of 0.2 mm
+    fine[0][0, :3] = 0
+    images = {
+        "cam0/depth": depth,
+        "cam0/color": color,
+        "cam1/depth": fine,
+        "cam1/color": [decoded(c) for c in compressed],
+    }
+    arrays = {
+        "left/position": position,
+        "left/quat_wxyz": quat,
+        "left/force": force[:, :3],
+        "left/torque": force[:, 3:],
+    }
+    arrays |= {"left/closed": np.arange(n) < 3, "arm/q": q, "arm/width": width, "arm/closed": np.ones(n, bool)}
+    arrays |= {"left/t": np.arange(n) / 100, "arm/t": np.arange(n) / 100, "points/t": np.arange(2) / 100}
+    arrays |= {"points/xyz": np.concatenate(clouds).astype(float)}
+    times = {key: [i / 100 for i in range(FRAMES)] for key in images}
+    return Foreign(root, scene, images, times, arrays)
+
+
+def lerobot(folder: Path) -> Foreign:
+    """A copy of the data set that lerobot itself wrote, second episode."""
+    import shutil
+
+    root = Path(shutil.copytree(lerobot_truth.FOLDER / "dataset", folder / "lerobot"))
+    names = lerobot_truth.NAMES
+    source = {
+        "motion": {"left": {"column": "observation.state", "joints": names[:7], "unit": "rad", "width": names[7]}},
+        "cameras": {"cam0": {"color": lerobot_truth.CAMERA}},
+    }
+    scene = {**KNOWN, "source": source, "cameras": {"cam0": {"T_world_camera": POSE, "K": TUM_K}}}
+    length = lerobot_truth.LENGTHS[1]
+    states = np.array([lerobot_truth.state(1, i) for i in range(length)], dtype=np.float64)
+    t = np.arange(length) / lerobot_truth.FPS
+    grey = [
+        np.full((lerobot_truth.HEIGHT, lerobot_truth.WIDTH, 3), lerobot_truth.grey(1, i), np.uint8)
+        for i in range(length)
+    ]
+    arrays = {"left/q": states[:, :7], "left/width": states[:, 7], "left/t": t}
+    return Foreign(root, scene, {"cam0/color": grey}, {"cam0/color": t.tolist()}, arrays, {"episode": 1})
+
+
+FACTORY = [0.50148, 0.49705, 0.49204, 0.49193, 4.7247, 3.2092, 0.1706, 5.0559, 4.7758, 0.88649, 0, 0, 1.24e-4, 5.9e-6]
+TILT = 0.1  # rad, of depth from colour; close to the real 6 degrees
+
+
+def calibration() -> dict:
+    """Attached by k4arecorder; the numbers of a real device (k4a issue 1617) for the depth lens."""
+    c, s = np.cos(TILT), np.sin(TILT)
+    turn = [1.0, 0.0, 0.0, 0.0, c, -s, 0.0, s, c]
+
+    def lens(place: str, values: list, size: tuple[int, int], turn: list, shift: list) -> dict:
+        model = {"ModelParameterCount": 14, "ModelParameters": values}
+        model["ModelType"] = "CALIBRATION_LensDistortionModelBrownConrady"
+        rt = {"Rotation": turn, "Translation": shift}
+        return {"Intrinsics": model, "Location": place, "Rt": rt, "SensorWidth": size[0], "SensorHeight": size[1]}
+
+    unmoved = np.eye(3).reshape(-1).tolist()
+    color = [0.5, 0.5, 0.48, 0.64, *FACTORY[4:]]
+    lenses = [
+        lens("CALIBRATION_CameraLocationD0", FACTORY, (1024, 1024), unmoved, [0.0, 0.0, 0.0]),
+        lens("CALIBRATION_CameraLocationPV0", color, (4096, 3072), turn, [-0.032, -0.002, 0.004]),
+    ]
+    return {"CalibrationInformation": {"Cameras": lenses}}
+
+
+def kinect(folder: Path, *, size: tuple[int, int] = (320, 288), frames: int = FRAMES) -> Foreign:
+    """By FFmpeg's Matroska writer, with tracks, tags and attachment as k4arecorder leaves them.
+
+    FFmpeg stores raw video without its fourcc; it is put there afterwards, as k4arecorder has it.
+    """
+    import av
+
+    folder.mkdir(parents=True, exist_ok=True)
+    path, rng = folder / "take.mkv", np.random.default_rng(4)
+    blocks = [rng.integers(500, 3000, (size[1] // 32, size[0] // 32)) for _ in range(frames)]
+    depth = [np.kron(b, np.ones((32, 32))).astype(np.uint16) for b in blocks]
+    colors = [np.full((720, 1280, 3), 40 + 30 * i, dtype=np.uint8) for i in range(frames)]
+    files = [jpeg(c) for c in colors]
+    with av.open(str(path), "w", format="matroska", container_options={"allow_raw_vfw": "1"}) as container:
+        container.metadata["K4A_DEVICE_SERIAL_NUMBER"] = "000123"
+        color = container.add_mux_stream("mjpeg", rate=30, width=1280, height=720, pix_fmt="yuvj420p")
+        color.metadata["title"] = "COLOR"
+        raw = container.add_stream("rawvideo", rate=30)
+        raw.width, raw.height, raw.pix_fmt = *size, "gray16be"
+        raw.metadata["title"] = "DEPTH"
+        imu = container.add_mux_stream("subrip", rate=1000)
+        imu.metadata["title"] = "IMU"
+        container.add_attachment("calibration.json", "application/octet-stream", json.dumps(calibration()).encode())
+        for i in range(frames):
+            for stream, data in ((color, files[i]), (imu, bytes(24))):
+                packet = av.Packet(data)
+                packet.pts = packet.dts = i
+                packet.time_base = Fraction(1, 30)
+                packet.stream, packet.is_keyframe = stream, True
+                container.mux(packet)
+            frame = av.VideoFrame.from_ndarray(depth[i], format="gray16le").reformat(format="gray16be")
+            frame.pts = i
+            container.mux(raw.encode(frame))
+        container.mux(raw.encode())
+    data = bytearray(path.read_bytes())
+    at = data.index(struct.pack("<IiiHH", 40, size[0], -size[1], 1, 16))
+    data[at : at + 20] = struct.pack("<IiiHH4s", 40, *size, 1, 16, b"b16g")
+    path.write_bytes(data.replace(b"S_TEXT/UTF8", b"S_K4A/IMU\0\0"))
+    times = [round(i / 30, 3) for i in range(frames)]
+    images = {"depth/depth": depth, "color/color": [decoded(f) for f in files]}
+    scene = {**KNOWN, "cameras": {"depth": {"T_world_camera": POSE}}}
+    return Foreign(path, scene, images, dict.fromkeys(images, times))
+
+
+WRITERS = {"redwood": redwood, "tum": tum, "ros2": ros2, "lerobot": lerobot, "kinect": kinect}

@@ -1,0 +1,26 @@
+"""What the gradient tests share."""
+
+from torch.func import functional_call
+
+STEPS = tuple(10.0 ** (-1 - k / 2) for k in range(9))
+
+
+ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
+
+
+def parameters(cloth):
+    """Those that act: without contact the director's are not in the graph."""
+    named = {name: value.detach() for name, value in cloth.named_parameters()}
+    if cloth.contact is None:
+        named = {name: value for name, value in named.items() if not any(key in name for key in ONLY_IN_CONTACT)}
+    return named
+
+
+def simulate(cloth, values, state, motion, times, **options):
+    """The rollout with parameters replaced; values may be leaves, duals or batches."""
+    return functional_call(cloth, values, (state, motion, times), options)
+
+
+def sizes(values):
+    """A coarse change: 1 for logarithms and angles, the value itself where that is smaller."""
+    return {name: min(1.0, float(value.abs().mean())) or 1.0 for name, value in values.items()}

@@ -1,0 +1,108 @@
+"""Least-squares problems whose answer is known, in the form that the solver takes. No simulation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from torchcloth.identification.estimators.levenberg_marquardt import WINDOW, Linearised, Problem, minimise
+
+FRAMES, PATCHES, EACH = 40, 16, 3  # rows: 40 frames of 16 patches of 3 points
+SIGMA = 1e-3  # m
+TRUE = torch.tensor([0.4, -0.3, 0.7], dtype=torch.float64)
+Model = Callable[[Tensor], Tensor]
+
+
+@dataclass
+class Toy:
+    """``model(raw) - data``, with a log of what the solver asked for."""
+
+    model: Model
+    data: Tensor
+    frame: Tensor
+    patch: Tensor
+    prior_std: float = 5.0
+    unknowns: int = len(TRUE)
+    forbidden: Callable[[Tensor], Exception | None] = lambda raw: None
+    linearised: list[Tensor] = field(default_factory=list)
+    evaluated: list[Tensor] = field(default_factory=list)
+
+    def problem(self) -> Problem:
+        """The solver's view."""
+        mean = torch.zeros(self.unknowns, dtype=torch.float64)
+        std = torch.full_like(mean, self.prior_std)
+        return Problem(
+            linearise=self._linearise,
+            evaluate=self._evaluate,
+            clip=lambda raw: raw,
+            prior_mean=mean,
+            prior_std=std,
+            longest=torch.ones_like(mean),
+            noise=None,
+        )
+
+    def _linearise(self, raw: Tensor) -> Linearised:
+        self.linearised.append(raw)
+        jacobian = torch.func.jacfwd(self.model)(raw)
+        factor = torch.ones(len(self.data), dtype=torch.float64)
+        return Linearised(self.model(raw) - self.data, jacobian, factor, self.frame, self.patch)
+
+    def _evaluate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        self.evaluated.append(raw)
+        error = self.forbidden(raw)
+        if error is not None:
+            raise error
+        return self.model(raw) - self.data, self.patch
+
+
+def layout(frames: int = FRAMES) -> tuple[Tensor, Tensor]:
+    """Frame and patch of every row; frame 0 has none, as in an episode."""
+    frame = torch.arange(1, frames + 1).repeat_interleave(PATCHES * EACH)
+    patch = torch.arange(PATCHES).repeat_interleave(EACH).repeat(frames)
+    return frame, patch
+
+
+def sensitivities(generator: torch.Generator, frames: int = FRAMES, unknowns: int = len(TRUE)) -> Tensor:
+    """[R, K] m: smooth over time and equal within a patch, as those of a fabric are."""
+    frame, patch = layout(frames)
+    phase, rate = torch.rand(2, PATCHES, unknowns, generator=generator, dtype=torch.float64)
+    t = frame[:, None] / FRAMES
+    return 2e-3 * torch.sin(2 * math.pi * (phase[patch] + (0.5 + rate[patch]) * t))
+
+
+def noise(generator: torch.Generator, shared: float, frames: int = FRAMES) -> Tensor:
+    """[R] m: independent, and a part of ``shared`` times its size that a patch keeps over a window of frames.
+
+    The windows begin two frames off those that the solver counts in: real errors do not know them.
+    """
+    frame, patch = layout(frames)
+    window = (frame + 2) // WINDOW
+    common = torch.randn(int(window.max()) + 1, PATCHES, generator=generator, dtype=torch.float64)
+    alone = torch.randn(len(frame), generator=generator, dtype=torch.float64)
+    return SIGMA * (alone + shared * common[window, patch])
+
+
+def linear(seed: int, shared: float = 0.0) -> tuple[Toy, Tensor]:
+    """A linear problem and its Jacobian."""
+    generator = torch.Generator().manual_seed(seed)
+    jacobian = sensitivities(generator)
+    return Toy(lambda raw: jacobian @ raw, jacobian @ TRUE + noise(generator, shared), *layout()), jacobian
+
+
+def curved(seed: int = 0, bend: float = 1.0) -> Toy:
+    """Exponentials of the unknowns: a Jacobian that changes by a factor between start and solution."""
+    generator = torch.Generator().manual_seed(seed)
+    jacobian = sensitivities(generator)
+    model = lambda raw: jacobian @ (torch.expm1(bend * raw) / bend)  # noqa: E731
+    return Toy(model, model(TRUE) + noise(generator, 0.0), *layout())
+
+
+START = torch.zeros(3, dtype=torch.float64)
+
+
+def solve(toy, iterations=35, start=START, **options):
+    return minimise(toy.problem(), start, iterations, lambda _: False, **options)

@@ -1,0 +1,71 @@
+"""A twin of tests/identification whose cloth is partly hidden, with its truth kept apart.
+
+The same engine made it on another mesh with another substep (an inverse crime, softened): it shows that the machinery
+works. How far the estimate is from another engine's truth is what the study ``pose`` shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchcloth as tc
+from helpers import twins
+from torchcloth import recordings as rec
+from torchcloth.robots import replay
+
+WRONG = replace(twins.TRUE, membrane=0.5 * twins.TRUE.membrane, drag=0.5 * twins.TRUE.drag)
+SHARE = 0.3  # of the sheet that a bar hides while it passes
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    recording: rec.Recording
+    truth: Tensor  # [T, V, 3] m
+    hidden: Tensor  # [T, V] bool, behind the bar
+
+
+def twin() -> Scene:
+    """A shaken sheet behind a bar that passes once from one side to the other."""
+    whole, t = twins.twin(), np.arange(twins.FRAMES) / twins.RATE
+    x = _truth(t)
+    uv = np.asarray(tc.meshes.rectangle(twins.SIDE, twins.SIDE, resolution=twins.FIT).uv)
+    truth = np.stack([twins.bilinear(frame, twins.TRUTH, uv) for frame in x])
+    left = (1 - SHARE) * twins.SIDE * t / t[-1]  # of the bar, along the pattern's v
+    clouds, kept = np.split(whole.points.xyz, np.cumsum(whole.points.counts)[:-1]), []
+    for frame, cloud, start in zip(x, clouds, left, strict=True):
+        v = _across(frame, cloud)
+        kept.append(cloud[(v < start) | (v > start + SHARE * twins.SIDE)])
+    points = rec.PointClouds(t, np.concatenate(kept), np.array([len(cloud) for cloud in kept]))
+    hidden = (uv[:, 1] > left[:, None]) & (uv[:, 1] < left[:, None] + SHARE * twins.SIDE)
+    return Scene(replace(whole, points=points), torch.as_tensor(truth), torch.as_tensor(hidden))
+
+
+def model(scene: Scene, fabric: twins.Fabric) -> tc.Cloth:
+    """The cloth of the fit's mesh with some fabric's values."""
+    values = {
+        "youngs_modulus": fabric.membrane / twins.THICKNESS,
+        "poisson_ratio": fabric.poisson,
+        "bending.stiffness": fabric.bending,
+        "air.normal": fabric.drag,
+    }
+    return twins.at(scene.recording, **values)
+
+
+def _truth(t: np.ndarray) -> np.ndarray:
+    """[T, V, 3] m on the truth's mesh, as ``twins.twin`` has it."""
+    truth, motion = twins.cloth(twins.TRUE, twins.TRUTH), twins.shake()
+    empty = rec.Recording(cloth=rec.ClothInfo(areal_density=1.0), provenance="synthetic: twins.py", grippers=motion)
+    with torch.no_grad():
+        trajectories = replay(empty)
+        state = truth.settle(truth.state(twins.hammock(truth)), trajectories, duration=1.0, rate=15.0)
+        return truth(state, trajectories, t.tolist(), dt=0.6 * truth.stable_step()).x.numpy()
+
+
+def _across(frame: np.ndarray, cloud: np.ndarray) -> np.ndarray:
+    """[N] m, the pattern's v of the vertex that a point is nearest to."""
+    near = np.linalg.norm(cloud[:, None] - frame, axis=-1).argmin(1)
+    return twins.SIDE * (near % twins.TRUTH[1]) / (twins.TRUTH[1] - 1)

@@ -1,0 +1,116 @@
+"""Small episodes of a light sheet in two grippers, made by the same engine on another mesh: they test the machinery."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+import torchcloth as tc
+from torchcloth import recordings as rec
+from torchcloth.diagnosis import World, base_model
+from torchcloth.episodes.observed import Episode
+from torchcloth.episodes.observed import build_episode as tensors
+from torchcloth.episodes.pattern_interpolation import interpolation_weights, interpolate_on_pattern
+from torchcloth.episodes.replay import Frames
+
+SIDE = 0.2  # m
+TRUTH, FIT = (13, 13), (7, 7)
+NOMINAL = {"membrane_stiffness": 60.0, "poisson_ratio": 0.3, "bending_stiffness": 2e-4, "bending_damping_time": 0.01}
+EYE = (0.1, -1.2, 1.1)  # m, of the camera
+FRAMES, RATE, POINTS, NOISE = 16, 20.0, 80, 5e-4  # -, Hz, a frame, m
+
+
+def swing(amplitude: float, rate: float, axis: int = 1) -> Callable[[np.ndarray], np.ndarray]:
+    """Displacement [K, 3] m of both grippers."""
+
+    def moved(t: np.ndarray) -> np.ndarray:
+        out = np.zeros((len(t), 3))
+        out[:, axis] = 0.5 * amplitude * (1 - np.cos(2 * np.pi * rate * t))
+        return out
+
+    return moved
+
+
+MOTIONS = {"slow": swing(0.06, 1.2), "fast": swing(0.10, 1.6), "lift": swing(0.05, 2.0, axis=2)}
+
+
+def episode(motion: str = "slow", resolution: tuple[int, int] = FIT, duration: float = 0.3) -> rec.Recording:
+    """Without anything seen of it but points on its first shape."""
+    mesh = tc.meshes.rectangle(SIDE, SIDE, resolution=resolution)
+    t, rng = np.linspace(0.0, duration, 2 + int(50 * duration)), np.random.default_rng(0)
+    first = np.c_[mesh.uv[:, 0], 0.01 * np.sin(8 * mesh.uv[:, 0]), mesh.uv[:, 1]] + [0.0, 0.0, 1.0]
+    grippers, grasps = {}, {}
+    for name, u in (("left", 0.0), ("right", SIDE)):
+        path = MOTIONS[motion](t) + np.array([u, 0.0, 1.0 + SIDE])
+        grippers[name] = rec.GripperMotion(t, path, np.tile([1.0, 0, 0, 0], (len(t), 1)), np.ones(len(t), bool))
+        grasps[name] = rec.GraspInfo(np.array([[u, SIDE]]), 0.051)
+    frames = 1 + int(duration * RATE)
+    points = first[rng.integers(0, len(first), (frames, 40))] + 1e-3 * rng.standard_normal((frames, 40, 3))
+    info = rec.ClothInfo(
+        areal_density=0.2,
+        areal_density_std=0.004,
+        thickness=1e-3,
+        vertices=np.c_[mesh.uv, np.zeros(len(first))],
+        faces=mesh.faces,
+        uv=mesh.uv,
+        initial_vertices=first,
+        nominal=NOMINAL,
+    )
+    return rec.Recording(
+        cloth=info,
+        provenance="synthetic: tests/diagnosis/sheets.py",
+        grasps=grasps,
+        grippers=grippers,
+        points=rec.PointClouds(np.arange(frames) / RATE, points.reshape(-1, 3), np.full(frames, 40)),
+        observation_noise_std=1e-3,
+        cameras={"camera": rec.Camera(width=640, height=480, K=np.eye(3), T_world_camera=_at(EYE))},
+        split={"motion": motion},
+    )
+
+
+def _at(place: tuple[float, float, float]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    return pose
+
+
+def recorded(
+    motion: str, change: Callable[[World], World], seed: int, play: Callable[[World, Episode], Frames] = World.frames
+) -> rec.Recording:
+    """What a noisy sensor has of a world that is changed, played on a finer mesh; the first shape is settled."""
+    blank, rng = episode(motion, TRUTH, (FRAMES - 1) / RATE + 0.01), np.random.default_rng(seed)
+    plain = base_model(blank).world()
+    world, even = change(plain), np.asarray(blank.cloth.uv)
+    with torch.no_grad():
+        data = tensors(world.cloth, blank)
+        state = world.cloth.settle(world.cloth.state(data.initial), data.motion, duration=1.0, rate=15.0)
+        start = interpolate_on_pattern(interpolation_weights(world.cloth.mesh, even), state.x)
+        settled = replace(blank, cloth=replace(blank.cloth, initial_vertices=start.numpy()))
+        found = play(world, tensors(world.cloth, settled))
+        x = interpolate_on_pattern(interpolation_weights(plain.cloth.mesh, even), found.x).numpy()
+    coarse = episode(motion, FIT, (FRAMES - 1) / RATE + 0.01)
+    clouds = [_seen(frame, rng) for frame in x]
+    first = _bilinear(x[0], np.asarray(coarse.cloth.uv)) + 2e-4 * rng.standard_normal((len(coarse.cloth.uv), 3))
+    return replace(
+        coarse,
+        cloth=replace(coarse.cloth, initial_vertices=first),
+        points=rec.PointClouds(np.arange(FRAMES) / RATE, np.concatenate(clouds), np.full(FRAMES, POINTS)),
+        observation_noise_std=NOISE,
+    )
+
+
+def _seen(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return _bilinear(x, SIDE * rng.random((POINTS, 2))) + NOISE * rng.standard_normal((POINTS, 3))
+
+
+def _bilinear(x: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    columns, rows = TRUTH
+    place = np.clip(uv / SIDE, 0, 1) * [columns - 1, rows - 1]
+    cell = np.minimum(place.astype(int), [columns - 2, rows - 2])
+    a, b = (place - cell).T[:, :, None]
+    first = cell[:, 0] * rows + cell[:, 1]
+    low, high = ((1 - b) * x[first + skip] + b * x[first + skip + 1] for skip in (0, rows))
+    return (1 - a) * low + a * high

@@ -1,0 +1,75 @@
+"""The comparison of the two engines, small: known distances, and what the page prints."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", minversion="4.0")
+
+import torch
+
+from torchcloth import meshes
+from torchcloth.episodes.replay import Replay
+from torchcloth.identification import build_episode
+from torchcloth.training.validation.null import report_page, run
+from torchcloth.training.validation.null.comparison import Values, between, carry, cloth, compare, load, pattern
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """An effect-free episode on a coarse mesh."""
+    study = run.Study(tmp_path_factory.mktemp("null"), ("hang",), 9)
+    study._generate("hang", 9)
+    return study
+
+
+def test_the_two_engines_agree_on_a_hanging_sheet_and_disagree_about_another_one(study):
+    folder = study._episode("hang", 9)
+    values, recording = Values.true(folder), load(folder, 9)
+    right = compare(recording, values)
+    assert right.material < 0.6e-3
+    assert right.frames.shape == recording.truth.t.shape
+    assert right.surface <= right.material
+    soft = compare(recording, replace(values, membrane_stiffness=0.5 * values.membrane_stiffness))
+    assert soft.material > 2 * right.material
+
+
+def test_a_model_that_is_its_own_truth_has_no_distance(study):
+    folder = study._episode("hang", 9)
+    values, recording = Values.true(folder), load(folder, 9)
+    model = cloth(recording, values)
+    with torch.no_grad():
+        x = Replay(model)(build_episode(model, recording)).x.numpy()
+    own = carry(model.mesh, pattern(recording), x)
+    truth = replace(recording.truth, t=recording.points.t, vertices=own)
+    same = replace(recording, truth=truth)
+    assert compare(same, values).material < 1e-9
+    shifted = replace(recording, truth=replace(truth, vertices=own + np.array([0, 0, 3e-3])))
+    assert compare(shifted, values).material == pytest.approx(3e-3, rel=1e-6)
+    assert between(same, shifted) == pytest.approx(3e-3, rel=1e-6)
+
+
+def test_carrying_is_exact_for_linear_maps_on_any_mesh():
+    mesh = meshes.rectangle(0.3, 0.2, resolution=(4, 5))
+    turn = np.array([[1.0, 0.2, 0.0], [-0.3, 0.9, 0.4]])
+    uv = np.random.default_rng(0).uniform([0, 0], [0.3, 0.2], (40, 2))
+    np.testing.assert_allclose(carry(mesh, uv, (mesh.uv @ turn)[None])[0], uv @ turn, atol=1e-12)
+
+
+def test_finished_steps_are_not_repeated_and_the_page_shows_them(study, tmp_path):
+    distance = {"material": 1e-3, "surface": 5e-4, "frames": [0.0, 1e-3], "places": [0.0, 1e-3, 2e-3, 3e-3]}
+    values = {"membrane_stiffness": 100.0, "poisson_ratio": 0.3, "bending_stiffness": 1e-5, "damping_time": 0.01}
+    done = run.Study(tmp_path, ("swing",), 17)
+    for name, _ in done.tasks():
+        done.found[name] = 0.5 if name.startswith(("episode", "truth")) else dict(distance)
+    done.found["fit"] = {"values": values, "true": values}
+    calls = []
+    done.tasks = lambda: ((name, lambda name=name: calls.append(name)) for name in [*done.found])
+    with run.Progress(disable=True) as progress:
+        done.run(progress)
+    assert calls == []
+    text = report_page.table(done.found, ("swing",), done.meshes)
+    assert "| swing | 0.50 | 1.00 (0.50) | 1.00 (0.50) | 500.00 |" in text
+    assert report_page.draw(done.found, ("swing",), done.meshes, tmp_path).stat().st_size > 1000
+    assert "bending_stiffness [N m] | 1e-05" in report_page.write(done.found, ("swing",), done.meshes, tmp_path).read_text()

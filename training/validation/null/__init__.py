@@ -1,0 +1,1 @@
+"""How far torchcloth is from the independent engine when nothing is hidden."""

@@ -1,0 +1,1 @@
+"""Adapters that read published measurements of cloth."""

@@ -1,0 +1,141 @@
+"""Pictures of the measured data, and of what was fitted to them. Measured: dots; computed: lines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchcloth.identification import TensionFit, Trellis, Uniaxial, fit_tension
+from torchcloth.recordings import ForceDisplacement, Recording
+
+from . import bias_extension as glass
+from . import knits as knit
+
+BLUE, BROWN, GREY = "#1f6f8b", "#b0653a", "#888888"
+LIGHT = 5.0  # N, up to which knits are fitted
+
+
+def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, np.ndarray]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def swings(episodes: dict[str, Recording], path: Path) -> None:
+    """Upper edge over the tool, lag taken out, for three runs; side views of frames in the swing of one."""
+    figure, axes = _figure(2, 3, (15, 8))
+    for axis, run in zip(axes[0], ("range30_rep3", "range60_rep5", "range90_rep8"), strict=True):
+        e = episodes[run]
+        good, mesh = e.markers.extra["accepted"], e.markers.xyz.reshape(-1, 8, 8, 3)
+        t, edge, low = e.markers.t + e.clock_offset, mesh[:, 1:-1, -1, 1], mesh[:, 1:-1, 0, 1]
+        tool = e.grippers["hanger"]
+        axis.plot(tool.t, tool.position[:, 1], color=GREY, label="tool")
+        axis.plot(t[good], np.nanmedian(edge, 1)[good], ".", color=BLUE, label="upper edge")
+        axis.plot(t[good], np.nanmedian(low, 1)[good], ".", color=BROWN, ms=4, label="lower edge")
+        axis.plot(t[~good], np.nanmedian(edge, 1)[~good], "x", color="k", ms=4, label="refused frames, upper edge")
+        axis.set(title=f"{run}: lag {-e.clock_offset:.3f} s, {(~good).sum()} of {len(good)} refused", xlabel="s")
+        axis.set_ylabel("y, along the stroke, m")
+    axes[0, 0].legend(fontsize=8)
+    e = episodes["range60_rep5"]
+    good, mesh, t = e.markers.extra["accepted"], e.markers.xyz.reshape(-1, 8, 8, 3), e.markers.t + e.clock_offset
+    for axis, begin in zip(axes[1], (0.0, 4.0, 9.9), strict=True):
+        for i in np.flatnonzero(good & (t > begin))[:8]:
+            side = np.nanmedian(mesh[i], axis=0)
+            axis.plot(side[:, 1], side[:, 2], ".-", ms=4, label=f"{t[i]:.1f} s")
+        corners = e.cloth.initial_vertices.mean(0)
+        if begin == 0:
+            axis.plot(corners[:, 1], corners[:, 2], color="k", label="flat sheet of the episode")
+        middle = np.mean(axis.get_xlim())
+        axis.set(title=f"side view from {begin:.1f} s, rows' medians", xlabel="y, m", ylabel="z, m", aspect="equal")
+        axis.set_xlim(middle - 0.22, middle + 0.22)
+        axis.legend(fontsize=7)
+    figure.savefig(path, dpi=90)
+
+
+def lifts(episodes: dict[str, Recording], path: Path) -> None:
+    """Three frames of every lift seen along x, dropped points in red, with the path."""
+    figure, axes = _figure(3, len(episodes), (20, 9))
+    for column, (trial, e) in zip(axes.T, episodes.items(), strict=True):
+        gripper, ends = e.grippers["gripper"], np.cumsum(e.points.counts)
+        for axis, i in zip(column, (8, 16, 24), strict=True):
+            cloud, cloth = e.points.frame(i), e.points.extra["cloth"][ends[i] - e.points.counts[i] : ends[i]]
+            axis.plot(*cloud[cloth][:, 1:].T, ",", color=BLUE)
+            axis.plot(*cloud[~cloth][:, 1:].T, ".", color="red", ms=3)
+            axis.plot(gripper.position[: i + 1, 1], gripper.position[: i + 1, 2], color="k", lw=1)
+            axis.plot(gripper.position[i, 1], gripper.position[i, 2], "k*")
+            axis.set(title=f"{trial}, {0.1 * i:.1f} s", aspect="equal", xlim=(-0.12, 0.32), ylim=(0.06, 0.44))
+    figure.suptitle("y and z, m. Blue: cloth; red: dropped; star: gripper, its command moved to the clouds' frame")
+    figure.savefig(path, dpi=80)
+
+
+def nylon(tables: dict[int, ForceDisplacement], fit: TensionFit, path: Path) -> None:
+    """Four curves and their fit; errors."""
+    figure, axes = _figure(1, 2, (13, 5))
+    for (angle, table), curve, tint in zip(
+        tables.items(), fit.curves, (BLUE, BROWN, "#6a8d3a", "#7a4f8b"), strict=True
+    ):
+        u = 1e3 * table.displacement
+        axes[0, 0].plot(u, table.force, ".", color=tint, ms=4)
+        axes[0, 0].plot(u, curve.force, color=tint, label=f"{angle} degrees to the warp")
+        axes[0, 1].plot(u, 100 * (curve.force.numpy() - table.force) / table.force.max(), color=tint)
+    axes[0, 0].set(xlabel="mm", ylabel="N", title="nylon, 97 mm x 27 mm: one law, four numbers")
+    axes[0, 0].legend()
+    axes[0, 1].set(xlabel="mm", ylabel="% of each curve's largest force", title="computed minus measured", ylim=(-6, 6))
+    axes[0, 1].axhline(0, color=GREY, lw=0.5)
+    figure.savefig(path, dpi=90)
+
+
+def knits(fabrics: dict[str, tuple[ForceDisplacement, ForceDisplacement]], path: Path) -> list[float]:
+    """Force and lateral strain of repeat 3 and their prediction from repeats 1 and 2; returns the Poisson ratios."""
+    figure, axes = _figure(2, len(fabrics), (24, 8))
+    ratios = []
+    for column, (name, pair) in zip(axes.T, fabrics.items(), strict=True):
+        light = [table.rows(table.force < LIGHT) for table in pair]
+        fit = fit_tension(knit.start(), [table.repeats(1, 2) for table in light], knit.NAMES)
+        found = knit.start()
+        for key, place in fit.keys.items():
+            found.get_submodule(place).set(fit.parameters[key].value)
+        ratios.append(fit.parameters["poisson_ratio"].value)
+        for label, tint, table, whole in zip("XY", (BLUE, BROWN), light, pair, strict=True):
+            kept, curve = whole.repeats(3), Uniaxial().curve(found.material, table.repeats(3))
+            column[0].plot(kept.strain, kept.force, ".", color=tint, ms=4)
+            column[0].plot(table.repeats(3).strain, curve.force.detach(), color=tint, label=f"pulled along {label}")
+            column[1].plot(kept.strain, kept.lateral_strain, ".", color=tint, ms=4)
+            column[1].plot(table.repeats(3).strain, curve.lateral_strain.detach(), color=tint)
+        column[0].set(title=name.replace("_Yarn", ""), ylim=(0, 15))
+        column[1].set(xlabel="strain")
+    axes[0, 0].legend(fontsize=8)
+    axes[0, 0].set_ylabel("N")
+    axes[1, 0].set_ylabel("lateral strain")
+    figure.suptitle(f"Knits, third repeat: measured (dots), predicted from the first two up to {LIGHT:g} N (lines)")
+    figure.savefig(path, dpi=80)
+    return ratios
+
+
+def bias_extension(table: ForceDisplacement, fit: TensionFit, path: Path) -> None:
+    """Force over shear angle, and the one modulus that was fitted below 40 degrees."""
+    figure, axes = _figure(1, 2, (13, 5))
+    law = fit.apply(glass.start()).material
+    angle, force = np.degrees(Trellis().angle(table).numpy()), Trellis().curve(law, table).force.detach().numpy()
+    for axis in axes[0]:
+        axis.plot(angle, table.force, ".", color=BLUE, label="measured")
+        axis.plot(angle, force, color=BROWN, label="one shear modulus, fitted below 40 degrees")
+        axis.axvline(40, color=GREY, lw=0.5)
+        axis.set(xlabel="shear angle of the middle, if a trellis, degrees", ylabel="N")
+    axes[0, 0].set(ylim=(0, 60), title="glass plain weave, 115 x 230 mm")
+    axes[0, 1].set(xlim=(0, 50), ylim=(0, 8), title="small angles: an offset of about 1 N, as of friction")
+    axes[0, 0].legend()
+    figure.savefig(path, dpi=90)
+
+
+def cantilever(line: np.ndarray, table: np.ndarray, path: Path) -> None:
+    """Profile, and the authors' table of moments."""
+    figure, axes = _figure(1, 2, (13, 5))
+    axes[0, 0].plot(1e3 * line[:, 0], 1e3 * line[:, 1], ".-", color=BLUE)
+    axes[0, 0].set(xlabel="mm", ylabel="mm", aspect="equal", title="glass strip as a cantilever, midline")
+    axes[0, 1].plot(*table.T, ".-", color=BLUE)
+    axes[0, 1].set(xlabel="curvature, 1/m", ylabel="moment per width, N", title="the authors' table: it saturates")
+    figure.savefig(path, dpi=90)
