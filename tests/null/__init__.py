@@ -1,1 +1,0 @@
-"""How far torchcloth is from the independent engine when nothing is hidden."""
