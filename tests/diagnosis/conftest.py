@@ -18,10 +18,10 @@ def made():
     """The base model of ``sheets.episode()``, and its setting."""
     from helpers import sheet_episodes
 
-    from torchcloth.diagnosis import base_model, setting_of
+    from torchcloth.diagnosis import base_model, prepare_data
 
     before, recording = torch.get_default_dtype(), sheet_episodes.episode()
     torch.set_default_dtype(torch.float64)
     model = base_model(recording)
-    yield model, setting_of(model, [recording])
+    yield model, prepare_data(model, [recording])
     torch.set_default_dtype(before)

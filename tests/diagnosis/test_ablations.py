@@ -7,7 +7,7 @@ from helpers import linear_evidence as toys
 from helpers import sheet_episodes
 
 from torchcloth.diagnosis.causes.hypotheses import catalogue
-from torchcloth.diagnosis.data.dataset import setting_of
+from torchcloth.diagnosis.data.dataset import prepare_data
 from torchcloth.diagnosis.inference.screening import screen
 from torchcloth.diagnosis.models.base_model import base_model
 
@@ -44,7 +44,7 @@ def test_without_nuisances_what_differs_from_episode_to_episode_would_be_a_cause
     for seed in SEEDS:
         ev = toys.evidence(slopes, 2, NAMES, torch.zeros(5).double(), seed)
         off = [std * x for x in (2.0, 2.0, 0.5, 1.5)]
-        cells = [c._replace(value=c.value + x * c.jacobian[:, -1]) for c, x in zip(ev.cells, off, strict=True)]
+        cells = [c._replace(value=c.value + x * c.jacobian[:, -1]) for c, x in zip(ev.bins, off, strict=True)]
         right += present(toys.fitted(replace(ev, cells=cells, stds=[torch.tensor([std]).double()] * len(off))))
         wrong += present(toys.fitted(replace(ev, cells=cells, stds=[torch.tensor([1e-9]).double()] * len(off))))
     assert right == 0
@@ -70,8 +70,8 @@ def test_tested_against_zero_what_does_not_matter_would_be_a_cause():
     for seed in SEEDS:
         found = toys.fitted(made((0.0, 0.2, 0.0), seed))
         right += present(found)
-        anything = [replace(h, share=0.0) for h in found.evidence.hypotheses]
-        wrong += present(replace(found, evidence=replace(found.evidence, hypotheses=anything)))
+        anything = [replace(h, share=0.0) for h in found.linearisation.hypotheses]
+        wrong += present(replace(found, evidence=replace(found.linearisation, hypotheses=anything)))
     assert right == 0
     assert wrong > 30
 
@@ -79,7 +79,7 @@ def test_tested_against_zero_what_does_not_matter_would_be_a_cause():
 def test_on_one_mesh_what_a_mesh_does_would_be_a_cause():
     """The difference between two meshes, which looks like b, is half as large as is left on the finer one."""
     ev = made((0.0, 0.6, 0.0))
-    other = [-1.5 * c.jacobian[:, 3] for c in ev.cells]
+    other = [-1.5 * c.jacobian[:, 3] for c in ev.bins]
     assert present(toys.fitted(ev)) == 1
     assert present(toys.fitted(replace(ev, numerics=other))) == 0
 
@@ -89,7 +89,7 @@ def test_a_tangent_would_not_see_what_begins_slowly(monkeypatch):
     monkeypatch.setitem(sheet_episodes.MOTIONS, "still", sheet_episodes.swing(0.0, 1.0))
     recording = sheet_episodes.episode("still", duration=0.5)
     model = base_model(recording)
-    setting = setting_of(model, [recording])
+    setting = prepare_data(model, [recording])
     (wind,) = (h for h in catalogue(model, [recording]) if h.name == "air.wind[y]")
     moved = lambda a: model.world([(wind, a * wind.typical)]).frames(setting.episodes[0]).x  # noqa: E731
     still = moved(1e-6)  # any wind brings its drag along

@@ -23,8 +23,8 @@ from torchcloth.diagnosis.decide.candidates import (
     standard_errors,
 )
 from torchcloth.diagnosis.decide.verdict import _disagreed, _error, _parameters
-from torchcloth.diagnosis.inference.comparison import Gain, heard, predict, spread, told_by
-from torchcloth.diagnosis.inference.screening import Row
+from torchcloth.diagnosis.inference.comparison import Gain, list_observed_motions, predict_held_out, jackknife, count_effective_motions
+from torchcloth.diagnosis.inference.screening import ScoreTest
 from torchcloth.episodes.world import Model
 
 
@@ -55,13 +55,13 @@ def test_motions_without_cells_neither_count_nor_are_left_out():
     slopes = toys.smooth(2, 3)
     ev = toys.evidence(slopes, 2, [], torch.tensor([0.3, -0.2]).double(), 0)
     silent = replace(
-        ev, cells=[*ev.cells[:3], ev.cells[3].rows(slice(0))], numerics=[*ev.numerics[:3], ev.numerics[3][:0]]
+        ev, cells=[*ev.bins[:3], ev.bins[3].select(slice(0))], numerics=[*ev.mesh_differences[:3], ev.mesh_differences[3][:0]]
     )
-    three = replace(ev, cells=ev.cells[:3], stds=ev.stds[:3], numerics=ev.numerics[:3])
-    mean, std = spread(toys.fitted(silent), ["a", "b", "c", "d"])
-    for one, other in zip((mean, std), spread(toys.fitted(three), ["a", "b", "c"]), strict=True):
+    three = replace(ev, cells=ev.bins[:3], stds=ev.nuisance_stds[:3], numerics=ev.mesh_differences[:3])
+    mean, std = jackknife(toys.fitted(silent), ["a", "b", "c", "d"])
+    for one, other in zip((mean, std), jackknife(toys.fitted(three), ["a", "b", "c"]), strict=True):
         torch.testing.assert_close(one, other)
-    assert heard(toys.fitted(silent).white.episode, ["a", "b", "c", "d"]) == ["a", "b", "c"]
+    assert list_observed_motions(toys.fitted(silent).whitened.episode, ["a", "b", "c", "d"]) == ["a", "b", "c"]
 
 
 def test_one_motion_agrees_with_nothing():
@@ -79,7 +79,7 @@ def test_of_those_that_predict_alike_the_one_that_mends_most_comes_first():
         Candidate(None, None, None, gain(after)._replace(density=density), set(), 2.57)  # type: ignore[arg-type]
         for after, density in ((0.5, 100.0), (0.3, 97.0), (0.1, 95.0), (0.4, 98.0))
     ]
-    assert [c.gain.density for c in _ranked(tried)] == [97.0, 98.0, 100.0, 95.0]
+    assert [c.gain.log_density for c in _ranked(tried)] == [97.0, 98.0, 100.0, 95.0]
     assert _ranked([]) == []
 
 
@@ -87,38 +87,38 @@ def test_of_those_that_predict_alike_the_one_that_mends_most_comes_first():
 def test_motions_that_all_take_a_cause_away_do_not_agree_that_it_is_there(asked, agreed):
     """At zero, where an amplitude without a sign ends, they differ by nothing at all."""
     tried = candidate(asked, numerics=0.0)
-    assert known(tried.fitted, "cause", list("abcd"), tried) == agreed
+    assert known(tried.fit, "cause", list("abcd"), tried) == agreed
 
 
 @pytest.mark.parametrize(("numerics", "agreed"), [(0.02, True), (-0.02, True), (0.5, False), (-0.5, False)])
 def test_what_another_mesh_would_ask_for_is_no_cause(numerics, agreed):
     """Motions agree about what the same mesh does to all of them."""
     tried = candidate(0.1, numerics)
-    assert known(tried.fitted, "cause", list("abcd"), tried) == agreed
+    assert known(tried.fit, "cause", list("abcd"), tried) == agreed
 
 
 def test_less_is_asked_of_a_rival_than_of_a_cause():
     """Ten standard errors of the thirteen that three motions ask for, one of which tells alone, rule nothing out."""
     tried = candidate(0.1, 0.0)
-    cells = tried.fitted.evidence.cells
+    cells = tried.fit.linearisation.bins
     for k, c in enumerate(cells):  # each asks for a little more or less
         cells[k] = c._replace(value=c.value - (0.03, -0.03, 0.02, -0.02)[k] * c.jacobian[:, 1])
-    tried = replace(tried, fitted=toys.fitted(tried.fitted.evidence), sure=1e3)
-    model = replace(tried.fitted.model, accepted=(tried.hypothesis,), amplitudes=(0.3,))
+    tried = replace(tried, fitted=toys.fitted(tried.fit.linearisation), sure=1e3)
+    model = replace(tried.fit.model, accepted=(tried.hypothesis,), amplitudes=(0.3,))
     model = replace(model, parameters=model.parameters[:1], values=torch.zeros(1).double())
-    tried = replace(tried, fitted=replace(tried.fitted, model=model))
-    assert not known(tried.fitted, "cause", list("abcd"), tried)
+    tried = replace(tried, fitted=replace(tried.fit, model=model))
+    assert not known(tried.fit, "cause", list("abcd"), tried)
     assert _agreed(tried, list("abcd"))
-    assert not _agreed(replace(tried, row=tried.row._replace(bias=5.0)), list("abcd"))
+    assert not _agreed(replace(tried, row=tried.score._replace(bias=5.0)), list("abcd"))
 
 
 @pytest.mark.parametrize(("amplitude", "named", "rival"), [(4.9, True, True), (5.1, False, True), (10.1, False, False)])
 def test_a_rival_may_be_larger_than_a_cause(amplitude, named, rival):
     """A lean of 0.0501 rad, a hair more than is believed, left a wind alone that it cannot be told from."""
     tried = candidate(0.1, 0.0)
-    model = replace(tried.fitted.model, amplitudes=(amplitude,))
-    tried = replace(tried, fitted=replace(tried.fitted, model=model))
-    assert known(tried.fitted, "cause", list("abcd"), tried) == named
+    model = replace(tried.fit.model, amplitudes=(amplitude,))
+    tried = replace(tried, fitted=replace(tried.fit, model=model))
+    assert known(tried.fit, "cause", list("abcd"), tried) == named
     assert _agreed(tried, list("abcd")) == rival
 
 
@@ -129,46 +129,46 @@ def test_halves_of_one_motion_need_not_agree_about_the_size_of_what_is_overwhelm
     They leave other motions alone; friction in the place of a stiff patch (sealed 016) took a turn by a third worse.
     """
     tried = replace(candidate(0.1, 0.0), alone=alone, gain=gain(0.7)._replace(least=least), sure=1e3)
-    cells = tried.fitted.evidence.cells
+    cells = tried.fit.linearisation.bins
     for k, c in enumerate(cells):
         cells[k] = c._replace(value=c.value - (0.03, -0.03, 0.02, -0.02)[k] * c.jacobian[:, 1])
-    model = tried.fitted.model
-    tried = replace(tried, fitted=replace(toys.fitted(tried.fitted.evidence), model=model))
-    assert known(tried.fitted, "cause", list("abcd"), tried) == named
-    assert not known(tried.fitted, "cause", list("abcd"), replace(tried, disturbs=True))
+    model = tried.fit.model
+    tried = replace(tried, fitted=replace(toys.fitted(tried.fit.linearisation), model=model))
+    assert known(tried.fit, "cause", list("abcd"), tried) == named
+    assert not known(tried.fit, "cause", list("abcd"), replace(tried, disturbs=True))
     nothing = replace(model, amplitudes=(0.0,))
-    assert not known(replace(tried.fitted, model=nothing), "cause", list("abcd"), tried)
+    assert not known(replace(tried.fit, model=nothing), "cause", list("abcd"), tried)
 
 
 def test_what_one_motion_tells_is_not_there_where_another_becomes_less_likely():
     """Friction in bending for a stretch that folds another way: it gained 186, and a turn lost 30 (0.76 to 1.26 mm)."""
     tried = replace(candidate(0.1, 0.0), alone={"a"}, gain=gain(0.7))
-    assert known(tried.fitted, "cause", list("abcd"), replace(tried, disturbs=True))
-    assert not known(tried.fitted, "cause", list("abcd"), replace(tried, disturbs=True, contradicted=True))
-    assert known(tried.fitted, "cause", list("abcd"), replace(tried, contradicted=True, bent=5.1))
+    assert known(tried.fit, "cause", list("abcd"), replace(tried, disturbs=True))
+    assert not known(tried.fit, "cause", list("abcd"), replace(tried, disturbs=True, contradicted=True))
+    assert known(tried.fit, "cause", list("abcd"), replace(tried, contradicted=True, bent=5.1))
 
 
 def test_a_motion_that_is_predicted_worse_is_found_where_it_is_not_the_one_that_tells():
     ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.tensor([0.0, 0.1]).double(), 0)
-    first = predict(toys.fitted(ev), list("abcd"))
+    first = predict_held_out(toys.fitted(ev), list("abcd"))
     larger = torch.ones(4).double().index_fill(0, torch.tensor([1]), 1.5)[first.episode]
-    second = first._replace(value=larger * first.value, white=larger * first.white)
+    second = first._replace(value=larger * first.residual, white=larger * first.whitened)
     (worse,) = _disturbed(first, second, list("abcd"), {"a"})
-    assert worse.after == pytest.approx(1.5 * worse.before)
-    assert worse.density < 0
+    assert worse.rms_after == pytest.approx(1.5 * worse.rms_before)
+    assert worse.log_density < 0
     assert _disturbed(first, second, list("abcd"), {"b"}) == []
 
 
 def test_motions_need_not_agree_about_a_number_that_nothing_else_has_bent_so_far():
     """Stiffening, 6.6 prior standard deviations from its sheet: a stretch tells of it, and a drag says otherwise."""
     tried = replace(candidate(0.1, 0.0), sure=1e3)
-    cells = tried.fitted.evidence.cells
+    cells = tried.fit.linearisation.bins
     for k, c in enumerate(cells):
         cells[k] = c._replace(value=c.value - (0.3, -0.3, 0.2, -0.2)[k] * c.jacobian[:, 1])
-    tried = replace(tried, fitted=replace(toys.fitted(tried.fitted.evidence), model=tried.fitted.model))
-    assert not known(tried.fitted, "cause", list("abcd"), tried)
-    assert not known(tried.fitted, "cause", list("abcd"), replace(tried, bent=4.9))
-    assert known(tried.fitted, "cause", list("abcd"), replace(tried, bent=5.1))
+    tried = replace(tried, fitted=replace(toys.fitted(tried.fit.linearisation), model=tried.fit.model))
+    assert not known(tried.fit, "cause", list("abcd"), tried)
+    assert not known(tried.fit, "cause", list("abcd"), replace(tried, bent=4.9))
+    assert known(tried.fit, "cause", list("abcd"), replace(tried, bent=5.1))
 
 
 def test_how_far_a_twin_has_left_its_sheet_is_in_standard_deviations_of_its_prior():
@@ -184,7 +184,7 @@ def test_as_many_tell_as_would_say_as_much():
     one = all_alike.clone()
     one[1:, :, 1] = 0.0
     told = [
-        told_by(toys.fitted(toys.evidence(own, 2, [], torch.zeros(2).double(), 0)), 1, list("abcd"), halved)
+        count_effective_motions(toys.fitted(toys.evidence(own, 2, [], torch.zeros(2).double(), 0)), 1, list("abcd"), halved)
         for own, halved in ((all_alike, ()), (one, ()), (one, {"a"}))
     ]
     assert told[0] == pytest.approx(4.0, abs=1e-6)
@@ -198,7 +198,7 @@ def candidate(asked, numerics):
     there = toys.fitted(ev)
     cause = replace(toys.hypothesis("cause"), signed=False)
     model = Model(None, there.model.parameters[:1], torch.zeros(1).double(), (cause,), (0.3,))  # type: ignore[arg-type]
-    row = Row(cause, asked, 0.01, numerics, 0.0, 0.0, 0.0, asked, 0.0, "present")
+    row = ScoreTest(cause, asked, 0.01, numerics, 0.0, 0.0, 0.0, asked, 0.0, "present")
     return Candidate(row, replace(there, model=model), None, None, set(), 2.57)  # type: ignore[arg-type]
 
 
@@ -206,13 +206,13 @@ def test_a_numbers_interval_knows_of_what_motions_disagree_by():
     """Each of four motions has a value of its own: one interval holds what noise allows, the other what they say."""
     ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.zeros(2).double(), 0)
     own = (0.3, -0.3, 0.2, -0.2)
-    cells = [c._replace(value=c.value - a * c.jacobian[:, 1]) for c, a in zip(ev.cells, own, strict=True)]
+    cells = [c._replace(value=c.value - a * c.jacobian[:, 1]) for c, a in zip(ev.bins, own, strict=True)]
     found = toys.fitted(replace(ev, cells=cells))
     width = {
         name: (row["ci95"][1] - row["ci95"][0]) / 3.92
         for name, row in _parameters(SimpleNamespace(end=found), list("abcd")).items()  # type: ignore[arg-type]
     }
-    noise, motions = found.covariance.diagonal().sqrt(), spread(found, list("abcd"))[1]
+    noise, motions = found.covariance.diagonal().sqrt(), jackknife(found, list("abcd"))[1]
     student, values = float(motions[1]) * 3.18 / 1.96, found.model.values.tolist()  # of four
     assert width["p1"] == pytest.approx(math.hypot(student, 0.03 * values[1]))
     assert width["p1"] > 3 * float(noise[1])
@@ -226,7 +226,7 @@ def test_a_numbers_interval_knows_of_what_motions_disagree_by():
 def test_motions_that_differ_by_more_than_noise_disagree(own, told, disagree):
     """Where hardly two of them tell of a number, nothing is known of what others would say."""
     ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.zeros(2).double(), 1)
-    cells = [c._replace(value=c.value - a * c.jacobian[:, 1]) for c, a in zip(ev.cells, own, strict=True)]
+    cells = [c._replace(value=c.value - a * c.jacobian[:, 1]) for c, a in zip(ev.bins, own, strict=True)]
     found = SimpleNamespace(end=toys.fitted(replace(ev, cells=cells)))
     assert _disagreed(found, 1, told, list("abcd")) == disagree  # type: ignore[arg-type]
 
@@ -234,7 +234,7 @@ def test_motions_that_differ_by_more_than_noise_disagree(own, told, disagree):
 def test_motions_of_one_value_disagree_as_often_as_chance_has_it():
     slopes, count = toys.smooth(1, 3), 300
     found = [toys.fitted(toys.evidence(slopes, 2, [], torch.zeros(2).double(), seed)) for seed in range(count)]
-    told = told_by(found[0], 1, list("abcd"))
+    told = count_effective_motions(found[0], 1, list("abcd"))
     often = sum(_disagreed(SimpleNamespace(end=f), 1, told, list("abcd")) for f in found)  # type: ignore[arg-type]
     assert often <= 0.02 * count
 
@@ -243,7 +243,7 @@ def test_an_error_is_the_noises_where_motions_agree_and_says_how_many_tell():
     ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.zeros(2).double(), 0)
     share = (1.0, 1.0, 0.0, 0.0)  # two of four motions tell of the second number, all of the first
     scale = lambda c, s: torch.stack([c.jacobian[:, 0], s * c.jacobian[:, 1]], 1)  # noqa: E731
-    cells = [c._replace(jacobian=scale(c, s), value=0 * c.value) for c, s in zip(ev.cells, share, strict=True)]
+    cells = [c._replace(jacobian=scale(c, s), value=0 * c.value) for c, s in zip(ev.bins, share, strict=True)]
     found = toys.fitted(replace(ev, cells=cells))
     noise = found.covariance.diagonal().sqrt()
     for place, few in ((0, False), (1, True)):

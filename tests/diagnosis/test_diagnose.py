@@ -10,11 +10,11 @@ from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
-from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, run, search, setting_of, write_diagnosis
+from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, run, search, prepare_data, write_diagnosis
 from torchcloth.diagnosis.decide.verdict import judge
 from torchcloth.diagnosis.experiment.proposal import Proposal
-from torchcloth.diagnosis.report.cloud_pictures import over_cloud
-from torchcloth.diagnosis.report.pictures import residual_maps
+from torchcloth.diagnosis.report.cloud_pictures import draw_cloud_overlays
+from torchcloth.diagnosis.report.pictures import draw_residual_maps
 from torchcloth.errors import InvalidInput
 
 ASKED = ("air.drag_n", "air.linear", "mass.hem", "rest.shrink[weft]", "obs.extrinsic[y]")
@@ -81,7 +81,7 @@ def test_the_cloud_is_shown_over_both_models_where_the_first_is_farthest_off(wit
         assert np.array_equal(o.points.numpy(), own)
         before, after = (float(d.mean()) for d in o.distances)
         assert after < (1.05 if o.motion == "lift" else 0.25) * before  # lifted, drag hardly shows
-    figure = over_cloud(answer.overlays, answer.found.setting.sheet.faces.numpy())
+    figure = draw_cloud_overlays(answer.overlays, answer.found.setting.sheet.faces.numpy())
     assert len(figure.axes) == 2 * len(answer.overlays) + 1
     assert "with causes" in figure.axes[-2].get_title()
 
@@ -99,7 +99,7 @@ def test_an_amplitude_that_no_world_can_have_ends_a_fit_and_not_the_diagnosis(wi
         return drag.apply(world, amplitude)
 
     model = base_model(recordings[0])
-    found = search(model, setting_of(model, recordings), [replace(drag, name="user.brittle", apply=brittle)])
+    found = search(model, prepare_data(model, recordings), [replace(drag, name="user.brittle", apply=brittle)])
     assert all(amplitude <= drag.typical for amplitude in found.end.model.amplitudes)
     assert refused
 
@@ -143,7 +143,7 @@ def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
 def test_the_map_of_residuals_says_which_part_of_the_fabric_a_row_is(with_drag):
     """Sixteen parts of a sheet of 0.2 m, the pattern's top first; missing drag shows at the free, lower end."""
     _, answer = with_drag
-    figure = residual_maps(answer)
+    figure = draw_residual_maps(answer)
     *maps, bar = figure.axes
     places = [tuple(map(float, label.get_text().split(","))) for label in maps[0].get_yticklabels()]
     assert len(places) == 16
@@ -161,15 +161,15 @@ def test_where_nothing_is_hidden_nothing_is_named():
     assert answer.content["causes"] == []
     assert answer.verdict in ("adequate", "inconclusive")
     assert answer.content["gain"] is None
-    withdrawn = replace(answer.found, withdrawn=("air.drag_n",))  # a law did more, and then did not hold
-    assert judge(withdrawn, withdrawn.setting.names).verdict == "unexplained"
-    end = answer.found.end
-    apart = [torch.full_like(n, 0.03) for n in end.evidence.numerics]  # m, and N: both meshes fold the cloth elsewhere
-    folded = replace(answer.found, end=replace(end, evidence=replace(end.evidence, numerics=apart)))
-    assert judge(folded, folded.setting.names).verdict == "numerics"
-    setting, (first, *others) = answer.found.setting, answer.found.setting.episodes
-    late = replace(answer.found, setting=replace(setting, episodes=(replace(first, dropped=3), *others)))
-    assert any("come after the motion's end" in text for text in judge(late, setting.names).content["warnings"])
+    withdrawn = replace(answer.search, withdrawn=("air.drag_n",))  # a law did more, and then did not hold
+    assert judge(withdrawn, withdrawn.data.motions).verdict == "unexplained"
+    end = answer.search.end
+    apart = [torch.full_like(n, 0.03) for n in end.linearisation.mesh_differences]  # m, and N: both meshes fold the cloth elsewhere
+    folded = replace(answer.search, end=replace(end, evidence=replace(end.linearisation, numerics=apart)))
+    assert judge(folded, folded.data.motions).verdict == "numerics"
+    setting, (first, *others) = answer.search.data, answer.search.data.episodes
+    late = replace(answer.search, setting=replace(setting, episodes=(replace(first, dropped=3), *others)))
+    assert any("come after the motion's end" in text for text in judge(late, setting.motions).content["warnings"])
 
 
 def test_one_motion_is_refused(tmp_path, capsys):

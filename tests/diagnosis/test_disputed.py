@@ -9,7 +9,7 @@ from helpers import linear_evidence as toys
 from torchcloth.diagnosis.causes.fabric import OF_BENDING, OF_MEMBRANE
 from torchcloth.diagnosis.causes.hypotheses import known
 from torchcloth.diagnosis.decide import search
-from torchcloth.diagnosis.inference.heterogeneity import LAWS, disputed
+from torchcloth.diagnosis.inference.heterogeneity import LAWS, propose_from_heterogeneity
 
 NAMES = ["a", "b", "c", "d"]
 
@@ -17,8 +17,8 @@ NAMES = ["a", "b", "c", "d"]
 def fitted(apart, name="bending.stiffness"):
     """Four motions, each of which wants a law's number by so much more or less than the others."""
     ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.tensor([0.0, 0.0]).double(), 0)
-    for k, c in enumerate(ev.cells):
-        ev.cells[k] = c._replace(value=c.value - (1, -1, 1, -1)[k] * apart * c.jacobian[:, 1])
+    for k, c in enumerate(ev.bins):
+        ev.bins[k] = c._replace(value=c.value - (1, -1, 1, -1)[k] * apart * c.jacobian[:, 1])
     there = toys.fitted(ev)
     parameters = (there.model.parameters[0], replace(there.model.parameters[1], name=name))
     return replace(there, model=replace(there.model, parameters=parameters, values=torch.tensor([0.2, -0.4]).double()))
@@ -26,7 +26,7 @@ def fitted(apart, name="bending.stiffness"):
 
 @pytest.mark.parametrize(("name", "effects"), [("bending.stiffness", OF_BENDING), ("youngs_modulus", OF_MEMBRANE)])
 def test_causes_of_a_disputed_law_are_begun_both_ways_at_their_size(name, effects):
-    begun = disputed(fitted(0.5, name), NAMES, known())
+    begun = propose_from_heterogeneity(fitted(0.5, name), NAMES, known())
     assert {h.effect for h, _ in begun} == set(effects)
     for h, model in begun:
         assert model.values.tolist() == [0.2, 0.0]  # back at its sheet; the other stays
@@ -36,12 +36,12 @@ def test_causes_of_a_disputed_law_are_begun_both_ways_at_their_size(name, effect
 
 
 def test_motions_that_agree_dispute_nothing():
-    assert disputed(fitted(0.02), NAMES, known()) == []
-    assert disputed(fitted(0.5, "areal_density"), NAMES, known()) == []
+    assert propose_from_heterogeneity(fitted(0.02), NAMES, known()) == []
+    assert propose_from_heterogeneity(fitted(0.5, "areal_density"), NAMES, known()) == []
 
 
 def test_two_motions_are_too_few_to_tell_the_odd_one():
-    assert disputed(fitted(0.5), ["a", "a", "b", "b"], known()) == []
+    assert propose_from_heterogeneity(fitted(0.5), ["a", "a", "b", "b"], known()) == []
 
 
 def test_the_laws_are_the_catalogues():
@@ -52,5 +52,5 @@ def test_where_nothing_is_disputed_nothing_is_fitted(monkeypatch):
     monkeypatch.setattr(search, "one_step", lambda *_: pytest.fail("nothing to try"))
     start = fitted(0.02)
     chain = search._of_disputed(start, type("S", (), {"names": NAMES})(), known(), lambda _: None)
-    assert chain.steps == []
-    assert chain.current is start
+    assert chain.accepted == []
+    assert chain.fit is start

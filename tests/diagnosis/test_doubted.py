@@ -8,9 +8,9 @@ import torch
 from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.decide import search
-from torchcloth.diagnosis.decide.search import instead
-from torchcloth.diagnosis.inference.comparison import compare, predict
-from torchcloth.diagnosis.inference.fitting import renoised
+from torchcloth.diagnosis.decide.search import replace_by_law
+from torchcloth.diagnosis.inference.comparison import compare, predict_held_out
+from torchcloth.diagnosis.inference.fitting import reweight_by_noise
 
 SLOPES = toys.smooth(1, 5)  # two parameters, a cause, a law, a nuisance
 NAMES = [f"motion {k}" for k in range(toys.EPISODES)]
@@ -21,7 +21,7 @@ def models(cause, law):
     every = toys.evidence(SLOPES, 4, [], torch.tensor([0.0, 0.0, cause, law]).double(), 0)
 
     def model(*columns):
-        cells = [c._replace(jacobian=c.jacobian[:, [*columns, 4]]) for c in every.cells]
+        cells = [c._replace(jacobian=c.jacobian[:, [*columns, 4]]) for c in every.bins]
         return toys.fitted(replace(every, cells=cells, own=len(columns)), std=5.0)
 
     return model(0, 1), model(0, 1, 2), model(0, 1, 3)
@@ -32,20 +32,20 @@ def doubted(monkeypatch, cause, law, useful=True):
     best = SimpleNamespace(fitted=other, alone=set(), hypothesis=toys.hypothesis("a"))
     own = SimpleNamespace(best=SimpleNamespace(alone=set(), hypothesis=toys.hypothesis("c")))
     monkeypatch.setattr(search, "one_step", lambda *_: SimpleNamespace(best=best) if useful else None)
-    first = predict(renoised(start, end.noise, end.evidence), NAMES)
-    whole = compare(first, predict(end, NAMES), 0.0)
+    first = predict_held_out(reweight_by_noise(start, end.noise, end.linearisation), NAMES)
+    whole = compare(first, predict_held_out(end, NAMES), 0.0)
     setting = SimpleNamespace(names=NAMES, recordings=(), episodes=())
     found = SimpleNamespace(
         start=start, end=end, steps=[own], causes=[own], whole=whole, setting=setting, impossible=()
     )
-    return found, instead(found, start, 2)  # type: ignore[arg-type]
+    return found, replace_by_law(found, start, 2)  # type: ignore[arg-type]
 
 
 def test_a_cause_that_only_stands_in_is_withdrawn(monkeypatch):
     found, after = doubted(monkeypatch, cause=0.3, law=1.0)
     assert found.whole.density > 0  # it was of use
     assert after.withdrawn == ("c",)
-    assert after.steps == []
+    assert after.accepted == []
     assert after.end is found.start
 
 

@@ -7,33 +7,33 @@ import torch
 from helpers import linear_evidence as toys
 from scipy.stats import t as student
 
-from torchcloth.diagnosis import drifts
-from torchcloth.diagnosis.data.binning import NAMES, SEEN
+from torchcloth.diagnosis import estimate_force_drifts
+from torchcloth.diagnosis.data.binning import BLOCK_NAMES, FORCE_BLOCK
 from torchcloth.diagnosis.inference.force_drift import _beyond, _pooled
 from torchcloth.diagnosis.inference.lack_of_fit import SENSOR
 from torchcloth.diagnosis.inference.noise import Noise
 
 TARE = 0.1  # N
 SLOPES = torch.zeros(toys.EPISODES, len(toys.grid().value), 2).double()
-SLOPES[..., 1] = (toys.grid().patch // 3 % 3 == 2).double()  # what differs from episode to episode: forces along z
+SLOPES[..., 1] = (toys.grid().channel // 3 % 3 == 2).double()  # what differs from episode to episode: forces along z
 
 
 def evidence(seed, *rates):
     """Forces of five grippers and one axis more in each episode, which grow along z by a rate [N/s] for each."""
     rng = torch.Generator().manual_seed(seed)
     blank = toys.evidence(SLOPES, 1, [], torch.zeros(1).double(), seed)
-    level = torch.tensor([SENSOR[name] for name in NAMES]).double()
+    level = torch.tensor([SENSOR[name] for name in BLOCK_NAMES]).double()
     cells, std = [], torch.tensor([TARE]).double()
-    for c, rate in zip(blank.cells, rates, strict=False):
-        c = c._replace(block=torch.full_like(c.block, SEEN), patch=c.patch // 3)
+    for c, rate in zip(blank.bins, rates, strict=False):
+        c = c._replace(block=torch.full_like(c.block, FORCE_BLOCK), patch=c.channel // 3)
         root = torch.linalg.cholesky(Noise(level).covariance(c, c.jacobian[:, -1:], std))
         noise = root @ torch.randn(len(root), generator=rng).double()
-        cells.append(c._replace(value=noise + rate * c.time * (c.patch % 3 == 2)))
-    return replace(blank, cells=cells, stds=[std] * len(cells), numerics=blank.numerics[: len(cells)])
+        cells.append(c._replace(value=noise + rate * c.time * (c.channel % 3 == 2)))
+    return replace(blank, cells=cells, stds=[std] * len(cells), numerics=blank.mesh_differences[: len(cells)])
 
 
 def told(seed, *rates, names="abcd"):
-    return drifts(toys.fitted(evidence(seed, *rates)), names)
+    return estimate_force_drifts(toys.fitted(evidence(seed, *rates)), names)
 
 
 def test_an_axis_of_which_too_few_motions_know_is_left_out():
@@ -43,34 +43,34 @@ def test_an_axis_of_which_too_few_motions_know_is_left_out():
     def less(c, keep):
         return type(c)(*(column[keep] for column in c))
 
-    cells = [less(c, c.patch % 3 != 0) for c in whole.cells]
+    cells = [less(c, c.channel % 3 != 0) for c in whole.bins]
     some = _of(whole, cells)
     assert [row.axis for row in some] == ["y", "z"]
-    cells = [less(c, torch.zeros(len(c.time), dtype=torch.bool)) if k == 0 else c for k, c in enumerate(whole.cells)]
+    cells = [less(c, torch.zeros(len(c.time), dtype=torch.bool)) if k == 0 else c for k, c in enumerate(whole.bins)]
     assert _of(whole, cells) == [], "three motions are too few"
 
 
 def _of(evidence, cells):
     numerics = [n[: len(c.value)] for n, c in zip(evidence.numerics, cells, strict=True)]
-    return drifts(toys.fitted(replace(evidence, cells=cells, numerics=numerics)), range(toys.EPISODES))
+    return estimate_force_drifts(toys.fitted(replace(evidence, cells=cells, numerics=numerics)), range(toys.EPISODES))
 
 
 def test_a_right_model_drifts_by_chance_as_often_as_it_says():
     rows = [row for seed in range(60) for row in told(seed, *[0.0] * toys.EPISODES)]
     size = torch.tensor([row.rate / row.std for row in rows])
     assert 0.7 < float(size.square().mean()) < 1.1  # what episodes differ by makes it a little careful
-    assert sum(row.lacking for row in rows) <= 2
+    assert sum(row.is_significant for row in rows) <= 2
 
 
 def test_what_all_motions_share_is_seen_though_none_shows_it():
     x, y, z = told(0, *[-0.03] * toys.EPISODES)
-    assert [row.lacking for row in (x, y, z)] == [False, False, True]
+    assert [row.is_significant for row in (x, y, z)] == [False, False, True]
     assert z.rate == pytest.approx(-0.03, abs=3 * z.std)
     assert z.std * toys.EPISODES**0.5 > 0.3 * 0.03  # two or three standard errors in each
 
 
 def test_what_depends_on_the_motion_is_no_drift():
-    assert not any(row.lacking for row in told(0, 0.2, -0.1, 0.1, -0.05))
+    assert not any(row.is_significant for row in told(0, 0.2, -0.1, 0.1, -0.05))
 
 
 @pytest.mark.parametrize("spread", [0.0, 1.0, 3.0, 10.0])
@@ -99,11 +99,11 @@ def test_repetitions_of_a_motion_are_no_other_motions():
 
 def test_where_meshes_fold_apart_no_force_is_judged():
     ev = evidence(0, *[-0.03] * toys.EPISODES)
-    seen = replace(ev, cells=[c._replace(block=torch.where(c.window == 0, 0, c.block)) for c in ev.cells])
-    assert drifts(toys.fitted(seen), "abcd") != []
-    apart = replace(seen, numerics=[torch.full_like(n, 1.0) for n in ev.numerics])
-    assert drifts(toys.fitted(apart), "abcd") == []
+    seen = replace(ev, cells=[c._replace(block=torch.where(c.window == 0, 0, c.block)) for c in ev.bins])
+    assert estimate_force_drifts(toys.fitted(seen), "abcd") != []
+    apart = replace(seen, numerics=[torch.full_like(n, 1.0) for n in ev.mesh_differences])
+    assert estimate_force_drifts(toys.fitted(apart), "abcd") == []
 
 
 def test_without_forces_nothing_is_said():
-    assert drifts(toys.fitted(toys.evidence(SLOPES, 1, [], torch.zeros(1).double(), 0)), "abcd") == []
+    assert estimate_force_drifts(toys.fitted(toys.evidence(SLOPES, 1, [], torch.zeros(1).double(), 0)), "abcd") == []

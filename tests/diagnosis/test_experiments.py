@@ -13,8 +13,8 @@ from helpers import linear_evidence as toys
 from helpers import sheet_episodes
 from helpers.undecided_search import undecided
 
-from torchcloth.diagnosis import base_model, setting_of
-from torchcloth.diagnosis.data.dataset import foreseen
+from torchcloth.diagnosis import base_model, prepare_data
+from torchcloth.diagnosis.data.dataset import extend_for_clock
 from torchcloth.diagnosis.decide.candidates import HARDLY
 from torchcloth.diagnosis.experiment import proposal
 from torchcloth.diagnosis.experiment.motions import LIBRARY, PLANS, Experiment, heading_of, planned, possible
@@ -27,7 +27,7 @@ from torchcloth.diagnosis.experiment.proposal import (
     question_of,
     whitened_slopes,
 )
-from torchcloth.diagnosis.inference.linearise import central
+from torchcloth.diagnosis.inference.linearise import central_differences
 from torchcloth.episodes.observed import build_episode
 from torchcloth.recordings import Collider
 
@@ -107,7 +107,7 @@ def test_distances_are_those_of_two_columns():
     found = toys.fitted(toys.evidence(slopes, 2, ["a", "b", "c"], torch.zeros(5).double(), 0))
     question = Question(found, {"c": 0.7, "a": 0.4}, (("c", "a"),))
     told = distances(question, information(question, []))[("c", "a")]
-    white, prior = found.white.jacobian, 2.0 * torch.eye(2).double()
+    white, prior = found.whitened.jacobian, 2.0 * torch.eye(2).double()
     fitted = torch.cat([white[:, :2], prior])
 
     def left(columns, target):
@@ -125,8 +125,8 @@ def test_distances_are_those_of_two_columns():
 
 def smooth(*of):
     """As if no cloth rippled."""
-    found = central(*of)
-    return found._replace(rough=torch.zeros_like(found.rough))
+    found = central_differences(*of)
+    return found._replace(rough=torch.zeros_like(found.roughness))
 
 
 @pytest.mark.parametrize("said", ["causes", "minor"])
@@ -159,7 +159,7 @@ def test_what_does_the_same_as_a_fitted_number_is_not_waited_for():
     """No motion tells a density from the fabric's own; its data sheet alone does."""
     end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
     twin, other = replace(toys.hypothesis("a"), twin=end.model.parameters[0].name), toys.hypothesis("b")
-    end = replace(end, evidence=replace(end.evidence, hypotheses=[twin, other]))
+    end = replace(end, evidence=replace(end.linearisation, hypotheses=[twin, other]))
     rows = [SimpleNamespace(hypothesis=h, decision="inconclusive") for h in (twin, other)]
     found, none = SimpleNamespace(causes=[], minor=[], screened=rows, end=end), {"causes": [], "minor": []}
     assert question_of(found, none).amplitudes.keys() == {"b"}
@@ -173,8 +173,8 @@ def test_an_experiment_feels_what_the_data_felt():
     pulled = {name: replace(g, force=np.tile([0, 0, -0.04], (len(g.t), 1))) for name, g in seen.grippers.items()}
     seen = replace(seen, grippers=pulled)
     model = base_model(seen)
-    setting = setting_of(model, [seen])
-    blank = foreseen(build_episode(model.base.cloth, replace(planned(Experiment("hang"), seen), joints={})))
+    setting = prepare_data(model, [seen])
+    blank = extend_for_clock(build_episode(model.base.cloth, replace(planned(Experiment("hang"), seen), joints={})))
     felt = as_seen(model.world().frames(blank), blank, setting).wrenches["left"]
     assert felt[1:, :3].isfinite().all()
     assert felt[:, 3:].isnan().all()

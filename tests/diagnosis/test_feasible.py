@@ -60,7 +60,7 @@ def test_where_no_arm_is_named_none_is_asked(monkeypatch):
 def test_what_is_in_the_arms_way_is_said_and_not_proposed(shipped, monkeypatch):
     monkeypatch.setattr(motions, "LIBRARY", (FAST,))
     far = {name: replace(r, T_world_base=r.T_world_base + np.eye(4, k=3) * 3.0) for name, r in shipped.robots.items()}
-    paths = {name: robots.gripper_motion(path) for name, path in robots.replay(shipped).items()}
+    paths = {name: robots.to_gripper_motion(path) for name, path in robots.replay(shipped).items()}
     (refused,) = feasible([replace(shipped, grippers=paths, joints={}, robots=far)], quiet)
     assert "reach" in refused.why_not
     found, content, setting = undecided(("env.gravity_tilt[y]", "obs.rotation[x]"))
@@ -120,17 +120,17 @@ def test_what_is_no_proposal_is_left_and_no_diagnosis_is_lost_for_it(slowed, tmp
 
 def test_a_urdf_beside_the_episode_is_found_from_a_proposal(shipped, tmp_path):
     (tmp_path / "e").mkdir()
-    shutil.copy(robots.description.locate("rizon4"), tmp_path / "e" / "arm.urdf")
+    shutil.copy(robots.description.locate_urdf("rizon4"), tmp_path / "e" / "arm.urdf")
     own = {name: replace(r, model="arm.urdf") for name, r in shipped.robots.items()}
     episode = planned(FAST, replace(shipped, robots=own, path=tmp_path / "e"))
     assert {r.model for r in episode.robots.values()} == {str(tmp_path / "e" / "arm.urdf")}
-    assert robots.arm_of(episode, "left").model == str(tmp_path / "e" / "arm.urdf")
+    assert robots.arm_from_recording(episode, "left").model == str(tmp_path / "e" / "arm.urdf")
 
 
 def test_arms_that_cannot_be_asked_forbid_nothing(shipped, monkeypatch):
     """Of a model that is not here, or whose solids are meshes; one without motion is not looked at."""
     monkeypatch.setattr(motions, "LIBRARY", (FAST,))
-    paths = {name: robots.gripper_motion(path) for name, path in robots.replay(shipped).items()}
+    paths = {name: robots.to_gripper_motion(path) for name, path in robots.replay(shipped).items()}
     plain = replace(shipped, grippers=paths, joints={})
     strange = {name: replace(r, model="nobody's") for name, r in shipped.robots.items()}
     (found,) = feasible([replace(plain, robots=strange)], quiet)

@@ -8,10 +8,10 @@ from helpers import sheet_episodes
 
 from torchcloth._utils.caching import LRUCache
 from torchcloth.diagnosis.causes.hypotheses import catalogue
-from torchcloth.diagnosis.data.binning import aligned, cells_of, directions
-from torchcloth.diagnosis.data.fine_mesh import refined
-from torchcloth.diagnosis.inference.episode_simulation import runs
-from torchcloth.diagnosis.inference.linearise import asked_about, gather
+from torchcloth.diagnosis.data.binning import align_rows, bin_residuals, finite_differences
+from torchcloth.diagnosis.data.fine_mesh import refine_model
+from torchcloth.diagnosis.inference.episode_simulation import run_episode
+from torchcloth.diagnosis.inference.linearise import linearise_hypotheses, linearise
 from torchcloth.diagnosis.models.base_model import base_model
 from torchcloth.episodes.world import World
 from torchcloth.episodes.world_cache import Worlds
@@ -30,70 +30,70 @@ def asked(made):
 def on_finer(made, hypothesis, key):
     """Slopes by simulations of the finer mesh alone, for the cells of ``key``."""
     model, setting = made
-    finer, world = setting.finer, refined(model, [RECORDING])[0].world()
+    finer, world = setting.finer, refine_model(model, [RECORDING])[0].world()
     e = finer.episodes[0]
     base, moved = world.frames(e), hypothesis.apply(world, hypothesis.typical).frames(e)
-    found = cells_of(base, directions(base, [moved], [hypothesis.typical]), e, finer.sheet, finer.rest)
-    return aligned(key, found.key, found.jacobian)[:, 0]
+    found = bin_residuals(base, finite_differences(base, [moved], [hypothesis.typical]), e, finer.sheet, finer.rest)
+    return align_rows(key, found.key, found.jacobian)[:, 0]
 
 
 def test_creases_are_one():
     model = base_model(RECORDING)
-    assert [h.name for h in catalogue(model, [RECORDING]) if h.finer] == ["plast.crease"]
+    assert [h.name for h in catalogue(model, [RECORDING]) if h.needs_fine_mesh] == ["plast.crease"]
 
 
 def test_its_column_is_of_the_finer_mesh_and_the_others_as_before(made, asked):
     model, setting = made
-    found, usual = gather(model, setting, asked), gather(model, setting, [replace(h, finer=False) for h in asked])
-    place = found.own + 1
-    own = found.cells[0].jacobian[:, place]
-    assert torch.equal(own, on_finer(made, asked[1], found.cells[0].key))
-    changed = [k for k in range(usual.cells[0].jacobian.shape[1]) if k != place]
-    assert torch.equal(found.cells[0].jacobian[:, changed], usual.cells[0].jacobian[:, changed])
-    assert not torch.allclose(own, usual.cells[0].jacobian[:, place], rtol=1e-3)
+    found, usual = linearise(model, setting, asked), linearise(model, setting, [replace(h, finer=False) for h in asked])
+    place = found.n_coordinates + 1
+    own = found.bins[0].jacobian[:, place]
+    assert torch.equal(own, on_finer(made, asked[1], found.bins[0].key))
+    changed = [k for k in range(usual.bins[0].jacobian.shape[1]) if k != place]
+    assert torch.equal(found.bins[0].jacobian[:, changed], usual.bins[0].jacobian[:, changed])
+    assert not torch.allclose(own, usual.bins[0].jacobian[:, place], rtol=1e-3)
 
 
 def test_who_asks_later_is_told_the_same(made, asked):
     model, setting = made
-    at_once, known = gather(model, setting, asked), gather(model, setting, asked[:1])
-    later = asked_about(known, model, setting, asked)
-    assert torch.equal(at_once.cells[0].jacobian, later.cells[0].jacobian)
+    at_once, known = linearise(model, setting, asked), linearise(model, setting, asked[:1])
+    later = linearise_hypotheses(known, model, setting, asked)
+    assert torch.equal(at_once.bins[0].jacobian, later.bins[0].jacobian)
 
 
 @pytest.mark.parametrize(("memory", "again"), [(2**30, 0), (0, 2)])
 def test_the_point_itself_is_simulated_once(made, asked, monkeypatch, memory, again):
     """On both meshes; beside it each of three causes, one of them on the finer mesh, too."""
     model, setting = made[0], replace(made[1], recent=LRUCache(memory, lambda frames: 1))
-    known, simulate, simulated = gather(model, setting, asked[:1]), World.simulated, []
+    known, simulate, simulated = linearise(model, setting, asked[:1]), World.simulated, []
 
     def counted(world, *arguments):
         simulated.append(world)
         return simulate(world, *arguments)
 
     monkeypatch.setattr(World, "simulated", counted)
-    later = asked_about(known, model, setting, asked)
+    later = linearise_hypotheses(known, model, setting, asked)
     assert len(simulated) == 4 + again
-    assert torch.equal(later.cells[0].jacobian, asked_about(known, model, setting, asked).cells[0].jacobian)
+    assert torch.equal(later.bins[0].jacobian, linearise_hypotheses(known, model, setting, asked).bins[0].jacobian)
 
 
 def test_an_accepted_one_keeps_its_mesh(made, asked):
     """Beside a small amplitude, too: its own column is about what it was asked by, from the finer mesh."""
     model, setting = made
     cause = replace(asked[1], step=1.0)  # slopes by the typical amplitude, both ways
-    found = gather(model.plus(cause), setting)
+    found = linearise(model.plus(cause), setting)
     place = len(model.point)
     column = 0.5 * sum(
-        on_finer(made, replace(cause, typical=sign * cause.typical), found.cells[0].key) for sign in (1.0, -1.0)
+        on_finer(made, replace(cause, typical=sign * cause.typical), found.bins[0].key) for sign in (1.0, -1.0)
     )
-    torch.testing.assert_close(found.cells[0].jacobian[:, place], column, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(found.bins[0].jacobian[:, place], column, rtol=1e-9, atol=1e-12)
 
 
 def test_without_a_finer_mesh_it_is_as_the_others(made, asked):
     """As where experiments are planned."""
     model, setting = made
-    done = runs(Worlds(model), setting.episodes[0], None, asked, with_held=False)
+    done = run_episode(Worlds(model), setting.episodes[0], None, asked, with_grasp_shifts=False)
     coarse = asked[1].apply(model.world(), asked[1].typical).frames(setting.episodes[0])
-    assert torch.equal(done.trials[1].x, coarse.x)
+    assert torch.equal(done.with_hypotheses[1].x, coarse.x)
 
 
 def test_what_does_nothing_on_the_given_mesh_is_not_simulated_on_the_finer(made, asked):
@@ -102,20 +102,20 @@ def test_what_does_nothing_on_the_given_mesh_is_not_simulated_on_the_finer(made,
     e, finer = setting.episodes[0], (setting.finer.episodes[0], None)
     worlds = Worlds(model, (), setting.finer.base)
     slack = replace(crease, apply=lambda world, amplitude: world.with_cloth())  # another cloth, which moves alike
-    none, some = (runs(worlds, e, None, [h], with_held=False, finer=finer) for h in (slack, asked[1]))
-    assert (none.fine, none.refined) == (None, set())
+    none, some = (run_episode(worlds, e, None, [h], with_grasp_shifts=False, finer=finer) for h in (slack, asked[1]))
+    assert (none.fine, none.fine_hypotheses) == (None, set())
     assert some.fine is not None
-    assert some.refined == {0}
+    assert some.fine_hypotheses == {0}
 
 
 def test_cells_that_are_seen_for_the_first_time_have_slopes_along_nuisances(made):
     """All but those of grasps, which would take simulations: else they would seem surer than all others."""
     model, setting = made
-    whole = gather(model, setting)
-    first = whole.cells[0]
+    whole = linearise(model, setting)
+    first = whole.bins[0]
     places = torch.arange(len(first.key)) % 5 == 0
-    less = replace(whole, cells=[c.rows(~places) if k == 0 else c for k, c in enumerate(whole.cells)])
-    again = gather(model, setting, before=less).cells[0]
+    less = replace(whole, cells=[c.select(~places) if k == 0 else c for k, c in enumerate(whole.bins)])
+    again = linearise(model, setting, before=less).bins[0]
     grasps = len(Held().modes(model.base.cloth, setting.episodes[0]))
     assert torch.equal(again.key, first.key)
     count = again.jacobian.shape[1] - grasps

@@ -9,8 +9,8 @@ from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.decide.search import _impossible
 from torchcloth.diagnosis.inference import fitting
-from torchcloth.diagnosis.inference.fitting import fit, with_cause
-from torchcloth.diagnosis.inference.linearise import as_held
+from torchcloth.diagnosis.inference.fitting import fit, add_cause
+from torchcloth.diagnosis.inference.linearise import use_nuisance_slopes
 from torchcloth.errors import SimulationDiverged
 
 TRUTH = torch.tensor([0.4]).double()
@@ -34,11 +34,11 @@ def looks(monkeypatch):
         seen.append((at, len(hypotheses)))
         if at > seen.edge:
             raise SimulationDiverged("x", got="nan", expected="numbers")
-        cells = [c._replace(value=c.value + c.jacobian[:, 0] * at) for c in there.evidence.cells]
+        cells = [c._replace(value=c.value + c.jacobian[:, 0] * at) for c in there.linearisation.bins]
         kept = [c.window >= (seen.hidden if at == 0.0 else 0) for c in cells]
-        cells = [c.rows(k) for c, k in zip(cells, kept, strict=True)]
-        numerics = [n[k] for n, k in zip(there.evidence.numerics, kept, strict=True)]
-        return replace(there.evidence, cells=cells, numerics=numerics, hypotheses=list(hypotheses))
+        cells = [c.select(k) for c, k in zip(cells, kept, strict=True)]
+        numerics = [n[k] for n, k in zip(there.linearisation.mesh_differences, kept, strict=True)]
+        return replace(there.linearisation, cells=cells, numerics=numerics, hypotheses=list(hypotheses))
 
     def asked_about(here, model, setting, hypotheses, progress):
         seen.append((float(model.point[0]), len(hypotheses)))
@@ -63,7 +63,7 @@ def test_a_step_into_the_impossible_is_not_taken(looks, iterations):
     seen.edge = 0.1
     found = fit(model, None, [toys.hypothesis("a")], iterations)  # type: ignore[arg-type]
     assert float(found.model.point[0]) == 0.0
-    assert [h.name for h in found.evidence.hypotheses] == ["a"]
+    assert [h.name for h in found.linearisation.hypotheses] == ["a"]
     assert seen[-1] == (0.0, 1)
 
 
@@ -86,7 +86,7 @@ def test_causes_are_asked_about_where_it_ends_alone(looks, monkeypatch):
     monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.9]).double(), 9.0))
     found = fit(model, None, [toys.hypothesis("a")], 1)  # type: ignore[arg-type]
     assert seen == [(0.0, 0), (0.9, 0), (0.0, 1)]
-    assert [h.name for h in found.evidence.hypotheses] == ["a"]
+    assert [h.name for h in found.linearisation.hypotheses] == ["a"]
 
 
 def test_noise_is_estimated_once_where_a_step_loses(looks, monkeypatch):
@@ -98,7 +98,7 @@ def test_noise_is_estimated_once_where_a_step_loses(looks, monkeypatch):
     found = fit(model, None, iterations=2)  # type: ignore[arg-type]
     assert [at for at, _ in seen] == [0.0, 0.9, 0.45]
     assert len(estimated) == 2
-    assert estimated[-1] is found.evidence
+    assert estimated[-1] is found.linearisation
 
 
 def test_what_only_the_later_point_meets_is_no_loss(looks, monkeypatch):
@@ -126,7 +126,7 @@ def test_where_it_begins_must_be_possible(looks):
 
 def test_what_is_known_is_not_looked_at_again(looks):
     seen, model = looks
-    here = fit(model, None, iterations=0).evidence  # type: ignore[arg-type]
+    here = fit(model, None, iterations=0).linearisation  # type: ignore[arg-type]
     seen.clear()
     fit(model, None, iterations=0, here=here)  # type: ignore[arg-type]
     assert not seen
@@ -140,7 +140,7 @@ def test_a_twin_takes_over_what_the_parameter_did():
     sheet = replace(there.model.parameters[0], value=math.exp)
     model = replace(there.model, parameters=(sheet,)).at(torch.tensor([math.log(1.2)]).double())
     twin = toys.hypothesis("twin", twin=sheet.name)
-    found = with_cause(replace(there, model=model, evidence=replace(there.evidence, hypotheses=[twin])), twin)
+    found = add_cause(replace(there, model=model, evidence=replace(there.linearisation, hypotheses=[twin])), twin)
     amplitude, coordinate = found.amplitudes[0], float(found.values[0])
     assert amplitude + coordinate == pytest.approx(0.2, abs=0.1)
     assert abs(coordinate) < 0.05 < 0.1 < amplitude
@@ -156,10 +156,10 @@ def test_amplitudes_stop_where_a_world_ends():
 
 def test_cells_that_the_base_model_had_not_keep_their_nuisances():
     """They would err by noise alone, however late the clock may be."""
-    here = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0)).evidence
-    later = [c.rows(c.window > 0) for c in here.cells]
+    here = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0)).linearisation
+    later = [c.select(c.window > 0) for c in here.bins]
     known = replace(here, cells=[c._replace(jacobian=2 * c.jacobian) for c in later])
-    for own, held, like in zip(here.cells, as_held(here, known).cells, known.cells, strict=True):
+    for own, held, like in zip(here.bins, use_nuisance_slopes(here, known).bins, known.bins, strict=True):
         new = own.window == 0
         assert torch.equal(held.jacobian[new], own.jacobian[new])
         assert torch.equal(held.jacobian[~new, 1], like.jacobian[:, 1])

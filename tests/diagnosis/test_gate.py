@@ -14,10 +14,10 @@ from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
-from torchcloth.diagnosis import base_model, check, diagnose, setting_of
-from torchcloth.diagnosis.data.cloud_checks import Seen
+from torchcloth.diagnosis import base_model, check_episodes, diagnose, prepare_data
+from torchcloth.diagnosis.data.cloud_checks import CheckedEpisode
 from torchcloth.diagnosis.data.data_checks import _stamps
-from torchcloth.diagnosis.data.dataset import somewhere_seen
+from torchcloth.diagnosis.data.dataset import check_positions_observed
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings.images import ImageStream
 
@@ -89,7 +89,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("said", FAULTS)
 def test_a_planted_fault_is_named(turned, said):
-    found = check([FAULTS[said](turned)])
+    found = check_episodes([FAULTS[said](turned)])
     assert found, "nothing"
     assert re.search(said, str(found[0])), found[0]
     assert found[0].episode == "turn"
@@ -102,7 +102,7 @@ def test_a_mirrored_cloud_is_told_though_some_frames_are_empty(turned):
     full = np.arange(len(points)) % 7 != 3
     xyz = np.concatenate([points.frame(i) for i in np.flatnonzero(full)])
     points = rec.PointClouds(points.t, xyz, np.where(full, points.counts, 0))
-    assert "mirrored along y" in str(check([replace(turned, points=points)])[0])
+    assert "mirrored along y" in str(check_episodes([replace(turned, points=points)])[0])
 
 
 GOOD = {
@@ -186,7 +186,7 @@ GOOD |= {
 
 @pytest.mark.parametrize("what", GOOD)
 def test_what_a_diagnosis_looks_for_passes(turned, what):
-    assert check([GOOD[what](turned)]) == []
+    assert check_episodes([GOOD[what](turned)]) == []
 
 
 def test_two_knots_are_enough_of_a_gripper_that_rests(turned):
@@ -204,7 +204,7 @@ def test_an_arm_that_was_recorded_with_its_fingers_width_holds_while_they_are_ne
     whole = rec.read(EXAMPLE)
     width = np.where(np.arange(len(whole.joints["left"].t)) < 5, 0.08, 0.0)
     joints = {"left": replace(whole.joints["left"], closed=None, width=width), "right": whole.joints["right"]}
-    seen = Seen(replace(whole, joints=joints))
+    seen = CheckedEpisode(replace(whole, joints=joints))
     free = seen.t < whole.joints["left"].t[5]
     assert np.isnan(seen.holding[free, list(seen.paths).index("left")]).all()
     assert np.isfinite(seen.holding[~free]).all()
@@ -213,16 +213,16 @@ def test_an_arm_that_was_recorded_with_its_fingers_width_holds_while_they_are_ne
 def test_episodes_of_two_cloths_are_refused(turned):
     light = replace(turned, cloth=replace(turned.cloth, areal_density=0.1))
     with pytest.raises(InvalidInput, match=r"another areal density.*got 0\.1.*expected 0\.25.*apart"):
-        check([turned, light])
+        check_episodes([turned, light])
     uv = turned.cloth.uv * 1.5
     with pytest.raises(InvalidInput, match=r"another cloth.*got 0\.45 x 0\.45.*expected 0\.3 x 0\.3"):
-        check([turned, replace(turned, cloth=replace(turned.cloth, uv=uv))])
+        check_episodes([turned, replace(turned, cloth=replace(turned.cloth, uv=uv))])
     for other in (
         replace(turned, gravity=np.array([9.81, 0.0, 0.0])),
         replace(turned, cloth=replace(turned.cloth, nominal={**turned.cloth.nominal, "membrane_stiffness": 1e4})),
     ):
         with pytest.raises(InvalidInput, match=r"another (gravity|data sheet)"):
-            check([turned, other])
+            check_episodes([turned, other])
     held = {name: rec.GraspInfo(vertices=np.array([0, 1]), uv=None) for name in turned.grasps}
     others = {name: replace(g, vertices=np.array([40, 41])) for name, g in held.items()}
     beside = [{n: replace(g, vertices=np.array([k])) for n, g in held.items()} for k in (1500, 1501)]  # of a fine mesh
@@ -234,10 +234,10 @@ def test_episodes_of_two_cloths_are_refused(turned):
         (replace(turned, air_density=None), replace(turned, air_density=1.2), "air"),
     ):
         with pytest.raises(InvalidInput, match=f"another {what}"):
-            check([one, two])
+            check_episodes([one, two])
     elsewhere = {name: rec.GraspInfo(g.uv * 0.5, g.radius) for name, g in turned.grasps.items()}
     with pytest.raises(InvalidInput, match="another place of a grasp"):
-        check([turned, replace(turned, grasps=elsewhere)])
+        check_episodes([turned, replace(turned, grasps=elsewhere)])
 
 
 def test_the_verdict_is_written_and_the_command_is_done(turned, tmp_path, capsys):
@@ -287,15 +287,15 @@ def test_forces_alone_do_not_say_where_the_cloth_goes(turned):
     ends = np.isin(np.arange(len(turned.points)), (0, len(turned.points) - 1))
     blind = [replace(turned, points=None, markers=None, split={"motion": m}) for m in "ab"]
     with pytest.raises(InvalidInput, match="none with points or markers"):
-        somewhere_seen(setting_of(model, blind))
-    somewhere_seen(setting_of(model, [turned, *blind]))
+        check_positions_observed(prepare_data(model, blind))
+    check_positions_observed(prepare_data(model, [turned, *blind]))
     with pytest.raises(InvalidInput, match="after its first frame"):
-        somewhere_seen(setting_of(model, [replace(turned, points=turned.points.only(ends))]))
+        check_positions_observed(prepare_data(model, [replace(turned, points=turned.points.only(ends))]))
 
 
 def test_small_episodes_of_the_same_engine_pass():
     torch.set_default_dtype(torch.float64)
-    assert check([sheet_episodes.episode(motion, duration=0.6) for motion in sheet_episodes.MOTIONS]) == []
+    assert check_episodes([sheet_episodes.episode(motion, duration=0.6) for motion in sheet_episodes.MOTIONS]) == []
 
 
 @pytest.mark.parametrize("seed", [2, 3])
@@ -304,7 +304,7 @@ def test_a_bar_in_view_is_no_mirror(tmp_path, seed):
     out, barred = tmp_path / "shake", ("--effect", "obs.occlusion=0.2")
     made = [sys.executable, "-m", GENERATE, "--motion", "shake", *SMALL, *barred, "--seed", str(seed), "--out", out]
     subprocess.run(made, check=True)
-    assert check([rec.read(out)]) == []
+    assert check_episodes([rec.read(out)]) == []
 
 
 def test_an_episode_that_says_nothing_is_refused_by_name(tmp_path, capsys):

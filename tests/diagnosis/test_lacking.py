@@ -7,9 +7,9 @@ import pytest
 import torch
 from helpers import linear_evidence as toys
 
-from torchcloth.diagnosis import lack_of_fit
+from torchcloth.diagnosis import measure_lack_of_fit
 from torchcloth.diagnosis.decide import backward_elimination
-from torchcloth.diagnosis.inference.lack_of_fit import RARE, SENSOR, Left, explained, is_lacking
+from torchcloth.diagnosis.inference.lack_of_fit import RARE, SENSOR, LackOfFit, compare_misfit, has_lack_of_fit
 
 NAMES = ["a"]
 SLOPES = toys.smooth(1, 4)  # two parameters, one hypothesis, one nuisance
@@ -23,66 +23,66 @@ def _sensor(monkeypatch):
 
 
 def left(truth, seed):
-    return lack_of_fit(toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor(truth).double(), seed)), MOTIONS)
+    return measure_lack_of_fit(toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor(truth).double(), seed)), MOTIONS)
 
 
 def test_of_a_right_model_the_chances_are_what_they_say():
     """Of 160 motions with nothing but noise about 5 % leave what is to be expected in 5 %."""
     rows = [row for seed in range(40) for row in left([0.0, 0.0, 0.0], seed)]
-    p = torch.tensor([row.p for row in rows])
+    p = torch.tensor([row.p_value for row in rows])
     assert 0.01 < float((p < 0.05).double().mean()) < 0.11
     assert 0.4 < float(p.mean()) < 0.6
-    assert torch.tensor([row.ratio for row in rows]).square().mean() == pytest.approx(1.0, abs=0.1)
-    assert not any(row.lacking for row in rows)
+    assert torch.tensor([row.rms_ratio for row in rows]).square().mean() == pytest.approx(1.0, abs=0.1)
+    assert not any(row.is_significant for row in rows)
 
 
 def test_the_effective_number_of_cells_is_far_from_their_count():
     (row, *_) = left([0.0, 0.0, 0.0], 0)
-    assert 4 < row.cells < 0.5 * toys.PATCHES * toys.WINDOWS
+    assert 4 < row.effective_bins < 0.5 * toys.PATCHES * toys.WINDOWS
 
 
 def test_what_nothing_explains_is_lacking_and_what_parameters_do_is_not():
-    assert all(row.lacking for row in left([0.0, 0.0, 2.0], 0))  # 7 mm RMS
+    assert all(row.is_significant for row in left([0.0, 0.0, 2.0], 0))  # 7 mm RMS
     found = toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.3, -0.3, 0.0]).double(), 0), std=0.5)
     free = torch.eye(2).double()
-    rows = lack_of_fit(replace(found, covariance=free), MOTIONS)
-    assert not any(row.lacking for row in rows)
+    rows = measure_lack_of_fit(replace(found, covariance=free), MOTIONS)
+    assert not any(row.is_significant for row in rows)
 
 
 def test_small_excess_is_no_lack_even_where_it_is_certain():
     rows = left([0.0, 0.0, 0.35], 1)
-    assert min(row.p for row in rows) < RARE
-    assert not any(row.lacking for row in rows)
+    assert min(row.p_value for row in rows) < RARE
+    assert not any(row.is_significant for row in rows)
 
 
 def between_meshes(difference):
     """3 mm RMS that nothing explains, and so much between both meshes."""
     ev = toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.9]).double(), 0)
-    rough = [torch.full_like(c.value, difference) for c in ev.cells]
-    return lack_of_fit(toys.fitted(replace(ev, numerics=rough)), MOTIONS)
+    rough = [torch.full_like(c.value, difference) for c in ev.bins]
+    return measure_lack_of_fit(toys.fitted(replace(ev, numerics=rough)), MOTIONS)
 
 
 def test_numerics_are_expected_to_leave_their_share():
-    assert any(row.lacking for row in between_meshes(0.0))
+    assert any(row.is_significant for row in between_meshes(0.0))
     rows = between_meshes(6e-3)
-    assert rows[0].numerics == pytest.approx(2e-3)
-    assert not any(row.lacking for row in rows)
+    assert rows[0].mesh_rms == pytest.approx(2e-3)
+    assert not any(row.is_significant for row in rows)
 
 
 def test_where_meshes_fold_apart_nothing_is_judged():
     rows = between_meshes(0.03)
-    assert not any(row.stable or row.lacking for row in rows)
+    assert not any(row.meshes_agree or row.is_significant for row in rows)
 
 
 @pytest.mark.parametrize(("folded", "share"), [(0, 0.75), (2, 0.5), (3, 0.75)])
 def test_where_most_motions_fold_apart_what_is_held_out_says_how_much_is_mended(folded, share):
     """Three of four motions are put right; of two that are judged one."""
     wrong, right = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (3.0, 0.0))
-    rough = [torch.full_like(c.value, 0.03 if k < folded else 0.0) for k, c in enumerate(wrong.cells)]
+    rough = [torch.full_like(c.value, 0.03 if k < folded else 0.0) for k, c in enumerate(wrong.bins)]
     start = toys.fitted(replace(wrong, numerics=rough))
-    end = toys.fitted(replace(wrong, cells=[*right.cells[:3], wrong.cells[3]], numerics=rough))
-    assert backward_elimination.mended(start, end, MOTIONS) == pytest.approx(share, abs=0.1)
-    assert backward_elimination.mended(start, toys.fitted(replace(right, numerics=rough)), MOTIONS) == pytest.approx(
+    end = toys.fitted(replace(wrong, cells=[*right.bins[:3], wrong.bins[3]], numerics=rough))
+    assert backward_elimination.fraction_explained(start, end, MOTIONS) == pytest.approx(share, abs=0.1)
+    assert backward_elimination.fraction_explained(start, toys.fitted(replace(right, numerics=rough)), MOTIONS) == pytest.approx(
         1.0, abs=0.1
     )
 
@@ -90,45 +90,45 @@ def test_where_most_motions_fold_apart_what_is_held_out_says_how_much_is_mended(
 def test_where_all_motions_fold_apart_more_is_no_mending():
     """Nothing is judged to be lacking then, neither before nor after."""
     worse, wrong = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (6.0, 1.0))
-    rough = [torch.full_like(c.value, 0.03) for c in wrong.cells]
+    rough = [torch.full_like(c.value, 0.03) for c in wrong.bins]
     start, end = (toys.fitted(replace(e, numerics=rough)) for e in (wrong, worse))
-    assert not is_lacking(end, MOTIONS)
-    assert backward_elimination.mended(start, end, MOTIONS) < 0
+    assert not has_lack_of_fit(end, MOTIONS)
+    assert backward_elimination.fraction_explained(start, end, MOTIONS) < 0
 
 
 def test_how_much_is_mended_is_counted_on_cells_that_both_fits_have():
     """What the start finds elsewhere on the cloth is wrong in the end, too, and has not come with the causes."""
     wrong, right = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (3.0, 0.0))
-    elsewhere = torch.arange(len(wrong.cells[0].value)) % 8 == 0
-    cells = [c._replace(value=torch.where(elsewhere, 0.05, c.value)) for c in right.cells]
-    met = [c.rows(~elsewhere) for c in wrong.cells]
-    numerics = [n[~elsewhere] for n in wrong.numerics]
+    elsewhere = torch.arange(len(wrong.bins[0].value)) % 8 == 0
+    cells = [c._replace(value=torch.where(elsewhere, 0.05, c.value)) for c in right.bins]
+    met = [c.select(~elsewhere) for c in wrong.bins]
+    numerics = [n[~elsewhere] for n in wrong.mesh_differences]
     start, end = toys.fitted(replace(wrong, cells=met, numerics=numerics)), toys.fitted(replace(right, cells=cells))
-    assert explained(lack_of_fit(start, MOTIONS), lack_of_fit(end, MOTIONS)) < 0
-    assert backward_elimination.mended(start, end, MOTIONS) > 0.9
+    assert compare_misfit(measure_lack_of_fit(start, MOTIONS), measure_lack_of_fit(end, MOTIONS)) < 0
+    assert backward_elimination.fraction_explained(start, end, MOTIONS) > 0.9
 
 
 def row(motion, left, expected=1e-3, kind="points", unit="m", stable=True, stretches=8, episode=0):
     """As much left in each of some stretches of time."""
     shares = {w: (left**2 / stretches, expected**2 / stretches) for w in range(stretches)}
-    return Left(episode, motion, kind, unit, left, expected, 0.0, 50.0, 0.0, stable, shares)
+    return LackOfFit(episode, motion, kind, unit, left, expected, 0.0, 50.0, 0.0, stable, shares)
 
 
 def test_what_is_explained_is_counted_beyond_what_a_right_model_leaves():
     def rows(left, stable=True):
         return [row("swing", left, stable=stable), row("swing", 9.0, 1e-2, "force", "N")]
 
-    assert explained(rows(5e-3), rows(1e-3)) == pytest.approx(1.0)  # forces are no part of it
-    assert explained(rows(5e-3), rows(13**0.5 * 1e-3)) == pytest.approx(0.5)
-    assert explained(rows(5e-3), rows(7e-3)) < 0
-    assert explained(rows(0.9e-3), rows(0.8e-3)) == 1.0  # nothing was wrong
-    assert explained(rows(5e-3, False), rows(1e-3, False)) == 1.0  # nothing can be said
+    assert compare_misfit(rows(5e-3), rows(1e-3)) == pytest.approx(1.0)  # forces are no part of it
+    assert compare_misfit(rows(5e-3), rows(13**0.5 * 1e-3)) == pytest.approx(0.5)
+    assert compare_misfit(rows(5e-3), rows(7e-3)) < 0
+    assert compare_misfit(rows(0.9e-3), rows(0.8e-3)) == 1.0  # nothing was wrong
+    assert compare_misfit(rows(5e-3, False), rows(1e-3, False)) == 1.0  # nothing can be said
     other, better = [row("hang", 2e-3, episode=1)], [row("hang", 1e-3, episode=1)]
-    assert explained(rows(9e-3, False) + other, rows(5e-3) + better) == pytest.approx(1.0)  # of what both can judge
-    assert explained(rows(9e-3) + other, rows(5e-3, False) + better) == pytest.approx(1.0)
+    assert compare_misfit(rows(9e-3, False) + other, rows(5e-3) + better) == pytest.approx(1.0)  # of what both can judge
+    assert compare_misfit(rows(9e-3) + other, rows(5e-3, False) + better) == pytest.approx(1.0)
     calm = [row("hang", 1e-3, 9e-3, episode=1)]
-    assert explained(rows(5e-3) + calm, rows(13**0.5 * 1e-3) + calm) == pytest.approx(0.5)  # calm makes up for nothing
-    assert explained(calm, calm + rows(5e-3)) == 0.0
+    assert compare_misfit(rows(5e-3) + calm, rows(13**0.5 * 1e-3) + calm) == pytest.approx(0.5)  # calm makes up for nothing
+    assert compare_misfit(calm, calm + rows(5e-3)) == 0.0
 
 
 def test_what_only_forces_tell_is_counted_where_positions_lack_nothing():
@@ -136,9 +136,9 @@ def test_what_only_forces_tell_is_counted_where_positions_lack_nothing():
         felt = [row("swing", force, 1.0, "force", "N"), row("swing", torque, 1.0, "torque", "N m")]
         return [row("swing", 1e-3 * points), *felt]
 
-    assert explained(rows(1.05, 5.0), rows(1.06, 1.0)) == pytest.approx(24 / 32)
-    assert explained(rows(1.5, 5.0), rows(1.0, 5.0)) == 1.0  # or positions alone
-    assert explained(rows(5.0, 5.0), rows(5.0, 1.0)) == 0.0
+    assert compare_misfit(rows(1.05, 5.0), rows(1.06, 1.0)) == pytest.approx(24 / 32)
+    assert compare_misfit(rows(1.5, 5.0), rows(1.0, 5.0)) == 1.0  # or positions alone
+    assert compare_misfit(rows(5.0, 5.0), rows(5.0, 1.0)) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_a_cause_is_not_doubted_for_what_was_hardly_less_before(monkeypatch, bef
     told = iter([[row(m, 1e-3 * r) for m, r in zip(("stretch", "swing"), own, strict=True)] for own in (before, after)])
     monkeypatch.setattr(backward_elimination, "is_lacking", lambda *_: True)
     monkeypatch.setattr(backward_elimination, "lack_of_fit", lambda *_: next(told))
-    assert backward_elimination.mended(toy, toy, MOTIONS) == pytest.approx(share, abs=0.05)
+    assert backward_elimination.fraction_explained(toy, toy, MOTIONS) == pytest.approx(share, abs=0.05)
 
 
 def snapped(found, at, stretches=8):
@@ -188,6 +188,6 @@ def test_motions_that_fit_are_asked_about_causes_where_others_do_not(monkeypatch
     monkeypatch.setattr(backward_elimination, "compare", lambda *_: None)
     monkeypatch.setattr(backward_elimination, "worthwhile", lambda _: gains)
     steps = [SimpleNamespace(best=SimpleNamespace(alone={"c"}))]
-    assert backward_elimination.unheard("start", end, steps, ["a", "b", "a"]) == said  # type: ignore[arg-type]
+    assert backward_elimination.supported_only_by_misfit_motions("start", end, steps, ["a", "b", "a"]) == said  # type: ignore[arg-type]
     fit = [k for k, name in enumerate(["a", "b", "a"]) if name not in lacking]
     assert asked == ([(["c"], fit)] * 2 if fit else [])

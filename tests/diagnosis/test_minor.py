@@ -7,8 +7,8 @@ import pytest
 from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.decide import backward_elimination, candidates, search
-from torchcloth.diagnosis.decide.candidates import Step, _open, _rival, _themselves
-from torchcloth.diagnosis.decide.search import Found
+from torchcloth.diagnosis.decide.candidates import AcceptedCause, _open, _rival, _themselves
+from torchcloth.diagnosis.decide.search import SearchResult
 from torchcloth.diagnosis.decide.verdict import _minor, _verdict
 from torchcloth.diagnosis.inference.comparison import Gain
 from torchcloth.episodes.world import MATTERS, Model
@@ -26,24 +26,24 @@ def candidate(name, typical, amplitude, **options):
 def ended(best, *rivals):
     """A search with one cause and what predicts as well."""
     best, *rivals = (candidate(*one) for one in (best, *rivals))
-    step = Step(best, None, [best, *rivals], rivals, [], None, None)  # type: ignore[arg-type]
+    step = AcceptedCause(best, None, [best, *rivals], rivals, [], None, None)  # type: ignore[arg-type]
     model = Model(None, (), toys.torch.zeros(0), (best.hypothesis,), (best.amplitude,))  # type: ignore[arg-type]
-    return Found(None, SimpleNamespace(model=model), [step], [], None, None, 0.0, 0.0, None, None)  # type: ignore[arg-type]
+    return SearchResult(None, SimpleNamespace(model=model), [step], [], None, None, 0.0, 0.0, None, None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("order", [(SCALE, BIAS, HEM), (BIAS, SCALE, HEM)])
 def test_rivals_that_would_matter_are_said_and_no_others(order):
     """Whichever of them happens to do a little more."""
     found = ended(*order)
-    assert (found.causes, found.minor) == ([], found.steps)
-    told = _minor(found, found.steps[0])
+    assert (found.causes, found.minor) == ([], found.accepted)
+    told = _minor(found, found.accepted[0])
     assert told["effect"] == "obs.depth_scale"
     assert [(r["effect"], r["amplitude"]) for r in told["rivals"]] == [("obs.depth_bias", -2.5e-3)]
 
 
 def test_what_matters_with_all_its_rivals_is_a_cause():
     found = ended(BIAS, EXTRINSIC)
-    assert (found.causes, found.minor) == (found.steps, [])
+    assert (found.causes, found.minor) == (found.accepted, [])
 
 
 @pytest.mark.parametrize(("scale", "named"), [(0.0034, True), (0.0029, False)])
@@ -52,7 +52,7 @@ def test_of_two_that_cannot_be_told_apart_one_may_be_somewhat_small(scale, named
     alike = [("obs.depth_scale", 0.015, scale), ("obs.depth_bias", 5e-3, 1.45 * scale)]
     for order in (alike, alike[::-1]):
         found = ended(*order)
-        assert (found.causes, found.minor) == ((found.steps, []) if named else ([], found.steps))
+        assert (found.causes, found.minor) == ((found.accepted, []) if named else ([], found.accepted))
 
 
 @pytest.mark.parametrize(
@@ -64,14 +64,14 @@ def test_what_slopes_cannot_tell_from_a_cause_might_have_to_matter_too(monkeypat
     What is the same by structure has no size of its own.
     """
     found = ended(("contact.aniso", -0.5, 0.41), EXTRINSIC)
-    (step,), mu = found.steps, toys.hypothesis("contact.mu", 0.2)
-    step.best.hypothesis = replace(step.best.hypothesis, kin=kin)
+    (step,), mu = found.accepted, toys.hypothesis("contact.mu", 0.2)
+    step.candidate.hypothesis = replace(step.candidate.hypothesis, kin=kin)
     like = SimpleNamespace(hypothesis=mu, amplitude=asked, gain=1.0)
     monkeypatch.setattr(search, "alike", lambda before, row, amplitude, others: others)
     found = replace(found, steps=[replace(step, screened=[like])])
-    assert (found.causes, found.minor) == ((found.steps, []) if named else ([], found.steps))
+    assert (found.causes, found.minor) == ((found.accepted, []) if named else ([], found.accepted))
     if not named:
-        told = _minor(found, found.steps[0])
+        told = _minor(found, found.accepted[0])
         assert told["effect"] == "contact.mu"
         assert [r["effect"] for r in told["rivals"]] == ["contact.aniso", "obs.extrinsic[x]"]
 
@@ -81,10 +81,10 @@ def test_a_rival_that_joins_the_model_beside_a_cause_is_none_any_more():
     found = ended(SCALE_LARGE, BIAS, EXTRINSIC)
     other = candidate(*BIAS)
     model = Model(None, (), toys.torch.zeros(0), (*found.end.model.accepted, other.hypothesis), (0.01, BIAS[2]))  # type: ignore[arg-type]
-    second = Step(other, None, [other], [], [], None, None)  # type: ignore[arg-type]
-    both = replace(found, end=SimpleNamespace(model=model), steps=[*found.steps, second])  # type: ignore[arg-type]
-    assert [h.name for h, _ in found.alike(found.steps[0])] == ["obs.depth_scale", "obs.depth_bias", "obs.extrinsic[x]"]
-    assert [h.name for h, _ in both.alike(both.steps[0])] == ["obs.depth_scale", "obs.extrinsic[x]"]
+    second = AcceptedCause(other, None, [other], [], [], None, None)  # type: ignore[arg-type]
+    both = replace(found, end=SimpleNamespace(model=model), steps=[*found.accepted, second])  # type: ignore[arg-type]
+    assert [h.name for h, _ in found.equivalents(found.accepted[0])] == ["obs.depth_scale", "obs.depth_bias", "obs.extrinsic[x]"]
+    assert [h.name for h, _ in both.equivalents(both.accepted[0])] == ["obs.depth_scale", "obs.extrinsic[x]"]
 
 
 @pytest.mark.parametrize("doubtful", [True, False])
@@ -149,7 +149,7 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
     camera = toys.hypothesis("obs.extrinsic[y]", 4e-3)
     base = Model(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
     current = SimpleNamespace(model=base.plus(wind.hypothesis, left), evidence=None)
-    step = Step(wind, None, [wind, drag], [drag], [], None, None)  # type: ignore[arg-type]
+    step = AcceptedCause(wind, None, [wind, drag], [drag], [], None, None)  # type: ignore[arg-type]
     monkeypatch.setattr(backward_elimination, "without_cause", lambda found, name: found.model.without(name))
     monkeypatch.setattr(
         backward_elimination, "fit", lambda model, *_, **__: SimpleNamespace(model=model, noise=None, evidence=None)
@@ -158,22 +158,22 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
     monkeypatch.setattr(backward_elimination, "placebo", lambda *_: SimpleNamespace(passed=passed))
     monkeypatch.setattr(backward_elimination, "predicts_better", lambda *_: over)
     asked = (SimpleNamespace(names=[]), [camera, wind.hypothesis, drag.hypothesis], lambda _: None)
-    end, (then,) = backward_elimination.plainer(current, [step], *asked)  # type: ignore[arg-type]
-    assert then.best.hypothesis.name == named
+    end, (then,) = backward_elimination.replace_by_implied(current, [step], *asked)  # type: ignore[arg-type]
+    assert then.candidate.hypothesis.name == named
     assert [h.name for h in end.model.accepted] == ["obs.extrinsic[y]", named]
     if named == "air.drag_n":
         assert end.model.amplitudes == (4e-3, 1.2)  # what the wind brings
         assert then.rivals == []
-        assert then.placebo.passed
+        assert then.permutation_test.is_passed
 
 
 def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
     drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, brings="air.drag_n")
     model = Model(None, (), toys.torch.zeros(0), (wind.hypothesis, drag.hypothesis), (0.01, 1.4))  # type: ignore[arg-type]
-    steps = [Step(c, None, [wind, drag], [], [], None, None) for c in (wind, drag)]  # type: ignore[arg-type]
+    steps = [AcceptedCause(c, None, [wind, drag], [], [], None, None) for c in (wind, drag)]  # type: ignore[arg-type]
     monkeypatch.delattr(backward_elimination, "fit")
     current = SimpleNamespace(model=model)
-    assert backward_elimination.plainer(current, steps, None, [], print) == (current, steps)  # type: ignore[arg-type]
+    assert backward_elimination.replace_by_implied(current, steps, None, [], print) == (current, steps)  # type: ignore[arg-type]
 
 
 def test_what_cannot_be_simulated_without_a_cause_leaves_it_in(monkeypatch):
@@ -181,7 +181,7 @@ def test_what_cannot_be_simulated_without_a_cause_leaves_it_in(monkeypatch):
     drag, law = candidate("air.drag_n", 1.2, 1.4), candidate("b", 1.0, 1.0)
     drag.alone = law.alone = set()
     model = Model(None, (), toys.torch.zeros(0), (drag.hypothesis, law.hypothesis), (1.4, 1.0))  # type: ignore[arg-type]
-    steps = [Step(c, None, [c], [], [], None, None) for c in (drag, law)]  # type: ignore[arg-type]
+    steps = [AcceptedCause(c, None, [c], [], [], None, None) for c in (drag, law)]  # type: ignore[arg-type]
     current = SimpleNamespace(model=model, noise=None, evidence=None)
 
     def diverges(*_):
@@ -191,7 +191,7 @@ def test_what_cannot_be_simulated_without_a_cause_leaves_it_in(monkeypatch):
     monkeypatch.setattr(backward_elimination, "known", lambda *_: False)
     monkeypatch.setattr(backward_elimination, "fit", diverges)
     asked = (SimpleNamespace(names=[]), [], lambda _: None)
-    assert backward_elimination.pruned(current, steps, *asked) == (current, steps)  # type: ignore[arg-type]
+    assert backward_elimination.drop_redundant(current, steps, *asked) == (current, steps)  # type: ignore[arg-type]
 
 
 def row_of(shows: bool, decision: str = "present", worth: float = 10.0) -> SimpleNamespace:

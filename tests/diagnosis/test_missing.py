@@ -4,9 +4,9 @@ import pytest
 import torch
 from helpers import sheet_episodes
 
-from torchcloth.diagnosis import base_model, fit, lack_of_fit, missing_force, setting_of
+from torchcloth.diagnosis import base_model, fit, measure_lack_of_fit, missing_force, prepare_data
 from torchcloth.diagnosis.unknown import missing_force as missing
-from torchcloth.diagnosis.unknown.force_sensitivities import Pushes, pushed
+from torchcloth.diagnosis.unknown.force_sensitivities import ForcePulses, differentiate_pulses
 from torchcloth.effects import BodyForce
 from torchcloth.episodes.replay import Frames, frames_of
 from torchcloth.pose.objective import joined
@@ -41,7 +41,7 @@ def pushed_for_a_while(world, episode):
 
 def fitted(recordings):
     model = base_model(recordings[0])
-    setting = setting_of(model, recordings)
+    setting = prepare_data(model, recordings)
     return fit(model, setting), setting
 
 
@@ -58,7 +58,7 @@ def planted():
 def test_it_is_found_there_and_then(planted):
     found, setting = planted
     answer = missing_force(found, setting, window=STRETCH)
-    there, elsewhere = answer.parts
+    there, elsewhere = answer.motions
     window, vertex = there.strongest
     begin, end = BEGIN / sheet_episodes.RATE, END / sheet_episodes.RATE
     assert float(there.windows[window].mean()) == pytest.approx((begin + end) / 2, abs=STRETCH)
@@ -76,7 +76,7 @@ def test_it_is_found_there_and_then(planted):
 
 def test_the_fit_lacks_there_and_not_in_the_other_motion(planted):
     found, setting = planted
-    lacking = {(row.motion, row.kind): row.lacking for row in lack_of_fit(found, setting.names)}
+    lacking = {(row.motion, row.kind): row.is_significant for row in measure_lack_of_fit(found, setting.names)}
     assert lacking["slow", "points"]
     assert not lacking["fast", "points"]
 
@@ -88,7 +88,7 @@ def test_pushes_are_those_of_a_body_force(planted):
     last, count = len(episode.times) - 1, len(setting.rest)
     push = torch.zeros(2, 1, count, 3)
     push[:, 0, :, 1] = 1.0
-    frames, moved = pushed(world, episode, Pushes([(0, 5), (5, last)], push))
+    frames, moved = differentiate_pulses(world, episode, ForcePulses([(0, 5), (5, last)], push))
     step = 1e-3
     beside = world.with_cloth({"more": BodyForce(step * push[0, 0])}).frames(episode)
     difference = (beside.x - frames.x) / step
@@ -103,16 +103,16 @@ def test_memory_does_not_change_what_is_asked(planted, monkeypatch, at_once):
     x = e.initial.expand(len(e.times), -1, -1).clone()
     moved = Frames(torch.randn(7, *x.shape), torch.randn(7, *x.shape), {}, torch.zeros(7, len(x)))
     frames = Frames(x, torch.zeros_like(x), {}, x.new_zeros(len(x)))
-    plain = missing.whitened_beside(found, setting, 0, frames, moved, 100)
+    plain = missing.whiten_with_force(found, setting, 0, frames, moved, 100)
     monkeypatch.setattr(missing, "AT_ONCE", at_once)
-    assert all(map(torch.equal, missing.whitened_beside(found, setting, 0, frames, moved, 100), plain))
+    assert all(map(torch.equal, missing.whiten_with_force(found, setting, 0, frames, moved, 100), plain))
 
 
 @pytest.mark.parametrize("size", [1e30, torch.nan])
 def test_where_pushes_grow_without_end_nothing_is_asked(planted, monkeypatch, size):
     """Of one motion that is unstable from half a second on; what the other says is as it was."""
     found, setting = planted
-    usual, unstable = missing.pushed, setting.episodes[1]
+    usual, unstable = missing.differentiate_pulses, setting.episodes[1]
 
     def growing(world, episode, *rest):
         frames, moved = usual(world, episode, *rest)
@@ -122,11 +122,11 @@ def test_where_pushes_grow_without_end_nothing_is_asked(planted, monkeypatch, si
     plain = missing_force(found, setting, window=STRETCH)
     monkeypatch.setattr(missing, "pushed", growing)
     answer = missing_force(found, setting, window=STRETCH)
-    assert [part.until for part in answer.parts] == [None, pytest.approx(0.4)]
-    assert answer.parts[0].force == pytest.approx(plain.parts[0].force, rel=0.05, abs=0.02 * answer.weight)
-    assert bool(answer.parts[1].force.isfinite().all())
-    late = answer.parts[1].windows[:, 0] > 0.5
-    assert float(answer.parts[1].certainty[late].max()) < 1e-6
+    assert [part.unstable_from for part in answer.motions] == [None, pytest.approx(0.4)]
+    assert answer.motions[0].force == pytest.approx(plain.motions[0].force, rel=0.05, abs=0.02 * answer.weight)
+    assert bool(answer.motions[1].force.isfinite().all())
+    late = answer.motions[1].windows[:, 0] > 0.5
+    assert float(answer.motions[1].certainty[late].max()) < 1e-6
     assert [m["until"] for m in answer.as_dict()["motions"]] == [None, pytest.approx(0.4)]
 
 
@@ -156,7 +156,7 @@ def test_two_forces_are_told_at_one_of_them(other, pressure):
     uv = torch.cartesian_prod(u, u)
     force = torch.zeros(1, len(uv), 3).double()
     force[0, :, 1] = torch.where(uv[:, 0] < 0.05, 5.0, torch.where(uv[:, 0] > 0.15, other, 0.0))
-    part = missing.Missing(
+    part = missing.MotionForce(
         "swing", torch.tensor([[0.0, 0.2]]), force, torch.full_like(force, 0.2), torch.zeros_like(force), None
     )
     area = torch.full((len(uv),), 1e-4).double()

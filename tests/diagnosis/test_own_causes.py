@@ -10,7 +10,7 @@ import torch
 from helpers import sheet_episodes
 
 from torchcloth.cli import main
-from torchcloth.diagnosis import Hypothesis, base_model, register_file, setting_of
+from torchcloth.diagnosis import Hypothesis, base_model, register_file, prepare_data
 from torchcloth.diagnosis.causes import hypotheses, user_hypotheses
 from torchcloth.errors import InvalidInput
 
@@ -88,7 +88,7 @@ def test_what_a_hypothesis_lacks_is_said_once(file):
 def test_kin_may_be_a_list():
     """What was simulated is remembered by the causes of the world."""
     given = {"name": "my.damping", "unit": "1/s", "typical": 2.0, "apply": lambda world, _: world}
-    listed, plain = (Hypothesis(**given, kin=kin) for kin in (["obs.clock"], ("obs.clock",)))
+    listed, plain = (Hypothesis(**given, structurally_equivalent=kin) for kin in (["obs.clock"], ("obs.clock",)))
     assert hash(listed) == hash(plain)
     assert listed == plain
 
@@ -121,7 +121,7 @@ def test_the_example_of_the_docs_is_one(file):
     hypotheses.forget(travel.name)
     recording = sheet_episodes.episode()
     model = base_model(recording)
-    (episode,) = setting_of(model, [recording]).episodes
+    (episode,) = prepare_data(model, [recording]).episodes
     before, after = (model.world([(travel, a)]).driven(episode).motion["left"].pose[:, :3, 3] for a in (0.0, 0.1))
     way = before - before[0]
     assert float(way.abs().max()) > 0.01

@@ -9,10 +9,10 @@ import torch
 from helpers import sheet_episodes
 
 from torchcloth import diagnosis as dx
-from torchcloth.diagnosis.data.binning import NAMES, STRETCH
-from torchcloth.diagnosis.inference.screening import Row
-from torchcloth.diagnosis.report.fabric_maps import misfit_limit, misfit_maps
-from torchcloth.diagnosis.report.pictures import FARTHEST, residual_maps, screening
+from torchcloth.diagnosis.data.binning import BLOCK_NAMES, BIN_SECONDS
+from torchcloth.diagnosis.inference.screening import ScoreTest
+from torchcloth.diagnosis.report.fabric_maps import choose_misfit_limit, draw_misfit_maps
+from torchcloth.diagnosis.report.pictures import FARTHEST, draw_residual_maps, draw_scores
 
 
 @pytest.fixture(scope="module")
@@ -23,18 +23,18 @@ def gathered():
     blank = sheet_episodes.episode()
     wind = next(h for h in dx.catalogue(dx.base_model(blank), [blank]) if h.name == "air.wind[y]")
     model = dx.base_model(blank)
-    setting = dx.setting_of(model, [sheet_episodes.recorded("slow", lambda world: wind.apply(world, 0.5), 3)])
-    yield dx.gather(model, setting), setting
+    setting = dx.prepare_data(model, [sheet_episodes.recorded("slow", lambda world: wind.apply(world, 0.5), 3)])
+    yield dx.linearise(model, setting), setting
     torch.set_default_dtype(before)
 
 
 def test_a_part_of_the_fabric_has_its_misfit_where_it_lies(gathered):
     evidence, _ = gathered
-    cells, figure = evidence.cells[0], misfit_maps(*gathered)
+    cells, figure = evidence.cells[0], draw_misfit_maps(*gathered)
     tiles = [axis for axis in figure.axes if axis.get_title().endswith(" s")]
     checked = 0
     for k in np.flatnonzero(cells.block == 0):
-        assert tiles[cells.window[k]].get_title() == f"{STRETCH * cells.window[k]:.1f} s"
+        assert tiles[cells.window[k]].get_title() == f"{BIN_SECONDS * cells.window[k]:.1f} s"
         image = tiles[cells.window[k]].images[0]
         left, right, low, high = image.get_extent()
         field, (u, v, _) = image.get_array(), cells.place[k].tolist()
@@ -43,7 +43,7 @@ def test_a_part_of_the_fabric_has_its_misfit_where_it_lies(gathered):
         assert field[row, column] == pytest.approx(1e3 * cells.value[k].item())
         checked += 1
     assert checked > 30
-    limit = misfit_limit(evidence)
+    limit = choose_misfit_limit(evidence)
     assert tiles[0].images[0].get_clim() == (-limit, limit)
     assert limit > 3.0  # mm, what half a metre a second does
 
@@ -53,7 +53,7 @@ def test_parts_that_nobody_saw_are_grey(gathered):
     cells = evidence.cells[0]
     kept = ~((cells.window == 0) & (cells.patch < 3))
     less = replace(evidence, cells=[type(cells)(*(column[kept] for column in cells))])
-    tile = misfit_maps(less, setting).axes[0]
+    tile = draw_misfit_maps(less, setting).axes[0]
     unseen = tile.images[1].get_array()[..., 3] > 0
     assert 0 < unseen.mean() < 0.15
     assert not (tile.images[0].get_array().filled(np.nan)[~unseen] == 0).any()
@@ -64,13 +64,13 @@ def test_an_episode_without_points_has_an_empty_map_and_markers_do_as_well(gathe
     cells = evidence.cells[0]
     blind = type(cells)(*(column[cells.block != 0] for column in cells))
     marked = cells._replace(
-        block=torch.where(cells.block == 0, NAMES.index("markers"), cells.block), patch=3 * cells.patch + 2
+        block=torch.where(cells.block == 0, BLOCK_NAMES.index("markers"), cells.block), patch=3 * cells.patch + 2
     )
 
     def maps(*every):
         found = SimpleNamespace(evidence=replace(evidence, cells=list(every)))
         searched = SimpleNamespace(start=found, end=found, steps=[])
-        return residual_maps(SimpleNamespace(found=searched, content={"motions": ["a", "b"]}))  # type: ignore[arg-type]
+        return draw_residual_maps(SimpleNamespace(found=searched, content={"motions": ["a", "b"]}))  # type: ignore[arg-type]
 
     one, two, bar = maps(cells, blind).axes
     assert not np.isnan(one.images[0].get_array().filled(np.nan)).all()
@@ -82,7 +82,7 @@ def test_an_episode_without_points_has_an_empty_map_and_markers_do_as_well(gathe
 
 def test_amplitudes_beyond_the_picture_are_arrows_at_its_end():
     h = dx.Hypothesis("my.own", "N", 2.0, lambda world, a: world)
-    rows = [Row(h, a, 0.1, 0.0, 9.0, 1e-3, 0.0, a, 4.5, "present") for a in (1.0, 50.0, -50.0)]
-    (axis,) = screening(rows).axes
+    rows = [ScoreTest(h, a, 0.1, 0.0, 9.0, 1e-3, 0.0, a, 4.5, "present") for a in (1.0, 50.0, -50.0)]
+    (axis,) = draw_scores(rows).axes
     arrows = {line.get_marker(): float(line.get_xdata()[0]) for line in axis.lines if line.get_marker() in "<>"}
     assert arrows == {">": pytest.approx(FARTHEST - 0.05), "<": pytest.approx(0.05 - FARTHEST)}

@@ -5,9 +5,9 @@ from dataclasses import replace
 import torch
 from helpers import linear_evidence as toys
 
-from torchcloth.diagnosis.inference.fitting import leap
-from torchcloth.diagnosis.inference.permutation_test import placebo
-from torchcloth.diagnosis.inference.robust_weights import calmed
+from torchcloth.diagnosis.inference.fitting import robust_step
+from torchcloth.diagnosis.inference.permutation_test import run_permutation_test
+from torchcloth.diagnosis.inference.robust_weights import reweight
 
 SLOPES = toys.smooth(1, 4)  # two parameters, a cause, a nuisance
 MOTIONS = [f"motion {k}" for k in range(toys.EPISODES)]
@@ -19,27 +19,27 @@ def with_cause(amplitude: float, seed: int, slopes=SLOPES):
     found = toys.fitted(ev)
     model = replace(found.model, parameters=found.model.parameters[:2], values=found.model.values[:2])
     model = model.plus(toys.hypothesis("cause"))
-    step, _ = leap(found.white, model)
-    there = found.white._replace(value=found.white.value + found.white.jacobian[:, :3] @ step)
-    return replace(found, model=model.at(step), white=calmed(there))
+    step, _ = robust_step(found.whitened, model)
+    there = found.whitened._replace(value=found.whitened.value + found.whitened.jacobian[:, :3] @ step)
+    return replace(found, model=model.at(step), white=reweight(there))
 
 
 def test_a_cause_beats_its_placebos():
     for seed in range(5):
-        found = placebo(with_cause(0.5, seed), MOTIONS, seed=seed)
-        assert found.passed
-        assert found.gain > 20 + 5 * max(found.chance, 0.0)
+        found = run_permutation_test(with_cause(0.5, seed), MOTIONS, seed=seed)
+        assert found.is_passed
+        assert found.gain > 20 + 5 * max(found.quantile_95, 0.0)
 
 
 def test_what_is_not_there_seldom_does():
     """Of 30 data without the cause some 5 % may pass by chance: 6 or more would happen once in 300 times."""
-    passed = sum(placebo(with_cause(0.0, seed), MOTIONS, seed=seed).passed for seed in range(30))
+    passed = sum(run_permutation_test(with_cause(0.0, seed), MOTIONS, seed=seed).is_passed for seed in range(30))
     assert passed < 6
 
 
 def test_the_same_seed_gives_the_same_placebos():
     found = with_cause(0.0, 1)
-    assert placebo(found, MOTIONS, seed=3) == placebo(found, MOTIONS, seed=3)
+    assert run_permutation_test(found, MOTIONS, seed=3) == run_permutation_test(found, MOTIONS, seed=3)
 
 
 def test_what_is_alike_everywhere_is_no_placebo_of_itself():
@@ -49,4 +49,4 @@ def test_what_is_alike_everywhere_is_no_placebo_of_itself():
         steady = SLOPES.clone()
         windows = 1 - share * torch.rand(toys.EPISODES, toys.WINDOWS, generator=rng).double()
         steady[..., 2] = 4e-3 * windows[:, toys.grid().window]
-        assert all(placebo(with_cause(1.0, seed, steady), MOTIONS, seed=seed).passed for seed in range(6))
+        assert all(run_permutation_test(with_cause(1.0, seed, steady), MOTIONS, seed=seed).is_passed for seed in range(6))

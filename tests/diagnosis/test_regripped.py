@@ -10,8 +10,8 @@ from helpers import sheet_episodes
 from torchcloth import diagnosis as dx
 from torchcloth import recordings as rec
 from torchcloth.boundaries import Grasp
-from torchcloth.diagnosis.data.dataset import setting_of
-from torchcloth.diagnosis.data.grip_patch_mesh import regripped
+from torchcloth.diagnosis.data.dataset import prepare_data
+from torchcloth.diagnosis.data.grip_patch_mesh import move_grip_patches
 from torchcloth.episodes.observed import build_episode
 from torchcloth.episodes.replay import Frames
 from torchcloth.errors import InvalidInput
@@ -25,7 +25,7 @@ def made():
     torch.set_default_dtype(torch.float64)
     blank = sheet_episodes.episode()
     model = dx.base_model(blank)
-    yield model, setting_of(model, [blank]).episodes[0], blank
+    yield model, prepare_data(model, [blank]).episodes[0], blank
     torch.set_default_dtype(before)
 
 
@@ -36,7 +36,7 @@ def held(world, name):
 @pytest.mark.parametrize("along", [-0.012, 0.007])
 def test_the_edge_of_a_patch_goes_along_and_the_outline_stays(made, along):
     world = made[0].world()
-    moved, before = regripped(world, along=along), world.cloth.mesh
+    moved, before = move_grip_patches(world, along=along), world.cloth.mesh
     after = moved.cloth.mesh
     for name in ("left", "right"):
         assert torch.equal(moved.cloth.boundaries[name].index, world.cloth.boundaries[name].index)
@@ -51,10 +51,10 @@ def test_the_edge_of_a_patch_goes_along_and_the_outline_stays(made, along):
 
 def test_a_wider_patch_grows_on_all_sides_and_the_next_grows_from_there(made):
     world = made[0].world()
-    wider = regripped(world, wider=0.01)
+    wider = move_grip_patches(world, wider=0.01)
     far = lambda w: np.linalg.norm(held(w, "left") - [0.0, sheet_episodes.SIDE], axis=1)  # noqa: E731
     np.testing.assert_allclose(far(wider), far(world) * (RADIUS + 0.01) / RADIUS)
-    both = regripped(wider, wider=0.01)
+    both = move_grip_patches(wider, wider=0.01)
     np.testing.assert_allclose(far(both), far(world) * (RADIUS + 0.02) / RADIUS)
     assert both.cloth.boundaries["left"].radius == pytest.approx(RADIUS + 0.02)
 
@@ -76,7 +76,7 @@ def test_nobody_sees_another_mesh(made):
     world, e = made[0].world(), made[1]
     u, v = torch.as_tensor(world.cloth.mesh.uv).T
     shape = torch.stack([u - u * u, 3 * u * v, v + 2 * v * v], 1)
-    other = regripped(world, wider=0.01, along=0.005)
+    other = move_grip_patches(world, wider=0.01, along=0.005)
     there = other.driven(replace(e, initial=shape)).initial
     assert float((there - shape).norm(dim=1).max()) > 5e-3
     still = Frames(there[None], 2 * there[None], {}, torch.zeros(1))
@@ -103,8 +103,8 @@ def test_a_model_of_an_episode_starts_where_the_episode_says(made, tmp_path):
 def test_grips_without_a_place_and_patterns_without_room(made):
     world = made[0].world()
     named = world.with_cloth(boundaries={n: Grasp(held.index.tolist()) for n, held in world.cloth.boundaries.items()})
-    assert regripped(named, wider=0.01) is named
+    assert move_grip_patches(named, wider=0.01) is named
     with pytest.raises(InvalidInput, match="150 mm further along; expected as much"):
-        regripped(world, along=0.15)
+        move_grip_patches(world, along=0.15)
     with pytest.raises(InvalidInput, match=r"without a place.*given by uv"):
         Grasp([0, 1]).shifted(0.01, 0.0)

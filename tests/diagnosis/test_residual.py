@@ -11,13 +11,13 @@ from torchcloth.diagnosis import (
     catalogue,
     diagnose,
     fit,
-    learn_residual,
+    learn_residual_force,
     load_model,
     save_model,
-    setting_of,
+    prepare_data,
     write_diagnosis,
 )
-from torchcloth.diagnosis.inference.lack_of_fit import is_lacking
+from torchcloth.diagnosis.inference.lack_of_fit import has_lack_of_fit
 from torchcloth.diagnosis.unknown.residual_force import RESIDUAL, TERMS
 from torchcloth.effects import AirDrag
 
@@ -56,8 +56,8 @@ def test_it_predicts_motions_that_were_held_out(without_air):
 def test_laws_are_asked_about_until_nothing_is_lacking(without_air):
     _, answer = without_air
     found = answer.residual.found
-    assert is_lacking(found.start, found.setting.names)
-    assert bool(found.screened) == is_lacking(found.end, found.setting.names)
+    assert has_lack_of_fit(found.start, found.setting.names)
+    assert bool(found.screened) == has_lack_of_fit(found.end, found.setting.names)
 
 
 @pytest.mark.slow
@@ -101,17 +101,17 @@ def test_a_force_that_is_missing_is_learned():
     """Air, of which the model has none, and nothing else; with an answer around it: the slow tests."""
     recordings = recorded(lambda world: world.with_cloth({"air": AirDrag(HIDDEN)}), 0)
     model = base_model(recordings[0])
-    setting = setting_of(model, recordings)
-    residual = learn_residual(fit(model, setting), setting)
+    setting = prepare_data(model, recordings)
+    residual = learn_residual_force(fit(model, setting), setting)
     assert residual.terms
     assert all(name.startswith("across") for name in residual.terms)
-    assert residual.gain.after < 0.5 * residual.gain.before
+    assert residual.gain.rms_after < 0.5 * residual.gain.rms_before
 
 
 def test_where_nothing_is_missing_nothing_is_learned():
     recordings = recorded(lambda world: world, 20)
     model = base_model(recordings[0])
-    setting = setting_of(model, recordings)
-    residual = learn_residual(fit(model, setting), setting)
+    setting = prepare_data(model, recordings)
+    residual = learn_residual_force(fit(model, setting), setting)
     assert residual.terms == {}
     assert residual.gain is None

@@ -30,7 +30,7 @@ def episodes():
 @pytest.fixture
 def counted(monkeypatch):
     """Calls of the simulations of an episode; ``stop`` interrupts after so many."""
-    work, state = linearise.piece_of, {"calls": 0, "stop": 10**9}
+    work, state = linearise.simulate_episode, {"calls": 0, "stop": 10**9}
 
     def piece(*arguments):
         if state["calls"] == state["stop"]:
@@ -59,7 +59,7 @@ def test_the_answer_of_a_resumed_diagnosis_is_the_same(episodes, counted, tmp_pa
     assert counted["calls"] == total - done
     assert again.content == whole.content
     assert torch.equal(again.model.point, whole.model.point)
-    assert torch.equal(again.found.end.covariance, whole.found.end.covariance)
+    assert torch.equal(again.search.end.covariance, whole.search.end.covariance)
 
 
 def test_another_diagnosis_is_not_resumed(episodes, counted, tmp_path):
@@ -84,7 +84,7 @@ def test_the_command_says_how_to_go_on(episodes, counted, tmp_path, capsys, monk
     folders = [str(rec.write(e, tmp_path / e.split["motion"])) for e in episodes]
     out, counted["stop"] = tmp_path / "out", 0
     assert main(["diagnose", *folders, "--out", str(out)]) == 130
-    assert capsys.readouterr().err.splitlines() == ["torchcloth: stopped; nothing was kept yet"]
+    assert capsys.readouterr().err.splitlines() == ["torchcloth: stopped; nothing was stored yet"]
     counted["stop"] = 2
     assert main(["diagnose", *folders, "--out", str(out)]) == 130
     assert capsys.readouterr().err.splitlines() == ["torchcloth: stopped; `--resume` goes on from there"]

@@ -9,7 +9,7 @@ from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.inference import fitting, noise
 from torchcloth.diagnosis.inference.fitting import fit
-from torchcloth.diagnosis.inference.linearise import Evidence, central
+from torchcloth.diagnosis.inference.linearise import Linearisation, central_differences
 
 TRUTH, STEP = 0.3, 0.1
 RIPPLES, LENGTH = 2e-3, 0.15  # m, of ripples that come and go within so much of the parameter
@@ -24,18 +24,18 @@ def rippling(monkeypatch):
     phases, real = 2 * math.pi * torch.rand(2, toys.EPISODES, size, generator=rng)  # real cloth has ripples of its own
 
     def seen(k, at):
-        cells = there.evidence.cells[k]
+        cells = there.linearisation.bins[k]
         ripples = RIPPLES * (torch.sin(2 * math.pi * at / LENGTH + phases[k]) - torch.sin(real[k]))
         return cells.value + cells.jacobian[:, 0] * at + torch.where(cells.window >= 4, ripples.double(), 0.0)
 
-    def gather(model, setting, hypotheses, progress, before) -> Evidence:
+    def gather(model, setting, hypotheses, progress, before) -> Linearisation:
         at, cells = float(model.point[0]), []
-        for k, c in enumerate(there.evidence.cells):
+        for k, c in enumerate(there.linearisation.bins):
             down, here, up = (seen(k, at + step) for step in (-STEP, 0.0, STEP))
             sides = torch.stack([(up - here) / STEP, (here - down) / STEP], 1)
             sided = c._replace(value=here, jacobian=torch.cat([sides, c.jacobian[:, 1:]], 1))
-            cells.append(central(sided, [(0, STEP), (0, -STEP)], 1))
-        return replace(there.evidence, cells=cells)
+            cells.append(central_differences(sided, [(0, STEP), (0, -STEP)], 1))
+        return replace(there.linearisation, cells=cells)
 
     monkeypatch.setattr(fitting, "gather", gather)
     return there.model

@@ -7,8 +7,8 @@ import pytest
 import torch
 from helpers import linear_evidence as toys
 
-from torchcloth.diagnosis.data.binning import NAMES
-from torchcloth.diagnosis.unknown.localisation import shown
+from torchcloth.diagnosis.data.binning import BLOCK_NAMES
+from torchcloth.diagnosis.unknown.localisation import localise_cause
 
 PART, WINDOW, EPISODE, BUMP, AMPLITUDE = 5, 3, 2, 2e-3, 1.5
 PLACE = torch.tensor([(PART // 4) * 0.075, (PART % 4) * 0.075], dtype=torch.float64)
@@ -18,19 +18,19 @@ EPISODES = [SimpleNamespace(wrenches={f"hand {k}": None for k in range(toys.PATC
 def with_cause(change=lambda cells: cells):
     """A fit in which a cause does what the first parameter does, ten times as much as that, and one bump."""
     cells = toys.grid()
-    here = (cells.patch == 3 * PART) & (cells.window == WINDOW)
+    here = (cells.channel == 3 * PART) & (cells.window == WINDOW)
     slopes = toys.smooth(0, 2)
     slopes = torch.stack([slopes[..., 0], 10 * slopes[..., 0], slopes[..., 1]], -1)
     slopes[EPISODE, here, 1] += BUMP
     found = toys.fitted(toys.evidence(slopes, 2, [], torch.zeros(2).double(), 0), std=100.0)
-    evidence = replace(found.evidence, cells=[change(c) for c in found.evidence.cells])
+    evidence = replace(found.linearisation, cells=[change(c) for c in found.linearisation.bins])
     model = replace(found.model, parameters=found.model.parameters[:1], values=found.model.values[:1])
     model = model.plus(toys.hypothesis("cause", 1.0), AMPLITUDE)
     return replace(found, evidence=evidence, model=model)
 
 
 def told(found):
-    return shown(found, "cause", ["a", "b", "c", "d"], EPISODES)
+    return localise_cause(found, "cause", ["a", "b", "c", "d"], EPISODES)
 
 
 def test_it_shows_where_and_when_it_does_what_parameters_do_not():
@@ -42,7 +42,7 @@ def test_it_shows_where_and_when_it_does_what_parameters_do_not():
 
 def test_what_forces_alone_tell_shows_at_a_gripper():
     def felt(cells):
-        return cells._replace(block=torch.full_like(cells.block, NAMES.index("force")))
+        return cells._replace(block=torch.full_like(cells.block, BLOCK_NAMES.index("force")))
 
     answer = told(with_cause(felt))
     assert answer["where"] == {"gripper": f"hand {PART}"}

@@ -9,23 +9,23 @@ import torch
 from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.confirmation import Confirmation
-from torchcloth.diagnosis.data.binning import NAMES as KINDS
-from torchcloth.diagnosis.data.binning import SEEN
+from torchcloth.diagnosis.data.binning import BLOCK_NAMES as KINDS
+from torchcloth.diagnosis.data.binning import FORCE_BLOCK
 from torchcloth.diagnosis.decide.candidates import CLEAR
 from torchcloth.diagnosis.inference.comparison import (
-    Predicted,
+    HeldOutPrediction,
     _resampled,
-    as_it_is,
+    predict_as_given,
     compare,
-    of_episodes,
-    predict,
-    spread,
+    select_episodes,
+    predict_held_out,
+    jackknife,
 )
-from torchcloth.diagnosis.inference.confounding import TOLD, alike, correlations, fitted_alike
-from torchcloth.diagnosis.inference.fitting import renoised, step_of, weighed_alike
-from torchcloth.diagnosis.inference.linearise import as_rough
-from torchcloth.diagnosis.inference.noise import MEMORY, ROUGH, Noise, fit_noise, floor_of, whitened
-from torchcloth.diagnosis.inference.screening import Row, _decided, screen
+from torchcloth.diagnosis.inference.confounding import TOLD, find_confounded, correlate_scores, are_fits_confounded
+from torchcloth.diagnosis.inference.fitting import reweight_by_noise, gauss_newton_step, put_on_common_noise
+from torchcloth.diagnosis.inference.linearise import use_noise_inputs
+from torchcloth.diagnosis.inference.noise import MEMORY, ROUGH, Noise, fit_noise, compute_noise_floor, whiten
+from torchcloth.diagnosis.inference.screening import ScoreTest, _decided, screen
 from torchcloth.diagnosis.report.wording import _is_too_large, _too_large
 from torchcloth.errors import InvalidInput
 
@@ -64,10 +64,10 @@ def test_power_is_that_of_the_normal_distribution(strength):
 def test_single_stretches_are_surely_no_gain():
     """Of episodes of 0.4 s or less nothing is known of how their stretches scatter."""
     found = asked([0.3, 0.0, 0.0, 0.0, 0.0])
-    short = [p._replace(window=0 * p.window) for p in (as_it_is(found), predict(found, list("abcd")))]
+    short = [p._replace(window=0 * p.window) for p in (predict_as_given(found), predict_held_out(found, list("abcd")))]
     assert compare(*short, 0.0).density > 0
     assert compare(*short, 0.0).least == -math.inf
-    assert -math.inf < compare(as_it_is(found), predict(found, list("abcd")), 0.0).least < math.inf
+    assert -math.inf < compare(predict_as_given(found), predict_held_out(found, list("abcd")), 0.0).lower_bound_95 < math.inf
 
 
 def test_without_noise_it_is_exact_and_parameters_do_not_matter():
@@ -75,8 +75,8 @@ def test_without_noise_it_is_exact_and_parameters_do_not_matter():
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 0)
     for shift in (0.0, 0.3):
         truth = torch.tensor([shift, -shift, 0.0, 0.7, 0.0]).double()
-        cells = [c._replace(value=-c.jacobian[:, :5] @ truth) for c in ev.cells]
-        found = toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.stds, ev.numerics), std=1e6)
+        cells = [c._replace(value=-c.jacobian[:, :5] @ truth) for c in ev.bins]
+        found = toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences), std=1e6)
         fitted_out = {r.hypothesis.name: r for r in screen(found)}
         joint = torch.linalg.lstsq(
             torch.cat([c.jacobian[:, [0, 1, 3]] for c in cells]), torch.cat([c.value for c in cells])[:, None]
@@ -91,12 +91,12 @@ def disagreeing(seed, by):
     truths = 0.7 + by * torch.randn(toys.EPISODES, generator=rng).double()
     none = torch.zeros(5).double()
     ev = toys.evidence(SLOPES, 3, NAMES[:2], none, seed)
-    cells = [c._replace(value=c.value - t * c.jacobian[:, 2]) for c, t in zip(ev.cells, truths, strict=True)]
-    found = toys.fitted(ev.__class__(cells, 3, ev.hypotheses, ev.stds, ev.numerics), std=1e6)
-    own, value = found.white.jacobian[:, :3], found.white.value
+    cells = [c._replace(value=c.value - t * c.jacobian[:, 2]) for c, t in zip(ev.bins, truths, strict=True)]
+    found = toys.fitted(ev.__class__(cells, 3, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences), std=1e6)
+    own, value = found.whitened.jacobian[:, :3], found.whitened.value
     estimate = -torch.linalg.lstsq(own, value[:, None]).solution[2, 0]
     motions = [str(k) for k in range(toys.EPISODES)]
-    return float(estimate) - 0.7, float(spread(found, motions)[1][2]), float(found.covariance[2, 2].sqrt())
+    return float(estimate) - 0.7, float(jackknife(found, motions)[1][2]), float(found.covariance[2, 2].sqrt())
 
 
 def test_motions_that_disagree_widen_an_error_and_those_that_agree_do_not():
@@ -113,7 +113,7 @@ def test_scores_do_not_depend_on_how_parameters_are_written():
     mixed = SLOPES.clone()
     mixed[..., :2] = SLOPES[..., :2] @ torch.tensor([[2.0, 1.0], [0.5, -1.0]]).double()
     a, b = (screen(asked([0.0, 0.0, 0.4, 0.0, 0.0], 3, s, std=1e6)) for s in (SLOPES, mixed))
-    first, second = ({r.hypothesis.name: (r.amplitude, r.gain) for r in rows} for rows in (a, b))
+    first, second = ({r.hypothesis.name: (r.amplitude, r.chi2) for r in rows} for rows in (a, b))
     for name in NAMES:
         assert first[name] == pytest.approx(second[name], rel=1e-6)
 
@@ -121,8 +121,8 @@ def test_scores_do_not_depend_on_how_parameters_are_written():
 def test_a_nuisance_of_one_episode_is_no_cause():
     """Three standard deviations of every episode's own nuisance leave all hypotheses below notice."""
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 5)
-    cells = [c._replace(value=c.value + 3 * toys.STD * c.jacobian[:, -1] * (-1) ** k) for k, c in enumerate(ev.cells)]
-    rows = screen(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.stds, ev.numerics)))
+    cells = [c._replace(value=c.value + 3 * toys.STD * c.jacobian[:, -1] * (-1) ** k) for k, c in enumerate(ev.bins)]
+    rows = screen(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences)))
     assert max(abs(r.amplitude) / r.std for r in rows) < 4
     assert not any(r.decision == "present" for r in rows)
 
@@ -130,30 +130,30 @@ def test_a_nuisance_of_one_episode_is_no_cause():
 def test_the_level_of_slow_errors_is_found_also_beside_a_strong_effect():
     for truth in ([0.0] * 5, [0.0, 0.0, 0.0, 3.0, 0.0]):
         noise = fit_noise(toys.evidence(SLOPES, 2, NAMES, torch.tensor(truth).double(), 7))
-        assert float(noise.level[0]) == pytest.approx(toys.SLOW, rel=0.35)
+        assert float(noise.levels[0]) == pytest.approx(toys.SLOW, rel=0.35)
 
 
 def test_the_slow_error_of_depths_is_found_and_is_no_error_of_places():
     """Images 1.5 mm too far or too near, for a while each, of cloth that faces the camera here and not there."""
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 7)
     rng, size, cells = torch.Generator().manual_seed(3), 1.5e-3, []
-    for c in ev.cells:
+    for c in ev.bins:
         times = c.time.unique()
         memory = torch.linalg.cholesky(torch.exp(-(times[:, None] - times).abs() / MEMORY))
         off = size * (memory @ torch.randn(len(times), generator=rng).double())[c.window]
-        ray = torch.cos(10 * c.place[:, 0])
+        ray = torch.cos(10 * c.rest_position[:, 0])
         cells.append(c._replace(ray=ray, value=c.value + ray * off))
     noise = fit_noise(replace(ev, cells=cells))
-    assert noise.depth == pytest.approx(size, rel=0.4)
-    assert float(noise.level[0]) == pytest.approx(toys.SLOW, rel=0.35)
+    assert noise.depth_level == pytest.approx(size, rel=0.4)
+    assert float(noise.levels[0]) == pytest.approx(toys.SLOW, rel=0.35)
     unaware = fit_noise(replace(ev, cells=[c._replace(ray=torch.zeros_like(c.ray)) for c in cells]))
-    assert unaware.depth == 0, "nothing is known of a camera"
-    assert float(unaware.level[0]) > 1.3 * float(noise.level[0])
+    assert unaware.depth_level == 0, "nothing is known of a camera"
+    assert float(unaware.levels[0]) > 1.3 * float(noise.levels[0])
 
 
 def test_whitened_noise_is_white():
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 11)
-    white = whitened(ev, fit_noise(ev)).value
+    white = whiten(ev, fit_noise(ev)).value
     assert float(white.square().mean()) == pytest.approx(1.0, rel=0.2)
     assert abs(float((white[1:] * white[:-1]).mean())) < 4 / len(white) ** 0.5
 
@@ -183,12 +183,12 @@ def test_what_a_further_mesh_has_more_or_less_of_is_no_cause(share):
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 0)
     generator = torch.Generator().manual_seed(3)
     numerics = []
-    for c in ev.cells:  # mostly what "b" does, and something of its own
+    for c in ev.bins:  # mostly what "b" does, and something of its own
         own = torch.randn(len(c.value), generator=generator).double() * c.jacobian[:, 3].std()
         numerics.append(3.0 * (c.jacobian[:, 3] + 0.3 * own))
-    cells = [c._replace(value=c.value + share * n) for c, n in zip(ev.cells, numerics, strict=True)]
-    blind = row(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.stds, ev.numerics)), "b")
-    aware = row(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.stds, numerics)), "b")
+    cells = [c._replace(value=c.value + share * n) for c, n in zip(ev.bins, numerics, strict=True)]
+    blind = row(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences)), "b")
+    aware = row(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, numerics)), "b")
     assert abs(blind.amplitude) > 10 * blind.std
     assert abs(aware.amplitude) < 2.5 * aware.std
     assert aware.std < 2 * abs(share) * 3.0 / toys.EPISODES**0.5  # episodes have their own share each
@@ -196,21 +196,21 @@ def test_what_a_further_mesh_has_more_or_less_of_is_no_cause(share):
 
 def test_numerics_widen_the_error():
     ev = toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.0, 0.6, 0.0]).double(), 2)
-    shifted = [-3 * 0.5 * c.jacobian[:, 3] for c in ev.cells]  # the coarser mesh errs like b at 1.5
+    shifted = [-3 * 0.5 * c.jacobian[:, 3] for c in ev.bins]  # the coarser mesh errs like b at 1.5
     plain = row(toys.fitted(ev), "b")
-    wide = row(toys.fitted(ev.__class__(ev.cells, 2, ev.hypotheses, ev.stds, shifted)), "b")
-    assert wide.bias == pytest.approx(0.5, rel=0.1)
+    wide = row(toys.fitted(ev.__class__(ev.bins, 2, ev.hypotheses, ev.nuisance_stds, shifted)), "b")
+    assert wide.mesh_bias == pytest.approx(0.5, rel=0.1)
     assert plain.decision == "present"
     assert wide.decision != "present"
 
 
 def test_what_a_fitted_parameter_does_as_well_is_known_by_its_prior_alone():
     found = asked([0.0, 0.0, 0.7, 0.0, 0.0])
-    hypotheses = [toys.hypothesis("a", twin="p1"), *found.evidence.hypotheses[1:]]
-    found = replace(found, evidence=replace(found.evidence, hypotheses=hypotheses))
+    hypotheses = [toys.hypothesis("a", twin="p1"), *found.linearisation.hypotheses[1:]]
+    found = replace(found, evidence=replace(found.linearisation, hypotheses=hypotheses))
     assert row(found, "a").decision == "unresolvable"
     far = replace(found, model=found.model.at(torch.tensor([0.0, 4 * 0.5]).double()))
-    stranger = replace(far, evidence=replace(far.evidence, hypotheses=[toys.hypothesis("a"), *hypotheses[1:]]))
+    stranger = replace(far, evidence=replace(far.linearisation, hypotheses=[toys.hypothesis("a"), *hypotheses[1:]]))
     apart = ("hypothesis", "size")
     alike = [{k: v for k, v in row(f, "a")._asdict().items() if k not in apart} for f in (far, stranger)]
     assert alike[0] == alike[1], "asked about as any other"
@@ -221,29 +221,29 @@ def test_beside_a_parameter_that_its_prior_holds_its_twin_asks_for_what_both_wou
     same = SLOPES.clone()
     same[..., 2] = same[..., 1]
     found = asked([0.0, 0.0, 0.7, 0.0, 0.0], slopes=same, std=0.05)
-    twins = [toys.hypothesis("a", twin="p1"), *found.evidence.hypotheses[1:]]
-    found = replace(found, evidence=replace(found.evidence, hypotheses=twins))
-    step, _ = step_of(found.white, found.model)
-    cells = [c._replace(value=c.value + c.jacobian[:, :2] @ step) for c in found.evidence.cells]
-    evidence = replace(found.evidence, cells=cells)
-    there = replace(found, model=found.model.at(step), evidence=evidence, white=whitened(evidence, found.noise))
-    both = there.white.jacobian[:, :3]
+    twins = [toys.hypothesis("a", twin="p1"), *found.linearisation.hypotheses[1:]]
+    found = replace(found, evidence=replace(found.linearisation, hypotheses=twins))
+    step, _ = gauss_newton_step(found.whitened, found.model)
+    cells = [c._replace(value=c.value + c.jacobian[:, :2] @ step) for c in found.linearisation.bins]
+    evidence = replace(found.linearisation, cells=cells)
+    there = replace(found, model=found.model.at(step), evidence=evidence, white=whiten(evidence, found.noise))
+    both = there.whitened.jacobian[:, :3]
     prior = torch.diag(torch.tensor([0.05**-2, 0.05**-2, 0.0]).double())
     at = torch.nn.functional.pad(there.model.point, (0, 1))
-    wanted = -torch.linalg.solve(both.mT @ both + prior, both.mT @ there.white.value + prior @ at)
+    wanted = -torch.linalg.solve(both.mT @ both + prior, both.mT @ there.whitened.value + prior @ at)
     twin = row(there, "a")
     assert twin.amplitude == pytest.approx(float(wanted[2]), rel=1e-6)
     assert twin.amplitude == pytest.approx(0.7, abs=3 * twin.std)
-    assert twin.size > 1e-3, "what it moves is not hidden by the parameter that does the same"
+    assert twin.position_rms > 1e-3, "what it moves is not hidden by the parameter that does the same"
 
 
 def test_what_is_rough_is_noise_of_its_stretch():
     ev = toys.evidence(SLOPES, 2, ["a", "b", "c"], torch.zeros(5).double(), 0)
-    rough = 3e-3 * (ev.cells[0].window == 2)
-    cells = [ev.cells[0]._replace(rough=rough), *ev.cells[1:]]
+    rough = 3e-3 * (ev.bins[0].window == 2)
+    cells = [ev.bins[0]._replace(rough=rough), *ev.bins[1:]]
     level = torch.full((len(KINDS),), toys.SLOW).double()
     none = torch.zeros(len(rough), 0).double()
-    plain, wide = (Noise(level).covariance(c[0], none, none[0]) for c in (ev.cells, cells))
+    plain, wide = (Noise(level).covariance(c[0], none, none[0]) for c in (ev.bins, cells))
     more = (wide - plain).diagonal()
     assert torch.equal(more > 0, rough > 0)
     torch.testing.assert_close(more[rough > 0], (ROUGH * rough[rough > 0]) ** 2)
@@ -255,8 +255,8 @@ def test_twins_form_a_class_and_strangers_do_not():
     same[..., 3] = 1.5 * same[..., 2] + 1e-4 * same[..., 4]  # b is a, but for a trifle
     found = asked([0.0, 0.0, 1.0, 0.0, 0.0], slopes=same)
     rows = {r.hypothesis.name: r for r in screen(found)}
-    assert float(correlations(found)[0, 1]) > 0.99
-    assert [r.hypothesis.name for r in alike(found, rows["a"], 1.0, [rows["b"], rows["c"]])] == ["b"]
+    assert float(correlate_scores(found)[0, 1]) > 0.99
+    assert [r.hypothesis.name for r in find_confounded(found, rows["a"], 1.0, [rows["b"], rows["c"]])] == ["b"]
 
 
 def test_what_would_need_a_sign_that_it_cannot_have_is_no_twin():
@@ -266,11 +266,11 @@ def test_what_would_need_a_sign_that_it_cannot_have_is_no_twin():
     found = asked([0.0, 0.0, 1.0, 0.0, 0.0], slopes=against)
     rows = {r.hypothesis.name: r for r in screen(found)}
     other = rows["b"]._replace(hypothesis=replace(rows["b"].hypothesis, signed=False))
-    assert alike(found, rows["a"], 1.0, [other]) == []
-    (instead,) = alike(found, rows["a"], -1.0, [other])  # slopes ask for less than none of it
+    assert find_confounded(found, rows["a"], 1.0, [other]) == []
+    (instead,) = find_confounded(found, rows["a"], -1.0, [other])  # slopes ask for less than none of it
     assert other.amplitude == pytest.approx(-1 / 1.5, rel=0.1)
     assert instead.amplitude == pytest.approx(1 / 1.5, rel=0.01)
-    assert alike(found, rows["a"], 1.0, [rows["b"]]) == [rows["b"]]
+    assert find_confounded(found, rows["a"], 1.0, [rows["b"]]) == [rows["b"]]
 
 
 def test_what_a_fit_finds_tells_it_from_strangers_though_a_score_found_little():
@@ -278,8 +278,8 @@ def test_what_a_fit_finds_tells_it_from_strangers_though_a_score_found_little():
     found = asked([0.0, 0.0, 1.0, 0.0, 0.0])
     rows = {r.hypothesis.name: r for r in screen(found)}
     little, others = rows["a"]._replace(gain=1.0), [rows["b"], rows["c"]]
-    assert len(alike(found, little, 0.0, others)) == 2
-    assert alike(found, little, 1.0, others) == []
+    assert len(find_confounded(found, little, 0.0, others)) == 2
+    assert find_confounded(found, little, 1.0, others) == []
 
 
 def test_more_scatter_within_cells_is_no_gain():
@@ -287,56 +287,56 @@ def test_more_scatter_within_cells_is_no_gain():
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
     cells = [
         c._replace(
-            spread=1.1 * c.spread,
+            spread=1.1 * c.row_std,
             count=c.count - 1,
-            rough=c.rough + 1e-4,
-            ray=c.ray + 0.2,
+            rough=c.roughness + 1e-4,
+            ray=c.depth_slope + 0.2,
             time=c.time + 0.01,
-            place=1.1 * c.place,
+            place=1.1 * c.rest_position,
         )
-        for c in ev.cells
+        for c in ev.bins
     ]
     groups, one, other = ["x", "y", "x", "y"], toys.fitted(ev), toys.fitted(replace(ev, cells=cells))
-    like = [renoised(found, one.noise, one.evidence) for found in (one, other)]
-    first, same, more = (predict(found, groups) for found in (*like, renoised(other, one.noise, other.evidence)))
-    assert compare(first, same, 1e-3).density == pytest.approx(0.0, abs=1e-9)
-    assert abs(compare(first, more, 1e-3).density) > CLEAR
+    like = [reweight_by_noise(found, one.noise, one.linearisation) for found in (one, other)]
+    first, same, more = (predict_held_out(found, groups) for found in (*like, reweight_by_noise(other, one.noise, other.linearisation)))
+    assert compare(first, same, 1e-3).log_density == pytest.approx(0.0, abs=1e-9)
+    assert abs(compare(first, more, 1e-3).log_density) > CLEAR
 
 
 def test_models_that_meet_other_cells_are_compared_on_those_that_both_meet():
     """The same residuals are no gain, whichever of the two has met fewer of them."""
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
-    rough = replace(ev, cells=[c._replace(rough=1e-3 * torch.rand(len(c.value))) for c in ev.cells])
-    fewer = [c.rows(slice(5, None)) for c in rough.cells]
-    less = replace(ev, cells=[c._replace(spread=2 * c.spread) for c in fewer], numerics=[n[5:] for n in ev.numerics])
-    for own, taken in zip(ev.cells, as_rough(ev, less).cells, strict=True):
+    rough = replace(ev, cells=[c._replace(rough=1e-3 * torch.rand(len(c.value))) for c in ev.bins])
+    fewer = [c.select(slice(5, None)) for c in rough.bins]
+    less = replace(ev, cells=[c._replace(spread=2 * c.row_std) for c in fewer], numerics=[n[5:] for n in ev.mesh_differences])
+    for own, taken in zip(ev.bins, use_noise_inputs(ev, less).bins, strict=True):
         assert torch.equal(taken.key, own.key[5:])
-        assert torch.equal(taken.spread, 2 * own.spread[5:])
+        assert torch.equal(taken.row_std, 2 * own.row_std[5:])
     groups, one, other = ["x", "y", "x", "y"], toys.fitted(rough), toys.fitted(replace(less, cells=fewer))
     for both in ((one, other), (other, one)):
-        first, second = (predict(found, groups) for found in weighed_alike(*both))
-        assert compare(first, second, 1e-3).density == pytest.approx(0.0, abs=1e-9)
+        first, second = (predict_held_out(found, groups) for found in put_on_common_noise(*both))
+        assert compare(first, second, 1e-3).log_density == pytest.approx(0.0, abs=1e-9)
 
 
 def test_an_episode_without_a_cell_says_nothing():
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
-    none = ev.cells[0].rows(slice(0))
-    empty = replace(ev, cells=[none, *ev.cells[1:]], numerics=[ev.numerics[0][:0], *ev.numerics[1:]])
-    rest = replace(ev, cells=ev.cells[1:], numerics=ev.numerics[1:], stds=ev.stds[1:])
+    none = ev.bins[0].select(slice(0))
+    empty = replace(ev, cells=[none, *ev.bins[1:]], numerics=[ev.mesh_differences[0][:0], *ev.mesh_differences[1:]])
+    rest = replace(ev, cells=ev.bins[1:], numerics=ev.mesh_differences[1:], stds=ev.nuisance_stds[1:])
     noise = fit_noise(empty)
-    assert torch.equal(noise.level, fit_noise(rest).level)
-    assert torch.equal(whitened(empty, noise).value, whitened(rest, noise).value)
-    alike = as_rough(ev, empty)
-    assert [len(c.value) for c in alike.cells] == [0, *(len(c.value) for c in ev.cells[1:])]
-    assert torch.isfinite(whitened(alike, noise).value).all()
+    assert torch.equal(noise.levels, fit_noise(rest).levels)
+    assert torch.equal(whiten(empty, noise).value, whiten(rest, noise).value)
+    alike = use_noise_inputs(ev, empty)
+    assert [len(c.value) for c in alike.bins] == [0, *(len(c.value) for c in ev.bins[1:])]
+    assert torch.isfinite(whiten(alike, noise).value).all()
     blind = toys.fitted(empty)
-    first = of_episodes(predict(blind, list("wxyz")), [0])
+    first = select_episodes(predict_held_out(blind, list("wxyz")), [0])
     gain = compare(first, first, 1e-3)  # of a motion alone
-    assert math.isnan(gain.before)
-    assert (gain.density, gain.ci95) == (0.0, (0.0, 0.0))
-    forces = replace(ev, cells=[c._replace(block=torch.full_like(c.block, SEEN)) for c in ev.cells])
+    assert math.isnan(gain.rms_before)
+    assert (gain.log_density, gain.log_density_ci95) == (0.0, (0.0, 0.0))
+    forces = replace(ev, cells=[c._replace(block=torch.full_like(c.block, FORCE_BLOCK)) for c in ev.bins])
     with pytest.raises(InvalidInput, match="no place on the cloth"):
-        floor_of(forces, noise)
+        compute_noise_floor(forces, noise)
 
 
 def test_a_true_cause_predicts_motions_that_were_held_out():
@@ -344,21 +344,21 @@ def test_a_true_cause_predicts_motions_that_were_held_out():
     truth = torch.tensor([0.2, 0.0, 0.0, 1.0, 0.0]).double()
     ev = toys.evidence(SLOPES, 2, NAMES, truth, 4)
     groups = ["x", "y", "x", "y"]
-    without = predict(toys.fitted(ev), groups)
+    without = predict_held_out(toys.fitted(ev), groups)
     order = [0, 1, 3, 2, 4, 5]  # b joins what is fitted
-    cells = [c._replace(jacobian=c.jacobian[:, order]) for c in ev.cells]
-    with_b = ev.__class__(cells, 3, [ev.hypotheses[0], ev.hypotheses[2]], ev.stds, ev.numerics)
-    after = predict(toys.fitted(with_b, std=2.0), groups)
-    floor = floor_of(ev, toys.fitted(ev).noise)
+    cells = [c._replace(jacobian=c.jacobian[:, order]) for c in ev.bins]
+    with_b = ev.__class__(cells, 3, [ev.hypotheses[0], ev.hypotheses[2]], ev.nuisance_stds, ev.mesh_differences)
+    after = predict_held_out(toys.fitted(with_b, std=2.0), groups)
+    floor = compute_noise_floor(ev, toys.fitted(ev).noise)
     gain = compare(without, after, floor)
-    assert gain.ci95[0] > 0
-    assert gain.after < 0.6 * gain.before
-    assert gain.explained > 0.8
+    assert gain.log_density_ci95[0] > 0
+    assert gain.rms_after < 0.6 * gain.rms_before
+    assert gain.explained_fraction > 0.8
     same = compare(without, without, floor)
-    assert same.density == 0.0
-    assert compare(without, after, 2 * gain.before).explained == 1.0  # below the floor there is nothing more to gain
-    assert compare(after, without, 2 * gain.before).explained == -1.0
-    assert same.explained == 0.0
+    assert same.log_density == 0.0
+    assert compare(without, after, 2 * gain.rms_before).explained_fraction == 1.0  # below the floor there is nothing more to gain
+    assert compare(after, without, 2 * gain.rms_before).explained_fraction == -1.0
+    assert same.explained_fraction == 0.0
 
 
 def test_a_wrong_cause_does_not_predict_them():
@@ -366,9 +366,9 @@ def test_a_wrong_cause_does_not_predict_them():
     gains = []
     for seed in range(12):
         ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 50 + seed)
-        more = ev.__class__(ev.cells, 3, ev.hypotheses[1:], ev.stds, ev.numerics)
+        more = ev.__class__(ev.bins, 3, ev.hypotheses[1:], ev.nuisance_stds, ev.mesh_differences)
         groups = ["x", "y", "x", "y"]
-        gains.append(compare(predict(toys.fitted(ev), groups), predict(toys.fitted(more), groups), 1e-3).ci95[0] > 0)
+        gains.append(compare(predict_held_out(toys.fitted(ev), groups), predict_held_out(toys.fitted(more), groups), 1e-3).log_density_ci95[0] > 0)
     assert sum(gains) <= 1
 
 
@@ -376,7 +376,7 @@ def test_what_shows_in_one_episode_shows_however_many_others_there_are():
     """Slopes of one of four episodes only: the size is theirs, and the means over all would be half of it."""
     slopes = SLOPES.clone()
     slopes[1:, :, 2] = 0.0
-    size = row(asked([0.0, 0.0, 0.0, 0.0, 0.0], slopes=slopes), "a").size
+    size = row(asked([0.0, 0.0, 0.0, 0.0, 0.0], slopes=slopes), "a").position_rms
     own = float(slopes[0, :, 2].square().mean().sqrt())
     assert 0.5 * own < size <= own
     assert size > 1.5 * float(slopes[..., 2].square().mean().sqrt())
@@ -387,7 +387,7 @@ def test_what_shows_in_one_episode_shows_however_many_others_there_are():
 )
 def test_what_a_leap_makes_large_is_not_ruled_out_by_slopes(reached, worth, said):
     """Large effects bend the fit until slopes there ask for less than there is."""
-    asks = Row(toys.hypothesis("a"), 0.2, 0.01, 0.0, 400.0, 1e-2, 0.0, reached, worth, "absent")
+    asks = ScoreTest(toys.hypothesis("a"), 0.2, 0.01, 0.0, 400.0, 1e-2, 0.0, reached, worth, "absent")
     assert _decided(asks) == said
 
 
@@ -397,26 +397,26 @@ def test_what_a_leap_makes_large_is_not_ruled_out_by_slopes(reached, worth, said
 )
 def test_what_would_matter_but_for_its_sign_is_no_trifle(amplitude, signed, decision, wrong):
     h = replace(toys.hypothesis("a"), signed=signed)
-    assert Row(h, amplitude, 0.01, 0.0, 400.0, 1e-2, 0.0, amplitude, 20.0, decision).wrong_sign == wrong
+    assert ScoreTest(h, amplitude, 0.01, 0.0, 400.0, 1e-2, 0.0, amplitude, 20.0, decision).has_wrong_sign == wrong
 
 
 def test_two_that_were_fitted_are_alike_where_what_lies_between_them_is_within_three_standard_deviations():
     found = asked([0.0] * 5)
-    unit = float(found.white.jacobian[:, 3].norm())
+    unit = float(found.whitened.jacobian[:, 3].norm())
 
     def moved(chi_squared):
         """Another model: what it says is so far from what the first one says."""
         far = chi_squared**0.5 / unit
-        cells = [c._replace(value=c.value + far * c.jacobian[:, 3]) for c in found.evidence.cells]
-        fewer = [c.rows(slice(1, None)) for c in cells]  # cells that only one of them has do not count
-        numerics = [n[1:] for n in found.evidence.numerics]
-        return replace(found, evidence=replace(found.evidence, cells=fewer, numerics=numerics))
+        cells = [c._replace(value=c.value + far * c.jacobian[:, 3]) for c in found.linearisation.bins]
+        fewer = [c.select(slice(1, None)) for c in cells]  # cells that only one of them has do not count
+        numerics = [n[1:] for n in found.linearisation.mesh_differences]
+        return replace(found, evidence=replace(found.linearisation, cells=fewer, numerics=numerics))
 
     for louder in (1.0, 3.0):  # by the noise that is given, not by that of the fits
-        noise = Noise(found.noise.level * louder)
-        floor = whitened(found.evidence, noise).jacobian[:, 3].norm() / unit
-        assert fitted_alike(found, moved(0.8 * TOLD / float(floor) ** 2), noise)
-        assert not fitted_alike(moved(1.3 * TOLD / float(floor) ** 2), found, noise)
+        noise = Noise(found.noise.levels * louder)
+        floor = whiten(found.linearisation, noise).jacobian[:, 3].norm() / unit
+        assert are_fits_confounded(found, moved(0.8 * TOLD / float(floor) ** 2), noise)
+        assert not are_fits_confounded(moved(1.3 * TOLD / float(floor) ** 2), found, noise)
 
 
 @pytest.mark.parametrize("stretches", [2, 3, 4])
@@ -432,13 +432,13 @@ def test_intervals_by_stretches_of_time_are_as_wide_as_few_of_them_allow(stretch
 
 def test_a_single_stretch_of_time_confirms_nothing():
     blank = asked([0.0] * 5, slopes=SLOPES)
-    first = as_it_is(blank)
-    short = of_episodes(first, [0])
-    short = Predicted(*(column[first.window[first.episode == 0] < 2] for column in short))
-    better = short._replace(value=0.5 * short.value, white=0.5 * short.white)
+    first = predict_as_given(blank)
+    short = select_episodes(first, [0])
+    short = HeldOutPrediction(*(column[first.window[first.episode == 0] < 2] for column in short))
+    better = short._replace(value=0.5 * short.residual, white=0.5 * short.whitened)
     gain = compare(short, better, 0.0)
-    assert gain.density > 0
-    assert gain.ci95[0] == gain.ci95[1]
+    assert gain.log_density > 0
+    assert gain.log_density_ci95[0] == gain.log_density_ci95[1]
     assert not Confirmation(gain, {}, 0.0, "the model", ("base.tcm", "extended.tcm"), ["e1"]).confirmed
 
 
@@ -446,7 +446,7 @@ def test_what_is_surely_there_is_present_though_a_usual_amount_of_it_could_not_b
     ev = toys.evidence(toys.smooth(5, 4), 2, ["X"], torch.tensor([0.0, 0.0, 0.3]), 0)
     small = replace(ev, hypotheses=[replace(ev.hypotheses[0], typical=0.06)])
     (row,) = screen(toys.fitted(small))
-    assert row.sight < 1 < row.sight * row.amplitude / 0.06
+    assert row.visibility < 1 < row.visibility * row.amplitude / 0.06
     assert row.decision == "present"
     less = toys.evidence(toys.smooth(5, 4), 2, ["X"], torch.tensor([0.0, 0.0, 0.03]), 0)
     (row,) = screen(toys.fitted(replace(less, hypotheses=small.hypotheses)))

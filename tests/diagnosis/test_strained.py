@@ -7,11 +7,11 @@ import pytest
 import torch
 from helpers import linear_evidence as toys
 
-from torchcloth.diagnosis.data.dataset import Setting
+from torchcloth.diagnosis.data.dataset import DiagnosisData
 from torchcloth.diagnosis.decide import candidates, search
-from torchcloth.diagnosis.decide.candidates import Candidate, Step
+from torchcloth.diagnosis.decide.candidates import Candidate, AcceptedCause
 from torchcloth.diagnosis.inference import prior_restarts
-from torchcloth.diagnosis.inference.prior_restarts import resettled
+from torchcloth.diagnosis.inference.prior_restarts import refit_from_prior
 from torchcloth.episodes.world import OFTEN
 from torchcloth.errors import SimulationDiverged
 
@@ -44,7 +44,7 @@ def test_it_begins_at_the_data_sheet_and_is_nothing_where_that_ends_as_far(monke
         prior_restarts, "approach", lambda model, setting, progress: (begun.append(model) or model, None)
     )
     monkeypatch.setattr(prior_restarts, "fit", fit)
-    again = resettled(found(OFTEN + 1), None, [CAUSE])  # type: ignore[arg-type]
+    again = refit_from_prior(found(OFTEN + 1), None, [CAUSE])  # type: ignore[arg-type]
     assert begun[0].point.tolist() == [0.0, 1.5]
     assert (again is None) == (ends > OFTEN)
     assert len(asked) == (1 if again is None else 2)  # what is not kept is asked about no others
@@ -60,7 +60,7 @@ def test_causes_that_are_known_stay_where_others_are_tried_from_the_data_sheet(m
 
     monkeypatch.setattr(prior_restarts, "gather", gather)
     with pytest.raises(SimulationDiverged):
-        prior_restarts.afresh(found(OFTEN + 1), None, [], 4)  # type: ignore[arg-type]
+        prior_restarts.propose_from_prior(found(OFTEN + 1), None, [], 4)  # type: ignore[arg-type]
     assert asked[0].point.tolist() == [0.0, 1.5]
 
 
@@ -69,7 +69,7 @@ def test_where_the_data_sheet_is_no_world_nothing_begins_there(monkeypatch):
         raise SimulationDiverged("x", got="nan", expected="numbers")
 
     monkeypatch.setattr(prior_restarts, "approach", diverges)
-    assert resettled(found(OFTEN + 1), None, [CAUSE]) is None  # type: ignore[arg-type]
+    assert refit_from_prior(found(OFTEN + 1), None, [CAUSE]) is None  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_causes_with_which_positions_are_hardly_better_predicted_are_none(
     one = found(0.1)
     whole = SimpleNamespace(before=1e-3, after=after, explained=explained, mended=(4e-4, pulls))
     row = SimpleNamespace(hypothesis=CAUSE)
-    first = Step(Candidate(row, one, None, None, set(), 0.0, relieves=relieves), None, [], [], [], one, None)  # type: ignore[arg-type]
+    first = AcceptedCause(Candidate(row, one, None, None, set(), 0.0, restores_prior=relieves), None, [], [], [], one, None)  # type: ignore[arg-type]
     monkeypatch.setattr(search, "fit", lambda *_, **__: one)
     monkeypatch.setattr(search, "screen", lambda f: [])
     monkeypatch.setattr(search, "one_step", lambda *_: None)
@@ -109,7 +109,7 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     """The first step ends strained; the second sees the causes of both fits, or those of the new one alone."""
     strained, anew = found(OFTEN + 1), found(0.2)
     looked, row = [], SimpleNamespace(hypothesis=CAUSE)
-    first = Step(Candidate(row, strained, None, None, set(), 0.0), None, [], [], [], strained, None)  # type: ignore[arg-type]
+    first = AcceptedCause(Candidate(row, strained, None, None, set(), 0.0), None, [], [], [], strained, None)  # type: ignore[arg-type]
     monkeypatch.setattr(search, "resettled", lambda *_: anew)
     monkeypatch.setattr(search, "fit", lambda *_, **__: strained)
     monkeypatch.setattr(search, "predicts_better", lambda *_: 1.0 if better else -1.0)
@@ -131,7 +131,7 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     """A fit that still has far to go may take back what a cause was accepted for."""
     far, near = replace(found(0.1), ahead=ahead), found(0.1)
     row = SimpleNamespace(hypothesis=CAUSE)
-    first = Step(Candidate(row, far, None, None, set(), 0.0), None, [], [], [], far, None)  # type: ignore[arg-type]
+    first = AcceptedCause(Candidate(row, far, None, None, set(), 0.0), None, [], [], [], far, None)  # type: ignore[arg-type]
     doubted, fits = [], iter([far, far, near, near])  # fitted, then asked about the other causes
     monkeypatch.setattr(search, "fit", lambda *_, **__: next(fits))
     monkeypatch.setattr(search, "screen", lambda f: [])
@@ -162,7 +162,7 @@ def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(
     """The fit has made up for half an effect, and nulls' causes promise something as well."""
     start, tried = found(0.1), []
     gain = SimpleNamespace(least=surely)
-    first = Step(Candidate(None, start, None, gain, set(), 0.0), None, [], [], [], start, None)  # type: ignore[arg-type]
+    first = AcceptedCause(Candidate(None, start, None, gain, set(), 0.0), None, [], [], [], start, None)  # type: ignore[arg-type]
     monkeypatch.setattr(search, "is_lacking", lambda *_: lacking)
     monkeypatch.setattr(search, "screen", lambda f: [])
     monkeypatch.setattr(search, "afresh", lambda *a: tried.append(a[-1]) or [])
@@ -177,12 +177,12 @@ def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(
 def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
     promised = [(10.0, "much", None), (5.0, "half", None), (1.0, "little", None)]
     causes = [toys.hypothesis(name, 2.0) for _, name, _ in promised]
-    monkeypatch.setattr(prior_restarts, "gather", lambda *_: found(0.0).evidence)
+    monkeypatch.setattr(prior_restarts, "gather", lambda *_: found(0.0).linearisation)
     monkeypatch.setattr(prior_restarts, "asked_about", lambda here, *_: here)
     monkeypatch.setattr(prior_restarts, "_promises", lambda _: promised)
     monkeypatch.setattr(prior_restarts, "WORTH_TRYING", 0.4)
     monkeypatch.setattr(prior_restarts, "with_cause", lambda _, h: h)
-    begun = prior_restarts.afresh(found(0.0), None, causes, 4, lambda _: None, least)  # type: ignore[arg-type]
+    begun = prior_restarts.propose_from_prior(found(0.0), None, causes, 4, lambda _: None, least)  # type: ignore[arg-type]
     assert [h.name for h, _ in begun] == tried
 
 
@@ -226,7 +226,7 @@ def test_where_what_predicts_best_is_too_large_to_be_believed_more_are_tried(mon
     monkeypatch.setattr(candidates, "_tried", likely)
     monkeypatch.setattr(candidates, "fit_noise", enough)
     with pytest.raises(Enough):
-        candidates.one_step(found(0.1), None, "first", [], print, "more")  # type: ignore[arg-type]
+        candidates.evaluate_candidates(found(0.1), None, "first", [], print, "more")  # type: ignore[arg-type]
     assert tried == tries
 
 
@@ -269,7 +269,7 @@ class Asked:
 
     names: list[str]
     unstable: tuple[torch.Tensor, ...]
-    less = Setting.less
+    less = DiagnosisData.without_bins
 
 
 @pytest.mark.parametrize(
@@ -279,13 +279,13 @@ class Asked:
 def test_cells_that_jump_with_a_cause_are_left_out_where_nothing_else_is_lacking(monkeypatch, lacking, kept, left_out):
     """A loose grip leaves slack that buckles to either side, where vacuum has none."""
     whole = toys.fitted(toys.evidence(toys.smooth(4, 2), 1, [], torch.tensor([0.4]).double(), 0))
-    first, second = (tuple(c.key[k : k + 1] for c in whole.evidence.cells) for k in (0, 1))
-    start = search.without(whole, first)
+    first, second = (tuple(c.key[k : k + 1] for c in whole.linearisation.bins) for k in (0, 1))
+    start = search.drop_bins(whole, first)
     best = Candidate(SimpleNamespace(hypothesis=CAUSE), start, None, None, set(), 0.0)  # type: ignore[arg-type]
-    step = Step(best, None, [], [], [], start, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(search, "fit", lambda model, setting, *_, **__: search.without(whole, setting.unstable))
+    step = AcceptedCause(best, None, [], [], [], start, None)  # type: ignore[arg-type]
+    monkeypatch.setattr(search, "fit", lambda model, setting, *_, **__: search.drop_bins(whole, setting.unstable))
     monkeypatch.setattr(search, "unstable", lambda *_: second)
-    less = lambda f: len(whole.evidence.cells[0].key) - len(f.evidence.cells[0].key)  # noqa: E731
+    less = lambda f: len(whole.linearisation.bins[0].key) - len(f.evidence.cells[0].key)  # noqa: E731
     monkeypatch.setattr(search, "is_lacking", lambda f, _: less(f) in lacking)
     monkeypatch.setattr(search, "screen", lambda f: [])
     monkeypatch.setattr(search, "one_step", lambda *_: None)
@@ -294,9 +294,9 @@ def test_cells_that_jump_with_a_cause_are_left_out_where_nothing_else_is_lacking
     monkeypatch.setattr(search, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
     asked = Asked(["a"] * toys.EPISODES, first)
     found = search._chain(start, asked, [], lambda _: None, 4, step)  # type: ignore[arg-type]
-    assert found.steps == ([step] if kept else [])
+    assert found.accepted == ([step] if kept else [])
     for cells, keys, before in zip(
-        found.current.evidence.cells, found.setting.unstable, whole.evidence.cells, strict=True
+        found.fit.linearisation.bins, found.data.bifurcating_bins, whole.linearisation.bins, strict=True
     ):
         assert len(keys) == left_out
         assert torch.equal(cells.key, before.key[left_out:])

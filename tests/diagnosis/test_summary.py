@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from torchcloth.diagnosis.report.wording import RIPPLED, sentences, warnings_of
+from torchcloth.diagnosis.report.wording import RIPPLED, write_sentences, collect_warnings
 
 LISTS = ("causes", "given", "minor", "ruled_out", "wrong_sign", "undecided", "unresolvable", "lack_of_fit", "drifts")
 LISTS = (*LISTS, "warnings")
@@ -14,7 +14,7 @@ NONE = ("gain", "missing_force", "residual", "next_experiment")
 def summary(verdict, **content):
     """With nothing else found."""
     blank = {key: [] for key in LISTS} | dict.fromkeys(NONE) | {"also_unexplained": False}
-    return sentences(verdict, blank | content)
+    return write_sentences(verdict, blank | content)
 
 
 def test_what_is_minor_is_said_with_what_it_cannot_be_told_from():
@@ -194,7 +194,7 @@ def test_ripples_that_would_hide_a_lack_of_fit_are_warned_of():
 
     def warned(expected, stable=True):
         row = SimpleNamespace(motion="turn", kind="points", seen=True, stable=stable, lacking=False, expected=expected)
-        return [text for text in warnings_of(found, ["turn"] * 8, [row]) if "ripples" in text]  # type: ignore[arg-type]
+        return [text for text in collect_warnings(found, ["turn"] * 8, [row]) if "ripples" in text]  # type: ignore[arg-type]
 
     (text,) = warned(1.5 * RIPPLED)
     assert "in turn that a right model might leave 15 mm of points" in text

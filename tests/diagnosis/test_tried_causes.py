@@ -9,7 +9,7 @@ from helpers import sheet_episodes
 from torchcloth import effects
 from torchcloth.diagnosis.causes.hypotheses import Hypothesis, catalogue, forget, own_among, register
 from torchcloth.diagnosis.causes.user_hypothesis_checks import check_own
-from torchcloth.diagnosis.data.dataset import setting_of
+from torchcloth.diagnosis.data.dataset import prepare_data
 from torchcloth.diagnosis.models.base_model import base_model
 from torchcloth.errors import InvalidInput
 
@@ -44,7 +44,7 @@ WRONG = {
 def world():
     recordings = [sheet_episodes.episode(motion) for motion in ("slow", "fast")]
     model = base_model(recordings[0])
-    return recordings, model, setting_of(model, recordings)
+    return recordings, model, prepare_data(model, recordings)
 
 
 @pytest.mark.parametrize("case", WRONG)

@@ -12,13 +12,13 @@ from torchcloth import materials
 from torchcloth._utils.resume import digest
 from torchcloth.diagnosis.causes import air, fabric, grip, observer
 from torchcloth.diagnosis.causes.hypotheses import catalogue, forget, register
-from torchcloth.diagnosis.data.binning import NAMES as NAMES_OF_DATA
-from torchcloth.diagnosis.data.binning import SEEN, _averaged, _places, cells_of
-from torchcloth.diagnosis.data.dataset import LATE, MOST, _telling, motions_of, setting_of
-from torchcloth.diagnosis.data.fine_mesh import refined
+from torchcloth.diagnosis.data.binning import BLOCK_NAMES as NAMES_OF_DATA
+from torchcloth.diagnosis.data.binning import FORCE_BLOCK, _averaged, _places, bin_residuals
+from torchcloth.diagnosis.data.dataset import MAX_CLOCK_DELAY_S, MAX_POINTS_PER_FRAME, _telling, label_motions, prepare_data
+from torchcloth.diagnosis.data.fine_mesh import refine_model
 from torchcloth.diagnosis.models.base_model import SILENT, base_model
 from torchcloth.diagnosis.models.model_file import load_model, save_model
-from torchcloth.diagnosis.report.wording import on_top
+from torchcloth.diagnosis.report.wording import warn_of_implied_amplitudes
 from torchcloth.effects import AirDrag
 from torchcloth.episodes.cloth_facts import cloth_fingerprint_parts
 from torchcloth.episodes.observed_surface import sheet_of
@@ -79,16 +79,16 @@ def test_air_and_hem_do_what_their_names_say(made):
 def test_cells_know_what_a_longer_depth_does_to_them(made):
     model, setting = made
     e, by = setting.episodes[0], {h.name: h for h in catalogue(model, [RECORDING])}
-    cells = lambda world: cells_of(world.frames(e), None, e, setting.sheet, setting.rest)  # noqa: E731
+    cells = lambda world: bin_residuals(world.frames(e), None, e, setting.sheet, setting.rest)  # noqa: E731
     base, off = cells(model.world()), cells(model.world([(by["obs.depth_bias"], 1e-4)]))
-    seen = base.block < SEEN
+    seen = base.block < FORCE_BLOCK
     assert torch.equal(base.key, off.key)
-    assert float(base.ray[seen].abs().max()) > 0.5
-    assert not base.ray[~seen].any()
+    assert float(base.depth_slope[seen].abs().max()) > 0.5
+    assert not base.depth_slope[~seen].any()
     change = (off.value - base.value) / 1e-4
-    assert float((change - base.ray).square().mean().sqrt()) < 0.05 * float(base.ray.square().mean().sqrt())
-    unplaced = cells_of(model.world().frames(e), None, replace(e, eye=None), setting.sheet, setting.rest)
-    assert not unplaced.ray.any(), "no camera, or several"
+    assert float((change - base.depth_slope).square().mean().sqrt()) < 0.05 * float(base.depth_slope.square().mean().sqrt())
+    unplaced = bin_residuals(model.world().frames(e), None, replace(e, eye=None), setting.sheet, setting.rest)
+    assert not unplaced.depth_slope.any(), "no camera, or several"
 
 
 @pytest.mark.parametrize("first", ["elas.ortho", "plast.crease", "air.drag_n", "rest.skew", "grip.width"])
@@ -143,7 +143,7 @@ def test_parts_of_the_fabric_that_have_no_vertex_are_where_the_nearest_is():
 def test_an_episode_that_names_no_motion_is_one_of_its_own():
     """Also where several come from folders of one name, or from none."""
     bare = replace(RECORDING, split={})
-    assert motions_of([bare, replace(RECORDING, split={"motion": "swing"}), bare]) == [
+    assert label_motions([bare, replace(RECORDING, split={"motion": "swing"}), bare]) == [
         "episode 0",
         "swing",
         "episode 2",
@@ -153,7 +153,7 @@ def test_an_episode_that_names_no_motion_is_one_of_its_own():
 def test_a_repetition_is_of_the_motion_that_it_repeats(tmp_path):
     own = lambda name, **split: replace(RECORDING, path=tmp_path / name, split=split)  # noqa: E731
     every = [own("a"), own("b", replicate_of="a"), own("c", motion="swing"), own("d", replicate_of="c"), own("e")]
-    assert motions_of(every) == ["a", "a", "swing", "swing", "episode 4"]
+    assert label_motions(every) == ["a", "a", "swing", "swing", "episode 4"]
 
 
 def test_a_data_sheet_without_bending_is_asked_nothing_about_it():
@@ -221,9 +221,9 @@ def test_dense_clouds_are_thinned_alike_on_both_meshes(made):
     xyz = np.concatenate([np.repeat(points.frame(0), 250, axis=0), *(points.frame(k) for k in range(1, len(points)))])
     counts = np.array([250 * points.counts[0], *points.counts[1:]])
     dense = replace(RECORDING, points=replace(points, xyz=xyz, counts=counts))
-    setting = setting_of(model, [dense])
-    (coarse,), (fine,) = setting.episodes, setting.finer.episodes
-    assert len(coarse.clouds[0]) == MOST
+    setting = prepare_data(model, [dense])
+    (coarse,), (fine,) = setting.episodes, setting.fine_mesh.episodes
+    assert len(coarse.clouds[0]) == MAX_POINTS_PER_FRAME
     assert torch.equal(coarse.clouds[0], fine.clouds[0])
     assert torch.equal(coarse.clouds[1], torch.as_tensor(points.frame(1)))
 
@@ -272,7 +272,7 @@ def test_the_base_is_in_vacuum_and_left_alone(made):
 
 def test_a_finer_mesh_is_the_same_cloth(made):
     model, _ = made
-    finer, (recording,) = refined(model, [RECORDING])
+    finer, (recording,) = refine_model(model, [RECORDING])
     a, b = model.base.cloth.mesh, finer.base.cloth.mesh
     assert len(b.faces) == 4 * len(a.faces)
     assert b.area.sum() == pytest.approx(a.area.sum(), rel=1e-12)
@@ -353,10 +353,10 @@ def test_a_late_clock_sees_only_frames_that_were_simulated():
     """Of the last ones, which it would see beyond the motion's end, no points are used."""
     recording = sheet_episodes.recorded("fast", lambda world: world, 4)
     model = base_model(recording)
-    (e,) = setting_of(model, [recording]).episodes
+    (e,) = prepare_data(model, [recording]).episodes
     used = torch.tensor([len(c) > 0 for c in e.clouds])
     assert used.sum() == len(recording.points) - 1
-    assert float(e.times[used][-1]) <= float(e.motion["left"].t[-1]) - LATE
+    assert float(e.times[used][-1]) <= float(e.motion["left"].t[-1]) - MAX_CLOCK_DELAY_S
     clock = next(h for h in catalogue(model, [recording]) if h.name == "obs.clock")
     late = clock.apply(model.world(), 0.03).frames(e).x
     then = torch.cat([e.times[:1], e.times[used][1:] + 0.03])
@@ -372,8 +372,8 @@ def test_a_seam_is_the_same_on_every_mesh(columns):
     """Where no line of vertices lies in the middle, too."""
     seam = next(h for h in fabric.HYPOTHESES if h.name == "mass.seam")
     model = base_model(sheet_episodes.episode(resolution=(columns, 7)))
-    for world in (model.world(), refined(model, [])[0].world()):
-        mass = (seam.apply(world, 0.02).cloth.model().mass - world.cloth.model().mass)[:, 0].detach().numpy()
+    for world in (model.world(), refine_model(model, [])[0].world()):
+        mass = (seam.apply(world, 0.02).cloth.build_model().mass - world.cloth.build_model().mass)[:, 0].detach().numpy()
         assert mass.sum() == pytest.approx(0.02 * sheet_episodes.SIDE, rel=1e-6)
         assert mass @ world.cloth.mesh.uv[:, 0] / mass.sum() == pytest.approx(sheet_episodes.SIDE / 2, abs=1e-6)
         assert np.abs(world.cloth.mesh.uv[mass > 1e-9, 0] - sheet_episodes.SIDE / 2).max() < 0.7 * sheet_episodes.SIDE / (columns - 1)
@@ -384,13 +384,13 @@ def test_drag_beside_wind_says_what_it_counts_from(made):
     by = {h.name: h for h in EVERY}
     both = model.plus(by["air.wind[x]"], 0.3).plus(by["air.drag_n"], 0.4)
     assert both.world().cloth.effects["air"].normal.value.item() == pytest.approx(1.6)
-    assert on_top(both) == ["air.drag_n = 0.4 comes on top of the 1.2 that air.wind[x] brought"]
-    assert on_top(model.plus(by["air.drag_n"], 0.4).plus(by["air.wind[x]"], 0.3)) == []
+    assert warn_of_implied_amplitudes(both) == ["air.drag_n = 0.4 comes on top of the 1.2 that air.wind[x] brought"]
+    assert warn_of_implied_amplitudes(model.plus(by["air.drag_n"], 0.4).plus(by["air.wind[x]"], 0.3)) == []
 
 
 def test_an_episode_without_a_motion_has_a_name_that_no_other_has():
     named = replace(RECORDING, split={"motion": "episode 1"})
-    assert len(set(motions_of([named, replace(RECORDING, split={})]))) == 2
+    assert len(set(label_motions([named, replace(RECORDING, split={})]))) == 2
 
 
 def test_drag_that_was_found_and_is_none_does_not_come_along_with_wind(made):

@@ -10,22 +10,22 @@ from ..episodes.world import Hypothesis, Model, World
 from .causes.hypotheses import catalogue, register
 from .causes.user_hypotheses import register_file
 from .confirmation import Confirmation, confirm
-from .data.data_checks import Fault, check, read_episodes
-from .data.dataset import setting_of
+from .data.data_checks import Fault, check_episodes, read_episodes
+from .data.dataset import prepare_data
 from .decide.search import search
-from .decide.verdict import Diagnosis, judge, refused
+from .decide.verdict import Diagnosis, judge, refuse
 from .experiment.proposal import propose
-from .inference.bifurcations import unstable
-from .inference.comparison import Gain, compare, predict
-from .inference.confounding import correlations
-from .inference.fitting import Fitted, fit
-from .inference.force_drift import drifts
-from .inference.lack_of_fit import lack_of_fit
-from .inference.linearise import gather
+from .inference.bifurcations import find_bifurcating_bins
+from .inference.comparison import Gain, compare, predict_held_out
+from .inference.confounding import correlate_scores
+from .inference.fitting import ModelFit, fit
+from .inference.force_drift import estimate_force_drifts
+from .inference.lack_of_fit import measure_lack_of_fit
+from .inference.linearise import linearise
 from .inference.noise import fit_noise
-from .inference.permutation_test import placebo
+from .inference.permutation_test import run_permutation_test
 from .inference.screening import screen
-from .inference.warm_start import approach
+from .inference.warm_start import quadratic_warm_start
 from .models.base_model import base_model
 from .models.loading import (
     begin_with,
@@ -42,59 +42,59 @@ from .models.loading import (
 from .models.model_file import load_model, read_model, save_model
 from .run import diagnose, write_diagnosis
 from .unknown.missing_force import MissingForce, missing_force
-from .unknown.residual_force import Residual, doubted, learn_residual
+from .unknown.residual_force import ResidualForceFit, check_against_laws, learn_residual_force
 
 __all__ = [
     "Confirmation",
     "Diagnosis",
     "Fault",
-    "Fitted",
+    "ModelFit",
     "Gain",
     "Hypothesis",
     "MissingForce",
     "Model",
-    "Residual",
+    "ResidualForceFit",
     "World",
-    "approach",
+    "quadratic_warm_start",
     "base_model",
     "begin_with",
     "beside_the_cloth",
     "catalogue",
-    "check",
+    "check_episodes",
     "cloth_for",
     "compare",
     "confirm",
-    "correlations",
+    "correlate_scores",
     "diagnose",
-    "doubted",
+    "check_against_laws",
     "drawn_models",
-    "drifts",
+    "estimate_force_drifts",
     "fit",
     "fit_noise",
-    "gather",
+    "linearise",
     "judge",
-    "lack_of_fit",
-    "learn_residual",
+    "measure_lack_of_fit",
+    "learn_residual_force",
     "load",
     "load_model",
     "load_world",
     "missing_force",
-    "placebo",
-    "predict",
+    "run_permutation_test",
+    "predict_held_out",
     "predicted",
     "propose",
     "read_episodes",
     "read_model",
-    "refused",
+    "refuse",
     "register",
     "register_file",
     "save_model",
     "screen",
     "search",
-    "setting_of",
+    "prepare_data",
     "start_of",
     "uncertain",
-    "unstable",
+    "find_bifurcating_bins",
     "was_fitted",
     "write_diagnosis",
 ]

@@ -11,38 +11,38 @@ from pathlib import Path
 
 from torch import Tensor
 
-from .._utils.resume import Journal, digest
-from ..episodes.cloth_facts import facts_of
+from .._utils.resume import ResumableStore, digest
+from ..episodes.cloth_facts import cloth_fingerprint_parts
 from ..episodes.world import Model
 from .causes.user_hypotheses import digests
-from .data.binning import Cells, Piece
-from .data.dataset import Kept, Setting
+from .data.binning import BinnedResiduals, EpisodeEvidence
+from .data.dataset import EpisodeCache, DiagnosisData
 
-FIELDS = len(Cells._fields)
+FIELDS = len(BinnedResiduals._fields)
 
 
-def kept_in(folder: Path, model: Model, setting: Setting, resume: bool | None) -> Kept:
+def kept_in(folder: Path, model: Model, setting: DiagnosisData, resume: bool | None) -> EpisodeCache:
     """Answers in a folder, which is made when the first is known.
 
     Raises:
         InvalidInput: nothing to resume, or what another diagnosis left; a folder of other things.
     """
-    journal = Journal(folder, _problem(model, setting), resume)
+    journal = ResumableStore(folder, _problem(model, setting), resume)
 
-    def kept(question: Sequence[object], point: Tensor, work: Callable[[], Piece]) -> Piece:
+    def kept(question: Sequence[object], point: Tensor, work: Callable[[], EpisodeEvidence]) -> EpisodeEvidence:
         def flat() -> tuple[Tensor, ...]:
             found = work()
-            return (*found.cells, found.std, found.numerics, found.able)
+            return (*found.bins, found.nuisance_stds, found.mesh_difference, found.is_simulated)
 
-        answer = journal.ask(f"episode{question[0]}-{digest(question)}", point, flat)
-        return Piece(Cells(*answer[:FIELDS]), *answer[FIELDS:])
+        answer = journal.get_or_compute(f"episode{question[0]}-{digest(question)}", point, flat)
+        return EpisodeEvidence(BinnedResiduals(*answer[:FIELDS]), *answer[FIELDS:])
 
     return kept
 
 
-def _problem(model: Model, setting: Setting) -> list[object]:
+def _problem(model: Model, setting: DiagnosisData) -> list[object]:
     """All that an answer depends on beside the question."""
     cloth = model.base.cloth
-    data = [part for e in setting.episodes for part in (*e.identity(), *model.base.identity(e))]
+    data = [part for e in setting.episodes for part in (*e.fingerprint_parts(), *model.base.identity(e))]
     parts = [(p.name, p.step, p.std) for p in model.parameters]
-    return [setting.dt, parts, *digests(), *facts_of(cloth), setting.rest, *data]
+    return [setting.dt, parts, *digests(), *cloth_fingerprint_parts(cloth), setting.rest_positions, *data]

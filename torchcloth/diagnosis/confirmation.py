@@ -10,21 +10,21 @@ from typing import Any
 
 import torch
 
-from .._utils.torch_modes import own_gradients
+from .._utils.torch_modes import isolated_grad_mode
 from ..episodes.world import Model
 from ..errors import InvalidInput, RecordingError
 from ..identification.result import or_none
 from ..recordings import Recording
 from ..recordings.consistency import listed, name_of, same_cloth, together
 from ..recordings.fingerprints import alike, each_once, mark
-from .data.binning import aligned
-from .data.data_checks import check
-from .data.dataset import Progress, setting_of, somewhere_seen, staged
-from .data.replicate_floor import pairs_of, repeats
-from .inference.comparison import Gain, Predicted, as_it_is, by_motion, compare
-from .inference.fitting import Fitted
-from .inference.linearise import Evidence, as_held, as_rough, gather, shared
-from .inference.noise import Noise, fit_noise, floor_of, least, unfitted, whitened
+from .data.binning import align_rows
+from .data.data_checks import check_episodes
+from .data.dataset import Progress, prepare_data, check_positions_observed, prefix_progress
+from .data.replicate_floor import find_replicate_pairs, estimate_replicate_floor
+from .inference.comparison import Gain, HeldOutPrediction, predict_as_given, compare_by_motion, compare
+from .inference.fitting import ModelFit
+from .inference.linearise import Linearisation, use_nuisance_slopes, use_noise_inputs, linearise, restrict_to_common_bins
+from .inference.noise import Noise, fit_noise, compute_noise_floor, minimal_noise, inflated_noise, whiten
 from .models.model_file import ModelFile, read_model
 
 CONVENTION = (
@@ -60,8 +60,8 @@ class Confirmation:
 
         Never by stretches of time that nothing can be compared with: an episode of 0.4 s is one.
         """
-        known = self.whole.ci95[0] < self.whole.ci95[1]
-        return known and min(self.whole.ci95[0], self.whole.explained_ci95[0]) > 0
+        known = self.whole.log_density_ci95[0] < self.whole.log_density_ci95[1]
+        return known and min(self.whole.log_density_ci95[0], self.whole.explained_fraction_ci95[0]) > 0
 
     def as_dict(self) -> dict[str, Any]:
         """The content of confirmation.json."""
@@ -78,19 +78,19 @@ class Confirmation:
 
 def _told(gain: Gain) -> dict[str, Any]:
     """Shares are of positions: null where none were seen. Of single stretches of time no interval is known."""
-    seen, known = not math.isnan(gain.before), gain.least > -math.inf
+    seen, known = not math.isnan(gain.rms_before), gain.lower_bound_95 > -math.inf
     return {
-        "rms_before": or_none(gain.before),
-        "rms_after": or_none(gain.after),
+        "rms_before": or_none(gain.rms_before),
+        "rms_after": or_none(gain.rms_after),
         "unit": "m",
-        "explained_fraction": gain.explained if seen else None,
-        "explained_ci95": list(gain.explained_ci95) if seen and known else None,
-        "log_density": gain.density,
-        "log_density_ci95": list(gain.ci95) if known else None,
+        "explained_fraction": gain.explained_fraction if seen else None,
+        "explained_ci95": list(gain.explained_fraction_ci95) if seen and known else None,
+        "log_density": gain.log_density,
+        "log_density_ci95": list(gain.log_density_ci95) if known else None,
     }
 
 
-@own_gradients()
+@isolated_grad_mode()
 def confirm(
     base: str | Path, extended: str | Path, recordings: Sequence[Recording], progress: Progress = lambda _: None
 ) -> Confirmation:
@@ -107,7 +107,7 @@ def confirm(
         RecordingError: a file that is no model, or an episode that cannot be believed.
     """
     recordings = listed(recordings)
-    if faults := check(recordings):
+    if faults := check_episodes(recordings):
         raise RecordingError(str(faults[0]))
     each_once(recordings)
     scene = together(recordings)
@@ -117,19 +117,19 @@ def confirm(
     _refuse_no_extension(*(file.model for file in files))
     for recording in recordings:
         _refuse_seen(recording, files)
-    settings = [setting_of(file.model, recordings) for file in files]
-    somewhere_seen(settings[0])
+    settings = [prepare_data(file.model, recordings) for file in files]
+    check_positions_observed(settings[0])
     found = [
-        gather(file.model, setting, (), staged(progress, stage))
+        linearise(file.model, setting, (), prefix_progress(progress, stage))
         for file, setting, stage in zip(files, settings, ("base", "extended"), strict=True)
     ]
-    noise, like = fit_noise(found[1]), shared(found[1], found[:1])
-    whole = [as_it_is(_as_fitted(f.model, e, unfitted())) for f, e in zip(files, found, strict=True)]
+    noise, like = fit_noise(found[1]), restrict_to_common_bins(found[1], found[:1])
+    whole = [predict_as_given(_as_fitted(f.model, e, inflated_noise())) for f, e in zip(files, found, strict=True)]
     before, after = (_judged(f.model, e, w, noise, like) for f, e, w in zip(files, found, whole, strict=True))
-    floor, source = min(floor_of(e, least()) for e in found), "sensor only"  # slow errors may be the models' own
-    if (repeated := repeats(whole[1], pairs_of(recordings, settings[1].episodes))) is not None:
+    floor, source = min(compute_noise_floor(e, minimal_noise()) for e in found), "sensor only"  # slow errors may be the models' own
+    if (repeated := estimate_replicate_floor(whole[1], find_replicate_pairs(recordings, settings[1].episodes))) is not None:
         floor, source = repeated.rms, "repetitions"
-    motions = by_motion(before, after, floor, settings[0].names)
+    motions = compare_by_motion(before, after, floor, settings[0].motions)
     told = [str(r.path or name_of(r, k)) for k, r in enumerate(recordings)]
     return Confirmation(compare(before, after, floor), motions, floor, source, (str(base), str(extended)), told)
 
@@ -163,15 +163,15 @@ def _refuse_seen(recording: Recording, files: Sequence[ModelFile]) -> None:
         )
 
 
-def _judged(model: Model, evidence: Evidence, whole: Predicted, noise: Noise, like: Evidence) -> Predicted:
+def _judged(model: Model, evidence: Linearisation, whole: HeldOutPrediction, noise: Noise, like: Linearisation) -> HeldOutPrediction:
     """Density by ``noise``, on the cells, as rough and with the nuisances of ``like``; metres by nobody's noise.
 
     So the base's metres are the same whatever it is compared with, on cells that both have.
     """
-    alike = as_it_is(_as_fitted(model, as_rough(as_held(evidence, like), like), noise))
-    return alike._replace(value=aligned(alike.place, whole.place, whole.value))
+    alike = predict_as_given(_as_fitted(model, use_noise_inputs(use_nuisance_slopes(evidence, like), like), noise))
+    return alike._replace(value=align_rows(alike.bin_key, whole.bin_key, whole.residual))
 
 
-def _as_fitted(model: Model, evidence: Evidence, noise: Noise) -> Fitted:
+def _as_fitted(model: Model, evidence: Linearisation, noise: Noise) -> ModelFit:
     none = torch.zeros(len(model.point), len(model.point), dtype=torch.float64)
-    return Fitted(model, evidence, noise, whitened(evidence, noise), none, 0.0)
+    return ModelFit(model, evidence, noise, whiten(evidence, noise), none, 0.0)

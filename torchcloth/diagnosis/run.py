@@ -9,10 +9,10 @@ from pathlib import Path
 
 import torch
 
-from .._utils.files import as_json, write_text
-from .._utils.resume import digest, program
-from .._utils.torch_modes import own_gradients
-from ..episodes.cloth_facts import facts_of
+from .._utils.files import to_json, write_text
+from .._utils.resume import digest, source_fingerprint
+from .._utils.torch_modes import isolated_grad_mode
+from ..episodes.cloth_facts import cloth_fingerprint_parts
 from ..episodes.world import Hypothesis, Model
 from ..errors import InvalidInput
 from ..recordings import Recording
@@ -22,19 +22,19 @@ from .causes.hypotheses import catalogue, own_among
 from .causes.user_hypotheses import digests
 from .causes.user_hypothesis_checks import check_own
 from .checkpointing import kept_in
-from .data.data_checks import check
-from .data.dataset import Progress, motions_of, setting_of, somewhere_seen, staged
-from .decide.search import Found, search
-from .decide.verdict import Diagnosis, judge, refused
+from .data.data_checks import check_episodes
+from .data.dataset import Progress, label_motions, prepare_data, check_positions_observed, prefix_progress
+from .decide.search import SearchResult, search
+from .decide.verdict import Diagnosis, judge, refuse
 from .experiment.feasibility import write_episode
 from .experiment.proposal import propose
-from .inference.lack_of_fit import lack_of_fit
+from .inference.lack_of_fit import measure_lack_of_fit
 from .models.base_model import base_model
 from .models.model_file import save_model
-from .report.cloud_overlays import overlays
+from .report.cloud_overlays import make_overlays
 from .report.html_report import REPORT, write_report
 from .unknown.missing_force import missing_force
-from .unknown.residual_force import doubted, is_residual, learn_residual
+from .unknown.residual_force import check_against_laws, is_residual, learn_residual_force
 
 OPEN = ("ambiguous", "inconclusive", "unexplained")  # verdicts that another experiment may change
 NONE_TELLS = "no short motion that can be done would tell the causes from what they cannot be told from now"
@@ -42,7 +42,7 @@ RESULT, BASE, EXTENDED = "diagnosis.json", "base.tcm", "extended.tcm"
 CONFIRMED = Path("confirmation") / "confirmation.json"  # where `torchcloth confirm` says what they gain
 
 
-@own_gradients()
+@isolated_grad_mode()
 def diagnose(
     recordings: Sequence[Recording],
     model: Model | None = None,
@@ -70,7 +70,7 @@ def diagnose(
         SimulationDiverged: the base model cannot be simulated.
     """
     recordings = listed(recordings)
-    names = motions_of(recordings)
+    names = label_motions(recordings)
     if len(set(names)) < 2:
         each_once(recordings)  # a copy needs no other name
         raise InvalidInput(
@@ -93,28 +93,28 @@ def diagnose(
             expected="one without",
             remedy="load_model(path, residual=False)",
         )
-    if faults := check(recordings):
-        return refused(faults, names)
+    if faults := check_episodes(recordings):
+        return refuse(faults, names)
     each_once(recordings)
     model = model or base_model(together(recordings))
     asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
     own = own_among(asked)
     plan = _plan(model, asked, names)
-    setting = setting_of(model, recordings)
-    somewhere_seen(setting)
-    for place in (setting, setting.finer):  # each with a mesh of its own
+    setting = prepare_data(model, recordings)
+    check_positions_observed(setting)
+    for place in (setting, setting.fine_mesh):  # each with a mesh of its own
         if place is not None:
             check_own(own, place.base, place.episodes)
     if journal is not None:
         setting = replace(setting, kept=kept_in(journal, model, setting, resume))
     many = torch.get_num_threads()
     with _threads(1):  # simulations run side by side: threads for the small arrays of each would wait for each other
-        found = doubted(search(model, setting, asked, progress), staged(progress, "laws without a cause"))
+        found = check_against_laws(search(model, setting, asked, progress), prefix_progress(progress, "laws without a cause"))
         answer = _judged(found, many, progress)
         proposal = None
         if answer.verdict in OPEN:
-            proposal = propose(found, answer.content, setting, staged(progress, "next experiment"))
-        over = overlays(answer.found, progress)
+            proposal = propose(found, answer.content, setting, prefix_progress(progress, "next experiment"))
+        over = make_overlays(answer.search, progress)
     warnings = [*answer.content["warnings"], *([NONE_TELLS] if answer.verdict == "ambiguous" and not proposal else [])]
     files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
     following, episode = proposal or (None, None)
@@ -131,7 +131,7 @@ def _plan(model: Model, asked: Sequence[Hypothesis], names: Sequence[str]) -> st
     """
     numbers = [(p.name, p.unit, p.std, p.step, p.low, p.high) for p in model.parameters]
     causes = [[(h.name, h.unit, *h.sizes) for h in hypotheses] for hypotheses in (model.accepted, asked)]
-    return digest([program(), *digests(), *facts_of(model.base.cloth), numbers, model.point, *causes, list(names)])
+    return digest([source_fingerprint(), *digests(), *cloth_fingerprint_parts(model.base.cloth), numbers, model.point, *causes, list(names)])
 
 
 @contextmanager
@@ -145,18 +145,18 @@ def _threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _judged(found: Found, threads: int, progress: Progress) -> Diagnosis:
+def _judged(found: SearchResult, threads: int, progress: Progress) -> Diagnosis:
     """With what can be said of what no known cause explains."""
-    left = lack_of_fit(found.end, found.setting.names)
-    lacking, stable = any(row.lacking for row in left), all(row.stable for row in left)
+    left = measure_lack_of_fit(found.end, found.data.motions)
+    lacking, stable = any(row.is_significant for row in left), all(row.meshes_agree for row in left)
     missing = None
     if lacking:
         with _threads(threads):  # an episode at a time, whose directions the threads share
-            missing = missing_force(found.end, found.setting, progress=progress)
+            missing = missing_force(found.end, found.data, progress=progress)
     # laws tell of more than what is left: they know what it would look like
     learned = lacking or (stable and not found.causes)
-    residual = learn_residual(found.end, found.setting, progress) if learned else None
-    return judge(found, found.setting.names, missing, residual)
+    residual = learn_residual_force(found.end, found.data, progress) if learned else None
+    return judge(found, found.data.motions, missing, residual)
 
 
 def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Diagnosis:
@@ -169,17 +169,17 @@ def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: 
     folder.mkdir(parents=True, exist_ok=True)
     for name in (RESULT, REPORT, CONFIRMED):  # of an earlier diagnosis: they say nothing of other models
         (folder / name).unlink(missing_ok=True)
-    if answer.searched is None:
+    if answer.optional_search is None:
         for name in (BASE, EXTENDED):
             (folder / name).unlink(missing_ok=True)
     else:
-        said, scene = [*answer.found.start.model.met, *answer.content["episodes"]], together(recordings)
-        residual = answer.residual.model if answer.residual is not None and answer.residual.terms else None
-        start, end = answer.found.start, answer.found.end
+        said, scene = [*answer.search.start.model.met, *answer.content["episodes"]], together(recordings)
+        residual = answer.residual_force.model if answer.residual_force is not None and answer.residual_force.terms else None
+        start, end = answer.search.start, answer.search.end
         save_model(folder / BASE, start.model, scene, start.covariance, episodes=said)
         save_model(folder / EXTENDED, end.model, scene, end.covariance, residual, said)
     if warning := write_episode(answer.experiment, folder):
         answer = replace(answer, content=answer.content | {"warnings": [*answer.content["warnings"], warning]})
-    write_text(folder / RESULT, as_json(answer.content))
+    write_text(folder / RESULT, to_json(answer.content))
     write_report(answer, folder)
     return answer

@@ -48,7 +48,7 @@ ALIKE = {
 
 def meaning(hypothesis: Hypothesis) -> str:
     """What a cause is; empty where nobody says so."""
-    return hypothesis.says or GLOSSARY.get(hypothesis.effect, "")
+    return hypothesis.description or GLOSSARY.get(hypothesis.effect, "")
 
 
 def table(hypotheses: list[Hypothesis]) -> str:

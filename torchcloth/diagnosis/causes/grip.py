@@ -9,7 +9,7 @@ from ...cloth import Cloth
 from ...effects import Adhesion, GripSlip
 from ...episodes.world import Hypothesis, World
 from ...recordings import Recording
-from ..data.grip_patch_mesh import regripped
+from ..data.grip_patch_mesh import move_grip_patches
 
 LEAST = 1e-3  # -, of friction
 HOLD = 0.3  # N, above which a loose grip yields
@@ -82,8 +82,8 @@ def _has_table(recording: Recording) -> bool:
 
 HYPOTHESES = (
     Hypothesis("grip.slip", "m/(N s)", 0.05, _slip),
-    Hypothesis("grip.width", "m", 0.02, lambda w, a: regripped(w, wider=a), high=0.05),
-    Hypothesis("robot.regrasp", "m", 0.017, lambda w, a: regripped(w, along=a), signed=True, low=-0.04, high=0.04),
+    Hypothesis("grip.width", "m", 0.02, lambda w, a: move_grip_patches(w, wider=a), high=0.05),
+    Hypothesis("robot.regrasp", "m", 0.017, lambda w, a: move_grip_patches(w, along=a), signed=True, low=-0.04, high=0.04),
     Hypothesis("contact.mu", "-", 0.2, lambda w, a: _friction(w, more=a), signed=True, needs=_has_table),
     Hypothesis("contact.aniso", "-", -0.5, lambda w, a: _friction(w, along=a), signed=True, needs=_has_table, low=-0.9),
     Hypothesis("contact.stick", "-", 0.3, lambda w, a: _friction(w, excess=a), needs=_has_table),

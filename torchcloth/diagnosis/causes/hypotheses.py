@@ -55,12 +55,12 @@ def _check_size(hypothesis: Hypothesis) -> None:
     for key in ("name", "unit"):
         if not isinstance(said := getattr(hypothesis, key), str) or not said:
             raise InvalidInput(f"{key} of a hypothesis", got=repr(said), expected="a word")
-    if not isinstance(hypothesis.says, str):
-        raise InvalidInput(f"says of {hypothesis.name!r}", got=repr(hypothesis.says), expected="a sentence")
+    if not isinstance(hypothesis.description, str):
+        raise InvalidInput(f"says of {hypothesis.name!r}", got=repr(hypothesis.description), expected="a sentence")
     for key in ("typical", "share", "step", "low", "high"):
         if not isinstance(number := getattr(hypothesis, key), (int, float)):
             raise InvalidInput(f"{key} of {hypothesis.name!r}", got=repr(number), expected="a number")
-    if not isinstance(kin := hypothesis.kin, tuple | list) or not all(isinstance(name, str) for name in kin):
+    if not isinstance(kin := hypothesis.structurally_equivalent, tuple | list) or not all(isinstance(name, str) for name in kin):
         raise InvalidInput(f"kin of {hypothesis.name!r}", got=repr(kin), expected='a tuple of names, ("obs.clock",)')
     if not callable(hypothesis.apply):
         raise InvalidInput(f"apply of {hypothesis.name!r}", got=repr(hypothesis.apply), expected="a function")
@@ -68,8 +68,8 @@ def _check_size(hypothesis: Hypothesis) -> None:
     if wrong or not math.isfinite(hypothesis.typical):
         expected = "another than 0" if hypothesis.signed else "a value > 0, or signed=True and one below"
         raise InvalidInput(f"typical of {hypothesis.name!r}", got=hypothesis.typical, expected=expected)
-    if not 0 < hypothesis.share < math.inf:
-        raise InvalidInput(f"share of {hypothesis.name!r}", got=hypothesis.share, expected="a value > 0, e.g. 0.4")
+    if not 0 < hypothesis.smallest_fraction < math.inf:
+        raise InvalidInput(f"share of {hypothesis.name!r}", got=hypothesis.smallest_fraction, expected="a value > 0, e.g. 0.4")
     if not 0 < hypothesis.step < math.inf:
         raise InvalidInput(f"step of {hypothesis.name!r}", got=hypothesis.step, expected="a value > 0, e.g. 0.1")
     ends = hypothesis.low, hypothesis.high

@@ -6,7 +6,7 @@ from functools import partial
 
 import torch
 
-from ...episodes.observed import Episode, eye_of
+from ...episodes.observed import Episode, find_depth_camera
 from ...episodes.replay import Frames
 from ...episodes.world import Hypothesis, World
 from ...identification.nuisances import Camera, Clock, Rim
@@ -29,22 +29,22 @@ def _depth(world: World, share: float = 0.0, offset: float = 0.0) -> World:
     """Along the rays of the one camera that an episode has; others stay as they are."""
 
     def view(frames: Frames, episode: Episode) -> Frames:
-        if episode.eye is None:
+        if episode.camera_position is None:
             return frames
-        ray = frames.x - episode.eye
+        ray = frames.x - episode.camera_position
         return frames._replace(x=frames.x + ray * (share + offset / ray.norm(dim=-1, keepdim=True)))
 
     return world.with_view(view)
 
 
 def _one_camera(recording: Recording) -> bool:
-    return eye_of(recording) is not None
+    return find_depth_camera(recording) is not None
 
 
 _CAMERA, _CLOCK, _RIM = Camera(), Clock(), Rim()
 HYPOTHESES = (
     *(
-        Hypothesis(f"obs.extrinsic[{axis}]", "m", 4e-3, partial(_see, _CAMERA, k, 6), signed=True, kin=("robot.base",))
+        Hypothesis(f"obs.extrinsic[{axis}]", "m", 4e-3, partial(_see, _CAMERA, k, 6), signed=True, structurally_equivalent=("robot.base",))
         for k, axis in enumerate(AXES)
     ),
     *(

@@ -27,7 +27,7 @@ def register_file(path: str | Path) -> list[Hypothesis]:
     """
     path = Path(path)
     if not path.is_file():
-        remedy = "correct the path; docs/diagnosis.md has an example"
+        remedy = "correct the path; docs/explanation/diagnosis.md has an example"
         raise InvalidInput("causes", got=f"no file {path}", expected=EXPECTED, remedy=remedy)
     before, beside = set(sys.modules), str(path.resolve().parent)
     sys.path.insert(0, beside)  # as Python has it for a script

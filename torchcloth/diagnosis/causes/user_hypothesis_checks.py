@@ -24,7 +24,7 @@ def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode
     """
     if not own:
         return
-    early = episodes[0].until(0.0)
+    early = episodes[0].first_fraction(0.0)
     plain = base.frames(early).x
     for hypothesis in own:
         with blamed(hypothesis):
@@ -35,7 +35,7 @@ def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode
             for k, episode in enumerate(episodes):
                 world.driven(episode)
                 if k:
-                    world.frames(episode.until(0.0))
+                    world.frames(episode.first_fraction(0.0))
             if not all(map(math.isfinite, moved)):
                 raise InvalidInput(
                     f"hypothesis {hypothesis.name!r}",

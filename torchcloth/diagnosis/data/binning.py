@@ -18,55 +18,55 @@ from ...episodes.replay import Frames
 from ...identification.residuals.blocks import BLOCKS
 from ...identification.residuals.rows import Rows, scene_of
 
-STRETCH = 0.2  # s
-WINDOWS = 1000  # of an episode, at most
-OUTLIER = 5.0  # robust standard deviations within a cell
-FEWEST = 3  # rows, of a cell of many
-NAMES = tuple(block.name for block in BLOCKS)
-SEEN = NAMES.index("force")  # kinds before it are positions
+BIN_SECONDS = 0.2  # s
+MAX_BINS = 1000  # of an episode, at most
+OUTLIER_ROBUST_STDS = 5.0  # robust standard deviations within a cell
+MIN_ROWS_PER_BIN = 3  # rows, of a cell of many
+BLOCK_NAMES = tuple(block.name for block in BLOCKS)
+FORCE_BLOCK = BLOCK_NAMES.index("force")  # kinds before it are positions
 
 
-class Cells(NamedTuple):
+class BinnedResiduals(NamedTuple):
     """Mean residuals of one episode, with derivatives along K directions."""
 
     value: Tensor  # [C] m, N or N m
     jacobian: Tensor  # [C, K], d residual / d direction
     count: Tensor  # [C] rows
-    spread: Tensor  # [C] standard deviation of a row within the cell
+    row_std: Tensor  # [C] standard deviation of a row within the cell
     block: Tensor  # [C] int64, kind of data
-    patch: Tensor  # [C] int64, three times the part of the fabric, piece of the rim or gripper, plus the axis
+    channel: Tensor  # [C] int64, three times the part of the fabric, piece of the rim or gripper, plus the axis
     window: Tensor  # [C] int64
-    place: Tensor  # [C, 3] m, where on the fabric at rest; zero where that makes no sense
+    rest_position: Tensor  # [C, 3] m, where on the fabric at rest; zero where that makes no sense
     time: Tensor  # [C] s
-    rough: Tensor  # [C] in the value's unit, see ``evidence.gather``; zero where nobody asked
-    ray: Tensor  # [C] -, d residual / d depth of the one camera; zero of what it does not see
+    roughness: Tensor  # [C] in the value's unit, see ``evidence.gather``; zero where nobody asked
+    depth_slope: Tensor  # [C] -, d residual / d depth of the one camera; zero of what it does not see
 
     @property
     def key(self) -> Tensor:
         """[C] the same for the same cell of another model."""
-        return (self.block * 10_000 + self.patch) * WINDOWS + self.window
+        return (self.block * 10_000 + self.channel) * MAX_BINS + self.window
 
-    def rows(self, index: Tensor | slice) -> Cells:
+    def select(self, index: Tensor | slice) -> BinnedResiduals:
         """Those cells alone, by a mask, numbers or a slice."""
-        return Cells(*(column[index] for column in self))
+        return BinnedResiduals(*(column[index] for column in self))
 
 
-class Piece(NamedTuple):
+class EpisodeEvidence(NamedTuple):
     """What one episode says."""
 
-    cells: Cells  # columns: the model's own, the hypotheses that could be simulated, nuisances
-    std: Tensor  # of the nuisances
-    numerics: Tensor  # [C]
-    able: Tensor  # [hypotheses] bool, could be simulated
+    bins: BinnedResiduals  # columns: the model's own, the hypotheses that could be simulated, nuisances
+    nuisance_stds: Tensor  # of the nuisances
+    mesh_difference: Tensor  # [C]
+    is_simulated: Tensor  # [hypotheses] bool, could be simulated
 
 
-def stretches(cells: Sequence[Cells]) -> Tensor:
+def time_blocks(cells: Sequence[BinnedResiduals]) -> Tensor:
     """[C] numbers that cells of one episode, kind of data and window share."""
     own = [torch.stack([torch.full_like(c.window, k), c.block, c.window], 1) for k, c in enumerate(cells)]
     return torch.cat(own).unique(dim=0, return_inverse=True)[1]
 
 
-def aligned(key: Tensor, other: Tensor, columns: Tensor) -> Tensor:
+def align_rows(key: Tensor, other: Tensor, columns: Tensor) -> Tensor:
     """Rows of ``columns`` [O, ...] of the cells ``other`` in the order of the cells ``key`` [C]; zero where missing."""
     if not len(other):
         return columns.new_zeros(len(key), *columns.shape[1:])
@@ -77,26 +77,26 @@ def aligned(key: Tensor, other: Tensor, columns: Tensor) -> Tensor:
     return found
 
 
-def mean_over(stretch: Tensor, values: Tensor) -> Tensor:
+def average_groups(stretch: Tensor, values: Tensor) -> Tensor:
     """[C] of values [C], over each cell's stretch."""
     count = torch.bincount(stretch)
     return (values.new_zeros(len(count)).index_add(0, stretch, values) / count)[stretch]
 
 
-def cells_of(frames: Frames, moved: Frames | None, episode: Episode, sheet: Sheet, rest: Tensor) -> Cells:
+def bin_residuals(frames: Frames, moved: Frames | None, episode: Episode, sheet: Sheet, rest: Tensor) -> BinnedResiduals:
     """Of one simulated episode; ``moved`` holds derivatives of the frames, ``rest`` [V, 3] m the pattern."""
     farther = _farther(frames, episode)
-    scene = scene_of(frames, farther if moved is None else joined(moved, farther), episode, sheet)
+    scene = scene_of(frames, farther if moved is None else concatenate_directions(moved, farther), episode, sheet)
     parts = []
     for b, block in enumerate(BLOCKS):
         rows = block.rows(scene)
         rows = None if rows is None else _shown(block.name, rows)
         if rows is not None and len(rows.value):
             parts.append(_averaged(_grouped(block.name, rows, episode, sheet), b, episode, sheet, rest))
-    return Cells(*(torch.cat(column) for column in zip(*parts, strict=True)))
+    return BinnedResiduals(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
-def directions(base: Frames, shifted: Sequence[Frames], steps: Sequence[float]) -> Frames:
+def finite_differences(base: Frames, shifted: Sequence[Frames], steps: Sequence[float]) -> Frames:
     """Finite differences of frames along K directions."""
 
     def slope(field):
@@ -106,7 +106,7 @@ def directions(base: Frames, shifted: Sequence[Frames], steps: Sequence[float]) 
     return Frames(slope(lambda f: f.x), slope(lambda f: f.v), wrench, slope(lambda f: f.edge))
 
 
-def joined(a: Frames, b: Frames) -> Frames:
+def concatenate_directions(a: Frames, b: Frames) -> Frames:
     """Directions of both."""
     wrench = {name: torch.cat([a.wrench[name], b.wrench[name]]) for name in a.wrench}
     return Frames(torch.cat([a.x, b.x]), torch.cat([a.v, b.v]), wrench, torch.cat([a.edge, b.edge]))
@@ -115,8 +115,8 @@ def joined(a: Frames, b: Frames) -> Frames:
 def _farther(frames: Frames, episode: Episode) -> Frames:
     """The direction [1, ...] away from the one camera that an episode has."""
     x = torch.zeros_like(frames.x)
-    if episode.eye is not None:
-        x = torch.nn.functional.normalize(frames.x - episode.eye, dim=-1)
+    if episode.camera_position is not None:
+        x = torch.nn.functional.normalize(frames.x - episode.camera_position, dim=-1)
     still = {name: torch.zeros_like(w)[None] for name, w in frames.wrench.items()}
     return Frames(x[None], torch.zeros_like(frames.v)[None], still, torch.zeros_like(frames.edge)[None])
 
@@ -133,44 +133,44 @@ def _shown(name: str, rows: Rows) -> Rows:
 def _grouped(name: str, rows: Rows, episode: Episode, sheet: Sheet) -> Rows:
     """Rows whose patches tell axes apart; single markers join the part of the fabric that they are on."""
     patch = rows.patch
-    if name == "markers" and episode.places is not None:
-        own = sheet.patches_on(episode.places.corners, episode.places.weights)
+    if name == "markers" and episode.marker_places is not None:
+        own = sheet.patches_on(episode.marker_places.corners, episode.marker_places.weights)
         patch = 3 * own[rows.patch // 3] + rows.patch % 3
     elif name in ("points", "edges"):
         patch = 3 * rows.patch
     return rows._replace(patch=patch)
 
 
-def _averaged(rows: Rows, block: int, episode: Episode, sheet: Sheet, rest: Tensor) -> Cells:
-    place = _places(NAMES[block], sheet, rest)[rows.patch // 3]
+def _averaged(rows: Rows, block: int, episode: Episode, sheet: Sheet, rest: Tensor) -> BinnedResiduals:
+    place = _places(BLOCK_NAMES[block], sheet, rest)[rows.patch // 3]
     times = episode.times.to(rows.value)
-    window = ((times - times[0]) / STRETCH + 1e-6).floor().long()[rows.frame]  # stamps are rounded
-    group, index = torch.unique(rows.patch * WINDOWS + window, return_inverse=True)
+    window = ((times - times[0]) / BIN_SECONDS + 1e-6).floor().long()[rows.frame]  # stamps are rounded
+    group, index = torch.unique(rows.patch * MAX_BINS + window, return_inverse=True)
     size = len(group)
     add = lambda v: torch.zeros(size, *v.shape[1:], dtype=v.dtype).index_add(0, index, v)  # noqa: E731
     kept = _inliers(rows.value, index, size).to(rows.value)
     count = add(kept)
     usual = int(add(torch.ones_like(kept)).median())  # slow streams have few rows in a window, and no strays to spot
-    least = FEWEST if usual > FEWEST else max(1, min(usual, FEWEST - 1))
+    least = MIN_ROWS_PER_BIN if usual > MIN_ROWS_PER_BIN else max(1, min(usual, MIN_ROWS_PER_BIN - 1))
     share = kept / count.clamp(min=1.0)[index]
     mean = add(share * rows.value)
     spread = add(share * (rows.value - mean[index]) ** 2).sqrt()
     slopes = add(share[:, None] * rows.jacobian)  # type: ignore[operator]
-    ray = torch.zeros_like(mean) if NAMES[block] == "markers" else slopes[:, -1]  # these may have cameras of their own
-    found = Cells(
+    ray = torch.zeros_like(mean) if BLOCK_NAMES[block] == "markers" else slopes[:, -1]  # these may have cameras of their own
+    found = BinnedResiduals(
         mean,
         slopes[:, :-1],
         count,
         spread,
         torch.full((size,), block),
-        group // WINDOWS,
-        group % WINDOWS,
+        group // MAX_BINS,
+        group % MAX_BINS,
         add(share[:, None] * place),
         add(share * times[rows.frame]),
         torch.zeros_like(mean),
         ray,
     )
-    return found.rows(count >= least)
+    return found.select(count >= least)
 
 
 def _inliers(value: Tensor, index: Tensor, size: int) -> Tensor:
@@ -184,7 +184,7 @@ def _inliers(value: Tensor, index: Tensor, size: int) -> Tensor:
     again = torch.argsort(off)
     again = again[torch.argsort(index[again], stable=True)]
     usual = 1.4826 * middle(off[again]).clamp(min=1e-9)
-    return off <= OUTLIER * usual[index]
+    return off <= OUTLIER_ROBUST_STDS * usual[index]
 
 
 def _places(name: str, sheet: Sheet, rest: Tensor) -> Tensor:

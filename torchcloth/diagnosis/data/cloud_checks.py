@@ -12,11 +12,11 @@ from scipy.optimize import linear_sum_assignment
 
 from ...boundaries import Grasp
 from ...cloth import Cloth
-from ...episodes.observed import cloth_from, first_shape
+from ...episodes.observed import build_cloth, compute_initial_vertices
 from ...losses import closest
 from ...recordings import Recording, size_checks
 from ...robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ...robots.paths import Path, holding  # pyright: ignore[reportMissingImports]
+from ...robots.paths import GripperPath, holding_paths  # pyright: ignore[reportMissingImports]
 from ...types import Trajectory
 
 FAR = 0.1  # m, of the first points from the first shape, half of them
@@ -28,7 +28,7 @@ NEAREST = 5  # points, whose mean distance from a gripper is looked at
 FIRST = 3  # frames
 
 
-class Seen:
+class CheckedEpisode:
     """One episode as the checks look at it."""
 
     def __init__(self, recording: Recording) -> None:
@@ -36,17 +36,17 @@ class Seen:
         stream = recording.points if recording.points is not None else recording.markers
         self.t = np.zeros(0) if stream is None else stream.t + recording.clock_offset
         self.clouds = size_checks.seen(recording)
-        self.paths: dict[str, Path] = holding(recording)
+        self.paths: dict[str, GripperPath] = holding_paths(recording)
 
     @cached_property
     def cloth(self) -> Cloth:
         """As the episode describes it."""
-        return cloth_from(self.recording)
+        return build_cloth(self.recording)
 
     @cached_property
     def first(self) -> torch.Tensor:
         """[V, 3] m, first shape."""
-        return first_shape("episode", self.cloth, self.recording).double()
+        return compute_initial_vertices("episode", self.cloth, self.recording).double()
 
     @cached_property
     def length(self) -> float:
@@ -99,13 +99,13 @@ def _nearest(cloud: np.ndarray, at: np.ndarray) -> np.ndarray:
     return away[:, :NEAREST].mean(1)
 
 
-def units(seen: Seen) -> Iterator[tuple[str, str]]:
+def check_units(seen: CheckedEpisode) -> Iterator[tuple[str, str]]:
     """A cloud that no cloth of this size could show."""
     if (found := size_checks.other_unit(size_checks.full(seen.clouds), seen.length)) is not None:
         yield found
 
 
-def places(seen: Seen) -> Iterator[tuple[str, str]]:
+def check_positions(seen: CheckedEpisode) -> Iterator[tuple[str, str]]:
     """Grippers, cloth and cloud that are not where each other says."""
     yield from _swapped(seen)
     if not any(len(c) for c in seen.clouds[:FIRST]):
@@ -135,7 +135,7 @@ def _beyond(cloud: np.ndarray, at: np.ndarray, reach: float) -> float:
     return float((np.linalg.norm(cloud[:, None] - at, axis=-1) > reach).any(1).mean())
 
 
-def _swapped(seen: Seen) -> Iterator[tuple[str, str]]:
+def _swapped(seen: CheckedEpisode) -> Iterator[tuple[str, str]]:
     held = {name: part.index for name, part in seen.cloth.boundaries.items() if isinstance(part, Grasp)}
     names = [name for name in held if name in seen.paths]
     if len(names) < 2:
@@ -166,13 +166,13 @@ class Mirror(NamedTuple):
         return [(c - self.place) @ self.turn.T + self.place for c in clouds]
 
 
-def _least(seen: Seen, measure: Callable[[list[np.ndarray]], float], mirrors: Iterable[Mirror]) -> tuple[str, float]:
+def _least(seen: CheckedEpisode, measure: Callable[[list[np.ndarray]], float], mirrors: Iterable[Mirror]) -> tuple[str, float]:
     """The mirror that leaves least of a measure [m], and what it leaves."""
     left = ((m.how, measure(m.of(seen.clouds))) for m in mirrors)
     return min(left, key=lambda pair: pair[1], default=("", np.inf))
 
 
-def _mirrors(seen: Seen) -> Iterator[Mirror]:
+def _mirrors(seen: CheckedEpisode) -> Iterator[Mirror]:
     """Planes through the origin, the cloud and the cameras."""
     middle = np.concatenate(seen.clouds[:FIRST]).mean(0)
     frames = [("", np.eye(4)), ("", _at(middle))]
@@ -194,7 +194,7 @@ def _at(place: np.ndarray) -> np.ndarray:
     return pose
 
 
-def handed(seen: Seen) -> Iterator[tuple[str, str]]:
+def check_handedness(seen: CheckedEpisode) -> Iterator[tuple[str, str]]:
     """A symmetric cloth looks the same in a mirror, but does not follow its grippers there.
 
     Where a bar hides what is near a gripper, a sound cloud seems not to follow it either: only mirrors that would turn

@@ -18,7 +18,7 @@ from ...recordings import Recording, checks, read
 from ...recordings.consistency import name_of, same_cloth
 from ...recordings.reading import EPISODE
 from ...recordings.timing import SLOWEST, times
-from .cloud_checks import Seen, handed, places, units
+from .cloud_checks import CheckedEpisode, check_handedness, check_positions, check_units
 
 JUMP, LEAST_JUMP = 8.0, 0.2  # usual intervals and s: a longer one is no dropped frame any more
 TICKS, EVEN, BEAT = 8, 0.05, 0.15  # frames to either side that tick evenly; usual intervals, of a tick and of a jump
@@ -45,7 +45,7 @@ class Fault:
         return f"{self.episode}: {self.what}; {self.remedy}"
 
 
-def check(recordings: Sequence[Recording]) -> list[Fault]:
+def check_episodes(recordings: Sequence[Recording]) -> list[Fault]:
     """What makes these episodes unusable; empty where nothing does.
 
     Raises:
@@ -86,8 +86,8 @@ def _faults(recording: Recording) -> Iterator[tuple[str, str]]:
     try:
         yield from (found := list(_stamps(recording)))
         if not found:
-            seen = Seen(recording)
-            yield from next((found for kind in (_overlap, units, places, handed) if (found := list(kind(seen)))), [])
+            seen = CheckedEpisode(recording)
+            yield from next((found for kind in (_overlap, check_units, check_positions, check_handedness) if (found := list(kind(seen)))), [])
     except RecordingError as error:
         yield str(error), "repair or repeat the recording"
 
@@ -105,7 +105,7 @@ def _stamps(recording: Recording) -> Iterator[tuple[str, str]]:
         if usual > SLOWEST:
             yield (
                 f"{name} come every {usual:.3g} s: no cloth stays in a motion for so long",
-                "stamps are seconds: divide those in milliseconds by 1000 (docs/episode.md)",
+                "stamps are seconds: divide those in milliseconds by 1000 (docs/reference/episode.md)",
             )
             continue
         jump = _set_clock(t, usual)
@@ -154,7 +154,7 @@ def _set_clock(t: np.ndarray, usual: float) -> int | None:
     return None
 
 
-def _overlap(seen: Seen) -> Iterator[tuple[str, str]]:
+def _overlap(seen: CheckedEpisode) -> Iterator[tuple[str, str]]:
     if not seen.paths or not len(seen.t):
         return
     start, end = max(p.t[0] for p in seen.paths.values()), min(p.t[-1] for p in seen.paths.values())

@@ -14,7 +14,7 @@ from ...identification.uncertainty.richardson import finer_cloth, finer_recordin
 from ...recordings import Recording
 
 
-def refined(model: Model, recordings: Sequence[Recording]) -> tuple[Model, list[Recording]]:
+def refine_model(model: Model, recordings: Sequence[Recording]) -> tuple[Model, list[Recording]]:
     """(model, recordings) with every triangle divided into four."""
     coarse = model.base.cloth
     cloth = finer_cloth(coarse)

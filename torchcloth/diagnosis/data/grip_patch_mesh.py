@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ...boundaries import Grasp
 from ...episodes.observed import Episode
-from ...episodes.pattern_interpolation import between, carried
+from ...episodes.pattern_interpolation import interpolation_weights, interpolate_on_pattern
 from ...episodes.replay import Frames
 from ...episodes.world import World, rebuilt
 from ...errors import InvalidInput
@@ -27,7 +27,7 @@ TAPER = 1.0  # radii, over which the pattern around a patch makes room for it: f
 SQUEEZED = 0.1  # of a triangle's area, the least that may be left
 
 
-def regripped(world: World, wider: float = 0.0, along: float = 0.0) -> World:
+def move_grip_patches(world: World, wider: float = 0.0, along: float = 0.0) -> World:
     """Patches that end ``wider`` [m] farther out and lie ``along`` [m] further along u, where their place is known.
 
     Raises:
@@ -36,15 +36,15 @@ def regripped(world: World, wider: float = 0.0, along: float = 0.0) -> World:
     before, parts, patches = world.cloth.mesh, {}, []
     for name, part in world.cloth.boundaries.items():
         if isinstance(part, Grasp) and part.uv is not None:
-            parts[name] = part.moved(wider, along)
+            parts[name] = part.shifted(wider, along)
             patches.append(Patch(part.uv, part.radius))
     if before.uv is None or not patches:
         return world
     uv = _stretched(before, before.uv, patches, wider, along)
-    there = between(before, uv)
-    vertices = carried(there, torch.as_tensor(before.vertices)).numpy()
+    there = interpolation_weights(before, uv)
+    vertices = interpolate_on_pattern(there, torch.as_tensor(before.vertices)).numpy()
     mesh = Mesh.build(vertices, before.faces, uv, before.places)
-    back = between(mesh, before.uv)
+    back = interpolation_weights(mesh, before.uv)
     cloth = rebuilt(world.cloth, {}, None, parts, mesh)
     motion = lambda e: _begun(e, there)  # noqa: E731
     view = lambda frames, _: _seen(frames, back)  # noqa: E731
@@ -52,11 +52,11 @@ def regripped(world: World, wider: float = 0.0, along: float = 0.0) -> World:
 
 
 def _begun(episode: Episode, there: Tensor) -> Episode:
-    return replace(episode, initial=carried(there, episode.initial))
+    return replace(episode, initial=interpolate_on_pattern(there, episode.initial))
 
 
 def _seen(frames: Frames, back: Tensor) -> Frames:
-    return frames._replace(x=carried(back, frames.x), v=carried(back, frames.v))
+    return frames._replace(x=interpolate_on_pattern(back, frames.x), v=interpolate_on_pattern(back, frames.v))
 
 
 def _stretched(mesh: Mesh, uv: np.ndarray, patches: list[Patch], wider: float, along: float) -> np.ndarray:

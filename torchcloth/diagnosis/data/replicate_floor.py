@@ -13,24 +13,24 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...boundaries.motion import interpolate
+from ...boundaries.motion import interpolate_poses
 from ...episodes.observed import Episode
 from ...identification.uncertainty.replicates import keys_of
 from ...recordings import Recording
-from ..inference.comparison import Predicted
-from .binning import aligned
+from ..inference.comparison import HeldOutPrediction
+from .binning import align_rows
 
 SAME, TURNED = 0.01, 0.1  # m and rad, within which two grippers follow one command
 
 
-class Repeats(NamedTuple):
+class ReplicateFloor(NamedTuple):
     """The floor that repetitions show."""
 
     pairs: int  # of episodes
     rms: float  # m, of a position cell of one episode
 
 
-def pairs_of(recordings: Sequence[Recording], episodes: Sequence[Episode]) -> list[tuple[int, int]]:
+def find_replicate_pairs(recordings: Sequence[Recording], episodes: Sequence[Episode]) -> list[tuple[int, int]]:
     """Episodes that repeat each other: they say so or have one motion, and grippers go the same way, if any do."""
     keys = keys_of(recordings)
     every = combinations(range(len(keys)), 2)
@@ -45,7 +45,7 @@ def _alike(a: Episode, b: Episode) -> bool:
     since = torch.linspace(0.0, span, 50, dtype=a.times.dtype)
 
     def poses(e: Episode) -> Tensor:
-        return torch.stack([interpolate(e.motion[name], float(e.times[0]) + since) for name in a.motion])
+        return torch.stack([interpolate_poses(e.motion[name], float(e.times[0]) + since) for name in a.motion])
 
     one, two = poses(a), poses(b)
     apart = (one[..., :3, 3] - one[:1, :1, :3, 3]) - (two[..., :3, 3] - two[:1, :1, :3, 3])
@@ -53,13 +53,13 @@ def _alike(a: Episode, b: Episode) -> bool:
     return float(apart.norm(dim=-1).max()) < SAME and float(turned.max()) < TURNED
 
 
-def repeats(predicted: Predicted, pairs: Sequence[tuple[int, int]]) -> Repeats | None:
+def estimate_replicate_floor(predicted: HeldOutPrediction, pairs: Sequence[tuple[int, int]]) -> ReplicateFloor | None:
     """The floor from residuals of one model; None without pairs that share cells."""
     squares = []
     for i, k in pairs:
         one, two = predicted.episode == i, predicted.episode == k
-        both = torch.isin(predicted.key[one], predicted.key[two]) & predicted.seen[one]
-        key, value = predicted.key[one][both], predicted.value[one][both]
-        squares.append((value - aligned(key, predicted.key[two], predicted.value[two])).square() / 2)
-    square = torch.cat(squares) if squares else predicted.value[:0]
-    return Repeats(sum(len(own) > 0 for own in squares), float(square.mean().sqrt())) if len(square) else None
+        both = torch.isin(predicted.key[one], predicted.key[two]) & predicted.is_position[one]
+        key, value = predicted.key[one][both], predicted.residual[one][both]
+        squares.append((value - align_rows(key, predicted.key[two], predicted.residual[two])).square() / 2)
+    square = torch.cat(squares) if squares else predicted.residual[:0]
+    return ReplicateFloor(sum(len(own) > 0 for own in squares), float(square.mean().sqrt())) if len(square) else None

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 
 from ...episodes.world import Hypothesis, Model
 from ...episodes.world_cache import IMPOSSIBLE
-from ..data.dataset import Progress, Setting, staged
-from ..inference.comparison import Gain, Predicted, by_motion, compare, heard, predict, spread, telling
-from ..inference.fitting import Fitted, fit, renoised, with_cause
-from ..inference.linearise import Evidence, shared
-from ..inference.noise import Noise, fit_noise, to_fit_by
-from ..inference.permutation_test import Placebo, placebo
-from ..inference.screening import MUCH, PRESENT, Row
+from ..data.dataset import Progress, DiagnosisData, prefix_progress
+from ..inference.comparison import Gain, HeldOutPrediction, compare_by_motion, compare, list_observed_motions, predict_held_out, jackknife, find_sole_informative_motion
+from ..inference.fitting import ModelFit, fit, reweight_by_noise, add_cause
+from ..inference.linearise import Linearisation, restrict_to_common_bins
+from ..inference.noise import Noise, fit_noise, cap_noise
+from ..inference.permutation_test import PermutationTest, run_permutation_test
+from ..inference.screening import MUCH, PRESENT, ScoreTest
 
 TRIED = 4  # hypotheses that are fitted at each step
 FURTHER = 3  # steps of the likelier ones among them
@@ -46,55 +46,55 @@ WORTH_MM, WORTH_PULL = 3e-4, 5e-3  # m or N, RMS of what is gone from one episod
 class Candidate:
     """A hypothesis that was fitted."""
 
-    row: Row  # as screened
-    fitted: Fitted
-    predicted: Predicted
+    score: ScoreTest  # as screened
+    fit: ModelFit
+    prediction: HeldOutPrediction
     gain: Gain  # over the model without it
-    alone: set[str]  # the motion that alone tells of it, if any
-    sure: float  # standard errors between motions that it must be away from zero
-    disturbs: bool = False  # where one motion alone tells of it: positions of another are predicted worse
-    contradicted: bool = False  # likewise, and that motion is clearly less likely
-    relieves: bool = False  # a fitted number that had left its data sheet is back with it
-    bent: float = 0.0  # prior standard deviations, by which its twin had left the data sheet without it
+    sole_informative_motion: set[str]  # the motion that alone tells of it, if any
+    t_threshold: float  # standard errors between motions that it must be away from zero
+    worsens_another_motion: bool = False  # where one motion alone tells of it: positions of another are predicted worse
+    is_contradicted: bool = False  # likewise, and that motion is clearly less likely
+    restores_prior: bool = False  # a fitted number that had left its data sheet is back with it
+    prior_shift: float = 0.0  # prior standard deviations, by which its twin had left the data sheet without it
 
     @property
     def hypothesis(self) -> Hypothesis:
         """What was added."""
-        return self.row.hypothesis
+        return self.score.hypothesis
 
     @property
     def amplitude(self) -> float:
         """Of what was added."""
-        return self.fitted.model.amplitudes[self.fitted.model.place(self.hypothesis.name)]
+        return self.fit.model.amplitudes[self.fit.model.place(self.hypothesis.name)]
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class AcceptedCause:
     """One accepted cause with what cannot be told from it."""
 
-    best: Candidate
-    placebo: Placebo  # that it passed
+    candidate: Candidate
+    permutation_test: PermutationTest  # that it passed
     tried: list[Candidate]  # best among them
     rivals: list[Candidate]
-    screened: list[Row]
-    before: Fitted  # the model without it, with slopes along everything that was asked about
+    scores: list[ScoreTest]
+    fit_before: ModelFit  # the model without it, with slopes along everything that was asked about
     noise: Noise  # by which they were compared
 
-    def instead(self, name: str) -> Step | None:
+    def replaced_by(self, name: str) -> AcceptedCause | None:
         """With another of the causes that were tried; None: it was not."""
         best = next((c for c in self.tried if c.hypothesis.name == name), None)
         if best is None:
             return None
-        others = [c for c in self.rivals if c is not best and c.hypothesis.brings != name]
+        others = [c for c in self.rivals if c is not best and c.hypothesis.implies != name]
         return replace(self, best=best, rivals=others)
 
 
-def alone_in(steps: Sequence[Step]) -> set[str]:
+def sole_informative_motions(steps: Sequence[AcceptedCause]) -> set[str]:
     """Motions that alone tell of one of the causes."""
-    return {name for step in steps for name in step.best.alone}
+    return {name for step in steps for name in step.candidate.sole_informative_motion}
 
 
-def _likely(screened: Sequence[Row]) -> list[Row]:
+def _likely(screened: Sequence[ScoreTest]) -> list[ScoreTest]:
     """What is present by slopes, or asks for so much that it would show and would matter or gain much.
 
     A typical amplitude need not show then. And a large effect bends the fitted parameters so far that slopes
@@ -102,22 +102,22 @@ def _likely(screened: Sequence[Row]) -> list[Row]:
     """
     asks = lambda r: r.worth > VERY_MUCH or (r.shows and (r.worth > MUCH or r.excess > PRESENT))  # noqa: E731
     likely = [r for r in screened if r.decision == "present" or asks(r)]
-    return sorted(likely, key=lambda r: -r.worth)
+    return sorted(likely, key=lambda r: -r.expected_gain)
 
 
-def begun_with(found: Fitted, screened: Sequence[Row], tried: int, after: int = 0) -> list[tuple[Row, Model]]:
+def propose_candidates(found: ModelFit, screened: Sequence[ScoreTest], tried: int, after: int = 0) -> list[tuple[ScoreTest, Model]]:
     """The likeliest causes ``after`` so many, each with the model to which one leap leads."""
-    return [(row, with_cause(found, row.hypothesis)) for row in _likely(screened)[after : after + tried]]
+    return [(row, add_cause(found, row.hypothesis)) for row in _likely(screened)[after : after + tried]]
 
 
-def one_step(
-    current: Fitted,
-    setting: Setting,
-    begun: Sequence[tuple[Row, Model]],
-    screened: list[Row],
+def evaluate_candidates(
+    current: ModelFit,
+    setting: DiagnosisData,
+    begun: Sequence[tuple[ScoreTest, Model]],
+    screened: list[ScoreTest],
     progress: Progress,
-    more: Sequence[tuple[Row, Model]] = (),
-) -> Step | None:
+    more: Sequence[tuple[ScoreTest, Model]] = (),
+) -> AcceptedCause | None:
     """The best of what was ``begun`` that is worth its name, with what cannot be told from it; None: nothing is.
 
     Where what predicts best is larger than is believed, what looks like it may be among the next likely ones.
@@ -133,41 +133,41 @@ def one_step(
     likely = _tried(current, setting, begun, progress)
     if not likely:
         return None
-    if more and not _plausible(max(likely, key=lambda c: c.gain.density)):
+    if more and not _plausible(max(likely, key=lambda c: c.gain.log_density)):
         likely += _tried(current, setting, more, progress)
-    likeliest = max(likely, key=lambda c: c.gain.density).fitted.evidence
+    likeliest = max(likely, key=lambda c: c.gain.log_density).fit.linearisation
     # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
-    fits = [(c.row, c.fitted) for c in likely]
+    fits = [(c.score, c.fit) for c in likely]
     noise, like = fit_noise(likeliest), _common(likeliest, current, fits)
-    tried = _compared(current, fits, setting.names, noise, like)
-    useful = _ranked(_themselves([c for c in tried if _useful(c, setting.names)]))
+    tried = _compare_held_out(current, fits, setting.motions, noise, like)
+    useful = _ranked(_themselves([c for c in tried if _useful(c, setting.motions)]))
     others = [c for c in tried if c not in useful]
-    beside = lambda c: placebo(renoised(c.fitted, noise, like), setting.names, c.alone)  # noqa: E731
+    beside = lambda c: run_permutation_test(reweight_by_noise(c.fitted, noise, like), setting.motions, c.alone)  # noqa: E731
     chance = None
-    while useful and not (chance := beside(useful[0])).passed:
+    while useful and not (chance := beside(useful[0])).is_passed:
         others, useful = [*others, useful[0]], useful[1:]
     if not useful or chance is None:
         return None
     best = useful[0]
-    alike = lambda c: predict(renoised(c.fitted, noise, like), setting.names, best.alone)  # noqa: E731
-    possible = [*useful, *(c for c in others if worth_naming(c, c.gain) and _agreed(c, setting.names))]
+    alike = lambda c: predict_held_out(reweight_by_noise(c.fitted, noise, like), setting.motions, best.sole_informative_motion)  # noqa: E731
+    possible = [*useful, *(c for c in others if worth_naming(c, c.gain) and _agreed(c, setting.motions))]
     rivals = {c.hypothesis.name: c for c in reversed(possible) if c is not best and _rival(c, alike(c), best)}
     rivals |= {c.hypothesis.name: c for c in others if _open(c, alike(c), best)}
-    return Step(best, chance, tried, [*reversed(rivals.values())], screened, current, noise)
+    return AcceptedCause(best, chance, tried, [*reversed(rivals.values())], screened, current, noise)
 
 
 def _tried(
-    current: Fitted, setting: Setting, begun: Sequence[tuple[Row, Model]], progress: Progress
+    current: ModelFit, setting: DiagnosisData, begun: Sequence[tuple[ScoreTest, Model]], progress: Progress
 ) -> list[Candidate]:
     """What was begun, fitted as far as that leads, beside the model without it; less what cannot be simulated."""
-    fits: list[tuple[Row, Fitted]] = []
-    by = to_fit_by(current.noise)
+    fits: list[tuple[ScoreTest, ModelFit]] = []
+    by = cap_noise(current.noise)
     for row, model in begun:
-        trial = staged(progress, f"trying {row.hypothesis.name}")
+        trial = prefix_progress(progress, f"trying {row.hypothesis.name}")
         with suppress(*IMPOSSIBLE):
-            fits.append((row, fit(model, setting, (), 0, trial, by, current.evidence)))
-    judged = lambda fits, every: _compared(  # noqa: E731
-        current, fits, setting.names, current.noise, _common(current.evidence, current, every)
+            fits.append((row, fit(model, setting, (), 0, trial, by, current.linearisation)))
+    judged = lambda fits, every: _compare_held_out(  # noqa: E731
+        current, fits, setting.motions, current.noise, _common(current.linearisation, current, every)
     )
     likely = judged(fits, fits)
     settled = _settled(likely, setting, progress)
@@ -178,49 +178,49 @@ def _tried(
     return likely
 
 
-def _common(like: Evidence, current: Fitted, fits: Sequence[tuple[Row, Fitted]]) -> Evidence:
+def _common(like: Linearisation, current: ModelFit, fits: Sequence[tuple[ScoreTest, ModelFit]]) -> Linearisation:
     """On the cells that all of these have."""
-    return shared(like, [current.evidence, *(f.evidence for _, f in fits)])
+    return restrict_to_common_bins(like, [current.linearisation, *(f.linearisation for _, f in fits)])
 
 
-def _settled(tried: list[Candidate], setting: Setting, progress: Progress) -> dict[int, tuple[Row, Fitted]]:
+def _settled(tried: list[Candidate], setting: DiagnosisData, progress: Progress) -> dict[int, tuple[ScoreTest, ModelFit]]:
     """The likelier ones, by number, where further steps lead: one step does for small effects only.
 
     Likely is what predicts well or still has far to go: a large effect that is half fitted predicts nothing.
     """
-    hope = [c.gain.density + c.fitted.ahead for c in tried]
+    hope = [c.gain.log_density + c.fit.expected_gain for c in tried]
     out = {}
     for k, (c, expected) in enumerate(zip(tried, hope, strict=True)):
-        found = c.fitted
-        if expected > max(0.0, 0.5 * max(hope)) and found.ahead > CLEAR:
-            further = staged(progress, f"trying {c.hypothesis.name} further")
-            found = fit(found.model, setting, (), FURTHER, further, found.noise, found.evidence, found.evidence)
-            out[k] = (c.row, found)
+        found = c.fit
+        if expected > max(0.0, 0.5 * max(hope)) and found.expected_gain > CLEAR:
+            further = prefix_progress(progress, f"trying {c.hypothesis.name} further")
+            found = fit(found.model, setting, (), FURTHER, further, found.noise, found.linearisation, found.linearisation)
+            out[k] = (c.score, found)
     return out
 
 
 def _better(before: Candidate, after: Candidate) -> Candidate:
     """Further steps, unless they predict clearly worse; what has ended at nothing was no fit of the cause."""
-    worse = after.gain.density < before.gain.density - HARDLY * abs(before.gain.density)
+    worse = after.gain.log_density < before.gain.log_density - HARDLY * abs(before.gain.log_density)
     return before if worse and (before.amplitude or not after.amplitude) else after
 
 
-def _compared(
-    current: Fitted, fits: list[tuple[Row, Fitted]], names: list[str], noise: Noise, like: Evidence
+def _compare_held_out(
+    current: ModelFit, fits: list[tuple[ScoreTest, ModelFit]], names: list[str], noise: Noise, like: Linearisation
 ) -> list[Candidate]:
     """Each fit beside the model without it, on motions held out; all by one noise, on the cells of ``like``."""
-    before, out = renoised(current, noise, like), []
+    before, out = reweight_by_noise(current, noise, like), []
     strained = {p.name for p, _ in current.model.strained}
     for row, found in fits:
-        after = renoised(found, noise, like)
-        alone = telling(after, names)
-        first, predicted = (predict(f, names, alone) for f in (before, after))
+        after = reweight_by_noise(found, noise, like)
+        alone = find_sole_informative_motion(after, names)
+        first, predicted = (predict_held_out(f, names, alone) for f in (before, after))
         gain = compare(first, predicted, 0.0)
         worse = _disturbed(first, predicted, names, alone) if alone else []
-        contradicted = any(motion.density < -CLEAR for motion in worse)
-        sure = standard_errors(gain, heard(predicted.episode, names), alone, not current.model.accepted)
+        contradicted = any(motion.log_density < -CLEAR for motion in worse)
+        sure = standard_errors(gain, list_observed_motions(predicted.episode, names), alone, not current.model.accepted)
         relieves = bool(strained - {p.name for p, _ in found.model.strained})
-        bent = _bent(current.model, row.hypothesis.twin)
+        bent = _bent(current.model, row.hypothesis.equivalent_parameter)
         out.append(Candidate(row, found, predicted, gain, alone, sure, bool(worse), contradicted, relieves, bent))
     return out
 
@@ -231,10 +231,10 @@ def _bent(model: Model, twin: str) -> float:
     return max((abs(c) / p.std for p, c in away if p.name == twin), default=0.0)
 
 
-def _disturbed(first: Predicted, second: Predicted, names: Sequence[str], alone: set[str]) -> list[Gain]:
+def _disturbed(first: HeldOutPrediction, second: HeldOutPrediction, names: Sequence[str], alone: set[str]) -> list[Gain]:
     """Of the other motions, those whose positions are predicted worse."""
-    motions = by_motion(first, second, 0.0, names).items()
-    return [m for name, m in motions if name not in alone and m.after > (1 + DISTURBED) * m.before]
+    motions = compare_by_motion(first, second, 0.0, names).items()
+    return [m for name, m in motions if name not in alone and m.rms_after > (1 + DISTURBED) * m.rms_before]
 
 
 def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bool) -> float:
@@ -244,7 +244,7 @@ def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bo
     """
     # Of what mends that much of all that is wrong in motions it was not fitted to, predictions have said that it is
     # there; real motions may then differ about its size. Two motions differ once, which tells nothing.
-    if first and len(set(names)) >= FEWEST and gain.before**2 - gain.after**2 > MUCH_OF_ALL * gain.before**2:
+    if first and len(set(names)) >= FEWEST and gain.rms_before**2 - gain.rms_after**2 > MUCH_OF_ALL * gain.rms_before**2:
         return NORMAL
     return between_motions(names, alone, SURE if first else SURE_OF_BEST)
 
@@ -258,14 +258,14 @@ def between_motions(names: Sequence[str], alone: Collection[str] = (), table: Se
     return table[min(count - 2, len(table) - 1)] if count > 1 else math.inf
 
 
-def _open(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
+def _open(c: Candidate, predicted: HeldOutPrediction, best: Candidate) -> bool:
     """Predicts clearly better, though motions do not agree how large it is: the best of the others is not the cause."""
     h = c.hypothesis
-    stands_in = bool(h.brings) and not h.matters(c.amplitude)
+    stands_in = bool(h.implies) and not h.is_relevant(c.amplitude)
     if h.effect == best.hypothesis.effect or stands_in or not (worth_naming(c, c.gain) and _plausible(c, POSSIBLE)):
         return False
-    over = compare(predicted, best.predicted, 0.0)
-    return over.density < -CLEAR and over.ci95[1] < 0
+    over = compare(predicted, best.prediction, 0.0)
+    return over.log_density < -CLEAR and over.log_density_ci95[1] < 0
 
 
 def _plausible(c: Candidate, most: float = PLAUSIBLE) -> bool:
@@ -274,9 +274,9 @@ def _plausible(c: Candidate, most: float = PLAUSIBLE) -> bool:
 
 def _useful(c: Candidate, names: Sequence[str]) -> bool:
     """What one motion alone tells has predicted no other one: it must surely gain what nulls' causes do not."""
-    few = len(set(heard(c.predicted.episode, names))) < FEWEST
-    sure = not c.alone or c.gain.least > (SURELY_OF_FEW if few else SURELY)
-    return sure and worth_naming(c, c.gain) and known(c.fitted, c.hypothesis.name, names, c)
+    few = len(set(list_observed_motions(c.prediction.episode, names))) < FEWEST
+    sure = not c.sole_informative_motion or c.gain.lower_bound_95 > (SURELY_OF_FEW if few else SURELY)
+    return sure and worth_naming(c, c.gain) and known(c.fit, c.hypothesis.name, names, c)
 
 
 def _agreed(c: Candidate, names: Sequence[str]) -> bool:
@@ -285,10 +285,10 @@ def _agreed(c: Candidate, names: Sequence[str]) -> bool:
     Halves of the one motion that tells of it need not agree: a law that is not quite right differs from early to late.
     Nor does a cause stand alone because its rival is a hair larger than is believed.
     """
-    return known(c.fitted, c.hypothesis.name, names, replace(c, sure=0.0 if c.alone else NORMAL), POSSIBLE)
+    return known(c.fit, c.hypothesis.name, names, replace(c, sure=0.0 if c.sole_informative_motion else NORMAL), POSSIBLE)
 
 
-def known(found: Fitted, name: str, names: Sequence[str], c: Candidate, most: float = PLAUSIBLE) -> bool:
+def known(found: ModelFit, name: str, names: Sequence[str], c: Candidate, most: float = PLAUSIBLE) -> bool:
     """Of a size that makes sense and that numerics do not ask for, and motions agree so far that there is something.
 
     It makes sense up to ``most`` times the typical amplitude; what has ended at nothing is not there. Halves of the one
@@ -297,15 +297,15 @@ def known(found: Fitted, name: str, names: Sequence[str], c: Candidate, most: fl
     clearly less likely with it, it is not there, whatever it gains. Nor need motions agree about a number that has left
     its data sheet so far that nothing else has bent it there.
     """
-    if c.contradicted and c.bent <= BENT:
+    if c.is_contradicted and c.prior_shift <= BENT:
         return False
     place = found.model.place(name)
     amplitude, largest = found.model.amplitudes[place], most * abs(found.model.accepted[place].typical)
-    middle, std = (float(v[len(found.model.parameters) + place]) for v in spread(found, names, c.alone))
-    if (c.alone and c.gain.least > VERY_MUCH and not c.disturbs) or c.bent > BENT:
+    middle, std = (float(v[len(found.model.parameters) + place]) for v in jackknife(found, names, c.sole_informative_motion))
+    if (c.sole_informative_motion and c.gain.lower_bound_95 > VERY_MUCH and not c.worsens_another_motion) or c.prior_shift > BENT:
         middle, std = amplitude, 0.0
-    least = max(c.sure * std, NORMAL * abs(c.row.bias))
-    return c.sure < math.inf and least < abs(middle) and 0 < abs(amplitude) < largest
+    least = max(c.t_threshold * std, NORMAL * abs(c.score.mesh_bias))
+    return c.t_threshold < math.inf and least < abs(middle) and 0 < abs(amplitude) < largest
 
 
 def worth_naming(c: Candidate, gain: Gain) -> bool:
@@ -313,19 +313,19 @@ def worth_naming(c: Candidate, gain: Gain) -> bool:
 
     Beside such a number nothing is left to mend.
     """
-    return gain.least > 0 or far_from_sheet(c, gain) if _twin(c) else worthwhile(gain)
+    return gain.lower_bound_95 > 0 or far_from_sheet(c, gain) if _twin(c) else worthwhile(gain)
 
 
 def far_from_sheet(c: Candidate, gain: Gain) -> bool:
     """A twin of a number that is surely far off: with that number bent it predicts as well, and need not gain more."""
-    if not _twin(c) or gain.density <= CLEAR:
+    if not _twin(c) or gain.log_density <= CLEAR:
         return False
-    return c.bent > BENT or (c.row.decision == "present" and c.row.worth > VERY_MUCH)
+    return c.prior_shift > BENT or (c.score.decision == "present" and c.score.expected_gain > VERY_MUCH)
 
 
 def _twin(c: Candidate) -> bool:
     """The same as a number that is fitted anyway, and shows beside its data sheet."""
-    return bool(c.hypothesis.twin) and c.hypothesis.twin in (p.name for p in c.fitted.model.parameters) and c.row.shows
+    return bool(c.hypothesis.equivalent_parameter) and c.hypothesis.equivalent_parameter in (p.name for p in c.fit.model.parameters) and c.score.is_visible
 
 
 def worthwhile(gain: Gain) -> bool:
@@ -333,14 +333,14 @@ def worthwhile(gain: Gain) -> bool:
 
     Beside numbers that the cause has bent, hardly a millimetre may be left to mend.
     """
-    seen, felt = gain.mended
-    mended = gain.fallen > WORTH_SHARE * gain.calm[0] ** 2 or seen > WORTH_MM or felt > WORTH_PULL
-    return (mended or gain.least > SURELY) and gain.least > 0 and not worsens(gain)
+    seen, felt = gain.rms_removed
+    mended = gain.mean_square_removed > WORTH_SHARE * gain.robust_rms[0] ** 2 or seen > WORTH_MM or felt > WORTH_PULL
+    return (mended or gain.lower_bound_95 > SURELY) and gain.lower_bound_95 > 0 and not worsens(gain)
 
 
 def worsens(gain: Gain) -> bool:
     """All positions together are predicted worse, whatever else is, and pulls hardly better."""
-    return gain.after > gain.before and gain.mended[1] < WORTH_PULL
+    return gain.rms_after > gain.rms_before and gain.rms_removed[1] < WORTH_PULL
 
 
 def _themselves(useful: Sequence[Candidate]) -> list[Candidate]:
@@ -353,16 +353,16 @@ def _themselves(useful: Sequence[Candidate]) -> list[Candidate]:
 
 def _ranked(useful: Sequence[Candidate]) -> list[Candidate]:
     """The likeliest first; of those that predict as well as that, the one that mends most."""
-    likeliest = max((c.gain.density for c in useful), default=0.0)
+    likeliest = max((c.gain.log_density for c in useful), default=0.0)
     alike = lambda c: c.gain.density > likeliest - CLEAR  # noqa: E731
-    return sorted(useful, key=lambda c: (0, -c.gain.fallen) if alike(c) else (1, -c.gain.density))
+    return sorted(useful, key=lambda c: (0, -c.gain.mean_square_removed) if alike(c) else (1, -c.gain.log_density))
 
 
-def _rival(c: Candidate, predicted: Predicted, best: Candidate) -> bool:
+def _rival(c: Candidate, predicted: HeldOutPrediction, best: Candidate) -> bool:
     """Predicts about as well: the paired difference is not clear, or no more than what two engines may differ by."""
     h = c.hypothesis
-    if h.effect == best.hypothesis.effect or (h.brings == best.hypothesis.name and not h.matters(c.amplitude)):
+    if h.effect == best.hypothesis.effect or (h.implies == best.hypothesis.name and not h.is_relevant(c.amplitude)):
         return False
-    over = compare(predicted, best.predicted, 0.0)
-    hardly = over.density < HARDLY * best.gain.density and over.fallen < HARDLY * best.gain.fallen
-    return over.density < CLEAR or over.least < 0 or hardly
+    over = compare(predicted, best.prediction, 0.0)
+    hardly = over.log_density < HARDLY * best.gain.log_density and over.mean_square_removed < HARDLY * best.gain.mean_square_removed
+    return over.log_density < CLEAR or over.lower_bound_95 < 0 or hardly

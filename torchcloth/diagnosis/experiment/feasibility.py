@@ -11,10 +11,10 @@ from pathlib import Path
 from ...errors import TorchclothError
 from ...recordings import Recording, write
 from ...recordings.templates import is_undone, undone
-from ...robots import Plan, gripper_motion, replan_episode  # pyright: ignore[reportMissingImports] - mapped from robots/
-from ...robots.replan_episode import scene_of  # pyright: ignore[reportMissingImports]
+from ...robots import JointPlan, to_gripper_motion, replan_episode  # pyright: ignore[reportMissingImports] - mapped from robots/
+from ...robots.replan_episode import scene_from_episode  # pyright: ignore[reportMissingImports]
 from ..data.dataset import Progress
-from ..inference.episode_simulation import side_by_side
+from ..inference.episode_simulation import map_parallel
 from .motions import Experiment, blank_frames, blank_readings, planned, possible
 
 FOLDER = "next_experiment"  # beside diagnosis.json
@@ -35,7 +35,7 @@ class Choice:
 
     experiment: Experiment
     episode: Recording
-    plan: Plan | None = None
+    plan: JointPlan | None = None
     why_not: str | None = None
     unasked: str | None = None
 
@@ -47,12 +47,12 @@ def feasible(recordings: Sequence[Recording], progress: Progress) -> list[Choice
         experiment, template = choice
         episode = planned(experiment, template)
         try:
-            scene = scene_of(episode)
+            scene = scene_from_episode(episode)
         except TorchclothError as error:
             return Choice(experiment, episode, unasked=str(error))
         if scene is None:
             return Choice(experiment, episode)
-        if bare := [name for name in scene.arms if scene[name].unshaped]:
+        if bare := [name for name in scene.arms if scene[name].links_without_primitives]:
             return Choice(experiment, episode, unasked=f"solids of {bare[0]!r} are meshes, which cannot be kept apart")
         progress(f"{experiment}: whether the arms can do it")
         try:
@@ -61,7 +61,7 @@ def feasible(recordings: Sequence[Recording], progress: Progress) -> list[Choice
             progress(f"{experiment}: the arms cannot do it: {error}")
             return Choice(experiment, episode, why_not=str(error))
         slower = replace(experiment, speed=experiment.speed / plan.slower)
-        paths = {name: gripper_motion(path) for name, path in plan.motion(scene).items()}
+        paths = {name: to_gripper_motion(path) for name, path in plan.motion(scene).items()}
         grippers = {name: blank_readings(path, episode.grippers[name]) for name, path in paths.items()}
         done = replace(
             episode,
@@ -72,7 +72,7 @@ def feasible(recordings: Sequence[Recording], progress: Progress) -> list[Choice
         )
         return Choice(slower, done, plan)
 
-    return side_by_side(ask, possible(recordings))
+    return map_parallel(ask, possible(recordings))
 
 
 def write_episode(episode: Recording | None, folder: Path) -> str | None:

@@ -3,7 +3,7 @@
 On a table all keep within 17 cm of the first pose, but for the lift (42 cm) and the fold that is opened again (39 cm:
 what then stays is a crease), in the air within 5 cm, but for the turn (each gripper on a quarter of a circle about the
 middle of all, which goes 4 cm ahead), and stretch the cloth by at most 1 cm. They are those of
-``tests/independent/motions.py``, so that another engine can carry an experiment out.
+``training/validation/independent/motions.py``, so that another engine can carry an experiment out.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ...episodes.observed import RATE
+from ...episodes.observed import DEFAULT_FRAME_RATE_HZ
 from ...recordings import GripperMotion, PointClouds, Recording
-from ...robots import gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ...robots.paths import holding  # pyright: ignore[reportMissingImports]
-from ...robots.replay import model_of  # pyright: ignore[reportMissingImports]
+from ...robots import to_gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ...robots.paths import holding_paths  # pyright: ignore[reportMissingImports]
+from ...robots.replay import locate_model  # pyright: ignore[reportMissingImports]
 from ...types import Trajectory
 
 STILL, KNOT = 0.2, 0.01  # s, all stand still before and after; between knots
@@ -102,9 +102,9 @@ def possible(recordings: Sequence[Recording]) -> list[tuple[Experiment, Recordin
     found = []
     for experiment in LIBRARY:
         template = begins[PLANS[experiment.motion].lying]
-        if template is None or not holding(template):
+        if template is None or not holding_paths(template):
             continue
-        if experiment.motion == "stretch" and len(holding(template)) < 2:
+        if experiment.motion == "stretch" and len(holding_paths(template)) < 2:
             continue
         found.append((experiment, template))
     return found
@@ -148,7 +148,7 @@ def planned(experiment: Experiment, template: Recording) -> Recording:
         placed,
         grippers=grippers,
         joints={},
-        robots={name: replace(r, model=model_of(template, name)) for name, r in arms.items()},
+        robots={name: replace(r, model=locate_model(template, name)) for name, r in arms.items()},
         points=blank_frames(placed, float(t[-1])),
         markers=None,
         clock_offset=0.0,
@@ -159,7 +159,7 @@ def planned(experiment: Experiment, template: Recording) -> Recording:
 
 def blank_frames(recording: Recording, end: float) -> PointClouds:
     """One point of the first shape, in frames until ``end`` [s]."""
-    frames = np.arange(int(end * RATE) + 1) / RATE
+    frames = np.arange(int(end * DEFAULT_FRAME_RATE_HZ) + 1) / DEFAULT_FRAME_RATE_HZ
     initial = recording.cloth.initial_vertices
     point = np.asarray(recording.cloth.vertices if initial is None else initial).reshape(-1, 3)[:1]
     return PointClouds(frames, np.repeat(point, len(frames), axis=0), np.ones(len(frames), int))
@@ -171,7 +171,7 @@ def _gripper(t: np.ndarray, path: np.ndarray, rotation: np.ndarray, template: Re
     pose = np.tile(np.eye(4), (len(t), 1, 1))
     pose[:, :3, :3], pose[:, :3, 3] = rotation, path
     closed = torch.ones(len(t), dtype=torch.bool)
-    return blank_readings(gripper_motion(Trajectory(torch.as_tensor(t), torch.as_tensor(pose), closed)), measured)
+    return blank_readings(to_gripper_motion(Trajectory(torch.as_tensor(t), torch.as_tensor(pose), closed)), measured)
 
 
 def blank_readings(path: GripperMotion, like: object) -> GripperMotion:
@@ -182,7 +182,7 @@ def blank_readings(path: GripperMotion, like: object) -> GripperMotion:
 
 def _first(template: Recording) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """By holding gripper (position [3] m, rotation [3, 3]) when the cloth is seen first."""
-    own, seen = holding(template), template.markers if template.points is None else template.points
+    own, seen = holding_paths(template), template.markers if template.points is None else template.points
     start = max(p.t[0] for p in own.values())
     if seen is not None:
         start = max(start, float(seen.t[0] + template.clock_offset))

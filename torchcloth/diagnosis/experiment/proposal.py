@@ -21,20 +21,20 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ...episodes.observed import Episode, episode
+from ...episodes.observed import Episode, build_episode
 from ...episodes.replay import Frames
 from ...episodes.steps import both_ways
 from ...episodes.world_cache import Worlds
 from ...errors import InvalidInput, TorchclothError
 from ...recordings import Recording
-from ..data.binning import cells_of, directions, joined
-from ..data.dataset import Progress, Setting, foreseen, surely_seen
+from ..data.binning import bin_residuals, finite_differences, concatenate_directions
+from ..data.dataset import Progress, DiagnosisData, extend_for_clock, drop_unsimulated_frames
 from ..decide.candidates import HARDLY
-from ..decide.search import Found
-from ..inference.episode_simulation import nuisances, runs, side_by_side
-from ..inference.fitting import Fitted, prior_precision
-from ..inference.lack_of_fit import reference
-from ..inference.linearise import central
+from ..decide.search import SearchResult
+from ..inference.episode_simulation import differentiate_nuisances, run_episode, map_parallel
+from ..inference.fitting import ModelFit, prior_precision
+from ..inference.lack_of_fit import reference_noise
+from ..inference.linearise import central_differences
 from ..inference.noise import Noise
 from .feasibility import Choice, feasible
 from .motions import Experiment
@@ -55,7 +55,7 @@ class Question:
         pairs: of causes to be told apart; none: each is to be seen at all.
     """
 
-    fitted: Fitted
+    fitted: ModelFit
     amplitudes: Mapping[str, float]
     pairs: tuple[tuple[str, str], ...] = ()
 
@@ -72,7 +72,7 @@ class Proposal(NamedTuple):
     episode: Recording  # it, with blanks for what will be seen and felt
 
 
-def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress: Progress) -> Proposal | None:
+def propose(found: SearchResult, content: Mapping[str, Any], setting: DiagnosisData, progress: Progress) -> Proposal | None:
     """Of what the arms can do, the experiment that tells most; None: nothing is open, or nothing tells of it."""
     question = question_of(found, content)
     if question is None:
@@ -89,7 +89,7 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
 
     choices = feasible(setting.recordings, progress)
     refused = {str(c.experiment): c.why_not for c in choices if c.why_not is not None}
-    tried = [answer for answer in side_by_side(ask, [c for c in choices if not c.why_not]) if answer is not None]
+    tried = [answer for answer in map_parallel(ask, [c for c in choices if not c.why_not]) if answer is not None]
     if not tried:
         return None
     told = [distances(question, information(question, [slopes])) for _, slopes in tried]
@@ -119,11 +119,11 @@ def propose(found: Found, content: Mapping[str, Any], setting: Setting, progress
 def _arms(choice: Choice, refused: Mapping[str, str]) -> dict[str, Any] | None:
     """What the arms make of it; None where none are named."""
     if choice.plan is not None:
-        return {"slower": choice.plan.slower, "limit": choice.plan.limiting, "refused": refused}
+        return {"slower": choice.plan.slowdown, "limit": choice.plan.limiting_joint, "refused": refused}
     return None if choice.unasked is None else {"unasked": choice.unasked}
 
 
-def question_of(found: Found, content: Mapping[str, Any]) -> Question | None:
+def question_of(found: SearchResult, content: Mapping[str, Any]) -> Question | None:
     """What a search leaves open: causes that have rivals, else causes that are not decided.
 
     ``content`` holds what was said of causes, and of what is too small to matter: that may have rivals that would.
@@ -131,31 +131,31 @@ def question_of(found: Found, content: Mapping[str, Any]) -> Question | None:
     said = [*content["causes"], *content["minor"]]
     fitted = {p.name for p in found.end.model.parameters}  # what does the same as one of them, no experiment shows
     for step, cause in zip([*found.causes, *found.minor], said, strict=True):
-        known = {h.name for h in step.before.evidence.hypotheses if h.twin not in fitted}
+        known = {h.name for h in step.fit_before.linearisation.hypotheses if h.equivalent_parameter not in fitted}
         open_to = known & {cause["effect"], *(r["effect"] for r in cause["rivals"])}
-        amplitudes = {h.name: a for h, a in found.alike(step) if h.name in open_to}
-        rows = {r.hypothesis.name: r.amplitude for r in step.screened if not r.wrong_sign}
+        amplitudes = {h.name: a for h, a in found.equivalents(step) if h.name in open_to}
+        rows = {r.hypothesis.name: r.amplitude for r in step.scores if not r.has_wrong_sign}
         more = known & rows.keys() & set(cause.get("class", ()))
         amplitudes |= {name: rows[name] for name in sorted(more - amplitudes.keys())}
-        signed = {h.name for h in step.before.evidence.hypotheses if h.signed}
+        signed = {h.name for h in step.fit_before.linearisation.hypotheses if h.signed}
         amplitudes = {name: a for name, a in amplitudes.items() if name in signed or a >= 0}
-        best = step.best.hypothesis.name
+        best = step.candidate.hypothesis.name
         pairs = tuple((best, other) for other in amplitudes if other != best)
         if best in amplitudes and pairs:
-            return Question(step.before, amplitudes, pairs)
+            return Question(step.fit_before, amplitudes, pairs)
     if found.causes:
         return None
-    known = {h.name for h in found.end.evidence.hypotheses if h.twin not in fitted}
-    open_rows = [r for r in found.screened if r.decision in ("present", "inconclusive") and r.hypothesis.name in known]
+    known = {h.name for h in found.end.linearisation.hypotheses if h.equivalent_parameter not in fitted}
+    open_rows = [r for r in found.scores if r.decision in ("present", "inconclusive") and r.hypothesis.name in known]
     amplitudes = {r.hypothesis.name: r.hypothesis.smallest for r in open_rows[:MANY]}
     return Question(found.end, amplitudes) if amplitudes else None
 
 
 def information(question: Question, added: Sequence[Tensor]) -> Tensor:
     """[causes, causes] that is left beside what is fitted anyway, of the data and of added experiments."""
-    found, own = question.fitted, question.fitted.evidence.own
+    found, own = question.fitted, question.fitted.linearisation.n_coordinates
     columns = [*range(own), *(own + k for k in _columns(question))]
-    data = found.white.jacobian[:, columns]
+    data = found.whitened.jacobian[:, columns]
     square = data.mT @ data + sum(slopes.mT @ slopes for slopes in added)
     square[range(own), range(own)] += prior_precision(found.model)
     beside = torch.linalg.solve(square[:own, :own], square[:own, own:])
@@ -179,40 +179,40 @@ def distances(question: Question, left: Tensor) -> dict[tuple[str, ...], float]:
     return out
 
 
-def whitened_slopes(question: Question, recording: Recording, setting: Setting) -> Tensor:
+def whitened_slopes(question: Question, recording: Recording, setting: DiagnosisData) -> Tensor:
     """[C, own + causes] of an experiment that has not been done, by the present model on the coarser mesh.
 
     Along causes as large as they were found: what wind brings along brakes whichever way that blows.
     """
     found, model = question.fitted, question.fitted.model
-    asked = [found.evidence.hypotheses[k] for k in _columns(question)]
+    asked = [found.linearisation.hypotheses[k] for k in _columns(question)]
     hypotheses = [replace(h, typical=question.amplitudes[h.name] or h.typical) for h in asked]
     world, shifts = question.worlds.plain, question.worlds.shifts
-    blank = foreseen(episode(model.base.cloth, recording))
-    done = runs(question.worlds, blank, setting.dt, hypotheses, with_held=True)
-    trials = [t for t in done.trials if t is not None]
+    blank = extend_for_clock(build_episode(model.base.cloth, recording))
+    done = run_episode(question.worlds, blank, setting.dt, hypotheses, with_grasp_shifts=True)
+    trials = [t for t in done.with_hypotheses if t is not None]
     if len(trials) < len(hypotheses):
         raise InvalidInput("experiment", got="a cause that it cannot be simulated with", expected="another experiment")
     base = done.plain
     seen = as_seen(base, blank, setting)
-    moved = directions(base, [*done.beside, *trials], [*(s for _, s in shifts), *(h.typical for h in hypotheses)])
-    other, std = nuisances(world, base, done.held, seen)
-    cells = cells_of(base, joined(moved, other), seen, setting.sheet, setting.rest)
-    cells = central(cells, shifts, len(model.parameters))
+    moved = finite_differences(base, [*done.shifted, *trials], [*(s for _, s in shifts), *(h.typical for h in hypotheses)])
+    other, std = differentiate_nuisances(world, base, done.grasp_shifted, seen)
+    cells = bin_residuals(base, concatenate_directions(moved, other), seen, setting.sheet, setting.rest_positions)
+    cells = central_differences(cells, shifts, len(model.parameters))
     count = len(model.point) + len(hypotheses)
-    level, _ = reference(cells, torch.zeros_like(cells.value))
-    noise = Noise(torch.maximum(level.level, found.noise.level), found.noise.depth)
+    level, _ = reference_noise(cells, torch.zeros_like(cells.value))
+    noise = Noise(torch.maximum(level.levels, found.noise.levels), found.noise.depth_level)
     root = torch.linalg.cholesky(noise.covariance(cells, cells.jacobian[:, count:], std))
     return torch.linalg.solve_triangular(root, cells.jacobian[:, :count], upper=False)
 
 
-def as_seen(frames: Frames, blank: Episode, setting: Setting, seed: int = 0) -> Episode:
+def as_seen(frames: Frames, blank: Episode, setting: DiagnosisData, seed: int = 0) -> Episode:
     """The episode with points as many and as noisy as in the data, evenly over the surface, and felt forces."""
     rng = torch.Generator().manual_seed(seed)
     counts = sorted(len(c) for e in setting.episodes for c in e.clouds if len(c))
     many = counts[len(counts) // 2] if counts else POINTS
-    faces, noise = setting.sheet.faces, blank.noise or 1e-3
-    corners = setting.rest[faces]
+    faces, noise = setting.sheet.faces, blank.noise_std or 1e-3
+    corners = setting.rest_positions[faces]
     area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1)
     clouds = []
     for x in frames.x:
@@ -223,11 +223,11 @@ def as_seen(frames: Frames, blank: Episode, setting: Setting, seed: int = 0) -> 
         clouds.append(on + noise * torch.randn(many, 3, generator=rng).to(x))
     felt = lambda w: w.isfinite().any(0)  # noqa: E731 - a force without a torque, or the other way round
     wrenches = {name: torch.where(felt(w), frames.wrench[name], w) for name, w in blank.wrenches.items()}
-    return surely_seen(replace(blank, clouds=clouds, wrenches=wrenches))
+    return drop_unsimulated_frames(replace(blank, clouds=clouds, wrenches=wrenches))
 
 
 def _columns(question: Question) -> list[int]:
-    index = {h.name: k for k, h in enumerate(question.fitted.evidence.hypotheses)}
+    index = {h.name: k for k, h in enumerate(question.fitted.linearisation.hypotheses)}
     return [index[name] for name in question.amplitudes]
 
 

@@ -22,11 +22,11 @@ from ...episodes.world import World
 from ...episodes.world_cache import if_possible
 from ...errors import SimulationDiverged, UnstableStep
 from ...meshes.mesh import vertex_normals
-from ..data.binning import NAMES, Cells, aligned, cells_of, mean_over
-from ..data.dataset import Progress, Setting
-from .episode_simulation import side_by_side
-from .fitting import Fitted, weighed
-from .linearise import Evidence
+from ..data.binning import BLOCK_NAMES, BinnedResiduals, align_rows, bin_residuals, average_groups
+from ..data.dataset import Progress, DiagnosisData
+from .episode_simulation import map_parallel
+from .fitting import ModelFit, assemble_fit
+from .linearise import Linearisation
 from .noise import FLOOR, fit_noise
 
 DIRECTIONS = 2  # random ones of parameters, and as many of the first shape, each there and back
@@ -36,7 +36,7 @@ MOST = 0.5  # of an episode's cells, that folds turn over: 0.34 in ten developme
 LEAST = 3.0  # of the noise's floor: predictions below count as this
 
 
-def unstable(found: Fitted, setting: Setting, progress: Progress = lambda _: None, seed: int = 0) -> tuple[Tensor, ...]:
+def find_bifurcating_bins(found: ModelFit, setting: DiagnosisData, progress: Progress = lambda _: None, seed: int = 0) -> tuple[Tensor, ...]:
     """Per episode, the keys of cells that jump within the uncertainty of the parameters, or of the first shape.
 
     By one standard error in random directions, or by one finite step of the slopes where that is more.
@@ -57,8 +57,8 @@ def unstable(found: Fitted, setting: Setting, progress: Progress = lambda _: Non
     for k, e in enumerate(setting.episodes):
         progress(f"{e.name}, {k + 1} of {len(setting.episodes)}")
         tried = [*((world, e) for world in worlds), *((plain, other) for other in _begun(e, plain, rng))]
-        seen = side_by_side(partial(_cells, setting=setting, seen=e), tried)
-        keys.append(_jumped(found.evidence, k, seen, moved))
+        seen = map_parallel(partial(_cells, setting=setting, seen=e), tried)
+        keys.append(_jumped(found.linearisation, k, seen, moved))
     return tuple(keys)
 
 
@@ -77,34 +77,34 @@ def _begun(e: Episode, world: World, rng: torch.Generator) -> list[Episode]:
     return out
 
 
-def without(found: Fitted, keys: Sequence[Tensor]) -> Fitted:
+def drop_bins(found: ModelFit, keys: Sequence[Tensor]) -> ModelFit:
     """The same fit, weighed anew by the cells that do not jump; slopes take care of what moves the solution."""
-    stable = [~torch.isin(c.key, k) for c, k in zip(found.evidence.cells, keys, strict=True)]
-    cells = [c.rows(s) for c, s in zip(found.evidence.cells, stable, strict=True)]
-    numerics = [n[s] for n, s in zip(found.evidence.numerics, stable, strict=True)]
-    evidence = replace(found.evidence, cells=cells, numerics=numerics)
-    return weighed(found.model, evidence, fit_noise(evidence))
+    stable = [~torch.isin(c.key, k) for c, k in zip(found.linearisation.bins, keys, strict=True)]
+    cells = [c.select(s) for c, s in zip(found.linearisation.bins, stable, strict=True)]
+    numerics = [n[s] for n, s in zip(found.linearisation.mesh_differences, stable, strict=True)]
+    evidence = replace(found.linearisation, cells=cells, numerics=numerics)
+    return assemble_fit(found.model, evidence, fit_noise(evidence))
 
 
-def _cells(tried: tuple[World, Episode], setting: Setting, seen: Episode) -> Cells | None:
+def _cells(tried: tuple[World, Episode], setting: DiagnosisData, seen: Episode) -> BinnedResiduals | None:
     world, e = tried
     try:
-        return cells_of(world.frames(e, setting.dt), None, seen, setting.sheet, setting.rest)
+        return bin_residuals(world.frames(e, setting.dt), None, seen, setting.sheet, setting.rest_positions)
     except (SimulationDiverged, UnstableStep):
         return None
 
 
-def _jumped(evidence: Evidence, k: int, seen: Sequence[Cells | None], moved: Sequence[Tensor]) -> Tensor:
-    cells = evidence.cells[k]
-    before = cells.value + evidence.numerics[k]  # on the mesh that the others are simulated on
-    least = LEAST * torch.tensor([FLOOR[name] for name in NAMES], dtype=before.dtype)[cells.block]
-    off = mean_over(cells.block, before.square()).sqrt()
+def _jumped(evidence: Linearisation, k: int, seen: Sequence[BinnedResiduals | None], moved: Sequence[Tensor]) -> Tensor:
+    cells = evidence.bins[k]
+    before = cells.value + evidence.mesh_differences[k]  # on the mesh that the others are simulated on
+    least = LEAST * torch.tensor([FLOOR[name] for name in BLOCK_NAMES], dtype=before.dtype)[cells.block]
+    off = average_groups(cells.block, before.square()).sqrt()
     jumped, turned, beyond = torch.zeros(3, len(before), dtype=torch.bool)
     for found, step in zip(seen, moved, strict=True):
         if found is None:
             continue
-        deviation = (aligned(cells.key, found.key, found.value) - before).abs()
-        expected = torch.maximum((cells.jacobian[:, : evidence.own] @ step).abs(), least)
+        deviation = (align_rows(cells.key, found.key, found.value) - before).abs()
+        expected = torch.maximum((cells.jacobian[:, : evidence.n_coordinates] @ step).abs(), least)
         far = torch.isin(cells.key, found.key) & (deviation > TIMES * expected)
         if step.any():
             jumped |= far

@@ -10,24 +10,24 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from .fitting import Fitted, renoised
-from .linearise import shared
+from .fitting import ModelFit, reweight_by_noise
+from .linearise import restrict_to_common_bins
 from .noise import Noise
-from .robust_weights import unweighted
-from .screening import Row, projection
+from .robust_weights import remove_weights
+from .screening import ScoreTest, build_projection
 
 TOLD = 9.0  # chi^2, three standard deviations
 ALIKE = 0.99  # correlation
 
 
-def correlations(found: Fitted) -> Tensor:
+def correlate_scores(found: ModelFit) -> Tensor:
     """[hypotheses, hypotheses] of the efficient scores."""
-    asked = projection(found)(found.white.jacobian[:, found.evidence.own :])
+    asked = build_projection(found)(found.whitened.jacobian[:, found.linearisation.n_coordinates :])
     norm = asked.norm(dim=0).clamp(min=1e-12)
     return (asked.mT @ asked) / (norm[:, None] * norm)
 
 
-def alike(found: Fitted, row: Row, amplitude: float, others: Sequence[Row]) -> list[Row]:
+def find_confounded(found: ModelFit, row: ScoreTest, amplitude: float, others: Sequence[ScoreTest]) -> list[ScoreTest]:
     """Those of ``others`` that cannot be told from ``row`` at this amplitude or the one that was asked for.
 
     Directions of the same effect are none, nor is what would have to have a sign that it cannot have. Where slopes ask
@@ -35,11 +35,11 @@ def alike(found: Fitted, row: Row, amplitude: float, others: Sequence[Row]) -> l
     """
     if not others:
         return []
-    index = {h.name: k for k, h in enumerate(found.evidence.hypotheses)}
+    index = {h.name: k for k, h in enumerate(found.linearisation.hypotheses)}
     if row.hypothesis.name not in index:  # no world could have it there
         return []
-    rho = correlations(found)[index[row.hypothesis.name]]
-    square = max(row.gain, (amplitude / row.std) ** 2)
+    rho = correlate_scores(found)[index[row.hypothesis.name]]
+    square = max(row.chi2, (amplitude / row.std) ** 2)
     out = []
     for other in others:
         r = float(rho[index[other.hypothesis.name]])
@@ -52,8 +52,8 @@ def alike(found: Fitted, row: Row, amplitude: float, others: Sequence[Row]) -> l
     return out
 
 
-def fitted_alike(one: Fitted, other: Fitted, noise: Noise) -> bool:
+def are_fits_confounded(one: ModelFit, other: ModelFit, noise: Noise) -> bool:
     """Two models that cannot be told from each other where either was fitted, whatever slopes said elsewhere."""
-    like = shared(one.evidence, [other.evidence])
-    mine, others = (unweighted(renoised(found, noise, like).white).value for found in (one, other))
+    like = restrict_to_common_bins(one.linearisation, [other.linearisation])
+    mine, others = (remove_weights(reweight_by_noise(found, noise, like).whitened).value for found in (one, other))
     return float((mine - others).square().sum()) < TOLD

@@ -18,105 +18,105 @@ from ...episodes.steps import taken
 from ...episodes.world import Hypothesis, World
 from ...episodes.world_cache import Worlds, if_possible
 from ...identification.nuisances import Camera, Clock, Held, Rim, Tare
-from ..data.binning import Cells, Piece, aligned, cells_of, directions, joined
-from ..data.dataset import Setting
+from ..data.binning import BinnedResiduals, EpisodeEvidence, align_rows, bin_residuals, finite_differences, concatenate_directions
+from ..data.dataset import DiagnosisData
 
 CLOCK, SHIFT, TURN, GRASP, RIM, TARE = 3e-3, 5e-4, 1e-3, 1.5e-3, 2e-3, 0.1  # standard deviations between episodes
 T = TypeVar("T")
 U = TypeVar("U")
 
 
-def piece_of(
+def simulate_episode(
     worlds: Worlds,
-    setting: Setting,
+    setting: DiagnosisData,
     k: int,
     hypotheses: Sequence[Hypothesis],
     known: Sequence[Tensor] | None,
-) -> Piece:
+) -> EpisodeEvidence:
     """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
     e, world = setting.episodes[k], worlds.plain
-    finer: Setting = setting.finer  # type: ignore[assignment]
+    finer: DiagnosisData = setting.fine_mesh  # type: ignore[assignment]
     steps = [taken(worlds.model, coordinate, step) for coordinate, step in worlds.shifts]
-    found = runs(worlds, e, setting.dt, hypotheses, known is None, (finer.episodes[k], finer.dt), with_fine=True)
-    base, able = found.plain, [t is not None for t in found.trials]
-    sides = [*zip(found.beside, steps, worlds.finer_beside, strict=True), *_trials(hypotheses, found)]
+    found = run_episode(worlds, e, setting.dt, hypotheses, known is None, (finer.episodes[k], finer.dt), with_fine=True)
+    base, able = found.plain, [t is not None for t in found.with_hypotheses]
+    sides = [*zip(found.shifted, steps, worlds.finer_beside, strict=True), *_trials(hypotheses, found)]
     moved, fine = _slopes(base, sides, False), _slopes(found.fine, sides, True)
     if known is None:
-        other, std = nuisances(world, base, found.held, e)
-        coarse = cells_of(base, other if moved is None else joined(moved, other), e, setting.sheet, setting.rest)
+        other, std = differentiate_nuisances(world, base, found.grasp_shifted, e)
+        coarse = bin_residuals(base, other if moved is None else concatenate_directions(moved, other), e, setting.sheet, setting.rest_positions)
     else:
         key, slopes, std = known
-        coarse = cells_of(base, moved, e, setting.sheet, setting.rest)
-        others, new = aligned(coarse.key, key, slopes), ~torch.isin(coarse.key, key)
+        coarse = bin_residuals(base, moved, e, setting.sheet, setting.rest_positions)
+        others, new = align_rows(coarse.key, key, slopes), ~torch.isin(coarse.key, key)
         if bool(new.any()):  # seen there for the first time; how grasps move it would take simulations
-            anew = cells_of(base, nuisances(world, base, [], e)[0], e, setting.sheet, setting.rest)
-            others[new, : anew.jacobian.shape[1]] = aligned(coarse.key, anew.key, anew.jacobian)[new]
+            anew = bin_residuals(base, differentiate_nuisances(world, base, [], e)[0], e, setting.sheet, setting.rest_positions)
+            others[new, : anew.jacobian.shape[1]] = align_rows(coarse.key, anew.key, anew.jacobian)[new]
         coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, others], 1))
-    finer_cells = cells_of(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest)  # type: ignore[arg-type]
+    finer_cells = bin_residuals(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest_positions)  # type: ignore[arg-type]
     kept, difference = _replaced(_woven(coarse, finer_cells, sides), finer_cells)
-    return Piece(kept, std, difference, torch.tensor(able, dtype=torch.bool))
+    return EpisodeEvidence(kept, std, difference, torch.tensor(able, dtype=torch.bool))
 
 
-def asked_piece(worlds: Worlds, setting: Setting, k: int, hypotheses: Sequence[Hypothesis]) -> Piece:
+def simulate_hypotheses(worlds: Worlds, setting: DiagnosisData, k: int, hypotheses: Sequence[Hypothesis]) -> EpisodeEvidence:
     """Slopes of the k-th episode along hypotheses alone; ``worlds`` without shifts."""
-    e, finer = setting.episodes[k], setting.finer
-    found = runs(worlds, e, setting.dt, hypotheses, False, finer and (finer.episodes[k], finer.dt))
-    base, able = found.plain, [t is not None for t in found.trials]
+    e, finer = setting.episodes[k], setting.fine_mesh
+    found = run_episode(worlds, e, setting.dt, hypotheses, False, finer and (finer.episodes[k], finer.dt))
+    base, able = found.plain, [t is not None for t in found.with_hypotheses]
     sides = list(_trials(hypotheses, found))
-    cells = cells_of(base, _slopes(base, sides, False), e, setting.sheet, setting.rest)
+    cells = bin_residuals(base, _slopes(base, sides, False), e, setting.sheet, setting.rest_positions)
     if finer is not None and found.fine is not None:
         fine = _slopes(found.fine, sides, True)
-        cells = _woven(cells, cells_of(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest), sides)
+        cells = _woven(cells, bin_residuals(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest_positions), sides)
     none = torch.zeros(0, dtype=torch.float64)
-    return Piece(cells, none, none, torch.tensor(able, dtype=torch.bool))
+    return EpisodeEvidence(cells, none, none, torch.tensor(able, dtype=torch.bool))
 
 
 Side = tuple[Frames, float, bool]  # beside the point, by which step, and whether on the finer mesh
 
 
-def _trials(hypotheses: Sequence[Hypothesis], found: Runs) -> Iterator[Side]:
+def _trials(hypotheses: Sequence[Hypothesis], found: EpisodeRuns) -> Iterator[Side]:
     """Of what could be simulated."""
-    for k, (h, frames) in enumerate(zip(hypotheses, found.trials, strict=True)):
+    for k, (h, frames) in enumerate(zip(hypotheses, found.with_hypotheses, strict=True)):
         if frames is not None:
-            yield frames, h.typical, k in found.refined
+            yield frames, h.typical, k in found.fine_hypotheses
 
 
 def _slopes(base: Frames | None, sides: Sequence[Side], finer: bool) -> Frames | None:
     """Along those on one mesh; None: there are none."""
     own = [(frames, step) for frames, step, fine in sides if fine == finer]
-    return directions(base, *zip(*own, strict=True)) if own and base else None
+    return finite_differences(base, *zip(*own, strict=True)) if own and base else None
 
 
-def _woven(coarse: Cells, fine: Cells, sides: Sequence[Side]) -> Cells:
+def _woven(coarse: BinnedResiduals, fine: BinnedResiduals, sides: Sequence[Side]) -> BinnedResiduals:
     """The coarse cells, first with a column for each side, from its own mesh."""
     first = [k for k, (*_, finer) in enumerate(sides) if not finer]
     last = [k for k, (*_, finer) in enumerate(sides) if finer]
     own, rest = coarse.jacobian[:, : len(first)], coarse.jacobian[:, len(first) :]
-    columns = torch.cat([own, aligned(coarse.key, fine.key, fine.jacobian)], 1)
+    columns = torch.cat([own, align_rows(coarse.key, fine.key, fine.jacobian)], 1)
     order = torch.argsort(torch.tensor([*first, *last], dtype=torch.int64))
     return coarse._replace(jacobian=torch.cat([columns[:, order], rest], 1))
 
 
-class Runs(NamedTuple):
+class EpisodeRuns(NamedTuple):
     """All simulations of one episode."""
 
     fine: Frames | None  # on the finer mesh; None where nobody asked
     plain: Frames  # at the point
-    beside: list[Frames]  # along the model's own coordinates, each on the mesh of its slopes
-    held: list[Frames]  # with the held places off
-    trials: list[Frames | None]  # with each hypothesis; None: cannot be simulated
-    refined: set[int]  # which of these are on the finer mesh
+    shifted: list[Frames]  # along the model's own coordinates, each on the mesh of its slopes
+    grasp_shifted: list[Frames]  # with the held places off
+    with_hypotheses: list[Frames | None]  # with each hypothesis; None: cannot be simulated
+    fine_hypotheses: set[int]  # which of these are on the finer mesh
 
 
-def runs(
+def run_episode(
     worlds: Worlds,
     e: Episode,
     dt: float | None,
     hypotheses: Sequence[Hypothesis],
-    with_held: bool,
+    with_grasp_shifts: bool,
     finer: tuple[Episode, float | None] | None = None,
     with_fine: bool = False,
-) -> Runs:
+) -> EpisodeRuns:
     """An episode in a world, in those beside it, with every hypothesis and with held places off, side by side.
 
     Args:
@@ -131,7 +131,7 @@ def runs(
     world, own = worlds.plain, (e, dt)
     on = lambda fine: finer if fine and finer else own  # noqa: E731
     beside = [partial(w.frames, *on(fine)) for w, fine in zip(worlds.beside, worlds.finer_beside, strict=True)]
-    modes = Held().modes(world.cloth, e) if with_held else ()
+    modes = Held().modes(world.cloth, e) if with_grasp_shifts else ()
     held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m), dt) for m in modes]
     changed = [worlds.changed(h) for h in hypotheses]
     moves = [c is not None and _moves(c, world) for c in changed]
@@ -140,7 +140,7 @@ def runs(
     tried = [
         partial(if_possible, partial(c.frames, *own)) for c, other in zip(changed, moves, strict=True) if c and other
     ]
-    done: list[Any] = side_by_side(lambda job: job(), [*jobs, *tried])
+    done: list[Any] = map_parallel(lambda job: job(), [*jobs, *tried])
     happens, *sure = done[len(first) : len(jobs)]
     rest = iter(done[len(jobs) :])
     seen = lambda c: c and if_possible(partial(c.seen, happens, e))  # noqa: E731
@@ -155,7 +155,7 @@ def runs(
         fine, again = _refined(worlds, list(folds.values()), finer, fine)
         for k, frames in zip(folds, again, strict=True):
             trials[k] = frames
-    return Runs(fine, plain, sure[: len(beside)], sure[len(beside) :], trials, set(folds))
+    return EpisodeRuns(fine, plain, sure[: len(beside)], sure[len(beside) :], trials, set(folds))
 
 
 def _refined(
@@ -165,7 +165,7 @@ def _refined(
     first = [] if fine else [partial(worlds.seen, *finer, finer=True)]
     changed = [worlds.changed(h, finer=True) for h in hypotheses]
     tried = [partial(if_possible, partial(c.frames, *finer)) if c else lambda: None for c in changed]
-    done: list[Any] = side_by_side(lambda job: job(), [*first, *tried])
+    done: list[Any] = map_parallel(lambda job: job(), [*first, *tried])
     return fine or done[0], done[len(first) :]
 
 
@@ -174,12 +174,12 @@ def _moves(changed: World, world: World) -> bool:
     return changed.cloth is not world.cloth or changed.motions is not world.motions
 
 
-def side_by_side(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
+def map_parallel(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
     """Results in order, on all cores: simulations are independent, and the engine leaves Python alone meanwhile."""
-    return list(overlapping(work, items))
+    return list(iterate_parallel(work, items))
 
 
-def overlapping(work: Callable[[T], U], items: Sequence[T]) -> Generator[U, None, None]:
+def iterate_parallel(work: Callable[[T], U], items: Sequence[T]) -> Generator[U, None, None]:
     """The same, one after the other as they are asked for."""
     # of torch's threads, a new thread has as many as there are cores
     pool = ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(torch.get_num_threads(),))
@@ -189,16 +189,16 @@ def overlapping(work: Callable[[T], U], items: Sequence[T]) -> Generator[U, None
         pool.shutdown(cancel_futures=True)  # when interrupted, what has begun ends and nothing else begins
 
 
-def _replaced(coarse: Cells, fine: Cells) -> tuple[Cells, Tensor]:
+def _replaced(coarse: BinnedResiduals, fine: BinnedResiduals) -> tuple[BinnedResiduals, Tensor]:
     """(cells that both have, with the slopes of the first and the values of the second; first minus second)."""
     both = torch.isin(coarse.key, fine.key)
-    kept = coarse.rows(both)
+    kept = coarse.select(both)
     order = torch.argsort(fine.key)
     place = order[torch.searchsorted(fine.key[order], kept.key)]
-    return kept._replace(value=fine.value[place], spread=fine.spread[place]), kept.value - fine.value[place]
+    return kept._replace(value=fine.value[place], spread=fine.row_std[place]), kept.value - fine.value[place]
 
 
-def nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:
+def differentiate_nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:
     """Derivatives along what differs from episode to episode, and its standard deviations."""
     moved, steps, stds = [], [], []
     for kind, std in ((Clock(), [CLOCK]), (Camera(), [SHIFT] * 3 + [TURN] * 3), (Rim(), [RIM]), (Tare(), None)):
@@ -211,4 +211,4 @@ def nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) ->
             steps.append(0.5 * own)
             stds.append(own)
     every = [GRASP] * len(held)
-    return directions(base, [*moved, *held], [*steps, *every]), torch.tensor([*stds, *every], dtype=torch.float64)
+    return finite_differences(base, [*moved, *held], [*steps, *every]), torch.tensor([*stds, *every], dtype=torch.float64)

@@ -19,38 +19,38 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..data.binning import SEEN
-from .fitting import Fitted
-from .lack_of_fit import RARE, right, stable
+from ..data.binning import FORCE_BLOCK
+from .fitting import ModelFit
+from .lack_of_fit import RARE, expected_covariance, do_meshes_agree
 
 FEWEST = 4  # motions that can be alike
 AXES = "xyz"
 
 
-class Drift(NamedTuple):
+class ForceDrift(NamedTuple):
     """Of the forces on all grippers, measured less simulated, along one axis of the world."""
 
     axis: str
     rate: float  # N/s
     std: float
-    p: float  # of a right model's drifting as much along any axis
+    p_value: float  # of a right model's drifting as much along any axis
 
     @property
-    def lacking(self) -> bool:
+    def is_significant(self) -> bool:
         """No chance."""
-        return self.p < RARE
+        return self.p_value < RARE
 
     def as_dict(self) -> dict[str, Any]:
         """As diagnosis.json has it."""
-        return {**self._asdict(), "unit": "N/s", "lacking": self.lacking}
+        return {**self._asdict(), "unit": "N/s", "lacking": self.is_significant}
 
 
-def drifts(found: Fitted, names: Sequence[str]) -> list[Drift]:
+def estimate_force_drifts(found: ModelFit, names: Sequence[str]) -> list[ForceDrift]:
     """One for each axis; none where fewer than four of the motions ``names`` have such forces and can be judged."""
-    later = lambda c: len(c.time) and bool(((c.block == SEEN) & (c.time > c.time.min())).any())  # noqa: E731
+    later = lambda c: len(c.time) and bool(((c.block == FORCE_BLOCK) & (c.time > c.time.min())).any())  # noqa: E731
     every: dict[str, list[tuple[Tensor, Tensor]]] = {}
-    for k, (name, cells) in enumerate(zip(names, found.evidence.cells, strict=True)):
-        if later(cells) and stable(found, k):
+    for k, (name, cells) in enumerate(zip(names, found.linearisation.bins, strict=True)):
+        if later(cells) and do_meshes_agree(found, k):
             every.setdefault(name, []).append(_rates(found, k))
     if len(every) < FEWEST:
         return []
@@ -61,7 +61,7 @@ def drifts(found: Fitted, names: Sequence[str]) -> list[Drift]:
         if int(tells.sum()) < FEWEST:
             continue
         mean, std, freedom = _pooled(rate[tells], 1 / information[tells])
-        rows.append(Drift(axis, mean, std, min(1.0, len(AXES) * _beyond(abs(mean) / std, freedom))))
+        rows.append(ForceDrift(axis, mean, std, min(1.0, len(AXES) * _beyond(abs(mean) / std, freedom))))
     return rows
 
 
@@ -75,13 +75,13 @@ def _or_one(information: Tensor) -> Tensor:
     return torch.where(information > 0, information, 1.0)
 
 
-def _rates(found: Fitted, k: int) -> tuple[Tensor, Tensor]:
+def _rates(found: ModelFit, k: int) -> tuple[Tensor, Tensor]:
     """(rates, information: inverse variances) [axes] of one episode with forces in more than one window."""
-    cells = found.evidence.cells[k]
+    cells = found.linearisation.bins[k]
     axis = torch.arange(len(AXES))
-    here = (cells.block == SEEN)[:, None] & (cells.patch[:, None] % 3 == axis)
+    here = (cells.block == FORCE_BLOCK)[:, None] & (cells.channel[:, None] % 3 == axis)
     since = torch.where(here, (cells.time - cells.time.min())[:, None], 0.0)
-    still, moved = right(found, k)
+    still, moved = expected_covariance(found, k)
     weighed = torch.linalg.solve(still + moved @ moved.mT, since)
     information = (weighed * since).sum(0)
     return weighed.mT @ cells.value / _or_one(information), information

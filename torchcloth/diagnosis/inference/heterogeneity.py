@@ -12,8 +12,8 @@ from dataclasses import replace
 
 from ...episodes.world import Hypothesis, Model
 from ..causes.fabric import OF_BENDING, OF_MEMBRANE
-from .comparison import heard, spread
-from .fitting import Fitted
+from .comparison import list_observed_motions, jackknife
+from .fitting import ModelFit
 
 # by the number of a law: standard error by how motions differ, in logarithms, beyond which they disagree, and the
 # effects that change the law. In 115 sealed nulls the first is reached by two of bending and by none of the membrane
@@ -21,14 +21,14 @@ LAWS = {"bending.stiffness": (0.15, OF_BENDING), "youngs_modulus": (0.075, OF_ME
 FEWEST = 3  # motions, of which one may be the odd one
 
 
-def disputed(found: Fitted, names: Sequence[str], hypotheses: Sequence[Hypothesis]) -> list[tuple[Hypothesis, Model]]:
+def propose_from_heterogeneity(found: ModelFit, names: Sequence[str], hypotheses: Sequence[Hypothesis]) -> list[tuple[Hypothesis, Model]]:
     """Causes with the models to begin fits of them at, both ways where they have a sign; none, as a rule.
 
     The number that is disputed is back at its data sheet, the others stay where they were fitted.
     """
-    if len(set(heard(found.white.episode, names))) < FEWEST:
+    if len(set(list_observed_motions(found.whitened.episode, names))) < FEWEST:
         return []
-    model, errors, out = found.model, spread(found, names)[1], []
+    model, errors, out = found.model, jackknife(found, names)[1], []
     for place, parameter in enumerate(model.parameters):
         most, effects = LAWS.get(parameter.name, (float("inf"), ()))
         if float(errors[place]) <= most:

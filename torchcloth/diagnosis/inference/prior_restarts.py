@@ -14,18 +14,18 @@ import torch
 
 from ...episodes.world import Hypothesis, Model
 from ...episodes.world_cache import IMPOSSIBLE
-from ..data.dataset import Progress, Setting, staged
-from .fitting import Fitted, fit, leap, leap_with, with_cause
-from .linearise import asked_about, gather
-from .noise import unfitted, whitened
-from .warm_start import approach
+from ..data.dataset import Progress, DiagnosisData, prefix_progress
+from .fitting import ModelFit, fit, robust_step, robust_step_with, add_cause
+from .linearise import linearise_hypotheses, linearise
+from .noise import inflated_noise, whiten
+from .warm_start import quadratic_warm_start
 
 WORTH_TRYING = 0.5  # of what the best promises
 
 
-def afresh(
-    start: Fitted,
-    setting: Setting,
+def propose_from_prior(
+    start: ModelFit,
+    setting: DiagnosisData,
     hypotheses: Sequence[Hypothesis],
     tried: int,
     progress: Progress = lambda _: None,
@@ -37,22 +37,22 @@ def afresh(
     """
     sheet = replace(start.model, values=torch.zeros_like(start.model.values))
     away = [h.opposite for h in hypotheses if h.reverses]
-    about = staged(progress, "from the data sheet, causes")
-    there = gather(sheet, setting, hypotheses, about, start.evidence)
-    back = asked_about(there, sheet, setting, away, staged(progress, "from the data sheet, the other way"))
+    about = prefix_progress(progress, "from the data sheet, causes")
+    there = linearise(sheet, setting, hypotheses, about, start.linearisation)
+    back = linearise_hypotheses(there, sheet, setting, away, prefix_progress(progress, "from the data sheet, the other way"))
     ways = [replace(start, model=sheet, evidence=evidence) for evidence in (there, back)]  # leaps ask for no more
     promised = sorted((pair for found in ways for pair in _promises(found)), key=lambda pair: -pair[0])
-    likely: dict[str, Fitted] = {}
+    likely: dict[str, ModelFit] = {}
     for gained, name, found in promised:
         if gained > max(least, WORTH_TRYING * promised[0][0]):
             likely.setdefault(name, found)
     named = {h.name: h for h in hypotheses}
-    return [(named[name], with_cause(found, named[name])) for name, found in list(likely.items())[:tried]]
+    return [(named[name], add_cause(found, named[name])) for name, found in list(likely.items())[:tried]]
 
 
-def resettled(
-    found: Fitted, setting: Setting, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
-) -> Fitted | None:
+def refit_from_prior(
+    found: ModelFit, setting: DiagnosisData, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
+) -> ModelFit | None:
     """The same causes, fitted from the data sheet and asked about the others.
 
     None where that ends as far from it, or no world has the data sheet's numbers beside these causes.
@@ -61,22 +61,22 @@ def resettled(
     model = replace(found.model, values=torch.zeros_like(found.model.values))
     left = model.others(hypotheses)
     try:
-        near, _ = approach(model, setting, staged(progress, "causes, from the data sheet"))
-        anew = staged(progress, "causes, anew")
-        again = fit(near, setting, progress=anew, before=found.evidence)
+        near, _ = quadratic_warm_start(model, setting, prefix_progress(progress, "causes, from the data sheet"))
+        anew = prefix_progress(progress, "causes, anew")
+        again = fit(near, setting, progress=anew, before=found.linearisation)
         if again.model.strained:  # so that nobody asks what it says about the others
             return None
-        return fit(again.model, setting, left, 0, anew, before=found.evidence, here=again.evidence)
+        return fit(again.model, setting, left, 0, anew, before=found.linearisation, here=again.linearisation)
     except IMPOSSIBLE:
         return None
 
 
-def _promises(found: Fitted) -> list[tuple[float, str, Fitted]]:
+def _promises(found: ModelFit) -> list[tuple[float, str, ModelFit]]:
     """(log density that a cause adds to what one leap should gain, its name, the fit), where the leap goes its way."""
-    white, out = whitened(found.evidence, unfitted()), []
-    _, without = leap(white, found.model)
-    for j, h in enumerate(found.evidence.hypotheses):
-        step, gained = leap_with(white, found.model.plus(h), found.evidence.own + j)
+    white, out = whiten(found.linearisation, inflated_noise()), []
+    _, without = robust_step(white, found.model)
+    for j, h in enumerate(found.linearisation.hypotheses):
+        step, gained = robust_step_with(white, found.model.plus(h), found.linearisation.n_coordinates + j)
         if float(step[-1]) * h.typical > 0:
             out.append((gained - without, h.name, found))
     return out

@@ -14,32 +14,32 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .noise import Whitened
+from .noise import WhitenedBins
 
 FREEDOM = 5.0  # degrees
 
 
-def calmed(white: Whitened, step: Tensor | None = None) -> Whitened:
+def reweight(white: WhitenedBins, step: Tensor | None = None) -> WhitenedBins:
     """Cells weighted by stretch, and by nothing else: as they are, or after a ``step`` of the first coordinates."""
-    plain = unweighted(white)
+    plain = remove_weights(white)
     value = plain.value if step is None else plain.value + plain.jacobian[:, : len(step)] @ step
-    share = weights(value, plain.stretch).sqrt()
+    share = t_weights(value, plain.time_block).sqrt()
     return plain._replace(value=share * plain.value, jacobian=share[:, None] * plain.jacobian, share=share)
 
 
-def unweighted(white: Whitened) -> Whitened:
+def remove_weights(white: WhitenedBins) -> WhitenedBins:
     """Cells as whitening left them."""
-    value, slopes = white.value / white.share, white.jacobian / white.share[:, None]
+    value, slopes = white.value / white.row_weight, white.jacobian / white.row_weight[:, None]
     return white._replace(value=value, jacobian=slopes, share=torch.ones_like(value))
 
 
-def weights(value: Tensor, stretch: Tensor) -> Tensor:
+def t_weights(value: Tensor, stretch: Tensor) -> Tensor:
     """[C] of whitened cells."""
     count, square = _sums(value, stretch)
     return ((FREEDOM + count) / (FREEDOM + square)).clamp(max=1.0)[stretch]
 
 
-def densities(value: Tensor, stretch: Tensor) -> Tensor:
+def t_log_density(value: Tensor, stretch: Tensor) -> Tensor:
     """[stretches] logarithms, up to a constant that depends on the number of cells alone."""
     count, square = _sums(value, stretch)
     return -0.5 * (FREEDOM + count) * torch.log1p(square / FREEDOM)

@@ -17,11 +17,11 @@ from ...episodes.steps import shifted
 from ...episodes.world import Model
 from ...episodes.world_cache import IMPOSSIBLE, if_possible
 from ...identification.estimators.box_qp import bounded
-from ..data.dataset import Progress, Setting
+from ..data.dataset import Progress, DiagnosisData
 from .fitting import prior_precision
-from .linearise import Evidence, gather
-from .noise import unfitted, whitened
-from .robust_weights import calmed
+from .linearise import Linearisation, linearise
+from .noise import inflated_noise, whiten
+from .robust_weights import reweight
 
 SWEEPS = 2
 FARTHEST = 1.2  # widths, of one sweep
@@ -29,7 +29,7 @@ HALVINGS = 4  # of a width without a world
 THERE = 0.25  # widths, from which on slopes do
 
 
-def approach(model: Model, setting: Setting, progress: Progress = lambda _: None) -> tuple[Model, Evidence]:
+def quadratic_warm_start(model: Model, setting: DiagnosisData, progress: Progress = lambda _: None) -> tuple[Model, Linearisation]:
     """(a model near the optimum, evidence whose nuisances' slopes may be used from there on)."""
     wide = [*(p.std for p in model.parameters), *(0.5 * abs(h.typical) for h in model.accepted)]
     wide = [_possible(model, k, width) for k, width in enumerate(wide)]
@@ -38,7 +38,7 @@ def approach(model: Model, setting: Setting, progress: Progress = lambda _: None
     for _ in range(SWEEPS):
         evidence, width = _on_either_side(model, setting, progress, before, width)
         before = before or evidence
-        white = calmed(whitened(evidence, unfitted()))
+        white = reweight(whiten(evidence, inflated_noise()))
         up, down = white.jacobian.chunk(2, dim=1)
         low, high = ((end - model.point) / width for end in model.ends)
         slope, bend = _parabola(up * width, down * width, high.clamp(max=1.0), -low.clamp(min=-1.0))
@@ -52,13 +52,13 @@ def approach(model: Model, setting: Setting, progress: Progress = lambda _: None
 
 
 def _on_either_side(
-    model: Model, setting: Setting, progress: Progress, before: Evidence | None, width: Tensor
-) -> tuple[Evidence, Tensor]:
+    model: Model, setting: DiagnosisData, progress: Progress, before: Linearisation | None, width: Tensor
+) -> tuple[Linearisation, Tensor]:
     """Evidence a width on either side of every coordinate, or as much of it as can be simulated; (it, the width)."""
 
-    def gathered() -> Evidence:
+    def gathered() -> Linearisation:
         shifts = [(k, sign * w) for sign in (1.0, -1.0) for k, w in enumerate(width.tolist())]
-        return gather(model, setting, (), progress, before, shifts)
+        return linearise(model, setting, (), progress, before, shifts)
 
     for _ in range(HALVINGS):
         try:

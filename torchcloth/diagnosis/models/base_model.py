@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 
 from ...cloth import Cloth
-from ...episodes.observed import cloth_from
+from ...episodes.observed import build_cloth
 from ...episodes.world import Model, Parameter, World
 from ...parameters import PhysicalParameter
 from ...recordings import Recording
@@ -24,7 +24,7 @@ LAW, STIFFER = 1.5, 2.0  # standard deviation and step of stiffening in tension:
 
 def base_model(recording: Recording) -> Model:
     """From what an episode says of its cloth."""
-    cloth = cloth_from(replace(recording, air_density=None)).requires_grad_(False)
+    cloth = build_cloth(replace(recording, air_density=None)).requires_grad_(False)
     return Model(World(cloth), (found := tuple(_parameters(cloth, recording))), torch.zeros(len(found)).double())
 
 

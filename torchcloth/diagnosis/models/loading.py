@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from ...cloth import Cloth
-from ...episodes.observed import RATE, Episode, episode
+from ...episodes.observed import DEFAULT_FRAME_RATE_HZ, Episode, build_episode
 from ...episodes.replay import Frames, each
 from ...episodes.steps import one_way, shifted
 from ...episodes.world import Model, World
@@ -24,9 +24,9 @@ from ...recordings import Recording
 from ...recordings.consistency import same_cloth, together
 from ...recordings.fingerprints import alike, mark
 from ...recordings.size_checks import check_size
-from ..data.binning import directions
-from ..data.dataset import LATE
-from ..inference.episode_simulation import side_by_side
+from ..data.binning import finite_differences
+from ..data.dataset import MAX_CLOCK_DELAY_S
+from ..inference.episode_simulation import map_parallel
 from .model_file import ModelFile, load_model, of_fabric, read_model
 
 TRIES = 5  # of drawing a world that there is, for each that is wanted
@@ -146,7 +146,7 @@ def begin_with(path: str | Path, recordings: Sequence[Recording]) -> tuple[Model
 
 def watched(world: World, data: Episode) -> Frames:
     """What an observer whose clock may be late has of all of an episode's frames."""
-    return each(world.frames(data.beyond(LATE)), lambda field: field[: len(data.times)])
+    return each(world.frames(data.with_lookahead(MAX_CLOCK_DELAY_S)), lambda field: field[: len(data.times)])
 
 
 def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
@@ -158,10 +158,10 @@ def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
     check_size(recording)
     file = read_model(path, recording)
     model, world = file.model, file.model.world()
-    data, every = episode(model.base.cloth, recording, RATE), one_way(model)
+    data, every = build_episode(model.base.cloth, recording, DEFAULT_FRAME_RATE_HZ), one_way(model)
     covariance = torch.zeros(len(every), len(every)) if file.covariance is None else file.covariance
     shifts = every[: len(covariance)]  # a residual force, which comes last, has no errors
     worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]
-    frames, *beside = side_by_side(lambda w: watched(w, data), worlds)
-    slopes = directions(frames, beside, [step for _, step in shifts])
+    frames, *beside = map_parallel(lambda w: watched(w, data), worlds)
+    slopes = finite_differences(frames, beside, [step for _, step in shifts])
     return with_errors(world.cloth, data, frames, slopes, covariance, math.nan)

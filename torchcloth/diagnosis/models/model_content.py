@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...episodes.observed import effects_of, material_of, mesh_of
+from ...episodes.observed import build_effects, build_material, build_mesh
 from ...episodes.world import Parameter
 from ...errors import RecordingError, TorchclothError
 from ...recordings import ClothInfo, Collider, Recording, checks, scene
@@ -98,7 +98,7 @@ def read_content(path: Path) -> Content:
         raise RecordingError(f"{path}: format", got=reprlib.repr(found), expected=f"{FORMAT}", remedy=remedy)
     with damage(path):
         own = _scene(fields.inside("cloth"), Fields(folder.npz(ARRAYS), folder.place(ARRAYS), ": "))
-        for part in (mesh_of, material_of, effects_of):  # they refuse what is none, also where another takes its place
+        for part in (build_mesh, build_material, build_effects):  # they refuse what is none, also where another takes its place
             part(own)
         numbers = _numbers(fields)
         return Content(

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from ..._utils.files import atomically
+from ..._utils.files import write_atomically
 from ...episodes.world import Model
 from ...errors import InvalidInput
 from ...recordings import GraspInfo, Recording
@@ -69,7 +69,7 @@ def save_model(
     arrays = {name: getattr(cloth, name) for name in MESH if getattr(cloth, name) is not None}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    with atomically(Path(path)) as part, zipfile.ZipFile(part, "w") as file:
+    with write_atomically(Path(path)) as part, zipfile.ZipFile(part, "w") as file:
         file.writestr(CONTENT, json.dumps(content, indent=1, allow_nan=False, default=float))
         file.writestr(ARRAYS, buffer.getvalue())
     return Path(path)

@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 
 from ...episodes.observed_surface import ACROSS
-from ..data.binning import NAMES, STRETCH
-from ..data.dataset import Setting
-from ..inference.linearise import Evidence
+from ..data.binning import BLOCK_NAMES, BIN_SECONDS
+from ..data.dataset import DiagnosisData
+from ..inference.linearise import Linearisation
 
-POINTS = NAMES.index("points")
+POINTS = BLOCK_NAMES.index("points")
 SHOWN = 0.98  # quantile of the misfit at the end of the colour bar
 PIXELS = 49  # along each side of a tile
 LEAST = 1.0  # mm, that the colour bar spans at least: less would dramatise noise
 
 
-def misfit_maps(evidence: Evidence, setting: Setting, title: str = "", limit: float | None = None) -> Any:
+def draw_misfit_maps(evidence: Linearisation, setting: DiagnosisData, title: str = "", limit: float | None = None) -> Any:
     """Mean offset of the points from the surface along its normal, one row a motion, one column each 0.2 s.
 
     Each tile is the pattern as it lies, v upwards; grey parts were not seen. Red points lie on the side of the
@@ -36,16 +36,16 @@ def misfit_maps(evidence: Evidence, setting: Setting, title: str = "", limit: fl
 
     parts = ACROSS**2
     tiles = [_by_window(evidence, k, parts) for k in range(len(setting.episodes))]
-    limit = limit or misfit_limit(evidence)
+    limit = limit or choose_misfit_limit(evidence)
     rows, columns = len(tiles), 1 + max(max(t, default=0) for t in tiles)
     figure = Figure(figsize=(1.0 * columns + 1.4, 1.05 * rows + 0.5), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
     part, inside, extent = _raster(setting)
-    for k, (name, tile) in enumerate(zip(setting.names, tiles, strict=True)):
+    for k, (name, tile) in enumerate(zip(setting.motions, tiles, strict=True)):
         for j, axis in enumerate(axes[k]):
             axis.set(xticks=[], yticks=[], frame_on=False)
             if k == 0:
-                axis.set_title(f"{j * STRETCH:.1f} s", fontsize=8)
+                axis.set_title(f"{j * BIN_SECONDS:.1f} s", fontsize=8)
             if j in tile:
                 field = np.where(inside, tile[j][part], 0.0)
                 grey = np.full((*part.shape, 4), 0.82)
@@ -60,28 +60,28 @@ def misfit_maps(evidence: Evidence, setting: Setting, title: str = "", limit: fl
     return figure
 
 
-def misfit_limit(*evidence: Evidence) -> float:
+def choose_misfit_limit(*evidence: Linearisation) -> float:
     """mm, an end of the colour bar that fits all."""
-    size = np.concatenate([c.value[c.block == POINTS].abs().numpy() for e in evidence for c in e.cells])
+    size = np.concatenate([c.value[c.block == POINTS].abs().numpy() for e in evidence for c in e.bins])
     return max(1e3 * float(np.quantile(size, SHOWN)), LEAST) if len(size) else LEAST
 
 
-def _by_window(evidence: Evidence, episode: int, parts: int) -> dict[int, np.ndarray]:
+def _by_window(evidence: Linearisation, episode: int, parts: int) -> dict[int, np.ndarray]:
     """Window -> [parts] mm, NaN where nothing was seen."""
-    cells, out = evidence.cells[episode], {}
+    cells, out = evidence.bins[episode], {}
     own = (cells.block == POINTS).numpy()
-    part, window, value = (c.numpy()[own] for c in (cells.patch // 3, cells.window, cells.value))
+    part, window, value = (c.numpy()[own] for c in (cells.channel // 3, cells.window, cells.value))
     for w in np.unique(window):
         out[int(w)] = np.full(parts, np.nan)
         out[int(w)][part[window == w]] = 1e3 * value[window == w]
     return out
 
 
-def _raster(setting: Setting) -> tuple[np.ndarray, np.ndarray, tuple[float, float, float, float]]:
+def _raster(setting: DiagnosisData) -> tuple[np.ndarray, np.ndarray, tuple[float, float, float, float]]:
     """([N, N] part of the fabric that is nearest, [N, N] whether there is fabric, extent m) over the pattern."""
     from matplotlib.tri import Triangulation
 
-    place, faces = setting.rest.numpy()[:, :2], setting.sheet.faces.numpy()
+    place, faces = setting.rest_positions.numpy()[:, :2], setting.sheet.faces.numpy()
     low, high = place.min(0), place.max(0)
     u, v = np.meshgrid(*(np.linspace(a, b, PIXELS) for a, b in zip(low, high, strict=True)))
     pixels = np.stack([u, v], -1)

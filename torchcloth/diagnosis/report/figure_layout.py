@@ -7,12 +7,12 @@ from typing import Any
 ACROSS = 3
 
 
-def laid(count: int) -> tuple[int, int]:
+def grid_shape(count: int) -> tuple[int, int]:
     """(columns, lines) of so many."""
     return min(count, ACROSS), -(-count // ACROSS)
 
 
-def without_unused(axes: Any, count: int, rows: int) -> None:
+def hide_unused_axes(axes: Any, count: int, rows: int) -> None:
     """Clear the places of a grid that hold nothing; ``rows`` of it belong to one line of the ``count`` pictures."""
     across = axes.shape[1]
     for k in range(count, axes.size // rows):

@@ -13,9 +13,9 @@ from typing import Any
 from ..._utils.files import write_text
 from ..causes.glossary import ALIKE, GLOSSARY
 from ..decide.verdict import Diagnosis
-from ..inference.screening import Row, screen
+from ..inference.screening import ScoreTest, screen
 from . import pictures
-from .cloud_pictures import over_cloud
+from .cloud_pictures import draw_cloud_overlays
 
 REPORT = "report.html"
 ASIDE = (
@@ -39,7 +39,7 @@ def write_report(answer: Diagnosis, folder: Path) -> Path:
         f'<p class="verdict">Verdict: <b>{answer.verdict}</b></p>',
         *_told(answer),
     ]
-    parts = verdict if answer.searched is None else verdict + _evidence(answer)
+    parts = verdict if answer.optional_search is None else verdict + _evidence(answer)
     title = "What the simulation gets wrong"
     page = f"<!doctype html><html><head><meta charset='utf-8'><title>{title}</title><style>{STYLE}</style></head>"
     return write_text(folder / REPORT, f"{page}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")
@@ -58,12 +58,12 @@ def _told(answer: Diagnosis) -> list[str]:
 
 def _evidence(answer: Diagnosis) -> list[str]:
     """Pictures and tables of a search."""
-    found, content = answer.found, answer.content
+    found, content = answer.search, answer.content
     before, after = found.held_out
     first = screen(found.start)
-    rows = [*first, *found.screened]
+    rows = [*first, *found.scores]
     named = _named(content, rows)
-    own = {r.hypothesis.effect: r.hypothesis.says for r in rows} | {c["effect"]: c["says"] for c in content["causes"]}
+    own = {r.hypothesis.effect: r.hypothesis.description for r in rows} | {c["effect"]: c["says"] for c in content["causes"]}
     meanings = {name: said for name, said in own.items() if said} | GLOSSARY | ALIKE
     instead = {n: c["effect"] for c in content["causes"] for n in (*c["class"], *(r["effect"] for r in c["rivals"]))}
     return [
@@ -72,27 +72,27 @@ def _evidence(answer: Diagnosis) -> list[str]:
         "<h2>Where and when</h2>",
         "<p>Means over parts of the fabric and 0.2 s, as a fit to all motions leaves them. Grey: not seen, or left out "
         "because it jumps between shapes of the cloth.</p>",
-        _image(pictures.residual_maps(answer), "Neither points nor markers were seen."),
+        _image(pictures.draw_residual_maps(answer), "Neither points nor markers were seen."),
         "<h2>Motions held out</h2>",
         "<p>Each motion is predicted from the others. Small errors of clock, camera and grip that differ between "
         "episodes are taken out, so that a camera that stands elsewhere hardly shows here.</p>",
-        _image(pictures.courses(answer, before, after if found.steps else None)),
+        _image(pictures.draw_held_out_rms(answer, before, after if found.accepted else None)),
         _gained(answer.content["gain"]),
         "<h2>What the residuals of the base model ask for</h2>",
         "<p>A first guess by slopes, which decides what is fitted, with 95 % intervals. The causes above are what fits "
         "ended with.</p>",
-        _image(pictures.screening(first)),
-        "<h2>What is left</h2>" if found.steps else "<h2>All hypotheses</h2>",
-        _table(found.screened, instead),
+        _image(pictures.draw_scores(first)),
+        "<h2>What is left</h2>" if found.accepted else "<h2>All hypotheses</h2>",
+        _table(found.scores, instead),
         "<h2>Lack of fit</h2>",
         f"<p>{LACK}</p>",
-        _left(content["lack_of_fit"], pictures.titles(content)),
+        _left(content["lack_of_fit"], pictures.wrap_labels(content)),
         _drifts(answer.content["drifts"]),
         *_missing(answer),
         *_learned(answer.content["residual"]),
         "<h2>What these motions can tell apart</h2>",
         "<p>Dark: the two look alike in these data, by slopes. Which cannot be told apart by fits is said above.</p>",
-        _image(pictures.isolability(answer), "Nothing that was asked about shows in them."),
+        _image(pictures.draw_correlations(answer), "Nothing that was asked about shows in them."),
         "<h2>Parameters of the model</h2>",
         _parameters(answer.content["parameters"]),
         "<h2>What the names mean</h2>",
@@ -100,7 +100,7 @@ def _evidence(answer: Diagnosis) -> list[str]:
     ]
 
 
-def _named(content: Mapping[str, Any], screened: Sequence[Row]) -> set[str]:
+def _named(content: Mapping[str, Any], screened: Sequence[ScoreTest]) -> set[str]:
     """Effects that the report speaks of, without axes."""
     names = {r.hypothesis.name for r in screened}
     names |= {n for c in content["causes"] for n in (c["effect"], *c["class"], *(r["effect"] for r in c["rivals"]))}
@@ -144,7 +144,7 @@ def _over_cloud(answer: Diagnosis) -> list[str]:
     """The moments that were kept, if any."""
     if not answer.overlays:
         return []
-    faces = answer.found.setting.sheet.faces.numpy()
+    faces = answer.search.data.sheet.faces.numpy()
     told = (
         "Of each episode the moment in which the base model is farthest off, with the mean distance of all its points, "
         "also of those that count for nothing elsewhere because the cloth jumps."
@@ -152,7 +152,7 @@ def _over_cloud(answer: Diagnosis) -> list[str]:
     return [
         "<h2>Measured points over the simulation</h2>",
         f"<p>{told}</p>",
-        _image(over_cloud(answer.overlays, faces), alt="Measured points over the simulated cloth"),
+        _image(draw_cloud_overlays(answer.overlays, faces), alt="Measured points over the simulated cloth"),
     ]
 
 
@@ -208,12 +208,12 @@ DECISIONS = (
 )
 
 
-def _table(rows: list[Row], instead: dict[str, str]) -> str:
+def _table(rows: list[ScoreTest], instead: dict[str, str]) -> str:
     """``instead``: by name, the cause that is named for it as well."""
     body = []
     for r in rows:
         h = r.hypothesis
-        numbers = (r.amplitude, r.std, r.bias, abs(h.smallest), r.detectable, h.typical, 1e3 * r.size)
+        numbers = (r.amplitude, r.std, r.mesh_bias, abs(h.smallest), r.smallest_detectable, h.typical, 1e3 * r.position_rms)
         decision = f"not told from {instead[h.name]}" if h.name in instead else r.decision
         cells = [h.name, h.unit, *(f"{x:.3g}" if math.isfinite(x) else "–" for x in numbers), decision]
         if not math.isfinite(r.std):  # it could not be asked about
@@ -255,13 +255,13 @@ def _drifts(rows: list[dict[str, Any]]) -> str:
 
 
 def _missing(answer: Diagnosis) -> list[str]:
-    if answer.missing is None:
+    if answer.missing_force is None:
         return []
     return [
         "<h2>The force that is missing</h2>",
         "<p>Beside the model and its causes, where and when it is the surest in each motion. Red: along the normal "
         "u × v; arrows: along the cloth, where sure. Names no cause.</p>",
-        _image(pictures.missing_force(answer.missing)),
+        _image(pictures.draw_missing_force(answer.missing_force)),
     ]
 
 

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from ...episodes.world import Model
-from ..data.binning import NAMES, SEEN
+from ..data.binning import BLOCK_NAMES, FORCE_BLOCK
 from ..decide.candidates import PLAUSIBLE
-from ..decide.search import Found
-from ..inference.lack_of_fit import TOLERATED, Left
-from ..inference.screening import MUCH, Row
+from ..decide.search import SearchResult
+from ..inference.lack_of_fit import TOLERATED, LackOfFit
+from ..inference.screening import MUCH, ScoreTest
 from ..models.base_model import SILENT
 
 NEARLY = 0.9  # of the largest amplitude that is believed: fits end a little beyond what slopes ask for
@@ -25,7 +25,7 @@ MILLIMETRES = (
     "Millimetres are of means over parts of the fabric and 0.2 s, small errors of clock, camera and grip taken out: "
     "single points are farther off."
 )
-FELT = NAMES[SEEN:]
+FELT = BLOCK_NAMES[FORCE_BLOCK:]
 NO_MASS = (
     "No forces were measured, so mass itself cannot be told: cloth that is heavier, and as many times stiffer and "
     "braked harder, moves alike. What is said of it is what the data sheet says."
@@ -37,7 +37,7 @@ DISAGREED = (
 FLOORS = {"sensor only": "the sensor alone would leave", "repetitions": "repetitions of a command differ by"}
 
 
-def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
+def write_sentences(verdict: str, content: dict[str, Any]) -> list[str]:
     """Plain language, a line each."""
     gain, out = content["gain"], []
     if gain:
@@ -110,7 +110,7 @@ def sentences(verdict: str, content: dict[str, Any]) -> list[str]:
     return [*out, *(f"Warning: {text}." for text in content["warnings"])]
 
 
-def labels(content: dict[str, Any]) -> list[str]:
+def label_episodes(content: dict[str, Any]) -> list[str]:
     """What each episode's motion is called, with the episode's name, or number, where another has the same."""
     motions = content["motions"]
     names = [e["name"] for e in content.get("episodes", [])] or [str(k + 1) for k in range(len(motions))]
@@ -162,7 +162,7 @@ def _shown(c: dict[str, Any], content: dict[str, Any]) -> str:
     place = f"at ({u:.0f}, {v:.0f}) mm of the pattern" if "at" in where else f"in what gripper {where['gripper']} feels"
     time = f"{when['from']:.1f} to {when['to']:.1f} s"
     beyond = "beyond what fitted numbers could do instead"
-    motion, size = labels(content)[when["episode"]], f"{1e3 * moves['value']:.3g} m{moves['unit']}"
+    motion, size = label_episodes(content)[when["episode"]], f"{1e3 * moves['value']:.3g} m{moves['unit']}"
     return f"Surest in {motion} from {time}, {place}: {size} {beyond}."
 
 
@@ -225,15 +225,15 @@ def _residual(found: dict[str, Any] | None) -> list[str]:
     return [f"  A force that {told} would mend {before:.2f} to {after:.2f} mm on motions held out. It names no cause."]
 
 
-def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> list[str]:
+def collect_warnings(found: SearchResult, names: Sequence[str], left: Sequence[LackOfFit]) -> list[str]:
     """What a reader of a search over episodes with these motions should mind; ``left`` is its lack of fit."""
-    out = [doubt for e in found.setting.episodes for doubt in e.doubts()]
+    out = [doubt for e in found.data.episodes for doubt in e.data_warnings()]
     out += [
         f"{p.name} is {far:.1f} standard deviations from its data sheet: it does another's job"
         for p, far in found.end.model.strained
     ]
-    out += on_top(found.end.model)
-    if found.repeats is None:
+    out += warn_of_implied_amplitudes(found.end.model)
+    if found.replicate_floor is None:
         out.append("floor: sensor only; no episode repeats another, so what repetitions differ by is not known")
     if any(p.name == "youngs_modulus" and p.std > SILENT for p in found.start.model.parameters):
         out.append("the data sheet says no stiffness in tension: it is sought over two decades")
@@ -241,50 +241,50 @@ def warnings_of(found: Found, names: Sequence[str], left: Sequence[Left]) -> lis
         out.append(
             "the data sheet says no bending stiffness: the model's cloth has none, and nothing is asked about it"
         )
-    if found.impossible:
-        out.append(f"{', '.join(found.impossible)}: could not be simulated here, so nothing is said of it")
+    if found.not_simulated:
+        out.append(f"{', '.join(found.not_simulated)}: could not be simulated here, so nothing is said of it")
     if found.withdrawn:
         names_of = ", ".join(found.withdrawn)
         out.append(f"{names_of} was withdrawn: a local law that is no known cause predicts much better")
-    if found.left_out:
-        out.append(f"{100 * found.left_out:.1f} % of the cells jump between shapes of the cloth and are left out")
-    folded = sorted({row.motion for row in left if not row.stable})
+    if found.bifurcating_fraction:
+        out.append(f"{100 * found.bifurcating_fraction:.1f} % of the cells jump between shapes of the cloth and are left out")
+    folded = sorted({row.motion for row in left if not row.meshes_agree})
     if folded:
         out.append(f"the cloth folds in another way on another mesh in {', '.join(folded)}: no judgement there")
-    rippled = [row for row in left if row.seen and row.stable and row.expected > RIPPLED]
+    rippled = [row for row in left if row.is_position and row.meshes_agree and row.expected_rms > RIPPLED]
     out += [
-        f"the cloth ripples so much in {row.motion} that a right model might leave {1e3 * row.expected:.0f} mm of "
+        f"the cloth ripples so much in {row.motion} that a right model might leave {1e3 * row.expected_rms:.0f} mm of "
         f"{row.kind}: little there can be called lacking"
         for row in rippled
     ]
-    if not found.causes and any(row.lacking for row in left):
-        out += [_too_large(row) for row in found.screened if _is_too_large(row)][:1]
+    if not found.causes and any(row.is_significant for row in left):
+        out += [_too_large(row) for row in found.scores if _is_too_large(row)][:1]
     if len(set(names)) < 3:
         out.append(f"{len(set(names))} kind(s) of motion: many causes look alike in them")
-    if found.whole is not None and found.whole.few:
+    if found.total_gain is not None and found.total_gain.small_sample_episodes:
         out.append(
-            f"{found.whole.few} episodes, fewer than eight, tell little of how they scatter: the interval of the "
+            f"{found.total_gain.small_sample_episodes} episodes, fewer than eight, tell little of how they scatter: the interval of the "
             "explained share was doubled to be safe"
         )
     return out
 
 
-def on_top(model: Model) -> list[str]:
+def warn_of_implied_amplitudes(model: Model) -> list[str]:
     """Amplitudes that count from what another cause brought along."""
     causes = list(zip(model.accepted, model.amplitudes, strict=True))
     return [
         f"{h.name} = {amplitude:.3g} comes on top of the {h.typical:g} that {earlier.name} brought"
         for k, (h, amplitude) in enumerate(causes)
-        for earlier in [e for e, _ in causes[:k] if e.brings == h.name][:1]
+        for earlier in [e for e, _ in causes[:k] if e.implies == h.name][:1]
     ]
 
 
-def _is_too_large(row: Row) -> bool:
+def _is_too_large(row: ScoreTest) -> bool:
     """It would mend much, if it were believed."""
-    return row.shows and row.worth > MUCH and abs(row.amplitude) > NEARLY * PLAUSIBLE * abs(row.hypothesis.typical)
+    return row.is_visible and row.expected_gain > MUCH and abs(row.amplitude) > NEARLY * PLAUSIBLE * abs(row.hypothesis.typical)
 
 
-def _too_large(row: Row) -> str:
+def _too_large(row: ScoreTest) -> str:
     h = row.hypothesis
     return (
         f"{h.name} asks for {row.amplitude:.2g} {h.unit}, and more than {abs(PLAUSIBLE * h.typical):.2g} is not "

@@ -18,20 +18,20 @@ from ...episodes.world import View, World
 from ...pose.objective import CORRECTION, joined, pushable
 from ...simulation.sensitivities import Directions
 from ...types import ClothState
-from ..data.binning import directions
+from ..data.binning import finite_differences
 
 KEY = f"effects.{CORRECTION}.acceleration.raw"
 NUDGE = 1e-3  # of a direction, by which views are differentiated
 
 
-class Pushes(NamedTuple):
+class ForcePulses(NamedTuple):
     """K accelerations of the cloth, each constant within a stretch of frames; the first also acts while it settles."""
 
     windows: Sequence[tuple[int, int]]  # first and last frame of each; the last is the first of the next
     fields: Tensor  # [W, K, V, 3] m/s^2
 
 
-def pushed(world: World, episode: Episode, pushes: Pushes, dt: float | None = None) -> tuple[Frames, Frames]:
+def differentiate_pulses(world: World, episode: Episode, pushes: ForcePulses, dt: float | None = None) -> tuple[Frames, Frames]:
     """(what an observer has of the episode, its derivatives along the K pushes)."""
     frames, moved = _tangents(pushable(world.cloth), world.driven(episode), pushes, dt)
     for view in world.views:
@@ -39,7 +39,7 @@ def pushed(world: World, episode: Episode, pushes: Pushes, dt: float | None = No
     return frames, moved
 
 
-def _tangents(cloth: Cloth, episode: Episode, pushes: Pushes, dt: float | None) -> tuple[Frames, Frames]:
+def _tangents(cloth: Cloth, episode: Episode, pushes: ForcePulses, dt: float | None) -> tuple[Frames, Frames]:
     """Directions join in when they first push."""
     count, state = pushes.fields.shape[1], cloth.state(episode.initial)
     begun = pushes.fields.abs().amax((2, 3)).cummax(0).values > 0
@@ -49,7 +49,7 @@ def _tangents(cloth: Cloth, episode: Episode, pushes: Pushes, dt: float | None) 
         index = begun[w].nonzero().squeeze(1)
         moved = _grown(state, moved, before[index])
         along = Directions({KEY: pushes.fields[w, index].to(state.x)}, moved)
-        settle = SETTLING if episode.settles and w == 0 else 0.0
+        settle = SETTLING if episode.needs_settling and w == 0 else 0.0
         times = episode.times[first : last + 1]
         out, way = cloth.sensitivities(state, episode.motion, times, along=along, dt=dt, settle=settle)
         state, moved, before = out.state, way.state, begun[w]
@@ -75,7 +75,7 @@ def _viewed(view: View, frames: Frames, moved: Frames, episode: Episode) -> tupl
     seen, tried = view(frames, episode), []
     for k in range(len(moved.x)):
         tried.append(view(_added(frames, moved, k), episode))
-    return seen, directions(seen, tried, [NUDGE] * len(tried))
+    return seen, finite_differences(seen, tried, [NUDGE] * len(tried))
 
 
 def _added(frames: Frames, moved: Frames, k: int) -> Frames:

@@ -21,11 +21,11 @@ from ...episodes.replay import Frames
 from ...episodes.replay import each as of_each
 from ...pose.modes import modes_of
 from ...pose.objective import windows_of
-from ..data.binning import STRETCH, aligned, cells_of
-from ..data.dataset import Progress, Setting
-from ..inference.fitting import Fitted, prior_precision
-from ..inference.lack_of_fit import reference
-from .force_sensitivities import Pushes, pushed
+from ..data.binning import BIN_SECONDS, align_rows, bin_residuals
+from ..data.dataset import Progress, DiagnosisData
+from ..inference.fitting import ModelFit, prior_precision
+from ..inference.lack_of_fit import reference_noise
+from .force_sensitivities import ForcePulses, differentiate_pulses
 
 WINDOW, MODES = 0.2, 8  # s, fields for each axis
 LEVELS = 10 ** torch.linspace(-2.5, 1.5, 41, dtype=torch.float64)  # m/s^2, prior standard deviation of a field
@@ -36,7 +36,7 @@ AT_ONCE = 100_000_000  # slopes of points, 0.8 GB: of long motions they would fi
 SURE = 4.0  # standard errors; a chi of three numbers exceeds it once in 900 places
 
 
-class Missing(NamedTuple):
+class MotionForce(NamedTuple):
     """The missing force in one motion."""
 
     motion: str
@@ -44,7 +44,7 @@ class Missing(NamedTuple):
     force: Tensor  # [W, V, 3] Pa, world axes
     std: Tensor  # [W, V, 3] Pa
     x: Tensor  # [W, V, 3] m, where the cloth is in the middle of each
-    until: float | None  # s, from the first frame: from then on pushes grow without end, and nothing was asked
+    unstable_from: float | None  # s, from the first frame: from then on pushes grow without end, and nothing was asked
 
     @property
     def certainty(self) -> Tensor:
@@ -71,22 +71,22 @@ class MissingForce:
         area: [V] m^2.
     """
 
-    parts: Sequence[Missing]
+    motions: Sequence[MotionForce]
     gain: float
     weight: float
     uv: Tensor
     faces: Tensor
     area: Tensor
 
-    def total(self, m: Missing) -> Tensor:
+    def total(self, m: MotionForce) -> Tensor:
         """[W, 3] N, sum over the cloth."""
         return (m.force * self.area[:, None]).sum(1)
 
     def as_dict(self) -> dict[str, Any]:
         """The content of diagnosis.json: when the force is the most certain and what pushes alike then, by motion."""
-        return {"weight": self.weight, "gain": self.gain, "motions": [self._told(m) for m in self.parts]}
+        return {"weight": self.weight, "gain": self.gain, "motions": [self._told(m) for m in self.motions]}
 
-    def _told(self, m: Missing) -> dict[str, Any]:
+    def _told(self, m: MotionForce) -> dict[str, Any]:
         w, v = m.strongest
         alike = (m.force[w] @ m.force[w, v] / m.force[w, v].norm().clamp(min=1e-30)).clamp(min=0.0)
         weight = alike.square() * self.area  # what pushes the other way has its middle elsewhere
@@ -105,13 +105,13 @@ class MissingForce:
             "total": self.total(m)[w].tolist(),
             "standard_errors": certain,
             "sure": certain > SURE,
-            "until": m.until,
+            "until": m.unstable_from,
         }
 
 
 def missing_force(
-    found: Fitted,
-    setting: Setting,
+    found: ModelFit,
+    setting: DiagnosisData,
     window: float = WINDOW,
     modes: int = MODES,
     progress: Progress = lambda _: None,
@@ -130,15 +130,15 @@ def missing_force(
     parts = [_asked(found, setting, k, fields, window, progress) for k in range(len(setting.episodes))]
     gain, answer = _likeliest(parts, found, 3 * modes)
     area = torch.as_tensor(world.cloth.mesh.vertex_area).to(fields)
-    density = world.cloth.model().mass.to(fields)[:, 0] / area  # kg/m^2 where it pushes
-    told, first = [], found.evidence.own
-    for name, p, e in zip(setting.names, parts, setting.episodes, strict=True):
+    density = world.cloth.build_model().mass.to(fields)[:, 0] / area  # kg/m^2 where it pushes
+    told, first = [], found.linearisation.n_coordinates
+    for name, p, e in zip(setting.motions, parts, setting.episodes, strict=True):
         here = slice(first, first := first + 3 * modes * len(p.windows))
         force, std = (density[:, None] * f for f in _spread(answer.mean[here], answer.covariance[here, here], fields))
         windows = torch.stack([e.times[list(w)] - e.times[0] for w in p.windows])
-        told.append(Missing(name, windows, force, std, p.x, p.until))
+        told.append(MotionForce(name, windows, force, std, p.x, p.until))
     weight = GRAVITY * float((density * area).sum() / area.sum())
-    return MissingForce(told, gain, weight, setting.rest[:, :2], torch.as_tensor(world.cloth.mesh.faces), area)
+    return MissingForce(told, gain, weight, setting.rest_positions[:, :2], torch.as_tensor(world.cloth.mesh.faces), area)
 
 
 class _Asked(NamedTuple):
@@ -151,47 +151,47 @@ class _Asked(NamedTuple):
     until: float | None  # s, from the first frame
 
 
-def _asked(found: Fitted, setting: Setting, k: int, fields: Tensor, window: float, progress: Progress) -> _Asked:
+def _asked(found: ModelFit, setting: DiagnosisData, k: int, fields: Tensor, window: float, progress: Progress) -> _Asked:
     e = setting.episodes[k]
     progress(f"{e.name}: missing force")
     windows = windows_of(e.times, window)
-    frames, moved = pushed(found.model.world(), e, Pushes(windows, modal(windows, fields)), setting.dt)
+    frames, moved = differentiate_pulses(found.model.world(), e, ForcePulses(windows, expand_modes(windows, fields)), setting.dt)
     middle = torch.tensor([(first + last) // 2 for first, last in windows])
     count = _foreseen(e, moved)
-    value, slopes = whitened_beside(found, setting, k, frames, moved, count)
-    unasked = bool((found.evidence.cells[k].window >= count).any())
-    return _Asked(value, slopes, windows, frames.x[middle], count * STRETCH if unasked else None)
+    value, slopes = whiten_with_force(found, setting, k, frames, moved, count)
+    unasked = bool((found.linearisation.bins[k].window >= count).any())
+    return _Asked(value, slopes, windows, frames.x[middle], count * BIN_SECONDS if unasked else None)
 
 
 def _foreseen(e: Episode, moved: Frames) -> int:
     """Stretches of time of the cells before the first in which a push moves the cloth farther than any could."""
     since = e.times - e.times[0]
     far = ~(moved.x.abs().amax((0, 2, 3)) < FARTHEST * float(since[-1]) ** 2)  # not a number is far
-    return int(since[far.nonzero()[0]] / STRETCH) if bool(far.any()) else int(since[-1] / STRETCH) + 1
+    return int(since[far.nonzero()[0]] / BIN_SECONDS) if bool(far.any()) else int(since[-1] / BIN_SECONDS) + 1
 
 
-def modal(windows: Sequence[tuple[int, int]], fields: Tensor) -> Tensor:
+def expand_modes(windows: Sequence[tuple[int, int]], fields: Tensor) -> Tensor:
     """[W, W * M * 3, V, 3]: every field [M, V] along every axis in every window."""
     count = len(windows)
     unit = torch.einsum("mv,ab->mavb", fields, torch.eye(3).to(fields)).flatten(0, 1)
     return torch.einsum("wu,kvb->wukvb", torch.eye(count).to(fields), unit).flatten(1, 2)
 
 
-def whitened_beside(
-    found: Fitted, setting: Setting, k: int, frames: Frames, moved: Frames, count: int
+def whiten_with_force(
+    found: ModelFit, setting: DiagnosisData, k: int, frames: Frames, moved: Frames, count: int
 ) -> tuple[Tensor, Tensor]:
     """(residuals [C], slopes [C, own + K]) along the model's own coordinates, then along ``moved``; both whitened.
 
     Of cells in the first ``count`` stretches of time.
     """
-    e, stds, told = setting.episodes[k], found.evidence.stds[k], found.evidence.cells[k].window < count
-    cells = found.evidence.cells[k].rows(told)
+    e, stds, told = setting.episodes[k], found.linearisation.nuisance_stds[k], found.linearisation.bins[k].window < count
+    cells = found.linearisation.bins[k].select(told)
     most = AT_ONCE // max(1, sum(map(len, e.clouds)))
-    coarse = [cells_of(frames, some, e, setting.sheet, setting.rest) for some in _divided(moved, most)]
-    slopes = torch.cat([aligned(cells.key, c.key, c.jacobian) for c in coarse], 1)
-    noise, _ = reference(cells, found.evidence.numerics[k][told])
+    coarse = [bin_residuals(frames, some, e, setting.sheet, setting.rest_positions) for some in _divided(moved, most)]
+    slopes = torch.cat([align_rows(cells.key, c.key, c.jacobian) for c in coarse], 1)
+    noise, _ = reference_noise(cells, found.linearisation.mesh_differences[k][told])
     root = torch.linalg.cholesky(noise.covariance(cells, cells.jacobian[:, -len(stds) :], stds))
-    both = torch.cat([cells.value[:, None], cells.jacobian[:, : found.evidence.own], slopes], 1)
+    both = torch.cat([cells.value[:, None], cells.jacobian[:, : found.linearisation.n_coordinates], slopes], 1)
     both = torch.linalg.solve_triangular(root, both, upper=False)
     return both[:, 0], both[:, 1:]
 
@@ -211,12 +211,12 @@ class _Found(NamedTuple):
     covariance: Tensor
 
 
-def _likeliest(parts: Sequence[_Asked], found: Fitted, each: int) -> tuple[float, _Found]:
+def _likeliest(parts: Sequence[_Asked], found: ModelFit, each: int) -> tuple[float, _Found]:
     """(gain in log-likelihood over no force, the force).
 
     First one size for all that is pushed, then one for each window, of ``each`` numbers (MacKay 1992): most are still.
     """
-    own = found.evidence.own
+    own = found.linearisation.n_coordinates
     pushes = torch.block_diag(*(p.slopes[:, own:] for p in parts))
     slopes = torch.cat([torch.cat([p.slopes[:, :own] for p in parts]), pushes], 1)
     known = prior_precision(found.model)

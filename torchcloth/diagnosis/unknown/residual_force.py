@@ -18,10 +18,10 @@ from ...boundaries import Grasp
 from ...effects import ResidualForce
 from ...effects.residual import LAWS, PLACES, describe
 from ...episodes.world import RESIDUAL, Hypothesis, Model, World
-from ..data.dataset import Progress, Setting
-from ..decide.search import Found, extend, instead
+from ..data.dataset import Progress, DiagnosisData
+from ..decide.search import SearchResult, extend_search, replace_by_law
 from ..inference.comparison import Gain
-from ..inference.fitting import Fitted, fit
+from ..inference.fitting import ModelFit, fit
 
 TRIED = 2  # laws that are fitted at each step
 NEARLY_ALL = 0.9  # of what can be explained, beyond which no law does clearly more
@@ -48,19 +48,19 @@ TERMS = tuple(_term(law, place) for law in LAWS for place in PLACES if place or 
 
 
 @dataclass(frozen=True, eq=False)
-class Residual:
+class ResidualForceFit:
     """What was learned.
 
     Attributes:
         found: the search among laws, from the model with its causes.
     """
 
-    found: Found
+    search: SearchResult
 
     @property
     def model(self) -> Model:
         """With the residual force; its parameters and causes were fitted beside it."""
-        return self.found.end.model
+        return self.search.end.model
 
     @property
     def terms(self) -> dict[str, float]:
@@ -71,7 +71,7 @@ class Residual:
     @property
     def gain(self) -> Gain | None:
         """On motions held out, over the model without it; None: nothing was learned."""
-        return self.found.whole
+        return self.search.total_gain
 
     def as_dict(self) -> dict[str, Any]:
         """The content of diagnosis.json."""
@@ -83,13 +83,13 @@ class Residual:
             ],
             "path": [
                 {
-                    "kept": s.best.hypothesis.name.removeprefix(f"{RESIDUAL}."),
-                    "log_density": s.best.gain.density,
-                    "instead_of": [c.hypothesis.name.removeprefix(f"{RESIDUAL}.") for c in s.tried if c is not s.best],
+                    "kept": s.candidate.hypothesis.name.removeprefix(f"{RESIDUAL}."),
+                    "log_density": s.candidate.gain.log_density,
+                    "instead_of": [c.hypothesis.name.removeprefix(f"{RESIDUAL}.") for c in s.tried if c is not s.candidate],
                 }
-                for s in self.found.steps
+                for s in self.search.accepted
             ],
-            "gain": None if gain is None else {"rms_before": gain.before, "rms_after": gain.after, "unit": "m"},
+            "gain": None if gain is None else {"rms_before": gain.rms_before, "rms_after": gain.rms_after, "unit": "m"},
         }
 
 
@@ -98,20 +98,20 @@ def is_residual(hypothesis: Hypothesis) -> bool:
     return hypothesis.name.startswith(f"{RESIDUAL}.")
 
 
-def doubted(found: Found, progress: Progress = lambda _: None) -> Found:
+def check_against_laws(found: SearchResult, progress: Progress = lambda _: None) -> SearchResult:
     """A search with its causes, or without where one law does clearly more: something that nobody asked about.
 
     What is not in the catalogue may be done in part by what is: a stiff patch by a wider grip.
     """
-    if not found.causes or found.whole is None or found.whole.explained > NEARLY_ALL:
+    if not found.causes or found.total_gain is None or found.total_gain.explained_fraction > NEARLY_ALL:
         return found
-    start, setting = found.start, found.setting
-    asked, known = start.model.others(TERMS), start.evidence
+    start, setting = found.start, found.data
+    asked, known = start.model.others(TERMS), start.linearisation
     laws = fit(start.model, setting, asked, 0, progress, start.noise, known, known)
-    return instead(found, laws, TRIED, progress)
+    return replace_by_law(found, laws, TRIED, progress)
 
 
-def learn_residual(found: Fitted, setting: Setting, progress: Progress = lambda _: None) -> Residual:
+def learn_residual_force(found: ModelFit, setting: DiagnosisData, progress: Progress = lambda _: None) -> ResidualForceFit:
     """Local laws that mend what a model with its causes leaves, if any does.
 
     Args:
@@ -120,5 +120,5 @@ def learn_residual(found: Fitted, setting: Setting, progress: Progress = lambda 
         progress: called with one line for each thing that is simulated.
     """
     laws = found.model.others(TERMS)
-    start = fit(found.model, setting, laws, 1, progress, before=found.evidence, here=found.evidence)
-    return Residual(extend(start, setting, laws, progress, TRIED))
+    start = fit(found.model, setting, laws, 1, progress, before=found.linearisation, here=found.linearisation)
+    return ResidualForceFit(extend_search(start, setting, laws, progress, TRIED))
