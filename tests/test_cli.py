@@ -18,7 +18,7 @@ from helpers.twins import doubles, first, twin
 
 from torchcloth import recordings
 from torchcloth.cli import doctor, main
-from torchcloth.cli.output_paths import check_file, check_output_folder
+from torchcloth.cli.output_paths import check_output_file, check_output_folder
 from torchcloth.errors import InvalidInput
 from torchcloth.observe import render
 
@@ -89,7 +89,7 @@ WRONG = {
     "nuisance twice": (["--nuisance", "clock", "clock=0.1"], "--nuisance; got 'clock' twice; expected each name once"),
     "prior twice": (["--prior", "air.normal=1,2", "air.normal=3,2"], "--prior; got 'air.normal' twice"),
     "prior of a distance": (["--method", "adam", "--prior", "youngs_modulus=1e6,1.01"], "priors; got youngs_modulus w"),
-    "contrast of nothing": (["--contrast", "2"], "--contrast; got 2.0; expected --fields beside it"),
+    "contrast of nothing": (["--contrast", "2"], "--contrast; got 2.0; expected --fields as well"),
     "impossible contrast": (["--fields", "youngs_modulus", "--contrast", "-1"], "contrast; got -1.0; expected a num"),
     "fields without iterations": (["--fields", "youngs_modulus", "--iterations", "0"], "iterations; got 0; expected"),
 }
@@ -418,7 +418,7 @@ def test_a_place_that_can_be_written_is_left_as_it_is(tmp_path, monkeypatch):
     (tmp_path / "dangling").symlink_to(tmp_path / "nothing")
     for path in (Path("old"), Path("new/a/b"), tmp_path / "new" / ".." / "b", Path(".."), Path("old/../c")):
         check_output_folder(path)
-    check_file(Path("new/a.gif"))
+    check_output_file(Path("new/a.gif"))
     for path in (Path("dangling"), Path("dangling/a")):
         with pytest.raises(InvalidInput, match="dangling, a file"):
             check_output_folder(path)

@@ -50,7 +50,7 @@ def test_a_strip_at_any_angle(strips, tmp_path, capsys):
     assert (out / "prediction.png").stat().st_size > 5000
     assert "replaced" not in printed
     assert main(["predict", str(strips), "--angle", "45", "--out", str(out)]) == 0
-    assert "prediction.json (the last one is replaced)" in capsys.readouterr().out
+    assert "prediction.json (the earlier one was replaced)" in capsys.readouterr().out
 
 
 def test_a_table_is_predicted_and_compared_with(strips, tmp_path, capsys):
@@ -97,7 +97,7 @@ def test_wrong_input_is_one_line(strips, swing, tmp_path, capsys):
         (strips,): "--angle; got none; expected degrees",
         (strips, "--angle", "1000"): "angle; got 1000 degrees; expected -180 to 180",
         (strips, "--angle", "30", "--length", "-1"): "length; got -1.0",
-        (strips, table, "--angle", "30"): "SEEN; got a table and a strip's numbers; expected one of them",
+        (strips, table, "--angle", "30"): "DATA; got a table and a strip's numbers; expected one of them",
         (strips, other): "FIT; got tension.json with an episode to predict; expected identification.json",
         (
             fit,
@@ -109,7 +109,7 @@ def test_wrong_input_is_one_line(strips, swing, tmp_path, capsys):
         (fit, other, "--width", "0.02"): "got identification.json with a strip to predict",
         (fit, other, "--preload", "0"): "got identification.json with a strip to predict",
         (model, other, "--angle", "30"): "got m.tcm with a strip to predict; expected tension.json",
-        (fit,): "SEEN; got none; expected an episode",
+        (fit,): "DATA; got none; expected an episode",
         (fit, tmp_path / "no"): "no",
         (fit / "run1.json", other): "FIT; got .*run1.json; expected tension.json, identification.json or the folder",
         (fit / "deep", other): "FIT; got .*deep; expected",

@@ -13,7 +13,7 @@ from torchcloth.cli import main
 from torchcloth.diagnosis import base_model, save_model
 from torchcloth.diagnosis.causes.hypotheses import known
 from torchcloth.identification import build_episode
-from torchcloth.planning.result import PLANNED
+from torchcloth.planning.result import PLANNED_PROVENANCE
 
 OPTIONS = ["--iterations", "3", "--wait", "0.1", "--waypoints", "2"]
 
@@ -58,7 +58,7 @@ def test_writes_what_was_planned(folder, goal, tmp_path, capsys):
     assert words["limit"]["what"].endswith("of arm")
     assert words["warnings"] == []
     planned = rec.read(out / "episode")
-    assert planned.provenance == PLANNED
+    assert planned.provenance == PLANNED_PROVENANCE
     assert planned.joints["arm"].q.shape[1] == 7
     assert (out / "plan.png").stat().st_size > 10_000
     assert sorted(file.name for file in out.iterdir()) == ["episode", "plan.json", "plan.png"]
@@ -82,7 +82,7 @@ def test_plans_with_the_model_of_a_diagnosis(folder, goal, planned, tmp_path, ca
         str(goal),
         "--fit",
         str(tmp_path / "model.tcm"),
-        "--draws",
+        "--samples",
         "3",
         "--out",
         str(tmp_path / "o"),
@@ -100,8 +100,8 @@ def test_plans_with_the_model_of_a_diagnosis(folder, goal, planned, tmp_path, ca
     [
         (["--goal", "nowhere.npy"], "goal"),
         (["--fit", "nowhere"], "nowhere"),
-        (["--draws", "0"], "--draws"),
-        (["--draws", "4"], "--draws"),
+        (["--samples", "0"], "--samples"),
+        (["--samples", "4"], "--samples"),
         (["--waypoints", "0"], "waypoints"),
         (["--wait", "-1"], "wait"),
         (["--resume"], "resume"),

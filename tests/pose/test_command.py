@@ -18,7 +18,7 @@ def folder(scene, tmp_path_factory):
 
 def test_writes_what_it_found(folder, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(["pose", str(folder), "--out", str(out), "--modes", "2", "--uncertain", "youngs_modulus=2"]) == 0
+    assert main(["pose", str(folder), "--out", str(out), "--modes", "2", "--uncertainty", "youngs_modulus=2"]) == 0
     arrays, words = np.load(out / "pose.npz"), json.loads((out / "pose.json").read_text())
     assert arrays["x"].shape == arrays["std"].shape == (5, 49, 3)
     assert arrays["seen"].shape == (5, 49)
@@ -50,9 +50,9 @@ def test_takes_a_fit(scene, folder, tmp_path):
     ("more", "said"),
     [
         (["--fit", "nowhere"], "nowhere"),
-        (["--uncertain", "colour=2"], "got 'colour'"),
-        (["--uncertain", "youngs_modulus=0.5"], "prior of youngs_modulus; got (79999"),
-        (["--uncertain", "youngs_modulus=2", "youngs_modulus=3"], "got 'youngs_modulus' twice"),
+        (["--uncertainty", "colour=2"], "got 'colour'"),
+        (["--uncertainty", "youngs_modulus=0.5"], "prior of youngs_modulus; got (79999"),
+        (["--uncertainty", "youngs_modulus=2", "youngs_modulus=3"], "got 'youngs_modulus' twice"),
         (["--modes", "0"], "modes; got 0"),
         (["--window", "-1"], "window; got -1"),
         (["--truth"], "truth"),

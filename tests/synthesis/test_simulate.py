@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from torchcloth import cli, recordings, robots
-from torchcloth.boundaries.motion import interpolate
-from torchcloth.identification import cloth_from, episode
+from torchcloth.boundaries.motion import interpolate_poses
+from torchcloth.identification import build_cloth, build_episode
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.observe import DepthCamera, decode, to_points
 from torchcloth.parameters import PhysicalParameter
@@ -60,7 +60,7 @@ def test_held_vertices_follow_the_replayed_joints(recording):
     assert set(motion) == {"left", "right"} == set(recording.robots)
     times = torch.as_tensor(recording.truth.t)
     for name, grasp in recording.grasps.items():
-        pose = interpolate(motion[name], times).numpy()
+        pose = interpolate_poses(motion[name], times).numpy()
         held = recording.truth.vertices[:, grasp.vertices]
         local = np.einsum("tba,tvb->tva", pose[:, :3, :3], held - pose[:, None, :3, 3])
         assert np.abs(local - local[0]).max() < 2e-5
@@ -97,15 +97,15 @@ def test_depth_images_show_arms_table_and_cloth(recording):
 
 
 def test_identification_takes_it(recording):
-    cloth = cloth_from(recording)
-    taken = episode(cloth, recording)
+    cloth = build_cloth(recording)
+    taken = build_episode(cloth, recording)
     assert len(taken.clouds) == len(recording.points)
     assert set(taken.motion) == {"left", "right"}
 
 
 def test_a_fit_starts_from_the_model_that_made_it_but_for_a_stiffer_membrane(recording):
     truth = {key.removeprefix("parameter/"): value for key, value in recording.truth.extra.items()}
-    modules = cloth_from(recording).named_modules()
+    modules = build_cloth(recording).named_modules()
     start = {name: part.value.detach().numpy() for name, part in modules if isinstance(part, PhysicalParameter)}
     assert truth["material.youngs_modulus"] == pytest.approx(609020.0)  # DiffCP's cotton, Pa at 1 mm
     bending = ("effects.bending.stiffness", "effects.bending.damping_time")
@@ -117,7 +117,7 @@ def test_a_fit_starts_from_the_model_that_made_it_but_for_a_stiffer_membrane(rec
 def test_a_finished_episode_is_not_made_again(folder, capsys):
     made = (folder / EPISODE / "episode.json").stat().st_mtime_ns
     assert simulate(folder) == 0
-    assert "was there" in capsys.readouterr().out
+    assert "existed" in capsys.readouterr().out
     assert (folder / EPISODE / "episode.json").stat().st_mtime_ns == made
 
 
@@ -172,7 +172,7 @@ def test_an_interruption_leaves_no_half_episode(tmp_path, capsys, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchcloth.synthesis.episodes.capture", stop)
+    monkeypatch.setattr("torchcloth.synthesis.generate.capture", stop)
     assert simulate(tmp_path, "--grippers-only") == 130
     assert "the same command goes on" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

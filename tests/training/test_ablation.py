@@ -11,7 +11,7 @@ import torch
 from torchcloth.errors import InvalidInput
 from torchcloth.materials import AEP
 from torchcloth.training.ablation import command
-from torchcloth.training.ablation import study as studies
+from torchcloth.training.ablation import runs as studies
 from torchcloth.training.ablation.measures import (
     energies,
     scaled_poisson,
@@ -41,7 +41,7 @@ def test_scenes_start_unstrained_above_the_table(garment, action):
     assert scene.start[:, 2].min() >= 0
     cloth = scene.cloth([REFERENCE])
     with torch.no_grad():
-        membrane = float(energies(cloth.model(), cloth.rest_state())["total"])
+        membrane = float(energies(cloth.build_model(), cloth.rest_state())["total"])
     weight = 9.81 * COARSE.areal_density * scene.mesh.area.sum()
     assert membrane < 1e-4 * weight * scene.mesh.mean_edge, "nothing springs up at the start"
     for name, at in scene.action.motion.items():
@@ -197,8 +197,8 @@ def test_a_folder_with_other_settings_is_refused(finished, tmp_path, capsys):
 
 
 def test_a_damaged_run_is_named(finished, tmp_path, capsys):
-    study = studies.Study(tmp_path, Setup(triangles=60, pace=8.0))
-    study.begin()
+    runs = studies.Study(tmp_path, Setup(triangles=60, pace=8.0))
+    runs.begin()
     (tmp_path / "runs" / "dress-drag-reference.npz").write_bytes(b"half")
     assert call(tmp_path, "--report") == 2
     assert "dress-drag-reference.npz: unreadable" in capsys.readouterr().err

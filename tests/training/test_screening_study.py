@@ -14,26 +14,26 @@ from torchcloth.training.studies.command import main
 def evidence(truth=(0.0, 0.3, 0.0, 0.7, 0.0), mesh=0.0):
     found = toys.evidence(toys.smooth(1, 6), 2, ["a", "b", "c"], torch.tensor(truth).double(), 0)
     return found.__class__(
-        found.cells, found.own, found.hypotheses, found.stds, [mesh * c.jacobian[:, 3] for c in found.cells]
+        found.bins, found.n_coordinates, found.hypotheses, found.nuisance_stds, [mesh * c.jacobian[:, 3] for c in found.bins]
     )
 
 
 def test_independent_errors_are_as_large_and_agree_with_nobody():
     found = toys.fitted(evidence())
     other = screening_ablations.independent(found)
-    cells, nothing = found.evidence.cells[0], torch.zeros(0).double()
+    cells, nothing = found.linearisation.bins[0], torch.zeros(0).double()
     usual, alone = (f.noise.covariance(cells, cells.jacobian[:, :0], nothing) for f in (found, other))
     assert torch.equal(usual.diagonal(), alone.diagonal())
     assert float((alone - torch.diag(alone.diagonal())).abs().max()) == 0.0 < float((usual[0, 1:]).abs().max())
-    assert other.evidence is found.evidence
-    assert other.noise.smooth(cells).equal(found.noise.smooth(cells))
+    assert other.linearisation is found.linearisation
+    assert other.noise.smooth_fraction(cells).equal(found.noise.smooth_fraction(cells))
 
 
 def test_exact_episodes_keep_all_but_their_nuisances():
     found = toys.fitted(evidence())
     other = screening_ablations.exact(found)
-    assert all(float(s.max()) < 1e-11 for s in other.evidence.stds)
-    assert all(a is b for a, b in zip(found.evidence.cells, other.evidence.cells, strict=True))
+    assert all(float(s.max()) < 1e-11 for s in other.linearisation.nuisance_stds)
+    assert all(a is b for a, b in zip(found.linearisation.bins, other.linearisation.bins, strict=True))
 
 
 def test_against_zero_only_what_matters_changes():
@@ -46,18 +46,18 @@ def test_against_zero_only_what_matters_changes():
 def test_on_one_mesh_residuals_are_those_of_the_given_one():
     found = toys.fitted(evidence(mesh=-0.5))
     other = screening_ablations.one_mesh(found)
-    for a, b, n in zip(found.evidence.cells, other.evidence.cells, found.evidence.numerics, strict=True):
+    for a, b, n in zip(found.linearisation.bins, other.linearisation.bins, found.linearisation.mesh_differences, strict=True):
         assert torch.equal(b.value, a.value + n)
         assert torch.equal(b.jacobian, a.jacobian)
-    assert not any(n.any() for n in other.evidence.numerics)
+    assert not any(n.any() for n in other.linearisation.mesh_differences)
 
 
 def test_a_rigid_fabric_leaves_all_to_the_causes():
     """What is asked for is then the plain regression on that cause alone."""
     found = screening_ablations.rigid(toys.fitted(evidence()))
-    slopes, value = found.white.jacobian[:, found.evidence.own :], found.white.value
+    slopes, value = found.whitened.jacobian[:, found.linearisation.n_coordinates :], found.whitened.value
     for r in screen(found):
-        k = [h.name for h in found.evidence.hypotheses].index(r.hypothesis.name)
+        k = [h.name for h in found.linearisation.hypotheses].index(r.hypothesis.name)
         assert r.amplitude == pytest.approx(-float(slopes[:, k] @ value / slopes[:, k].square().sum()), rel=1e-5)
 
 

@@ -14,7 +14,7 @@ from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.recordings import PointClouds
 from torchcloth.viewing import Cloud, film_of_fit, with_cloth
-from torchcloth.viewing.distances import _beside, _when, _worst
+from torchcloth.viewing.fit_film import _beside, _when, _worst
 
 
 @pytest.fixture

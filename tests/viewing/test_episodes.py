@@ -98,7 +98,7 @@ def test_a_single_knot_of_motion_is_a_picture(example):
 
 def test_arms_stand_where_the_kinematics_say(example):
     film = film_of(example)
-    arm, joints = robots.arm_of(example, "left"), example.joints["left"]
+    arm, joints = robots.arm_from_recording(example, "left"), example.joints["left"]
     at = 7
     q = np.array([np.interp(film.times[at], joints.t, column) for column in joints.q.T])
     shapes = arm.geometry(arm.home.new_tensor(q))

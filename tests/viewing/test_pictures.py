@@ -8,9 +8,9 @@ from PIL import Image
 
 from torchcloth.errors import InvalidInput
 from torchcloth.viewing import Cloud, Curve, Plane, Sheet, animate, picture
-from torchcloth.viewing.pictures import _durations
+from torchcloth.viewing.frame_renderer import Stage
+from torchcloth.viewing.image_files import _durations
 from torchcloth.viewing.projection import camera_for, polygons
-from torchcloth.viewing.stage import Stage
 
 ABOVE = (0.0, 89.0)  # azimuth, elevation: straight down, nearly
 RED, BLUE = (255, 0, 0), (0, 0, 255)

@@ -1,4 +1,7 @@
-"""The command line: one module a verb. Wrong input: one line on stderr, exit code 2."""
+"""The command line ``torchcloth VERB``.
+
+Each verb is one module with a function ``add(verbs)``. Wrong input gives one line on stderr and exit code 2.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +30,8 @@ VERBS = (
     simulate,
     doctor,
     bench,
-)  # each has add(verbs)
-WITH_MODELS = (
+)
+VERBS_WITH_CAUSES = (
     "identify",
     "predict",
     "pose",
@@ -36,16 +39,23 @@ WITH_MODELS = (
     "confirm",
     "plan",
     "view",
-)  # which a user's own causes may be in
+)  # verbs that read model files, which may hold causes of the user's own
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted, 141 where nobody reads on)."""
+    """Run the command line.
+
+    Args:
+        arguments: words after ``torchcloth``; None: those of the process.
+
+    Returns:
+        Exit code: 0 done, 2 wrong input, 130 interrupted, 141 if the reader of stdout has closed it.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a terminal that has no such letter
+            stream.reconfigure(errors="backslashreplace")  # the terminal's encoding may lack a character
     try:
-        options = _parsed(arguments)
+        options = _parse_arguments(arguments)
     except KeyboardInterrupt:
         print("torchcloth: stopped", file=sys.stderr)
         return 130
@@ -62,37 +72,37 @@ def _run(options: argparse.Namespace) -> int:
             register_file(options.causes)
         return options.run(options)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes what is left at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes stdout when it exits
         return 141
     except (TorchclothError, OSError) as error:
-        said = error if isinstance(error, TorchclothError) else _of_system(error)
-        print(f"torchcloth: {said}", file=sys.stderr)
+        message = error if isinstance(error, TorchclothError) else _from_os_error(error)
+        print(f"torchcloth: {message}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        said = getattr(options, "stopped", "")
-        print(f"torchcloth: stopped{said(options) if callable(said) else said}", file=sys.stderr)
+        message = getattr(options, "stopped", "")
+        print(f"torchcloth: stopped{message(options) if callable(message) else message}", file=sys.stderr)
         return 130
 
 
-def _warn(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-    """One line, without the place in the library's sources."""
+def _warn(message: Warning | str, category: type[Warning], *where: Any, **help_text: Any) -> None:
+    """Print a warning in one line, without its place in the library's sources."""
     print(f"torchcloth: warning: {message}", file=sys.stderr)
 
 
-def _of_system(error: OSError) -> TorchclothError:
-    """What the system says of a file, as everything else is said."""
-    said = error.strerror or str(error)
+def _from_os_error(error: OSError) -> TorchclothError:
+    """Convert an error of the operating system to the library's form."""
+    message = error.strerror or str(error)
     if error.filename is None:
-        return InvalidInput("the system refuses", got=said)
+        return InvalidInput("the system refuses", got=message)
     expected = "a path that can be read and written"
     return InvalidInput(
-        f"{error.filename}", got=said, expected=expected, remedy="choose another, or change its permissions"
+        f"{error.filename}", got=message, expected=expected, remedy="choose another, or change its permissions"
     )
 
 
-def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """What is not known is the verb's matter, which has options of its own."""
-    parser = _parser()
+def _parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Parse the arguments; unknown options are reported under the verb's name, whose help lists the known ones."""
+    parser = _make_parser()
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         options.verb.error(f"unrecognized arguments: {' '.join(unknown)}")
@@ -100,21 +110,21 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, without the usage of all options."""
+    """Parser that reports an error in one line, without the usage of all options."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}; to do: see {self.prog} --help\n")
 
 
-def _parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="torchcloth", description="Differentiable cloth for robotics.")
     parser.add_argument("--version", action="version", version=metadata.version("torchcloth"))
     verbs = parser.add_subparsers(required=True, metavar="VERB")
     for verb in VERBS:
         verb.add(verbs)
-    for name in WITH_MODELS:
-        more = "a Python file that registers causes of your own (torchcloth.diagnosis.register)"
-        verbs.choices[name].add_argument("--causes", metavar="FILE", help=more)
+    for name in VERBS_WITH_CAUSES:
+        help_text = "Python file that registers your own causes with torchcloth.diagnosis.register"
+        verbs.choices[name].add_argument("--causes", metavar="FILE", help=help_text)
     for verb in verbs.choices.values():
         verb.set_defaults(verb=verb)
     return parser

@@ -1,4 +1,4 @@
-"""``python -m torchcloth.cli``, where the script is not on the path."""
+"""Run the command line as ``python -m torchcloth.cli``, if the script is not on the path."""
 
 import sys
 

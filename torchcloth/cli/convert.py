@@ -1,4 +1,4 @@
-"""``torchcloth convert``: recordings of other formats into episodes, episodes into MCAP."""
+"""``torchcloth convert``: convert recordings of other formats to episodes, and episodes to MCAP."""
 
 from __future__ import annotations
 
@@ -9,30 +9,36 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
-from .folders import check_folder, place
+from .output_paths import check_output_folder, output_path
 
 if TYPE_CHECKING:
     from ..recordings import Recording
 
 FORMATS = ("episode", "ros2", "lerobot", "redwood", "tum", "kinect")
-MCAP = ".mcap"
-FILES = f"{MCAP} .bag .db3 .mkv .mp4 .json .npz .npy .h5 .hdf5 .parquet .csv .txt .zip .tar .gz .tgz .zst"  # no folders
+MCAP_SUFFIX = ".mcap"
+# Suffixes that a folder would hardly have.
+FILE_SUFFIXES = ".mcap .bag .db3 .mkv .mp4 .json .npz .npy .h5 .hdf5 .parquet .csv .txt .zip .tar .gz .tgz .zst"
 
 
 def add(verbs: Any) -> None:
-    """The verb and its options."""
+    """Add the verb and its options."""
     convert = verbs.add_parser(
         "convert",
-        help="turn a recording of another format into an episode, or an episode into MCAP",
-        epilog="--scene: a JSON file in the words of episode.json (cloth, grasps, robots, cameras, provenance), and "
-        'under "source" which topic or column is what. Without it the message says what to write.',
+        help="convert a recording of another format to an episode, or an episode to MCAP",
+        epilog="The file of --scene has the keys of episode.json (cloth, grasps, robots, cameras, provenance). Its key "
+        '"source" says what each topic or column means. If --scene is missing and needed, the message says what to '
+        "write.",
     )
     convert.add_argument("source", type=Path, metavar="SRC", help="file or folder to read")
-    convert.add_argument("target", type=place, metavar="DST", help=f"episode folder to write, or a file ending {MCAP}")
-    convert.add_argument("--from", dest="format", choices=FORMATS, help="what SRC must be (default: found by content)")
-    convert.add_argument("--scene", type=Path, metavar="FILE", help="JSON with what the recording does not tell")
-    convert.add_argument("--episode", type=int, metavar="N", help="which one, where SRC holds many (LeRobot)")
-    convert.add_argument("--overwrite", action="store_true", help="replace DST")
+    convert.add_argument(
+        "target", type=output_path, metavar="DST", help=f"episode folder to write, or a file ending {MCAP_SUFFIX}"
+    )
+    convert.add_argument("--from", dest="format", choices=FORMATS, help="format of SRC (default: detected)")
+    convert.add_argument("--scene", type=Path, metavar="FILE", help="JSON file with facts that the recording lacks")
+    convert.add_argument(
+        "--episode", type=int, metavar="N", help="number of the episode, if SRC holds several (LeRobot)"
+    )
+    convert.add_argument("--overwrite", action="store_true", help="replace DST if it exists")
     convert.set_defaults(run=_convert, stopped="; nothing was written")
 
 
@@ -44,9 +50,9 @@ def _convert(options: argparse.Namespace) -> int:
     from ..recordings import formats
 
     _check_target(options)
-    with Console(stderr=True).status(escape(f"reading {options.source}")):  # silent where nobody looks
+    with Console(stderr=True).status(escape(f"reading {options.source}")):  # prints nothing if stderr is no terminal
         recording = formats.read(options.source, format=options.format, scene=options.scene, episode=options.episode)
-    write = formats.write_mcap if options.target.suffix == MCAP else recordings.write
+    write = formats.write_mcap if options.target.suffix == MCAP_SUFFIX else recordings.write
     _with_progress(
         recording, lambda on_image: write(recording, options.target, overwrite=options.overwrite, on_image=on_image)
     )
@@ -57,21 +63,21 @@ def _convert(options: argparse.Namespace) -> int:
 def _check_target(options: argparse.Namespace) -> None:
     source, target = options.source, options.target
     if source.resolve().is_relative_to(target.resolve()):
-        raise InvalidInput("DST is SRC or holds it", got=target, expected="another name")
+        raise InvalidInput("DST is SRC or contains it", got=target, expected="another name")
     if target.resolve().is_relative_to(source.resolve()):
         raise InvalidInput("DST is within SRC", got=target, expected="a place outside it")
     if options.scene is not None and options.scene.resolve().is_relative_to(target.resolve()):
         raise InvalidInput("--scene is in DST", got=options.scene, expected="a place outside it")
-    if target.suffix != MCAP and target.suffix.lower() in FILES.split():
-        expected = f"a folder's name, or a file ending {MCAP}"
+    if target.suffix != MCAP_SUFFIX and target.suffix.lower() in FILE_SUFFIXES.split():
+        expected = f"a folder's name, or a file ending {MCAP_SUFFIX}"
         raise InvalidInput(f"DST cannot be a {target.suffix} file", got=target, expected=expected)
     if os.path.lexists(target) and not options.overwrite:
-        raise InvalidInput("DST exists", got=target, expected="a new name", remedy="or --overwrite")
-    check_folder(target.parent, "DST")
+        raise InvalidInput("DST exists", got=target, expected="a new name", remedy="choose one, or give --overwrite")
+    check_output_folder(target.parent, "DST")
 
 
-def _streams(recording: Recording) -> list[tuple[str, str, Any]]:
-    """Name, what it holds, and times of every stream."""
+def _list_streams(recording: Recording) -> list[tuple[str, str, Any]]:
+    """Return name, content and times [s] of every stream."""
     rows: list[tuple[str, str, Any]] = []
     for name, gripper in recording.grippers.items():
         rows.append((name, "pose" + ", wrench" * (gripper.force is not None), gripper.t))
@@ -102,13 +108,13 @@ def _report(recording: Recording, target: Path) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table("stream", "holds", "samples", "from, s", "to, s", "rate, Hz")
-    for name, holds, t in _streams(recording):
+    table = Table("stream", "content", "samples", "first, s", "last, s", "rate, Hz")
+    for name, content, t in _list_streams(recording):
         rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else float("nan")
-        usual = "" if rate != rate else f"{rate:.1f}"
-        table.add_row(escape(name), holds, str(len(t)), f"{t[0]:.3f}", f"{t[-1]:.3f}", usual)
+        rate_text = "" if rate != rate else f"{rate:.1f}"
+        table.add_row(escape(name), content, str(len(t)), f"{t[0]:.3f}", f"{t[-1]:.3f}", rate_text)
     Console(soft_wrap=True).print(table)
     source = recording.extra.get("source")
     if isinstance(source, dict) and source.get("unchecked"):
-        print(f"no checksum covers {source['unchecked']}: damage there would go unnoticed")
+        print(f"no checksum covers {source['unchecked']}: damage there is not detected")
     print(f"written: {target}")

@@ -1,4 +1,4 @@
-"""``torchcloth diagnose``: what the simulation gets wrong in recorded episodes, and why."""
+"""``torchcloth diagnose``: find what the simulation gets wrong in recorded episodes, and why."""
 
 from __future__ import annotations
 
@@ -9,88 +9,92 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .._utils.files import PROGRESS
+from .._utils.files import PROGRESS_FOLDER_NAME
 from ..errors import InvalidInput
-from .folders import check_apart, check_folder, how_to_go_on, place, say
+from .output_paths import check_output_folder, check_outside_episodes, output_path, print_line, resume_hint
 
-LONG = 10.0  # s, of an episode
+LONG_EPISODE_S = 10.0  # longer episodes are announced, because their cost grows with the cube of the duration
 
 
 def add(verbs: Any) -> None:
-    """The verb and its options."""
+    """Add the verb and its options."""
     parser = verbs.add_parser(
         "diagnose",
         help="find what a simulation of recorded episodes gets wrong, and why",
-        description="Find what a simulation of one cloth's episodes gets wrong, and why. At least two motions "
-        "(split.motion in episode.json). Writes diagnosis.json, report.html, base.tcm and extended.tcm, and the motion "
-        "to record next.",
+        description="Find what a simulation of one cloth's episodes gets wrong, and why. The episodes must show at "
+        "least two motions (split.motion in episode.json). Writes diagnosis.json, report.html, base.tcm, extended.tcm "
+        "and the motion to record next.",
     )
-    parser.add_argument("episodes", nargs="+", metavar="EPISODE", help="folders of one cloth's episodes")
+    parser.add_argument("episodes", nargs="+", metavar="EPISODE", help="folders of episodes of one cloth")
     parser.add_argument("--model", metavar="MODEL", help="a .tcm file to start from (default: A-EP in vacuum)")
-    parser.add_argument("--out", type=place, required=True, metavar="DIR", help="folder for the result")
-    parser.add_argument("--resume", action="store_true", help="go on with a diagnosis that was stopped")
-    parser.set_defaults(run=_diagnose, stopped=how_to_go_on)
+    parser.add_argument("--out", type=output_path, required=True, metavar="DIR", help="folder for the result")
+    parser.add_argument("--resume", action="store_true", help="resume a diagnosis that was stopped")
+    parser.set_defaults(run=_diagnose, stopped=resume_hint)
 
 
 def _diagnose(options: argparse.Namespace) -> int:
     import torch
 
     from .. import diagnosis
-    from .._utils.resume import clear
+    from .._utils.resume import clear_store
     from ..diagnosis.experiment.feasibility import FOLDER
     from ..diagnosis.report.html_report import REPORT
     from ..diagnosis.run import RESULT
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
-    check_apart(options.out, *options.episodes)
-    check_folder(options.out)
-    _refuse_own_result(options)
+    check_outside_episodes(options.out, *options.episodes)
+    check_output_folder(options.out)
+    _check_model_not_replaced(options)
     replaced = (options.out / RESULT).exists()
     if replaced:
-        say(f"{options.out} holds a diagnosis, which this one will replace")
+        print_line(f"{options.out} holds a diagnosis, which this one will replace")
     episodes, faults = diagnosis.read_episodes(options.episodes)
     if faults:
-        answer = diagnosis.refused(faults)
+        answer = diagnosis.refuse(faults)
     else:
         model = None
         if options.model is not None:
             model, episodes = diagnosis.begin_with(options.model, episodes)
         streams = [e.markers if e.points is None else e.points for e in episodes]
-        seen = [float(s.t[-1] - s.t[0]) for s in streams if s is not None]
-        seconds, longest = sum(seen), max(seen, default=0.0)
+        durations = [float(s.t[-1] - s.t[0]) for s in streams if s is not None]
+        seconds, longest = sum(durations), max(durations, default=0.0)
         print(
-            f"{len(episodes)} episodes, seen for {seconds:.0f} s: some {max(1, round(seconds / 1.5)):.0f} minutes of "
-            "a core, up to three times as many where causes are found",
+            f"{len(episodes)} episodes, observed for {seconds:.0f} s: this takes about "
+            f"{max(1, round(seconds / 1.5)):.0f} minutes of one core, up to three times as long if causes are found",
             flush=True,
         )
-        if longest > LONG:
-            print(f"one lasts {longest:.0f} s: time and memory grow with the cube of that", flush=True)
-        with progress_line() as progress:
+        if longest > LONG_EPISODE_S:
+            print(f"the longest lasts {longest:.0f} s: time and memory grow with the cube of this", flush=True)
+        with show_progress_line() as progress:
             answer = diagnosis.diagnose(
-                episodes, model, progress=progress, journal=options.out / PROGRESS, resume=options.resume or None
+                episodes,
+                model,
+                progress=progress,
+                journal=options.out / PROGRESS_FOLDER_NAME,
+                resume=options.resume or None,
             )
     written = diagnosis.write_diagnosis(answer, episodes, options.out)
-    if answer.searched is not None:  # a stopped diagnosis goes on once the episodes can be read
-        clear(options.out / PROGRESS)
+    if answer.optional_search is not None:  # a stopped diagnosis goes on once the episodes can be read
+        clear_store(options.out / PROGRESS_FOLDER_NAME)
     print(f"verdict: {answer.verdict}")
     print(answer.summary())
-    amiss = [text for text in written.content["warnings"] if text not in answer.content["warnings"]]
-    print("".join(f"Warning: {text}.\n" for text in amiss), end="")
-    proposed = FOLDER if answer.experiment is not None and not amiss else None
-    files = (RESULT, REPORT, answer.content.get("base"), answer.content["model"], proposed)
+    new_warnings = [text for text in written.content["warnings"] if text not in answer.content["warnings"]]
+    print("".join(f"Warning: {text}.\n" for text in new_warnings), end="")
+    experiment_folder = FOLDER if answer.experiment is not None and not new_warnings else None
+    files = (RESULT, REPORT, answer.content.get("base"), answer.content["model"], experiment_folder)
     print("\n".join(str(options.out / name) for name in files if name))
     if replaced:
-        print("the last diagnosis there is replaced")
+        print("the earlier diagnosis in this folder was replaced")
     return 0
 
 
-def _refuse_own_result(options: argparse.Namespace) -> None:
-    """A model to start from that the result would replace."""
+def _check_model_not_replaced(options: argparse.Namespace) -> None:
+    """Refuse an output folder whose new model files would replace the file of --model."""
     from ..diagnosis.run import BASE, EXTENDED
 
-    own = [(options.out / name).resolve() for name in (BASE, EXTENDED)]
-    if options.model is not None and Path(options.model).resolve() in own:
+    replaced_models = [(options.out / name).resolve() for name in (BASE, EXTENDED)]
+    if options.model is not None and Path(options.model).resolve() in replaced_models:
         raise InvalidInput(
             "--out",
             got=f"{options.out}, where the result would replace {options.model}",
@@ -99,10 +103,14 @@ def _refuse_own_result(options: argparse.Namespace) -> None:
 
 
 @contextmanager
-def progress_line() -> Iterator[Callable[[str], None]]:
-    """One line that changes on a terminal; in a log, a line for every stage."""
+def show_progress_line() -> Iterator[Callable[[str], None]]:
+    """Show progress in one changing line on a terminal, or in one line for each stage in a log.
+
+    Yields:
+        A function that takes the text to show.
+    """
     if not sys.stderr.isatty():
-        yield lambda text: None if text.endswith("left") else say(text)
+        yield lambda text: None if text.endswith("left") else print_line(text)
         return
     from rich.console import Console
     from rich.markup import escape

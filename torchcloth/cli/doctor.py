@@ -1,4 +1,4 @@
-"""``torchcloth doctor``: what is installed and what works."""
+"""``torchcloth doctor``: report what is installed and what works."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from importlib import metadata
 from typing import Any
 
-PACKAGES = {
+OPTIONAL_PACKAGES = {
     "pytorch_kinematics": "robots",
     "yourdfpy": "robots",
     "trimesh": "robots",
@@ -23,8 +23,8 @@ PACKAGES = {
 
 
 def add(verbs: Any) -> None:
-    """The verb."""
-    doctor = verbs.add_parser("doctor", help="say what is installed and what works")
+    """Add the verb ``doctor``."""
+    doctor = verbs.add_parser("doctor", help="report what is installed and what works")
     doctor.set_defaults(run=_doctor)
 
 
@@ -40,15 +40,15 @@ def _doctor(options: argparse.Namespace) -> int:
     print(f"{'engine':20s} {library.status()}")
     if torch.cuda.is_available():
         print(f"{'engine on CUDA':20s} {driver.status()}")
-    for name, extra in PACKAGES.items():
+    for name, extra in OPTIONAL_PACKAGES.items():
         state = "installed" if find_spec(name) else f'missing: pip install "torchcloth[{extra}]"'
-        if name == "open3d" and find_spec(name):  # it may lack a library of the system
-            state = _open3d()
+        if name == "open3d" and find_spec(name):  # a system library that it needs may be missing
+            state = _open3d_status()
         print(f"{name:20s} {state}")
     return 0
 
 
-def _open3d() -> str:
+def _open3d_status() -> str:
     from ..errors import MissingDependency
     from ..observe.render import open3d_or_refuse
 

@@ -1,4 +1,4 @@
-"""``torchcloth identify | demo``: fits fabric parameters to recorded episodes."""
+"""``torchcloth identify`` and ``torchcloth demo``: fit fabric parameters to recorded episodes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,17 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._utils.files import PROGRESS
+from .._utils.files import PROGRESS_FOLDER_NAME
 from ..errors import InvalidInput
-from . import fields
-from .folders import check_apart, check_folder, how_to_go_on, place, replaces, say
+from . import identify_fields
+from .output_paths import (
+    check_output_folder,
+    check_outside_episodes,
+    output_path,
+    print_line,
+    replacement_note,
+    resume_hint,
+)
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -23,27 +30,32 @@ if TYPE_CHECKING:
     from ..identification.fields import FieldFit
     from ..recordings import Recording
 
-DEMO = "bimanual_swing"
-NUISANCES = {"obs.clock": "clock", "obs.extrinsic": "camera", "obs.rotation": "camera", "obs.edge": "rim"}  # by cause
+DEMO_EPISODE = "bimanual_swing"
+NUISANCE_OF_CAUSE = {"obs.clock": "clock", "obs.extrinsic": "camera", "obs.rotation": "camera", "obs.edge": "rim"}
 
 
 def add(verbs: Any) -> None:
-    """The verbs and their options."""
+    """Add both verbs and their options."""
     identify = verbs.add_parser("identify", help="fit fabric parameters to recorded episodes")
     identify.add_argument("episodes", nargs="+", metavar="EPISODE", help="folder of a recording")
-    identify.add_argument("--out", type=place, required=True, metavar="DIR", help="folder for the result and pictures")
-    identify.set_defaults(run=_identify, stopped=how_to_go_on)
+    identify.add_argument(
+        "--out", type=output_path, required=True, metavar="DIR", help="folder for the result and pictures"
+    )
+    identify.set_defaults(run=_identify, stopped=resume_hint)
     _add_options(identify)
     demo = verbs.add_parser("demo", help="identify the shipped example")
-    demo.add_argument("--out", type=place, default=Path("out/demo"), metavar="DIR", help="default out/demo")
-    demo.set_defaults(run=_demo, stopped=how_to_go_on)
+    demo.add_argument("--out", type=output_path, default=Path("out/demo"), metavar="DIR", help="default out/demo")
+    demo.set_defaults(run=_demo, stopped=resume_hint)
     _add_options(demo)
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", metavar="MODEL", help="a .tcm file of `diagnose` to start from")
     parser.add_argument(
-        "--fit", nargs="+", metavar="NAME", help="parameters to fit (default: of the fabric, and each effect's first)"
+        "--fit",
+        nargs="+",
+        metavar="NAME",
+        help="parameters to fit (default: those of the fabric, and the first one of each effect)",
     )
     parser.add_argument(
         "--start",
@@ -51,27 +63,34 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="NAME=VALUE",
-        help="start values, SI units, e.g. youngs_modulus=2e5",
+        help="start values in SI units, e.g. youngs_modulus=2e5",
     )
     parser.add_argument(
         "--method",
         choices=["gauss-newton", "lbfgs", "adam", "gradient-descent"],
         default="gauss-newton",
-        help="default gauss-newton; the last two: on the paper's Chamfer distance alone, without priors, to compare",
+        help="default: gauss-newton. adam and gradient-descent minimise the DiffCP paper's Chamfer distance alone, "
+        "without priors; they are there for comparison",
     )
     parser.add_argument(
-        "--stop", choices=["converged", "paper"], default="converged", help="paper: Chamfer below 1.5 cm"
+        "--stop",
+        choices=["converged", "paper"],
+        default="converged",
+        help="default: converged. paper stops at a Chamfer distance below 1.5 cm",
     )
     parser.add_argument(
         "--iterations",
         type=int,
         default=35,
         metavar="N",
-        help="at most N on all frames, after up to 10 on early ones (35); what is sought where derivatives "
-        "fail takes up to 20 a stage",
+        help="most iterations on all frames (default: 35). Up to 10 on early frames come before them. Where "
+        "derivatives are of no use, a search takes up to 20 in each stage",
     )
     parser.add_argument(
-        "--use", nargs="+", choices=["points", "markers", "force"], help="kinds of data (default: all of an episode)"
+        "--use",
+        nargs="+",
+        choices=["points", "markers", "force"],
+        help="kinds of data to compare with (default: all that an episode has)",
     )
     parser.add_argument(
         "--nuisance",
@@ -79,7 +98,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="NAME[=STD]",
-        help="of each episode: clock, camera, grasp, shape, tare, rim; with the prior's deviation, e.g. clock=0.02",
+        help="unknowns of each episode: clock, camera, grasp, shape, tare, rim; STD is the prior's standard deviation, "
+        "e.g. clock=0.02",
     )
     parser.add_argument(
         "--prior",
@@ -87,29 +107,43 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="NAME=VALUE,SPREAD",
-        help="SPREAD: a factor for positive parameters, a standard deviation for others",
+        help="prior of a parameter; SPREAD is a factor for positive parameters, a standard deviation for others",
     )
-    parser.add_argument("--contact", type=float, metavar="SPACING", help="contact grid [m]; left out: no contact")
+    parser.add_argument(
+        "--contact",
+        type=float,
+        metavar="SPACING",
+        help="spacing of the contact grid [m] (default: layers do not touch)",
+    )
     parser.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
     parser.add_argument(
-        "--engine", choices=["auto", "reference", "fused"], default="auto", help="default auto: fused where it can be"
+        "--engine",
+        choices=["auto", "reference", "fused"],
+        default="auto",
+        help="default: auto, which takes the fused engine if it supports the model",
     )
-    parser.add_argument("--starts", type=int, default=1, metavar="N", help="starts over two decades (1)")
     parser.add_argument(
-        "--profile", nargs="+", default=[], metavar="NAME", help="seek the interval by fitting the others beside it"
+        "--starts",
+        type=int,
+        default=1,
+        metavar="N",
+        help="number of start values, spread over two decades (default: 1)",
+    )
+    parser.add_argument(
+        "--profile", nargs="+", default=[], metavar="NAME", help="find the interval by profile likelihood"
     )
     parser.add_argument(
         "--refine",
         action=argparse.BooleanOptionalAction,
-        help="correct for the coarseness of the mesh by one run on a mesh twice as fine (default; not with --profile, "
-        "or where --method or --stop follow the paper)",
+        help="correct for the coarseness of the mesh by one run on a mesh twice as fine (default: yes, but not with "
+        "--profile, nor where --method or --stop follow the paper)",
     )
-    parser.add_argument("--resume", action="store_true", help="go on where a stopped fit into DIR was")
-    fields.add(parser)
+    parser.add_argument("--resume", action="store_true", help="resume a fit into DIR that was stopped")
+    identify_fields.add(parser)
 
 
 def _demo(options: argparse.Namespace) -> int:
-    with resources.as_file(resources.files("torchcloth") / "examples" / DEMO) as folder:
+    with resources.as_file(resources.files("torchcloth") / "examples" / DEMO_EPISODE) as folder:
         options.episodes = [str(folder)]
         return _identify(options)
 
@@ -122,114 +156,122 @@ def _identify(options: argparse.Namespace) -> int:
     from ..recordings.consistency import together
 
     torch.set_default_dtype(torch.float64)  # sensitivities lose digits over thousands of substeps in float32
-    torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
-    check_apart(options.out, *options.episodes)
-    check_folder(options.out)
-    fields.check(options, _defaults())
+    torch.set_num_threads(1)  # on meshes of a thousand triangles a second thread costs more than it gains
+    check_outside_episodes(options.out, *options.episodes)
+    check_output_folder(options.out)
+    identify_fields.check(options, _default_options())
     episodes = [recordings.read(path) for path in options.episodes]
     cloth, notes = _cloth(options, together(episodes))
     for note in notes:
         print(f"note: {note}")
     size = f"{len(episodes)} episode(s), {len(cloth.mesh.faces)} triangles"
     seconds, step = sum(float(e.points.t[-1] - e.points.t[0]) for e in episodes if e.points), cloth.stable_step()
-    many = f", {seconds / step:.2g} in all frames" if seconds else ""
-    print(f"{size}, stable substep {step:.3g} s with the start values{many}")
+    substeps_text = f", {seconds / step:.2g} in all frames" if seconds else ""
+    print(f"{size}, stable substep {step:.3g} s with the start values{substeps_text}")
     if options.fields:
-        fields.spread_out(cloth, options.fields)
+        identify_fields.make_fields(cloth, options.fields)
     fit = _fit(options, cloth, episodes)
     if isinstance(fit, Identification):
         fit = replace(fit, warnings=[*fit.warnings, *notes])
         return _report(options, fit, cloth, episodes)
-    return fields.report(options.out, fit, cloth)
+    return identify_fields.report(options.out, fit, cloth)
 
 
-def _defaults() -> argparse.Namespace:
+def _default_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     _add_options(parser)
     return parser.parse_args([])
 
 
 def _cloth(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, list[str]]:
-    """The cloth at its start values, and what of its model it has not."""
+    """Return the cloth at its start values, and notes on parts of the model that it cannot hold."""
     from ..dynamics.contact import Contact
-    from ..episodes.unknowns import available
-    from ..identification import cloth_from
+    from ..episodes.unknowns import find_scalar_parameters
+    from ..identification import build_cloth
 
     if options.model is not None:
-        cloth, notes = _of_model(options, recording)
+        cloth, notes = _cloth_from_model(options, recording)
     else:
         contact = None if options.contact is None else Contact(options.contact)
-        cloth, notes = cloth_from(recording, contact=contact), []
+        cloth, notes = build_cloth(recording, contact=contact), []
     cloth.engine = options.engine
-    names = available(cloth)
-    for name, value in assignments(options.start).items():
+    names = find_scalar_parameters(cloth)
+    for name, value in parse_assignments(options.start).items():
         if name not in names:
             raise InvalidInput("--start", got=repr(name), expected=f"one of {', '.join(sorted(names))}")
         cloth.get_submodule(names[name]).set(value)  # type: ignore[operator]
     return cloth, notes
 
 
-def _of_model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, list[str]]:
-    """The extended cloth of a diagnosis, in the episode's scene."""
+def _cloth_from_model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, list[str]]:
+    """Return the extended cloth of a diagnosis in the episode's scene, and notes on what it cannot hold."""
     from .. import diagnosis
 
     if options.contact is not None:
-        raise InvalidInput("--contact", got="it beside --model", expected="one of them")
+        raise InvalidInput("--contact", got="it and --model", expected="one of them")
     file = diagnosis.read_model(options.model, recording)
-    return file.model.world().cloth.requires_grad_(True), what_is_beside(file.model)
+    return file.model.world().cloth.requires_grad_(True), describe_causes_outside_cloth(file.model)
 
 
-def what_is_beside(model: Model) -> list[str]:
-    """Notes on causes that a cloth cannot carry."""
+def describe_causes_outside_cloth(model: Model) -> list[str]:
+    """Return notes on causes of a model that belong to robot or camera, which a cloth cannot hold."""
     from .. import diagnosis
 
     notes = []
     for name, amplitude in diagnosis.beside_the_cloth(model).items():
-        allowed = NUISANCES.get(name.partition("[")[0])
-        to_do = f"--nuisance {allowed} allows for it" if allowed else "nothing here allows for it"
-        notes.append(f"{name} = {amplitude:.4g} of the model is of robot or camera and not in the cloth: {to_do}")
+        allowed = NUISANCE_OF_CAUSE.get(name.partition("[")[0])
+        remedy = f"--nuisance {allowed} allows for it" if allowed else "no option allows for it"
+        notes.append(f"{name} = {amplitude:.4g} of the model belongs to robot or camera, not to the cloth: {remedy}")
     return notes
 
 
-def assignments(pairs: Sequence[str], option: str = "--start") -> dict[str, float]:
-    """NAME=NUMBER pairs of an option."""
-    _each_once(pairs, option)
-    out = {}
+def parse_assignments(pairs: Sequence[str], option: str = "--start") -> dict[str, float]:
+    """Parse the NAME=NUMBER pairs of an option.
+
+    Raises:
+        InvalidInput: a pair that is none, or a name twice.
+    """
+    _check_unique(pairs, option)
+    parsed = {}
     for pair in pairs:
         name, _, value = pair.partition("=")
         try:
-            out[name] = float(value)
+            parsed[name] = float(value)
         except ValueError:
             raise InvalidInput(option, got=repr(pair), expected="NAME=NUMBER in SI units") from None
-    return out
+    return parsed
 
 
-def nuisances_of(given: Sequence[str]) -> dict[str, float | None]:
-    """NAME or NAME=STD, None where no deviation is given."""
-    _each_once(given, "--nuisance")
-    plain = dict.fromkeys(name for name in given if "=" not in name)
-    return plain | assignments([pair for pair in given if "=" in pair], "--nuisance")
+def parse_nuisances(options: Sequence[str]) -> dict[str, float | None]:
+    """Parse NAME or NAME=STD of ``--nuisance``; the value is None if no standard deviation is given.
+
+    Raises:
+        InvalidInput: a standard deviation that is no number, or a name twice.
+    """
+    _check_unique(options, "--nuisance")
+    plain = dict.fromkeys(name for name in options if "=" not in name)
+    return plain | parse_assignments([pair for pair in options if "=" in pair], "--nuisance")
 
 
-def _each_once(pairs: Sequence[str], option: str) -> None:
-    """Of two values for one name either would be ignored."""
+def _check_unique(pairs: Sequence[str], option: str) -> None:
+    """Refuse a name that is given twice, because one of its values would be ignored."""
     names = [pair.partition("=")[0] for pair in pairs]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise InvalidInput(option, got=f"{name!r} twice", expected="each name once")
 
 
-def _priors(pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
-    _each_once(pairs, "--prior")
-    out = {}
+def _parse_priors(pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
+    _check_unique(pairs, "--prior")
+    parsed = {}
     for pair in pairs:
         name, _, numbers = pair.partition("=")
         try:
             value, spread = (float(number) for number in numbers.split(","))
         except ValueError:
             raise InvalidInput("--prior", got=repr(pair), expected="NAME=VALUE,SPREAD") from None
-        out[name] = (value, spread)
-    return out
+        parsed[name] = (value, spread)
+    return parsed
 
 
 def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -> Identification | FieldFit:
@@ -247,11 +289,11 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             text = shown if math.isnan(chamfer) else f"Chamfer {1e3 * chamfer:.2f} mm, {shown}"
             text = f"{used}, {text}"
             progress.update(task, completed=iteration, description=text)
-            if not progress.console.is_terminal:  # a log file shows a bar once, at the end
-                say(f"iteration {iteration}: {text}")
+            if not progress.console.is_terminal:  # in a log file the bar would appear only once, at the end
+                print_line(f"iteration {iteration}: {text}")
 
         if options.fields:
-            return fields.fit(options, cloth, episodes, options.out / PROGRESS, advance)
+            return identify_fields.fit(options, cloth, episodes, options.out / PROGRESS_FOLDER_NAME, advance)
         return identify(
             cloth,
             episodes,
@@ -261,36 +303,36 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             iterations=options.iterations,
             starts=options.starts,
             profile=options.profile,
-            journal=options.out / PROGRESS,
-            resume=options.resume or None,  # work is not thrown away unasked
+            journal=options.out / PROGRESS_FOLDER_NAME,
+            resume=options.resume or None,  # None: refuse to discard the progress of a stopped fit
             dt=options.dt,
             use=options.use,
-            nuisances=nuisances_of(options.nuisance),
-            priors=_priors(options.prior),
+            nuisances=parse_nuisances(options.nuisance),
+            priors=_parse_priors(options.prior),
             on_progress=advance,
-            refine=_refines(options),
+            refine=_should_refine(options),
         )
 
 
-def _refines(options: argparse.Namespace) -> bool:
-    """As asked for; else where a search ends at the optimum, which the correction moves, and nothing is profiled."""
+def _should_refine(options: argparse.Namespace) -> bool:
+    """Whether to correct for the mesh: as asked for; else if the search ends at an optimum and nothing is profiled."""
     if options.refine is not None:
         return options.refine
     return options.method in ("gauss-newton", "lbfgs") and options.stop == "converged" and not options.profile
 
 
 def _report(options: argparse.Namespace, fit: Identification, cloth: Cloth, recordings: list[Recording]) -> int:
-    from .._utils.resume import clear
-    from ..identification import episode
+    from .._utils.resume import clear_store
+    from ..identification import build_episode
     from ..identification.io.saved_fit import RESULT
     from ..identification.pictures import draw
     from ..identification.tables import print_fit
 
     folder = options.out
-    note = replaces(folder / RESULT)
+    note = replacement_note(folder / RESULT)
     path = fit.save(folder, options.model)
-    pictures = draw(fit, [episode(cloth, r) for r in recordings], cloth.mesh.faces, folder)
-    clear(folder / PROGRESS)
+    pictures = draw(fit, [build_episode(cloth, r) for r in recordings], cloth.mesh.faces, folder)
+    clear_store(folder / PROGRESS_FOLDER_NAME)
     print_fit(fit)
     print(f"result:   {path}{note}")
     print("pictures: " + ", ".join(str(p) for p in pictures))

@@ -1,4 +1,4 @@
-"""``torchcloth plan``: a motion after which the cloth lies where it shall."""
+"""``torchcloth plan``: plan a motion that brings the cloth to a goal."""
 
 from __future__ import annotations
 
@@ -6,125 +6,159 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._utils.files import PROGRESS
+from .._utils.files import PROGRESS_FOLDER_NAME
 from ..errors import InvalidInput
-from .diagnose import progress_line
-from .folders import check_apart, check_folder, how_to_go_on, place, replaces
+from .diagnose import show_progress_line
+from .output_paths import check_output_folder, check_outside_episodes, output_path, replacement_note, resume_hint
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
     from ..diagnosis import Model
     from ..recordings import Recording
 
-PICTURE = (520, 440)  # pixels of each of four moments
+PANEL_SIZE_PX = (520, 440)  # of each of the four frames in plan.png
 
 
 def add(verbs: Any) -> None:
-    """The verb and its options."""
+    """Add the verb and its options."""
     parser = verbs.add_parser(
         "plan",
-        help="change a motion until the cloth ends at a goal",
-        description="Changes the motion of an episode's arms (or free grippers) until the simulated cloth ends at a "
-        "goal, within the joints' limits and clear of each other and of the table. Writes plan.json, an episode with "
-        "the planned motion to drive the arms by, and a picture.",
+        help="plan a motion that brings the cloth to a goal",
+        description="Change the motion of an episode's arms (or free grippers) until the simulated cloth ends at a "
+        "goal. The motion stays within the joints' limits, and the arms keep clear of each other and of the table. "
+        "Writes plan.json, an episode with the planned motion for the arms, and a picture.",
     )
     option = parser.add_argument
-    option("episode", metavar="EPISODE", help="folder: cloth, grasps, arms, where it is, the motion to begin with")
+    option(
+        "episode", metavar="EPISODE", help="folder with the cloth, its first shape, the arms and a motion to begin with"
+    )
     option(
         "--goal",
         required=True,
         metavar="GOAL",
-        help="an episode (its last points), .npy [N, 3] of points, .obj or .ply of a mesh, pose.npz, or "
-        ".npz with x [N, 3] and uv [N, 2] of pieces",
+        help="an episode (its last points), an .npy file of points [N, 3], a mesh (.obj or .ply), a pose.npz, or an "
+        ".npz file with points x [N, 3] and their pattern coordinates uv [N, 2]",
     )
     option(
-        "--pieces",
+        "--correspondences",
         action="store_true",
-        help="the goal tells each piece's place: a mesh by vt, or like pose.npz by vertices, an episode by markers",
+        help="match material points instead of shapes: of a mesh by its vt, or by its vertices like pose.npz; of an "
+        "episode by its markers",
     )
-    option("--fit", type=Path, metavar="RESULT", help="identification.json, its folder or a .tcm file: take its values")
-    option("--draws", type=int, default=1, metavar="N", help="plan for N models, drawn from what the fit leaves open")
-    option("--waypoints", type=int, default=4, metavar="N", help="of what is added to each gripper's motion (4)")
+    option(
+        "--fit",
+        type=Path,
+        metavar="RESULT",
+        help="take the values of identification.json, of its folder or of a .tcm file",
+    )
+    option(
+        "--samples",
+        type=int,
+        default=1,
+        metavar="N",
+        help="plan for N models that are sampled from the posterior of --fit (default: 1)",
+    )
+    option(
+        "--waypoints",
+        type=int,
+        default=4,
+        metavar="N",
+        help="waypoints of the correction of each gripper's motion (default: 4)",
+    )
     option(
         "--iterations",
         type=int,
         default=15,
         metavar="N",
-        help="at most (15; adam needs several times as many: 60, say)",
+        help="most iterations (default: 15; adam needs several times as many, e.g. 60)",
     )
     option(
         "--method",
         choices=["gauss-newton", "adam"],
         default="gauss-newton",
-        help="adam: descent of the distance by reverse mode, as in the DiffCP paper",
+        help="default: gauss-newton. adam follows reverse-mode gradients of the distance, as the DiffCP paper does",
     )
-    option("--rate", type=float, default=0.003, metavar="X", help="of adam, rad or m at a step (0.003)")
-    option("--wait", type=float, default=0.3, metavar="SECONDS", help="after the motion (0.3)")
-    option("--acceleration", type=float, metavar="X", help="of any joint, at most [rad/s^2] (3)")
-    option("--clearance", type=float, default=0.02, metavar="M", help="of arms, and of arm and table [m] (0.02)")
+    option(
+        "--learning-rate", type=float, default=0.003, metavar="X", help="step size of adam [rad or m] (default: 0.003)"
+    )
+    option("--wait", type=float, default=0.3, metavar="SECONDS", help="time after the motion's end (default: 0.3)")
+    option("--acceleration", type=float, metavar="X", help="largest acceleration of a joint [rad/s^2] (default: 3)")
+    option(
+        "--clearance",
+        type=float,
+        default=0.02,
+        metavar="M",
+        help="smallest distance between the arms, and between arms and table [m] (default: 0.02)",
+    )
     option("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
-    option("--resume", action="store_true", help="go on with a search that was stopped")
-    option("--out", type=place, required=True, metavar="DIR", help="folder for plan.json, the episode, the picture")
-    parser.set_defaults(run=_plan, stopped=how_to_go_on)
+    option("--resume", action="store_true", help="resume a plan that was stopped")
+    option(
+        "--out",
+        type=output_path,
+        required=True,
+        metavar="DIR",
+        help="folder for plan.json, the episode and the picture",
+    )
+    parser.set_defaults(run=_plan, stopped=resume_hint)
 
 
 def _plan(options: argparse.Namespace) -> int:
     import torch
 
     from .. import planning, recordings, viewing
-    from .._utils.resume import clear
-    from ..planning.result import EPISODE, RESULT, check_place
-    from ..robots import ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+    from .._utils.resume import clear_store
+    from ..planning.result import PLAN_FILE, PLANNED_EPISODE_FOLDER, check_result_folder
+    from ..robots import DEFAULT_JOINT_ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
-    for path in (options.out, options.out / EPISODE):
-        check_apart(path, options.episode, options.goal)
-    check_folder(options.out)
-    check_place(options.out)
-    recording, goal = recordings.read(options.episode), planning.read_goal(options.goal, options.pieces)
+    for path in (options.out, options.out / PLANNED_EPISODE_FOLDER):
+        check_outside_episodes(path, options.episode, options.goal)
+    check_output_folder(options.out)
+    check_result_folder(options.out)
+    recording, goal = recordings.read(options.episode), planning.read_goal(options.goal, options.correspondences)
     models = _models(options, recording)
-    with progress_line() as progress:
-        found = planning.plan(
+    with show_progress_line() as progress:
+        result = planning.plan(
             models,
             recording,
             goal,
             waypoints=options.waypoints,
             iterations=options.iterations,
             method=options.method,
-            rate=options.rate,
+            rate=options.learning_rate,
             wait=options.wait,
-            acceleration=ACCELERATION if options.acceleration is None else options.acceleration,
+            acceleration=DEFAULT_JOINT_ACCELERATION if options.acceleration is None else options.acceleration,
             clearance=options.clearance,
             dt=options.dt,
-            on_progress=lambda *numbers: progress(_words(*numbers)),
-            journal=options.out / PROGRESS,
+            on_progress=lambda *numbers: progress(_progress_text(*numbers)),
+            journal=options.out / PROGRESS_FOLDER_NAME,
             resume=options.resume or None,
         )
-    note = replaces(options.out / RESULT)
-    files = found.save(options.out)
-    clear(options.out / PROGRESS)
-    picture = viewing.picture(viewing.film_of_plan(found, goal), options.out / "plan.png", size=PICTURE)
-    planning.print_plan(found)
-    print("result: " + ", ".join(str(path) for path in (*files, picture)) + note)
+    replacement = replacement_note(options.out / PLAN_FILE)
+    files = result.save(options.out)
+    clear_store(options.out / PROGRESS_FOLDER_NAME)
+    picture = viewing.picture(viewing.film_of_plan(result, goal), options.out / "plan.png", size=PANEL_SIZE_PX)
+    planning.print_plan(result)
+    print("result: " + ", ".join(str(path) for path in (*files, picture)) + replacement)
     return 0
 
 
 def _models(options: argparse.Namespace, recording: Recording) -> list[Cloth] | list[Model]:
-    """What is believed of the cloth: the best values first, then draws."""
+    """Return the models to plan with: the best estimate first, then samples of the posterior."""
     from .. import diagnosis
-    from ..identification import cloth_from, drawn
+    from ..identification import build_cloth, drawn
 
-    if options.draws < 1:
-        raise InvalidInput("--draws", got=options.draws, expected="1 or more")
+    if options.samples < 1:
+        raise InvalidInput("--samples", got=options.samples, expected="1 or more")
     if options.fit is None:
-        if options.draws > 1:
-            raise InvalidInput("--draws", got="it without --fit", expected="a fit, which says what is open")
-        return [cloth_from(recording)]
+        if options.samples > 1:
+            raise InvalidInput("--samples", got="it without --fit", expected="--fit as well")
+        return [build_cloth(recording)]
     if options.fit.suffix == ".tcm":
-        return diagnosis.drawn_models(diagnosis.read_model(options.fit, recording), options.draws)
-    return drawn(options.fit, recording, options.draws, begun=diagnosis.start_of(options.fit))
+        return diagnosis.drawn_models(diagnosis.read_model(options.fit, recording), options.samples)
+    return drawn(options.fit, recording, options.samples, begun=diagnosis.start_of(options.fit))
 
 
-def _words(number: int, distance: float, best: float) -> str:
+def _progress_text(number: int, distance: float, best: float) -> str:
     return f"motion {number}: {1e3 * distance:.2f} mm from the goal, the best so far {1e3 * best:.2f} mm"

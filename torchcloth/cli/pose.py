@@ -1,4 +1,4 @@
-"""``torchcloth pose``: the full mesh over time from a recording that shows a part of it."""
+"""``torchcloth pose``: estimate the full mesh over time from a recording that shows a part of it."""
 
 from __future__ import annotations
 
@@ -8,39 +8,61 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
-from .folders import check_apart, check_folder, place, replaces, say
-from .identify import assignments, nuisances_of, what_is_beside
+from .identify import describe_causes_outside_cloth, parse_assignments, parse_nuisances
+from .output_paths import check_output_folder, check_outside_episodes, output_path, print_line, replacement_note
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
     from ..pose import PoseEstimate
     from ..recordings import Recording
 
-PICTURE = (520, 440)  # pixels of each of four moments
+PANEL_SIZE_PX = (520, 440)  # of each of the four frames in pose.png
 
 
 def add(verbs: Any) -> None:
-    """The verb and its options."""
+    """Add the verb and its options."""
     pose = verbs.add_parser("pose", help="estimate the full mesh over time from partial clouds")
     pose.add_argument("episode", metavar="EPISODE", help="folder of a recording")
     pose.add_argument(
-        "--fit", type=Path, metavar="RESULT", help="identification.json, its folder or a .tcm file: take its values"
+        "--fit",
+        type=Path,
+        metavar="RESULT",
+        help="take the values of identification.json, of its folder or of a .tcm file",
     )
     pose.add_argument(
-        "--uncertain",
+        "--uncertainty",
         nargs="+",
         action="extend",
         default=[],
         metavar="NAME=SPREAD",
-        help="fabric values known with an error: SPREAD is a factor for positive ones, else a standard deviation",
+        help="uncertainty of a value; SPREAD is a factor for positive parameters, a standard deviation for others",
     )
-    pose.add_argument("--window", type=float, default=0.15, metavar="SECONDS", help="of a constant force (0.15)")
-    pose.add_argument("--modes", type=int, default=8, metavar="N", help="smooth fields of the force (8)")
-    pose.add_argument("--nuisance", nargs="+", action="extend", default=[], metavar="NAME[=STD]", help="as of identify")
-    pose.add_argument("--use", nargs="+", choices=["points", "markers", "force"], help="kinds of data (default: all)")
+    pose.add_argument(
+        "--window",
+        type=float,
+        default=0.15,
+        metavar="SECONDS",
+        help="time over which the corrective force is constant (default: 0.15)",
+    )
+    pose.add_argument(
+        "--modes", type=int, default=8, metavar="N", help="number of smooth modes of the corrective force (default: 8)"
+    )
+    pose.add_argument(
+        "--nuisance",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME[=STD]",
+        help="unknowns of the episode, as in `torchcloth identify`",
+    )
+    pose.add_argument(
+        "--use", nargs="+", choices=["points", "markers", "force"], help="kinds of data to compare with (default: all)"
+    )
     pose.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
     pose.add_argument("--truth", action="store_true", help="show the true cloth of a synthetic episode in the picture")
-    pose.add_argument("--out", type=place, required=True, metavar="DIR", help="folder for the result and the picture")
+    pose.add_argument(
+        "--out", type=output_path, required=True, metavar="DIR", help="folder for the result and the picture"
+    )
     pose.set_defaults(run=_pose)
 
 
@@ -52,26 +74,26 @@ def _pose(options: argparse.Namespace) -> int:
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
-    check_apart(options.out, options.episode)
-    check_folder(options.out)
+    check_outside_episodes(options.out, options.episode)
+    check_output_folder(options.out)
     recording = recordings.read(options.episode, with_truth=options.truth)
     if options.truth:
         recording.require("truth", by="--truth")
     cloth, uncertain = _model(options, recording)
     estimate = _estimate(options, cloth, uncertain, recording)
-    note = replaces(options.out / "pose.json")
+    note = replacement_note(options.out / "pose.json")
     files = estimate.save(options.out)
     film = viewing.film_of_pose(recording, estimate, truth=options.truth)
-    picture = viewing.picture(film, options.out / "pose.png", size=PICTURE)
+    picture = viewing.picture(film, options.out / "pose.png", size=PANEL_SIZE_PX)
     print_pose(estimate)
-    if options.fit is not None and _used(options.fit, recording):
-        print("note: the fit used this episode: it counts twice, and the errors of the fabric's values are too small")
+    if options.fit is not None and _was_fitted_to(options.fit, recording):
+        print("note: the fit used this episode. It counts twice, so the fabric's standard errors are too small")
     print("result: " + ", ".join(str(path) for path in (*files, picture)) + note)
     return 0
 
 
-def _used(fit: Path, recording: Recording) -> bool:
-    """Whether the fit or model has seen this episode."""
+def _was_fitted_to(fit: Path, recording: Recording) -> bool:
+    """Whether the fit or model was fitted to this episode."""
     from .. import diagnosis
     from ..identification import is_fitted
 
@@ -79,30 +101,30 @@ def _used(fit: Path, recording: Recording) -> bool:
 
 
 def _model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
-    """The cloth, and what is uncertain of its values."""
+    """Return the cloth, and value and spread of each uncertain parameter."""
     from ..diagnosis import start_of
-    from ..episodes.unknowns import available
-    from ..identification import cloth_from, fitted
+    from ..episodes.unknowns import find_scalar_parameters
+    from ..identification import build_cloth, fitted
 
     if options.fit is None:
-        cloth, uncertain = cloth_from(recording), {}
+        cloth, uncertain = build_cloth(recording), {}
     elif options.fit.suffix == ".tcm":
-        cloth, uncertain = _of_model(options.fit, recording)
+        cloth, uncertain = _cloth_from_model(options.fit, recording)
     else:
         cloth, uncertain = fitted(options.fit, recording, start_of(options.fit))
-    names = available(cloth)
-    for name, spread in assignments(options.uncertain, "--uncertain").items():
+    names = find_scalar_parameters(cloth)
+    for name, spread in parse_assignments(options.uncertainty, "--uncertainty").items():
         if name not in names:
-            raise InvalidInput("--uncertain", got=repr(name), expected=f"one of {', '.join(sorted(names))}")
+            raise InvalidInput("--uncertainty", got=repr(name), expected=f"one of {', '.join(sorted(names))}")
         uncertain[name] = (cloth.get_submodule(names[name]).value.item(), spread)  # type: ignore[union-attr]
     return cloth, uncertain
 
 
-def _of_model(path: Path, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
+def _cloth_from_model(path: Path, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
     from .. import diagnosis
 
     file = diagnosis.read_model(path, recording)
-    for note in what_is_beside(file.model):
+    for note in describe_causes_outside_cloth(file.model):
         print(f"note: {note}")
     return file.model.world().cloth, diagnosis.uncertain(file)
 
@@ -122,7 +144,7 @@ def _estimate(
             text = f"{stage}: corrective force {100 * share:.1f} % of the weight"
             progress.update(task, description=text)
             if not progress.console.is_terminal:
-                say(text)
+                print_line(text)
 
         return estimate_pose(
             cloth,
@@ -130,7 +152,7 @@ def _estimate(
             uncertain=uncertain,
             window=options.window,
             modes=options.modes,
-            nuisances=nuisances_of(options.nuisance),
+            nuisances=parse_nuisances(options.nuisance),
             use=options.use,
             dt=options.dt,
             on_progress=advance,

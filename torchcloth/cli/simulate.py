@@ -1,4 +1,4 @@
-"""``torchcloth simulate``: synthetic recordings of a robot that moves garments."""
+"""``torchcloth simulate``: generate synthetic recordings of a robot that moves garments."""
 
 from __future__ import annotations
 
@@ -13,66 +13,80 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._utils.files import atomically
+from .._utils.files import write_atomically
 from ..errors import InvalidInput, TorchclothError
-from .folders import check_folder, place, say
+from .output_paths import check_output_folder, output_path, print_line
 
 if TYPE_CHECKING:
     from ..recordings import Recording
     from ..synthesis import Order
 
-STOPPED = "; the same command goes on, finished episodes are kept"
-OVERVIEW = "overview.png"
-GIF_RATE = 10.0  # 1/s
+STOPPED_HINT = "; the same command continues, finished episodes remain"
+OVERVIEW_FILE = "overview.png"
+GIF_RATE_HZ = 10.0
 
 
 def add(verbs: Any) -> None:
-    """The verb and its options."""
-    from ..synthesis.orders import CAMERAS, MOTIONS, Order
+    """Add the verb and its options."""
+    from ..synthesis.episode_spec import CAMERAS, MOTIONS, Order
 
     parser = verbs.add_parser(
         "simulate",
-        help="make synthetic recordings: two arms move a garment, a depth camera looks on",
-        epilog="Every garment is moved in every way. Finished episodes in DIR are skipped. What a fit finds in them it "
-        "finds under the model that made them (an inverse crime): they test a method, not the model.",
+        help="generate synthetic recordings: two arms move a garment in front of a depth camera",
+        epilog="Each garment is combined with each motion. Finished episodes in DIR are skipped. A fit to these "
+        "episodes uses the model that generated them (an inverse crime). They therefore test a method, not the model.",
     )
     option = parser.add_argument
     option("--garment", nargs="+", required=True, metavar="NAME", help="shirt, trousers, dress, sheet")
     option("--motion", nargs="+", required=True, metavar="NAME", help=", ".join(MOTIONS))
-    option("--out", type=place, required=True, metavar="DIR", help="folder for episodes, a GIF of each, an overview")
-    option("--fabric", metavar="PRESET", help="a published fabric instead of the garment's own")
-    option("--seed", type=int, default=Order.seed, metavar="N", help="of the sensor's errors and the cloth's place (0)")
-    option("--triangles", type=int, default=Order.triangles, metavar="N", help="of the cloth, about (800)")
-    option("--camera", choices=CAMERAS, default=Order.camera, help="default azure_kinect")
-    option("--rate", type=float, default=Order.rate, metavar="HZ", help="frames per second (15)")
-    option("--speed", type=float, default=Order.speed, metavar="M_S", help="of the grippers, at most [m/s] (1)")
-    option("--grippers-only", action="store_true", help="no arms: grippers fly, as fast as asked (two Rizon 4)")
-    option("--no-pictures", action="store_true", help="episodes only")
-    parser.set_defaults(run=_simulate, stopped=STOPPED)
+    option(
+        "--out", type=output_path, required=True, metavar="DIR", help="folder for episodes, their GIFs and an overview"
+    )
+    option("--fabric", metavar="PRESET", help="a published fabric (default: that of the garment)")
+    option(
+        "--seed",
+        type=int,
+        default=Order.seed,
+        metavar="N",
+        help="seed of sensor errors and cloth placement (default: 0)",
+    )
+    option(
+        "--triangles",
+        type=int,
+        default=Order.triangles,
+        metavar="N",
+        help="approximate number of triangles (default: 800)",
+    )
+    option("--camera", choices=CAMERAS, default=Order.camera, help="depth camera (default: azure_kinect)")
+    option("--rate", type=float, default=Order.rate, metavar="HZ", help="frames per second (default: 15)")
+    option("--speed", type=float, default=Order.speed, metavar="M_S", help="largest gripper speed [m/s] (default: 1)")
+    option("--grippers-only", action="store_true", help="move free grippers instead of two Rizon 4 arms")
+    option("--no-pictures", action="store_true", help="write episodes only")
+    parser.set_defaults(run=_simulate, stopped=STOPPED_HINT)
 
 
 def _simulate(options: argparse.Namespace) -> int:
     import torch
 
     torch.set_default_dtype(torch.float64)
-    torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
+    torch.set_num_threads(1)  # on meshes of a thousand triangles a second thread costs more than it gains
     out: Path = options.out
-    check_folder(out)
-    orders = _orders(options)
-    finished = {order.name: _finished(out / order.name, order) for order in orders}
+    check_output_folder(out)
+    orders = _episode_specs(options)
+    finished = {order.name: _is_finished(out / order.name, order) for order in orders}
     rows = []
     for order in orders:
-        begun = time.process_time()
+        started = time.process_time()
         if not finished[order.name]:
             _make(out, order)
-        rows.append((order, None if finished[order.name] else time.process_time() - begun))
+        rows.append((order, None if finished[order.name] else time.process_time() - started))
     if not options.no_pictures:
         _draw(out, orders)
     _print(out, rows)
     return 0
 
 
-def _orders(options: argparse.Namespace) -> list[Order]:
+def _episode_specs(options: argparse.Namespace) -> list[Order]:
     from ..synthesis import Order
 
     pairs = dict.fromkeys(product(options.garment, options.motion))
@@ -92,30 +106,32 @@ def _orders(options: argparse.Namespace) -> list[Order]:
     ]
 
 
-def _finished(folder: Path, order: Order) -> bool:
-    """Whether the episode is there; refuses one that was ordered otherwise."""
+def _is_finished(folder: Path, order: Order) -> bool:
+    """Whether the episode exists; refuses an episode with another specification."""
     try:
-        found = json.loads((folder / "episode.json").read_text(encoding="utf-8")).get("order")
+        stored = json.loads((folder / "episode.json").read_text(encoding="utf-8")).get("order")
     except FileNotFoundError:
         if not folder.exists():
             return False
-        found = None
+        stored = None
     except (OSError, ValueError, AttributeError):
-        found = None
-    if found != order.facts():
-        known, asked = found if isinstance(found, dict) else {}, order.facts()
-        changed = [key for key, value in asked.items() if known.get(key) != value]
+        stored = None
+    if stored != order.items():
+        stored_spec, requested = stored if isinstance(stored, dict) else {}, order.items()
+        changed = [key for key, value in requested.items() if stored_spec.get(key) != value]
         raise InvalidInput(
             f"{folder}",
-            got=f"an episode with {_told(known, changed)}" if known else "no episode of this command",
-            expected=_told(asked, changed) if known else "none, or one",
+            got=f"an episode with {_format_items(stored_spec, changed)}"
+            if stored_spec
+            else "no episode of this command",
+            expected=_format_items(requested, changed) if stored_spec else "none, or one",
             remedy="choose another --out, or remove it",
         )
     return True
 
 
-def _told(facts: dict[str, Any], keys: list[str]) -> str:
-    return ", ".join(f"{key} {facts.get(key)}" for key in keys)
+def _format_items(items: dict[str, Any], keys: list[str]) -> str:
+    return ", ".join(f"{key} {items.get(key)}" for key in keys)
 
 
 def _make(out: Path, order: Order) -> None:
@@ -128,15 +144,15 @@ def _make(out: Path, order: Order) -> None:
             error.args = (f"{order.name}: {error}",)
             raise
         advance("writing", 0, 1)
-        if _finished(out / order.name, order):
-            return  # by another command, meanwhile
+        if _is_finished(out / order.name, order):
+            return  # another process has written it meanwhile
         recordings.write(recording, out / order.name)
-        (out / f"{order.name}.gif").unlink(missing_ok=True)  # of an episode that is gone
+        (out / f"{order.name}.gif").unlink(missing_ok=True)  # it may show an episode that was removed
 
 
 @contextmanager
 def _progress(name: str) -> Iterator[Callable[[str, int, int], None]]:
-    """A bar on a terminal; a line for each stage in a log."""
+    """Show a progress bar on a terminal, or print one line for each stage in a log."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -147,14 +163,14 @@ def _progress(name: str) -> Iterator[Callable[[str, int, int], None]]:
         def advance(stage: str, done: int, of: int) -> None:
             progress.update(task, description=f"{name}: {stage}", completed=done, total=of)
             if not progress.console.is_terminal and stage not in stages:
-                say(f"{name}: {stage}")
+                print_line(f"{name}: {stage}")
                 stages.append(stage)
 
         yield advance
 
 
 def _draw(out: Path, orders: list[Order]) -> None:
-    """A GIF of each episode that has none, and one picture of all: a row of moments each."""
+    """Write a GIF of each episode that has none, and one overview with a row of frames for each episode."""
     from PIL import Image
 
     from .. import recordings, viewing
@@ -166,13 +182,13 @@ def _draw(out: Path, orders: list[Order]) -> None:
             film = viewing.film_of(recordings.read(out / order.name, with_truth=True), truth=True)
             if not gif.exists():
                 with _progress(order.name) as advance:
-                    viewing.animate(film, gif, rate=GIF_RATE, on_frame=lambda i, n, a=advance: a("drawing", i, n))
+                    viewing.animate(film, gif, rate=GIF_RATE_HZ, on_frame=lambda i, n, a=advance: a("drawing", i, n))
             viewing.picture(film, strip, size=(320, 280))
             rows.append(Image.open(strip).convert("RGB"))
         sheet = Image.new("RGB", (max(r.width for r in rows), sum(r.height for r in rows)), "white")
         for i, row in enumerate(rows):
             sheet.paste(row, (0, sum(r.height for r in rows[:i])))
-        with atomically(out / OVERVIEW) as part:
+        with write_atomically(out / OVERVIEW_FILE) as part:
             sheet.save(part, optimize=True)
 
 
@@ -183,14 +199,17 @@ def _print(out: Path, rows: list[tuple[Order, float | None]]) -> None:
 
     from .. import recordings
 
-    table = Table("episode", "frames", "seconds", "slower", "limited by", "nearest", "CPU", title=escape(str(out)))
-    for order, spent in rows:
+    headings = ("episode", "frames", "duration, s", "slowed down", "limited by", "clearance", "CPU time")
+    table = Table(*headings, title=escape(str(out)))
+    for order, cpu_seconds in rows:
         recording = recordings.read(out / order.name)
-        table.add_row(order.name, *_facts(recording), "was there" if spent is None else f"{spent:.0f} s")
+        table.add_row(
+            order.name, *_summary_cells(recording), "existed" if cpu_seconds is None else f"{cpu_seconds:.0f} s"
+        )
     Console().print(table)
 
 
-def _facts(recording: Recording) -> tuple[str, ...]:
+def _summary_cells(recording: Recording) -> tuple[str, ...]:
     motion = next(iter({**recording.grippers, **recording.joints}.values()))
     frames, seconds = str(len(recording.require("depth")["cam0"])), f"{motion.t[-1]:.2f}"
     plan = recording.extra.get("plan")

@@ -1,4 +1,4 @@
-"""``torchcloth view``: an episode, and a fit beside it, in a browser or as a file."""
+"""``torchcloth view``: show an episode, and a fit beside it, in a browser or as a file."""
 
 from __future__ import annotations
 
@@ -9,77 +9,82 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
-from .folders import check_apart, check_file, place, replaces
+from .output_paths import check_output_file, check_outside_episodes, output_path, replacement_note
 
 if TYPE_CHECKING:
     from ..viewing import Film
 
-PICTURES, OTHERS = (".gif", ".png"), (".rrd", ".viser", ".html")
-PORT = 8080
+IMAGE_SUFFIXES, VIEWER_SUFFIXES = (".gif", ".png"), (".rrd", ".viser", ".html")
+DEFAULT_PORT = 8080
 
 
 def add(verbs: Any) -> None:
-    """The verb and its options."""
-    view = verbs.add_parser("view", help="look at an episode, and at a fit beside it")
+    """Add the verb and its options."""
+    view = verbs.add_parser("view", help="show an episode, and a fit beside it")
     view.add_argument("episode", metavar="EPISODE", help="folder of a recording")
     view.add_argument(
-        "--fit", type=Path, metavar="RESULT", help="identification.json, its folder or a .tcm file: simulate it too"
+        "--fit",
+        type=Path,
+        metavar="RESULT",
+        help="also simulate the cloth of identification.json, of its folder or of a .tcm file",
     )
     view.add_argument(
         "--out",
-        type=place,
+        type=output_path,
         metavar="FILE",
-        help=".gif, .png, .rrd (rerun), .html or .viser; left out: a server for the browser",
+        help="a .gif, .png, .rrd (rerun), .html or .viser file (default: serve the scene to a browser)",
     )
-    view.add_argument("--truth", action="store_true", help="show the true cloth of a synthetic episode too")
-    view.add_argument("--port", type=int, metavar="N", help=f"of the server, on this machine only ({PORT})")
-    view.add_argument("--fps", type=float, metavar="N", help="at most N frames a second (all; of a GIF 25)")
-    view.add_argument("--size", metavar="WxH", help="pixels of a GIF, or of each of a PNG's moments")
+    view.add_argument("--truth", action="store_true", help="also show the true cloth of a synthetic episode")
+    view.add_argument("--port", type=int, metavar="N", help=f"port of the local server (default: {DEFAULT_PORT})")
+    view.add_argument("--fps", type=float, metavar="N", help="most frames per second (default: all; 25 in a GIF)")
+    view.add_argument("--size", metavar="WxH", help="pixels of a GIF, or of each frame in a PNG")
     view.set_defaults(run=_view)
 
 
 def _view(options: argparse.Namespace) -> int:
-    size = _checked(options)
+    size = _check_options(options)
     film = _film(options)
     for note in film.notes:
         print(f"note: {note}", file=sys.stderr)
     if options.out is None:
-        return _serve(film, options.port or PORT)
-    note = replaces(options.out)
+        return _serve(film, options.port or DEFAULT_PORT)
+    note = replacement_note(options.out)
     _write(film, options.out, size, options.fps)
     print(f"{options.out}: {options.out.stat().st_size / 1e3:.0f} kB{note}")
     return 0
 
 
-def _checked(options: argparse.Namespace) -> tuple[int, int] | None:
-    """Refuse before anything is computed; the size of pictures."""
+def _check_options(options: argparse.Namespace) -> tuple[int, int] | None:
+    """Check the options before anything is computed; return the size of pictures in pixels."""
     out: Path | None = options.out
     suffix = None if out is None else out.suffix.lower()
-    if out is not None and suffix not in PICTURES + OTHERS:
-        raise InvalidInput("--out", got=repr(out.name), expected=f"a name with {', '.join(PICTURES + OTHERS)}")
+    if out is not None and suffix not in IMAGE_SUFFIXES + VIEWER_SUFFIXES:
+        raise InvalidInput(
+            "--out", got=repr(out.name), expected=f"a name with {', '.join(IMAGE_SUFFIXES + VIEWER_SUFFIXES)}"
+        )
     if out is not None:
-        check_apart(out, options.episode)
-        check_file(out)
+        check_outside_episodes(out, options.episode)
+        check_output_file(out)
     if options.port is not None and (out is not None or not 0 < options.port < 65536):
         raise InvalidInput("--port", got=options.port, expected="1 to 65535, without --out")
     if options.fps is not None and not 0 < options.fps < float("inf"):
         raise InvalidInput("--fps", got=options.fps, expected="a number > 0")
     if options.fps is not None and suffix == ".gif":
-        from ..viewing.pictures import check_rate
+        from ..viewing.image_files import check_rate
 
         check_rate(options.fps)
     if options.size is None:
         return None
-    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", options.size)
-    if found is None or suffix not in PICTURES:
+    match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", options.size)
+    if match is None or suffix not in IMAGE_SUFFIXES:
         raise InvalidInput(
             "--size",
             got=repr(options.size),
             expected="WIDTHxHEIGHT in pixels, of two to four digits, with a GIF or PNG",
         )
-    from ..viewing.stage import check_size
+    from ..viewing.frame_renderer import check_size
 
-    return check_size((int(found[1]), int(found[2])))
+    return check_size((int(match[1]), int(match[2])))
 
 
 def _film(options: argparse.Namespace) -> Film:
@@ -87,7 +92,7 @@ def _film(options: argparse.Namespace) -> Film:
 
     from .. import recordings, viewing
 
-    torch.set_default_dtype(torch.float64)  # as the fit was computed
+    torch.set_default_dtype(torch.float64)  # the precision of the fit
     torch.set_num_threads(1)
     recording = recordings.read(options.episode, with_truth=options.truth)
     if options.fit is None:

@@ -6,12 +6,12 @@ inspection.draw(report, "out/ep_01")
 """
 
 from ..recordings.timing import Stream
-from .frames import Frames
-from .images import Depth
+from .depth_images import Depth
+from .frame_checks import Frames
+from .inspect_recording import Inspection, inspect
+from .inspection_figure import draw
+from .inspection_tables import show
 from .lag import Lag
-from .look import Inspection, inspect
 from .noise import Noise
-from .pictures import draw
-from .tables import show
 
 __all__ = ["Depth", "Frames", "Inspection", "Lag", "Noise", "Stream", "draw", "inspect", "show"]

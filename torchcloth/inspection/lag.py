@@ -9,8 +9,8 @@ from types import MappingProxyType
 import numpy as np
 
 from ..recordings import Markers, PointClouds, Recording
-from ..robots.paths import Path  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from .robust import median
+from ..robots.paths import GripperPath  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from .nan_statistics import median
 
 SEARCH, COARSE = 1.0, 0.02  # s to either side; step
 NEAR, FINE = 0.16, 0.004  # the same about the least
@@ -64,7 +64,7 @@ class Lag:
 
 
 def lag(
-    recording: Recording, paths: dict[str, Path], use: Mapping[str, np.ndarray] = MappingProxyType({})
+    recording: Recording, paths: dict[str, GripperPath], use: Mapping[str, np.ndarray] = MappingProxyType({})
 ) -> Lag | None:
     """The lag of markers, or else of the clouds; None without motion or observations.
 
@@ -149,7 +149,7 @@ class _CloudFollows:
 
 
 def _curve(
-    follow: _MarkersFollow | _CloudFollows, paths: dict[str, Path], t: np.ndarray, tried: np.ndarray
+    follow: _MarkersFollow | _CloudFollows, paths: dict[str, GripperPath], t: np.ndarray, tried: np.ndarray
 ) -> np.ndarray:
     """Misfit [F, N] m, mean over the grippers; NaN where a path does not reach."""
     start, end = max(p.t[0] for p in paths.values()), min(p.t[-1] for p in paths.values())
@@ -162,7 +162,7 @@ def _curve(
     return out
 
 
-def _unsteady(paths: dict[str, Path], t: np.ndarray) -> float:
+def _unsteady(paths: dict[str, GripperPath], t: np.ndarray) -> float:
     """Standard deviation of the grippers' velocity, m/s: what a lag shows against, as a mean velocity is an offset."""
     step = 0.05
     speeds = [(path.at(t + step)[0] - path.at(t - step)[0]) / (2 * step) for path in paths.values()]
@@ -178,7 +178,7 @@ def _mean(curve: np.ndarray) -> np.ndarray:
     return np.where(seen.mean(0) >= 0.5, mean, np.nan)
 
 
-def _turned(path: Path, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _turned(path: GripperPath, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Position, and rotation since the start of the path: with it, axes stay the world's as long as nothing turns."""
     position, rotation = path.at(t)
     return position, rotation @ path.rotation[0].T

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..recordings import Markers, PointClouds
-from .robust import median
+from .nan_statistics import median
 
 SHORTEST = 6  # frames
 QUIET = 2.0  # of a coordinate's scatter over that of its steps, 1 of white noise: beyond, the cloth was moving

@@ -6,8 +6,8 @@ method works at all, never how well it does on cloth. Their provenance says so.
 
 from __future__ import annotations
 
-from .episodes import make
+from .episode_spec import CAMERAS, MOTIONS, Order
 from .garments import GARMENTS
-from .orders import CAMERAS, MOTIONS, Order
+from .generate import make
 
 __all__ = ["CAMERAS", "GARMENTS", "MOTIONS", "Order", "make"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import meshes
 from ..materials import AEP, AbstractMaterial, OrthotropicAEP
-from ..materials.presets import NOMINAL, find
+from ..materials.presets import NOMINAL_THICKNESS_M, find_fabric
 from ..meshes import Mesh
 
 SHEET = 0.5  # m, its sides
@@ -60,7 +60,7 @@ def material(fabric: str) -> AbstractMaterial:
     Raises:
         InvalidInput: an unknown fabric, or one whose source leaves out a stiffness.
     """
-    row = find(fabric)
+    row = find_fabric(fabric)
     if row.membrane_warp is not None and row.membrane_warp != row.membrane_weft:
         return OrthotropicAEP(**_softened(row.orthotropic()))
     return AEP(**_softened(row.isotropic()))
@@ -68,17 +68,17 @@ def material(fabric: str) -> AbstractMaterial:
 
 def numbers(fabric: str) -> dict[str, float]:
     """Areal density [kg/m^2], bending stiffness [N m] and thickness [m], ours where a fabric's source gives none."""
-    row = find(fabric)
+    row = find_fabric(fabric)
     return {
         "areal_density": row.areal_density or DENSITY,
         "bending_stiffness": row.bending_warp or BENDING,
-        "thickness": row.thickness or NOMINAL,
+        "thickness": row.thickness or NOMINAL_THICKNESS_M,
     }
 
 
 def data_sheet(fabric: str) -> dict[str, float]:
     """Nominal values of an episode's cloth: the membrane ``OFF`` times too stiff (along the warp), the rest true."""
-    row = find(fabric)
+    row = find_fabric(fabric)
     sheet = {"bending_stiffness": numbers(fabric)["bending_stiffness"], "bending_damping_time": DAMPING}
     if row.membrane_warp is not None:
         sheet["membrane_stiffness"] = OFF * row.membrane_warp

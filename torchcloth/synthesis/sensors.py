@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..observe import DepthCamera, DepthNoise, StereoNoise, View, look_at
-from .orders import Order
+from .episode_spec import Order
 
 EYE, TARGET = (1.50, 0.45, 0.85), (0.52, 0.0, 0.20)  # m
 POINTS = 600  # of the cloth, per frame at most

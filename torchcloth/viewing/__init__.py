@@ -4,14 +4,14 @@ film = viewing.film_of(recordings.read("episodes/ep_01"))
 viewing.animate(film, "ep_01.gif")
 """
 
-from .distances import film_of_fit, with_cloth
-from .episodes import film_of
 from .film import Cloud, Curve, Film, Plane, Sheet, Solid, Trace, View
-from .pictures import RATE, animate, picture
-from .plans import film_of_plan
-from .poses import film_of_pose
-from .rerun_file import write_rrd
-from .viser_view import Viewer, write_viser
+from .fit_film import film_of_fit, with_cloth
+from .image_files import RATE, animate, picture
+from .plan_film import film_of_plan
+from .pose_film import film_of_pose
+from .recording_film import film_of
+from .rerun_export import write_rrd
+from .viser_viewer import Viewer, write_viser
 
 __all__ = [
     "RATE",

@@ -15,8 +15,8 @@ from pathlib import Path
 from torchcloth.errors import InvalidInput
 
 from ..resumable import guarded
+from .runs import Name, Study, Task, missing, simulate
 from .scenes import ACTIONS, ASSUMED, GARMENTS, LEVELS, Scene, Setup, Variant, variants
-from .study import Name, Study, Task, missing, simulate
 
 FAST = {"triangles": 150, "pace": 3.0, "levels": [25, 175]}
 

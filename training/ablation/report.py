@@ -14,9 +14,9 @@ from torchcloth._utils.files import write_text
 from torchcloth.errors import InvalidInput
 
 from .measures import bidirectional_chamfer, contributions, spearman
-from .paper import CHAMFER, ENERGY
+from .paper_tables import CHAMFER, ENERGY
+from .runs import Name, Study
 from .scenes import LEVELS, PARAMETERS, PERTURBED, REFERENCE, Run, Variant
-from .study import Name, Study
 
 CONVENTION = (
     "chamfer_cm: bidirectional Chamfer distance [cm] to the reference run, the sum of both means of the distance from "
@@ -100,8 +100,8 @@ def report(study: Study, scenes: Sequence[Name], wanted: Sequence[Variant]) -> N
     Raises:
         InvalidInput: no scene has its reference run yet.
     """
-    from .pictures import draw
-    from .tables import print_study
+    from .ablation_figures import draw
+    from .ablation_tables import print_study
 
     measured = measure(study, scenes, wanted)
     if not measured:

@@ -15,15 +15,15 @@ import torchcloth as tc
 from torchcloth import meshes
 from torchcloth.boundaries import Grasp, Plane
 from torchcloth.dynamics.contact import Contact
-from torchcloth.dynamics.contact.grid import GAP, SPARSEST
+from torchcloth.dynamics.contact.grid import REST_GAP_SPACINGS, MAX_POINT_DISTANCE_SPACINGS
 from torchcloth.effects import AirDrag, Bending, Gravity
 from torchcloth.errors import InvalidInput
 from torchcloth.materials import AEP
-from torchcloth.materials.presets import find
+from torchcloth.materials.presets import find_fabric
 from torchcloth.meshes import Mesh
 from torchcloth.robots.primitives import (  # pyright: ignore[reportMissingImports] - mapped from robots/
     Action,
-    Limits,
+    GripperLimits,
     cover,
     drag,
     fling,
@@ -121,7 +121,7 @@ class Scene:
         made = self.garment.mesh(triangles=setup.triangles)
         pattern = setup.scale * np.asarray(made.pattern)
         mesh = Mesh.build(setup.scale * made.vertices, made.faces, pattern, made.places)
-        self.spacing = mesh.mean_edge / SPARSEST if setup.spacing is None else setup.spacing
+        self.spacing = mesh.mean_edge / MAX_POINT_DISTANCE_SPACINGS if setup.spacing is None else setup.spacing
         self.start = self._placed(mesh, hanging=action == "fling")
         self.mesh = Mesh.build(self.start, mesh.faces, mesh.pattern, mesh.places)
         grips = {name: self.start[self.mesh.places[place]].mean(0) for name, place in self.garment.grips.items()}
@@ -140,14 +140,14 @@ class Scene:
 
     def _action(self, name: str, grips: dict[str, Any]) -> Action:
         scale, pace = self.setup.scale, self.setup.pace
-        limits = Limits(1.0 * scale * pace, 5.0 * scale * pace**2)
+        limits = GripperLimits(1.0 * scale * pace, 5.0 * scale * pace**2)
         low, high = 0.02 * scale, 0.05 * scale
         if name == "fling":
             return fling(grips, 0.3 * scale, pull=0.3 * scale, landing=high, rest=0.4 / pace, limits=limits)
         if name == "drag":
             return drag(grips, 0.3 * scale, height=high, landing=low, rest=0.3 / pace, limits=limits)
         reach = 0.75 * float(np.ptp(self.start[:, 1]))
-        return cover(grips, reach, landing=2 * GAP * self.spacing, rest=0.4 / pace, limits=limits)
+        return cover(grips, reach, landing=2 * REST_GAP_SPACINGS * self.spacing, rest=0.4 / pace, limits=limits)
 
     def cloth(self, variants: list[Variant]) -> tc.Cloth:
         """The garment with the parameters of each variant, as a batch."""
@@ -162,7 +162,7 @@ class Scene:
         )
 
     def _parameters(self, variants: list[Variant]) -> dict[str, Any]:
-        values = find(self.garment.preset).isotropic()
+        values = find_fabric(self.garment.preset).isotropic()
         for short, name in PARAMETERS.items():
             factors = [variant.factors().get(short, 1.0) for variant in variants]
             scaled = [scaled_poisson(values[name], f) if short == "nu" else values[name] * f for f in factors]
@@ -171,7 +171,7 @@ class Scene:
 
     def step(self) -> float:
         """One substep [s] for every run, stable with all parameters at once at their highest level."""
-        values = find(self.garment.preset).isotropic()
+        values = find_fabric(self.garment.preset).isotropic()
         highest = LEVELS[-1] / 100
         for short, name in PARAMETERS.items():
             values[name] = scaled_poisson(values[name], highest) if short == "nu" else highest * values[name]
@@ -188,7 +188,7 @@ class Scene:
     def simulate(self, variants: list[Variant]) -> Iterator[tuple[float, list[Run]]]:
         """Yields (share done, []) after each frame, at last (1, a run for each variant)."""
         cloth, dt, frames = self.cloth(variants), self.step(), self.frames()
-        model = cloth.model()
+        model = cloth.build_model()
         state = cloth.state(self._starts(cloth, variants))
         kept, energy = [state.x], [energies(model, state)]
         for i in range(1, len(frames)):

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from torchcloth._utils.files import atomically
+from torchcloth._utils.files import write_atomically
 
 
 class Whole(TorchCheckpointIO):
@@ -28,7 +28,7 @@ class Whole(TorchCheckpointIO):
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """As torch.save has it; ``storage_options`` are not used."""
-        with atomically(Path(path)) as part:
+        with write_atomically(Path(path)) as part:
             torch.save(checkpoint, part)
         for path in self.outdated:
             path.unlink(missing_ok=True)

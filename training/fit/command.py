@@ -59,7 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=f"python -m {NAME}",
         description="Fit what a config names to episodes, by gradient descent through the simulation.",
-        epilog="On several processes: run.processes=N, or under torchrun or srun; see docs/training.md.",
+        epilog="On several processes: run.processes=N, or under torchrun or srun; see docs/how-to/train-with-lightning.md.",
     )
     add = parser.add_argument
     add("--config", required=True, metavar="FILE", help="YAML file, or the name of a shipped one: demo")

@@ -13,12 +13,12 @@ from torch.utils.data import DataLoader, Sampler
 
 from torchcloth import Cloth, recordings
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import Episode, episode
+from torchcloth.identification import Episode, build_episode
 from torchcloth.recordings import Recording
 from torchcloth.recordings.size_checks import check_size
 
+from .cloth_description import described, same_cloth
 from .config import Data
-from .described import described, same_cloth
 
 EXAMPLE = "example:"
 
@@ -125,7 +125,7 @@ class Episodes(pl.LightningDataModule):
         self, cloth: Cloth, train: Sequence[Recording], val: Sequence[Recording], per_step: int = 0, seed: int = 0
     ) -> None:
         super().__init__()
-        self.train, self.val = [episode(cloth, r) for r in train], [episode(cloth, r) for r in val]
+        self.train, self.val = [build_episode(cloth, r) for r in train], [build_episode(cloth, r) for r in val]
         self.per_step, self.seed = per_step or len(self.train), seed
         if self.per_step > len(self.train):
             expected = f"at most {len(self.train)}, the training episodes"

@@ -9,18 +9,18 @@ import torch
 from torch import Tensor
 
 from torchcloth import Cloth
-from torchcloth.episodes.observed_surface import Sheet
-from torchcloth.episodes.replay import Replay, frames_of
+from torchcloth.episodes.observed_surface import ObservedSurface
+from torchcloth.episodes.replay import Replay, frames_from_rollout
 from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.identification import Episode
 from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.residuals.rows import Scene, scene_of
-from torchcloth.parameters import called
+from torchcloth.parameters import call_with_parameters
 
+from .cloth_description import built, precision
 from .config import from_dict
 from .data import Episodes
-from .described import built, precision
-from .learned import Learned, summary
+from .learned_cloth import Learned, summary
 from .losses import Loss, chamfer
 
 
@@ -44,7 +44,7 @@ class FitModule(pl.LightningModule):
         self.loss = Loss(self.config.loss)
         self.begun: dict[str, float] = {}  # values before the present step
         self.history: dict[int, dict[str, float]] = {}
-        self.sheet: Sheet | None = None
+        self.sheet: ObservedSurface | None = None
         self.clouded = False  # every process must log the same
 
     def now(self) -> dict[str, float]:
@@ -63,8 +63,8 @@ class FitModule(pl.LightningModule):
             raise InvalidInput("forward", got="a module without data", expected="a module in a run, or use cloth()")
         entries = {f"cloth.{key}": value for key, value in self.learned.entries().items()}
         model = Replay(self.learned.cloth)
-        rollout = called(model, entries, (episode, self.config.model.dt or None))
-        return scene_of(frames_of(rollout), None, episode, self.sheet)
+        rollout = call_with_parameters(model, entries, (episode, self.config.model.dt or None))
+        return scene_of(frames_from_rollout(rollout), None, episode, self.sheet)
 
     def setup(self, stage: str) -> None:
         """The surface, in the pieces that the residuals of this run's episodes need."""

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth._utils.files import as_json, atomically, write_text
+from torchcloth._utils.files import to_json, write_atomically, write_text
 
 from .config import Config
-from .learned import summary
+from .learned_cloth import summary
 from .module import FitModule
 
 RESULTS = ("fit.json", "fields.npz")  # in a run's folder
@@ -53,11 +53,11 @@ def save(
         "history": [{"step": step, **entry} for step, entry in sorted(module.history.items())],
     }
     if fields:
-        with atomically(folder / "fields.npz") as part:
+        with write_atomically(folder / "fields.npz") as part:
             np.savez(part, **fields)
     else:
         (folder / "fields.npz").unlink(missing_ok=True)  # of an earlier run
-    write_text(folder / "fit.json", as_json(content))
+    write_text(folder / "fit.json", to_json(content))
     return content
 
 

@@ -20,15 +20,15 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch import nn
 
 from torchcloth import Cloth
-from torchcloth._utils.resume import DAMAGED, digest, program
+from torchcloth._utils.resume import DAMAGED_FILE_ERRORS, digest, source_fingerprint
 from torchcloth.errors import InvalidInput, MissingDependency
 from torchcloth.identification.estimators.objective import Objective
 
 from . import result
 from .checkpoints import Whole
+from .cloth_description import built, described, precision
 from .config import CHECKPOINT, Config, Network, Optimizer, Run
 from .data import Episodes, found
-from .described import built, described, precision
 from .module import FitModule
 from .progress import Told
 
@@ -71,7 +71,7 @@ def _check_checkpoint(checkpoint: Path, steps: int) -> None:
     try:
         found = torch.load(checkpoint, weights_only=True)
         whole = {"state_dict", "hyper_parameters", "history"} <= found.keys()
-    except (*DAMAGED, AttributeError):
+    except (*DAMAGED_FILE_ERRORS, AttributeError):
         found, whole = {}, False
     if not whole:
         raise InvalidInput(
@@ -107,7 +107,7 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
         "steps": trainer.global_step,
         "seconds": time.perf_counter() - began,
         "processes": trainer.world_size,
-        "warnings": [doubt for e in (*data.train, *data.val) for doubt in e.doubts()],
+        "warnings": [doubt for e in (*data.train, *data.val) for doubt in e.data_warnings()],
     }
     if data.per_step == len(train):  # else the first step told of a part of them
         first = module.history[0]
@@ -209,5 +209,5 @@ def _problem(config: Config, cloth: Cloth, data: Episodes) -> str:
     """
     fixed = replace(config, out="", run=Run(seed=config.run.seed), data=replace(config.data, train=[], val=[]))
     fixed = replace(fixed, optimizer=replace(config.optimizer, steps=Optimizer.steps))
-    code = program(Path(__file__).resolve().parent), _source(config.learn.network)
+    code = source_fingerprint(Path(__file__).resolve().parent), _source(config.learn.network)
     return digest([*code, fixed, len(data.train), *Objective(cloth, [], [*data.train, *data.val]).identity()])

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from torchcloth.episodes.unknowns import available
+from torchcloth.episodes.unknowns import find_scalar_parameters
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import identify
 
@@ -125,7 +125,7 @@ def sheet(scale: Scale) -> Problem:
     detail = stretching.Detail(scale.cell, scale.frames)
     recording = stretching.record(SHEET, stretching.Pull("x"), 5, detail)
     cloth = stretching.sheet(recording, SHEET)
-    names = available(cloth)
+    names = find_scalar_parameters(cloth)
     parameters: dict[str, Any] = {name: cloth.get_submodule(names[name]) for name in OFF}
     truth = {name: float(p.value.detach()) for name, p in parameters.items()}
     for name, off in OFF.items():

@@ -11,7 +11,7 @@ import numpy as np
 
 import torchcloth as tc
 from torchcloth.identification import Identification, identify
-from torchcloth.materials.presets import find
+from torchcloth.materials.presets import find_fabric
 
 from ..resumable import Case
 from . import pressing, stretching
@@ -66,13 +66,13 @@ FAST = Scale(("cotton", "wool"), (PULLS[3], PULLS[5], PULLS[8]), Detail(0.05, 9,
 
 def fabric(name: str) -> Fabric:
     """A paper's fabric as a sheet."""
-    f = find(name).isotropic()
+    f = find_fabric(name).isotropic()
     return Fabric(f["youngs_modulus"] * f["thickness"], f["poisson_ratio"], DENSITIES[name])
 
 
 def layer(name: str) -> Layer:
     """A paper's fabric as a pressed layer."""
-    return Layer(**find(name).isotropic(), cone=CONE, density=DENSITIES[name])
+    return Layer(**find_fabric(name).isotropic(), cone=CONE, density=DENSITIES[name])
 
 
 def truth(name: str) -> dict[str, float]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchcloth._utils.files import write_text
-from torchcloth.materials.presets import find
+from torchcloth.materials.presets import find_fabric
 
 from ..resumable import Kept
 from . import fabric_figures, fabric_tables
@@ -58,7 +58,7 @@ def summary(scale: Scale, cases: Mapping[str, Mapping[str, Any]]) -> dict[str, A
         "trials": len(scale.pulls),
         "presses": scale.presses,
         "assumed_density": {name: DENSITIES[name] for name in scale.fabrics},
-        "source": find(scale.fabrics[0]).source,
+        "source": find_fabric(scale.fabrics[0]).source,
         "fabrics": fabrics,
         "marks": _marks(fabrics),
         "seconds": float(np.median([c["seconds"] for key, c in cases.items() if "-pull-" in key])),

@@ -20,10 +20,10 @@ import numpy as np
 import torch
 
 from torchcloth._utils.files import write_text
-from torchcloth.diagnosis import Hypothesis, approach, base_model, begin_with, catalogue, fit, screen, setting_of
-from torchcloth.diagnosis.data.binning import aligned
-from torchcloth.diagnosis.inference.fitting import Fitted, weighed
-from torchcloth.diagnosis.inference.linearise import Evidence
+from torchcloth.diagnosis import Hypothesis, quadratic_warm_start, base_model, begin_with, catalogue, fit, screen, prepare_data
+from torchcloth.diagnosis.data.binning import align_rows
+from torchcloth.diagnosis.inference.fitting import ModelFit, assemble_fit
+from torchcloth.diagnosis.inference.linearise import Linearisation
 from torchcloth.diagnosis.run import EXTENDED
 from torchcloth.recordings import Camera, PointClouds, Recording
 from torchcloth.recordings.consistency import together
@@ -104,19 +104,19 @@ def salted(source: Path, fast: bool) -> dict[str, Any]:
     model = base_model(together(plain))
     every = catalogue(model, plain)
     own, asked = _named(every, OWN), [h for h in every if h.name.startswith(ASKED)]
-    setting = setting_of(model, plain)
-    near, before = approach(model, setting)
+    setting = prepare_data(model, plain)
+    near, before = quadratic_warm_start(model, setting)
     base = fit(near.plus(own, own.typical), setting, asked, before=before)
     out = {}
     for label, salt in SALTS.items():
-        changed = setting_of(model, [_with(r, salt) for r in plain])
+        changed = prepare_data(model, [_with(r, salt) for r in plain])
         after = fit(base.model, changed, asked, 0, noise=base.noise)
         rows = screen(difference(base, after))
         h = _named(asked, salt.cause)
         sizes = [_fitted(base, s, h) for s in (setting, changed)]
         out[label] = {
             "truth": {"effect": salt.cause, "amplitude": salt.amplitude, "unit": salt.unit},
-            "told": [{"effect": r.hypothesis.name, "amplitude": r.amplitude, "gain": r.gain} for r in rows[:3]],
+            "told": [{"effect": r.hypothesis.name, "amplitude": r.amplitude, "gain": r.chi2} for r in rows[:3]],
             "fitted": sizes[1][0] - sizes[0][0],
             "std": sizes[1][1],  # of either fit; of their difference it is less, they have their noise in common
         }
@@ -139,19 +139,19 @@ def _file(label: str) -> str:
     return "diagnosed-" + label.replace(" ", "-").replace("%", "percent")
 
 
-def difference(plain: Fitted, salted: Fitted) -> Fitted:
+def difference(plain: ModelFit, salted: ModelFit) -> ModelFit:
     """The change of the cells as residuals, with the slopes of the first."""
     cells, numerics = [], []
-    for a, b, n in zip(plain.evidence.cells, salted.evidence.cells, plain.evidence.numerics, strict=True):
+    for a, b, n in zip(plain.linearisation.bins, salted.linearisation.bins, plain.linearisation.mesh_differences, strict=True):
         both = torch.isin(a.key, b.key)
-        kept = a.rows(both)
-        cells.append(kept._replace(value=aligned(kept.key, b.key, b.value) - kept.value))
+        kept = a.select(both)
+        cells.append(kept._replace(value=align_rows(kept.key, b.key, b.value) - kept.value))
         numerics.append(torch.zeros_like(n[both]))
-    evidence: Evidence = replace(plain.evidence, cells=cells, numerics=numerics)
-    return weighed(plain.model, evidence, plain.noise)
+    evidence: Linearisation = replace(plain.linearisation, cells=cells, numerics=numerics)
+    return assemble_fit(plain.model, evidence, plain.noise)
 
 
-def _fitted(base: Fitted, setting: Any, h: Hypothesis) -> tuple[float, float]:
+def _fitted(base: ModelFit, setting: Any, h: Hypothesis) -> tuple[float, float]:
     """(amplitude, standard error) of a cause beside the model."""
     found = fit(base.model.plus(h), setting, (), ITERATIONS, noise=base.noise)
     return found.model.amplitudes[-1], float(found.covariance[-1, -1].sqrt())

@@ -24,7 +24,7 @@ from torchcloth._utils.files import write_text
 from torchcloth.effects import AirDrag, Bending, Gravity
 from torchcloth.errors import InvalidInput
 from torchcloth.pose import PoseEstimate, estimate_pose
-from torchcloth.pose.visibility import seen_vertices
+from torchcloth.pose.visibility import find_seen_vertices
 from torchcloth.recordings import Recording, read
 
 from ..resumable import Kept
@@ -99,7 +99,7 @@ def _scene(out: Path, setting: Setting, motion: str) -> Scene:
     cloth = _cloth(recording)
     data = identification.build_episode(cloth, recording)
     truth = _at(recording, cloth, data.times.numpy())
-    return Scene(recording, truth, ~seen_vertices(truth, data, cloth.mesh))
+    return Scene(recording, truth, ~find_seen_vertices(truth, data, cloth.mesh))
 
 
 def _at(recording: Recording, cloth: tc.Cloth, times: np.ndarray) -> Tensor:
@@ -182,7 +182,7 @@ def _case(out: Path, setting: Setting, motion: str, model: str) -> dict[str, Any
     for part in cloth.boundaries.values():
         free[part.index] = False  # type: ignore[index]
     return {
-        "simulated": _errors(found.alone, scene),
+        "simulated": _errors(found.uncorrected, scene),
         "estimated": _errors(found.x, scene) | _coverage(found, scene, free) | _figures(found),
     }
 

@@ -129,13 +129,13 @@ def reach(scale: Scale, number: int, name: str, folder: Path) -> dict[str, Any]:
         found = planning.plan(model, episode, goal, **({"iterations": scale.iterations, "wait": 0.0} | how))
         done = simulate(cloth, _along(moved, found.recording))
         out[label] = {
-            "before": found.before[0],
-            "expected": found.after[0],
+            "before": found.distance_before[0],
+            "expected": found.distance_after[0],
             **_from_goal(goal, done.x[-1], faces),
             "vertices": _rms(done.x[-1], there.x[-1]),
-            "looks": len(found.history),
+            "looks": len(found.distance_history),
             "seconds": time.perf_counter() - began,
-            "limit": found.limit,
+            "limit": found.nearest_limit,
         }
     return out
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from torchcloth._utils.files import write_text
-from torchcloth.diagnosis import Fitted, approach, base_model, catalogue, fit, screen, setting_of, unstable
-from torchcloth.diagnosis.inference.bifurcations import without
+from torchcloth.diagnosis import ModelFit, quadratic_warm_start, base_model, catalogue, fit, screen, prepare_data, find_bifurcating_bins
+from torchcloth.diagnosis.inference.bifurcations import drop_bins
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings import read
 from torchcloth.recordings.consistency import together
@@ -64,13 +64,13 @@ def one(out: Path, seed: int, fast: bool) -> dict[str, Any]:
     return {"seed": seed, "family": truth["family"], "hidden": hidden, "ways": told}
 
 
-def _ways(recordings: Sequence[Any]) -> dict[str, Fitted]:
+def _ways(recordings: Sequence[Any]) -> dict[str, ModelFit]:
     """The fit as a diagnosis screens it, and without each part."""
     model = base_model(together(recordings))
-    setting, asked = setting_of(model, recordings), catalogue(model, recordings)
-    near, before = approach(model, setting)
+    setting, asked = prepare_data(model, recordings), catalogue(model, recordings)
+    near, before = quadratic_warm_start(model, setting)
     whole = fit(near, setting, asked, before=before)
-    found = without(whole, unstable(whole, setting))
+    found = drop_bins(whole, find_bifurcating_bins(whole, setting))
     return {
         ALL: found,
         **{name: way(found) for name, way in WAYS.items()},

@@ -11,11 +11,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchcloth.diagnosis import Fitted, fit, fit_noise
-from torchcloth.diagnosis.data.binning import Cells
-from torchcloth.diagnosis.data.dataset import Setting
-from torchcloth.diagnosis.inference.fitting import weighed
-from torchcloth.diagnosis.inference.noise import Noise, Parts
+from torchcloth.diagnosis import ModelFit, fit, fit_noise
+from torchcloth.diagnosis.data.binning import BinnedResiduals
+from torchcloth.diagnosis.data.dataset import DiagnosisData
+from torchcloth.diagnosis.inference.fitting import assemble_fit
+from torchcloth.diagnosis.inference.noise import Noise, CovarianceParts
 
 NONE = 1e-9  # nearly, of a standard deviation
 SMALL = 1e-2  # of a typical amplitude: a tangent at zero
@@ -24,52 +24,52 @@ SMALL = 1e-2  # of a typical amplitude: a tangent at zero
 class Independent(Noise):
     """Slow errors are as large as they are, and agree with no neighbour."""
 
-    def covariance(self, cells: Cells, nuisance: Tensor, std: Tensor, parts: Parts | None = None) -> Tensor:
+    def covariance(self, cells: BinnedResiduals, nuisance: Tensor, std: Tensor, parts: CovarianceParts | None = None) -> Tensor:
         """Their variances alone, and what differs from episode to episode."""
         moved = nuisance * std
         return torch.diag(super().covariance(cells, nuisance[:, :0], std[:0], parts).diagonal()) + moved @ moved.mT
 
 
-def independent(found: Fitted) -> Fitted:
+def independent(found: ModelFit) -> ModelFit:
     """Every cell for itself."""
-    return weighed(found.model, found.evidence, Independent(*found.noise))
+    return assemble_fit(found.model, found.linearisation, Independent(*found.noise))
 
 
-def exact(found: Fitted) -> Fitted:
+def exact(found: ModelFit) -> ModelFit:
     """Clock, camera, grasp, rim and tare are as stated in every episode."""
-    evidence = replace(found.evidence, stds=[NONE * s for s in found.evidence.stds])
-    return weighed(found.model, evidence, fit_noise(evidence))
+    evidence = replace(found.linearisation, stds=[NONE * s for s in found.linearisation.nuisance_stds])
+    return assemble_fit(found.model, evidence, fit_noise(evidence))
 
 
-def against_zero(found: Fitted) -> Fitted:
+def against_zero(found: ModelFit) -> ModelFit:
     """Any amplitude matters."""
-    anything = [replace(h, share=0.0) for h in found.evidence.hypotheses]
-    return replace(found, evidence=replace(found.evidence, hypotheses=anything))
+    anything = [replace(h, share=0.0) for h in found.linearisation.hypotheses]
+    return replace(found, evidence=replace(found.linearisation, hypotheses=anything))
 
 
-def one_mesh(found: Fitted) -> Fitted:
+def one_mesh(found: ModelFit) -> ModelFit:
     """Residuals on the given mesh, and nobody knows of another; slopes are those of before."""
-    cells = [c._replace(value=c.value + n) for c, n in zip(found.evidence.cells, found.evidence.numerics, strict=True)]
-    evidence = replace(found.evidence, cells=cells, numerics=[torch.zeros_like(n) for n in found.evidence.numerics])
-    return weighed(found.model, evidence, fit_noise(evidence))
+    cells = [c._replace(value=c.value + n) for c, n in zip(found.linearisation.bins, found.linearisation.mesh_differences, strict=True)]
+    evidence = replace(found.linearisation, cells=cells, numerics=[torch.zeros_like(n) for n in found.linearisation.mesh_differences])
+    return assemble_fit(found.model, evidence, fit_noise(evidence))
 
 
-def rigid(found: Fitted) -> Fitted:
+def rigid(found: ModelFit) -> ModelFit:
     """What is fitted stays where it is, however much it could do."""
     parameters = tuple(replace(p, std=NONE) for p in found.model.parameters)
-    return weighed(replace(found.model, parameters=parameters), found.evidence, found.noise)
+    return assemble_fit(replace(found.model, parameters=parameters), found.linearisation, found.noise)
 
 
-def tangents(found: Fitted, setting: Setting) -> Fitted:
+def tangents(found: ModelFit, setting: DiagnosisData) -> ModelFit:
     """Slopes at a hundredth of a typical amplitude, simulated anew."""
-    whole = {h.name: h for h in found.evidence.hypotheses}
+    whole = {h.name: h for h in found.linearisation.hypotheses}
     small = [replace(h, typical=SMALL * h.typical) for h in whole.values()]
-    near = fit(found.model, setting, small, 0, noise=found.noise, before=found.evidence)
-    own = [whole[h.name] for h in near.evidence.hypotheses]
-    return replace(near, evidence=replace(near.evidence, hypotheses=own))
+    near = fit(found.model, setting, small, 0, noise=found.noise, before=found.linearisation)
+    own = [whole[h.name] for h in near.linearisation.hypotheses]
+    return replace(near, evidence=replace(near.linearisation, hypotheses=own))
 
 
-WAYS: Mapping[str, Callable[[Fitted], Fitted]] = {
+WAYS: Mapping[str, Callable[[ModelFit], ModelFit]] = {
     "slow errors independent": independent,
     "episodes exact": exact,
     "tested against zero": against_zero,

@@ -23,15 +23,15 @@ from torchcloth import planning
 from torchcloth.cloth import Cloth
 from torchcloth.errors import InvalidInput
 from torchcloth.planning import Goal
-from torchcloth.planning.constrained_step import step_within
+from torchcloth.planning.constrained_step import solve_constrained_step
 from torchcloth.planning.episode_conversion import extract_motion_parameters
 from torchcloth.planning.forward_model import ForwardModel, exact_model
 from torchcloth.planning.motion_parameters import GripperMotionParameters
 from torchcloth.planning.objective import build_objective
-from torchcloth.planning.task import Task
+from torchcloth.planning.task import PlanningTask
 from torchcloth.recordings import ClothInfo, Collider, GraspInfo, Recording
-from torchcloth.robots import ACCELERATION, gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/
-from torchcloth.robots.primitives import Limits  # pyright: ignore[reportMissingImports]
+from torchcloth.robots import DEFAULT_JOINT_ACCELERATION, to_gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/
+from torchcloth.robots.primitives import GripperLimits  # pyright: ignore[reportMissingImports]
 from torchcloth.types import Trajectory
 
 from ..resumable import Kept
@@ -152,12 +152,12 @@ def found_by(
             method=method,  # type: ignore[arg-type] - one of two words
             wait=WAIT,
         )
-        return plan.motion, plan.after[0], plan.history, {"ended": plan.ended, "warnings": plan.warnings}
+        return plan.motion, plan.distance_after[0], plan.distance_history, {"ended": plan.stop_reason, "warnings": plan.warnings}
     from ..rl import learn
     from ..rl.env import stepwise
 
     courses = [stepwise(c) for c in scene.courses]
-    task = Task([scene.run], courses, goal, None, None)
+    task = PlanningTask([scene.run], courses, goal, None, None)
     found = learn(task, scale.sac)
     return task.motion(found.best), min(found.history), found.history, {"policy": found.policy}
 
@@ -176,19 +176,19 @@ def set_up(garment: str, motion: str, fine: Discretisation, waypoints: int) -> S
         ),
         provenance="synthetic: torchcloth, same engine",
         grasps={name: GraspInfo(vertices=held) for name, held in staged.held.items()},
-        grippers={name: gripper_motion(path) for name, path in staged.action.motion.items()},
+        grippers={name: to_gripper_motion(path) for name, path in staged.action.motion.items()},
         colliders={"table": Collider(np.array([0.0, 0.0, LAYERS / 2]), np.array([0.0, 0.0, 1.0]), FRICTION)},
     )
-    courses = extract_motion_parameters(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())
+    courses = extract_motion_parameters(cloth, recording, waypoints, WAIT, DEFAULT_JOINT_ACCELERATION, GripperLimits())
     return Scene(cloth, recording, courses, ForwardModel(exact_model(cloth), recording, courses, None))
 
 
 def hidden_goal(scene: Scene, rng: np.random.Generator) -> Goal:
     """Where another motion within the limits brings the garment, as noisy points of its surface."""
-    blank = Task([scene.run], scene.courses, Goal(torch.zeros(1, 3)), None, None)
+    blank = PlanningTask([scene.run], scene.courses, Goal(torch.zeros(1, 3)), None, None)
     wanted = torch.as_tensor(rng.standard_normal((len(scene.courses), *blank.courses[0].zero_waypoints.shape)))
     wanted = (0.7 * wanted.mean(0) + 0.3 * wanted) * torch.tensor([AWAY] * 3 + [TURN] * 3)  # hands go much alike
-    at = step_within(blank.start, -wanted.flatten(), torch.eye(len(blank.start)).to(wanted), blank.bounds)
+    at = solve_constrained_step(blank.start, -wanted.flatten(), torch.eye(len(blank.start)).to(wanted), blank.bounds)
     with torch.no_grad():
         x = scene.run.simulate(blank.motion(at))[-1]
     return Goal(on_surface(x, scene.run.faces, POINTS, rng) + torch.as_tensor(NOISE * rng.standard_normal((POINTS, 3))))

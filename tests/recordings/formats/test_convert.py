@@ -84,7 +84,7 @@ def test_the_target_must_be_what_is_written(tmp_path, capsys):
     for target, match in (
         ("a.bag", "DST cannot be a .bag file"),
         ("a.db3", "DST cannot be a .db3 file"),
-        ("ep_0.15/../ep_0.15", "DST is SRC or holds it"),
+        ("ep_0.15/../ep_0.15", "DST is SRC or contains it"),
     ):
         assert call(episode, tmp_path / target, "--overwrite") == 2
         assert match in capsys.readouterr().err

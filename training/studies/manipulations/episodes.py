@@ -13,7 +13,7 @@ from torchcloth import recordings as rec
 from torchcloth.errors import SimulationDiverged
 from torchcloth.losses import closest
 from torchcloth.observe import DepthCamera, DepthNoise, View, capture, look_at, render_depth, solid_mesh
-from torchcloth.robots import gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/
+from torchcloth.robots import to_gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/
 from torchcloth.synthesis.garments import DENSITY
 from torchcloth.synthesis.sensors import EYE, TARGET
 from torchcloth.types import Trajectory
@@ -71,7 +71,7 @@ def record(truth: Scene, model: Scene, rate: float, points: int) -> Seen:
             t[kept], np.concatenate([clouds[i] for i in kept]), np.array([len(clouds[i]) for i in kept])
         ),
         observation_noise_std=sigma,
-        grippers={name: gripper_motion(path) for name, path in motion.items()},
+        grippers={name: to_gripper_motion(path) for name, path in motion.items()},
     )
     return Seen(recording, own, hidden)
 

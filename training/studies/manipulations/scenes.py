@@ -17,7 +17,7 @@ from torchcloth.errors import InvalidInput
 from torchcloth.materials import AEP
 from torchcloth.meshes import Mesh
 from torchcloth.robots import primitives  # pyright: ignore[reportMissingImports] - mapped from robots/
-from torchcloth.robots.primitives import Action, Limits  # pyright: ignore[reportMissingImports]
+from torchcloth.robots.primitives import Action, GripperLimits  # pyright: ignore[reportMissingImports]
 from torchcloth.synthesis.garments import BENDING, DAMPING, DENSITY, GARMENTS, material, numbers, sewn
 
 WORN = ("dress", "trousers", "shirt")
@@ -181,7 +181,7 @@ class Scene:
     def _action(self, grips: dict[str, tuple[float, ...]]) -> Action:
         """Away for cover and fling, towards the arms for drag."""
         speed = SPEEDS[self.what.speed] / self.what.slower
-        limits = Limits(speed, 8.0 * speed**2)
+        limits = GripperLimits(speed, 8.0 * speed**2)
         if self.what.action == "fling":
             return primitives.fling(grips, 0.12, heading=0.0, pull=0.15, landing=0.05, rest=REST, limits=limits)
         if self.what.action == "drag":

@@ -27,17 +27,17 @@ from ..recordings import (
     Truth,
 )
 from ..robots import (  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-    Plan,
+    JointPlan,
     Scene,
     bimanual_rig,
-    gripper_motion,
+    to_gripper_motion,
     plan,
 )
 from ..types import Trajectory
+from .episode_spec import Order
 from .garments import data_sheet, numbers
-from .orders import Order
+from .initial_scene import FRICTION, LAYERS, Staged, stage
 from .sensors import DEPTH_SCALE, view
-from .staging import FRICTION, LAYERS, Staged, stage
 
 SETTLING = 0.6  # s, in which hanging cloth comes to rest before the first frame
 AIR = 1.204  # kg/m^3
@@ -54,7 +54,7 @@ class Performance:
     x: np.ndarray  # [T, V, 3] m
     motion: dict[str, Trajectory]
     scene: Scene
-    plan: Plan | None
+    plan: JointPlan | None
 
 
 def make(order: Order, images: Path, on_progress: Progress = lambda stage, done, of: None) -> Recording:
@@ -140,9 +140,9 @@ def _recorded(
         observation_noise_std=sigma,
         air_density=AIR,
         split={"motion": order.motion, "replicate_of": None},
-        grippers={} if done.plan else {name: gripper_motion(path) for name, path in done.motion.items()},
-        joints=done.plan.joints() if done.plan else {},
-        robots=done.scene.infos() if done.plan else {},
+        grippers={} if done.plan else {name: to_gripper_motion(path) for name, path in done.motion.items()},
+        joints=done.plan.joint_motions() if done.plan else {},
+        robots=done.scene.robot_infos() if done.plan else {},
         extra={"order": order.facts(), **_planned(done)},
     )
 
@@ -197,11 +197,11 @@ def _planned(done: Performance) -> dict[str, Any]:
     """What the arms' limits made of the motion."""
     if done.plan is None:
         return {}
-    gap = done.plan.gap
+    gap = done.plan.smallest_gap
     return {
         "plan": {
-            "slower": done.plan.slower,
-            "limiting": done.plan.limiting,
+            "slower": done.plan.slowdown,
+            "limiting": done.plan.limiting_joint,
             "nearest": {"distance": gap.distance, "solids": [gap.first, gap.second], "time": gap.time},
         }
     }

@@ -10,14 +10,14 @@ import torch
 
 from ..diagnosis import read_model, start_of
 from ..diagnosis.models.loading import watched
-from ..episodes.observed import RATE, episode
-from ..episodes.streams import SAME
+from ..episodes.observed import DEFAULT_FRAME_RATE_HZ, build_episode
+from ..episodes.streams import SAME_TIME_S
 from ..identification import replayed
 from ..losses import closest
 from ..recordings import Recording
-from .episodes import film_of
 from .film import DISTANCE, Curve, Film, Sheet
 from .geometry import Array, edges_of
+from .recording_film import film_of
 
 MODEL = ".tcm"
 QUANTILE = 0.95  # of the distances, is dark red
@@ -52,7 +52,7 @@ def film_of_fit(recording: Recording, fit: str | Path, *, truth: bool = False) -
 def _film_of_model(recording: Recording, path: str | Path, truth: bool) -> Film:
     """As ``film_of_fit``, with the cloth, robot and observer of a model file."""
     model = read_model(path, recording).model
-    world, data = model.world(), episode(model.base.cloth, recording, RATE)
+    world, data = model.world(), build_episode(model.base.cloth, recording, DEFAULT_FRAME_RATE_HZ)
     film = film_of(recording, truth=truth, times=data.times.numpy())
     x = watched(world, data).x.numpy()
     film = _beside(film, recording, x, world.cloth.mesh.faces)
@@ -74,7 +74,7 @@ def _when(recording: Recording, times: Array) -> Array:
     """[T] whether points were seen then, and not only a little before or after."""
     if recording.points is None:
         return np.zeros(len(times), dtype=bool)
-    return np.abs(times[:, None] - recording.points.t - recording.clock_offset).min(1) <= SAME
+    return np.abs(times[:, None] - recording.points.t - recording.clock_offset).min(1) <= SAME_TIME_S
 
 
 def with_cloth(

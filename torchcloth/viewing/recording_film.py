@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from ..boundaries.motion import interpolate
+from ..boundaries.motion import interpolate_poses
 from ..errors import InvalidInput, RecordingError, TorchclothError
 from ..observe import DepthCamera, decode, solid_mesh, to_points
 from ..recordings import Collider, Recording
-from ..robots import arm_of, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ..robots.replay import unwound  # pyright: ignore[reportMissingImports]
+from ..robots import arm_from_recording, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..robots.replay import unwrap_joints  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
 from .film import (
     MARKERS,
@@ -162,12 +162,12 @@ def _arms(recording: Recording, times: Array) -> tuple[dict[str, Solid], dict[st
     solids, paths, notes = {}, {}, []
     for name, motion in recording.joints.items():
         try:
-            arm = arm_of(recording, name)
-            q = np.stack([np.interp(times, motion.t, own) for own in unwound(arm, motion.q).T], axis=-1)
+            arm = arm_from_recording(recording, name)
+            q = np.stack([np.interp(times, motion.t, own) for own in unwrap_joints(arm, motion.q).T], axis=-1)
             shapes = arm.geometry(torch.as_tensor(q, dtype=arm.base.dtype))
             paths |= replay(replace(recording, grippers={}, joints={name: motion}))
-            if arm.unshaped:
-                notes.append(f"of arm {name!r} links that are meshes alone are not drawn: {', '.join(arm.unshaped)}")
+            if arm.links_without_primitives:
+                notes.append(f"of arm {name!r} links that are meshes alone are not drawn: {', '.join(arm.links_without_primitives)}")
         except ImportError:
             raise
         except TorchclothError as error:
@@ -187,7 +187,7 @@ def _poses(pose: torch.Tensor, count: int) -> Array:
 
 def _trace(path: Trajectory, times: Array) -> Trace:
     inside = np.clip(times, float(path.t[0]), float(path.t[-1]))
-    poses = interpolate(path, torch.as_tensor(inside))
+    poses = interpolate_poses(path, torch.as_tensor(inside))
     return Trace(path.pose[:, :3, 3].numpy(), poses.numpy())
 
 

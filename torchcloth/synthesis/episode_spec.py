@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from ..errors import InvalidInput
-from ..materials.presets import find
+from ..materials.presets import find_fabric
 from .garments import GARMENTS
 
 MOTIONS = ("cover", "fling", "drag", "fold", "hang", "swing", "shake", "stretch")
@@ -50,7 +50,7 @@ class Order:
         for name, known in (("garment", tuple(GARMENTS)), ("motion", MOTIONS), ("camera", CAMERAS)):
             if getattr(self, name) not in known:
                 raise InvalidInput(name, got=repr(getattr(self, name)), expected=f"one of {', '.join(known)}")
-        find(self.cloth_fabric)
+        find_fabric(self.cloth_fabric)
         if not FEWEST <= self.triangles <= MOST:
             raise InvalidInput("triangles", got=self.triangles, expected=f"{FEWEST} to {MOST}")
         if self.seed < 0:

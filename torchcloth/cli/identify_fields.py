@@ -1,4 +1,4 @@
-"""``torchcloth identify --fields``: one value per triangle instead of one for the cloth."""
+"""``torchcloth identify --fields``: fit one value per triangle instead of one for the whole cloth."""
 
 from __future__ import annotations
 
@@ -7,51 +7,63 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._utils.files import PROGRESS
+from .._utils.files import PROGRESS_FOLDER_NAME
 from ..errors import InvalidInput
-from .folders import replaces
+from .output_paths import replacement_note
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
     from ..identification.fields import FieldFit
     from ..recordings import Recording
 
-SINGLE = ("fit", "starts", "profile", "nuisance", "prior", "refine", "method", "stop")  # options of single values only
+SINGLE_VALUE_OPTIONS = (
+    "fit",
+    "starts",
+    "profile",
+    "nuisance",
+    "prior",
+    "refine",
+    "method",
+    "stop",
+)  # without --fields only
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Options."""
+    """Add the options of fields."""
     parser.add_argument(
         "--fields",
         nargs="+",
         metavar="NAME",
-        help="instead: one value per triangle of these parameters of the material, smooth, without errors",
+        help="fit a smooth field, one value per triangle, of each named material parameter; without standard errors",
     )
     parser.add_argument(
-        "--contrast", type=float, metavar="X", help="how much a field may vary: a factor of e^X from side to side (1)"
+        "--contrast",
+        type=float,
+        metavar="X",
+        help="expected contrast of a field: a factor of e^X from side to side (default: 1)",
     )
 
 
 def check(options: argparse.Namespace, defaults: argparse.Namespace) -> None:
-    """Refuse options that fields do not have, and the other way round.
+    """Check that options of fields and of single values are not mixed.
 
     Raises:
-        InvalidInput: such an option.
+        InvalidInput: an option that does not go with ``--fields``, or ``--contrast`` without it.
     """
     if options.fields is None:
         if options.contrast is not None:
-            raise InvalidInput("--contrast", got=options.contrast, expected="--fields beside it")
+            raise InvalidInput("--contrast", got=options.contrast, expected="--fields as well")
         return
-    for name in SINGLE:
+    for name in SINGLE_VALUE_OPTIONS:
         if getattr(options, name) != getattr(defaults, name):
             raise InvalidInput(f"--{name}", got="a value, with --fields", expected="one of them")
 
 
-def spread_out(cloth: Cloth, names: list[str]) -> None:
-    """Give parameters of the material one value per triangle, equal at first.
+def make_fields(cloth: Cloth, names: list[str]) -> None:
+    """Turn material parameters into fields with one value per triangle, equal at first.
 
     Raises:
-        InvalidInput: no such parameter.
+        InvalidInput: the material has no such parameter.
     """
     from ..parameters import PhysicalParameter
 
@@ -64,7 +76,15 @@ def spread_out(cloth: Cloth, names: list[str]) -> None:
 
 
 def fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording], journal: Path, advance: Any) -> FieldFit:
-    """The search."""
+    """Fit the fields to the episodes.
+
+    Args:
+        options: of the command line.
+        cloth: with fields, see ``make_fields``.
+        episodes: recordings of the cloth.
+        journal: folder in which the progress is stored.
+        advance: called after each iteration.
+    """
     from ..identification import fit_fields
 
     contrast = {} if options.contrast is None else {"contrast": options.contrast}
@@ -82,33 +102,37 @@ def fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording], jo
     )
 
 
-def report(folder: Path, found: FieldFit, cloth: Cloth) -> int:
-    """A table, fields.json and fields.png."""
+def report(folder: Path, fit: FieldFit, cloth: Cloth) -> int:
+    """Print a table and write fields.json and fields.png.
+
+    Returns:
+        Exit code 0.
+    """
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    from .._utils.resume import clear
+    from .._utils.resume import clear_store
     from ..identification.fields import RESULT
     from ..identification.pictures import field_maps, save_figure
 
-    note = replaces(folder / RESULT)
-    path = found.save(folder)
-    picture = save_figure(field_maps(found.fields, cloth), folder / "fields.png")
-    clear(folder / PROGRESS)  # before anything is printed, to somebody who may stop reading
+    note = replacement_note(folder / RESULT)
+    path = fit.save(folder)
+    picture = save_figure(field_maps(fit.fields, cloth), folder / "fields.png")
+    clear_store(folder / PROGRESS_FOLDER_NAME)  # before anything is printed, to somebody who may stop reading
     table = Table(title=f"{len(cloth.mesh.faces)} triangles", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("field", "median", "5 %", "95 %", "unit"):
         table.add_column(heading, justify="left" if heading == "field" else "right")
-    units = {name: str(cloth.material.get_submodule(name).unit) for name in found.fields}
-    for name, values in found.fields.items():
+    units = {name: str(cloth.material.get_submodule(name).unit) for name in fit.fields}
+    for name, values in fit.fields.items():
         low, middle, high = values.quantile(values.new_tensor([0.05, 0.5, 0.95])).tolist()
         table.add_row(name, f"{middle:.3g}", f"{low:.3g}", f"{high:.3g}", units[name])
     console = Console(highlight=False)
     console.print(table)
-    before, after = (1e3 * found.fit[f"chamfer_{key}"] for key in ("before", "after"))
+    before, after = (1e3 * fit.fit[f"chamfer_{key}"] for key in ("before", "after"))
     if not math.isnan(after):
         console.print(f"Chamfer, one-sided, cloud to surface: {before:.2f} mm before, {after:.2f} mm fitted")
-    for warning in found.warnings:
+    for warning in fit.warnings:
         console.print(f"note: {warning}", style="yellow", markup=False)
     print(f"result:   {path}{note}\npicture:  {picture}")
     return 0

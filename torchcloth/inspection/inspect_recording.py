@@ -10,10 +10,10 @@ import numpy as np
 from ..errors import MissingDependency, TorchclothError
 from ..recordings import Recording, size_checks, timing
 from ..recordings.timing import Stream
-from ..robots.paths import Path, holding, paths  # pyright: ignore[reportMissingImports] - mapped from robots/
-from . import frames, images, noise
-from .frames import Frames
-from .images import Depth
+from ..robots.paths import GripperPath, holding_paths, gripper_paths  # pyright: ignore[reportMissingImports] - mapped from robots/
+from . import depth_images, frame_checks, noise
+from .depth_images import Depth
+from .frame_checks import Frames
 from .lag import CANNOT, Lag, lag
 from .noise import Noise
 
@@ -42,7 +42,7 @@ class Inspection:
 
     recording: Recording = field(repr=False)
     streams: dict[str, Stream]
-    paths: dict[str, Path] = field(repr=False)
+    paths: dict[str, GripperPath] = field(repr=False)
     lag: Lag | None
     noise: dict[str, Noise]
     frames: dict[str, Frames]
@@ -68,12 +68,12 @@ class Inspection:
         return _plain(whole)
 
 
-def _moved(recording: Recording, holds: dict[str, Path]) -> tuple[dict[str, Path], list[str]]:
+def _moved(recording: Recording, holds: dict[str, GripperPath]) -> tuple[dict[str, GripperPath], list[str]]:
     """(the paths of those that hold the cloth and of others that are known, why others are not there)."""
     found, notes = dict(holds), []
     for name in sorted({*recording.grippers, *recording.joints} - holds.keys()) if holds else []:
         try:
-            found |= paths(recording, [name])
+            found |= gripper_paths(recording, [name])
         except TorchclothError as error:
             notes.append(f"{name!r} stands by and has no path: {error}")
     return found, notes
@@ -90,7 +90,7 @@ def inspect(recording: Recording) -> Inspection:
     """
     notes: list[str] = []
     try:
-        holds = holding(recording)  # an arm that stands by tells nothing of the cloth
+        holds = holding_paths(recording)  # an arm that stands by tells nothing of the cloth
     except TorchclothError as error:  # joints without an arm that is known here: all else can still be looked at
         holds = {}
         notes.append(f"no gripper paths, so no lag: {error}")
@@ -98,17 +98,17 @@ def inspect(recording: Recording) -> Inspection:
     notes += more
     seen: dict[str, Frames] = {}
     if recording.markers is not None:
-        seen["markers"] = frames.of_markers(recording.markers, recording.cloth)
+        seen["markers"] = frame_checks.of_markers(recording.markers, recording.cloth)
     if recording.points is not None:
         held = _held(recording.points.t + recording.clock_offset, holds)
-        seen["points"], more = frames.of_clouds(recording.points, recording.cloth, held)
+        seen["points"], more = frame_checks.of_clouds(recording.points, recording.cloth, held)
         notes += more
     late = lag(recording, holds, {name: ~found.rejected for name, found in seen.items()})
     shift = -recording.clock_offset if late is None else late.trusted
     depth = {}
     for name, camera in recording.cameras.items():
         try:
-            if (found := images.depth_of(camera)) is not None:
+            if (found := depth_images.depth_of(camera)) is not None:
                 depth[name] = found
         except MissingDependency as error:
             notes.append(f"{name}: {error}")
@@ -124,14 +124,14 @@ def inspect(recording: Recording) -> Inspection:
     )
 
 
-def _held(t: np.ndarray, holds: dict[str, Path]) -> np.ndarray:
+def _held(t: np.ndarray, holds: dict[str, GripperPath]) -> np.ndarray:
     """[T, G, 3] m, where the grippers that hold are at times on the motion clock."""
     return np.stack([path.at(t)[0] for path in holds.values()], 1) if holds else np.zeros((len(t), 0, 3))
 
 
-def _noises(recording: Recording, holds: dict[str, Path], seen: dict[str, Frames], shift: float) -> dict[str, Noise]:
+def _noises(recording: Recording, holds: dict[str, GripperPath], seen: dict[str, Frames], shift: float) -> dict[str, Noise]:
     def still(t: np.ndarray) -> np.ndarray:
-        return np.all([path.still(t - shift) for path in holds.values()], axis=0) if holds else np.zeros(len(t), bool)
+        return np.all([path.is_standing(t - shift) for path in holds.values()], axis=0) if holds else np.zeros(len(t), bool)
 
     found = {}
     if (markers := recording.markers) is not None:
@@ -141,7 +141,7 @@ def _noises(recording: Recording, holds: dict[str, Path], seen: dict[str, Frames
     return {name: value for name, value in found.items() if value is not None}
 
 
-def _remarks(recording: Recording, holds: dict[str, Path], late: Lag | None) -> list[str]:
+def _remarks(recording: Recording, holds: dict[str, GripperPath], late: Lag | None) -> list[str]:
     """What a person should do about it."""
     remarks = []
     if late is None and holds:

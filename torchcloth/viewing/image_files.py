@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from .._utils.files import atomically
+from .._utils.files import write_atomically
 from ..errors import InvalidInput
 from .film import Film
+from .frame_renderer import Stage
 from .geometry import Array
-from .stage import Stage
 
 RATE, FASTEST = 25.0, 50.0  # 1/s; browsers slow a faster GIF down
 COLOURS = 96  # of a GIF
@@ -59,7 +59,7 @@ def animate(
         if on_frame is not None:
             on_frame(frame + 1, len(film))
     steps = _durations(film.times)
-    with atomically(Path(path)) as part:
+    with write_atomically(Path(path)) as part:
         images[0].save(
             part, format="GIF", save_all=True, append_images=images[1:], duration=steps, loop=0, optimize=True
         )
@@ -98,7 +98,7 @@ def picture(
     stage = Stage(film, size or MOMENT, look)
     moments = [stage.pixels(int(frame), titled=frame == shown[0]) for frame in shown]
     row = np.concatenate([*(moment[:, : stage.scene] for moment in moments[:-1]), moments[-1]], axis=1)
-    with atomically(Path(path)) as part:
+    with write_atomically(Path(path)) as part:
         Image.fromarray(row).save(part, format="PNG", optimize=True)
     return Path(path)
 

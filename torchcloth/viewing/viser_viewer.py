@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .._utils.files import atomically
+from .._utils.files import write_atomically
 from .colours import colour_map, colours
 from .film import DISTANCE, Film, View
 from .geometry import Array
@@ -173,7 +173,7 @@ def write_viser(film: Film, path: str | Path) -> Path:
             scene.show(frame)
             recorder.insert_sleep(float(step))
         page = path.suffix.lower() == ".html"
-        with atomically(path) as part:
+        with write_atomically(path) as part:
             part.write_bytes(recorder.as_html().encode() if page else recorder.serialize())
     finally:
         _stop(server)

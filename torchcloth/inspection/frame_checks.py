@@ -10,8 +10,8 @@ from ..errors import MissingDependency, RecordingError
 from ..observe import Segmentation, segment
 from ..recordings import ClothInfo, Markers, PointClouds
 from ..recordings.size_checks import longest, size
-from .cuts import cuts
-from .robust import median
+from .crop_planes import cuts
+from .nan_statistics import median
 
 TOLERANCE = 0.1  # of the cloth's size
 NEIGHBOURS = 4  # of a marker, whose pattern distances are looked at

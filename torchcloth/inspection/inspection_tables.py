@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from .frames import Frames
-from .look import Inspection
+from .frame_checks import Frames
+from .inspect_recording import Inspection
 
 WIDTH = 100
 MARKERS_SEEN = "share of the markers seen"

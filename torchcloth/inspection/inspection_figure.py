@@ -10,7 +10,7 @@ import numpy as np
 from ..identification.pictures import save_figure
 from ..observe import decode
 from ..recordings.timing import GAP, times
-from .look import Inspection
+from .inspect_recording import Inspection
 
 INK, GOOD, BAD, SOFT = "#1f6f8b", "#1f6f8b", "#b0653a", "#888888"
 MOST = 3000  # points drawn of a frame

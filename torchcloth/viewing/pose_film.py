@@ -8,8 +8,8 @@ import numpy as np
 
 from ..pose import PoseEstimate
 from ..recordings import Recording
-from .episodes import film_of
 from .film import Film, Sheet
+from .recording_film import film_of
 
 LEAST = 2.0  # mm, that the colour bar spans at least
 QUANTILE = 0.95  # of the hidden vertices' errors, is dark red

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._utils.files import atomically
+from .._utils.files import write_atomically
 from ..errors import MissingDependency
 from ..meshes.mesh import vertex_normals
 from ..observe import DepthCamera, decode, encode, reproject
@@ -42,7 +42,7 @@ def write_rrd(film: Film, path: str | Path) -> Path:
         MissingDependency: rerun-sdk is not installed.
     """
     rr = _rerun()
-    with atomically(Path(path)) as part:
+    with write_atomically(Path(path)) as part:
         part.touch()  # where nothing can be written, rerun's own error would not say which file
         stream = rr.RecordingStream("torchcloth")
         stream.save(part, default_blueprint=_layout(film))

@@ -16,9 +16,9 @@ from ..dynamics.contact import Contact
 from ..effects import AirDrag, Bending, Gravity
 from ..meshes import Mesh
 from ..robots import primitives  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ..robots.primitives import Action, Limits  # pyright: ignore[reportMissingImports]
+from ..robots.primitives import Action, GripperLimits  # pyright: ignore[reportMissingImports]
+from .episode_spec import Order
 from .garments import DAMPING, GARMENTS, Garment, material, numbers, sewn
-from .orders import Order
 
 ARMS = ("right", "left")  # who takes a garment's first and second grip: the arm at -y, the arm at +y
 LAYERS = 1e-3  # m between front and back at the start
@@ -92,7 +92,7 @@ def _action(order: Order, garment: Garment, mesh: Mesh, length: float) -> Action
     for arm, place in zip(ARMS, garment.grips, strict=True):
         x, y, z = mesh.vertices[mesh.places[place]].mean(0).tolist()
         grips[arm] = (x, y, z if order.motion in HANGING else z + ABOVE)
-    limits, away = Limits(order.speed, order.acceleration), 0.0
+    limits, away = GripperLimits(order.speed, order.acceleration), 0.0
     match order.motion:
         case "cover":
             return primitives.cover(grips, 0.75 * length, heading=away, landing=0.04, roll=ROLL, limits=limits)
